@@ -129,31 +129,24 @@ def test_while_tenants_wait_none_is_served_twice_more_than_another(comers: list[
 
 
 @pytest.mark.parametrize(
-    ("robot", "expected_s"),
-    [("x/1", 8.0), ("x/9", 4.0), ("y/9", 3.0), ("z/1", 3.0)],
+    ("robot", "position"),
+    [("x/1", 8), ("x/9", 6), ("y/1", 8), ("z/1", 3), ("x/3", 4)],
     ids=[
-        "behind its own item",
-        "behind its tenant's robot",
-        "its tenant waits for less",
-        "of another tenant",
+        "behind its own items",
+        "of a tenant with two",
+        "behind its own four",
+        "of a new tenant",
+        "its second",
     ],
 )
-def test_the_expected_wait_is_that_of_the_front_for_each_own_item(robot: str, expected_s: float):
+def test_the_position_counts_one_item_of_each_robot_and_tenant_for_each_own_item(robot: str, position: int):
     queue: FairQueue[str] = FairQueue()
-    for name in ("x/1", "x/2"):
-        queue.add(robot_of(name), name, now=6.0)
-    queue.add(robot_of("y/1"), "y/1", now=7.0)
-    assert queue.take(now=8.0) == "x/1"
-    queue.release(robot_of("x/1"), now=8.0)
-    queue.add(robot_of("x/1"), "x/1", now=8.0)
+    waiting = {"x/1": 2, "x/2": 1, "y/1": 4} if robot != "x/3" else {"x/1": 9, "x/3": 1}
+    for name, count in waiting.items():
+        for _ in range(count):
+            queue.add(robot_of(name), name)
 
-    assert queue.expected_wait_s(robot_of(robot), now=10.0) == expected_s
-
-
-def test_nothing_is_expected_to_wait_in_an_empty_queue():
-    queue: FairQueue[str] = FairQueue()
-
-    assert queue.expected_wait_s(robot_of("a"), now=10.0) == 0.0
+    assert queue.position(robot_of(robot)) == position
 
 
 @pytest.mark.parametrize(

@@ -5,14 +5,13 @@ It has the same rules as the other queue (`Scheduler`), and as many threads as t
 
 from __future__ import annotations
 
-from asyncio import AbstractEventLoop, TimerHandle
+from asyncio import AbstractEventLoop
 from collections.abc import Callable, Iterable
 from typing import Generic, Protocol, TypeVar
 
 from rse_pf.backend.compute.limited_services import LimitedServices
 from rse_pf.backend.scheduling.command_queue import CommandQueue, QueueReport
 from rse_pf.backend.scheduling.scheduler import (
-    QUEUE_TARGET_S,
     QueueBacklog,
     QueuedCommand,
     RefusedCommand,
@@ -75,10 +74,8 @@ class ComputeLane(CommandQueue, Generic[Answer]):
         self._limited = limited
         self._scheduler = Scheduler()
         self._count = threads
-        self._loop = loop
         self._monotonic = monotonic
         self._answers = answers
-        self._sweep_timer: TimerHandle | None = None
         self._threads = SolverThreads(
             threads,
             self._compute,
@@ -96,12 +93,8 @@ class ComputeLane(CommandQueue, Generic[Answer]):
         return service in self._names
 
     def backlog(self, queued: QueuedCommand) -> QueueBacklog:
-        """Return the commands that would delay *queued*, see `Scheduler.backlog`."""
+        """Return what would delay *queued*, see `Scheduler.backlog`."""
         return self._scheduler.backlog(queued)
-
-    def note_refused(self, now: float) -> None:
-        """Count a command that was not queued because it would have waited too long."""
-        self._scheduler.note_refused(now)
 
     def submit(self, queued: QueuedCommand, now: float) -> None:
         """Queue *queued*, which was admitted, or refuse it while its robot is blocked after crashes."""
@@ -143,8 +136,6 @@ class ComputeLane(CommandQueue, Generic[Answer]):
             self._refuse_all(refusals, now)
             if queued is not None:
                 self._threads.run(queued)
-        if scheduler.waiting and self._sweep_timer is None:
-            self._sweep_timer = self._loop.call_later(QUEUE_TARGET_S / 2, self._sweep)
 
     def _compute(self, queued: QueuedCommand) -> Answer:
         started = self._monotonic()
@@ -154,12 +145,6 @@ class ComputeLane(CommandQueue, Generic[Answer]):
         now = self._monotonic()
         self._scheduler.done(answer.queued, now)
         self._answers.send(answer, now)
-        self._start()
-
-    def _sweep(self) -> None:
-        self._sweep_timer = None
-        now = self._monotonic()
-        self._refuse_all(self._scheduler.sweep(now), now)
         self._start()
 
     def _refuse_all(self, refusals: list[RefusedCommand], now: float) -> None:

@@ -1,6 +1,6 @@
 """Decide whether a server takes a command: by rate, size, scope, deadline and backlog, in this order.
 
-Rate (`RobotRates`), the backlog of the whole server (`Scheduler.retry_unread_ms`) and size are judged before
+Rate (`RobotRates`), the backlog of the whole server (`Scheduler.unread_pause_s`) and size are judged before
 a message is decoded, because a refusal is then cheaper than decoding.  Scope, deadline and the backlog of the
 robot are judged once the command is known, in whichever queue it waits then.
 Values go in and decisions come out: there is no clock, no queue and no connection here.
@@ -13,15 +13,15 @@ from typing import NamedTuple
 from rse_pf.auth.roster import scopes_allow
 from rse_pf.auth.tokens import Claims
 from rse_pf.backend.gateway.rate_limits import RobotRates
+from rse_pf.backend.scheduling.overload import PAUSE_S
 from rse_pf.backend.scheduling.scheduler import (
     BEHIND,
     BEHIND_HINT,
     QueueBacklog,
     QueuedCommand,
     RefusedCommand,
+    behind_error,
     expired_error,
-    max_wait_s,
-    retry_after_ms,
 )
 from rse_pf.config import SessionSettings
 from rse_pf.errors import Busy, Forbidden
@@ -92,20 +92,17 @@ class Admission:
                 f"this token does not hold the scope services:{service}", hint="issue one that does"
             )
             return RefusedCommand(queued, forbidden, "scope")
-        allowed_s = queued.deadline_s - queued.received_s
-        if allowed_s <= 0:
+        if queued.allowed_s <= 0:
             return RefusedCommand(queued, expired_error(queued, queued.received_s), "expired")
         if backlog.waiting >= self._max_queue:
             busy = Busy(
                 f"{backlog.waiting} commands of this robot wait already",
                 hint="send slower, or let newer frames replace older ones",
-                retry_after_ms=retry_after_ms(backlog.waiting * backlog.turn_s),
+                retry_after_ms=1e3 * PAUSE_S,
             )
             return RefusedCommand(queued, busy, "robot-queue")
-        if backlog.delay_s > max_wait_s(allowed_s, backlog.max_delay_s):
-            retry_ms = retry_after_ms(max(backlog.delay_s, backlog.pause_s))
-            busy = Busy(BEHIND, hint=BEHIND_HINT, retry_after_ms=retry_ms)
-            return RefusedCommand(queued, busy, "behind")
+        if backlog.pause_s:
+            return RefusedCommand(queued, behind_error(backlog.pause_s), "behind")
         return None
 
 

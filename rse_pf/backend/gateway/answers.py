@@ -7,8 +7,6 @@ Neither a payload nor a token reaches the log.
 from __future__ import annotations
 
 import traceback
-from collections.abc import Sequence
-from typing import Any
 
 import msgspec
 import numpy as np
@@ -24,7 +22,6 @@ from rse_pf.recording.tap import RecordingTap
 from rse_pf.service import Registry, dispatch, failure_of, unknown_service
 from rse_pf.wire import Command, Failure, Result
 from rse_pf.wire.envelope import Envelope, encode_refusal
-from rse_pf.wire.messages import MAX_REFUSED_IDS, Refused
 
 __all__ = ["Answers", "EncodedAnswer"]
 
@@ -180,40 +177,33 @@ class Answers:
         self._context.metrics.shed[refusal.reason] += 1
         self.send(self._encode_failure(refusal.queued, refusal.error), now)
 
-    def send_unread_refusals(
+    def refuse_unread(
         self,
         connection: RobotConnection,
-        unread: Sequence[tuple[Envelope | None, int]],
+        envelope: Envelope | None,
+        size_bytes: int,
         refusal: UnreadRefusal,
         retry_after_ms: float,
     ) -> None:
-        """Answer messages that are not decoded: in one message, if the robot knows such messages.
+        """Answer a message that is not decoded.
 
         Args:
             connection: Of the robot.
-            unread: Which command each message is, if that is known, and its length.
-            refusal: Why they are refused.
+            envelope: Which command the message is, if that is known.
+            size_bytes: Its length.
+            refusal: Why it is refused.
             retry_after_ms: When the robot may try again.
         """
         session = connection.session
         assert session is not None
-        fields: dict[str, Any] = {
-            "code": Busy.code, "message": refusal.message, "hint": refusal.hint,
-            "retry_after_ms": retry_after_ms, "server": self._context.server_id,
-        }  # fmt: skip
-        self._context.metrics.shed[refusal.reason] += len(unread)
-        ids = [envelope.id for envelope, _ in unread if envelope is not None]
-        if len(ids) > 1 and len(ids) == len(unread) and session.hears_refusals:
-            for first in range(0, len(ids), MAX_REFUSED_IDS):
-                together = Refused(ids=ids[first : first + MAX_REFUSED_IDS], **fields)
-                connection.write(encode_refusal(session.codec, together))
-        else:
-            for envelope, _ in unread:
-                failure = Failure(id=None if envelope is None else envelope.id, **fields)
-                connection.write(encode_refusal(session.codec, failure))
-        for envelope, size_bytes in unread:
-            if envelope is not None:
-                self._note_unread(connection, envelope, size_bytes)
+        failure = Failure(
+            id=None if envelope is None else envelope.id, code=Busy.code, message=refusal.message,
+            hint=refusal.hint, retry_after_ms=retry_after_ms, server=self._context.server_id,
+        )  # fmt: skip
+        self._context.metrics.shed[refusal.reason] += 1
+        connection.write(encode_refusal(session.codec, failure))
+        if envelope is not None:
+            self._note_unread(connection, envelope, size_bytes)
 
     def _note_unread(self, connection: RobotConnection, envelope: Envelope, size_bytes: int) -> None:
         service = self.label(envelope.service)

@@ -18,6 +18,7 @@ from rse_pf.backend.gateway.frames import CloseSocket, FrameAssembler, Received,
 from rse_pf.backend.gateway.handshake import Accepted
 from rse_pf.backend.gateway.rate_limits import RobotRates
 from rse_pf.backend.ports import Wire, WorkerContext
+from rse_pf.backend.scheduling.overload import MAX_EARLY_COMMANDS
 from rse_pf.errors import ProtocolError, RsePfError
 from rse_pf.wire import CODECS, Command, Failure, Progress
 from rse_pf.wire.messages import FromRobot
@@ -97,9 +98,10 @@ class RobotConnection:
     """One robot's connection between its handshake and its end."""
 
     __slots__ = (
-        "_assembler", "_context", "_deferred", "_handler", "_wire", "allowed_s", "claims", "commands",
-        "is_connected", "last_heard_s", "last_result", "moving_until_s", "number", "opened_s",
-        "paused_s", "pinged_s", "rated_until_s", "recorded", "robot", "session", "tap",
+        "_assembler", "_awaited_id", "_context", "_deferred", "_early_commands", "_handler", "_wire",
+        "allowed_s", "claims", "commands", "ignores_pauses", "is_connected", "last_heard_s", "last_result",
+        "moving_until_s", "number", "opened_s", "paused_until_s", "pinged_s", "recorded", "robot", "session",
+        "tap",
     )  # fmt: skip
 
     def __init__(
@@ -128,12 +130,14 @@ class RobotConnection:
         self.session = session
         self.number = number
         self.opened_s = self.last_heard_s = self.pinged_s = now
-        self.allowed_s: float | None = None
+        self.allowed_s = handler.context.settings.session.answer_timeout_s
         """Time that the last command had, from its arrival to its deadline."""
-        self.paused_s = float("-inf")
-        """When the robot was told to pause, because the server is behind."""
-        self.rated_until_s = float("-inf")
-        """Until when the robot keeps to the rate that it was told."""
+        self.paused_until_s = float("-inf")
+        """Until when the robot has to pause, because the server has more to do than it can."""
+        self.ignores_pauses = False
+        """Whether it sent on in a pause: it is not refused any more, but read one command at a time."""
+        self._early_commands = 0
+        self._awaited_id: int | None = None
         self.commands = 0
         """How many of its commands were answered; ``last_result`` is ``ok`` or the code of the last one."""
         self.last_result = ""
@@ -149,8 +153,8 @@ class RobotConnection:
             self.recorded = self.tap.opened(session.codec.name, accepted.robot)
         self._wire = wire
         self._assembler = FrameAssembler(handler.context.settings.session)
-        self._deferred: deque[tuple[bytes, bool, float]] | None = None
-        """Messages that arrived while the decoder thread has one of this robot; None if it has none."""
+        self._deferred: deque[tuple[bytes, bool]] | None = None
+        """Messages that arrived while the decoder thread has one of this robot, or one awaits its answer."""
 
     @property
     def is_closing(self) -> bool:
@@ -196,6 +200,9 @@ class RobotConnection:
             session.in_flight -= 1
             if session.is_pinged:
                 session.forget_command(command_id)
+            if command_id == self._awaited_id:
+                self._awaited_id = None
+                self._context.loop.call_soon(self._read_deferred)
             if not self._assembler.closed:
                 self._context.metrics.bytes_out += len(data)
                 self._wire.send(data, session.codec.is_text)
@@ -250,6 +257,29 @@ class RobotConnection:
         if self.session is not None:
             self._execute(self.session.answer_renewal(token_s), now)
 
+    def pause(self, seconds: float, now: float) -> None:
+        """Note that the robot was refused, and has to pause."""
+        self.paused_until_s, self._early_commands = now + seconds, 0
+
+    def note_early(self) -> None:
+        """Count a command that the robot sent in its pause."""
+        self._early_commands += 1
+        self.ignores_pauses |= self._early_commands > MAX_EARLY_COMMANDS
+
+    def hold_until_answered(self, command_id: int) -> None:
+        """Read nothing more from the robot until a command is answered."""
+        self._awaited_id = command_id
+        self._deferred = deque()
+        self._wire.hold()
+
+    def _read_deferred(self) -> None:
+        deferred, self._deferred = self._deferred, None
+        now = self._context.clocks.monotonic()
+        for waiting, was_text in deferred or ():
+            if not self._assembler.closed:
+                self._take(waiting, was_text, now)
+        self._wire.read_on()
+
     def close(self, code: int, reason: str) -> None:
         """Close the socket and take nothing more from it."""
         self._context.metrics.closed[reason] += 1
@@ -268,7 +298,7 @@ class RobotConnection:
         self.last_heard_s = now
         handler, session = self._handler, self.session
         if self._deferred is not None:
-            self._deferred.append((data, is_text, now))
+            self._deferred.append((data, is_text))
             return
         metrics = self._context.metrics
         metrics.bytes_in += len(data)
@@ -299,14 +329,10 @@ class RobotConnection:
         state, suspicion = session.state, session.suspicion
 
         def follow_decoded(message: FromRobot | ProtocolError) -> None:
-            deferred, self._deferred = self._deferred, None
             if self.is_connected and not self._assembler.closed:
                 decisions = session.take(message, now, data)
                 self._follow(session, decisions, len(data), now, state, suspicion)
-            for waiting, was_text, arrived in deferred or ():
-                if not self._assembler.closed:
-                    self._take(waiting, was_text, arrived)
-            self._wire.read_on()
+            self._read_deferred()
 
         self._deferred = deque()
         self._wire.hold()

@@ -6,12 +6,11 @@ is known here.  Each queue (`CommandQueue`) answers what it took.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
-from rse_pf.backend.gateway.admission import DECODER_FULL, TOO_FAST, Admission
+from rse_pf.backend.gateway.admission import DECODER_FULL, TOO_FAST, TOO_LATE, Admission
 from rse_pf.backend.gateway.answers import Answers
 from rse_pf.backend.gateway.connection import RobotConnection
 from rse_pf.backend.gateway.decoder_thread import DecoderThread
@@ -27,14 +26,12 @@ from rse_pf.backend.rosbridge.codec import RosbridgeCodec
 from rse_pf.backend.rosbridge.session import RosbridgeSession
 from rse_pf.backend.rosbridge.topics import RosbridgeTopics
 from rse_pf.backend.scheduling.command_queue import CommandQueue
-from rse_pf.backend.scheduling.robot_shares import AGAIN_S, TOLD_S
 from rse_pf.backend.scheduling.scheduler import QueueBacklog, QueuedCommand, RefusedCommand
-from rse_pf.errors import NotFound, UnknownService
+from rse_pf.errors import Busy, NotFound, UnknownService
 from rse_pf.services.pnp import wire_types
 from rse_pf.silent_connections import SilentConnections
 from rse_pf.wire import CODECS, Codec, Command, Failure, make_codec
 from rse_pf.wire.envelope import peek
-from rse_pf.wire.messages import Rate
 from rse_pf.wire.server_session import CLOSE_GOING_AWAY, CLOSE_RATE, CLOSE_TOKEN_OVER, ServerSession
 
 __all__ = ["Dispatcher"]
@@ -42,8 +39,6 @@ __all__ = ["Dispatcher"]
 _DECODER_RETRY_MS = 500.0
 _TOKEN_S = 3.0
 """Time from the handshake to the token of a rosbridge client that showed none in it."""
-_FREED_AT_ONCE = 32
-"""With each message, so many robots are told that they are free once there is room."""
 _NO_JOBS = {"jobs": 0.0, "jobs_pending": 0.0}
 """Alarms read these gauges of every server."""
 
@@ -75,13 +70,10 @@ class Dispatcher:
         settings = context.settings
         self.context = context
         self.connections = token_watch.connections
-        self._rated: set[RobotConnection] = set()
-        """Those that were told a rate, which may have ended."""
         self.admission = Admission(settings.session)
         self.rates = self.admission.rates
         self.decoder = DecoderThread(context.loop.call_soon_threadsafe)
         self.stateless = StatelessQueue(context, answers)
-        self._scheduler = self.stateless.scheduler
         self._queues: tuple[CommandQueue, ...] = (*queues, self.stateless)
         self._answers = answers
         self._updates = updates
@@ -145,7 +137,6 @@ class Dispatcher:
     def _add_connection(self, connection: RobotConnection, expires_s: float | None, now: float) -> None:
         """Add a connection whose robot is known; its token ends at *expires_s* (monotonic clock, s)."""
         self.connections.add(connection)
-        self._scheduler.shares.connected = len(self.connections)
         self._token_watch.watch(connection, expires_s)
         for queue in self._queues:
             queue.enter(connection)
@@ -182,10 +173,6 @@ class Dispatcher:
         self._token_watch.forget(connection)
         if connection in self.connections:
             self.connections.discard(connection)
-            self._rated.discard(connection)
-            shares = self._scheduler.shares
-            shares.forget(connection.robot)
-            shares.connected = len(self.connections)
             if self._topics is not None:
                 self._topics.leave(connection)
             for queue in self._queues:
@@ -233,68 +220,29 @@ class Dispatcher:
             connection.close(CLOSE_RATE, "rate")
             return True
         if retry_ms:
-            answers.send_unread_refusals(connection, [(peek(codec, data), len(data))], TOO_FAST, retry_ms)
+            answers.refuse_unread(connection, peek(codec, data), len(data), TOO_FAST, retry_ms)
             return True
-        if connection.allowed_s is None:
+        scheduler = self.stateless.scheduler
+        if connection.ignores_pauses or not scheduler.waiting:
             return False
-        shares = self._scheduler.shares
-        shares.note(connection.robot)
-        if not self._scheduler.is_behind:
-            return False
-        told_s = connection.rated_until_s - now
-        if shares.has_room:
-            self._free_some(now)
-        elif -TOLD_S < told_s < AGAIN_S:
-            self._tell_rate(connection, now)
-        retry_ms = 1e3 * (connection.paused_s + self._scheduler.pause_s - now)
-        is_early = retry_ms > 0.0
-        if not is_early:
-            spread = shares.next_spread()
-            retry_ms = spread * self._scheduler.retry_unread_ms(
-                connection.robot, connection.allowed_s, keeps_share=session.hears_rate
-            )
-        envelope = peek(codec, data) if retry_ms else None
+        early_s = max(0.0, connection.paused_until_s - now)
+        pause_s = early_s or scheduler.unread_pause_s(connection.robot, connection.allowed_s)
+        envelope = peek(codec, data) if pause_s else None
         if envelope is None or self._queue_of(envelope.service) is not self.stateless:
             return False
-        if not is_early:
-            pause_s = self._scheduler.pause_s
-            self._pause(connection, now + min(1e-3 * retry_ms, spread * pause_s) - pause_s)
-        self.stateless.refuse_unread(connection, envelope, retry_ms, len(data), is_early=is_early)
+        if early_s:
+            connection.note_early()
+        else:
+            connection.pause(pause_s, now)
+        answers.refuse_unread(connection, envelope, len(data), TOO_LATE, 1e3 * pause_s)
         return True
-
-    def _pause(self, connection: RobotConnection, paused_s: float) -> None:
-        """Note that a robot is told to pause, as if it had been at *paused_s*, and what its share is."""
-        connection.paused_s = paused_s
-        now = self.context.clocks.monotonic()
-        if now >= connection.rated_until_s and not self._scheduler.shares.has_room:
-            self._tell_rate(connection, now)
-
-    def _tell_rate(self, connection: RobotConnection, now: float) -> None:
-        session, share_per_s = connection.session, self._scheduler.shares.per_s
-        if share_per_s and session is not None and session.hears_rate:
-            connection.rated_until_s = now + TOLD_S
-            self._rated.add(connection)
-            share_per_s *= self._scheduler.shares.next_spread()
-            connection.write(session.codec.encode(Rate(commands_per_s=share_per_s, for_ms=1e3 * TOLD_S)))
-
-    def _free_some(self, now: float) -> None:
-        """Tell some of the robots that keep to a rate that they are free."""
-        for _ in range(min(_FREED_AT_ONCE, len(self._rated))):
-            connection = self._rated.pop()
-            session = connection.session
-            if connection.rated_until_s > now and session is not None and connection.is_connected:
-                rate = Rate(commands_per_s=self._scheduler.shares.per_s, for_ms=0.0)
-                connection.write(session.codec.encode(rate))
-            connection.rated_until_s = -math.inf
 
     def refuse_long(self, connection: RobotConnection, session: ServerSession, data: bytes) -> bool:
         """Refuse a message that is too long for the event loop; False if the decoder thread may take it."""
         may_wait = self.admission.may_wait(len(data), self.decoder.unread_bytes, session.suspicion)
         if not may_wait:
             envelope = peek(session.codec, data)
-            self._answers.send_unread_refusals(
-                connection, [(envelope, len(data))], DECODER_FULL, _DECODER_RETRY_MS
-            )
+            self._answers.refuse_unread(connection, envelope, len(data), DECODER_FULL, _DECODER_RETRY_MS)
         return not may_wait
 
     def note_undecoded(self, connection: RobotConnection, failure: Failure, size_bytes: int) -> None:
@@ -312,15 +260,16 @@ class Dispatcher:
         queue = self._queue_of(command.service)
         judges_itself = queue is not None and queue.judges_scope
         claims = None if judges_itself else connection.claims
-        backlog = QueueBacklog() if queue is None else queue.backlog(queued)
+        is_held = connection.ignores_pauses and queue is self.stateless
+        backlog = QueueBacklog() if queue is None or is_held else queue.backlog(queued)
         refusal = self.admission.judge(queued, claims, backlog)
         if refusal is not None:
-            if queue is not None and refusal.reason == "behind":
-                queue.note_refused(now)
-                if queue is self.stateless:
-                    self._pause(connection, now)
+            if queue is self.stateless and isinstance(refusal.error, Busy):
+                connection.pause(1e-3 * (refusal.error.retry_after_ms or 0.0), now)
             self._answers.send_refusal(refusal, now)
         elif queue is not None:
+            if is_held:
+                connection.hold_until_answered(command.id)
             queue.submit(queued, now)
         elif command.service in self._names:
             error = UnknownService(

@@ -8,23 +8,20 @@ from __future__ import annotations
 from asyncio import TimerHandle
 from collections.abc import Callable
 
-from rse_pf.backend.gateway.admission import TOO_LATE, is_in_scope
+from rse_pf.backend.gateway.admission import is_in_scope
 from rse_pf.backend.gateway.answers import Answers, EncodedAnswer
-from rse_pf.backend.gateway.connection import RobotConnection
 from rse_pf.backend.metrics import LongestRecently
 from rse_pf.backend.ports import WorkerContext
 from rse_pf.backend.scheduling.command_queue import CommandQueue, QueueReport
-from rse_pf.backend.scheduling.cpu_throttle import BATCH_S, CpuThrottle
+from rse_pf.backend.scheduling.cpu_throttle import CpuThrottle
 from rse_pf.backend.scheduling.scheduler import (
     INLINE_BYTES,
-    QUEUE_TARGET_S,
     QueueBacklog,
     QueuedCommand,
     RefusedCommand,
     Scheduler,
 )
 from rse_pf.backend.scheduling.thread_pool import SOLVER_THREADS, SolverThreads
-from rse_pf.wire.envelope import Envelope
 
 __all__ = ["StatelessQueue"]
 
@@ -76,9 +73,6 @@ class StatelessQueue(CommandQueue):
         self.leaves_unread: Callable[[], bool] = lambda: False
         """Whether there was no time for some of the sockets when they were read last."""
         self._throttle_timer: TimerHandle | None = None
-        self._sweep_timer: TimerHandle | None = None
-        self._batched: dict[RobotConnection, tuple[float, list[tuple[Envelope, int]]]] = {}
-        """Refusals that are written together: when the robot may try again, ms, and which messages."""
 
     @property
     def held(self) -> int:
@@ -90,12 +84,8 @@ class StatelessQueue(CommandQueue):
         return service in self._names
 
     def backlog(self, queued: QueuedCommand) -> QueueBacklog:
-        """Return the commands that would delay *queued*, see `Scheduler.backlog`."""
+        """Return what would delay *queued*, see `Scheduler.backlog`."""
         return self.scheduler.backlog(queued)
-
-    def note_refused(self, now: float) -> None:
-        """Count a command that was not queued because it would have waited too long."""
-        self.scheduler.note_refused(now)
 
     def submit(self, queued: QueuedCommand, now: float) -> None:
         """Queue *queued*, which was admitted, and start the commands whose turn it is."""
@@ -152,33 +142,6 @@ class StatelessQueue(CommandQueue):
         self._answers.send(answer, ended)
         return True
 
-    def refuse_unread(
-        self,
-        connection: RobotConnection,
-        envelope: Envelope,
-        retry_ms: float,
-        size_bytes: int,
-        *,
-        is_early: bool = False,
-    ) -> None:
-        """Refuse a message that is not decoded, because the server is behind.
-
-        Args:
-            connection: Of the robot.
-            envelope: What could be read of the message.
-            retry_ms: When the robot may try again, see `Scheduler.retry_unread_ms`.
-            size_bytes: Length of the message.
-            is_early: Whether the robot was told to wait longer.
-        """
-        self.scheduler.note_refused(self._monotonic(), is_early=is_early)
-        session = connection.session
-        if self._throttle_timer is None and (session is None or not session.hears_refusals):
-            self._answers.send_unread_refusals(connection, [(envelope, size_bytes)], TOO_LATE, retry_ms)
-            return
-        if not self._batched:
-            self._loop.call_later(BATCH_S, self._send_batch)
-        self._batched.setdefault(connection, (retry_ms, []))[1].append((envelope, size_bytes))
-
     # --- from the queue to an answer -----------------------------------------------------------
 
     def _note_inline(self, spent_s: float) -> None:
@@ -205,8 +168,6 @@ class StatelessQueue(CommandQueue):
             if queued is not None:
                 self._waits.note(now - queued.received_s, now)
                 self._run(queued)
-        if scheduler.waiting and self._sweep_timer is None:
-            self._sweep_timer = self._loop.call_later(QUEUE_TARGET_S / 2, self._sweep)
 
     def _run(self, queued: QueuedCommand) -> None:
         """Compute the answer to *queued*, in the event loop or in a solver thread."""
@@ -247,16 +208,4 @@ class StatelessQueue(CommandQueue):
 
     def _go_on(self) -> None:
         self._throttle_timer = None
-        self._start()
-
-    def _send_batch(self) -> None:
-        batched, self._batched = self._batched, {}
-        for connection, (retry_ms, unread) in batched.items():
-            if connection.is_connected:
-                self._answers.send_unread_refusals(connection, unread, TOO_LATE, retry_ms)
-
-    def _sweep(self) -> None:
-        self._sweep_timer = None
-        now = self._monotonic()
-        self._refuse(self.scheduler.sweep(now), now)
         self._start()

@@ -25,7 +25,7 @@ from rse_pf.backend.jobs.record_gc import RECORD_TTL_S, RecordCollector
 from rse_pf.backend.jobs.runner import WAITING, JobContext, JobOutcome, JobSignals, run_job
 from rse_pf.backend.ports import Log
 from rse_pf.backend.robot_store import quota_bytes
-from rse_pf.backend.scheduling.command_queue import CommandQueue, QueueReport, unmeasured_backlog
+from rse_pf.backend.scheduling.command_queue import CommandQueue, QueueReport
 from rse_pf.backend.scheduling.scheduler import QueueBacklog, QueuedCommand
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import BadRequest, Busy, Cancelled, RsePfError
@@ -151,7 +151,7 @@ class JobManager(CommandQueue):
     def backlog(self, queued: QueuedCommand) -> QueueBacklog:
         """Return how many commands of the robot have no answer yet."""
         entries = [entry for entry in self._entries.values() if entry.request.robot == queued.robot]
-        return unmeasured_backlog(sum(len(entry.waiters) + len(entry.resubmitted) for entry in entries))
+        return QueueBacklog(sum(len(entry.waiters) + len(entry.resubmitted) for entry in entries))
 
     def withdraw(self, owner: Any, command_id: int) -> None:
         """Cancel one command; its job ends unless another command waits for it."""

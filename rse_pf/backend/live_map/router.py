@@ -19,7 +19,7 @@ from rse_pf.backend.live_map.garbage import GarbageCounts
 from rse_pf.backend.live_map.map_link import OwnerLinks
 from rse_pf.backend.live_map.subscriptions import Reader, Subscriptions
 from rse_pf.backend.ports import WorkerContext
-from rse_pf.backend.scheduling.command_queue import CommandQueue, QueueReport, unmeasured_backlog
+from rse_pf.backend.scheduling.command_queue import CommandQueue, QueueReport
 from rse_pf.backend.scheduling.scheduler import QueueBacklog, QueuedCommand
 from rse_pf.errors import (
     BadMessage,
@@ -111,7 +111,7 @@ class LiveMapRouter(CommandQueue):
 
     def backlog(self, queued: QueuedCommand) -> QueueBacklog:
         """Return how many commands of the robot have no answer yet."""
-        return unmeasured_backlog(self._waiting.get(queued.robot, 0))
+        return QueueBacklog(self._waiting.get(queued.robot, 0))
 
     # --- commands ------------------------------------------------------------------------------
 

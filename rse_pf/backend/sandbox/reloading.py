@@ -17,7 +17,7 @@ from typing import Any, Protocol
 
 from rse_pf.backend.sandbox.circuit_breaker import Block
 from rse_pf.backend.sandbox.manager import SandboxHost, SandboxManager
-from rse_pf.backend.scheduling.command_queue import CommandQueue, QueueReport, unmeasured_backlog
+from rse_pf.backend.scheduling.command_queue import CommandQueue, QueueReport
 from rse_pf.backend.scheduling.scheduler import QueueBacklog, QueuedCommand
 from rse_pf.identity import RobotId
 from rse_pf.service import failure_of, unknown_service
@@ -259,7 +259,7 @@ class ReloadingSandboxes(CommandQueue):
         """Return how many commands of the robot wait."""
         robot = queued.robot
         here = len(self._waiting.get(robot, ()))
-        return unmeasured_backlog(here + sum(manager.waiting_of(robot) for manager in self._all))
+        return QueueBacklog(here + sum(manager.waiting_of(robot) for manager in self._all))
 
     def report(self) -> QueueReport:
         """Return the state and the counts of this worker's sandboxes for /readyz and /metrics."""

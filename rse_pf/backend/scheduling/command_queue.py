@@ -12,10 +12,7 @@ from typing import Any, Protocol
 
 from rse_pf.backend.scheduling.scheduler import QueueBacklog, QueuedCommand
 
-__all__ = ["CommandQueue", "QueueReport", "unmeasured_backlog"]
-
-_UNMEASURED_TURN_S = 0.125
-"""A robot whose queue is full waits this long for each of its turns where turns are not measured."""
+__all__ = ["CommandQueue", "QueueReport"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -47,7 +44,7 @@ class CommandQueue(Protocol):
         """Return whether commands to *service* wait here, now."""
 
     def backlog(self, queued: QueuedCommand) -> QueueBacklog:
-        """Return the commands that would delay *queued*, which is offered here."""
+        """Return what would delay *queued*, which is offered here."""
 
     def submit(self, queued: QueuedCommand, now: float) -> None:
         """Take *queued*, which was admitted at *now*; it is answered once, unless its connection ends."""
@@ -65,10 +62,6 @@ class CommandQueue(Protocol):
         """Note the connection *owner*, whose robot is known from now on."""
         return
 
-    def note_refused(self, now: float) -> None:
-        """Count a command that was refused at *now* because of `QueueBacklog.delay_s`."""
-        return
-
     def give_up(self) -> None:
         """The server drains: leave to other servers what they can go on with."""
         return
@@ -76,8 +69,3 @@ class CommandQueue(Protocol):
     def close(self) -> None:
         """End what works for this queue; commands that are held may stay unanswered."""
         return
-
-
-def unmeasured_backlog(waiting: int) -> QueueBacklog:
-    """Return the backlog of a queue that measures no turns, in which *waiting* commands of a robot wait."""
-    return QueueBacklog(waiting, turn_s=_UNMEASURED_TURN_S)

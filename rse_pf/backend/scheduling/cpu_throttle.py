@@ -9,14 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-__all__ = ["BATCH_S", "MIN_WAIT_S", "CpuThrottle"]
+__all__ = ["MIN_WAIT_S", "CpuThrottle"]
 
 MIN_WAIT_S = 0.002
 """Measured: with shorter waits, the waiting itself used up the budget of a small server."""
 _BURST_S = 0.02
-BATCH_S = 0.01
-"""While an emulated server waits for its budget, the refusals of this time are written together, which costs
-less CPU than one at a time."""
 
 
 class CpuThrottle:

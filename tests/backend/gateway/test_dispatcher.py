@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import threading
 from collections.abc import Iterator
 from typing import Any
@@ -10,20 +9,18 @@ from typing import Any
 import msgspec
 import pytest
 from backend.gateway.worker_parts import BINARY, UNIX_S, WorkerParts, worker_parts
-from backend.scheduling.admitted import fall_behind, queued
+from backend.scheduling.admitted import measure_turns, queued
 from fakes import FakeLoop, FakeWire
 
 from rse_pf.backend.gateway.answers import EncodedAnswer
 from rse_pf.backend.gateway.connection import RobotConnection
-from rse_pf.backend.scheduling.command_queue import CommandQueue, QueueReport, unmeasured_backlog
+from rse_pf.backend.scheduling.command_queue import CommandQueue, QueueReport
 from rse_pf.backend.scheduling.scheduler import QueueBacklog, QueuedCommand
 from rse_pf.config import PlatformSettings
 from rse_pf.identity import RobotId, object_name
 from rse_pf.object_store import MemoryStore, digest_of
 from rse_pf.service import Registry
-from rse_pf.wire import Cancel, Command, Failure, Hello, Move, Ping, Pong, Result, Welcome
-from rse_pf.wire.messages import MAX_REFUSED_IDS, Rate, Refused
-from rse_pf.wire.server_session import RATE, REFUSALS
+from rse_pf.wire import Cancel, Command, Failure, Move, Ping, Pong, Result, Welcome
 
 SETTINGS = PlatformSettings()
 
@@ -176,266 +173,84 @@ def test_nothing_is_written_behind_a_close(worker: WorkerParts):
     assert [type(m) for m in wire.sent] == [Welcome]
 
 
-def overload(worker: WorkerParts, *, waiting: int = 1) -> None:
-    """Let the scheduler be behind, with *waiting* robots that wait half a second each."""
-    fall_behind(worker.scheduler, turn_s=0.5, now=worker.loop.now)
-    for number in range(waiting):
-        worker.scheduler.submit(queued(f"other-{number}", at=worker.loop.now))
+def overload(worker: WorkerParts) -> QueuedCommand:
+    """Return a command that runs while another one waits, on a server whose turns take half a second."""
+    measure_turns(worker.scheduler, 0.5, worker.loop.now)
+    for name in ("runs", "waits"):
+        worker.scheduler.submit(queued(name, at=worker.loop.now))
+    running, _ = worker.scheduler.start(worker.loop.now)
+    assert running is not None
+    return running
 
 
-def compute_waiting(worker: WorkerParts) -> None:
-    """Empty the queue."""
-    now = worker.loop.now
-    while (started := worker.scheduler.start(now)[0]) is not None:
-        worker.scheduler.done(started, now)
+def send_until_refused(worker: WorkerParts, connection: RobotConnection, wire: FakeWire) -> int:
+    """Send commands with little time until one is refused; return its number."""
+    for number in range(10, 20):
+        worker.say(connection, echo(number, deadline_ms=250.0))
+        if number in refused(wire):
+            return number
+    raise AssertionError("none was refused")
+
+
+def end_overload(worker: WorkerParts, running: QueuedCommand) -> None:
+    """End the command that runs, and those that wait for it."""
+    worker.scheduler.leave("waits")
+    worker.scheduler.done(running, worker.loop.now)
 
 
 def test_a_server_that_is_behind_refuses_without_decoding(worker: WorkerParts):
     connection, wire = worker.join()
     worker.say(connection, echo(7, deadline_ms=250.0))
     overload(worker)
-
-    worker.say(connection, echo(8, deadline_ms=250.0))
-
-    refused = wire.sent[-1]
-    assert (refused.id, refused.code) == (8, "busy")
-    assert refused.retry_after_ms == pytest.approx(500.0, rel=0.25)
     assert connection.session is not None
-    assert connection.session.in_flight == 0
+
+    number = send_until_refused(worker, connection, wire)
+
+    assert (wire.sent[-1].id, wire.sent[-1].code) == (number, "busy")
+    assert 500.0 <= wire.sent[-1].retry_after_ms <= 1500.0
+    assert connection.session.in_flight == number - 10, "those that were accepted before"
     assert worker.metrics.shed["unread"] == 1
     assert worker.metrics.requests["echo", "busy"] == 1
 
 
-def test_a_robot_that_was_told_to_pause_is_refused_until_then_although_there_is_room(worker: WorkerParts):
+def test_a_robot_that_has_to_pause_is_refused_until_then_while_others_wait(worker: WorkerParts):
     connection, wire = worker.join()
     worker.say(connection, echo(7, deadline_ms=250.0))
-    overload(worker)
-    worker.say(connection, echo(8, deadline_ms=250.0))
-    compute_waiting(worker)
-    told_s, pause_s = worker.loop.now, worker.scheduler.pause_s
+    running = overload(worker)
+    first = send_until_refused(worker, connection, wire)
+    pause_ms = wire.sent[-1].retry_after_ms
 
-    worker.loop.now += 0.7 * pause_s
-    left_ms = 1e3 * (connection.paused_s + pause_s - worker.loop.now)
-    worker.say(connection, echo(9, deadline_ms=250.0))
-    assert refused(wire) == [8, 9]
-    assert wire.sent[-1].retry_after_ms == pytest.approx(left_ms)
+    worker.loop.now += 0.3
+    worker.say(connection, echo(21, deadline_ms=250.0))
+    assert refused(wire) == [first, 21]
+    assert wire.sent[-1].retry_after_ms == pytest.approx(pause_ms - 300.0)
 
-    worker.loop.now = told_s + 1.51 * worker.scheduler.pause_s
-    worker.say(connection, echo(10, deadline_ms=250.0))
-    worker.loop.run_until(lambda: bool(results(wire)[1:]))
-    assert refused(wire) == [8, 9]
-    assert results(wire)[-1].id == 10
+    end_overload(worker, running)
+    worker.say(connection, echo(22, deadline_ms=250.0))
+    assert refused(wire) == [first, 21], "nothing waits any more"
+    assert results(wire)[-1].id == 22
 
 
-@pytest.fixture
-def starved() -> Iterator[WorkerParts]:
-    """A worker without CPU time for any command, which is behind after the first one of a robot."""
-    settings = PlatformSettings.from_dict({"session": {"max_commands_per_s": 0.0}})
-    with worker_parts(settings=settings, emulated_cores=0.25) as parts:
-        other, _ = parts.join("other")
-        parts.say(other, echo(1))
-        parts.loop.advance()
-        parts.cpu_s = 10.0
-        yield parts
-
-
-def fall_behind_for_good(worker: WorkerParts) -> None:
-    overload(worker, waiting=0)
-    worker.say(worker.join("waits")[0], echo(1))
-    worker.scheduler.submit(queued("another", at=worker.loop.now))
-
-
-def join_one_that_hears_rates(worker: WorkerParts) -> tuple[RobotConnection, FakeWire]:
-    """Connect a robot to a worker that is behind; its share is 2.5 commands a second."""
-    connection, wire = worker.join(hello=False)
-    worker.say(connection, Hello(capabilities=[RATE, REFUSALS]))
-    connection.allowed_s = 0.25
-    fall_behind_for_good(worker)
-    worker.scheduler.shares.per_s = 2.5
-    return connection, wire
-
-
-def test_a_robot_that_knows_such_messages_is_told_its_share_once_and_many_ends_in_one(starved: WorkerParts):
-    connection, wire = join_one_that_hears_rates(starved)
-
-    for number in range(MAX_REFUSED_IDS + 3):
-        starved.say(connection, echo(number, deadline_ms=250.0))
-    starved.loop.advance(0.01)
-
-    told = wire.sent[1:]
-    assert [type(message) for message in told] == [Rate, Refused, Refused]
-    assert told[0].commands_per_s == pytest.approx(2.5, rel=0.5)
-    assert told[0].for_ms == 1400.0
-    assert [*told[1].ids, *told[2].ids] == list(range(MAX_REFUSED_IDS + 3))
-    assert told[1].code == "busy"
-    assert told[1].retry_after_ms > 0
-    assert starved.metrics.requests["echo", "busy"] == MAX_REFUSED_IDS + 3
-
-    starved.scheduler.shares.per_s = 2.0
-    starved.loop.now += 1.1
-    starved.say(connection, echo(100, deadline_ms=250.0))
-    starved.loop.advance(0.01)
-    assert [type(message) for message in wire.sent[4:]] == [Rate, Failure]
-    assert wire.sent[4].commands_per_s == pytest.approx(2.0, rel=0.5)
-
-
-def test_a_robot_that_was_told_its_share_is_told_that_it_is_free_once_there_is_room(starved: WorkerParts):
-    connection, wire = join_one_that_hears_rates(starved)
-    starved.say(connection, echo(0, deadline_ms=250.0))
-    starved.scheduler.shares.has_room = True
-
-    for number in range(1, 4):
-        starved.say(connection, echo(number, deadline_ms=250.0))
-
-    assert told_for_ms(wire) == [1400.0, 0.0]
-    starved.scheduler.shares.has_room = False
-    compute_waiting(starved)
-    starved.loop.now += 1.2
-    starved.say(connection, echo(9, deadline_ms=250.0))
-    assert told_for_ms(wire) == [1400.0, 0.0], "a free robot is told nothing again"
-
-
-def told_for_ms(wire: FakeWire) -> list[float]:
-    return [message.for_ms for message in wire.sent if isinstance(message, Rate)]
-
-
-def test_a_robot_whose_rate_ended_is_told_again_though_its_command_is_taken(starved: WorkerParts):
-    connection, wire = join_one_that_hears_rates(starved)
-    starved.say(connection, echo(0, deadline_ms=250.0))
-    for later_s, told in [(1.5, 2), (3.0, 2)]:
-        compute_waiting(starved)
-        starved.loop.now += later_s
-        connection.paused_s = -math.inf
-        starved.say(connection, echo(1, deadline_ms=250.0))
-        assert len(told_for_ms(wire)) == told, "a robot that sends so rarely needs no rate"
-
-
-def test_one_message_frees_the_robots_that_still_keep_to_a_rate(starved: WorkerParts):
-    hearing = [join_one_that_hears_rates(starved), *(starved.join(f"r{k}", hello=False) for k in range(2))]
-    for connection, _ in hearing[1:]:
-        starved.say(connection, Hello(capabilities=[RATE, REFUSALS]))
-        connection.allowed_s = 0.25
-    for connection, _ in hearing:
-        starved.say(connection, echo(0, deadline_ms=250.0))
-    ended, gone = hearing[1][0], hearing[2][0]
-    ended.rated_until_s = starved.loop.now - 0.1
-    starved.dispatcher.disconnect(gone)
-    starved.scheduler.shares.has_room = True
-
-    starved.say(hearing[0][0], echo(1, deadline_ms=250.0))
-
-    assert [told_for_ms(wire) for _, wire in hearing] == [[1400.0, 0.0], [1400.0], [1400.0]]
-
-
-def test_a_message_frees_so_many_robots_that_others_need_not_wait(starved: WorkerParts):
-    first, _ = join_one_that_hears_rates(starved)
-    hearing = [starved.join(f"r{number}", hello=False) for number in range(50)]
-    for connection, _ in hearing:
-        starved.say(connection, Hello(capabilities=[RATE, REFUSALS]))
-        connection.allowed_s = 0.25
-        starved.say(connection, echo(0, deadline_ms=250.0))
-    starved.scheduler.shares.has_room = True
-    freed = []
-    for number in range(2):
-        starved.say(first, echo(number, deadline_ms=250.0))
-        freed.append(sum(told_for_ms(wire) == [1400.0, 0.0] for _, wire in hearing))
-
-    assert freed == [32, 50]
-
-
-def test_shares_know_who_is_connected(worker: WorkerParts):
-    shares = worker.scheduler.shares
-    connections = [worker.join(f"r{number}")[0] for number in range(3)]
-    assert shares.connected == 3
-    for connection in connections:
-        worker.say(connection, echo(1))  # notes how long its commands may wait
-        worker.say(connection, echo(2))
-    shares.note_free(0.0, 30.0)
-    worker.dispatcher.disconnect(connections[0])
-    assert shares.connected == 2
-    shares.begin(1.0)
-
-    assert shares.per_s == pytest.approx(15.0)
-
-
-def test_a_robot_that_was_told_no_share_is_not_told_that_it_is_free(starved: WorkerParts):
-    connection, wire = join_one_that_hears_rates(starved)
-    starved.scheduler.shares.has_room = True
-
-    starved.say(connection, echo(0, deadline_ms=250.0))
-    starved.loop.advance(0.01)
-
-    assert [type(message) for message in wire.sent[1:]] == [Failure]
-
-
-def test_a_robot_that_waited_until_its_next_command_is_not_early_although_others_pause_for_longer(
-    starved: WorkerParts,
-):
-    connection, wire = join_one_that_hears_rates(starved)
-    for interval in range(1, 10):
-        starved.scheduler.note_refused(starved.loop.now + 0.11 * interval)
-    starved.scheduler.shares.per_s = 5.0
-    assert starved.scheduler.pause_s == 0.65
-
-    starved.say(connection, echo(0, deadline_ms=250.0))
-    starved.loop.advance(0.01)
-
-    told_ms = wire.sent[-1].retry_after_ms
-    assert told_ms == pytest.approx(200.0, rel=0.5)
-    early_s = connection.paused_s + starved.scheduler.pause_s - connection.last_heard_s
-    assert early_s == pytest.approx(1e-3 * told_ms)
-
-
-def test_a_robot_that_does_not_name_them_gets_neither_rate_nor_refused(starved: WorkerParts):
-    connection, wire = starved.join()
-    connection.allowed_s = 0.25
-    fall_behind_for_good(starved)
-    starved.scheduler.shares.per_s = 2.5
-
-    for number in range(3):
-        starved.say(connection, echo(number, deadline_ms=250.0))
-    starved.loop.advance(0.01)
-
-    assert [type(message) for message in wire.sent[1:]] == [Failure] * 3
-    assert refused(wire) == [0, 1, 2]
-
-
-def test_a_robot_that_left_gets_none_of_the_refusals_that_waited(starved: WorkerParts):
-    connection, wire = starved.join(hello=False)
-    starved.say(connection, Hello(capabilities=[REFUSALS]))
-    connection.allowed_s = 0.25
-    fall_behind_for_good(starved)
-    starved.say(connection, echo(8, deadline_ms=250.0))
-    assert len(wire.sent) == 1, "it waits for others"
-
-    connection.on_socket_end()
-    starved.loop.advance(0.01)
-
-    assert len(wire.sent) == 1
-
-
-def test_a_pause_ends_when_the_server_is_no_longer_behind(worker: WorkerParts):
+def test_a_robot_that_ignores_its_pause_is_read_one_command_at_a_time(worker: WorkerParts):
     connection, wire = worker.join()
     worker.say(connection, echo(7, deadline_ms=250.0))
-    overload(worker)
-    worker.say(connection, echo(8, deadline_ms=250.0))
-    worker.scheduler.is_behind = False
-    compute_waiting(worker)
+    running = overload(worker)
+    send_until_refused(worker, connection, wire)
+    for number in range(30, 39):
+        worker.say(connection, echo(number, deadline_ms=250.0))
+    assert refused(wire)[-9:] == list(range(30, 39))
+    assert wire.holds == 0
 
-    worker.say(connection, echo(9, deadline_ms=250.0))
+    for number in range(40, 43):
+        worker.say(connection, echo(number, deadline_ms=250.0))
+    assert wire.holds == 1
+    assert refused(wire)[-1] == 38, "it is refused no more"
+    end_overload(worker, running)
+    worker.say(worker.join("next")[0], echo(1))
+    worker.loop.run_until(lambda: len(results(wire)) >= 4)
 
-    assert refused(wire) == [8]
-    assert results(wire)[-1].id == 9
-
-
-def test_the_first_command_of_a_robot_is_decoded_whatever_waits(worker: WorkerParts):
-    connection, wire = worker.join()
-    overload(worker, waiting=0)
-
-    worker.say(connection, echo(8))
-
-    assert worker.metrics.shed["unread"] == 0
-    assert isinstance(wire.sent[-1], Result)
+    assert [result.id for result in results(wire)[-3:]] == [40, 41, 42]
+    assert wire.holds == 0
 
 
 def test_hellos_pings_and_unknown_services_are_decoded_even_behind(worker: WorkerParts):
@@ -493,27 +308,6 @@ def test_an_emulated_server_without_budget_starts_nothing_until_its_timer():
         assert len(results(wire)) == 1
 
 
-@pytest.mark.parametrize(("emulated_cores", "at_once"), [(0.25, 0), (0.0, 3)])
-def test_only_an_emulated_server_that_is_behind_refuses_in_batches(emulated_cores: float, at_once: int):
-    with worker_parts(emulated_cores=emulated_cores) as worker:
-        connection, wire = worker.join()
-        worker.say(connection, echo(1, deadline_ms=250.0))
-        worker.loop.advance()
-        worker.cpu_s = 10.0
-        overload(worker, waiting=0)
-        other, _ = worker.join("other")
-        worker.say(other, echo(1))
-        worker.scheduler.submit(queued("another", at=worker.loop.now))
-
-        for number in (2, 3, 4):
-            worker.say(connection, echo(number, deadline_ms=250.0))
-
-        assert len(refused(wire)) == at_once
-        if emulated_cores:
-            worker.loop.advance(0.01)
-        assert refused(wire) == [2, 3, 4]
-
-
 def test_a_robot_that_sends_undecodable_messages_is_read_more_and_more_rarely(worker: WorkerParts):
     connection, wire = worker.join()
 
@@ -567,7 +361,7 @@ class Queue(CommandQueue):
         return service == self._service
 
     def backlog(self, queued: QueuedCommand) -> QueueBacklog:
-        return unmeasured_backlog(self._waiting)
+        return QueueBacklog(self._waiting)
 
     def submit(self, queued: QueuedCommand, now: float) -> None:
         self.submitted.append(queued)

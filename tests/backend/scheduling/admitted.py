@@ -1,4 +1,4 @@
-"""The scheduler behind the admission step, as the dispatcher uses them, and ways to bring it into a state."""
+"""The scheduler behind the admission step, as the dispatcher uses them."""
 
 from __future__ import annotations
 
@@ -29,34 +29,14 @@ class AdmittedScheduler(Scheduler):
         refusal = self._admission.judge(command, None, self.backlog(command))
         if refusal is None:
             return super().submit(command)
-        if refusal.reason == "behind":
-            self.note_refused(now)
         return [refusal]
-
-    def refuse_unread(self, robot: str, allowed_s: float, now: float) -> float:
-        retry_ms = self.retry_unread_ms(RobotId("default", robot), allowed_s)
-        if retry_ms:
-            self.note_refused(now)
-        return retry_ms
 
 
 def measure_turns(scheduler: Scheduler, turn_s: float, until_s: float) -> None:
-    """Start a command every *turn_s* until the average has converged; the last at *until_s*."""
-    for step in range(200):
-        now = until_s - (199 - step) * turn_s
+    """Start a command every *turn_s* until the mean has converged; the last at *until_s*."""
+    for step in range(400):
+        now = until_s - (399 - step) * turn_s
         Scheduler.submit(scheduler, queued("turns", at=now - turn_s))
         started, _ = scheduler.start(now)
         assert started is not None
         scheduler.done(started, now)
-    scheduler.is_behind = False  # long turns are late ones
-    assert scheduler.start(until_s) == (None, [])
-
-
-def fall_behind(scheduler: Scheduler, *, turn_s: float = 0.0, now: float = 0.0) -> None:
-    """Let *scheduler* measure *turn_s* between two starts and fall behind at *now*, with an empty queue."""
-    if turn_s:
-        measure_turns(scheduler, turn_s, now - 1.0)
-    Scheduler.submit(scheduler, queued("late", at=now - 0.5))
-    assert scheduler.sweep(now - 0.2) == scheduler.sweep(now) == []
-    scheduler.leave("late")
-    assert scheduler.is_behind

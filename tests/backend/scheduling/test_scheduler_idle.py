@@ -1,19 +1,10 @@
-"""What an idle server does without its queue is what its queue would do."""
+"""When a command starts without a place in the queue, and when in the event loop."""
 
 from __future__ import annotations
 
-import random
-from typing import Any
-
-import pytest
 from backend.scheduling.admitted import queued
 
 from rse_pf.backend.scheduling.scheduler import Scheduler
-
-
-def state(scheduler: Scheduler) -> dict[str, Any]:
-    """Return what a scheduler knows, but for when its next sweep has something to look at."""
-    return {name: value for name, value in vars(scheduler).items() if name != "_sweep_from_s"}
 
 
 def compute(scheduler: Scheduler, wait_s: float, spent_s: float, now: float, *, alone: bool) -> None:
@@ -28,23 +19,6 @@ def compute(scheduler: Scheduler, wait_s: float, spent_s: float, now: float, *, 
         assert (started, refusals) == (work, [])
         scheduler.done(work, now + spent_s)
     assert work.started_s == now
-
-
-@pytest.mark.parametrize("seed", range(8))
-def test_a_command_that_starts_alone_leaves_the_scheduler_as_the_queue_would(seed: int) -> None:
-    chance = random.Random(seed)
-    alone, by_queue = Scheduler(), Scheduler()
-    now, was_behind = 100.0, 0
-    for _ in range(300):
-        now += chance.choice((0.0001, 0.002, 0.08, 0.3))
-        wait_s = chance.choice((0.0, 0.0001, 0.0004, 0.0006, 0.04, 0.2, 0.3))
-        spent_s = chance.choice((0.00001, 0.0009, 0.0011, 0.02, 0.5))
-        compute(alone, wait_s, spent_s, now, alone=True)
-        compute(by_queue, wait_s, spent_s, now, alone=False)
-
-        assert state(alone) == state(by_queue)
-        was_behind += alone.is_behind
-    assert 0 < was_behind < 300
 
 
 def test_nothing_starts_alone_while_another_command_waits_or_runs_or_when_it_is_too_late() -> None:

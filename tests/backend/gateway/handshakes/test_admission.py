@@ -38,7 +38,7 @@ def reason(admission: Admission, **changed: object) -> str:
 def test_a_command_that_breaks_no_limit_is_admitted(admission: Admission):
     assert reason(admission) == ""
     assert reason(admission, claims=claims("services:*")) == ""
-    assert reason(admission, backlog=QueueBacklog(3, 0.4, 0.1)) == ""
+    assert reason(admission, backlog=QueueBacklog(3)) == ""
 
 
 @pytest.mark.parametrize(
@@ -46,9 +46,8 @@ def test_a_command_that_breaks_no_limit_is_admitted(admission: Admission):
     [
         ({"claims": claims("services:other", "data:read")}, "scope", "forbidden"),
         ({"queued": queued("r", within=0.0)}, "expired", "expired"),
-        ({"backlog": QueueBacklog(4, 0.0, 0.3)}, "robot-queue", "busy"),
-        ({"backlog": QueueBacklog(0, 0.6, 0.1)}, "behind", "busy"),
-        ({"backlog": QueueBacklog(0, 0.5, 0.1, 0.025)}, "behind", "busy"),
+        ({"backlog": QueueBacklog(4)}, "robot-queue", "busy"),
+        ({"backlog": QueueBacklog(0, 0.6)}, "behind", "busy"),
     ],
 )
 def test_a_command_beyond_a_limit_is_refused_for_its_reason(
@@ -67,12 +66,12 @@ def test_of_several_reasons_the_first_in_order_is_told(admission: Admission):
     everything = {
         "queued": queued("r", within=0.0),
         "claims": claims("data:read"),
-        "backlog": QueueBacklog(9, 9.0, 1.0),
+        "backlog": QueueBacklog(9, 1.0),
     }
 
     assert reason(admission, **everything) == "scope"
     assert reason(admission, **{**everything, "claims": None}) == "expired"
-    assert reason(admission, backlog=QueueBacklog(9, 9.0, 1.0)) == "robot-queue"
+    assert reason(admission, backlog=QueueBacklog(9, 1.0)) == "robot-queue"
 
 
 def test_the_bytes_that_wait_for_the_decoder_are_bounded_and_suspects_get_a_quarter(admission: Admission):
