@@ -28,9 +28,8 @@ import time
 import traceback
 from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from typing import Any, NoReturn, Protocol
+from typing import Any, NoReturn
 
 from rse_pf.child.fork_server import ForkPlan, read_packet, send_order, serve_forks, start_fork_server
 from rse_pf.child.start import Child, ChildPlan, how_ended
@@ -48,7 +47,6 @@ from rse_pf.linux import be_killed_first, die_with_parent, limit_memory
 
 __all__ = [
     "DEFAULT_NICENESS",
-    "CallWatch",
     "Handler",
     "LimitedProcesses",
     "Overran",
@@ -96,16 +94,6 @@ class ProcessLimits:
     """A process that replies with more has failed."""
 
 
-class CallWatch(Protocol):
-    """Sees in which process a call is worked on, and what it uses."""
-
-    def working(self, pid: int) -> AbstractContextManager[None]:
-        """Return what lasts as long as the process *pid* works; it has not been reaped before the end."""
-
-    def used(self, cpu_s: float) -> None:
-        """Get the CPU seconds that the call took, once for each process that worked on it."""
-
-
 class LimitedProcesses:
     """Up to *count* processes that answer calls; nothing is started before the first call."""
 
@@ -142,7 +130,9 @@ class LimitedProcesses:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def call(self, data: bytes, timeout_s: float, *, near: str = "", watch: CallWatch | None = None) -> bytes:
+    def call(
+        self, data: bytes, timeout_s: float, *, near: str = "", charge: Callable[[float], None] | None = None
+    ) -> bytes:
         """Return the handler's reply to *data*; blocks for at most *timeout_s* seconds, and some ms.
 
         A call whose process ends, although it had answered other calls before, is repeated once in a new
@@ -153,7 +143,7 @@ class LimitedProcesses:
             timeout_s: Bounds the wait for a process and the work.
             near: A free process that answered a call with the same text lately is preferred: it may have
                 cached what this call needs.
-            watch: Is told of the work.
+            charge: Gets the CPU seconds that the call took, once for each process that worked on it.
 
         Raises:
             Crashed: *data* ended the process: a limit, or a signal; the message says which.
@@ -164,7 +154,6 @@ class LimitedProcesses:
             RsePfError: What the handler raised.
         """
         until = time.monotonic() + timeout_s
-        watch = watch or _Unwatched()
         slot = self._free.take(near, until)
         try:
             while True:
@@ -176,8 +165,7 @@ class LimitedProcesses:
                 slot.note(near)
                 before_s = process.cpu_s
                 try:
-                    with watch.working(process.pid):
-                        return _exchange(process, data, until, self._max_reply_bytes)
+                    return _exchange(process, data, until, self._max_reply_bytes)
                 except TimeoutError:
                     _, cpu_s = self._end(slot, process)
                     raise Overran(timeout_s, cpu_s) from None
@@ -186,7 +174,8 @@ class LimitedProcesses:
                     if is_new or how == _NO_TIME:
                         raise self._crash(ended.reason or how) from None
                 finally:
-                    watch.used(process.cpu_s - before_s)
+                    if charge is not None:
+                        charge(process.cpu_s - before_s)
         finally:
             self._free.give(slot)
 
@@ -269,16 +258,6 @@ class _FreeSlots:
             for slot in self._slots:
                 slot.forget()
             self._slots.clear()
-
-
-class _Unwatched:
-    """A watch that sees nothing."""
-
-    def working(self, pid: int) -> AbstractContextManager[None]:
-        return contextlib.nullcontext()
-
-    def used(self, cpu_s: float) -> None:
-        pass
 
 
 class _ProcessEnded(Exception):

@@ -36,7 +36,6 @@ from rse_pf.data_server.http import (
 )
 from rse_pf.data_server.map_describer import MapDescriber
 from rse_pf.data_server.photo_localiser import PhotoLocaliser
-from rse_pf.data_server.photo_turns import PhotoTurns
 from rse_pf.data_server.request_limits import RequestLimits
 from rse_pf.data_server.robot_processes import RobotProcesses
 from rse_pf.data_server.routes import PHOTO_COST, ROUTES, Route
@@ -114,7 +113,7 @@ class DataServer:
         if localiser is None:
             count = max(photo_localiser.LEAST_PROCESSES, settings.serving.compute_processes)
             processes = RobotProcesses(photo_localiser.TARGET, settings, store, clock, count=count)
-            localiser = PhotoLocaliser(processes, PhotoTurns(clock))
+            localiser = PhotoLocaliser(processes)
         self._closing.callback(localiser.close)
         self.handlers = Handlers(
             store, settings.data, MapWork(describe, localiser, self._charge_photo), clock=clock,

@@ -1,8 +1,7 @@
 """Threads that work for robots in turn, so that the slow work of one robot delays no other for long.
 
-Of the robots that wait, the one whose tenant uses the fewest threads goes first, then the one that uses the
-fewest itself, then the one that was served least recently.  A robot never has more than `_PER_ROBOT` threads
-and a tenant never all of them, if there are several.  Work that is no longer wanted is not started; work that
+The order is that of `FairQueue`.  A robot never has more than one thread and a tenant never all of them, if
+there are several.  Work that is no longer wanted is not started; work that
 runs ends at its next call of `check_wanted`.
 """
 
@@ -12,19 +11,19 @@ import asyncio
 import contextlib
 import queue
 import threading
-from collections import Counter, OrderedDict, deque
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from rse_pf.errors import Disconnected
+from rse_pf.fair_queue import FairQueue
 from rse_pf.identity import RobotId
 
 __all__ = ["FairThreads", "check_wanted", "while_wanted"]
 
 _T = TypeVar("_T")
 _THREADS = 8
-_PER_ROBOT, _PER_TENANT = 1, 6
+_MAX_PER_TENANT = 6  # threads of one tenant: two are left for the others
 
 
 @dataclass(slots=True, eq=False)
@@ -66,21 +65,20 @@ class FairThreads:
 
     def __init__(self, threads: int = _THREADS) -> None:
         self._most = threads
-        self._per_tenant = min(_PER_TENANT, max(1, threads - 1))
         self._threads: list[threading.Thread] = []
         self._started: queue.SimpleQueue[_Task | None] = queue.SimpleQueue()
         self._free = threads
         self._lock = threading.Lock()  # held for some microseconds, never during work
-        self._waiting: OrderedDict[RobotId, deque[_Task]] = OrderedDict()
-        self._robots: Counter[RobotId] = Counter()
-        self._tenants: Counter[str] = Counter()
+        self._queue: FairQueue[_Task] = FairQueue(
+            max_running_per_robot=1, max_running_per_tenant=min(_MAX_PER_TENANT, max(1, threads - 1))
+        )
 
     async def run(self, robot: RobotId, function: Callable[..., _T], *arguments: Any) -> _T:
         """Return ``function(*arguments)``, computed in a thread when it is the robot's turn."""
         loop = asyncio.get_running_loop()
         task = _Task(robot, function, arguments, loop, loop.create_future())
         with self._lock:
-            self._waiting.setdefault(robot, deque()).append(task)
+            self._queue.add(robot, task)
             self._start()
         try:
             result: _T = await task.future
@@ -93,7 +91,7 @@ class FairThreads:
         """Wait for the work that runs, and start no more."""
         with self._lock:
             self._free = 0
-            self._waiting.clear()
+            self._queue.remove(lambda task: True)
         for _ in self._threads:
             self._started.put(None)
         for thread in self._threads:
@@ -101,31 +99,16 @@ class FairThreads:
 
     def _start(self) -> None:
         """Start what may run now; the lock is held."""
-        while self._free > 0 and (robot := self._next()) is not None:
-            waiting = self._waiting[robot]
-            task = waiting.popleft()
-            if waiting:
-                self._waiting.move_to_end(robot)
-            else:
-                del self._waiting[robot]
-            if task.is_wanted:
-                self._free -= 1
-                self._robots[robot] += 1
-                self._tenants[robot.tenant] += 1
-                self._started.put(task)
-                if len(self._threads) < min(self._most, self._most - self._free):
-                    thread = threading.Thread(target=self._work_on, name="data", daemon=True)
-                    self._threads.append(thread)
-                    thread.start()
-
-    def _next(self) -> RobotId | None:
-        """Return the robot whose turn it is; `_waiting` has the one first that was served least recently."""
-        best, fewest = None, (self._per_tenant, 0)
-        for robot in self._waiting:
-            used = self._tenants[robot.tenant], self._robots[robot]
-            if used < fewest and used[1] < _PER_ROBOT:
-                best, fewest = robot, used
-        return best
+        while self._free > 0 and (task := self._queue.take()) is not None:
+            if not task.is_wanted:
+                self._queue.release(task.robot)
+                continue
+            self._free -= 1
+            self._started.put(task)
+            if len(self._threads) < min(self._most, self._most - self._free):
+                thread = threading.Thread(target=self._work_on, name="data", daemon=True)
+                self._threads.append(thread)
+                thread.start()
 
     def _work_on(self) -> None:
         while (task := self._started.get()) is not None:
@@ -145,8 +128,7 @@ class FairThreads:
     def _end(self, task: _Task) -> None:
         with self._lock:
             self._free += 1
-            _decrease(self._robots, task.robot)
-            _decrease(self._tenants, task.robot.tenant)
+            self._queue.release(task.robot)
             self._start()
 
 
@@ -157,9 +139,3 @@ def _settle(future: asyncio.Future[Any], result: Any, problem: BaseException | N
         future.set_result(result)
     else:
         future.set_exception(problem)
-
-
-def _decrease(counter: Counter[_T], key: _T) -> None:
-    counter[key] -= 1
-    if not counter[key]:
-        del counter[key]

@@ -16,7 +16,6 @@ import msgspec
 
 from rse_pf.child.limited import Handler
 from rse_pf.config import PlatformSettings
-from rse_pf.data_server.photo_turns import PhotoTurns
 from rse_pf.data_server.robot_processes import RobotProcesses, max_map_bytes, shared_store
 from rse_pf.errors import MissingExtra
 from rse_pf.identity import RobotId
@@ -50,12 +49,11 @@ class _Request(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class PhotoLocaliser:
-    """Localises photos in *processes*, which have the target `TARGET`, by the turns of their robots."""
+    """Localises photos in *processes*, which have the target `TARGET`."""
 
-    def __init__(self, processes: RobotProcesses, turns: PhotoTurns) -> None:
+    def __init__(self, processes: RobotProcesses) -> None:
         self.count = processes.count
         self._processes = processes
-        self._turns = turns
 
     def localise(
         self, robot: RobotId, name: str, photo: bytes, lens: Lens, charge: Callable[[float], None]
@@ -88,12 +86,8 @@ class PhotoLocaliser:
             maps = MapRegistry(store, robot.tenant)
             version = maps.head(request.name).id
             request = msgspec.structs.replace(request, version=version, data=maps.data(request.name, version))
-        call = self._turns.call_of(robot)
-        try:
-            near = f"{request.tenant}/{request.name}"
-            return self._processes.call(robot, msgspec.msgpack.encode(request), near=near, watch=call)
-        finally:
-            charge(call.cpu_s)
+        near = f"{request.tenant}/{request.name}"
+        return self._processes.call(robot, msgspec.msgpack.encode(request), near=near, charge=charge)
 
 
 def make_handler(configuration: str) -> Handler:

@@ -9,7 +9,7 @@ import json
 from collections.abc import Callable
 
 from rse_pf.aws.storage import open_data_store
-from rse_pf.child.limited import CallWatch, LimitedProcesses, ProcessLimits
+from rse_pf.child.limited import LimitedProcesses, ProcessLimits
 from rse_pf.config import PlatformSettings
 from rse_pf.crash_record import CrashRecord
 from rse_pf.errors import Crashed
@@ -74,11 +74,11 @@ class RobotProcesses:
         )
 
     def call(
-        self, robot: RobotId, request: bytes, *, near: str = "", watch: CallWatch | None = None
+        self, robot: RobotId, request: bytes, *, near: str = "", charge: Callable[[float], None] | None = None
     ) -> bytes:
         """Return the handler's reply to what *robot* asked; blocks.
 
-        *near* and *watch* are those of `LimitedProcesses.call`.
+        *near* and *charge* are those of `LimitedProcesses.call`.
 
         Raises:
             Crashed: The request ended the process that worked on it.
@@ -90,7 +90,7 @@ class RobotProcesses:
         if refusal is not None:
             raise refusal
         try:
-            return self._processes.call(request, self._timeout_s, near=near, watch=watch)
+            return self._processes.call(request, self._timeout_s, near=near, charge=charge)
         except Crashed:
             self._crashes.note_crash(robot, self._clock())
             raise

@@ -177,45 +177,24 @@ def test_a_call_gets_the_process_that_had_one_like_it(handler: str):
             assert made.call(b"pid", LONG_S, near="kitchen") == of_kitchen
 
 
-class Watch:
-    """Notes which processes worked on a call, and what they used."""
-
-    def __init__(self) -> None:
-        self.pids: list[int] = []
-        self.cpu_s: list[float] = []
-        self.is_working = False
-
-    @contextmanager
-    def working(self, pid: int) -> Iterator[None]:
-        assert not self.is_working
-        self.pids.append(pid)
-        self.is_working = True
-        try:
-            yield
-        finally:
-            self.is_working = False
-
-    def used(self, cpu_s: float) -> None:
-        self.cpu_s.append(cpu_s)
-
-
 @pytest.mark.parametrize(
     ("data", "error", "times"), [(b"burn 0.1", None, 1), (b"refuse", BadRequest, 1), (b"loop", Crashed, 1),
                                  (b"signal 9", Crashed, 2)],
 )  # fmt: skip
-def test_a_watch_sees_the_processes_and_their_cpu_time(
+def test_a_call_is_charged_for_the_cpu_time_of_each_process_that_worked_on_it(
     processes: LimitedProcesses, data: bytes, error: type[RsePfError] | None, times: int
 ):
-    start, watch = Watch(), Watch()
-    processes.call(b"", LONG_S, watch=start)
+    start_s: list[float] = []
+    call_s: list[float] = []
+    processes.call(b"", LONG_S, charge=start_s.append)
 
     with nullcontext() if error is None else pytest.raises(error):
-        processes.call(data, LONG_S, watch=watch)
+        processes.call(data, LONG_S, charge=call_s.append)
 
-    assert len(watch.pids) == len(watch.cpu_s) == times
+    assert len(call_s) == times
     # The limit of 0.3 s, which ends the loop, includes what the same process took to start.
-    expected = {b"burn 0.1": 0.1, b"loop": 0.3 - sum(start.cpu_s)}.get(data, 0.0)
-    assert 0.9 * expected <= sum(watch.cpu_s) < expected + 0.1
+    expected = {b"burn 0.1": 0.1, b"loop": 0.3 - sum(start_s)}.get(data, 0.0)
+    assert 0.9 * expected <= sum(call_s) < expected + 0.1
 
 
 def test_a_process_has_its_limits_and_none_of_the_sockets_of_its_owner(processes: LimitedProcesses):

@@ -82,7 +82,7 @@ async def test_a_robot_is_served_beside_the_flood_of_another(threads: FairThread
     await asyncio.wait_for(asyncio.gather(*work), TIMEOUT_S)
 
 
-async def test_robots_take_turns() -> None:
+async def test_tenants_are_served_in_turn_and_then_their_robots() -> None:
     threads, gate = FairThreads(1), Gate()
     order: list[str] = []
 
@@ -94,7 +94,7 @@ async def test_robots_take_turns() -> None:
     gate.open.set()
     await asyncio.wait_for(asyncio.gather(first, *later), TIMEOUT_S)
     threads.close()
-    assert order == ["a", "b", "c", "a", "b", "a", "a"]
+    assert order == ["a", "c", "b", "a", "b", "a", "a"]
 
 
 async def test_unwanted_work_is_not_started_and_running_work_ends_at_its_next_step() -> None:
