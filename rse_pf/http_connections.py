@@ -29,15 +29,11 @@ except ImportError as error:  # as on a robot, which serves nothing: `bounded_pr
 
 __all__ = ["MAX_HEADERS", "MAX_HEAD_BYTES", "OneRequestProtocol", "bounded_protocol"]
 
-MAX_HEAD_BYTES = (
-    16384  # of one request, with the empty line that ends its head: what Envoy accepts is shorter
-)
+MAX_HEAD_BYTES = 16384  # of one request: a token, the longest header, has at most 4 KiB
 MAX_HEADERS = 64  # of one request: browsers and load balancers send fewer than 30
-MAX_FRAMING_BYTES = 4096  # of a chunked body, beside its chunks: room for short bodies in short chunks
-FRAMING_SHIFT = (
-    3  # a chunk of n bytes adds n / 8 to that: chunks of one byte cost a hundred times as much CPU
-)
-PARSED_AT_ONCE_BYTES = 16384  # of a chunked body, before its framing is checked: 3 ms of chunks of one byte
+MAX_FRAMING_BYTES = 4096  # of a chunked body beside its chunks, so that short bodies may have short chunks
+FRAMING_SHIFT = 3  # a chunk of n bytes allows n / 8 bytes more: each chunk costs CPU, however short it is
+PARSED_AT_ONCE_BYTES = 16384  # of a chunked body: its framing is checked after so many
 UNSENT_HIGH_BYTES = 1 << 19  # of a reply: the application waits for a client that has not read so many
 UNSENT_LOW_BYTES = 1 << 18  # of a reply: the application goes on when no more than these wait
 _END_OF_HEAD = b"\r\n\r\n"
@@ -123,10 +119,7 @@ class OneRequestProtocol(HttpToolsProtocol):
         if self.transport.is_closing():
             return
         if self._is_in_request():
-            if self.cycle.more_body:
-                self._parse(data)
-            else:
-                self._close_after_reply()
+            self._parse_body(data)
             return
         searched = max(0, len(self._head) - len(_END_OF_HEAD) + 1)
         data = self._head + data
@@ -147,8 +140,7 @@ class OneRequestProtocol(HttpToolsProtocol):
         self._silent.leave(self)
         self._idle.leave(self)
         self._parse(head)
-        if body and not self.transport.is_closing():
-            self._parse(body)
+        self._parse_body(body)
 
     # --- called by llhttp; what is raised ends the parsing, and `_parse` refuses the request -----------
 
@@ -198,16 +190,24 @@ class OneRequestProtocol(HttpToolsProtocol):
     def _is_in_request(self) -> bool:
         return self.cycle is not None and not self.cycle.response_complete
 
+    def _parse_body(self, data: bytes) -> None:
+        """Parse what follows a head, and bound its framing."""
+        step = PARSED_AT_ONCE_BYTES if self._is_chunked else max(len(data), 1)
+        for start in range(0, len(data), step):
+            if self.transport.is_closing():
+                return
+            if not self.cycle.more_body:
+                self._close_after_reply()
+                return
+            part = data[start : start + step]
+            self._framing_bytes_left -= len(part)
+            self._parse(part)
+            if self._is_chunked and self._framing_bytes_left < 0 and self.cycle.more_body:
+                self._refuse()
+
     def _parse(self, data: bytes) -> None:
-        step = PARSED_AT_ONCE_BYTES if self._is_chunked else len(data)
         try:
-            for start in range(0, len(data), step):
-                part = memoryview(data)[start : start + step]
-                self.parser.feed_data(part)
-                if self._is_chunked:
-                    self._framing_bytes_left -= len(part)
-                    if self._framing_bytes_left < 0:
-                        raise httptools.HttpParserError("chunks that are too short")
+            self.parser.feed_data(data)
         except httptools.HttpParserError:
             if self._is_in_request() and not self.cycle.more_body:
                 self._close_after_reply()
@@ -220,6 +220,8 @@ class OneRequestProtocol(HttpToolsProtocol):
 
     def _refuse(self) -> None:
         """Answer 400 unless a reply has begun, and close the connection."""
+        if self.transport.is_closing():
+            return
         has_begun = False
         if self._is_in_request():
             has_begun = self.cycle.response_started

@@ -26,9 +26,7 @@ MAX_REQUESTS_PER_ROBOT = 8
 _BODIES_PER_ROBOT = 0.25  # of ``data.max_uploads``
 _BODIES_PER_TENANT = 0.75  # of ``data.max_uploads``
 _RETRY_AFTER_MS = 1000.0  # for who got no place, or lost it: most bodies come within this time
-_REFUSED_BYTES = (
-    64 << 10
-)  # so many bytes of a refused body count as one request more: they are read and dropped
+_REFUSED_BYTES = 64 << 10  # of a refused body count as one request more: they are read and dropped
 _REFUSED_COST = 32.0  # requests that one refused body counts for at the most: 2 MiB
 
 CPU_S_PER_REQUEST = 0.005

@@ -284,7 +284,7 @@ def test_a_refused_upload_costs_its_sender_the_rate_that_its_body_is_worth_and_n
     large = f"/data/v1/objects/{digest_of(b'large')}"
 
     assert put(service, b"small").status == 201
-    assert service.ask("PUT", large, headers={"content-length": str(10 << 16)}).status == 413
+    assert service.ask("PUT", large, bytes(10 << 16)).status == 413
     service.now += 7.5  # 4 - 1 - 1 - 10 + 7.5 is below one
     refused = put(service, b"other")
     assert put(service, b"other", robot="robot-2").status == 201
