@@ -13,6 +13,7 @@ from rse_pf.errors import SettingsError
 __all__ = [
     "FAST_PERIOD_S",
     "FAST_SAMPLES",
+    "IDLE_CPU_PERCENT",
     "MOVES_PER_S",
     "UNDERUSED_CPU_PERCENT",
     "check_elasticity",
@@ -25,6 +26,8 @@ FAST_PERIOD_S = 10
 """One sample of the fast profile: the shortest period of a high-resolution alarm."""
 FAST_SAMPLES = 3
 """Busy samples in a row before the fast profile grows."""
+# Average CPU below which a fleet without commands is idle; a server without robots needs a few percent.
+IDLE_CPU_PERCENT = 20.0
 UNDERUSED_CPU_PERCENT = 15.0
 """Average CPU below which a server can be spared although robots send commands; ``scaling.underused_s``."""
 

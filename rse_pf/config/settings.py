@@ -122,9 +122,8 @@ class HealthSettings:
 class ScalingSettings:
     """When the cloud grows and shrinks."""
 
-    busy_cpu_percent: float = setting(70.0, unit="%", source="paper, Sect. 6.2", doc="add a server above this average CPU", low=1, high=100)
-    idle_s: int = setting(300, unit="s", source="paper, Sect. 6.2", doc="remove a server after this long without work", low=60)
-    idle_cpu_percent: float = setting(20.0, unit="%", doc="idle means no command of a robot and CPU below this; the commands of synthetic robots, such as the canary, do not count", low=0, high=100)
+    busy_cpu_percent: float = setting(70.0, unit="%", source="paper, Sect. 6.2", doc="add a server above this average CPU", low=20, high=100)
+    idle_s: int = setting(300, unit="s", source="paper, Sect. 6.2", doc="remove a server after this long without a command of a robot, and with less than 20 % CPU; commands of synthetic robots, such as the canary, do not count", low=60)
     period_s: int = setting(60, unit="s", doc="one sample of the monitor, in the paper's profile", low=10)
     min_servers: int = setting(2, unit="servers", doc="never fewer", low=1)
     max_servers: int = setting(10, unit="servers", doc="never more", low=1)
@@ -332,7 +331,6 @@ def _check_contradictions(s: PlatformSettings) -> None:
     """Raise SettingsError if two settings cannot both hold."""
     pairs = [
         ("scaling", "min_servers", "max_servers"),
-        ("scaling", "idle_cpu_percent", "busy_cpu_percent"),
         ("session", "max_message_bytes", "max_inflated_bytes"),
     ]
     for group, small, large in pairs:

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from rse_pf.config import ScalingSettings
-from rse_pf.config.elasticity import UNDERUSED_CPU_PERCENT
+from rse_pf.config.elasticity import IDLE_CPU_PERCENT, UNDERUSED_CPU_PERCENT
 from rse_pf.scaling.policy import BIG_STEP, STEP
 from rse_pf.scaling.profile import cadence_of
 
@@ -133,7 +133,7 @@ def _grow(
 
 
 def _idle(settings: ScalingSettings, cpu: Metric) -> Alarm:
-    conditions = {_REQUESTS: "== 0", cpu: f"< {settings.idle_cpu_percent:g}", **_spare(settings, 1.0)}
+    conditions = {_REQUESTS: "== 0", cpu: f"< {IDLE_CPU_PERCENT:g}", **_spare(settings, 1.0)}
     cadence = cadence_of(settings)
     return _shrink(
         "idle", conditions, cadence.period_s, cadence.idle, "there were no requests, and the servers are idle"

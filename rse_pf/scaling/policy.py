@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from rse_pf.config import ScalingSettings
-from rse_pf.config.elasticity import UNDERUSED_CPU_PERCENT
+from rse_pf.config.elasticity import IDLE_CPU_PERCENT, UNDERUSED_CPU_PERCENT
 from rse_pf.scaling.profile import Cadence, cadence_of
 
 __all__ = ["BIG_STEP", "STEP", "Action", "FleetState", "Kind", "Sample", "decide", "find_rule_starts"]
@@ -195,7 +195,7 @@ def _rules(settings: ScalingSettings, cadence: Cadence) -> list[_Rule]:
             name="idle",
             samples=cadence.idle,
             holds=lambda sample: (
-                sample.requests == 0 and sample.cpu_percent < settings.idle_cpu_percent and spare(sample, 1.0)
+                sample.requests == 0 and sample.cpu_percent < IDLE_CPU_PERCENT and spare(sample, 1.0)
             ),
             change=lambda sample: -1,
             reason=lambda sample: f"idle for {settings.idle_s} s",

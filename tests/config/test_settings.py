@@ -46,7 +46,6 @@ def test_the_paper_is_the_default() -> None:
     ("overrides", "words"),
     [
         ({"scaling": {"max_servers": 1}}, ["scaling.max_servers = 1", "scaling.min_servers = 2"]),
-        ({"scaling": {"idle_cpu_percent": 80}}, ["scaling.busy_cpu_percent = 70"]),
         ({"scaling": {"idle_s": 90}}, ["scaling.idle_s = 90", "scaling.period_s = 60"]),
         ({"session": {"max_inflated_bytes": 2048}}, ["session.max_message_bytes"]),
         ({"cloud": {"allow_insecure": False}}, ["cloud.certificate_arn", "cloud.domain_name"]),

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from rse_pf.config import ScalingSettings
-from rse_pf.config.elasticity import UNDERUSED_CPU_PERCENT
+from rse_pf.config.elasticity import IDLE_CPU_PERCENT, UNDERUSED_CPU_PERCENT
 from rse_pf.scaling.policy import BIG_STEP, STEP
 from rse_pf.scaling.profile import cadence_of
 
@@ -82,7 +82,7 @@ def _busy_reason(
 def _idle(
     samples: Sequence[Mapping[str, Any]], policy: Mapping[str, Any], settings: ScalingSettings, servers: int
 ) -> str:
-    limit = settings.idle_cpu_percent
+    limit = IDLE_CPU_PERCENT
     count = _count_last_that(
         samples, lambda sample: float(sample["requests"]) == 0 and float(sample["cpu_percent"]) < limit
     )
