@@ -25,7 +25,6 @@ MIN_WAIT_SHARE = 0.2  # of the time of a command: a shorter wait is no overload
 MAX_WAIT_SHARE = 0.5  # of the time of a command: the other half is for compute and network
 MAX_QUEUED_SHARE = 0.75  # of the time of a command: one that waited for longer would be answered too late
 RESERVE_S = 1.5  # enough for compute and network of any command: one with much time may wait for all but this
-MAX_REFUSED_SHARE = 0.5  # refusing every robot at once would leave the server idle, until all return at once
 PAUSE_S = 1.0  # mean pause of a refused robot: it spans five frames of a camera at 5 Hz
 MAX_EARLY_COMMANDS = 8  # within one pause: as many as were on their way when the robot was refused
 MEMORY_S = 1.0  # time after which what was accepted of a tenant counts half: some frames of each robot
@@ -58,7 +57,7 @@ class Overload:
             return 0.0
         max_wait_s = max(MAX_WAIT_SHARE * allowed_s, allowed_s - RESERVE_S)
         excess = (expected_wait_s - min_wait_s) / (max_wait_s - min_wait_s)
-        refused_share = min(MAX_REFUSED_SHARE, excess)
+        refused_share = min(1.0, excess)
         spread = self._spread / refused_share
         if spread >= 1.0:
             return 0.0
@@ -84,20 +83,14 @@ class Overload:
 
 
 class TurnTime:
-    """The mean time between the starts of two commands while commands wait.
-
-    What was before the arrival of a command is no part of its gap, so a server with little to do measures
-    short ones.
-    """
+    """The mean time that a command waits for each place in the queue, with those that are given up."""
 
     def __init__(self) -> None:
         self.mean_s = 0.0
-        self._last_s = -math.inf
 
-    def note_start(self, now: float, waited_s: float) -> None:
-        """Count the start of a command at *now* (s) that waited for *waited_s*."""
-        self.mean_s += SMOOTHING * (min(now - self._last_s, waited_s) - self.mean_s)
-        self._last_s = now
+    def note(self, waited_s: float, position: int) -> None:
+        """Count a command that left the queue after *waited_s*, and had entered it at *position*, from 1."""
+        self.mean_s += SMOOTHING * (waited_s / position - self.mean_s)
 
 
 def is_too_late(waited_s: float, allowed_s: float) -> bool:

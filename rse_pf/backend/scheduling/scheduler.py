@@ -54,6 +54,7 @@ class QueuedCommand(msgspec.Struct, eq=False):
     received_s: float
     deadline_s: float
     started_s: float = 0.0
+    position: int = 1
 
     @property
     def allowed_s(self) -> float:
@@ -121,9 +122,11 @@ class Scheduler:
         if older is not None:
             if queued.command.seq < older.command.seq:
                 return [_stale(queued)]
+            queued.position = older.position
             waiting[waiting.index(older)] = queued
             return [_stale(older)]
         self._overload.note_accepted(queued.robot.tenant, queued.received_s)
+        queued.position = self._queue.position(queued.robot)
         self._queue.add(queued.robot, queued)
         return []
 
@@ -131,8 +134,8 @@ class Scheduler:
         """Return the command whose turn it is, now running, and those that were given up on the way."""
         refusals: list[RefusedCommand] = []
         while (queued := self._queue.take()) is not None:
+            self._turn.note(now - queued.received_s, queued.position)
             if queued.deadline_s > now and not is_too_late(now - queued.received_s, queued.allowed_s):
-                self._turn.note_start(now, now - queued.received_s)
                 queued.started_s = now
                 self.running += 1
                 return queued, refusals
@@ -148,7 +151,7 @@ class Scheduler:
         if self._queue or self.running or queued.deadline_s <= now:
             return False
         self._overload.note_accepted(queued.robot.tenant, now)
-        self._turn.note_start(now, now - queued.received_s)
+        self._turn.note(0.0, 1)
         queued.started_s = now
         self.running = 1
         return True

@@ -23,11 +23,11 @@ CAPACITY_PER_S = 1 / WORK_S
     ("wait_s", "allowed_s", "refused_percent"),
     [
         pytest.param(0.05, 0.25, 0, id="a short wait"),
-        pytest.param(0.06875, 0.25, 25, id="between the bounds"),
-        pytest.param(0.2, 0.25, 50, id="beyond half of the time"),
+        pytest.param(0.0875, 0.25, 50, id="between the bounds"),
+        pytest.param(0.2, 0.25, 100, id="beyond half of the time"),
         pytest.param(2.0, 10.0, 0, id="a short wait of a patient command"),
-        pytest.param(3.625, 10.0, 25, id="a patient command between the bounds"),
-        pytest.param(8.5, 10.0, 50, id="all but the reserve of a patient command"),
+        pytest.param(5.25, 10.0, 50, id="a patient command between the bounds"),
+        pytest.param(8.5, 10.0, 100, id="all but the reserve of a patient command"),
     ],
 )
 def test_the_refused_share_grows_with_the_expected_wait(
@@ -164,7 +164,7 @@ def test_robots_that_obey_keep_most_of_the_answers(load: float, least: float, ro
     assert len(of_robot) == robots, "none starves"
 
 
-@pytest.mark.parametrize("others", [Fleet("evil", 20, 380.0, obeys=False), Fleet("evil", 200, 900.0)])
+@pytest.mark.parametrize("others", [Fleet("evil", 20, 380.0, obeys=False), Fleet("evil", 60, 400.0)])
 def test_a_tenant_that_sends_no_more_than_its_fair_part_keeps_it(others: Fleet):
     served, _, _ = drive(Fleet("good", 10, 0.45 * CAPACITY_PER_S), others)
 
