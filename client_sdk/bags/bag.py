@@ -294,7 +294,9 @@ def _open(file: BagFile, options: BagOptions) -> Bag:
             CameraFacts(stated_by=_stated_by(chosen, options), camera=each.camera, is_fisheye=each.is_fisheye)
             for each in lenses
         ],
-        depth=_depth_facts(bag),
+        depth=_depth_facts(
+            bag, is_unit_stated=is_float or unit_m is not None or options.depth_scale is not None
+        ),
         times=[TimeFacts(stated_by=chosen.colour.name, stamps_s=np.array(bag.timestamps_s))],
         doubts=(*doubts, *_changes(chosen, lenses, lens)),
     )
@@ -319,7 +321,7 @@ class _Way:
         return self.rectifiers[self.times.row_at(stamp_ns, log_ns) if len(self.rectifiers) > 1 else 0]
 
 
-def _depth_facts(bag: Bag) -> DepthFacts | None:
+def _depth_facts(bag: Bag, *, is_unit_stated: bool) -> DepthFacts | None:
     """Return the median depth of some frames of a bag."""
     if not bag.has_depth:
         return None
@@ -328,7 +330,9 @@ def _depth_facts(bag: Bag) -> DepthFacts | None:
     for row in rows:
         with contextlib.suppress(UsageError):  # of a message that cannot be decoded, when it is its turn
             depths_m.append(bag.read(row).depth_m)
-    return DepthFacts(median_m=median_depth_m(depths_m), units_per_m=bag._depth_scale, is_unit_stated=True)
+    return DepthFacts(
+        median_m=median_depth_m(depths_m), units_per_m=bag._depth_scale, is_unit_stated=is_unit_stated
+    )
 
 
 def _stated_by(chosen: ChosenTopics, options: BagOptions) -> str:
