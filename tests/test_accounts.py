@@ -109,7 +109,7 @@ def test_a_robot_of_the_same_name_in_another_tenant_has_a_quota_of_its_own() -> 
     "name",
     [
         "objects/acme/r/1", "maps/acme/kitchen/blobs/1", "live/acme/lab/log/000000000001",
-        "live/acme/lab/features/000000001-1", "states/acme/r/keeper", "jobs/acme/r/1", "job-queue/acme/r/1",
+        "live/acme/lab/features/000000001-1", "states/acme/r/keeper", "jobs/acme/r/1",
     ],
 )  # fmt: skip
 def test_whatever_lies_in_a_folder_of_the_tenant_is_charged_to_it(name: str) -> None:

@@ -31,7 +31,7 @@ from scripts.site.blocks import pages
 
 PAGES = tuple(name for name in pages(Path(__file__).parents[2]) if name != "docs/settings.md")
 OTHER_PROGRAMS = (
-    "npx", "aws", "python", ".", "grep", "sudo", "g++", "cmake", "mkdir", "build/first_pose",
+    "npx", "aws", "dask", "python", ".", "grep", "sudo", "g++", "cmake", "mkdir", "build/first_pose",
     "client_cpp/build/rse_pf_tum_robot", "roscore", "roslaunch", "rosbag",
     "rse-pf-ros", "export", "pip", "python3.11", "ros2", "umask",
 )  # fmt: skip

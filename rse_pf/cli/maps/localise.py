@@ -150,7 +150,12 @@ def _lens_of(args: argparse.Namespace) -> Lens:
 def _photo_files(path: Path) -> list[Path]:
     from client_sdk.datasets.images import image_files
 
-    return image_files(path) if path.is_dir() else [path]
+    if not path.is_dir():
+        return [path]
+    photos = image_files(path)
+    if not photos:
+        raise UsageError(f"there is no image in the folder {path}", hint="name JPEG or PNG files")
+    return photos
 
 
 def _photo(path: Path) -> bytes:

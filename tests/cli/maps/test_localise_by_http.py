@@ -57,6 +57,7 @@ class Platform:
         files["phone.token"] = service.token() + "\n"
         for name, text in files.items():
             (folder / name).write_text(text)
+        (folder / "empty").mkdir()
 
     def run(self, *words: str) -> int:
         return main(["map", "localise", *words, "--url", self.server.url, "--token-file", "phone.token"])
@@ -107,7 +108,7 @@ def test_the_exit_code_is_1_if_no_photo_is_found(platform: Platform) -> None:
         (["kitchen", "known.jpg", "--camera", "1,2,3,4", "--intrinsics", "intrinsics.json"], "not both"),
         (["kitchen", "known.jpg", "--camera", "1,2,3"], "not four numbers"),
         (["kitchen", "none.jpg", "--camera", "1,2,3,4"], "none.jpg"),
-        (["kitchen", ".", "--camera", "1,2,3,4"], "directory"),
+        (["kitchen", "empty", "--camera", "1,2,3,4"], "empty"),
         (["kitchen", "known.jpg", "--camera", "1,2,3,4", "--store", "dir:x"], "--store"),
         (["kitchen", "known.jpg", "--camera", "1,2,3,4", "--enrolment", "x"], "--enrolment names"),
         (["kitchen", "known.jpg", "--intrinsics", "none.json"], "none.json"),
