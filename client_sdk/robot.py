@@ -466,7 +466,6 @@ class Robot:
             resent=session.resent,
             dropped_answers=session.dropped_answers,
             held_back={reason: session.held_back[reason] for reason in REASONS},
-            told_rate_per_s=session.told_rate_per_s,
             duplicates=keeper.duplicates,
             reconnects=connection.reconnects,
             moves=connection.moves,

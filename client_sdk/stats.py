@@ -32,9 +32,8 @@ class Stats:
 
     ``sent_to_burst`` counts the commands of the present 24 hours, also those that a server answered first.
     ``region`` is the address of the platform that is used now.  ``held_back`` counts the commands that were
-    not sent at once although there was a connection: by ``server-rate`` (the rate that a server told),
-    ``busy`` (its answer to this command, or to another one of the stream) or ``own-limit`` (what the Welcome
-    allows).  ``told_rate_per_s`` is the last rate told, commands a second.
+    not sent at once although there was a connection: by ``busy`` (the server's answer to this command, or to
+    another one of the stream) or ``own-limit`` (what the Welcome allows).
     """
 
     sent: int
@@ -48,7 +47,6 @@ class Stats:
     resent: int
     dropped_answers: int
     held_back: Mapping[str, int]
-    told_rate_per_s: float | None
     duplicates: int
     reconnects: int
     moves: int

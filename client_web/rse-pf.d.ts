@@ -105,13 +105,10 @@ export interface Stats {
   bytesDown: number;
   unanswered: number;
   roundTripMs: number | null;
-  /** Commands that were not sent at once although there was a connection: by the rate that a server told, after busy, */
-  heldByRate: number;
+  /** Commands that were not sent at once although there was a connection: after busy, */
   heldByBusy: number;
   /** and by what the Welcome allows. */
   heldByLimit: number;
-  /** The last rate that a server told, commands a second. */
-  toldRatePerS?: number;
 }
 
 export interface Robot {

@@ -19,8 +19,7 @@ const MAX_PUT_BYTES = 1 << 18;
 const MAX_PART_BYTES = 1 << 20;
 const MAX_BAD_MESSAGES = 10;
 const MAX_RETRIES = 5;
-const MAX_REFUSED_IDS = 64;
-// For so long it believes one word of a server about its rate.
+// The longest pause of a stream after one busy answer.
 const MAX_PAUSE_S = 60;
 // A client that uses a little less than its limits is not refused when a network bunches messages.
 const SHARE = 0.9;
@@ -197,8 +196,7 @@ export const connect = async (url, options = {}) => {
   const subscriptions = new Map();
   const lanes = { __proto__: null };
   const counts = {
-    sent: 0, answered: 0, resent: 0, reconnects: 0, moves: 0, bytesUp: 0, bytesDown: 0, heldByRate: 0, heldByBusy: 0,
-    heldByLimit: 0,
+    sent: 0, answered: 0, resent: 0, reconnects: 0, moves: 0, bytesUp: 0, bytesDown: 0, heldByBusy: 0, heldByLimit: 0,
   };
   let { token } = options;
   let current = null;
@@ -264,7 +262,7 @@ export const connect = async (url, options = {}) => {
       });
       socket.onopen = () =>
         socket.protocol === protocol
-          ? say(link, "hello", { sdk, capabilities: ["progress", "updates", "refusals", "rate"] })
+          ? say(link, "hello", { sdk, capabilities: ["progress", "updates"] })
           : lose(link, refused(unreadable("it does not speak " + protocol)));
       socket.onmessage = (event) => hear(link, event.data);
       // Node 22 has no close event for a handshake that failed; elsewhere it follows.
@@ -542,16 +540,6 @@ export const connect = async (url, options = {}) => {
           } else settle(each, failed);
         }
       },
-      refused() {
-        from(new Set(message.ids)).slice(0, MAX_REFUSED_IDS).forEach((id) => receive(link, { ...message, type: "failure", id }));
-      },
-      rate() {
-        const { commands_per_s: perS, for_ms: forMs } = message;
-        if (!(perS > 0 && forMs >= 0)) return;
-        counts.toldRatePerS = perS;
-        link._toldPause = 1 / perS;
-        link._toldUntil = time + min(MAX_PAUSE_S, forMs / 1e3);
-      },
       result() {
         if (!each) return;
         const { _lane: lane, _seq: seq } = each;
@@ -618,20 +606,17 @@ export const connect = async (url, options = {}) => {
     link._renewAt = now() + 0.8 * seconds;
   };
 
-  /** Return how many commands may be sent (section 4, "Rate" and "Overload"), or minus the seconds until one may. */
+  /** Return how many commands may be sent (section 4, "Rate"), or minus the seconds until one may. */
   const allowance = (time) => {
-    const { _toldUntil: toldUntil, _limits: limits } = current;
+    const { _limits: limits } = current;
     // What does not leave the machine yet can still be replaced by a newer frame.
     if (current._socket.bufferedAmount > MAX_BUFFERED_BYTES) return -0.02;
-    const wait = min(toldUntil, current._commandAt + current._toldPause) - time;
-    if (wait > 0) return -wait;
-    const told = toldUntil > time ? 1 : Infinity;
     const rate = limits.max_commands_per_s * share;
-    if (!rate) return told;
+    if (!rate) return Infinity;
     const fresh = max(0, time - current._filledAt);
     const left = (current._left = min(max(1, limits.command_burst * share), current._left + fresh * rate));
     current._filledAt += fresh;
-    return left < 1 ? time - current._filledAt - (1 - left) / rate : min(told, left | 0);
+    return left < 1 ? time - current._filledAt - (1 - left) / rate : left | 0;
   };
 
   // --- time ----------------------------------------------------------------------------------------------
@@ -650,13 +635,11 @@ export const connect = async (url, options = {}) => {
         if (isBusy && busyUntil >= each._until) {
           return settle(each, told({ ...busy, trace: each._trace, retry_after_ms: heldS * 1e3 }));
         }
-        const why = isBusy ? "Busy"
-          : room-- > 0 ? 0
-          : time < current._toldUntil ? "Rate" : "Limit";
+        const why = isBusy ? "Busy" : room-- > 0 ? 0 : "Limit";
         if (why) return (each._isHeld ||= ++counts["heldBy" + why]);
         if (each._at) counts.resent++;
         each._link = current;
-        current._commandAt = each._at = time;
+        each._at = time;
         const left = max(0, min(MAX_DEADLINE_MS, (each._until - time) * 1e3));
         send(current, `${each._head},"deadline_ms":${left},"payload":${each._payload}}`, each);
         if (each._isCancelled) withdraw(each);

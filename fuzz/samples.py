@@ -23,7 +23,7 @@ from rse_pf.pnp import PnpOptions
 from rse_pf.pnp.problems import DEGENERATE, KINECT, make_degenerate, make_problem, make_two_views
 from rse_pf.services.pnp import make_request
 from rse_pf.slam.pose_graph import write_g2o
-from rse_pf.wire import Cancel, Command, Failure, Hello, Ping, Rate, Refused, Result, make_codec
+from rse_pf.wire import Cancel, Command, Failure, Hello, Ping, Result, make_codec
 from tests.synthetic_maps import make_room, make_sphere, make_world
 
 __all__ = ["CORPUS", "EXPENSIVE", "MAX_INPUT_BYTES", "samples"]
@@ -52,8 +52,6 @@ def _messages() -> list[bytes]:
         Command(id=5, service="pnp", payload=with_depth),
         Command(id=2, service="echo", payload={"a": [1, "x", None, {"b": 2.5}]}),
         Result(id=1, reply=[1.0, 2.0]), Failure(id=2, code="busy", message="m", retry_after_ms=5.0),
-        Refused(ids=[1, 2], code="busy", message="m", retry_after_ms=5.0),
-        Rate(commands_per_s=2.5, for_ms=1e3),
     )  # fmt: skip
     return [
         bytes([kind]) + make_codec(name).encode(message)

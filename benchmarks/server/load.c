@@ -11,9 +11,8 @@
    Answers are matched by their `id`: message k of a payload file has the id k.  An answer without id belongs
    to the oldest unanswered message of its connection.
 
-   With --obey 1 a robot that is told `retry_after_ms` sends nothing until then, and keeps to the rate that it
-   is told by leaving messages out, never waiting with one; what it leaves out counts as unsent, so as offered.
-   Its hello file names the capabilities.  Each id of a `refused` message counts as failed.
+   With --obey 1 a robot that is told `retry_after_ms` sends nothing until then; what it
+   leaves out counts as unsent, so as offered.
 
    It connects to 127.0.0.0/8 only, ends at a deadline whatever happens, and does not check poses. */
 #define _GNU_SOURCE
@@ -44,7 +43,6 @@ enum {
   MAX_QUEUED = 8,             /* frames that one connection has not taken yet; more are not sent */
   MAX_MESSAGE = 1 << 20,      /* longest message of a server */
   MAX_CODES = 64,
-  MAX_REFUSED = 64,           /* commands that one message ends */
   HEAD_BYTES = 160,           /* type and id of an answer stand within its first bytes */
   EVENTS = 1024,
 };
@@ -59,14 +57,14 @@ static const char USAGE[] =
     "  --seconds 5 --warm-up 0.5 --drain 4 --opening 60   the window, before it, after it, to connect\n"
     "  --at-once 64   connections that open at the same time\n"
     "  --join-every 0   pause between two robots that connect\n"
-    "  --obey 0   1: wait as long as a failure says, and keep to a told rate\n"
+    "  --obey 0   1: wait as long as a failure says\n"
     "  --seed 1 --samples FILE\n";
 
 typedef enum { OPEN_LOOP, EARLY_LOOP, CLOSED_LOOP } Mode;
 typedef enum { REPLY_NONE, REPLY_JSON, REPLY_ZLIB, REPLY_MSGPACK, REPLY_PEER } ReplyKind;
 typedef enum { ABSENT, CONNECTING, UPGRADING, WELCOMING, READY } State;
 typedef enum { OK, FAILED, LOST, UNSENT } Outcome;
-typedef enum { ANSWER_OK, ANSWER_FAILED, MANY_FAILED, TOLD_RATE, NO_ANSWER } Answer;
+typedef enum { ANSWER_OK, ANSWER_FAILED, NO_ANSWER } Answer;
 
 typedef struct {
   uint8_t *bytes;
@@ -106,8 +104,6 @@ typedef struct {
   uint8_t *partial;
   size_t partial_size, partial_capacity;
   double opens_s, silent_until_s;
-  double told_per_s, told_until_s; /* the rate that it keeps to */
-  double may_send, counted_s;      /* messages that this rate allowed and that were not sent, up to this time */
 } Robot;
 
 typedef struct {
@@ -320,7 +316,6 @@ static void end(Robot *robot, const char *why) {
   robot->queued = 0;
   robot->offset = robot->partial_size = 0;
   robot->waits_for_room = robot->says_hello = false;
-  robot->told_until_s = 0;
   settle(robot);
 }
 
@@ -354,22 +349,10 @@ static void flush(Robot *robot) {
   watch(robot, robot->queued > 0 || robot->says_hello);
 }
 
-/* Return whether the rate that the robot was told allows a message.  Up to two are saved, since at a rate below
-   its own a robot would otherwise send every second message where nine of ten are allowed. */
-static bool rate_allows(Robot *robot, double now) {
-  if (now >= robot->told_until_s) return true;
-  robot->may_send = fmin(2, robot->may_send + robot->told_per_s * (now - robot->counted_s));
-  robot->counted_s = now;
-  if (robot->may_send < 1) return false;
-  robot->may_send--;
-  return true;
-}
-
 static void send_next(Robot *robot, double planned_s) {
   Group *group = robot->group;
   double now = now_s();
-  if (robot->state != READY || robot->queued == MAX_QUEUED || now < robot->silent_until_s ||
-      !rate_allows(robot, now)) {
+  if (robot->state != READY || robot->queued == MAX_QUEUED || now < robot->silent_until_s) {
     note(group, UNSENT, planned_s, NAN, NAN);
     return;
   }
@@ -467,8 +450,6 @@ static Answer kind_of(const uint8_t *type, size_t size) {
   if (size == 6 && !memcmp(type, "result", 6)) return ANSWER_OK;
   if (size == 4 && !memcmp(type, "pong", 4)) return ANSWER_OK;
   if (size == 7 && !memcmp(type, "failure", 7)) return ANSWER_FAILED;
-  if (size == 7 && !memcmp(type, "refused", 7)) return MANY_FAILED;
-  if (size == 4 && !memcmp(type, "rate", 4)) return TOLD_RATE;
   return NO_ANSWER;
 }
 
@@ -545,28 +526,6 @@ static double number_of(const uint8_t *text, size_t size, const char *name) {
   return value;
 }
 
-/* The ids of a `whole` message that ends many commands; returns how many. */
-static int ids_of(const uint8_t *text, size_t size, long ids[MAX_REFUSED]) {
-  const uint8_t *over = text + size, *at;
-  int n = 0;
-  if (option.reply != REPLY_MSGPACK) {
-    at = after(text, size, "\"ids\":[", 7);
-    for (char *next; at && n < MAX_REFUSED && *at >= '0' && *at <= '9'; at = (const uint8_t *)next + (*next == ','))
-      ids[n++] = strtol((const char *)at, &next, 10);
-    return n;
-  }
-  at = after(text, size, "\xa3ids", 4);
-  if (!at || at >= over) return 0;
-  int most = (*at & 0xf0) == 0x90 ? *at & 15 : *at == 0xdc && at + 2 < over ? at[1] << 8 | at[2] : 0;
-  for (at += *at == 0xdc ? 3 : 1; n < most && n < MAX_REFUSED && at < over; n++) {
-    int bytes = *at == 0xcc ? 1 : *at == 0xcd ? 2 : 0;
-    if ((*at >= 0x80 && !bytes) || at + bytes >= over) break;
-    ids[n] = !bytes ? *at : bytes == 1 ? at[1] : at[1] << 8 | at[2];
-    at += 1 + bytes;
-  }
-  return n;
-}
-
 static Answer read_answer(const uint8_t *data, size_t size, long *id) {
   static uint8_t text[8192];
   switch (option.reply) {
@@ -581,17 +540,6 @@ static Answer read_answer(const uint8_t *data, size_t size, long *id) {
     default: /* the order of the peer's fields is random */
       return read_json(text, inflated(data, size, text, sizeof text), true, id);
   }
-}
-
-/* Keep to the rate that the server tells, from the last message on. */
-static void obey(Robot *robot, double per_s, double for_s, double at_s) {
-  if (!(per_s > 0 && for_s >= 0)) return;
-  if (at_s >= robot->told_until_s) {
-    robot->may_send = 0;
-    robot->counted_s = at_s;
-  }
-  robot->told_per_s = per_s;
-  robot->told_until_s = at_s + fmin(60, for_s);
 }
 
 /* Take the end of message *id*, or of the oldest one where it is -1. */
@@ -613,16 +561,6 @@ static void take_end(Robot *robot, long id, Outcome outcome, double at_s) {
   if (group->mode == CLOSED_LOOP && at_s < last_s && !stop_asked) send_next(robot, now_s());
 }
 
-static void take_many(Robot *robot, const uint8_t *data, size_t size, double at_s) {
-  long ids[MAX_REFUSED];
-  const uint8_t *text = whole(data, &size);
-  int n = ids_of(text, size, ids);
-  for (int i = 0; i < n; i++) {
-    count_code(text, size);
-    take_end(robot, ids[i], FAILED, at_s);
-  }
-}
-
 static void take_answer(Robot *robot, const uint8_t *data, size_t size, double at_s) {
   long id = -1;
   Answer answer = read_answer(data, size, &id);
@@ -630,16 +568,9 @@ static void take_answer(Robot *robot, const uint8_t *data, size_t size, double a
   if (option.obeys && answer != ANSWER_OK) {
     size_t length = size;
     const uint8_t *text = whole(data, &length);
-    if (answer == TOLD_RATE) {
-      obey(robot, number_of(text, length, "commands_per_s"), 1e-3 * number_of(text, length, "for_ms"), at_s);
-    } else {
-      robot->silent_until_s = at_s + 1e-3 * number_of(text, length, "retry_after_ms");
-    }
+    robot->silent_until_s = at_s + 1e-3 * number_of(text, length, "retry_after_ms");
   }
-  if (answer == MANY_FAILED)
-    take_many(robot, data, size, at_s);
-  else if (answer != TOLD_RATE)
-    take_end(robot, id, answer == ANSWER_OK ? OK : FAILED, at_s);
+  take_end(robot, id, answer == ANSWER_OK ? OK : FAILED, at_s);
 }
 
 static void take_frame(Robot *robot, int opcode, const uint8_t *data, size_t size, double at_s) {

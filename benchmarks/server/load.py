@@ -30,7 +30,6 @@ from rse_pf.experiments.load.payloads import make_payloads
 from rse_pf.experiments.load.scenario import LoadScenario
 from rse_pf.wire import SUBPROTOCOLS, Command, Hello, Message, Ping, make_codec
 from rse_pf.wire.preencoded import encode_command
-from rse_pf.wire.server_session import RATE, REFUSALS
 
 __all__ = [
     "OUTCOMES", "SAMPLE", "GroupReport", "LoadPlan", "LoadProcess", "LoadReport", "Percentiles", "RobotGroup",
@@ -87,10 +86,9 @@ def write_messages(file: Path, messages: Iterable[bytes]) -> Path:
     return file
 
 
-def hello_file(folder: Path, codec_name: str, *, obeys: bool = False) -> Path:
-    """Write the first message of a robot, which names what one that *obeys* takes; return its file."""
-    name, capabilities = ("hello-obeys", (REFUSALS, RATE)) if obeys else ("hello", ())
-    return _encode(folder / f"{name}.{codec_name}", codec_name, [Hello(capabilities=capabilities)])
+def hello_file(folder: Path, codec_name: str) -> Path:
+    """Write the first message of a robot; return its file."""
+    return _encode(folder / f"hello.{codec_name}", codec_name, [Hello()])
 
 
 def ping_file(folder: Path, codec_name: str) -> Path:
@@ -158,7 +156,7 @@ class LoadPlan:
     seed: int = 1
     samples: Path | None = None
     obeys: bool = False
-    """Whether robots wait as failures say, and keep to a told rate; what they leave out is unsent."""
+    """Whether robots wait as failures say; what they leave out is unsent."""
 
     def command(self, program: Path) -> list[str]:
         """Return the command line."""

@@ -9,9 +9,8 @@ for some seconds, up to each multiple.  Every command has a deadline of 250 ms. 
 answered, of ``newest`` ones a newer frame of the camera takes the place of one that waits.
 
 A command counts as answered if its pose came within 250 ms of its planned time.  What the generator could not
-send, or left out because it obeys a told rate or a failure's ``retry_after_ms`` (``--obey``), is offered and
-not answered.  Recovery is the time from the end of the overload until 95 % of the remaining robots' commands
-are answered.
+send, or left out because it obeys a failure's ``retry_after_ms`` (``--obey``), is offered and not answered.
+Recovery is the time from the end of the overload until 95 % of the remaining robots' commands are answered.
 
 Defends: a server beyond its limit answers nearly as much as at its limit, and its pings do not wait.
 """
@@ -97,7 +96,7 @@ def step(
     frames, obeys, seconds = plan
     commands = LoadScenario(codec=codec, deadline_s=DEADLINE_S, keep=frames == "kept")
     payload = command_file(folder, commands)
-    hello = hello_file(folder, codec, obeys=obeys)
+    hello = hello_file(folder, codec)
     files = [folder / "staying.samples", folder / "joining.samples"]
 
     def made(name: str, count: int) -> RobotGroup:
@@ -148,7 +147,7 @@ def run_benchmark(
     *,
     codec: Literal["zlib", "json", "bin"] = "bin",
     frames: Annotated[Frames, "which are to be answered"] = "kept",
-    obey: Annotated[bool, "robots wait as long as a failure says, and keep to a told rate"] = False,
+    obey: Annotated[bool, "robots wait as long as a failure says"] = False,
     most: Annotated[int, "robots that the server carries; 0 searches them"] = 0,
     rounds: Annotated[int, "over all multiples"] = 1,
     seconds: Annotated[float, "of each overload"] = 4.0,

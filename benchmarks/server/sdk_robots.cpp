@@ -42,9 +42,7 @@ int main(int argc, char** argv) {
     rse_pf::json found;
     for (const auto& each : clients) {
         const auto stats = each->stats();
-        rse_pf::json told = nullptr;
-        if (stats.told_rate_per_s) told = *stats.told_rate_per_s;
-        found.push_back({{"held_back", stats.held_back}, {"told_rate_per_s", told}, {"reconnects", stats.reconnects}});
+        found.push_back({{"held_back", stats.held_back}, {"reconnects", stats.reconnects}});
     }
     std::puts(found.dump().c_str());
     return 0;

@@ -18,8 +18,7 @@ for (let turn = 0; turn < turns; turn++) {
   }
 }
 const found = clients.map(({ stats }) => ({
-  held_back: { "server-rate": stats.heldByRate, busy: stats.heldByBusy, "own-limit": stats.heldByLimit },
-  told_rate_per_s: stats.toldRatePerS ?? null, reconnects: stats.reconnects,
+  held_back: { busy: stats.heldByBusy, "own-limit": stats.heldByLimit }, reconnects: stats.reconnects,
 }));
 console.log(JSON.stringify(found));
 process.exit(0);

@@ -21,7 +21,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property, partial
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import Annotated, Any, NamedTuple, cast
 
 import msgspec
 import numpy as np
@@ -32,7 +32,8 @@ from rse_pf.errors import BadMessage, BadRequest, LimitExceeded, RsePfError, Uns
 from rse_pf.geometry import Array
 from rse_pf.recording import file_format
 from rse_pf.recording.summary import ChunkPlan, Wanted, plan_of, robot_of
-from rse_pf.wire import CODECS, Codec, Command, Failure, Refused, Result, make_codec
+from rse_pf.wire import CODECS, Codec, Command, Failure, Result, make_codec
+from rse_pf.wire.messages import Identifier
 
 __all__ = [
     "CASE_NAME", "Odometry", "RecordedCommand", "WireRecording", "open_recording", "recording_files",
@@ -280,16 +281,23 @@ class WireRecording:
                         replace(refused, answered_ns=message.time_ns, reply_bytes=data), sights
                     )
 
-    def _failures(self, codec: str, data: bytes) -> list[tuple[int | None, bytes]]:
-        """Return the id of each command that one message ends, and its own failure as a message."""
-        wire = _codec(codec, self._session)
+    def _failures(self, codec: str, data: bytes) -> list[tuple[int, bytes]]:
+        """Return the id of each command that one message ends, and its own failure as a message.
+
+        Servers before version 0.3.0 could end many commands with one message; recordings of them hold it.
+        """
         try:
-            message = wire.decode_from_server(data)
-        except RsePfError:
+            if codec == "bin":
+                refused = msgspec.msgpack.decode(data, type=_Refused)
+            else:
+                text = inflate_within(data, self._budget) if codec == "zlib" else data
+                refused = msgspec.json.decode(text, type=_Refused)
+        except (msgspec.DecodeError, ValueError):
             self.left_out += 1
             return []
-        failures = message.failures() if isinstance(message, Refused) else []
-        return [(failure.id, wire.encode(failure)) for failure in failures]
+        encode = _codec(codec, self._session).encode
+        fields = {name: getattr(refused, name) for name in _Refused.__struct_fields__ if name != "ids"}
+        return [(number, encode(Failure(id=number, **fields))) for number in dict.fromkeys(refused.ids)]
 
     def _envelope(self, codec: str, data: bytes) -> tuple[str, int | None, str]:
         """Return the type, the id and the service of a message, "" for one that cannot be read."""
@@ -400,6 +408,17 @@ class _Envelope(msgspec.Struct):
     type: str = ""
     id: int | None = None
     service: str = ""
+
+
+class _Refused(msgspec.Struct):
+    """A failure of each of its commands, of which one message names at most 64."""
+
+    ids: Annotated[list[Identifier], msgspec.Meta(max_length=64)]
+    code: str
+    message: str
+    hint: str = ""
+    retry_after_ms: float | None = None
+    server: str = ""
 
 
 class _Image(msgspec.Struct):

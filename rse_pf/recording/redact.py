@@ -21,7 +21,7 @@ import msgspec
 
 from rse_pf.errors import RsePfError
 from rse_pf.identity import DEFAULT_TENANT, RobotId
-from rse_pf.wire import Codec, Refused, Welcome, make_codec
+from rse_pf.wire import Codec, Welcome, make_codec
 from rse_pf.wire.envelope import peek
 
 __all__ = ["NAME_FREE_SERVICES", "ConnectionRedactor", "Kept", "Pseudonyms"]
@@ -32,7 +32,7 @@ KEY_BYTES = 32
 _DIGITS = 8
 _MAX_OPEN = 4096
 _ALWAYS_UP = frozenset({"hello", "ping", "cancel"})
-_ALWAYS_DOWN = frozenset({"move", "pong", "rate", "renewed"})
+_ALWAYS_DOWN = frozenset({"move", "pong", "renewed"})
 _TEXT_FIELDS = ("trace", "stream", "message", "hint", "what", "reason", "sdk")
 _VALUE_FIELDS = ("payload", "reply")
 PROTOCOL_WORDS = frozenset({
@@ -184,8 +184,6 @@ class ConnectionRedactor:
             service = ""
             if head.type == "welcome":
                 return self._welcome(data)
-            if head.type == "refused":
-                return self._refused(data) or self._leave_out()
             if head.type in ("result", "progress") or (head.type == "failure" and head.id is not None):
                 service = self._open.get(head.id or 0, "")
                 if not service:
@@ -198,18 +196,6 @@ class ConnectionRedactor:
         except _UNDECODABLE:
             return self._leave_out()
         return stored or self._leave_out()
-
-    def _refused(self, data: bytes) -> Kept | None:
-        """Return what is stored of a message that ends many commands: nothing of those that were left out."""
-        message = self._codec.decode_from_server(data)
-        ids = message.ids if isinstance(message, Refused) else []
-        services = {each: self._open.pop(each) for each in ids if each in self._open}
-        if not services:
-            return None
-        if len(services) < len(ids):
-            data = self._codec.encode(msgspec.structs.replace(message, ids=list(services)))
-        service = next(iter(services.values()))
-        return self._without_names(data, self._inflate(data), "refused", service, from_robot=False)
 
     def _leave_out(self) -> Kept | None:
         self.left_out += 1

@@ -8,7 +8,6 @@ The caller passes the time as ``now``: seconds of the robot's monotonic clock.
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections import Counter
 from dataclasses import dataclass, field
@@ -31,8 +30,6 @@ from rse_pf.wire.messages import (
     Ping,
     Pong,
     Progress,
-    Rate,
-    Refused,
     Renew,
     Renewed,
     Result,
@@ -42,7 +39,7 @@ from rse_pf.wire.messages import (
 from rse_pf.wire.preencoded import encode_command
 from rse_pf.wire.rate_limit import MAX_PAUSE_S, Backlog, RateLimiter, Reason, is_long_outage, send_order
 from rse_pf.wire.renewal_timer import RenewalTimer
-from rse_pf.wire.server_session import PROGRESS, RATE, REFUSALS, UPDATES
+from rse_pf.wire.server_session import PROGRESS, UPDATES
 
 __all__ = [
     "Answered",
@@ -57,7 +54,7 @@ __all__ = [
     "Welcomed",
 ]
 
-_CAPABILITIES = ("move", PROGRESS, UPDATES, REFUSALS, RATE)
+_CAPABILITIES = ("move", PROGRESS, UPDATES)
 _MAX_TRIES_AFTER_LOSS, _RETRY_BURST = 2, 5.0
 _PINGS_PER_STALL_TIMEOUT = 3.0
 _MAX_DEADLINE_MS = 3.6e6
@@ -184,7 +181,6 @@ class ClientSession:
     Attributes:
         held_back: How many commands were not sent at once although there was a connection, each counted by
             the first reason.
-        told_rate_per_s: The last rate that a server told, commands a second; None if none did.
     """
 
     def __init__(self, *, codec: Codec, settings: SessionSettings, sdk: str, first_id: int = 1) -> None:
@@ -194,7 +190,6 @@ class ClientSession:
         self.resent = 0
         self.dropped_answers = 0
         self.held_back: Counter[Reason] = Counter()
-        self.told_rate_per_s: float | None = None
         self._sdk = sdk
         self._next_id = first_id
         self._pending: dict[int, _Pending] = {}
@@ -352,13 +347,6 @@ class ClientSession:
                 return [Notice(message)]
             case Failure() if message.id in self.subscriptions:
                 return [*self.subscriptions.refuse(connection, message)]
-            case Rate():
-                if connection.rate_limiter.obey(message, now):
-                    self.told_rate_per_s = message.commands_per_s
-                return self._flush(now)
-            case Refused():
-                ended = [self._answer(connection, failure, now) for failure in message.failures()]
-                return [*itertools.chain.from_iterable(ended), *self._flush(now)]
             case Update():
                 return [*self.subscriptions.update(connection, message)]
             case Progress():
@@ -502,8 +490,6 @@ class ClientSession:
     ) -> Reason | None:
         if now < self._not_before(pending):
             return "busy"
-        if connection.rate_limiter.waits_for_told_rate(now):
-            return "server-rate"
         if capacity > 0 and pending.command.stream and connection.backlog is not None:
             sent = sum(
                 _is_frame(other) and other.connection is connection for other in self._pending.values()
@@ -540,7 +526,7 @@ class ClientSession:
         self.resent += pending.sent_at is not None
         pending.connection = connection
         pending.sent_at = now
-        connection.rate_limiter.spend(now, is_command=True)
+        connection.rate_limiter.spend(now)
         connection.outgoing.append(
             encode_command(self.codec, _with_deadline(pending.command, pending.deadline - now))
             if data is None

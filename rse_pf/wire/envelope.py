@@ -18,7 +18,7 @@ import msgspec
 from rse_pf.budget import Budget, announced_values, measure_msgpack, small_text
 from rse_pf.errors import ProtocolError
 from rse_pf.wire.codec import Codec, stored
-from rse_pf.wire.messages import Failure, Refused
+from rse_pf.wire.messages import Failure
 
 __all__ = ["Envelope", "encode_refusal", "peek", "undecodable_id"]
 
@@ -152,7 +152,7 @@ def _binary_fields(data: bytes) -> Iterator[tuple[str, bytes]]:
         at = end
 
 
-def encode_refusal(codec: Codec, failure: Failure | Refused) -> bytes:
+def encode_refusal(codec: Codec, failure: Failure) -> bytes:
     """Return the message of *failure*; with zlib it is stored, not deflated: 180 bytes instead of 150."""
     if codec.name != "zlib":
         return codec.encode(failure)

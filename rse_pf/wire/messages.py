@@ -10,7 +10,6 @@ from typing import Annotated, Any
 import msgspec
 
 __all__ = [
-    "MAX_REFUSED_IDS",
     "PROTOCOL_VERSION",
     "Cancel",
     "Command",
@@ -24,8 +23,6 @@ __all__ = [
     "Ping",
     "Pong",
     "Progress",
-    "Rate",
-    "Refused",
     "Renew",
     "Renewed",
     "Result",
@@ -36,9 +33,6 @@ __all__ = [
 ]
 
 PROTOCOL_VERSION = 1
-
-MAX_REFUSED_IDS = 64
-"""Commands that one `Refused` ends at the most."""
 
 Word = Annotated[str, msgspec.Meta(max_length=64)]
 """A name of at most 64 characters."""
@@ -156,44 +150,6 @@ class Failure(_Message, frozen=True, kw_only=True, tag="failure"):
     trace: str = ""
 
 
-class Refused(_Message, frozen=True, kw_only=True, tag="refused"):
-    """Server ends many commands, each as if it had got a Failure of these fields.
-
-    Only to robots whose Hello names the capability ``refusals``.
-    """
-
-    ids: Annotated[list[int], msgspec.Meta(max_length=MAX_REFUSED_IDS)]
-    code: str
-    message: str
-    hint: str = ""
-    retry_after_ms: float | None = None
-    server: str = ""
-
-    def failures(self) -> list[Failure]:
-        """Return what it stands for: a failure of each of its commands, once."""
-        return [
-            Failure(
-                id=identity,
-                code=self.code,
-                message=self.message,
-                hint=self.hint,
-                retry_after_ms=self.retry_after_ms,
-                server=self.server,
-            )
-            for identity in dict.fromkeys(self.ids)
-        ]
-
-
-class Rate(_Message, frozen=True, kw_only=True, tag="rate"):
-    """Server tells how many commands a second the robot may send for ``for_ms``; a new one replaces it.
-
-    Only to robots whose Hello names the capability ``rate``.
-    """
-
-    commands_per_s: float
-    for_ms: float
-
-
 class Move(_Message, frozen=True, kw_only=True, tag="move"):
     """Server asks the robot to open another socket first and then to leave this one."""
 
@@ -259,5 +215,5 @@ class Update(_Message, frozen=True, kw_only=True, tag="update"):
 
 
 FromRobot = Hello | Command | Ping | Cancel | Renew | Subscribe | Unsubscribe
-FromServer = Welcome | Result | Failure | Refused | Rate | Move | Pong | Progress | Renewed | Update
+FromServer = Welcome | Result | Failure | Move | Pong | Progress | Renewed | Update
 Message = FromRobot | FromServer

@@ -1,8 +1,7 @@
 """How fast a robot sends: by the server's limits, and in which order and at which rate after an outage.
 
 A robot that keeps to its own rate limiter, a token bucket a little smaller than the one that the server
-applies, is not refused for its rate.  A server with too much to do may tell it a lower rate for a while
-(`rse_pf.wire.messages.Rate`): commands then keep a pause, which pings do not count towards.
+applies, is not refused for its rate.
 
 When a network recovers, every robot has seconds of frames to send, and the server receives all of them at
 once.  Sent oldest first, each frame would reach the front of the queue only when its deadline has passed, and
@@ -17,12 +16,11 @@ Source:
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Literal, get_args
 
 from rse_pf.token_bucket import TokenBucket
-from rse_pf.wire.messages import Limits, Rate
+from rse_pf.wire.messages import Limits
 
 __all__ = [
     "MAX_PAUSE_S",
@@ -35,13 +33,13 @@ __all__ = [
     "send_order",
 ]
 
-Reason = Literal["server-rate", "busy", "own-limit"]
-"""Why a command was held back: by a told rate, by a busy answer, or by the limits of the Welcome."""
+Reason = Literal["busy", "own-limit"]
+"""Why a command was held back: by a busy answer, or by the limits of the Welcome."""
 
 REASONS: tuple[Reason, ...] = get_args(Reason)
 
 MAX_PAUSE_S = 60.0
-"""For how long a robot believes one word of a server about its rate."""
+"""Longest pause of a stream after one busy answer."""
 
 # Share of the server's limit that a robot uses: a network may deliver messages closer together than sent.
 _OWN_SHARE = 0.9
@@ -62,12 +60,10 @@ def command_burst(max_commands_per_s: float) -> int:
 class RateLimiter:
     """How fast a robot may send on one connection; unlimited without *limits* or without a rate in them."""
 
-    __slots__ = ("_bucket", "_last_command_s", "_told_pause_s", "_told_until_s")
+    __slots__ = ("_bucket",)
 
     def __init__(self, limits: Limits | None = None) -> None:
         self._bucket: TokenBucket | None = None
-        self._last_command_s = self._told_until_s = -math.inf
-        self._told_pause_s = 0.0
         if limits is not None and limits.max_commands_per_s > 0:
             burst = max(1.0, _OWN_SHARE * limits.command_burst)
             self._bucket = TokenBucket(_OWN_SHARE * limits.max_commands_per_s, burst)
@@ -79,32 +75,14 @@ class RateLimiter:
         self._bucket.fill(now)
         return max(0, int(self._bucket.tokens))
 
-    def obey(self, rate: Rate, now: float) -> bool:
-        """Keep to the rate that the server tells; return False if it makes no sense and is ignored."""
-        if not (0.0 < rate.commands_per_s < math.inf and 0.0 <= rate.for_ms < math.inf):
-            return False
-        self._told_pause_s = 1.0 / rate.commands_per_s
-        self._told_until_s = now + min(MAX_PAUSE_S, rate.for_ms / 1e3)
-        return True
-
-    def waits_for_told_rate(self, now: float) -> bool:
-        """Return whether the rate that the server told allows no command at *now*."""
-        return now < self._next_told_s()
-
-    def spend(self, now: float, *, is_command: bool = False) -> None:
+    def spend(self, now: float) -> None:
         """Count one message that is sent whatever the limit says."""
-        if is_command:
-            self._last_command_s = now
         if self._bucket is not None:
             self._bucket.spend(1.0, now)
 
     def next_s(self, now: float) -> float:
         """Return the time at which the next command may be sent, *now* if at once."""
-        bucket_s = now if self._bucket is None else now + self._bucket.wait_s(now)
-        return max(bucket_s, self._next_told_s())
-
-    def _next_told_s(self) -> float:
-        return min(self._told_until_s, self._last_command_s + self._told_pause_s)
+        return now if self._bucket is None else now + self._bucket.wait_s(now)
 
 
 @dataclass(slots=True, kw_only=True)

@@ -51,8 +51,6 @@ __all__ = [
     "CLOSE_UNSUPPORTED",
     "MAX_SUBSCRIPTIONS",
     "PROGRESS",
-    "RATE",
-    "REFUSALS",
     "RENEWAL_PAUSE_S",
     "UPDATES",
     "AskTopics",
@@ -74,12 +72,6 @@ PROGRESS = "progress"
 
 UPDATES = "updates"
 """Capability of a robot that may subscribe to topics."""
-
-REFUSALS = "refusals"
-"""Capability of a robot that accepts one message as the final answer to many commands."""
-
-RATE = "rate"
-"""Capability of a robot that sends no more commands a second than the server says."""
 
 MAX_SUBSCRIPTIONS = 8
 """Subscriptions of one connection; a robot needs one for each map that it drives in."""
@@ -172,8 +164,6 @@ class ServerSession:
         ends_s: When the robot's token expires, on the server's clock; set after authentication.
         hears_progress: Whether the robot announced the capability `PROGRESS`.
         hears_updates: Whether it announced the capability `UPDATES`.
-        hears_refusals: Whether it announced the capability `REFUSALS`.
-        hears_rate: Whether it announced the capability `RATE`.
         topics: The topic of each live subscription, by its id.
         bad_messages: How many invalid messages arrived whose id could not be read; a long one counts several
             times.
@@ -200,7 +190,7 @@ class ServerSession:
         self.state: Literal["opening", "open", "closed"] = "opening"
         self.in_flight = 0
         self.ends_s: float | None = None
-        self.hears_progress = self.hears_updates = self.hears_refusals = self.hears_rate = False
+        self.hears_progress = self.hears_updates = False
         self.topics: dict[int, str] = {}
         self.codec = codec
         self._server = server
@@ -325,8 +315,6 @@ class ServerSession:
         self.state = "open"
         self.hears_progress = PROGRESS in hello.capabilities
         self.hears_updates = UPDATES in hello.capabilities
-        self.hears_refusals = REFUSALS in hello.capabilities
-        self.hears_rate = RATE in hello.capabilities
         burst = self._burst
         has_burst = burst.url != "" and burst.robot_commands_per_day > 0
         welcome = Welcome(

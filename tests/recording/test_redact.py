@@ -19,8 +19,6 @@ from rse_pf.wire import (
     Hello,
     Limits,
     Ping,
-    Rate,
-    Refused,
     Renew,
     Result,
     Subscribe,
@@ -86,34 +84,6 @@ def test_an_answer_to_a_command_that_was_left_out_is_left_out(codec: str):
 
     assert judge.down(encode(Result(id=2, reply={"robot": "someone"}))) is None
     assert judge.down(encode(Update(id=3, topic="live/kitchen", seq=1))) is None
-
-
-@pytest.mark.parametrize("codec", CODECS)
-def test_of_a_message_that_ends_many_commands_those_that_are_kept_are_named(codec: str):
-    judge, codec_ = redactor(codec), make_codec(codec)
-    for message in (command(1), Command(id=2, service="merge"), command(3)):
-        judge.up(codec_.encode(message))
-    refused = Refused(ids=[1, 2, 9, 3], code="busy", message="müller-7 is too fast")
-
-    kept = judge.down(codec_.encode(refused))
-    again = judge.down(codec_.encode(refused))
-
-    assert kept is not None
-    assert (kept.type, kept.service) == ("refused", "pnp")
-    stored = codec_.decode_from_server(kept.data)
-    assert stored.ids == [1, 3]
-    assert stored.message == f"{judge.robot} is too fast"
-    assert again is None
-
-
-@pytest.mark.parametrize("codec", CODECS)
-def test_the_rate_that_a_robot_was_told_is_stored(codec: str):
-    data = make_codec(codec).encode(Rate(commands_per_s=2.5, for_ms=1e3))
-
-    kept = redactor(codec).down(data)
-
-    assert kept is not None
-    assert kept.data == data
 
 
 @pytest.mark.parametrize("codec", CODECS)

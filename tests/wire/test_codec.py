@@ -27,8 +27,6 @@ from rse_pf.wire import (
     Move,
     Ping,
     Pong,
-    Rate,
-    Refused,
     Result,
     Welcome,
     codec_for,
@@ -72,11 +70,6 @@ FROM_SERVER: dict[type[Any], st.SearchStrategy[Any]] = {
         retry_after_ms=st.none() | finite, server=texts, trace=texts,
     ),
     Move: st.builds(Move, reason=texts, within_ms=finite),
-    Refused: st.builds(
-        Refused, ids=st.lists(counters, max_size=64), code=texts, message=texts, hint=texts,
-        retry_after_ms=st.none() | finite, server=texts,
-    ),
-    Rate: st.builds(Rate, commands_per_s=finite, for_ms=finite),
     Pong: st.builds(Pong, sent_s=finite, received_s=finite, answered_s=finite),
 }  # fmt: skip
 
@@ -202,15 +195,6 @@ def test_a_command_whose_fields_do_not_fit_is_a_bad_message(fields: str) -> None
 @pytest.mark.parametrize("data", [b"[]", b"1", b"{}", b'{"type":"welcome"}', b'{"type":7}', b'{"type":"x"}'])
 def test_server_messages_from_a_robot_are_bad_messages(data: bytes) -> None:
     assert isinstance(refused("json", data), BadMessage)
-
-
-@pytest.mark.parametrize("name", CODECS)
-def test_one_message_ends_at_most_64_commands(name: str) -> None:
-    codec = make_codec(name)
-    message = codec.encode(Refused(ids=list(range(65)), code="busy", message="m"))
-
-    with pytest.raises(BadMessage, match="64"):
-        codec.decode_from_server(message)
 
 
 @pytest.mark.parametrize("name", CODECS)

@@ -19,17 +19,12 @@ struct Limits {
     double command_burst = 0;
 };
 
-/// Commands that one `refused` may end.
-constexpr std::uint32_t max_refused_ids = 64;
-
 /// A message of the server; which fields count depends on `type`.
 struct ServerMessage {
     std::string_view type, server, session, robot, code, message, hint, trace, topic, key, object, what, reason;
     std::optional<std::uint64_t> id;
-    std::vector<std::uint64_t> ids;
     std::uint64_t seq = 0;
     double queue_ms = 0, compute_ms = 0, received_s = 0, sent_s = 0, answered_s = 0, within_ms = 0, done = 0;
-    double commands_per_s = 0, for_ms = 0;
     std::optional<double> retry_after_ms, token_s;
     Limits limits;
     std::string_view reply, payload;  // MessagePack; empty: null
@@ -46,14 +41,6 @@ inline Limits read_limits(msgpack::Reader& reader) {
         else reader.value();
     }
     return limits;
-}
-
-inline std::vector<std::uint64_t> read_ids(msgpack::Reader& reader) {
-    const std::uint32_t n = reader.list();
-    if (n > max_refused_ids) throw Error("bad-message", "one message ends " + std::to_string(n) + " commands");
-    std::vector<std::uint64_t> ids;
-    for (std::uint32_t i = 0; i < n; ++i) ids.push_back(reader.integer());
-    return ids;
 }
 
 /// Return the message in *data*, whose strings point into it; throws Error `bad-message`.
@@ -96,9 +83,6 @@ inline ServerMessage read_message(std::string_view data) {
         else if (key == "seq") out.seq = reader.integer();
         else if (key == "done") out.done = reader.number();
         else if (key == "what") text(out.what);
-        else if (key == "ids") out.ids = read_ids(reader);
-        else if (key == "commands_per_s") out.commands_per_s = reader.number();
-        else if (key == "for_ms") out.for_ms = reader.number();
         else reader.value();
     }
     if (!reader.done()) throw Error("bad-message", "bytes follow the message");
@@ -112,8 +96,8 @@ inline Failure failure_of(const ServerMessage& message) {
 
 inline std::string hello(std::string_view sdk) {
     std::string out;
-    msgpack::Writer(out).map(3).text("type").text("hello").text("sdk").text(sdk).text("capabilities").list(5)
-        .text("move").text("progress").text("updates").text("refusals").text("rate");
+    msgpack::Writer(out).map(3).text("type").text("hello").text("sdk").text(sdk).text("capabilities").list(3)
+        .text("move").text("progress").text("updates");
     return out;
 }
 

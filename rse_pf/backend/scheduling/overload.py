@@ -2,8 +2,8 @@
 
 A command may wait for a part of the time that it has until its deadline.  One that is expected to wait for
 less than a lower bound is accepted.  From there to an upper bound the refused share grows in proportion, so
-that the queue settles instead of swinging; what is accepted and then waits for too long is given up.  Nothing
-is refused of a tenant of which fewer commands were accepted of late than of the others.
+that the queue settles, where a fixed threshold would swing; what is accepted and then waits for too long is
+given up.  Nothing is refused of a tenant of which fewer commands were accepted of late than of the others.
 
 A refused robot pauses.  A pause spans several frames, so that most of what arrives is accepted: a refusal
 costs about half of what a small answer costs.  A robot that goes on sending is served one command at a time,

@@ -97,7 +97,6 @@ def report_of(scenario: LoadScenario, result: SwarmResult, before: Mapping[str, 
         "resent": result.resent,
         "moves": result.moves,
         "held_back": result.held_back,
-        "told_a_rate": result.told_a_rate,
         "generator": {
             "cpu_s": result.cpu_s,
             "wall_s": result.wall_s,
@@ -204,17 +203,16 @@ def table_of(report: Mapping[str, Any], folder: Path) -> str:
         ("frames per second", f"{report['fps_per_robot']['mean'] or 0.0:.2f} per robot"),
         ("wrong poses", f"{report['wrong_poses']}"),
         ("reconnects", f"{report['reconnects']} ({report['resent']} resent), {report['moves']} migrations"),
-        ("held back", _held_back(report["held_back"], report["told_a_rate"])),
+        ("held back", _held_back(report["held_back"])),
         ("load generator", f"{own['cpu_percent']:.0f} % of a core, late p99 {_ms(own['late_sends_ms_p99'])}"),
         ("records", str(folder)),
     ]  # fmt: skip
     return "\n".join(f"{name:<18} {value}" for name, value in rows)
 
 
-def _held_back(counts: Mapping[str, int], told_a_rate: int) -> str:
+def _held_back(counts: Mapping[str, int]) -> str:
     """Return how many commands the robots held back, and why."""
-    told = f"{counts.get('server-rate', 0)} by a server's rate (told to {told_a_rate} robots)"
-    return f"{told}, {counts.get('busy', 0)} after busy, {counts.get('own-limit', 0)} by their own limit"
+    return f"{counts.get('busy', 0)} after busy, {counts.get('own-limit', 0)} by their own limit"
 
 
 def _ms(value: float | None) -> str:

@@ -58,10 +58,10 @@ Event = Mapping[str, Any]
 class SwarmResult:
     """The commands of all robots, and the cost of generating them.
 
-    ``held_back`` counts the commands that were not sent at once, as `client_sdk.Stats` does, and
-    ``told_a_rate`` the robots that a server told a rate.  ``cpu_s`` is the CPU time of all processes of the
-    generator during ``wall_s``; ``duplicates`` counts answers that were delivered twice;
-    ``late_sends_ms_p99`` is the delay of the generator itself between the planned and the real send time.
+    ``held_back`` counts the commands that were not sent at once, as `client_sdk.Stats` does.  ``cpu_s`` is
+    the CPU time of all processes of the generator during ``wall_s``; ``duplicates`` counts answers that were
+    delivered twice; ``late_sends_ms_p99`` is the delay of the generator itself between the planned and the
+    real send time.
     """
 
     commands: list[CommandRecord]
@@ -75,7 +75,6 @@ class SwarmResult:
     link: str | None
     late_sends_ms_p99: float
     held_back: dict[str, int] = field(default_factory=dict)
-    told_a_rate: int = 0
 
 
 @dataclass(slots=True, eq=False)
@@ -204,7 +203,6 @@ class Swarm:
             link=self.scenario.link,
             late_sends_ms_p99=round(float(np.percentile(late_ms, 99)), 3) if late_ms else 0.0,
             held_back={reason: totals[reason] for reason in REASONS},
-            told_a_rate=totals["told_a_rate"],
         )
 
     async def _launch(self) -> None:

@@ -252,7 +252,6 @@ class _Process:
                 stats = robot.client.stats
                 counts.update({name: getattr(stats, name) for name in names})
                 counts.update(stats.held_back)
-                counts["told_a_rate"] += stats.told_rate_per_s is not None
         return SwarmEnded(cpu_s=cpu_s, counts=counts)
 
 

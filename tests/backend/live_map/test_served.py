@@ -223,8 +223,6 @@ SENT_BY_WATCHER: dict[type, Callable[[ClientConnection, GuardedServer], Awaitabl
         for message in (
             messages.Welcome(server="s", session="s", robot="r", protocol=1, limits=LIMITS, clock_s=0.0),
             messages.Result(id=1, reply={}), messages.Failure(code="busy", message="m"),
-            messages.Refused(ids=[1], code="busy", message="m"),
-            messages.Rate(commands_per_s=1.0, for_ms=1.0),
             messages.Move(reason="drain", within_ms=1.0), messages.Progress(id=1, done=0.5),
             messages.Pong(sent_s=0.0, received_s=0.0, answered_s=0.0), messages.Renewed(token_s=1e9),
             messages.Update(id=300, topic="live/m", seq=1, key="map", payload={"kind": "map"}),

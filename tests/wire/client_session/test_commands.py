@@ -38,7 +38,7 @@ def tend_until_lost(session: ClientSession, connection: ConnectionState) -> tupl
 def test_a_connection_begins_with_hello():
     (hello,) = sent(make_session().open_connection(0.0))
 
-    assert hello == Hello(sdk="test", capabilities=("move", "progress", "updates", "refusals", "rate"))
+    assert hello == Hello(sdk="test", capabilities=("move", "progress", "updates"))
 
 
 def test_a_command_waits_for_a_connection_and_is_sent_with_its_remaining_time():

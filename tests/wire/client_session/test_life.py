@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 from wire.client_sessions import CODEC, SETTINGS, make_session, open_connection
 
-from rse_pf.wire import Command, Failure, Limits, Ping, Pong, Rate, Refused, Result, Welcome
+from rse_pf.wire import Command, Failure, Limits, Ping, Pong, Result, Welcome
 from rse_pf.wire.client_session import Answered, ClientSession, ConnectionState, Notice
 
 ROOM = 3
@@ -107,27 +107,6 @@ class RobotLife(RuleBasedStateMachine):
             message = Failure(id=command.id, code=code, message="", retry_after_ms=pause_ms)
         self.open_on[id(connection)].discard(command.id)
         self._take(self.session.receive(connection, CODEC.encode(message), self.now))
-
-    @rule(
-        count=st.integers(1, 5), foreign=st.lists(st.integers(0, 10**6), max_size=2),
-        code=st.sampled_from(CODES), pause_ms=st.sampled_from([None, 0.0, 50.0, 9e5]),
-    )  # fmt: skip
-    @precondition(lambda self: self.seen)
-    def refuse(self, count: int, foreign: list[int], code: str, pause_ms: float | None) -> None:
-        """End the commands that were sent last, on the connection of the last of them, and unknown ones."""
-        connection = self.seen[-1][0]
-        ids = [command.id for _, command in self.seen[-count:]]
-        unknown = [identity for identity in foreign if identity not in self.commands]
-        refused = Refused(ids=[*ids, *unknown, *ids], code=code, message="", retry_after_ms=pause_ms)
-        self.open_on[id(connection)].difference_update(ids)
-        self._take(self.session.receive(connection, CODEC.encode(refused), self.now))
-
-    @rule(pick=picks, per_s=st.sampled_from([0.5, 3.0, 50.0]), for_ms=st.sampled_from([0.0, 300.0, 1e9]))
-    @precondition(lambda self: self.connections)
-    def tell_rate(self, pick: int, per_s: float, for_ms: float) -> None:
-        rate = CODEC.encode(Rate(commands_per_s=per_s, for_ms=for_ms))
-        connection = self.connections[pick % len(self.connections)]
-        self._take(self.session.receive(connection, rate, self.now))
 
     @rule(seconds=st.floats(0.001, 1.5))
     def wait(self, seconds: float) -> None:

@@ -1,4 +1,4 @@
-"""A robot whose server has too much to do: many commands end at once, and it keeps to the rate it is told."""
+"""A robot whose server has too much to do pauses as long as the server says."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import math
 import pytest
 
 from rse_pf.config import SessionSettings
-from rse_pf.wire import Command, Failure, Limits, Ping, Rate, Refused, Result, Welcome, make_codec
+from rse_pf.wire import Command, Failure, Limits, Ping, Welcome, make_codec
 from rse_pf.wire.client_session import Answered, ClientSession, ConnectionState
 from rse_pf.wire.rate_limit import MAX_PAUSE_S
 
@@ -44,14 +44,12 @@ class Robot:
     def hear(self, message, now: float) -> None:
         self.take(self.session.receive(self.connection, CODEC.encode(message), now), now)
 
-    def until(self, end: float, now: float, *, answers: bool = False) -> None:
+    def until(self, end: float, now: float) -> None:
         """Let time pass from *now* to *end*."""
         while now < end:
             now = min(end, max(self.session.next_due(now), now + 1e-3))
             self.take(self.session.due(now), now)
             self.take(self.session.check(self.connection, now), now)
-            for _, identity in self.sent if answers else ():
-                self.hear(Result(id=identity, reply=None), now)
 
     def take(self, events, now: float) -> None:
         for event in events:
@@ -70,42 +68,18 @@ class Robot:
         return [identity for _, identity in self.sent]
 
 
-def test_one_message_ends_its_commands_as_failures_would():
-    robot = Robot()
-    ended = [robot.submit(0.0) for _ in range(3)]
-    other = robot.submit(0.0)
-
-    robot.hear(Refused(ids=ended, code="forbidden", message="m", hint="h", server="a"), 0.1)
-
-    assert robot.ends == dict.fromkeys(ended, "forbidden")
-    assert robot.session.unanswered == 1
-    robot.hear(Result(id=other, reply=None), 0.2)
-    assert robot.ends[other] == "ok"
-
-
-def test_a_refused_command_is_sent_again_after_the_pause():
+def test_a_refused_command_is_sent_again_once_after_the_pause():
     robot = Robot()
     identity = robot.submit(0.0)
 
-    robot.hear(Refused(ids=[identity], retry_after_ms=200.0, **BUSY), 0.1)
+    for _ in range(2):
+        robot.hear(Failure(id=identity, retry_after_ms=200.0, **BUSY), 0.1)
     robot.until(0.29, 0.1)
     assert robot.sent_ids == [identity]
     robot.until(0.31, 0.29)
 
     assert robot.sent_ids == [identity, identity]
     assert robot.session.held_back == {"busy": 1}
-
-
-@pytest.mark.parametrize("pause_ms", [None, 0.0, -5.0])
-def test_ids_that_are_named_twice_or_are_not_known_change_nothing(pause_ms: float | None):
-    robot = Robot()
-    identity = robot.submit(0.0)
-
-    robot.hear(Refused(ids=[77, identity, identity, -1, 2**62], retry_after_ms=pause_ms, **BUSY), 0.1)
-
-    assert robot.sent_ids == [identity, identity], "sent again once, not once for each time it is named"
-    assert robot.ends == {}
-    assert robot.session.dropped_answers == 3
 
 
 def test_a_refusal_on_a_connection_that_was_left_does_not_end_what_went_to_another():
@@ -115,125 +89,10 @@ def test_a_refusal_on_a_connection_that_was_left_does_not_end_what_went_to_anoth
     robot.session.close_connection(old)
     robot.connect(0.5)
 
-    events = robot.session.receive(old, CODEC.encode(Refused(ids=[identity], code="failed", message="")), 0.6)
+    events = robot.session.receive(old, CODEC.encode(Failure(id=identity, code="failed", message="")), 0.6)
 
     assert events == []
     assert robot.session.unanswered == 1
-
-
-def test_a_told_rate_spaces_all_commands_and_counts_no_pings():
-    robot = Robot()
-    robot.submit(0.0)
-    robot.hear(Rate(commands_per_s=4.0, for_ms=1000.0), 0.0)
-
-    for _ in range(8):
-        robot.submit(0.05)
-    robot.until(0.99, 0.05)
-    assert [round(at, 3) for at, _ in robot.sent] == [0.0, 0.25, 0.5, 0.75]
-    assert robot.pings >= 2
-    robot.until(1.01, 0.99)
-
-    assert len(robot.sent) == 9, "when the time has passed, the rest is sent at once"
-    assert robot.session.held_back == {"server-rate": 8}
-    assert robot.session.told_rate_per_s == 4.0
-
-
-def test_at_a_told_rate_the_newest_frame_waits_and_older_ones_end_at_once():
-    robot = Robot()
-    robot.submit(0.0, "pose")
-    robot.hear(Rate(commands_per_s=2.0, for_ms=5000.0), 0.0)
-
-    older, newer = robot.submit(0.1, "pose"), robot.submit(0.2, "pose")
-    assert robot.session.next_due(0.2) == 0.2
-    robot.until(0.21, 0.2)
-    assert robot.ends == {older: "stale"}
-    robot.until(0.6, 0.21)
-
-    assert [(round(at, 3), identity) for at, identity in robot.sent[1:]] == [(0.5, newer)]
-
-
-def test_kept_frames_and_commands_wait_at_a_told_rate_up_to_their_deadline():
-    robot = Robot()
-    robot.submit(0.0)
-    robot.hear(Rate(commands_per_s=1.0, for_ms=5000.0), 0.0)
-
-    kept = [robot.submit(0.1, "pose", keep=True, deadline_s=1.5) for _ in range(2)]
-    robot.until(2.0, 0.1)
-
-    assert robot.sent_ids[1:] == kept[:1]
-    assert robot.ends == dict.fromkeys(kept, "expired")
-
-
-def test_another_rate_replaces_the_first_and_gives_no_command_away():
-    robot = Robot()
-    robot.submit(0.0)
-    for at in (0.0, 0.1, 0.2, 0.3):
-        robot.hear(Rate(commands_per_s=1.0, for_ms=1000.0), at)
-    for _ in range(3):
-        robot.submit(0.3)
-    robot.until(0.95, 0.3)
-    assert len(robot.sent) == 1
-    robot.until(1.1, 0.95)
-    assert len(robot.sent) == 2
-
-    robot.hear(Rate(commands_per_s=20.0, for_ms=1000.0), 1.1)
-    robot.until(1.2, 1.1)
-
-    assert len(robot.sent) == 4
-
-
-def test_a_rate_of_no_time_ends_the_one_before():
-    robot = Robot()
-    robot.submit(0.0)
-    robot.hear(Rate(commands_per_s=0.1, for_ms=60_000.0), 0.0)
-    waiting = robot.submit(0.1)
-
-    robot.hear(Rate(commands_per_s=1.0, for_ms=0.0), 0.2)
-
-    assert robot.sent_ids[1:] == [waiting]
-
-
-def test_a_told_rate_ends_with_its_connection():
-    robot = Robot()
-    robot.submit(0.0)
-    robot.hear(Rate(commands_per_s=0.1, for_ms=60_000.0), 0.0)
-    waiting = robot.submit(0.1)
-
-    robot.session.close_connection(robot.connection)
-    robot.connect(0.2)
-
-    assert waiting in robot.sent_ids
-
-
-@pytest.mark.parametrize(
-    ("per_s", "for_ms"),
-    [
-        (math.nan, 1e3), (0.0, 1e3), (-1.0, 1e3), (math.inf, 1e3), (1.0, math.nan), (1.0, -1.0),
-        (1.0, math.inf), (1e300, 1e300), (1e300, 1e3),
-    ],
-)  # fmt: skip
-def test_a_rate_without_sense_holds_nothing_back(per_s: float, for_ms: float):
-    robot = Robot()
-    robot.hear(Rate(commands_per_s=per_s, for_ms=for_ms), 0.0)
-
-    ids = [robot.submit(0.01 * n) for n in range(5)]
-
-    assert robot.sent_ids == ids
-    assert robot.session.told_rate_per_s in (None, 1e300)
-
-
-@pytest.mark.parametrize(("per_s", "for_ms"), [(5e-324, 1e300), (1e-300, 1e9)])
-def test_no_rate_holds_a_robot_back_for_longer_than_a_minute(per_s: float, for_ms: float):
-    robot = Robot()
-    robot.submit(0.0)
-    robot.hear(Rate(commands_per_s=per_s, for_ms=for_ms), 0.0)
-    waiting = robot.submit(1.0, deadline_s=3000.0)
-
-    robot.until(MAX_PAUSE_S - 0.01, 59.0)
-    assert robot.sent_ids[1:] == []
-    robot.until(MAX_PAUSE_S + 0.01, MAX_PAUSE_S - 0.01)
-
-    assert robot.sent_ids[1:] == [waiting]
 
 
 @pytest.mark.parametrize("keep", [False, True])
@@ -289,17 +148,6 @@ def test_what_the_limits_of_the_welcome_hold_back_is_counted_as_own():
         slow.submit(0.0)
 
     assert slow.session.held_back == {"own-limit": 2}
-
-
-def test_the_lower_of_told_rate_and_own_limit_counts():
-    robot = Robot(commands_per_s=2.0)
-    robot.hear(Rate(commands_per_s=1000.0, for_ms=10_000.0), 0.0)
-    for _ in range(4):
-        robot.submit(0.0)
-
-    robot.until(1.0, 0.0, answers=True)
-
-    assert 1 <= len(robot.sent) <= 2
 
 
 def test_a_frame_that_could_not_wait_ends_at_once_with_the_words_of_the_server():

@@ -30,8 +30,6 @@ from rse_pf.wire import (
     Ping,
     Pong,
     Progress,
-    Rate,
-    Refused,
     Renew,
     Renewed,
     Result,
@@ -135,13 +133,6 @@ MESSAGES: dict[str, Message] = {
         id=8, code="forbidden", message="this token does not hold the scope maps:live/warehouse",
         hint="issue one that does", server="server-1",
     ),
-    "hello-with-refusals-and-rate": Hello(sdk="rse-pf 0.3.0", capabilities=("refusals", "rate")),
-    "refused": Refused(
-        ids=[7, 8, 300, 2**53 - 1], code="busy", message="4 commands of this robot wait", hint="send fewer",
-        retry_after_ms=20.0, server="server-1",
-    ),
-    "refused-shortest": Refused(ids=[7], code="stale", message="a newer frame took its place"),
-    "rate": Rate(commands_per_s=2.5, for_ms=1000.0),
 }  # fmt: skip
 
 POSES = {

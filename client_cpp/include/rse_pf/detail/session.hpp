@@ -25,10 +25,9 @@ struct Stats {
     std::uint64_t callback_exceptions = 0;  ///< exceptions of callbacks, which end there
     std::uint64_t bytes_in = 0, bytes_out = 0;
     std::map<std::string, std::uint64_t> failures_by_code{};
-    /// Commands that were not sent at once although there was a connection: by the rate that a server told, after a busy
-    /// answer (to this command, or another one of the stream), or by what the Welcome allows.
-    std::map<std::string, std::uint64_t> held_back{{"server-rate", 0}, {"busy", 0}, {"own-limit", 0}};
-    std::optional<double> told_rate_per_s{};  ///< the last rate that a server told, commands a second
+    /// Commands that were not sent at once although there was a connection: after a busy answer (to
+    /// this command, or another one of the stream), or by what the Welcome allows.
+    std::map<std::string, std::uint64_t> held_back{{"busy", 0}, {"own-limit", 0}};
     std::size_t unanswered = 0;
     std::string last_error{};
 };
@@ -187,15 +186,6 @@ class Session {
         const ServerMessage message = read_message(data);
         const auto type = message.type;
         if (type == "result" || type == "failure") return answered(link, message, now);
-        if (type == "refused") {
-            refused(link, message, now);
-            return {};
-        }
-        if (type == "rate") {
-            if (link->rate.obey(message.commands_per_s, message.for_ms, now)) stats.told_rate_per_s = message.commands_per_s;
-            flush(now);
-            return {};
-        }
         if (type == "pong") {
             link->ping_sent.reset();
             if (message.sent_s >= link->opened && message.sent_s <= now) {
@@ -372,8 +362,6 @@ class Session {
                 end(found, std::move(told));
             } else if (now < held) {
                 hold(pending, "busy", held);
-            } else if (now < current_->rate.held_until()) {
-                hold(pending, "server-rate", current_->rate.held_until());
             } else if (current_->in_flight >= std::max<std::size_t>(1, current_->limits.max_in_flight)) {
                 hold(pending, "own-limit", never);
             } else if (!current_->rate.allows(now)) {
@@ -397,7 +385,7 @@ class Session {
         pending.link = current_;
         pending.sent_at = now;
         ++current_->in_flight;
-        current_->rate.spend_command(now);
+        current_->rate.spend(now);
         current_->outgoing.push_back(encode(pending, now));
         if (pending.cancelled) cancel_on_server(pending);
     }
@@ -480,16 +468,6 @@ class Session {
         }
         flush(now);
         return {};
-    }
-
-    /// Take one message for a failure of each of its commands.
-    void refused(const std::shared_ptr<Link>& link, const ServerMessage& message, double now) {
-        ServerMessage failure = message;
-        failure.type = "failure";
-        for (const std::uint64_t id : std::set<std::uint64_t>(message.ids.begin(), message.ids.end())) {
-            failure.id = id;
-            answered(link, failure, now);
-        }
     }
 
     static Answer answer_of(const Link& link, const Pending& pending, const ServerMessage& message, double now) {

@@ -28,19 +28,6 @@ class RateLimiter {
         fill(now);
         return left_ >= 1;
     }
-    /// Keep to the rate that the server tells; false if it makes no sense and is ignored.
-    bool obey(double commands_per_s, double for_ms, double now) {
-        if (!(commands_per_s > 0 && commands_per_s < never && for_ms >= 0 && for_ms < never)) return false;
-        told_pause_ = 1 / commands_per_s;
-        told_until_ = now + std::min(max_pause_s, for_ms / 1e3);
-        return true;
-    }
-    /// Return until when the told rate holds commands back.
-    double held_until() const { return std::min(told_until_, last_command_ + told_pause_); }
-    void spend_command(double now) {
-        last_command_ = now;
-        spend(now);
-    }
     void spend(double now) {
         if (rate_ <= 0) return;
         fill(now);
@@ -55,7 +42,6 @@ class RateLimiter {
         filled_ = now;
     }
     double rate_ = 0, burst_ = 1, left_ = 1, filled_ = 0;
-    double told_pause_ = 0, told_until_ = -never, last_command_ = -never;
 };
 
 /// The offset of the server's clock, from the exchange with the shortest round trip of the last eight.
