@@ -29,8 +29,11 @@ __all__ = ["WebFirewall"]
 _BODY = "too-fast"
 _TOLD = {
     "code": "quota",
-    "message": "too many requests of this address",
-    "hint": f"wait {RETRY_AFTER_S} s; if many robots share the address, raise cloud.robots_per_site",
+    "message": "too many requests",
+    "hint": (
+        f"wait {RETRY_AFTER_S} s; operators raise cloud.robots_per_site if many robots share an address, "
+        "and burst.commands_per_5_minutes for commands sent to the function"
+    ),
 }
 _NO_TOKEN, _NO_TOKEN_BODY, _NO_TOKEN_STATUS = "burst-needs-a-token", "no-token", 401
 _NO_TOKEN_TOLD = {

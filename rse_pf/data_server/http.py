@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import math
 import re
 import sys
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
@@ -261,7 +262,7 @@ def failure_reply(error: RsePfError) -> HttpReply:
     if status == 401:
         headers["WWW-Authenticate"] = "Bearer"
     if error.retry_after_ms is not None:
-        headers["Retry-After"] = str(max(1, round(error.retry_after_ms / 1000)))
+        headers["Retry-After"] = str(max(1, math.ceil(error.retry_after_ms / 1000)))
     return json_reply(status, HttpFailure(code=error.code, message=error.message, hint=error.hint), headers)
 
 

@@ -442,8 +442,10 @@ def listener_type(
                 rsv = bool(frame.rsv1 or frame.rsv2 or frame.rsv3)
                 payload = frame.get_payload_as_bytes()
                 works_for[0] = self._number
-                self._connection.receive_frame(frame.msg_type, bool(frame.fin), rsv, payload)
-                works_for[0] = 0
+                try:
+                    self._connection.receive_frame(frame.msg_type, bool(frame.fin), rsv, payload)
+                finally:
+                    works_for[0] = 0
 
         def on_ws_disconnected(self, transport: Any) -> None:
             for timer in (self._cut, self._pause, self._linger):

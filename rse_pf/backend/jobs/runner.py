@@ -102,9 +102,11 @@ class JobSignals:
 
     def wait(self, seconds: float, *others: socket.socket) -> bool:
         """Wait for a signal or for bytes on *others*; return False if a signal was set."""
-        watched: list[Any] = [self._fd, *others]
-        ready, _, _ = select.select(watched, [], [], max(0.0, seconds))
-        if self._fd in ready:
+        poller = select.poll()  # select() takes no descriptor above 1,023, and a worker has thousands
+        poller.register(self._fd, select.POLLIN)
+        for other in others:
+            poller.register(other, select.POLLIN)
+        if any(fd == self._fd for fd, _ in poller.poll(max(0.0, 1e3 * seconds))):
             os.eventfd_read(self._fd)
         return not (self.cancelled or self.giving_up)
 

@@ -53,8 +53,8 @@ class Overload:
             allowed_s: Time from its arrival to its deadline.
         """
         min_wait_s = MIN_WAIT_SHARE * allowed_s
-        if expected_wait_s <= min_wait_s or self._is_below_fair_part(tenant):
-            return 0.0
+        if expected_wait_s <= min_wait_s or allowed_s <= 0.0 or self._is_below_fair_part(tenant):
+            return 0.0  # a command without any time left is not refused here; it expires
         max_wait_s = max(MAX_WAIT_SHARE * allowed_s, allowed_s - RESERVE_S)
         excess = (expected_wait_s - min_wait_s) / (max_wait_s - min_wait_s)
         refused_share = min(1.0, excess)

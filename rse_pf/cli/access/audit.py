@@ -116,7 +116,10 @@ def _json_line(who: str, entry: Entry) -> str:
 
 
 def _line(who: str, entry: Entry) -> str:
-    when = datetime.fromtimestamp(entry.time, timezone.utc).strftime("%Y-%m-%d %H:%M:%S")
+    try:
+        when = datetime.fromtimestamp(entry.time, timezone.utc).strftime("%Y-%m-%d %H:%M:%S")
+    except (OverflowError, ValueError, OSError):  # somebody changed the file
+        when = f"time={entry.time!r}"
     actor = [] if entry.actor == who else [f"by {_word(entry.actor)}"]
     subject = [_word(entry.subject)] if entry.subject else []
     details = [f"{_word(key)}={_word(value)}" for key, value in entry.detail.items()]

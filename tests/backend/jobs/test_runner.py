@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import os
 import socket
 import threading
 from collections.abc import Callable
@@ -21,6 +22,7 @@ from rse_pf.errors import Conflict, StoreError
 from rse_pf.identity import RobotId, object_name
 from rse_pf.ipc import encode_message
 from rse_pf.lease import ObjectRecords
+from rse_pf.linux import raise_descriptor_limit
 from rse_pf.object_store import MemoryStore, digest_of
 
 SETTINGS = PlatformSettings.from_dict(
@@ -159,6 +161,17 @@ def test_an_outcome_says_what_its_process_took_whatever_came_of_it(
     assert bench.run(lambda: FakeProcess(script)).cpu_s == 3.25
     if script == [DONE]:
         assert bench.run().cpu_s == 0.0, "a stored result was not computed again"
+
+
+def test_a_job_runs_in_a_worker_with_more_than_1024_descriptors():
+    raise_descriptor_limit()
+    with contextlib.ExitStack() as opened, open(os.devnull) as file:
+        for _ in range(1100):
+            opened.callback(os.close, os.dup(file.fileno()))
+        bench = Bench()
+
+        assert code(bench.run(lambda: FakeProcess([DONE]))) == "ok"
+        bench.signals.close()
 
 
 def test_a_job_with_a_stored_result_is_not_run_again(bench):

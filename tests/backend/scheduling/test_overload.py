@@ -28,6 +28,7 @@ CAPACITY_PER_S = 1 / WORK_S
         pytest.param(2.0, 10.0, 0, id="a short wait of a patient command"),
         pytest.param(5.25, 10.0, 50, id="a patient command between the bounds"),
         pytest.param(8.5, 10.0, 100, id="all but the reserve of a patient command"),
+        pytest.param(8.5, 0.0, 0, id="no time at all: the command expires instead"),
     ],
 )
 def test_the_refused_share_grows_with_the_expected_wait(

@@ -51,6 +51,14 @@ def test_show_cannot_be_made_to_write_control_characters(folder: Path, capsys: C
     assert r'reason="a reason\n\u001b[2J"' in out
 
 
+def test_show_prints_an_entry_whose_time_is_no_date(tmp_path: Path, capsys: Capture):
+    entry = {"time": 1e300, "actor": "operator", "action": "robot.disabled", "subject": "", "detail": {}}
+    (tmp_path / "operator.jsonl").write_text(json.dumps(entry) + "\n")
+
+    assert main(["audit", "show", str(tmp_path)]) == 0
+    assert "1e+300" in capsys.readouterr().out
+
+
 def test_show_as_json_by_action_and_by_file(folder: Path, capsys: Capture):
     files = [str(path) for path in folder.iterdir()]
     assert main(["audit", "show", *files, "--only", "disabled", "--json"]) == 0
