@@ -32,7 +32,7 @@ def test_a_range_of_two_numbers_is_the_slice_that_it_names(start: int, end: int,
     ("error", "status", "header"),
     [
         (Unauthorized("x"), 401, ("WWW-Authenticate", "Bearer")),
-        (Busy("x", retry_after_ms=2400.0), 503, ("Retry-After", "2")),
+        (Busy("x", retry_after_ms=2400.0), 503, ("Retry-After", "3")),
         (Busy("x", retry_after_ms=1.0), 503, ("Retry-After", "1")),
         (MethodNotAllowed("GET, PUT"), 405, ("Allow", "GET, PUT")),
         (StoreFull("x"), 507, None),
