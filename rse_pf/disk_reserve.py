@@ -15,7 +15,7 @@ from rse_pf.files import OWNER_ONLY
 
 __all__ = ["RESERVE_BYTES", "DiskReserve", "is_full"]
 
-# Size of a whole reserve: some hundred changes of a deny list, also if others take every second piece.
+# Size of a whole reserve: 256 changes of a short deny list, or 128 if others take every second piece.
 RESERVE_BYTES = 4 << 20
 # The reserve shrinks by at least this much beyond the content: blocks of the folder and of the lock file.
 _EXTRA_BYTES = 16 << 10

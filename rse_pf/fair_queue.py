@@ -72,7 +72,7 @@ class FairQueue(Generic[Item]):
         return item
 
     def release(self, robot: RobotId) -> None:
-        """Note that one running item of *robot* ended, which was served last with that."""
+        """Note that one running item of *robot* ended; robot and tenant go behind the others that wait."""
         for key in (robot, robot.tenant):
             self._running[key] -= 1
             if not self._running[key]:
@@ -97,7 +97,7 @@ class FairQueue(Generic[Item]):
         return removed
 
     def position(self, robot: RobotId) -> int:
-        """Return how many items, at most, are served up to one more item of *robot*, with this one.
+        """Return the position, from 1, that one more item of *robot* would have in the queue: an upper bound.
 
         Before each of the robot's items at most one of each robot of its tenant is served, and before each of
         these at most one of each tenant.

@@ -39,7 +39,7 @@ CONTROL_PLANE = "control-plane"
 OPERATOR = "operator"
 """Name of the log of operators' commands."""
 SYNC_S = 0.1
-"""An entry is on the disk after this."""
+"""Time between two writes to the disk: at most so much is lost when the machine fails."""
 _RETRY_S = 1.0
 """Time between two attempts to write to a disk that is full."""
 _GAP = "log.gap"
@@ -145,7 +145,7 @@ class AuditLog:
             return not self._is_failing
 
     def close(self) -> bool:
-        """Write what waits, close the file, and return whether nothing was lost."""
+        """Write what waits, close the file, and return whether the last write succeeded."""
         self._closed.set()
         self._wake.set()
         if self._thread is not None:
@@ -172,7 +172,7 @@ class AuditLog:
                 self._lost -= int(written.detail["entries"] or 0)
 
     def _append(self, line: bytes) -> None:
-        """Append one line by one call, which is whole also beside other writers."""
+        """Append one line by one call, so that lines of several writers do not mix."""
         if os.fstat(self._fd).st_size > self._max_bytes:
             self._rotate()
         if self._is_line_cut:  # what was written of it stays a line of its own, which no reader takes

@@ -1,4 +1,4 @@
-"""Watch the disks of a local platform: warn before one is full, and keep the reserve of the control files.
+"""Watch the disks of a local platform: warn before one is full, and refill the disk reserve of its roster.
 
 Servers are neither started nor replaced while the disk of the state folder is full: their logs and
 announcements could not be written.
@@ -49,7 +49,7 @@ class DiskSpace:
 
 
 def disk_level(free_bytes: int, total_bytes: int, before: Level = "ok") -> Level:
-    """Return whether a disk is full or nearly so; *before* is its level at the last look."""
+    """Return the level of a disk: ``ok``, ``low`` or ``full``; *before* is its level at the last look."""
     low_bytes = total_bytes * LOW_DISK_PERCENT / 100
     if free_bytes < _FULL_BYTES * (_HYSTERESIS if before == "full" else 1):
         return "full"
@@ -111,7 +111,7 @@ class DiskWatch:
         self._unwritten: dict[Path, str] = {}
 
     def is_full(self) -> bool:
-        """Return whether the disk of the state folder is full now."""
+        """Look at the disks, emit what changed, and return whether that of the state folder is full."""
         with contextlib.suppress(OSError):
             self._take(disk_spaces(self._folders))
         return self._levels.get(str(self._state)) == "full"

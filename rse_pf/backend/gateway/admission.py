@@ -1,8 +1,8 @@
-"""Decide whether a server takes a command: by rate, size, scope, deadline and backlog, in this order.
+"""Decide whether a server takes a command.
 
-Rate (`RobotRates`), the backlog of the whole server (`Scheduler.unread_pause_s`) and size are judged before
-a message is decoded, because a refusal is then cheaper than decoding.  Scope, deadline and the backlog of the
-robot are judged once the command is known, in whichever queue it waits then.
+Before a message is decoded, when a refusal is cheapest: the rate of the robot (`RobotRates`), the backlog of
+the server (`Scheduler.unread_pause_s`) and the size, in this order.  Once the command is decoded: its scope,
+its deadline, the number of commands of the robot that wait, and the backlog again.
 Values go in and decisions come out: there is no clock, no queue and no connection here.
 """
 
@@ -31,7 +31,7 @@ __all__ = ["DECODER_FULL", "TOO_FAST", "TOO_LATE", "Admission", "UnreadRefusal",
 MAX_QUEUE_PER_ROBOT = 8
 """Queued commands of one robot, as many as may be unanswered by default; more are refused."""
 _MAX_UNREAD_BYTES = 1 << 24
-"""Long messages that may wait for the decoder thread of a worker: 64 of the largest that a robot may send."""
+"""Bytes of long messages that may wait for the decoder thread of a worker."""
 _SUSPECTS_SHARE = 0.25
 """Share of `_MAX_UNREAD_BYTES` that is open to robots which sent undecodable messages before."""
 

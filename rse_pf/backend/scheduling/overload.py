@@ -3,7 +3,8 @@
 A command may wait for a part of the time that it has until its deadline.  One that is expected to wait for
 less than a lower bound is accepted.  From there to an upper bound the refused share grows in proportion, so
 that the queue settles, where a fixed threshold would swing; what is accepted and then waits for too long is
-given up.  Nothing is refused of a tenant of which fewer commands were accepted of late than of the others.
+given up.  No command is refused of a tenant of which fewer commands were accepted in the last second or two
+than of the average tenant.
 
 A refused robot pauses.  A pause spans several frames, so that most of what arrives is accepted: a refusal
 costs about half of what a small answer costs.  A robot that goes on sending is served one command at a time,
@@ -44,8 +45,9 @@ class Overload:
     def pause_s(self, tenant: str, expected_wait_s: float, allowed_s: float) -> float:
         """Return for how long a robot of *tenant* pauses whose command is refused; 0 accepts the command.
 
-        Until `note_accepted` the answer stays the same, so that it may be asked before and after decoding.
-        Robots that are refused together return apart, since pauses are spread by half.
+        An accepted command is accepted again until `note_accepted` counts it or another one is refused, so
+        that the rule may be asked before and after decoding.  Pauses differ by up to half of `PAUSE_S`, so
+        that robots that are refused together do not return together.
 
         Args:
             tenant: Of the robot.

@@ -36,7 +36,7 @@ BEHIND = "the server is behind with its work"
 BEHIND_HINT = "try again later; the server list may grow meanwhile"
 
 INLINE_BYTES = 16_384
-"""A command up to this size is computed in the event loop when nothing waits."""
+"""A cheap command up to this size is computed in the event loop when nothing waits."""
 SHORT_COMPUTE_S = 0.001  # passing a command to a thread costs 0.1 ms of CPU and up to 5 ms of waiting for it
 SHORT_SHARE = (
     0.8  # of the last commands were short: a share, since a process that others interrupt is not slow
@@ -106,10 +106,11 @@ class Scheduler:
         return QueueBacklog(len(waiting), self._pause_s(queued.robot, queued.allowed_s))
 
     def unread_pause_s(self, robot: RobotId, allowed_s: float) -> float:
-        """Return for how long a robot pauses whose next command, not decoded yet, would wait for too long.
+        """Return the pause of a robot, in seconds, if its next command would wait too long; 0 accepts it.
 
-        0 accepts the command, also if it might replace a frame that waits.  *allowed_s* is the time that the
-        robot's last command had until its deadline; the next one is taken for alike.
+        The command is not decoded yet, so its deadline is not known: *allowed_s*, the time that the robot's
+        last command had until its deadline, stands for it.  A command that may replace a waiting frame of
+        its stream is accepted.
         """
         if any(map(_is_replaceable, self._queue.items_of(robot))):
             return 0.0
