@@ -193,6 +193,13 @@ def _open_tum(folder: Path, of_camera: Path) -> Dataset:
                 f"colours begin at {colours.stamps_s[0]:.3f} s, depth at {depths.stamps_s[0]:.3f} s",
                 hint="check that rgb.txt and depth.txt use the same clock",
             )
+        unpaired = len(colours.images) - len(pairs)
+        if unpaired:
+            notes = (
+                *notes,
+                f"{unpaired} of {len(colours.images)} colour images of {folder} have no depth image of their own "
+                f"within {_MAX_STAMP_DIFFERENCE_S:g} s and are left out",
+            )
     camera, undistort = intrinsics.camera, Undistortion(intrinsics)
     units_per_m = intrinsics.depth_units_per_m
     no_depth: npt.NDArray[np.float32] = np.zeros((camera.height, camera.width), dtype=np.float32)

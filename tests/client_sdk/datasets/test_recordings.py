@@ -312,3 +312,14 @@ def test_an_empty_list_of_images_is_named(tmp_path: Path, name: str):
 
     with pytest.raises(UsageError, match=f"{name} lists no image"):
         open_dataset(folder)
+
+
+def test_colour_images_without_depth_are_left_out_and_counted(tmp_path: Path) -> None:
+    folder = write_tum(tmp_path / "drive", [0.0, 0.1, 0.2, 0.3, 0.4])
+    lines = (folder / "depth.txt").read_text().splitlines()
+    (folder / "depth.txt").write_text("\n".join(lines[:-2]) + "\n")
+
+    dataset = open_dataset(folder)
+
+    assert len(dataset) == 3
+    assert any(note.startswith("2 of 5 colour images") for note in dataset.notes)
