@@ -48,7 +48,7 @@ def write_drives(folders: list[Path], frames: int) -> None:
     for number, folder in enumerate(folders):
         for name in ("rgb", "depth"):
             (folder / name).mkdir(parents=True)
-        write_intrinsics(folder / "intrinsics.json", Intrinsics(camera=SMALL))
+        write_intrinsics(folder / "intrinsics.json", Intrinsics(camera=SMALL, depth_scale=1000.0))
         truth = true_trajectory(number, _ROBOTS, frames, _SEED)
         for row, pose in enumerate(truth.T_world_camera):
             rng = np.random.default_rng([number, row])
