@@ -249,6 +249,10 @@ class Mapper:
         """The number of frames tracked so far."""
         return 0 if self._tracker is None else self._tracker.frames
 
+    def restart_clock(self) -> None:
+        """Accept frames of an earlier time: their source began anew, such as a bag that is played again."""
+        self._last_stamp_s = float("-inf")
+
     @property
     def lost_frames(self) -> int:
         """The number of frames without a pose, but for those before the start of a camera without depth."""

@@ -41,6 +41,7 @@ _DIAGNOSTICS_EVERY_S = 1.0
 _PATH_EVERY_S = 0.5
 _LEAST_READINGS = 2
 _CALL_S = 10.0
+_CLOCK_RESTART_S = 1.0  # a stamp that is earlier by more was not mixed up: the source began anew
 _IDENTITY = np.eye(4)
 
 
@@ -89,6 +90,7 @@ class Bridge:
         self._has_frame = asyncio.Event()
         self._due = {"cloud": clock() + options.cloud_every_s, "path": clock()}
         self._stamp_ns = 0
+        self._last_s = float("-inf")
         self._reason = ""
         self._cloud: asyncio.Task[None] | None = None
         self._maps = None if robot is None else MapServices(robot, mapper, options)
@@ -215,7 +217,13 @@ class Bridge:
             self._publish(self._outgoing.imu_place(images.stamp_ns, images.camera_frame, rig.imu_frame, T))
 
     async def _track(self, frame: Frame) -> TrackedFrame:
-        return await self._mapper.track(frame)
+        back_s = self._last_s - frame.timestamp_s
+        if back_s > _CLOCK_RESTART_S:
+            show(f"the time of the images went back by {back_s:.1f} s, as if a bag is played again")
+            self._mapper.restart_clock()
+        tracked = await self._mapper.track(frame)
+        self._last_s = frame.timestamp_s
+        return tracked
 
     def _alignment(self) -> tuple[Array | None, Array | None]:
         """Return where the odometry frame is in the map; a map of its own begins where the robot did."""

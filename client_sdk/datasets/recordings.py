@@ -197,8 +197,8 @@ def _open_tum(folder: Path, of_camera: Path) -> Dataset:
         if unpaired:
             notes = (
                 *notes,
-                f"{unpaired} of {len(colours.images)} colour images of {folder} have no depth image of their own "
-                f"within {_MAX_STAMP_DIFFERENCE_S:g} s and are left out",
+                f"{unpaired} of {len(colours.images)} colour images of {folder} have no depth image of their "
+                f"own within {_MAX_STAMP_DIFFERENCE_S:g} s and are left out",
             )
     camera, undistort = intrinsics.camera, Undistortion(intrinsics)
     units_per_m = intrinsics.depth_units_per_m

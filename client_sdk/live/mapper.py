@@ -395,6 +395,10 @@ class LiveMapper:
         """The number of frames tracked so far."""
         return self._mapper.frames
 
+    def restart_clock(self) -> None:
+        """Accept frames of an earlier time: their source began anew, such as a bag that is played again."""
+        self._mapper.restart_clock()
+
     @property
     def lost_frames(self) -> int:
         """The number of frames without a pose."""

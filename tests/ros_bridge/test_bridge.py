@@ -119,6 +119,16 @@ async def test_poses_are_those_of_the_mapper_with_the_stamps_of_the_images() -> 
     assert stamps == [START_NS, START_NS + 100_000_000, START_NS + 200_000_000]
 
 
+async def test_a_bag_that_is_played_again_is_tracked_again() -> None:
+    heard = Heard()
+    async with running(heard) as bridge:
+        for count, row in enumerate((30, 31, 0, 1), 1):
+            send(bridge, frame_at(row % 30, depth=True), row)
+            await heard.until(count_of(POSE_WITH_COVARIANCE, count))
+
+    assert bridge.lost_frames == 0
+
+
 async def test_a_service_saves_the_map_into_the_folder_of_the_options(tmp_path: Path) -> None:
     heard = Heard()
     async with running(heard, out=str(tmp_path / "saved")) as bridge:
