@@ -37,7 +37,7 @@ MIN_INTERVAL_S = 1e-4  # no camera is faster than 10,000 Hz
 MAX_INTERVAL_S = 1e3  # slower than any drive: the unit of the time stamps is wrong
 _EPOCH_S = (1e9, 1e10)  # seconds since 1970 of the years 2001 to 2286
 _UNITS_S = {"seconds": 1.0, "milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9}
-_MAX_NAMED = 12  # so many files are named in one sentence
+_MAX_NAMED = 12  # files that one sentence names at most
 
 
 class DoubtName(str, Enum):
@@ -178,7 +178,7 @@ class DoubtLog:
 
 
 def ended_early(error: RsePfError, frames: int) -> Doubt:
-    """Return the doubt about a source that failed after so many frames."""
+    """Return the doubt about a source that failed after it had delivered some frames."""
     sentence = f"the source failed after {frames} frames, which are kept: {error.message}"
     return Doubt(name=DoubtName.ENDED_EARLY, sentence=sentence, hint=error.hint)
 

@@ -18,7 +18,7 @@ __all__ = ["BLOCK_S", "MAX_CRASHES", "WINDOW_S", "CrashRecord"]
 WINDOW_S = 300.0
 """Crashes of a robot that lie further apart do not count together."""
 MAX_CRASHES = 2
-"""A robot that caused so many is refused."""
+"""Number of crashes after which the robot that caused them is refused."""
 BLOCK_S = 60.0
 """For this long after the last of them."""
 _MAX_ROBOTS = 10_000

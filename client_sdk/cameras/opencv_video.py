@@ -19,7 +19,7 @@ from rse_pf.images import MAX_IMAGE_PIXELS, load_opencv
 
 __all__ = ["Video", "is_video_file", "open_video"]
 
-_LOOKED_AT = 3  # so many frames of a file tell whether it has presentation times
+_LOOKED_AT = 3  # frames that are read to see whether a file has presentation times
 _MAX_MISSES = 30
 """A device that gives no image so many times in a row has gone."""
 

@@ -27,7 +27,7 @@ __all__ = ["CrashRecovery", "restart_delay_s", "spare_plans"]
 _SPARES = 5
 """Processes that wait for a crash."""
 _PROMPT_RESTARTS = 2
-"""Crashes within `WINDOW_S` whose successors begin at once: one robot is refused after so many."""
+"""Crashes within `WINDOW_S` whose successors begin at once; one robot that causes as many is refused."""
 
 
 def restart_delay_s(crashes: int) -> float:
