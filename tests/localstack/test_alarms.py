@@ -40,7 +40,7 @@ ONE_METRIC = re.compile(r"(?P<name>\w+)|IF\((?P<compared>\w+) >= (?P<threshold>[
 
 
 class Server(FakeMachine):
-    """A server whose load is what the test says, on the real clock; a busy one does not reach the bucket."""
+    """A server under the load that the test sets, on the real clock; a busy one: full disk, no bucket."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -49,11 +49,11 @@ class Server(FakeMachine):
 
     def load(self, *, busy: bool) -> None:
         self._busy = busy
-        robots, queue_s = (500, 5.0) if busy else (1, 0.0)
+        robots, queue_s, disk_free_percent = (500, 5.0, 5.0) if busy else (1, 0.0, 50.0)
         self._crashes += busy
         self.text = (
             f"rse_pf_robots {robots}\nrse_pf_queue_oldest_s {queue_s}\n"
-            f"rse_pf_worker_crashes {self._crashes}\n"
+            f"rse_pf_worker_crashes {self._crashes}\nrse_pf_disk_free_percent {disk_free_percent}\n"
         )
 
     def reaches_store(self) -> bool:
