@@ -1,7 +1,8 @@
 """The owner processes that a worker has started: each is prepared, claims one map, and ends.
 
-Tenants share them as `FairShare` says.  A map that is only watched gives its process up, the one that was not
-used for longest first, when a map that is used needs one.
+When all are in use, a tenant that needs one gets that of the tenant that holds most, if that tenant holds at
+least two more.  A map that is only watched gives its process up, the one that was not used for longest first,
+when a map that is used needs one.
 """
 
 from __future__ import annotations
@@ -17,7 +18,6 @@ from typing import Any, Literal
 import msgspec
 
 from rse_pf.backend.live_map.owner.process import OwnerOrder
-from rse_pf.backend.scheduling.fair_share import CLAIM_S, FairShare
 from rse_pf.child.start import Child
 from rse_pf.ipc import FrameReader
 from rse_pf.linux import cpu_seconds
@@ -27,6 +27,9 @@ __all__ = ["OwnerChild", "OwnerChildren"]
 _READ_BYTES = 1 << 16
 _NEXT_SPARE_S = 3.0
 """After a process was taken the next one is prepared so much later: a takeover needs the processors."""
+
+_NEXT_CLAIM_S = 3.0
+"""A map that found no process has asked again within this time, for which one is kept."""
 
 
 class OwnerChild:
@@ -151,7 +154,8 @@ class OwnerChildren:
         self._max_owners = max_owners
         self._keeps_spare = keeps_spare
         self._clock = clock
-        self._share = FairShare(max_owners)
+        self._next_tenant = ""  # the process that is given up is kept for it
+        self._next_until_s = float("-inf")
         self._wanted_until_s = float("-inf")
         self._used: dict[OwnerChild, None] = {}
         self._ended_cpu_s: defaultdict[str, float] = defaultdict(float)
@@ -188,10 +192,13 @@ class OwnerChildren:
         now, held = self._clock(), Counter(child.tenant for child in self._used)
         if only_watched and now < self._wanted_until_s:
             return None
-        if not self._share.takes(tenant, held, now):
+        is_kept = now < self._next_until_s and held[tenant] > held[self._next_tenant]
+        if len(self._used) + is_kept >= self._max_owners:
             if not only_watched:
                 self._make_room(tenant, held, now)
             return None
+        if tenant == self._next_tenant:
+            self._next_until_s = float("-inf")
         self.prepare()
         child, self._spare = self._spare, None
         if child is not None:
@@ -232,21 +239,26 @@ class OwnerChildren:
             self._spare.kill()
 
     def _make_room(self, tenant: str, held: Counter[str], now: float) -> None:
-        """Let one process give its map up for a map of *tenant*, if a fair share allows that."""
-        self._share.claim(tenant, now)
-        self._wanted_until_s = now + CLAIM_S
+        """Let one process give its map up for a map of *tenant*, if another tenant holds two more."""
+        self._wanted_until_s = now + _NEXT_CLAIM_S
+        if self.is_making_room and tenant == self._next_tenant:
+            self._next_until_s = now + _NEXT_CLAIM_S
         if self.is_giving_up or self.is_making_room:
             return
-        donors = self._share.donors(tenant, held)
+        donors = [child for child in self._used if held[child.tenant] > held[tenant] + 1]
         unused = [
             child
             for child in self._used
             if child.unused_s is not None and (child.tenant == tenant or held[child.tenant] > held[tenant])
         ]
         if unused:
-            min(unused, key=lambda child: (child.tenant not in donors, child.unused_s)).release()
+            given = min(unused, key=lambda child: (child not in donors, child.unused_s))
         elif donors:
-            [child for child in self._used if child.tenant == donors[0]][-1].release()
+            given = max(reversed(donors), key=lambda child: held[child.tenant])
+        else:
+            return
+        self._next_tenant, self._next_until_s = tenant, now + _NEXT_CLAIM_S
+        given.release()
 
     def _lose(self, on_end: Callable[[OwnerChild, int], None], child: OwnerChild, code: int) -> None:
         self._used.pop(child, None)

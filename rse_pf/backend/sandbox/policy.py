@@ -10,8 +10,9 @@ order.  The rules:
   crash.
 - A sandbox outlives the last connection of its robot by a grace period, unless its place is needed.
 - When all places are taken, a robot gets the place of a sandbox in its grace period, or else, by
-  `FairShare`, that of the sandbox which has been idle longest of the tenant that holds most; if none of that
-  tenant is idle, the next one whose command ends is released.  State that no snapshot holds is lost.
+  `largest_holder`, that of the sandbox which has been idle longest of the tenant that holds most.  If all of
+  them work, the place of the first that ends its command is kept for the robot's tenant for `_KEPT_S`.
+  State that no snapshot holds is lost.
 - Commands that wait for a sandbox which crashed move to the new one.
 """
 
@@ -24,10 +25,10 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from rse_pf.backend.sandbox.circuit_breaker import CircuitBreaker
-from rse_pf.backend.scheduling.fair_share import FairShare
 from rse_pf.backend.scheduling.scheduler import QueuedCommand
 from rse_pf.config import ServiceSettings
 from rse_pf.errors import Busy, Conflict, Expired, Poison, RsePfError, StoreError, WorkerLost
+from rse_pf.fair_queue import largest_holder
 from rse_pf.identity import RobotId
 from rse_pf.ipc import encode_message
 from rse_pf.service import Kind
@@ -52,6 +53,8 @@ START_TIMEOUT_S = 5.0
 """A sandbox that is not ready by then is killed."""
 _MAX_TRIES = 2
 _BUSY_RETRY_MS = 1000.0
+_KEPT_S = 3.0
+"""A robot that was refused for want of a sandbox has asked again within this time."""
 _DEADLINE_FACTOR = 2.0
 """A sandbox is killed when a command takes this many deadlines."""
 
@@ -225,8 +228,9 @@ class SandboxPolicy:
         self.breaker = CircuitBreaker(settings)
         self._sandboxes: dict[int, _Sandbox] = {}
         self._by_robot: dict[RobotId, _Sandbox] = {}
-        self._shares = FairShare(max_sandboxes)
         self._held_by_tenant: Counter[str] = Counter()
+        self._next_tenant = ""  # gets the next place of a tenant that holds two more
+        self._next_until_s = -math.inf
         self._connections: Counter[RobotId] = Counter()
         self._last_number = 0
         self._actions: list[Action] = []
@@ -279,7 +283,7 @@ class SandboxPolicy:
         """Begin or queue the command of a robot."""
         refusal = self._refusal(call, now)
         sandbox = self._by_robot.get(call.queued.robot)
-        if refusal is None and sandbox is None and not self._gets_place(call.queued.robot.tenant, now):
+        if refusal is None and sandbox is None and not self._gets_place(call.queued.robot, now):
             refusal = self._no_place_error()
         if refusal is not None:
             self._answer(call, refusal)
@@ -411,28 +415,41 @@ class SandboxPolicy:
             self.counts["poison"] += 1
         return refusal
 
-    def _gets_place(self, tenant: str, now: float) -> bool:
-        """Return whether *tenant* gets one more sandbox; if all are in use, one may be released for it."""
-        if len(self._sandboxes) >= self._max_sandboxes:
-            spare = self._spare(tenant)
-            if spare is not None:
-                self.counts["released"] += 1
-                self._release(spare)
-        takes = self._shares.takes(tenant, self._held_by_tenant, now)
-        if not takes:
-            self._shares.claim(tenant, now)
-        return takes
+    def _gets_place(self, robot: RobotId, now: float) -> bool:
+        """Return whether *robot* gets a sandbox; if all places are taken, one may be released for it."""
+        if self._may_create(robot.tenant, now):
+            return True
+        by_idle = sorted(self._sandboxes.values(), key=lambda sandbox: sandbox.idle_since_s)
+        held = {sandbox.robot: 1 for sandbox in by_idle}
+        donor = self._in_grace() or largest_holder(
+            held, robot, lambda other: self._by_robot[other].state == "idle"
+        )
+        if donor is not None:
+            self.counts["released"] += 1
+            self._release(self._by_robot[donor])
+            return True
+        if largest_holder(held, robot, lambda other: True) is not None:
+            self._next_tenant, self._next_until_s = robot.tenant, now + _KEPT_S
+        return False
 
-    def _spare(self, tenant: str) -> _Sandbox | None:
-        free = [sandbox for sandbox in self._sandboxes.values() if sandbox.running is None]
-        in_grace = [sandbox for sandbox in free if sandbox.release_s < math.inf]
-        if in_grace:
-            return max(in_grace, key=lambda sandbox: self._held_by_tenant[sandbox.robot.tenant])
-        for donor in self._shares.donors(tenant, self._held_by_tenant):
-            idle = [sandbox for sandbox in free if sandbox.robot.tenant == donor and sandbox.state == "idle"]
-            if idle:
-                return min(idle, key=lambda sandbox: sandbox.idle_since_s)
-        return None
+    def _in_grace(self) -> RobotId | None:
+        """Return the robot without a connection of the tenant that holds most; None if there is none."""
+        in_grace = (
+            sandbox.robot
+            for sandbox in self._sandboxes.values()
+            if sandbox.running is None and sandbox.release_s < math.inf
+        )
+        return max(in_grace, key=lambda robot: self._held_by_tenant[robot.tenant], default=None)
+
+    def _may_create(self, tenant: str, now: float) -> bool:
+        """Return whether a place is free for *tenant*: the last one is kept for the next tenant, if any."""
+        free = self._max_sandboxes - len(self._sandboxes)
+        if tenant == self._next_tenant and free:
+            self._next_until_s = -math.inf
+        return free > (now < self._next_until_s and self._holds_more(tenant, 1))
+
+    def _holds_more(self, tenant: str, more: int) -> bool:
+        return self._held_by_tenant[tenant] >= self._held_by_tenant[self._next_tenant] + more
 
     def _no_place_error(self) -> Busy:
         return Busy(
@@ -483,7 +500,7 @@ class SandboxPolicy:
         """Move the commands that waited for a released sandbox to a new one."""
         if not sandbox.waiting or self._connections[sandbox.robot] == 0:
             return
-        if self._shares.takes(sandbox.robot.tenant, self._held_by_tenant, now):
+        if self._may_create(sandbox.robot.tenant, now):
             self._create(sandbox.robot, now).waiting.extend(sandbox.waiting)
         else:
             self._refuse_waiting(sandbox)
@@ -552,7 +569,8 @@ class SandboxPolicy:
         sandbox.late_s = sandbox.kill_s = math.inf
         sandbox.idle_since_s = now
         self._answer(call, outcome)
-        if self._shares.gives(sandbox.robot.tenant, self._held_by_tenant, now):
+        is_full = len(self._sandboxes) == self._max_sandboxes
+        if is_full and now < self._next_until_s and self._holds_more(sandbox.robot.tenant, 2):
             self.counts["released"] += 1
             self._refuse_waiting(sandbox)
             self._release(sandbox)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import itertools
 import json
 import os
 import shutil
@@ -408,6 +409,34 @@ def test_robots_beyond_the_capacity_are_busy_until_another_robot_leaves(serve_is
     busy = asyncio.run(asyncio.wait_for(run(), 10))
     assert busy.code == "busy"
     assert busy.retry_after_ms > 0
+
+
+def test_a_tenant_that_holds_every_sandbox_and_always_works_gives_one_to_another_tenant(serve_isolated):
+    server = serve_isolated(max_sandboxes=2)
+
+    async def ask_for_ever(robot):
+        for i in itertools.count(2):
+            await robot.ask(i, "worker", {}, keep=True)
+
+    async def run():
+        async with (
+            server.robot(token=server.token("one", tenant="rival")) as one,
+            server.robot(token=server.token("two", tenant="rival")) as two,
+            server.robot(token=server.token("three")) as three,
+        ):
+            await one.ask(1, "worker", {}, keep=True)
+            await two.ask(1, "worker", {}, keep=True)
+            rivals = [asyncio.create_task(ask_for_ever(robot)) for robot in (one, two)]
+            ids = itertools.count(1)
+            while not isinstance(await three.ask(next(ids), "worker", {}, keep=True), Result):
+                pass
+            answers = [await three.ask(next(ids), "worker", {}, keep=True) for _ in range(20)]
+            for task in rivals:
+                task.cancel()
+            return answers
+
+    answers = asyncio.run(asyncio.wait_for(run(), 20))
+    assert all(isinstance(answer, Result) for answer in answers)
 
 
 async def test_robots_are_served_again_after_the_zygote_was_killed(serve_isolated):
