@@ -295,14 +295,22 @@ class _Supervisor:
     # --- the end -------------------------------------------------------------------------------
 
     def _on_lost(self, worker: WorkerProcess) -> None:
-        heir = self._crashes.replace(worker, time.monotonic()) if self._state == "ready" else None
+        serves = self._state in ("ready", "draining")
+        heir = self._crashes.replace(worker, time.monotonic()) if serves else None
         if heir is not None:
-            self._keep(heir.connect(on_lost=self._on_lost, on_robot=self._on_robot))
+            self._keep(self._succeed(heir))
             if self._announce is not None:
                 replace_json(self._announce, self._identity())
         elif self._state != "leaving":
             self._log.error("worker-lost", pid=worker.pid, exit_code=worker.exit_code())
             self._finish(_EXIT_LOST)
+
+    async def _succeed(self, heir: WorkerProcess) -> None:
+        await heir.connect(on_lost=self._on_lost, on_robot=self._on_robot)
+        if self._state == "draining":
+            heir.order(DrainOrder(self._settings.serving.drain_within_ms))
+        elif self._state == "leaving":
+            heir.order(LeaveOrder(0.0))
 
     def _on_signal(self, number: signal.Signals) -> None:
         self._signals += 1
@@ -320,10 +328,14 @@ class _Supervisor:
         within_ms = self._settings.serving.drain_within_ms
         for worker in self._workers:
             worker.order(DrainOrder(within_ms))
-        empty = asyncio.gather(*(worker.empty.wait() for worker in self._workers))
         with suppress(asyncio.TimeoutError):
-            await asyncio.wait_for(empty, within_ms / 1e3)
+            await asyncio.wait_for(self._wait_empty(), within_ms / 1e3)
         await self._leave(self._settings.session.answer_timeout_s)
+
+    async def _wait_empty(self) -> None:
+        """Wait until no worker has a robot, those that replace a crashed one among them."""
+        while waiting := [worker for worker in self._workers if not worker.empty.is_set()]:
+            await waiting[0].empty.wait()
 
     async def _leave(self, held_s: float) -> None:
         if self._state == "leaving" and held_s > 0:

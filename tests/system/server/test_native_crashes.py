@@ -9,7 +9,7 @@ import time
 import pytest
 import websockets
 
-from rse_pf.wire import Command, Result
+from rse_pf.wire import Command, Move, Result
 
 pytestmark = pytest.mark.system
 
@@ -67,3 +67,23 @@ async def test_the_other_worker_serves_on_during_a_crash_and_disconnects_who_is_
             await asyncio.wait_for(sender.socket.wait_closed(), PROMPT_S)
         assert isinstance((await staying.ask(1, "echo")), Result)
     assert server.process.poll() is None
+
+
+async def test_a_crash_during_a_drain_takes_no_answer_from_the_robots_of_the_other_worker(start_server):
+    server = start_server(keys=True, serving={"workers": 2})
+
+    async with (
+        server.robot(token=server.token("staying")) as staying,
+        server.robot(token=server.token("culprit")) as culprit,
+    ):
+        await staying.send(Command(id=1, service="work", payload={"rest_s": 1.0}))
+        await asyncio.to_thread(server.http, "/drain?wait=0", "POST")
+        assert isinstance(await culprit.receive(), Move)
+        await culprit.send(Command(id=1, service="crash"))
+        await asyncio.wait_for(culprit.socket.wait_closed(), PROMPT_S)
+        async with server.robot(token=server.token("late")) as late:
+            assert isinstance(await late.receive(), Move)
+            assert isinstance(await late.ask(1, "echo"), Result)
+        assert [type(await staying.receive()) for _ in range(2)] == [Move, Result]
+    assert await asyncio.to_thread(server.process.wait, 10.0) == 0
+    assert server.wait_for_log("worker-crashed")["robot"] == "culprit"
