@@ -43,7 +43,6 @@ from rse_pf.ipc import encode_message
 from rse_pf.object_store import ObjectStore, is_name
 from rse_pf.service import failure_of
 from rse_pf.services.custom.installed import InstalledService
-from rse_pf.services.custom.recording import Recording
 from rse_pf.wire import Failure, Result
 
 __all__ = ["SandboxHost", "SandboxManager"]
@@ -108,8 +107,6 @@ class SandboxManager:
         self._channels: dict[int, IpcChannel] = {}
         self._working: set[int] = set()
         """Sandboxes that were sent a request and have not replied; all others are paused."""
-        self._recording: tuple[int, Recording] | None = None
-        """Number and calls of what an operator has recorded now."""
         self._actions: deque[Action] = deque()
         self._is_executing = False
         self._timer: TimerHandle | None = None
@@ -156,27 +153,6 @@ class SandboxManager:
     def unblock(self, service: str | None, tenant: str | None, robot: str | None) -> list[Block]:
         """Lift the matching blocks (None matches everything), and return them."""
         return self._policy.breaker.unblock(self._monotonic(), service=service, tenant=tenant, robot=robot)
-
-    def record(self, number: int, service: str, *, calls: int, max_bytes: int, seconds: float) -> bool:
-        """Begin recording *number*, which ends any other; return False if *service* is not installed."""
-        if service not in self._names:
-            return False
-        until_s = self._monotonic() + seconds
-        self._recording = number, Recording(service, max_calls=calls, max_bytes=max_bytes, until_s=until_s)
-        return True
-
-    def take_recorded(self, number: int, max_bytes: int) -> tuple[bytes, int, bool]:
-        """Return the next bytes of recording *number*, how many wait, and whether there will be no more."""
-        if self._recording is None or self._recording[0] != number:
-            return b"", 0, True
-        recording = self._recording[1]
-        data = recording.take(max_bytes)
-        return data, recording.waiting_bytes, recording.is_over(self._monotonic())
-
-    def end_recording(self, number: int) -> None:
-        """End recording *number* and forget what it holds; another one goes on."""
-        if self._recording is not None and self._recording[0] == number:
-            self._recording = None
 
     def add_connection(self, robot: RobotId) -> None:
         """Note a connection of *robot*."""
@@ -262,10 +238,7 @@ class SandboxManager:
                     self._channels[number].send(data)
                     self._zygote.resume(number)
             case AnswerCall(call, outcome):
-                message = self._answer_of(call, outcome)
-                if self._recording is not None and self._recording[1].service == call.service:
-                    self._note_call(self._recording[1], call, message)
-                self._answer(call.queued, message)
+                self._answer(call.queued, self._answer_of(call, outcome))
             case CreateSandbox(number, robot):
                 self._create(number, robot)
             case KillSandbox(number):
@@ -304,13 +277,6 @@ class SandboxManager:
         return Result(
             id=command.id, reply=outcome.value, server=self._server_id, compute_ms=outcome.compute_ms
         )
-
-    def _note_call(self, recording: Recording, call: SandboxCall, message: Result | Failure) -> None:
-        now, request = self._monotonic(), call.queued.command.payload
-        if isinstance(message, Result):
-            recording.add(request, message.reply, None, message.compute_ms, now)
-        else:
-            recording.add(request, None, message.code, 0.0, now)
 
     def _set_timer(self) -> None:
         """Wake up when the policy needs it; a timer that is early costs less than one more cancelled."""

@@ -296,20 +296,3 @@ class ReloadingSandboxes(CommandQueue):
         """Lift what is refused (None stands for all), and return what it was."""
         current = self._current.sandboxes
         return [] if current is None else current.unblock(service, tenant, robot)
-
-    def record(self, number: int, service: str, *, calls: int, max_bytes: int, seconds: float) -> bool:
-        """Begin recording *number*; a replacement ends it.  Return False if *service* does not run."""
-        current = self._current.sandboxes
-        return current is not None and current.record(
-            number, service, calls=calls, max_bytes=max_bytes, seconds=seconds
-        )
-
-    def take_recorded(self, number: int, max_bytes: int) -> tuple[bytes, int, bool]:
-        """Return the next bytes of recording *number*, how many wait, and whether there will be no more."""
-        current = self._current.sandboxes
-        return (b"", 0, True) if current is None else current.take_recorded(number, max_bytes)
-
-    def end_recording(self, number: int) -> None:
-        """End recording *number* and forget what it holds."""
-        if self._current.sandboxes is not None:
-            self._current.sandboxes.end_recording(number)

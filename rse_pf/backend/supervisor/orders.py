@@ -7,9 +7,9 @@ import msgspec
 from rse_pf.identity import RobotId
 
 __all__ = [
-    "BanOrder", "BeginOrder", "BlocksOrder", "DrainOrder", "LeaveOrder", "MigrateOrder", "RecordOrder",
-    "ReloadServicesOrder", "ReplaceOrder", "ReportOrder", "RobotsOrder", "TakeRecordedOrder", "TrustOrder",
-    "UnblockOrder", "WorkerOrder", "decode_order", "encode_order",
+    "BanOrder", "BeginOrder", "BlocksOrder", "DrainOrder", "LeaveOrder", "MigrateOrder",
+    "ReloadServicesOrder", "ReplaceOrder", "ReportOrder", "RobotsOrder", "TrustOrder", "UnblockOrder",
+    "WorkerOrder", "decode_order", "encode_order",
 ]  # fmt: skip
 
 
@@ -66,25 +66,6 @@ class UnblockOrder(msgspec.Struct, tag="unblock", tag_field="do", frozen=True):
     robot: str | None = None
 
 
-class RecordOrder(msgspec.Struct, tag="record", tag_field="do", frozen=True):
-    """Record requests to *service* under this *number*, or, with *ends*, end the recording of that number."""
-
-    number: int
-    service: str = ""
-    calls: int = 0
-    max_bytes: int = 0
-    seconds: float = 0.0
-    ends: int | None = None
-
-
-class TakeRecordedOrder(msgspec.Struct, tag="take-recorded", tag_field="do", frozen=True):
-    """Order an answer with this *number* and the next bytes of *recording*, at most *max_bytes*."""
-
-    number: int
-    recording: int
-    max_bytes: int
-
-
 class ReloadServicesOrder(msgspec.Struct, tag="reload-services", tag_field="do", frozen=True):
     """Load the services folder anew; what cannot be loaded changes nothing, and the log says why."""
 
@@ -127,8 +108,6 @@ WorkerOrder = (
     | BlocksOrder
     | RobotsOrder
     | UnblockOrder
-    | RecordOrder
-    | TakeRecordedOrder
     | ReloadServicesOrder
     | LeaveOrder
 )

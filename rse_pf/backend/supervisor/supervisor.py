@@ -17,7 +17,6 @@ import time
 from collections.abc import Awaitable, Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -40,10 +39,8 @@ from rse_pf.backend.supervisor.orders import (
     MigrateOrder,
     ReloadServicesOrder,
     RobotsOrder,
-    TakeRecordedOrder,
     UnblockOrder,
 )
-from rse_pf.backend.supervisor.record_query import NOT_FOR_YOU, WRONG_RECORDING, may_record, record_query
 from rse_pf.backend.supervisor.server_recording import ServerRecording, server_version
 from rse_pf.backend.supervisor.session_registry import SessionRegistry
 from rse_pf.backend.supervisor.trust_poller import poll_trust
@@ -72,8 +69,6 @@ _LEAVE_S = 3.0
 _MAX_MOVES = 10000
 _MAX_BLOCKS = 2000
 _MAX_ROBOTS = 1000
-_RECORDED_BYTES = 500_000
-"""Of all workers in one answer, which has at most 1 MiB in base64."""
 _MAX_SPREAD_S = _MAX_DRAIN_WAIT_S = 3600.0
 _EXIT_OK, _EXIT_LOST = 0, 1
 _PUBLIC_PAGES = ("/healthz", "/readyz")
@@ -370,8 +365,6 @@ class _Supervisor:
             ("GET", "/blocks"): self._blocks,
             ("GET", "/robots"): self._robots,
             ("POST", "/unblock"): self._post_unblock,
-            ("POST", "/record"): self._post_record,
-            ("POST", "/record/take"): self._post_take_recorded,
             ("POST", "/services"): self._post_services,
             ("POST", "/drain"): self._post_drain,
             ("POST", "/move"): self._post_move,
@@ -481,27 +474,6 @@ class _Supervisor:
         self._log.info("unblock", **scope, lifted=answer["count"])
         self._records.note("server.unblock", **scope, lifted=answer["count"])
         return json_reply(answer)
-
-    async def _post_record(self, ask: ControlRequest) -> ControlReply:
-        """Begin to record requests to an installed service, or end it."""
-        if not may_record(ask, self._control_token):
-            return refused_reply(403, "forbidden", NOT_FOR_YOU)
-        try:
-            query = record_query(ask)
-        except ValueError:
-            return refused_reply(400, "bad-request", WRONG_RECORDING)
-        answer = await self._ask_rows("workers", query.order, len(self._workers))
-        self._log.info("record", service=query.service, calls=query.calls, ends=query.ends)
-        self._records.note("server.record", service=query.service, calls=query.calls, ends=query.ends)
-        return json_reply({**answer, "recording": answer["order"]})
-
-    async def _post_take_recorded(self, ask: ControlRequest) -> ControlReply:
-        """Return the next bytes of a recording; they are returned once only."""
-        number, workers = ask.query.get("recording", ""), len(self._workers)
-        if not may_record(ask, self._control_token) or not number.isdecimal():
-            return refused_reply(403, "forbidden", NOT_FOR_YOU)
-        order = partial(TakeRecordedOrder, recording=int(number), max_bytes=_RECORDED_BYTES // workers)
-        return json_reply(await self._ask_rows("workers", order, workers))
 
     async def _ask_rows(self, key: str, make_order: Callable[[int], RowsOrder], most: int) -> dict[str, Any]:
         """Return the rows of all workers under *key*; a row that several workers report is repeated."""

@@ -8,7 +8,6 @@ ignores the signals of a terminal or a service manager: they are for the supervi
 from __future__ import annotations
 
 import asyncio
-import base64
 import contextlib
 import gc
 import os
@@ -61,12 +60,10 @@ from rse_pf.backend.supervisor.orders import (
     DrainOrder,
     LeaveOrder,
     MigrateOrder,
-    RecordOrder,
     ReloadServicesOrder,
     ReplaceOrder,
     ReportOrder,
     RobotsOrder,
-    TakeRecordedOrder,
     TrustOrder,
     UnblockOrder,
     WorkerOrder,
@@ -446,37 +443,14 @@ class _Worker:
                 sandboxes = self._sandboxes
                 lifted = [] if sandboxes is None else sandboxes.unblock(service, tenant, robot)
                 self._tell_blocks(number, lifted)
-            case RecordOrder():
-                self._tell_rows(order.number, 1, [{"worker": self._index, "offers": self._record(order)}])
             case ReloadServicesOrder():
                 self._keep(self._reload_services())
-            case TakeRecordedOrder(number, recording, max_bytes):
-                self._tell_rows(number, 1, [self._take_recorded(recording, max_bytes)])
 
     def ban(self, robot: RobotId, seconds: float) -> None:
         """Disconnect *robot*, and refuse it for *seconds*."""
         self._dispatcher.rates.ban(robot, time.monotonic(), seconds)
         for connection in [each for each in self._dispatcher.connections if each.robot == robot]:
             connection.close(CLOSE_RATE, "crashes")
-
-    def _record(self, order: RecordOrder) -> bool:
-        """Begin or end a recording; return whether its service is an installed one."""
-        if self._sandboxes is None:
-            return False
-        if order.ends is not None:
-            self._sandboxes.end_recording(order.ends)
-            return True
-        return self._sandboxes.record(
-            order.number, order.service, calls=order.calls, max_bytes=order.max_bytes, seconds=order.seconds
-        )
-
-    def _take_recorded(self, recording: int, max_bytes: int) -> dict[str, Any]:
-        recorded = (
-            (b"", 0, True) if self._sandboxes is None else self._sandboxes.take_recorded(recording, max_bytes)
-        )
-        data, waiting, is_over = recorded
-        text = base64.b64encode(data).decode("ascii")
-        return {"worker": self._index, "data": text, "waiting": waiting, "is_over": is_over}
 
     def _report(self) -> dict[str, Any]:
         report = self._dispatcher.snapshot()

@@ -23,10 +23,8 @@ import msgspec
 from rse_pf.backend.supervisor.orders import (
     BeginOrder,
     BlocksOrder,
-    RecordOrder,
     ReportOrder,
     RobotsOrder,
-    TakeRecordedOrder,
     UnblockOrder,
     WorkerOrder,
     encode_order,
@@ -38,7 +36,7 @@ from rse_pf.services.loading import load_services
 
 __all__ = ["BUILTIN", "RowsOrder", "WorkerProcess", "fork_workers", "warm_up"]
 
-RowsOrder = BlocksOrder | RobotsOrder | UnblockOrder | RecordOrder | TakeRecordedOrder
+RowsOrder = BlocksOrder | RobotsOrder | UnblockOrder
 """Orders that a worker answers with rows."""
 BUILTIN = "rse_pf.services.builtin:builtin_services"
 """The platform's own services."""

@@ -38,17 +38,17 @@ def add_block_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--robot", metavar="NAME", help="unblock: only for this robot of the tenant")
     parser.add_argument(
         "--control-port", type=int, metavar="PORT",
-        help="status, unblock, record: ask the server on this machine with this control port, "
+        help="status, unblock: ask the server on this machine with this control port, "
         "not a local platform",
     )  # fmt: skip
     parser.add_argument(
         "--control-token",
         type=Path,
         metavar="FILE",
-        help="status, unblock, record: token file of that server",
+        help="status, unblock: token file of that server",
     )
     parser.add_argument(
-        "--url", help="status, unblock, record: the same as --control-port, as in http://127.0.0.1:PORT"
+        "--url", help="status, unblock: the same as --control-port, as in http://127.0.0.1:PORT"
     )
 
 

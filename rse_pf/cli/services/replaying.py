@@ -13,16 +13,16 @@ from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError
 from rse_pf.services.custom.installed import InstalledService
 from rse_pf.services.custom.output import shown_output
-from rse_pf.services.custom.request_files import read_requests
 from rse_pf.terminal import counted, show
 
-__all__ = ["Recorded", "plain", "recorded_requests", "replay", "requests_of"]
+__all__ = ["Recorded", "plain", "recorded_requests", "replay"]
 
 Recorded = Sequence[tuple[str, Mapping[str, Any]]]
 """Name and content of each recorded request: ``request``, ``reply``, ``failure``, ``tolerance``."""
 
 _DEFAULT_TOLERANCE = 1e-9
 _DRY_RUN = "dry-run"
+_HINT = 'write {"request": {...}, "reply": {...}}'
 _MOST_LETTERS = 300
 
 
@@ -30,7 +30,7 @@ def recorded_requests(source: Path) -> Recorded:
     """Return the recorded requests of the service in *source*; raises UsageError if there are none."""
     requests: list[tuple[str, Mapping[str, Any]]] = []
     for path in sorted((source / "requests").glob("*.json")):
-        requests += read_requests(path).calls
+        requests.append((path.name, _read_request(path)))
     if not requests:
         raise UsageError(
             f"{source} has no recorded requests", hint=f"write one to {source / 'requests'}/NAME.json"
@@ -38,29 +38,13 @@ def recorded_requests(source: Path) -> Recorded:
     return requests
 
 
-def requests_of(path: Path, service: str) -> Recorded:
-    """Return the requests in *path*; raises UsageError if there are none, or of another service."""
-    read = read_requests(path)
-    if read.service not in ("", service):
-        raise UsageError(
-            f"{path} holds requests to {read.service!r}, not to {service!r}",
-            hint="record those of this service",
-        )
-    if not read.calls:
-        raise UsageError(f"{path} holds no request", hint="record while robots call the service")
-    return read.calls
-
-
-def replay(
-    service: InstalledService, recorded: Recorded, settings: PlatformSettings, *, compare: bool
-) -> int:
+def replay(service: InstalledService, recorded: Recorded, settings: PlatformSettings) -> int:
     """Send *recorded* to *service* in one sandbox, show what became of each; return 1 if one is wrong.
 
     Args:
         service: Built.
         recorded: Sent one after the other, as one robot.
         settings: Limits of the sandbox.
-        compare: Whether replies are compared; failures always are.
     """
     from rse_pf.backend.sandbox.dry_run import dry_run
 
@@ -72,12 +56,9 @@ def replay(
         show(f"note: this machine lacks isolation that a server has: {', '.join(missing)}")
     wrong = 0
     for (name, each), each_run in zip(recorded, runs, strict=True):
-        problem, detail = _judge(each, each_run.answer, compare=compare)
+        problem, detail = _judge(each, each_run.answer)
         wrong += problem
         show(f"{name:<28} {'WRONG' if problem else 'ok':<6} {each_run.took_ms:8.1f} ms  {detail}".rstrip())
-    secrets = sum(bool(call.get("secrets")) for _, call in recorded)
-    if secrets:
-        show(f"note: {counted(secrets, 'request')} held secrets, which were left out of the recording")
     show(f"{len(runs) - wrong} of {counted(len(runs), 'recorded request')} as expected")
     return 1 if wrong else 0
 
@@ -87,7 +68,19 @@ def plain(value: Any) -> Any:
     return json.loads(json.dumps(value, default=lambda each: getattr(each, "tolist", each.__repr__)()))
 
 
-def _judge(expected: Mapping[str, Any], answer: Any, *, compare: bool) -> tuple[bool, str]:
+def _read_request(path: Path) -> dict[str, Any]:
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise UsageError(f"cannot read {path}: {error.strerror}", hint=_HINT) from error
+    except (ValueError, RecursionError) as error:
+        raise UsageError(f"{path} is not JSON: {error}", hint=_HINT) from error
+    if not isinstance(found, dict) or "request" not in found:
+        raise UsageError(f"{path} holds no request", hint=_HINT)
+    return found
+
+
+def _judge(expected: Mapping[str, Any], answer: Any) -> tuple[bool, str]:
     """Return whether *answer* is wrong, and what to say about it."""
     from rse_pf.wire import Failure
 
@@ -96,10 +89,8 @@ def _judge(expected: Mapping[str, Any], answer: Any, *, compare: bool) -> tuple[
         return expected.get("failure") != answer.code, f"{answer.code}: {answer.message}{hint}"
     if "failure" in expected:
         return True, f"it was answered, expected {expected['failure']}"
-    if compare and "reply" not in expected:
+    if "reply" not in expected:
         return False, f"no reply is expected; it is {_shorten(json.dumps(plain(answer.reply)))}"
-    if not compare:
-        return False, ""
     tolerance = expected.get("tolerance", _DEFAULT_TOLERANCE)
     difference = _difference(plain(answer.reply), plain(expected["reply"]), tolerance)
     return bool(difference), difference

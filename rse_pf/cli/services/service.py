@@ -5,9 +5,7 @@ server; run serves it from a local platform until Ctrl-C and loads every saved c
 rse-pf local --services; call sends a request to a running local platform.
 
 lock writes the versions and hashes of the Python packages in requirements.in to requirements.txt; build
-installs them once, and compiles C and C++; test, run and install build, too.  record writes the requests that
-robots send to a service of a running platform to a file, test --requests replays it, and debug calls the
-service with one of them outside of the sandbox, under a debugger.
+installs them once, and compiles C and C++; test, run and install build, too.
 
 publish hands a service to all servers on AWS, pinned by its digest; they load it while robots are connected.
 publish --list shows what they run, publish NAME --remove takes it out.
@@ -20,9 +18,6 @@ examples:
   rse-pf service test centroid
   rse-pf service run centroid
   rse-pf service lock centroid
-  rse-pf service record centroid --out live.jsonl --count 20
-  rse-pf service test centroid --requests live.jsonl --compare
-  rse-pf service debug centroid --request live.jsonl --number 3
   rse-pf service publish centroid
   rse-pf service publish --list
   rse-pf service status
@@ -48,12 +43,10 @@ from typing import Any
 
 from rse_pf.cli.extras import require
 from rse_pf.cli.local_platform.logs import LogFollower, LogLine
-from rse_pf.cli.services.blocks import add_block_arguments, choose_servers, show_blocks, unblock
+from rse_pf.cli.services.blocks import add_block_arguments, show_blocks, unblock
 from rse_pf.cli.services.building import build_service, built_service, changed_s, lock_service
-from rse_pf.cli.services.debugging import DebugOptions, debug_service
 from rse_pf.cli.services.publishing import add_publish_arguments, publish_service
-from rse_pf.cli.services.recorder import RecordLimits, record_service
-from rse_pf.cli.services.replaying import Recorded, plain, recorded_requests, replay, requests_of
+from rse_pf.cli.services.replaying import Recorded, plain, recorded_requests, replay
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import RsePfError, UsageError
 from rse_pf.local.state import read_state, state_folder
@@ -65,15 +58,13 @@ from rse_pf.terminal import error_lines, show, show_json, show_progress
 __all__ = ["add_arguments", "run"]
 
 _ACTIONS = (
-    "new", "test", "run", "lock", "build", "install", "list", "call", "record", "debug", "status", "unblock",
-    "publish",
+    "new", "test", "run", "lock", "build", "install", "list", "call", "status", "unblock", "publish",
 )  # fmt: skip
-_OF_A_NAME = ("new", "call", "record")
+_OF_A_NAME = ("new", "call")
 _LANGUAGES = ("python", "cpp", "lua")
 _NAME = re.compile(r"[a-z][a-z0-9_-]{0,39}")
 _OUTPUT = re.compile(r"service-output robot=(?P<robot>\S+) text=(?P<text>.*) tenant=\S+")
 _POLL_S = 0.3
-_CLIENT_PORT = 5678
 _RECORDED_FIELDS = {"request", "reply", "tolerance", "failure"}
 
 
@@ -82,7 +73,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("action", choices=_ACTIONS, help="what to do")
     parser.add_argument(
         "what", nargs="?", metavar="NAME|FOLDER",
-        help="new, call, record: a name; test, run, lock, build, install, debug, publish: the folder; "
+        help="new, call: a name; test, run, lock, build, install, publish: the folder; "
         "unblock: only this service; publish --remove: the name",
     )  # fmt: skip
     parser.add_argument(
@@ -91,58 +82,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--services", type=Path, metavar="DIR", help="install, list: the services folder")
     parser.add_argument(
         "--request", metavar="JSON|FILE",
-        help="call: the request as JSON; @FILE reads it from a file, which may be a recorded request; "
-        "debug: the file",
+        help="call: the request as JSON; @FILE reads it from a file, which may be a recorded request",
     )  # fmt: skip
     parser.add_argument(
         "--name", default="default",
-        help="call, record, status, unblock: name of the local platform (default: default)",
+        help="call, status, unblock: name of the local platform (default: default)",
     )  # fmt: skip
     add_block_arguments(parser)
     add_publish_arguments(parser)
     parser.add_argument("--once", action="store_true", help="run: answer the recorded requests, then end")
-    _add_recording_arguments(parser)
-    _add_debug_arguments(parser)
-
-
-def _add_recording_arguments(parser: argparse.ArgumentParser) -> None:
-    limits = RecordLimits()
-    parser.add_argument("--out", type=Path, metavar="FILE", help="record: the file to write")
-    parser.add_argument(
-        "--record", type=Path, metavar="FILE",
-        help="test: record from the running platform to FILE, as record does, and replay that",
-    )  # fmt: skip
-    parser.add_argument(
-        "--requests", type=Path, metavar="FILE", help="test: replay the requests of this file"
-    )
-    parser.add_argument(
-        "--compare",
-        action="store_true",
-        help="test: compare with the replies in the file of --requests or --record",
-    )
-    parser.add_argument(
-        "--count", type=int, default=limits.calls, help=f"record: end after so many (default: {limits.calls})"
-    )
-    parser.add_argument(
-        "--seconds", type=float, default=limits.seconds,
-        help=f"record: end after this time (default: {limits.seconds:g})",
-    )  # fmt: skip
-    parser.add_argument(
-        "--max-mib", type=int, default=limits.max_mib,
-        help=f"record: what each process of a server may keep (default: {limits.max_mib})",
-    )  # fmt: skip
-
-
-def _add_debug_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--number", type=int, default=1, help="debug: which request of the file (default: 1)")
-    parser.add_argument(
-        "--no-debugger", action="store_true", help="debug: run without a debugger, outside of the sandbox"
-    )
-    parser.add_argument(
-        "--wait-for-client", type=int, nargs="?", const=_CLIENT_PORT, metavar="PORT",
-        help=f"debug: wait for a debugger that speaks to debugpy (default port: {_CLIENT_PORT})",
-    )  # fmt: skip
-    parser.add_argument("--gdb", action="store_true", help="debug: run gdb, for C and C++")
 
 
 def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
@@ -168,9 +116,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
         "install": lambda: _install(source, args.services or _services_folder(settings)),
         "lock": lambda: lock_service(source),
         "build": lambda: build_service(source),
-        "record": lambda: _record(args),
-        "debug": lambda: debug_service(source, _debug_options(args)),
-        "test": lambda: _test(source, args, settings),
+        "test": lambda: replay(built_service(source)[0], recorded_requests(source), settings),
         "run": lambda: asyncio.run(_run(source, settings, once=args.once)),
     }
     if args.action == "run":
@@ -228,44 +174,6 @@ def _services_folder(settings: PlatformSettings) -> Path:
     if settings.services.folder:
         return Path(settings.services.folder)
     return state_folder("default", os.environ).parent / "services"
-
-
-# --- test, record, debug ----------------------------------------------------------------------------
-
-
-def _test(source: Path, args: argparse.Namespace, settings: PlatformSettings) -> int:
-    if args.record is not None and args.requests is not None:
-        raise UsageError("--record and --requests exclude each other", hint="leave one of them out")
-    service, _ = built_service(source)
-    file = args.requests
-    if args.record is not None:
-        record_service(service.name, choose_servers(args), _limits(args), args.record)
-        file = args.record
-    if file is None:
-        return replay(service, recorded_requests(source), settings, compare=True)
-    return replay(service, requests_of(file, service.name), settings, compare=args.compare)
-
-
-def _record(args: argparse.Namespace) -> int:
-    if args.out is None:
-        raise UsageError("record needs a file to write", hint=f"add --out {args.what}.jsonl")
-    record_service(args.what, choose_servers(args), _limits(args), args.out)
-    return 0
-
-
-def _limits(args: argparse.Namespace) -> RecordLimits:
-    return RecordLimits(calls=args.count, seconds=args.seconds, max_mib=args.max_mib)
-
-
-def _debug_options(args: argparse.Namespace) -> DebugOptions:
-    if args.request is None:
-        raise UsageError(
-            "debug needs a recorded request", hint=f"add --request {args.what}/requests/example.json"
-        )
-    return DebugOptions(
-        request=Path(args.request.removeprefix("@")), number=args.number, debugger=not args.no_debugger,
-        gdb=args.gdb, client_port=args.wait_for_client,
-    )  # fmt: skip
 
 
 # --- run, call --------------------------------------------------------------------------------------

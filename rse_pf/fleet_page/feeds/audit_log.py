@@ -110,7 +110,6 @@ _SENTENCES: Mapping[str, str] = {
     "server.move": "{who} asks {robots} of its robots to move within {spread_s} s",
     "server.over": "{who} has ended",
     "server.ready": "{who} is ready",
-    "server.record": "{who} begins or ends to record {calls} calls of the service {service}",
     "server.robot-shut-out": "{who} refuses {robot} for {seconds} s: its bytes ended two processes",
     "server.services": "{who} loads its services anew",
     "server.unblock": "{who} lifts {lifted} blocks of robots and services",

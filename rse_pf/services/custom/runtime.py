@@ -7,7 +7,6 @@ and arrays.
 from __future__ import annotations
 
 import collections.abc
-import functools
 import importlib
 import importlib.util
 import inspect
@@ -15,7 +14,6 @@ import sys
 import types
 import typing
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -111,10 +109,6 @@ class _PythonRuntime:
                     hint=f"give {field} of {service.reply_type.__name__} what it is annotated with",
                 )
         return reply
-
-    def run_by(self, runner: Callable[..., Any]) -> None:
-        """Call the service as ``runner(function, request)`` from now on, such as by a debugger."""
-        self._service = replace(self._service, function=functools.partial(runner, self._service.function))
 
     def snapshot(self) -> bytes:
         state = self._object.snapshot()

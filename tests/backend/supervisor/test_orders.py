@@ -10,11 +10,9 @@ from rse_pf.backend.supervisor.orders import (
     DrainOrder,
     LeaveOrder,
     MigrateOrder,
-    RecordOrder,
     ReplaceOrder,
     ReportOrder,
     RobotsOrder,
-    TakeRecordedOrder,
     TrustOrder,
     UnblockOrder,
     WorkerOrder,
@@ -28,8 +26,7 @@ from rse_pf.backend.supervisor.orders import (
     [
         ReportOrder(), DrainOrder(200.0), MigrateOrder([0.1, 0.5], 200.0), TrustOrder('{"keys": "a\\nb"}'),
         ReplaceOrder(7), LeaveOrder(0.5), BlocksOrder(1), RobotsOrder(4), UnblockOrder(2),
-        UnblockOrder(3, "icp", "a", "b\n"), RecordOrder(5, "icp", 10, 1 << 20, 60.0), RecordOrder(6, ends=5),
-        TakeRecordedOrder(7, 5, 1000),
+        UnblockOrder(3, "icp", "a", "b\n"),
     ],
 )  # fmt: skip
 def test_an_order_travels_as_one_line(order: WorkerOrder) -> None:
