@@ -31,7 +31,7 @@ from rse_pf.terminal import show
 
 __all__ = ["Finding", "add_arguments", "check_machine", "report", "run"]
 
-_NOT_IMPORTED = {"aws_cdk", "constructs", "cdk_nag", "viser"}
+_NOT_IMPORTED = {"aws_cdk", "constructs", "cdk_nag"}
 """Looked for only: they start Node at once, or take a second."""
 _DEVELOPERS = {module for extra in EXTRAS.values() if not extra.is_for_users for module in extra.modules}
 _DESCRIPTORS_PER_ROBOT = 2

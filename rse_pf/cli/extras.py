@@ -99,7 +99,6 @@ EXTRAS: dict[str, Extra] = {
         modules=_same("distributed"), enables="merges in parts, by several processes or machines",
         includes=("maps", "keys"),
     ),
-    "view": Extra(modules=_same("viser"), enables="maps in the browser", includes=("demo",)),
     "experiments": Extra(modules=_same("matplotlib"), enables="figures of experiments", includes=("local",)),
     "aws": Extra(modules=_same("boto3"), enables="everything with --cloud, stores in S3"),
     "boot": Extra(
@@ -150,7 +149,6 @@ VERBS_NEED: dict[str, tuple[str, ...]] = {
     "map merge": ("maps",),
     "map localise": ("maps", "vision"),
     "map view": ("local",),
-    "map view --browser": ("view",),
     "map live": ("keys", "maps"),
     "map publish": ("keys", "maps"),
     "audit": (),

@@ -24,9 +24,7 @@ examples:
 from __future__ import annotations
 
 import argparse
-import contextlib
 import functools
-import threading
 import time
 from collections import Counter
 from pathlib import Path
@@ -58,7 +56,7 @@ _MAX_VALUE = 80
 _ACTIONS = {
     "list": ("list the maps", "list"),
     "show": ("show the contents and the origin of a version", "show kitchen --png kitchen.png"),
-    "view": ("draw a version as an image, or show it in the browser", "view kitchen --out kitchen.png"),
+    "view": ("draw a version as an image", "view kitchen --out kitchen.png"),
     "merge": (
         "merge several maps into one, or close the loops of one map",
         "merge robot-1 robot-2 --into kitchen",
@@ -105,12 +103,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     made["show"].add_argument("--all", action="store_true", help="list every version")
     made["show"].add_argument("--png", type=Path, metavar="FILE", help="write an image of the map")
     made["view"].add_argument("--out", type=Path, metavar="FILE", help="the image (default: MAP.png)")
-    made["view"].add_argument(
-        "--browser",
-        action="store_true",
-        help='show it in the browser (extra "view"); Ctrl-C ends it',
-    )
-    made["view"].add_argument("--port", type=int, default=8080, help="port of the page (default: 8080)")
     made["diff"].add_argument("before", metavar="BEFORE", help="a version")
     made["diff"].add_argument(
         "after", nargs="?", default="head", metavar="AFTER", help="default: %(default)s"
@@ -237,18 +229,6 @@ def _show(args: argparse.Namespace, maps: MapRegistry) -> None:
 
 def _view(args: argparse.Namespace, maps: MapRegistry) -> None:
     record = maps.record(args.name, args.version)
-    if args.browser:
-        from rse_pf.experiments.plots.map_viewer import browse_map
-
-        version = maps.load(args.name, record.id)
-        with contextlib.suppress(KeyboardInterrupt):
-            browse_map(
-                version,
-                args.port,
-                lambda url: show(f"{url}  (Ctrl-C ends it)"),
-                threading.Event(),
-            )
-        return
     args.png = args.out or Path(f"{args.name}.png")
     _draw(args, maps, record)
     _print(
