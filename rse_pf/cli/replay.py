@@ -1,15 +1,14 @@
 """Replay a recording: list what went wrong, solve commands again, and show why a pose was bad.
 
-FILE is what rse-pf local --record wrote, a folder of such files, or a case.rsepf that somebody exported.
-Without --command it lists what went wrong, worst first.  With --command, or for a case, it solves the very
-same bytes again, says whether the answer is equal to the byte, and shows the evidence for its verdict.
---all solves everything again, as a test of this version, and exits with 1 if an answer is different.
+FILE is what rse-pf local --record wrote, or a folder of such files.  Without --command it lists what went
+wrong, worst first.  With --command it solves the very same bytes again, says whether the answer is equal to
+the byte, and shows the evidence for its verdict.  --all solves everything again, as a test of this version,
+and exits with 1 if an answer is different.
 
 examples:
   rse-pf replay recordings
   rse-pf replay recordings --command 0123456789abcdef:42 --html pose.html
-  rse-pf replay recordings --command 0123456789abcdef:42 --export case.rsepf
-  rse-pf replay case.rsepf --inlier-px 4
+  rse-pf replay recordings --command 0123456789abcdef:42 --inlier-px 4
   rse-pf replay recordings --all --engine native --json
 """
 
@@ -18,7 +17,6 @@ from __future__ import annotations
 import argparse
 import math
 import re
-from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -42,7 +40,7 @@ _IDENTITY = re.compile(r"([0-9a-f]{16}:)?\d{1,16}")
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("file", type=Path, metavar="FILE", help="a recording, a folder of them, or a case")
+    parser.add_argument("file", type=Path, metavar="FILE", help="a recording, or a folder of them")
     parser.add_argument(
         "--command", metavar="ID", help="show this command: CONNECTION:ID, or ID if it is clear"
     )
@@ -54,24 +52,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--max-iterations", type=int, metavar="N", help="try another number of RANSAC iterations"
     )
-    parser.add_argument(
-        "--export", type=Path, metavar="CASE", help="write the command to a file without names: case.rsepf"
-    )
     parser.add_argument("--html", type=Path, metavar="PAGE", help="write the report to one HTML file")
     parser.add_argument("--json", action="store_true", help="print JSON; everything is solved again")
 
 
 def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
-    """List, solve again, show or export; return 1 if an answer that should be equal is not."""
+    """List, solve again or show; return 1 if an answer that should be equal is not."""
     require("replay")
     from rse_pf.recording.replay.limited import LimitedReplay
 
     overrides = _overrides(args)
     _check(args)
-    path: Path = args.file
     with LimitedReplay(settings) as replay:
-        is_case = path.suffix == ".rsepf" and not args.all
-        if args.command is not None or is_case:
+        if args.command is not None:
             return _show_one(args, replay, overrides)
         return _show_all(args, replay, overrides)
 
@@ -86,13 +79,11 @@ def _check(args: argparse.Namespace) -> None:
             f"{args.command[:60]!r} is no command",
             hint="write CONNECTION:ID, as rse-pf replay FILE lists them",
         )
-    if args.export is not None and args.command is None and path.suffix != ".rsepf":
-        raise UsageError("--export writes one command", hint="name it with --command")
-    for name, file in (("--export", args.export), ("--html", args.html)):
-        if file is not None and not file.parent.is_dir():
-            raise UsageError(f"{name}: there is no folder {file.parent}", hint="create it, or choose another")
-        if file is not None and (file.is_dir() or (file.exists() and path.exists() and file.samefile(path))):
-            raise UsageError(f"{name}: {file} is a folder, or the recording", hint="choose another file")
+    page: Path | None = args.html
+    if page is not None and not page.parent.is_dir():
+        raise UsageError(f"--html: there is no folder {page.parent}", hint="create it, or choose another")
+    if page is not None and (page.is_dir() or (page.exists() and path.exists() and page.samefile(path))):
+        raise UsageError(f"--html: {page} is a folder, or the recording", hint="choose another file")
 
 
 def _overrides(args: argparse.Namespace) -> Overrides:
@@ -169,19 +160,8 @@ def _show_overview(overview: Overview, args: argparse.Namespace) -> None:
 
 
 def _show_one(args: argparse.Namespace, replay: LimitedReplay, overrides: Overrides) -> int:
-    identity = args.command or ""
     with at_work("solving the command again"):
-        report = replay.command(args.file, identity, overrides, with_picture=args.html is not None)
-        exported = replay.case(args.file, identity) if args.export is not None else None
-    if exported is not None:
-        from rse_pf.recording.replay.case import write_case
-
-        size = write_case(
-            args.export, exported.parts, codec=exported.codec, number=exported.number,
-            metadata=exported.metadata, version=_version(),
-        )  # fmt: skip
-        if not args.json:
-            show(f"wrote {args.export}: {size} bytes, without names and tokens", "")
+        report = replay.command(args.file, args.command, overrides, with_picture=args.html is not None)
     if args.html is not None:
         _write_page(args.html, [report], None, args.file.name)
     if args.json:
@@ -266,10 +246,3 @@ def _write_page(path: Path, reports: Any, overview: Overview | None, name: str) 
         path.write_text(html_page(reports, overview=overview, title=f"Replay of {name}"), encoding="utf-8")
     except OSError as error:
         raise UsageError(f"{path} cannot be written: {error.strerror}", hint="choose another file") from error
-
-
-def _version() -> str:
-    try:
-        return metadata.version("rse-pf")
-    except metadata.PackageNotFoundError:
-        return ""

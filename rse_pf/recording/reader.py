@@ -36,10 +36,9 @@ from rse_pf.wire import CODECS, Codec, Command, Failure, Result, make_codec
 from rse_pf.wire.messages import Identifier
 
 __all__ = [
-    "CASE_NAME", "Odometry", "RecordedCommand", "WireRecording", "open_recording", "recording_files",
+    "Odometry", "RecordedCommand", "WireRecording", "open_recording", "recording_files",
 ]  # fmt: skip
 
-CASE_NAME = "rse_pf_case"
 """Metadata record of a file that was exported for one of its commands."""
 
 _MAGIC = b"\x89MCAP0\r\n"
@@ -139,7 +138,6 @@ class WireRecording:
     Attributes:
         files: In the order in which they are read.
         metadata: Of the first file of a server or robot: ``version``, ``side``, ``engine`` ...
-        case_id: Which command a case file is about, "" for recordings.
         cut: Files that end within a record, once they have been read.
         left_out: Messages that could not be decoded, or whose file has more connections than are read.
     """
@@ -147,7 +145,6 @@ class WireRecording:
     def __init__(self, files: tuple[Path, ...], session: SessionSettings) -> None:
         self.files = files
         self.metadata: dict[str, str] = {}
-        self.case_id = ""
         self.cut: list[Path] = []
         self.left_out = 0
         self._session = session
@@ -163,7 +160,6 @@ class WireRecording:
                     raise
                 continue
             about = head.get(file_format.METADATA_NAME, {})
-            self.case_id = self.case_id or head.get(CASE_NAME, {}).get("command", "")
             if about.get("side") in ("server", "robot"):
                 self.metadata = about
                 return
@@ -196,35 +192,28 @@ class WireRecording:
         Raises:
             BadRequest: There is none, or there are several.
         """
-        return self.find_with_history(identity, 0)[0]
-
-    def find_with_history(self, identity: str, count: int) -> tuple[RecordedCommand, list[RecordedCommand]]:
-        """Return a command, and up to *count* of its robot and service before it, oldest first."""
         exact = bool(_COMMAND_ID.fullmatch(identity))
-        before: dict[tuple[str, str], deque[RecordedCommand]] = {}
-        commands_with_history: list[tuple[RecordedCommand, list[RecordedCommand]]] = []
+        found: RecordedCommand | None = None
         for command in self.commands(self._plan_search(identity) if exact else None):
-            if command.id == identity or (not exact and command.id.endswith(f":{identity}")):
-                commands_with_history.append(
-                    (command, list(before.get((command.robot, command.service), ())))
+            if command.id == identity:
+                return command
+            if exact or not command.id.endswith(f":{identity}"):
+                continue
+            if found is not None:
+                raise BadRequest(
+                    f"several commands are called {identity[:40]!r}",
+                    hint=f"give the connection, too: {found.id} or {command.id}",
                 )
-                if exact:
-                    break
-                if len(commands_with_history) > 1:
-                    raise BadRequest(
-                        f"several commands are called {identity[:40]!r}",
-                        hint=f"give the connection, too: {commands_with_history[0][0].id} or {command.id}",
-                    )
-            before.setdefault((command.robot, command.service), deque(maxlen=count)).append(command)
-        if not commands_with_history:
+            found = command
+        if found is None:
             raise BadRequest(
                 f"the recording has no command {identity[:40]!r}",
                 hint="rse-pf replay FILE lists those that went wrong",
             )
-        return commands_with_history[0]
+        return found
 
     def _plan_search(self, identity: str) -> Wanted | None:
-        """Return what is read to find a command and its history, None if no summary knows its robot."""
+        """Return what is read to find a command, None if no summary knows its robot."""
         topic = file_format.wire_topic(identity.partition(":")[0], "up")
         robots = (robot_of(path, topic) for path in self.files)
         robot = next((candidate for candidate in robots if candidate), None)
@@ -327,7 +316,7 @@ def open_recording(path: Path, session: SessionSettings | None = None) -> WireRe
     """Return the recording at *path*: a file, or a folder with files; nothing but its start is read.
 
     Args:
-        path: Of a ``.mcap`` or ``.rsepf`` file, or of a folder.
+        path: Of a file, or of a folder.
         session: Limits of messages, None for the defaults.
 
     Raises:
@@ -626,7 +615,7 @@ class _Bounded:
 def _no_recording(path: Path) -> BadRequest:
     return BadRequest(
         f"{path} is not a recording of rse-pf",
-        hint="give a file that rse-pf local --record or rse-pf replay --export wrote",
+        hint="give a file that rse-pf local --record wrote",
     )
 
 

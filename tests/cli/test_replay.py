@@ -1,4 +1,4 @@
-"""`rse-pf replay` on recordings, on cases, and on files from strangers."""
+"""`rse-pf replay` on recordings, and on files from strangers."""
 
 from __future__ import annotations
 
@@ -92,14 +92,14 @@ def test_json_of_a_recording_has_the_counts_and_the_troubles(
 
 
 @pytest.mark.usefixtures("quick")
-def test_a_command_is_shown_exported_and_replayed_from_its_case(
+def test_a_command_is_shown_with_its_evidence_and_on_a_page(
     recording: tuple[Path, dict[str, str]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder, names = recording
-    case, page = tmp_path / "case.rsepf", tmp_path / "page.html"
+    page = tmp_path / "page.html"
 
-    out = printed(capsys, folder, "--command", names["weak"], "--export", case, "--html", page)
-    again = as_json(capsys, case)
+    out = printed(capsys, folder, "--command", names["weak"], "--html", page)
+    again = as_json(capsys, folder, "--command", names["weak"])
 
     assert "equal to the byte" in out
     assert "low-inlier-ratio" in out
@@ -161,7 +161,7 @@ def hostile(path: Path, kind: str) -> Path:
     """Write a file that asks for more than it is given."""
     fd = os.open(path, os.O_WRONLY | os.O_CREAT)
     file = McapFile(fd)
-    metadata = {"rse_pf": {"format": "1"}, "rse_pf_case": {"command": "0" * 16 + ":1"}}
+    metadata = {"rse_pf": {"format": "1"}}
     file.begin("rse-pf", "rse-pf", metadata)
     if kind == "channels":
         for number in range(60_000):
@@ -181,30 +181,20 @@ def hostile(path: Path, kind: str) -> Path:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["bomb", "nested", "channels"])
-def test_a_hostile_case_costs_one_line(tmp_path: Path, kind: str, capsys: pytest.CaptureFixture[str]) -> None:
-    code = main(["replay", str(hostile(tmp_path / "case.rsepf", kind))])
+def test_a_hostile_file_costs_one_line(tmp_path: Path, kind: str, capsys: pytest.CaptureFixture[str]) -> None:
+    code = main(["replay", str(hostile(tmp_path / "a.mcap", kind)), "--command", "0" * 16 + ":1"])
 
     told = capsys.readouterr()
     assert (code, told.out) == (1, "")
     assert len(told.err.splitlines()) == 2
 
 
-def test_a_case_is_replayed_in_a_process_with_limits(
+def test_a_command_is_replayed_in_a_process_with_limits(
     recording: tuple[Path, dict[str, str]], capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder, names = recording
 
     assert "equal to the byte" in printed(capsys, folder, "--command", names["good"])
-
-
-def test_a_case_that_is_too_large_is_not_opened(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = tmp_path / "case.rsepf"
-    with path.open("wb") as file:
-        file.write(b"\x89MCAP0\r\n")
-        file.truncate(limited.MAX_CASE_BYTES + 1)
-
-    assert main(["replay", str(path)]) == 1
-    assert "above 8388608" in capsys.readouterr().err
 
 
 @pytest.mark.usefixtures("quick")

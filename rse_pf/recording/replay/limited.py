@@ -17,10 +17,9 @@ import msgspec
 
 from rse_pf.child.limited import Handler, LimitedProcesses, Overran, ProcessLimits
 from rse_pf.config import PlatformSettings
-from rse_pf.errors import BadMessage, BadRequest, Crashed, InternalError, LimitExceeded
+from rse_pf.errors import BadMessage, BadRequest, Crashed, InternalError
 from rse_pf.recording.reader import recording_files
 from rse_pf.recording.replay import run
-from rse_pf.recording.replay.case import CASE_SUFFIX, MAX_CASE_BYTES
 from rse_pf.recording.replay.report import CommandReport
 from rse_pf.recording.replay.solving import Overrides
 
@@ -28,8 +27,8 @@ __all__ = ["LimitedReplay", "replayer"]
 
 _MEMORY_BYTES = 1 << 30
 _MAX_REPLY_BYTES = 64 << 20
-_COMMAND_S, _RECORDING_S = 60.0, 6 * 3600.0
-"""CPU seconds, and seconds, for one command of a case, and for a whole recording."""
+_RECORDING_S = 6 * 3600.0
+"""CPU seconds, and seconds, for a whole recording."""
 _TARGET = "rse_pf.recording.replay.limited:replayer"
 
 T = TypeVar("T")
@@ -85,7 +84,7 @@ class LimitedReplay:
         return self._ask(order, run.Overview)
 
     def command(
-        self, path: Path, identity: str = "", overrides: Overrides | None = None, *, with_picture: bool = True
+        self, path: Path, identity: str, overrides: Overrides | None = None, *, with_picture: bool = True
     ) -> CommandReport:
         """Return what `run.report` returns; raises RsePfError."""
         order = _Order(
@@ -93,10 +92,6 @@ class LimitedReplay:
             with_picture=with_picture,
         )  # fmt: skip
         return self._ask(order, CommandReport)
-
-    def case(self, path: Path, identity: str = "") -> run.Exported:
-        """Return what `run.case_of` returns; raises RsePfError."""
-        return self._ask(_Order(do="case", path=str(path), identity=identity), run.Exported)
 
     def find(
         self,
@@ -120,16 +115,8 @@ class LimitedReplay:
     def _ask(self, order: _Order, kind: type[T]) -> T:
         path = Path(order.path)
         recording_files(path)  # what is plainly wrong is told before a process is started
-        is_case = path.suffix == CASE_SUFFIX
-        if is_case and path.is_file() and path.stat().st_size > MAX_CASE_BYTES:
-            raise LimitExceeded(
-                f"{path} has {path.stat().st_size} bytes, above {MAX_CASE_BYTES}",
-                hint="a case holds one command; name the file .mcap if it is a recording",
-            )
         try:
-            data = self._processes.call(
-                msgspec.msgpack.encode(order), _COMMAND_S if is_case else _RECORDING_S
-            )
+            data = self._processes.call(msgspec.msgpack.encode(order), _RECORDING_S)
             return msgspec.msgpack.decode(data, type=kind)
         except Overran:
             raise BadRequest(f"{path} takes too long to read", hint="replay one --command of it") from None
@@ -157,8 +144,6 @@ def replayer(configuration: str) -> Handler:
             reply = run.report(
                 path, settings, order.identity, order.overrides, with_picture=order.with_picture
             )
-        elif order.do == "case":
-            reply = run.case_of(path, settings, order.identity)
         elif order.do == "find":
             reply = run.find(
                 path, settings, trace=order.trace, number=order.number, near_s=order.near_s,

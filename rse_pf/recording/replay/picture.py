@@ -15,7 +15,7 @@ import numpy.typing as npt
 from rse_pf.errors import BadRequest, MissingExtra
 from rse_pf.geometry import Array, Camera, transform
 
-__all__ = ["INLIER", "MAX_THUMBNAIL_PX", "OUTLIER", "match_picture", "plain_thumbnail"]
+__all__ = ["INLIER", "MAX_THUMBNAIL_PX", "OUTLIER", "match_picture"]
 
 INLIER, OUTLIER, MOVED = (0, 114, 178), (213, 94, 0), (230, 159, 0)
 """Distinct for colour-blind readers as well; Okabe and Ito 2008."""
@@ -78,22 +78,6 @@ def match_picture(
             draw.line((u - 4, v + 4, u + 4, v - 4), fill=OUTLIER, width=2)
     file = io.BytesIO()
     image.save(file, format="PNG")
-    return file.getvalue()
-
-
-def plain_thumbnail(thumbnail: bytes) -> bytes:
-    """Return the JPEG again without anything that its maker wrote beside the picture.
-
-    Raises:
-        BadRequest: It is no JPEG, or larger than thumbnails are.
-    """
-    image = _decode(thumbnail)
-    image.info.clear()
-    file = io.BytesIO()
-    try:
-        image.save(file, format="JPEG", quality="keep", exif=b"", comment=b"")
-    except (OSError, ValueError) as error:
-        raise BadRequest("a thumbnail cannot be written again", hint="export without it") from error
     return file.getvalue()
 
 

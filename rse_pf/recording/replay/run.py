@@ -11,18 +11,15 @@ from typing import Any
 import msgspec
 
 from rse_pf.config import PlatformSettings, PnpSettings
-from rse_pf.errors import BadRequest, RsePfError
-from rse_pf.recording.reader import RecordedCommand, WireRecording, open_recording
-from rse_pf.recording.replay.case import CasePart, case_parts
+from rse_pf.errors import RsePfError
+from rse_pf.recording.reader import RecordedCommand, open_recording
 from rse_pf.recording.replay.report import CommandReport, report_of
 from rse_pf.recording.replay.solving import Overrides, Resolver
 from rse_pf.recording.replay.troubles import KINDS, RobotHistory, Trouble
 from rse_pf.recording.summary import Wanted
 
-__all__ = ["HISTORY", "Changed", "Exported", "Overview", "case_of", "find", "overview", "report"]
+__all__ = ["Changed", "Overview", "find", "overview", "report"]
 
-HISTORY = 8
-"""Earlier commands of a robot that its case holds."""
 _MAX_ROBOTS = 10_000
 _MAX_CHANGED = 1000
 _MAX_RESOLVERS = 16
@@ -67,15 +64,6 @@ class Overview(msgspec.Struct, frozen=True, kw_only=True):
     not_solved: dict[str, int] = {}
     troubles: tuple[Trouble, ...] = ()
     by_kind: dict[str, int] = {}
-
-
-class Exported(msgspec.Struct, frozen=True, kw_only=True):
-    """What `write_case` needs."""
-
-    parts: tuple[CasePart, ...]
-    codec: str
-    number: int
-    metadata: dict[str, str]
 
 
 class _Worst:
@@ -169,27 +157,15 @@ def report(
     *,
     with_picture: bool = True,
 ) -> CommandReport:
-    """Return all that is known about one command; *identity* may be "" for the command of a case file.
+    """Return all that is known about the command *identity*, as `WireRecording.find` takes it.
 
     Raises:
         RsePfError: The recording cannot be read, has no such command, or *overrides* name an engine that is
             not there.
     """
     recording = open_recording(path, settings.session)
-    command = recording.find(_identity(recording, identity))
+    command = recording.find(identity)
     return report_of(command, _Resolvers(settings).of(command), overrides, with_picture=with_picture)
-
-
-def case_of(path: Path, settings: PlatformSettings, identity: str) -> Exported:
-    """Return the case of one command, to be written; raises what `report` raises."""
-    recording = open_recording(path, settings.session)
-    command, history = recording.find_with_history(_identity(recording, identity), HISTORY)
-    return Exported(
-        parts=tuple(case_parts(command, history, _Resolvers(settings).of(command))),
-        codec=command.codec,
-        number=command.command.id,
-        metadata=dict(command.about),
-    )
 
 
 def find(
@@ -229,12 +205,6 @@ def find(
         except RsePfError:
             continue
     return nearest
-
-
-def _identity(recording: WireRecording, identity: str) -> str:
-    if not identity and not recording.case_id:
-        raise BadRequest("this file is no case of one command", hint="name one with --command")
-    return identity or recording.case_id
 
 
 class _Resolvers:

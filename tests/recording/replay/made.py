@@ -7,6 +7,7 @@ import dataclasses
 import io
 import itertools
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -49,7 +50,20 @@ class Made:
         side: str = "server",
         settings: PlatformSettings | None = None,
         max_file_bytes: int = 1 << 30,
+        edit: Callable[[str, Any], Any] = lambda kind, written: written,
     ) -> None:
+        """Begin a recording.
+
+        Args:
+            folder: Of its files.
+            server: Which records.
+            start_ns: Of the first command.
+            side: Which end of the connections records.
+            settings: Of the solver.
+            max_file_bytes: A larger file is followed by another one.
+            edit: Returns what is written instead: the bytes of a message ("up", "down"), or the JSON value
+                of "frames" and "odometry".
+        """
         folder.mkdir(exist_ok=True)
         settings = settings or PlatformSettings()
         self.folder, self.server, self.now_ns = folder, server, start_ns
@@ -61,6 +75,7 @@ class Made:
                 "pnp": json.dumps(dataclasses.asdict(settings.pnp)),
             },
         )  # fmt: skip
+        self._edit = edit
         self._registry = builtin_services(settings)
         self._types = wire_types(self._registry)
         self._channels: dict[tuple[int, str, str], int] = {}
@@ -98,16 +113,15 @@ class Made:
                 "command": name, "number": identity, "timestamp_s": self.now_ns / 1e9 - 0.01,
                 "T_odom_camera": np.asarray(T_odom_camera).ravel().tolist(),
             })  # fmt: skip
-        self.writer.add(self._channel(robot, "up", codec), self.now_ns, command)
+        self.writer.add(self._channel(robot, "up", codec), self.now_ns, self._edit("up", command))
         if is_answered:
             codecs = make_codec(codec, pnp=self._types)
             message = codecs.decode_from_robot(command)
             assert isinstance(message, Command)
             clock = itertools.count(100.0).__next__
             answered = answer or dispatch(self._registry, message, clock, server=self.server, received_s=99.5)
-            self.writer.add(
-                self._channel(robot, "down", codec), self.now_ns + took_ns, codecs.encode(answered)
-            )
+            reply = self._edit("down", codecs.encode(answered))
+            self.writer.add(self._channel(robot, "down", codec), self.now_ns + took_ns, reply)
         self.writer.flush(self.now_ns)
         return name
 
@@ -123,7 +137,8 @@ class Made:
         return path
 
     def _json(self, prefix: str, schema: str, robot: int, value: object) -> None:
-        self.writer.add_json(f"{prefix}robot-{robot:08x}", schema, self.now_ns, value)
+        kind = "frames" if prefix == file_format.FRAMES_PREFIX else "odometry"
+        self.writer.add_json(f"{prefix}robot-{robot:08x}", schema, self.now_ns, self._edit(kind, value))
 
     def _channel(self, robot: int, direction: file_format.Direction, codec: str) -> int:
         key = robot, direction, codec

@@ -1,4 +1,4 @@
-"""Cases (``.rsepf``) that strangers made or edited: one line or one report, in bounded memory and time."""
+"""Recordings of commands that strangers made or edited: a line or a report, in bounded memory and time."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ from rse_pf.config import PlatformSettings
 from rse_pf.errors import RsePfError
 from rse_pf.pnp.problems import make_problem
 from rse_pf.recording import file_format
-from rse_pf.recording.replay import run
-from rse_pf.recording.replay.case import MAX_CASE_BYTES, CasePart, write_case
 from rse_pf.recording.replay.limited import LimitedReplay
 
 pytest.importorskip("mcap", reason="pip install 'rse-pf[local]'")
 
 SETTINGS = PlatformSettings()
 MAX_S = 20.0
-"""Of one case, on a slow machine."""
+"""Of one command, on a slow machine."""
+NAME = f"{0:016x}:0"
+"""Of the only command of a recording."""
 Fields = dict[str, Any]
 
 
@@ -41,27 +41,19 @@ def replay() -> Iterator[LimitedReplay]:
         yield started
 
 
-@pytest.fixture(scope="module")
-def parts(tmp_path_factory: pytest.TempPathFactory) -> list[CasePart]:
-    """Return the messages of an honest case: thumbnail, odometry, command and answer."""
-    made = Made(tmp_path_factory.mktemp("honest") / "a")
-    identity = made.send(make_problem(seed=8, n=60), thumbnail=jpeg(), T_odom_camera=np.eye(4))
-    return run.case_of(made.close(), SETTINGS, identity).parts
-
-
-def written(
-    path: Path, parts: list[CasePart], *, metadata: dict[str, str] | None = None, codec: str = "bin"
-) -> Path:
-    write_case(path, parts, codec=codec, number=0, metadata=metadata or {}, version="1.2.3")
-    return path
+def written(folder: Path, edit: Callable[[str, Any], Any] = lambda kind, data: data, **more: Any) -> Path:
+    """Record a command with thumbnail, odometry and answer, each of them as *edit* changes it."""
+    made = Made(folder, edit=edit)
+    made.send(make_problem(seed=8, n=60), thumbnail=jpeg(), T_odom_camera=np.eye(4), **more)
+    return made.close()
 
 
 def outcome(replay: LimitedReplay, path: Path) -> str:
-    """Read a case; return "report", or the code of the error, which has a hint and one line."""
+    """Read a command; return "report", or the code of the error, which has a hint and one line."""
     begin = time.monotonic()
     refusal: RsePfError | None = None
     try:
-        json.dumps(msgspec.to_builtins(replay.command(path), enc_hook=str))
+        json.dumps(msgspec.to_builtins(replay.command(path, NAME), enc_hook=str))
     except RsePfError as error:
         refusal = error
     assert time.monotonic() - begin < MAX_S
@@ -73,15 +65,17 @@ def outcome(replay: LimitedReplay, path: Path) -> str:
     return refusal.code
 
 
-def edited(parts: list[CasePart], kind: str, change: Callable[[Any], Any]) -> list[CasePart]:
-    """Return the case with the messages of *kind* decoded, changed and encoded again."""
-    codec = msgspec.json if kind in ("frames", "odometry") else msgspec.msgpack
-    return [
-        msgspec.structs.replace(each, data=codec.encode(change(codec.decode(each.data))))
-        if each.kind == kind
-        else each
-        for each in parts
-    ]
+def edited(kind: str, change: Callable[[Any], Any]) -> Callable[[str, Any], Any]:
+    """Return what decodes, changes and encodes the messages of *kind*."""
+
+    def edit(of: str, data: Any) -> Any:
+        if of != kind:
+            return data
+        if isinstance(data, dict):
+            return change(data)
+        return msgspec.msgpack.encode(change(msgspec.msgpack.decode(data)))
+
+    return edit
 
 
 def payload(**changes: Any) -> Callable[[Fields], Fields]:
@@ -151,17 +145,20 @@ def _claims(width: int, height: int) -> str:
 
 
 @pytest.mark.parametrize("name", EDITS)
-def test_an_edited_case_is_a_report_or_one_line(
-    tmp_path: Path, replay: LimitedReplay, parts: list[CasePart], name: str
+def test_an_edited_recording_is_a_report_or_one_line(
+    tmp_path: Path, replay: LimitedReplay, name: str
 ) -> None:
-    kind, change = EDITS[name]
-    path = written(tmp_path / "case.rsepf", edited(parts, kind, change))
+    assert outcome(replay, written(tmp_path / "a", edited(*EDITS[name]))) in (
+        "report",
+        "bad-request",
+        "bad-message",
+        "too-large",
+        "invalid-camera",
+    )
 
-    assert outcome(replay, path) in ("report", "bad-request", "bad-message", "too-large", "invalid-camera")
 
-
-def test_the_honest_case_is_a_report(tmp_path: Path, replay: LimitedReplay, parts: list[CasePart]) -> None:
-    assert outcome(replay, written(tmp_path / "case.rsepf", parts)) == "report"
+def test_an_honest_recording_is_a_report(tmp_path: Path, replay: LimitedReplay) -> None:
+    assert outcome(replay, written(tmp_path / "a")) == "report"
 
 
 @pytest.mark.parametrize(
@@ -182,69 +179,52 @@ def test_the_honest_case_is_a_report(tmp_path: Path, replay: LimitedReplay, part
     ],
     ids=["zlib bomb", "deep zlib", "deep json", "deep payload", "ten million lists", "deep bin", "nothing"],
 )
-def test_a_bomb_in_a_case_is_one_line(
-    tmp_path: Path, replay: LimitedReplay, parts: list[CasePart], codec: str, data: bytes
+def test_a_bomb_in_a_recording_is_one_line(
+    tmp_path: Path, replay: LimitedReplay, codec: str, data: bytes
 ) -> None:
-    hostile = [msgspec.structs.replace(each, data=data) if each.kind == "up" else each for each in parts]
-    path = written(tmp_path / "case.rsepf", hostile, codec=codec)
+    path = written(tmp_path / "a", lambda kind, sent: data if kind == "up" else sent, codec=codec)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
     assert outcome(replay, path) in ("bad-request", "bad-message", "too-large")
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 64 << 10, "KiB of this process"
 
 
-def test_a_hundred_thousand_messages_in_a_case_are_bounded(
-    tmp_path: Path, replay: LimitedReplay, parts: list[CasePart]
+def test_a_hundred_thousand_messages_beside_a_command_are_bounded(
+    tmp_path: Path, replay: LimitedReplay
 ) -> None:
-    (odometry,) = (each for each in parts if each.kind == "odometry")
-    path = written(tmp_path / "case.rsepf", [*[odometry] * 100_000, *parts])
+    made = Made(tmp_path / "a")
+    odometry = {"command": NAME, "number": 0, "timestamp_s": 1.0, "T_odom_camera": np.eye(4).ravel().tolist()}
+    for _ in range(100_000):
+        made.writer.add_json(
+            f"{file_format.ODOMETRY_PREFIX}robot-00000000", file_format.ODOMETRY_SCHEMA, made.now_ns, odometry
+        )
+    made.send(make_problem(seed=8, n=60))
 
-    assert outcome(replay, path) in ("report", "too-large")
+    assert outcome(replay, made.close()) in ("report", "too-large")
 
 
-def test_a_pipe_a_device_and_a_folder_are_no_case(tmp_path: Path, replay: LimitedReplay) -> None:
-    os.mkfifo(tmp_path / "pipe.rsepf")
-    (tmp_path / "zero.rsepf").symlink_to("/dev/zero")
-    (tmp_path / "folder.rsepf").mkdir()
+def test_a_pipe_a_device_and_an_empty_folder_are_no_recording(tmp_path: Path, replay: LimitedReplay) -> None:
+    os.mkfifo(tmp_path / "pipe.mcap")
+    (tmp_path / "zero.mcap").symlink_to("/dev/zero")
+    (tmp_path / "folder.mcap").mkdir()
 
     for name in ("pipe", "zero", "folder"):
-        assert outcome(replay, tmp_path / f"{name}.rsepf") in ("bad-request", "usage")
+        assert outcome(replay, tmp_path / f"{name}.mcap") in ("bad-request", "usage")
 
 
-def test_a_case_above_its_size_is_not_read(tmp_path: Path, replay: LimitedReplay) -> None:
-    with (tmp_path / "case.rsepf").open("wb") as file:
-        file.write(b"\x89MCAP0\r\n")
-        file.truncate(MAX_CASE_BYTES + 1)
-
-    assert outcome(replay, tmp_path / "case.rsepf") == "too-large"
-
-
-def test_a_case_of_a_newer_format_asks_for_a_newer_version(
-    tmp_path: Path, replay: LimitedReplay, parts: list[CasePart], monkeypatch: pytest.MonkeyPatch
+def test_names_in_a_recording_make_no_file_and_reach_no_terminal_or_page_as_they_are(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(file_format, "FORMAT_VERSION", 7)
-    path = written(tmp_path / "case.rsepf", parts)
-    monkeypatch.undo()
-
-    assert outcome(replay, path) == "unsupported"
-
-
-def test_names_in_a_case_make_no_file_and_reach_no_terminal_or_page_as_they_are(
-    tmp_path: Path, parts: list[CasePart], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "in").mkdir()
     name = "../../\x1b[2J<script>alert(1)</script>"
-    path = written(
-        tmp_path / "in/case.rsepf",
-        edited(parts, "down", lambda message: {**message, "server": name, "trace": name}),
-        metadata={"engine": "native", "version": "9.9.9"},
-    )
+    path = written(tmp_path / "a", edited("down", lambda message: {**message, "server": name, "trace": name}))
+    files = {each.name for each in path.iterdir()}
+    (tmp_path / "in").mkdir()
     monkeypatch.chdir(tmp_path / "in")
 
-    code = main(["replay", str(path), "--html", "page.html"])
+    code = main(["replay", str(path), "--command", NAME, "--html", "page.html"])
     out = capsys.readouterr()
 
     assert code in (0, 1)
     assert "\x1b[2J" not in out.out + out.err
     assert "<script>alert" not in Path("page.html").read_text()
-    assert {each.name for each in tmp_path.rglob("*")} == {"in", "case.rsepf", "page.html"}
+    assert {each.name for each in tmp_path.rglob("*")} == {"a", *files, "in", "page.html"}
