@@ -65,24 +65,6 @@ def answers(wire: FakeWire) -> list[tuple[int | None, str]]:
     ]
 
 
-def test_a_map_waits_for_its_process_and_nobody_waits_for_the_map(
-    worker: WorkerParts, processes: HeldProcesses
-):
-    one, wire = worker.join("one")
-    processes.script = [reply_of(3.0, {"map": b""})]
-
-    worker.say(one, asked(1))
-    worker.loop.run_until(lambda: processes.robots)
-    other, other_wire = worker.join("other")
-    worker.say(other, Command(id=2, service="echo", payload={"value": 1}))
-    before = answers(wire), answers(other_wire)
-    processes.go.release()
-    worker.loop.run_until(lambda: answers(wire))
-
-    assert before == ([], [(2, "ok")])
-    assert answers(wire) == [(1, "ok")]
-
-
 def test_robots_take_turns(worker: WorkerParts, processes: HeldProcesses):
     processes.script = [reply_of(1.0, None)] * 4
     (one, _), (other, _) = worker.join("one"), worker.join("other")

@@ -12,8 +12,7 @@ from backend.gateway.worker_parts import WorkerParts, worker_parts
 from rse_pf.backend.compute.limited_services import LimitedServices
 from rse_pf.backend.scheduling.scheduler import QueuedCommand
 from rse_pf.child.limited import Overran
-from rse_pf.crash_record import BLOCK_S
-from rse_pf.errors import Busy, Crashed, WorkerLost
+from rse_pf.errors import Busy, WorkerLost
 from rse_pf.identity import RobotId
 from rse_pf.wire import Command, Failure, Result
 
@@ -97,23 +96,6 @@ def test_a_failure_keeps_its_code_and_hint(
     )  # fmt: skip
 
 
-def test_two_crashes_keep_their_robot_out_and_no_other(
-    worker: WorkerParts, processes: ScriptedProcesses, limited: LimitedServices
-):
-    processes.script = [Crashed("memory"), Crashed("signal"), reply_of(1.0, None)]
-
-    codes = [code_of(limited.compute(place(worker))) for _ in range(3)]
-    of_bob = limited.compute(place(worker, BOB))
-
-    assert codes == ["crashed", "crashed", "busy"]
-    assert code_of(of_bob) == "ok"
-    assert limited.blocked_robots(worker.loop.now) == 1
-    refusal = limited.refusal(place(worker), worker.loop.now)
-    assert refusal is not None
-    assert refusal.retry_after_ms == BLOCK_S * 1e3
-    assert limited.refusal(place(worker), worker.loop.now + BLOCK_S) is None
-
-
 @pytest.mark.parametrize(
     ("error", "code"),
     [
@@ -154,9 +136,3 @@ def test_a_reply_of_no_known_form_is_internal(
 
 def test_a_payload_that_cannot_be_passed_on_is_a_bad_request(worker: WorkerParts, limited: LimitedServices):
     assert code_of(limited.compute(place(worker, payload={"map": 1 << 70}))) == "bad-request"
-
-
-def test_closing_ends_the_processes(processes: ScriptedProcesses, limited: LimitedServices):
-    limited.close()
-
-    assert processes.is_closed

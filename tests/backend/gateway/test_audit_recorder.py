@@ -11,7 +11,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rse_pf.audit.entry import RefusalLimiter
-from rse_pf.audit.log import read_entries
 from rse_pf.auth.tokens import Claims
 from rse_pf.backend.gateway.audit_recorder import AuditRecorder, ServerAudit
 from rse_pf.backend.gateway.handshake import Accepted, Rejected
@@ -42,18 +41,6 @@ class Recording:
     def _tell(self, **message: Any) -> None:
         assert message["event"] == "audit"
         self.told.append(message)
-
-
-def test_an_accepted_handshake_is_recorded_with_robot_token_key_and_source():
-    recording = Recording()
-
-    recording.recorder.record_verdict(ACCEPTED, "10.0.0.7", CLAIMED)
-    assert recording.told == [], "a handshake never waits for the log"
-    recording.loop.advance(0.1)
-
-    (note,) = recording.notes
-    assert (note["action"], note["subject"], note["time"]) == ("auth.accepted", "robot-1", 1e9)
-    assert note["detail"] == {"token": "t-1", "key": "k-1", "source": "10.0.0.7"}
 
 
 def test_a_robot_of_another_tenant_is_named_with_it():
@@ -148,24 +135,6 @@ def test_a_server_without_an_audit_log_records_nothing():
     recording.recorder.flush()
 
     assert recording.told == []
-
-
-def test_the_supervisor_writes_the_notes_of_workers_and_passes_other_messages_on(tmp_path: Path):
-    recording, others = Recording(), []
-    recording.recorder.record_verdict(ACCEPTED, "10.0.0.7", "")
-    recording.recorder.flush()
-
-    with ServerAudit(tmp_path, "server-1") as records:
-        hear = records.message_handler(lambda worker, message: others.append(message))
-        hear("worker", recording.told[0])
-        hear("worker", {"event": "left", "robot": "robot-1"})
-        records.note("server.over", exit_code=0)
-
-    entries = read_entries(tmp_path / "server-1.jsonl")
-    assert [(entry.actor, entry.action) for entry in entries] == [
-        ("server-1", "auth.accepted"), ("server-1", "server.over"),
-    ]  # fmt: skip
-    assert others == [{"event": "left", "robot": "robot-1"}]
 
 
 @pytest.mark.parametrize("message", [{"event": "audit", "notes": []}])

@@ -429,21 +429,6 @@ def test_every_kind_of_command_passes_the_same_admission(
         assert {name for name, commands in taken.items() if commands} == ({service} if not code else set())
 
 
-def test_a_connection_that_ends_drops_its_waiting_commands(worker: WorkerParts):
-    connection, wire = worker.join()
-    other, _ = worker.join("other")
-    worker.say(other, half(1))
-    worker.say(other, half(2))
-    worker.say(connection, echo(2))
-
-    connection.on_socket_end()
-    worker.loop.advance()
-
-    assert worker.metrics.requests["echo", "disconnected"] == 1
-    assert results(wire) == []
-    assert worker.dispatcher.connections == {other}
-
-
 @pytest.mark.parametrize(
     ("since_s", "leaves_unread", "computed"),
     [(0.0005, False, 2), (0.0039, False, 3), (1.0, False, 6), (1.0, True, 2)],

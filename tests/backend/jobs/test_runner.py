@@ -35,7 +35,6 @@ SETTINGS = PlatformSettings.from_dict(
 WANTED = JobRequest(
     service="long", payload={}, robot=RobotId("default", "robot-1"), key="ab" * 32, quota_bytes=1e6
 )
-WHO = RobotId("default", "robot-1")
 NAME = record_name(RobotId("default", "robot-1"), WANTED.key)
 REPLY = msgspec.msgpack.encode({"value": 1})
 DONE = ["done", 12.5, REPLY]
@@ -174,13 +173,6 @@ def test_a_job_runs_in_a_worker_with_more_than_1024_descriptors():
         bench.signals.close()
 
 
-def test_a_job_with_a_stored_result_is_not_run_again(bench):
-    first = bench.run(lambda: FakeProcess([DONE]))
-
-    assert bench.run() == first
-    assert len(bench.processes) == 1
-
-
 def test_a_large_reply_is_reported_by_name_only(bench):
     reply = msgspec.msgpack.encode({"value": "x" * 600})
 
@@ -205,14 +197,6 @@ def test_a_failure_is_reported_unchanged_and_the_next_request_runs_again(bench):
     assert outcome.error is not None
     assert (outcome.error.message, outcome.error.hint) == ("no maps", "send some")
     assert code(bench.run(lambda: FakeProcess([DONE]))) == "ok"
-
-
-def test_a_process_that_ends_without_an_answer_has_crashed(bench):
-    outcome = bench.run(lambda: FakeProcess([], code=-11))
-
-    assert code(outcome) == "crashed"
-    assert "SIGSEGV" in str(outcome.error)
-    assert bench.record.state == "failed"
 
 
 def test_a_reply_that_is_too_large_ends_the_job(bench):
@@ -272,14 +256,6 @@ def test_the_failure_of_a_followed_job_is_reported_and_not_retried(bench):
     assert bench.processes == []
 
 
-def test_a_job_is_taken_over_when_its_owner_stops_renewing(bench):
-    another(bench).take()
-
-    assert code(bench.run(lambda: FakeProcess([DONE]))) == "ok"
-    assert (bench.record.owner, bench.record.state, bench.record.beat) == ("us", "done", 0)
-    assert len(bench.processes) == 1
-
-
 def test_a_server_that_lost_the_lease_kills_its_process_and_follows_the_new_owner(bench):
     def overtake(share: float, what: str) -> None:
         if what == "half" and bench.record.owner == "us":
@@ -328,16 +304,6 @@ def test_a_store_that_fails_is_a_typed_failure(bench):
     bench.store = Gone()
 
     assert code(bench.run()) == "store"
-
-
-def test_a_slot_is_taken_once_and_again_after_its_release(bench):
-    slots = JobSlots(bench.pipe)
-    assert slots.acquire(WHO, lambda seconds: pytest.fail("there is a turn"))
-    waits: list[float] = []
-    assert not slots.acquire(WHO, lambda seconds: bool(waits.append(seconds)))
-    slots.release()
-    assert slots.acquire(WHO, lambda seconds: pytest.fail("there is a turn"))
-    assert len(waits) == 1
 
 
 def test_the_outcome_is_written_again_after_a_conflict(bench):

@@ -441,26 +441,6 @@ async def test_a_driver_whose_fresh_token_only_allows_to_watch_goes_on_reading_a
         assert parts.owners.may_start == {("default", "m"): False}
 
 
-@pytest.mark.parametrize("service", sorted(LIVE_SERVICES))
-@pytest.mark.parametrize("scope", ["maps:watch/m", "maps:watch"])
-async def test_a_token_to_watch_a_map_gives_no_command_to_it(service: str, scope: str) -> None:
-    async with a_router() as parts:
-        viewer = FakeReader()
-        viewer.claims = claims(scope)
-        parts.owners.maps = {"default": [{"name": "m"}]}
-        payload = {**keyframe(), "robot": "bob", "from": "m@ab12"}
-
-        answer = await parts.ask(service, payload, connection=viewer)
-
-        assert parts.owners.asked == []
-        if service == "live-list":
-            assert isinstance(answer, Result)
-            assert answer.reply == {"maps": []}
-        else:
-            assert isinstance(answer, Failure)
-            assert answer.code == "forbidden"
-
-
 @pytest.mark.parametrize(
     "error",
     [

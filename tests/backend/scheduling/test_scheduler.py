@@ -42,17 +42,6 @@ def test_robots_of_one_name_in_two_tenants_are_queued_and_run_apart():
     assert [(each.robot.tenant, each.command.id) for each in both if each] == [("acme", 1), ("rival", 2)]
 
 
-def test_the_newest_frame_takes_the_place_of_the_one_that_waits():
-    scheduler = AdmittedScheduler(max_queue=4)
-    scheduler.submit(queued("a", 1, stream="cam", seq=1), 0.0)
-
-    (refusal,) = scheduler.submit(queued("a", 2, stream="cam", seq=2), 0.0)
-
-    assert (refusal.queued.command.id, refusal.error.code) == (1, "stale")
-    assert run_order(scheduler, 1) == [("a", 2)]
-    assert scheduler.waiting == 0
-
-
 def test_an_older_frame_does_not_replace_a_newer_one():
     scheduler = AdmittedScheduler(max_queue=4)
     scheduler.submit(queued("a", 2, stream="cam", seq=2), 0.0)
@@ -115,16 +104,6 @@ def test_one_robot_waits_with_a_bound():
     assert refusal.error.code == "busy"
     assert refusal.error.retry_after_ms is not None
     assert scheduler.submit(queued("b", 1), 0.0) == []
-
-
-def test_a_connection_that_ends_takes_its_waiting_commands_along():
-    scheduler = AdmittedScheduler(max_queue=4)
-    scheduler.submit(queued("a", 1), 0.0)
-    scheduler.submit(queued("b", 2), 0.0)
-
-    assert [j.command.id for j in scheduler.leave("a")] == [1]
-    assert run_order(scheduler, 1) == [("b", 2)]
-    assert scheduler.start(0.0) == (None, [])
 
 
 def test_only_a_small_cheap_command_that_is_alone_runs_inline():

@@ -81,21 +81,6 @@ class Server:
         return [action for action, _ in self.noted]
 
 
-def test_a_process_that_waits_takes_the_place_of_a_worker_that_crashed() -> None:
-    server = Server()
-    ended = server.workers[1]
-
-    heir = server.crash(ONE, worker=1)
-
-    assert heir is server.workers[1]
-    assert heir is not ended
-    assert ended.killed
-    assert server.recovery.cpu_s == ended.cpu_s
-    assert (heir.orders[0].index, heir.orders[0].wait_s, heir.orders[0].banned) == (1, 0.0, [])
-    assert server.noted == [("server.worker-crashed", {"pid": 2, "signal": 11, "robot": "acme/one"})]
-    assert server.said[0][1]["at"] == "f.py:1 f"
-
-
 @pytest.mark.parametrize("code", [1, 0, -signal.SIGKILL, -signal.SIGTERM])
 def test_a_worker_that_ended_otherwise_is_not_replaced(code: int) -> None:
     server = Server()

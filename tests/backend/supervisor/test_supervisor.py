@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import socket
-
 import pytest
 
 from rse_pf.auth.tokens import SigningKey
@@ -31,11 +29,3 @@ def test_a_server_without_authentication_on_a_public_address_is_refused_with_a_h
         serve(settings, keys=keys, server_id="s", conformance_echo=echo)
 
     assert caught.value.hint
-
-
-def test_a_port_that_is_taken_is_a_configuration_error():
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        settings = PlatformSettings.from_dict({"serving": {"port": taken.getsockname()[1]}})
-
-        with pytest.raises(ConfigurationError, match="cannot listen"):
-            serve(settings, keys=KEYS, server_id="s")

@@ -16,7 +16,7 @@ from rse_pf.backend.gateway.handshake import Accepted, HandshakeRequest
 from rse_pf.backend.log import JsonLog
 from rse_pf.config import PlatformSettings
 from rse_pf.identity import RobotId
-from rse_pf.wire import SUBPROTOCOLS, Command, Failure, Hello, Renew, Renewed, Result, Welcome
+from rse_pf.wire import SUBPROTOCOLS, Command, Failure, Hello, Renew, Result, Welcome
 
 SETTINGS = PlatformSettings()
 KEY = SigningKey.from_seed(b"k" * 32, "k1")
@@ -66,33 +66,6 @@ def worker() -> Iterator[Worker]:
         made = Worker(log)
         yield made
         made.dispatcher.close_all()
-
-
-def test_a_connection_ends_when_its_token_expires_and_not_before(worker: Worker):
-    connection, wire = worker.robot(worker.token(ttl_s=10.0))
-    assert wire.sent[0].token_s == 10.0
-
-    connection.last_heard_s = worker.loop.now + 9.0
-    worker.loop.advance(9.99)
-    assert wire.closed is None
-    worker.loop.advance(0.02)
-
-    assert wire.closed == (4401, "token-over")
-
-
-def test_a_fresh_token_moves_the_end_of_the_connection(worker: Worker):
-    connection, wire = worker.robot(worker.token(ttl_s=10.0))
-    connection.last_heard_s = worker.loop.now + 1000.0
-    worker.loop.advance(8.0)
-
-    worker.say(connection, Renew(token=worker.token(ttl_s=20.0)))
-    connection.last_heard_s = worker.loop.now + 1000.0
-
-    assert wire.sent[-1] == Renewed(token_s=20.0)
-    worker.loop.advance(19.9)
-    assert wire.closed is None
-    worker.loop.advance(0.2)
-    assert wire.closed == (4401, "token-over")
 
 
 @pytest.mark.parametrize("wrong", ["robot", "tenant", "nonsense", "denied"])
@@ -148,15 +121,6 @@ def test_a_replaced_connection_ends_and_one_that_is_moving_may_finish_first(work
     assert worker.told == [{"event": "stays", "robot": RobotId("default", "s"), "number": moving.number}]
     worker.token_watch.replace(moving.number)
     assert other.closed == (4409, "replaced")
-
-
-def test_the_supervisor_is_told_which_robots_arrive_and_leave(worker: Worker):
-    connection, _ = worker.robot(worker.token("r"))
-    worker.dispatcher.disconnect(connection)
-    worker.token_watch.replace(connection.number)
-
-    said = {"robot": RobotId("default", "r"), "number": connection.number}
-    assert worker.told == [{"event": "arrived", **said}, {"event": "left", **said}]
 
 
 def test_a_service_outside_of_the_scopes_is_forbidden_and_counted(worker: Worker):
