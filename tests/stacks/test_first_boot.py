@@ -166,6 +166,21 @@ def test_the_server_and_the_data_service_share_a_store_and_keep_an_audit_log(
     assert " --audit /var/lib/rse-pf/audit" in started
 
 
+def test_keys_and_deny_list_lie_in_memory_which_no_full_disk_and_no_earlier_boot_can_change(
+    repository: Path,
+) -> None:
+    agent, server, data = (
+        unit(repository, f"{name}.service")["Service"] for name in ("rse-pf-agent", "rse-pf", "rse-pf-data")
+    )
+
+    assert all(
+        "--keys-file /run/rse-pf/keys.json" in line for line in (agent["ExecStart"], server["ExecStartPre"])
+    )
+    assert all("--keys /run/rse-pf/keys.json" in each["ExecStart"] for each in (server, data))
+    for writer in (agent, server):
+        assert (writer["RuntimeDirectory"], writer["RuntimeDirectoryPreserve"]) == ("rse-pf", "yes")
+
+
 def test_the_agent_makes_and_carries_the_token_that_the_server_asks_for(repository: Path) -> None:
     server, agent = (unit(repository, name)["Service"] for name in ("rse-pf.service", "rse-pf-agent.service"))
     wanted = " --control-token /var/lib/rse-pf/control.token"

@@ -1,6 +1,7 @@
 """The agent of a backend server on its instance: a table of tasks, each repeated in its own period.
 
-    python -m rse_pf.aws.fleet.agent --settings FILE --bucket B --keys-file FILE --group G --hook H
+    python -m rse_pf.aws.fleet.agent --settings FILE --bucket B --keys-file FILE --state FOLDER
+        --group G --hook H
 
 Without it the idle alarm never fires and a scale-in disconnects robots.  A task that fails writes one line to
 the log and is repeated; the other tasks go on.  The agent writes public keys, roster and deny list; the only
@@ -40,7 +41,6 @@ from rse_pf.aws.storage.audit_archive import Shipper
 from rse_pf.aws.storage.s3_store import open_bucket
 from rse_pf.config import load_settings
 from rse_pf.errors import RsePfError, StoreError, message_of
-from rse_pf.files import replace_file
 from rse_pf.terminal import show, show_error
 
 __all__ = ["SERVICES", "TASKS", "Agent", "AgentConfig", "AgentContext", "main"]
@@ -60,7 +60,7 @@ TASKS: tuple[Callable[[AgentContext], Task], ...] = (
 """The table, in the order of a step: one row and one module for each task."""
 
 _STEP_S = 1.0
-_BOOT, _FETCHED = Path("/proc/sys/kernel/random/boot_id"), "fetched"
+_FETCHED = "fetched"
 
 SERVICES = ("autoscaling", "cloudwatch")
 """The AWS services whose clients the tasks use, beside the buckets."""
@@ -137,7 +137,17 @@ def main(arguments: list[str] | None = None) -> int:
     for name in ("bucket", "keys-name", "group", "hook"):
         parser.add_argument(f"--{name}", required=True)
     parser.add_argument("--launch-hook", default="", metavar="H", help="the hook that waits for readiness")
-    parser.add_argument("--keys-file", type=Path, required=True, metavar="FILE")
+    parser.add_argument(
+        "--keys-file", type=Path, required=True, metavar="FILE",
+        help="the public keys, in a folder that is empty after each boot",
+    )  # fmt: skip
+    parser.add_argument(
+        "--state",
+        type=Path,
+        required=True,
+        metavar="FOLDER",
+        help="where services and the journal's cursor are",
+    )
     parser.add_argument(
         "--control-token", type=Path, metavar="FILE", help="the token of the control port; --once makes it"
     )
@@ -162,24 +172,24 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _fetch(agent: Agent, mark: Path) -> None:
-    """Fetch keys and access control before a start of the server; *mark* keeps in which boot that was done.
+    """Fetch keys and access control before a start of the server; the file *mark* says that it was done.
 
     A server that starts again while S3 is away takes what was fetched since the machine has started, just
-    as running servers do.  Nothing older is taken: a machine of the warm pool may have been off for weeks.
+    as running servers do.  Nothing older is there: a machine of the warm pool may have been off for weeks,
+    and the folder of the keys, where *mark* lies, is empty after each boot.
 
     Raises:
         RsePfError: They could not be fetched in this boot.
     """
-    boot = _BOOT.read_text(encoding="ascii").strip()
     try:
         agent.run("keys")
         agent.run("access-control")
     except StoreError as error:
-        if not mark.exists() or mark.read_text(encoding="ascii") != boot:
+        if not mark.exists():
             raise
         _log("not-fetched", error=message_of(error)[:200])
         return
-    replace_file(mark, boot)
+    mark.touch()
 
 
 def _context(args: argparse.Namespace) -> AgentContext:
@@ -199,6 +209,7 @@ def _context(args: argparse.Namespace) -> AgentContext:
             launch_hook=args.launch_hook,
             keys_name=args.keys_name,
             keys_file=args.keys_file,
+            state_folder=args.state,
         ),
         settings=settings,
         log=_log,

@@ -44,12 +44,15 @@ class AgentConfig:
     """Group and lifecycle hooks of the instance; object name and local file of the public keys.
 
     ``hook`` is completed when the robots are gone, ``launch_hook`` when the server is ready; empty: none.
+    ``keys_file`` lies in memory (tmpfs), so that a full disk keeps no revocation from the server; what must
+    survive a boot lies in ``state_folder``.
     """
 
     group: str
     hook: str
     keys_name: str
     keys_file: Path
+    state_folder: Path
     launch_hook: str = ""
 
 

@@ -107,8 +107,9 @@ class FakeScaling:
 def agent_context(machine: Any, folder: Path, *, group: str = "rse-pf", **changed: Any) -> AgentContext:
     """Return the context of an agent on *machine* with its keys in *folder*; *changed* replaces its parts."""
     config = AgentConfig(
-        group=group, hook="drain", launch_hook="launch", keys_name="keys.json", keys_file=folder / "keys.json"
-    )
+        group=group, hook="drain", launch_hook="launch", keys_name="keys.json",
+        keys_file=folder / "keys.json", state_folder=folder,
+    )  # fmt: skip
     parts: dict[str, Any] = {
         "machine": machine, "clients": {}, "artifacts": MemoryStore(), "settings": PlatformSettings(),
         "config": config, "log": lambda event, **fields: None, "clock": machine.clock,

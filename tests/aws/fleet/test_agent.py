@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Callable
 from datetime import datetime, timedelta, timezone
 from pathlib import Path
 from typing import Any
@@ -12,12 +14,12 @@ from botocore.exceptions import ClientError
 
 from rse_pf.audit.log import log_files, log_names, read_logs, record_once
 from rse_pf.auth.tokens import SigningKey
-from rse_pf.auth.trust_store import DENY_NAME, AccessControlStore
+from rse_pf.auth.trust_store import DENY_NAME, ROBOTS_NAME, AccessControlStore
 from rse_pf.aws.clients import make_client
 from rse_pf.aws.fleet.agent import Agent, main
 from rse_pf.aws.storage.audit_archive import Shipper, fetch_audit
-from rse_pf.errors import StoreError
-from rse_pf.object_store import MemoryStore
+from rse_pf.errors import RsePfError, StoreError
+from rse_pf.object_store import DirectoryStore, MemoryStore
 from rse_pf.scaling.alarms import NAMESPACE
 
 KEYS = SigningKey.from_seed(b"k" * 32, "test-key").key_set().to_json().encode()
@@ -190,7 +192,20 @@ def test_a_server_that_is_down_fails_one_task_only(setup: AgentSetup) -> None:
 
 
 def test_a_missing_settings_file_is_two_lines(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    place = ["--bucket", "b", "--keys-name", "k", "--keys-file", "k", "--group", "g", "--hook", "h"]
+    place = [
+        "--bucket",
+        "b",
+        "--keys-name",
+        "k",
+        "--keys-file",
+        "k",
+        "--state",
+        "s",
+        "--group",
+        "g",
+        "--hook",
+        "h",
+    ]
 
     assert main(["--settings", str(tmp_path / "none.json"), *place]) == 2
     assert len(capsys.readouterr().err.splitlines()) == 2
@@ -207,6 +222,28 @@ def test_the_deny_list_is_fetched_beside_the_keys_when_it_changes(setup: AgentSe
 
     assert (setup.file.parent / DENY_NAME).read_bytes() == setup.artifacts.get(DENY_NAME)
     assert setup.events() == ["fetched"]
+
+
+def test_a_full_disk_or_an_unreadable_roster_keeps_no_revocation_from_the_server(
+    small_disk: Callable[[str], Path], fill: Callable[[Path], Path], tmp_path: Path
+) -> None:
+    disk = small_disk("4m")
+    context = agent_context(FakeMachine(), disk)
+    config = dataclasses.replace(context.config, keys_file=tmp_path / "run" / "keys.json")
+    agent = Agent(dataclasses.replace(context, config=config))
+    config.keys_file.parent.mkdir()
+    control = AccessControlStore(context.artifacts)
+    control.create_missing()
+    agent.run("access-control")
+
+    fill(disk)
+    context.artifacts.put(ROBOTS_NAME, b"nonsense")
+    control.change_deny_list(lambda denied: denied.with_robot("default", "lost", 1.0))
+    with pytest.raises(RsePfError):  # only the roster
+        agent.run("access-control")
+
+    received = AccessControlStore(DirectoryStore(config.keys_file.parent)).deny_list()
+    assert received.is_disabled("default", "lost")
 
 
 @pytest.mark.parametrize("harm", ["invalid", "missing"])

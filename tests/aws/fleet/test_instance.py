@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import threading
 from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, HTTPServer
@@ -84,7 +85,20 @@ def test_the_unit_makes_the_token_before_any_request(tmp_path: Path, monkeypatch
     monkeypatch.setattr("rse_pf.aws.fleet.agent.make_client", refuse)
     settings, token = tmp_path / "settings.json", tmp_path / "control.token"
     settings.write_text('{"context": {"rse-pf": {}}}')
-    place = ["--bucket", "b", "--keys-name", "k", "--keys-file", "k", "--group", "g", "--hook", "h"]
+    place = [
+        "--bucket",
+        "b",
+        "--keys-name",
+        "k",
+        "--keys-file",
+        "k",
+        "--state",
+        "s",
+        "--group",
+        "g",
+        "--hook",
+        "h",
+    ]
     command = ["--settings", str(settings), *place, "--control-token", str(token)]
 
     assert main(command) == 2
@@ -107,17 +121,16 @@ class Bucket(MemoryStore):
 def test_a_server_starts_again_without_the_bucket_but_only_with_what_this_boot_has_fetched(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    bucket, boot = Bucket(), tmp_path / "boot_id"
-    boot.write_text("first\n")
-    monkeypatch.setattr(agent, "_BOOT", boot, raising=False)
+    bucket = Bucket()
     monkeypatch.setattr(agent, "make_client", lambda *_: None)
     monkeypatch.setattr(agent, "open_bucket", lambda *_: bucket)
     (tmp_path / "settings.json").write_text('{"context": {"rse-pf": {}}}')
     command = [
         "--settings", str(tmp_path / "settings.json"), "--bucket", "b", "--keys-name", "keys.json",
-        "--group", "g", "--hook", "h", "--keys-file", str(tmp_path / "state" / "keys.json"), "--once",
+        "--group", "g", "--hook", "h", "--keys-file", str(tmp_path / "run" / "keys.json"), "--once",
+        "--state", str(tmp_path),
     ]  # fmt: skip
-    (tmp_path / "state").mkdir()
+    (tmp_path / "run").mkdir()
     bucket.is_away = True
     assert main(command) == 2, "a new machine has nothing"
     bucket.is_away = False
@@ -125,5 +138,6 @@ def test_a_server_starts_again_without_the_bucket_but_only_with_what_this_boot_h
     bucket.is_away = True
 
     assert main(command) == 0
-    boot.write_text("second\n")
+    shutil.rmtree(tmp_path / "run")  # as a boot does
+    (tmp_path / "run").mkdir()
     assert main(command) == 2, "what an earlier boot fetched may be weeks old"

@@ -50,7 +50,9 @@ class Machine:
 
 
 def context(machine: Machine, store: Any, folder: Path) -> AgentContext:
-    config = AgentConfig(group="g", hook="h", keys_name="k", keys_file=folder / "keys.json")
+    config = AgentConfig(
+        group="g", hook="h", keys_name="k", keys_file=folder / "keys.json", state_folder=folder
+    )
     return AgentContext(
         machine=machine, clients={}, artifacts=store, config=config, settings=PlatformSettings(),  # type: ignore[arg-type]
         log=lambda *told, **more: None, journal=machine.read,

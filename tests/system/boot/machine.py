@@ -1,7 +1,7 @@
 """Process 1 of the machine under test: runs the user data, then starts units as systemd would.
 
 Runs inside the Debian root, with its Python and standard library alone.  Of a unit it knows what ours use:
-User, EnvironmentFile, StateDirectory, ExecStartPre, ExecStart, Restart, RestartSec, and PathChanged.  The
+User, EnvironmentFile, StateDirectory, RuntimeDirectory, ExecStartPre, ExecStart, Restart and RestartSec.  The
 `systemctl` in the root only writes its arguments to ORDERS.
 """
 
@@ -39,9 +39,11 @@ class Service:
         self.name, self.unit, self.process, self.again_at = name, entries(name), None, 0.0
         self.wanted = True
         user = pwd.getpwnam(self.unit["User"])
-        state = pathlib.Path("/var/lib", self.unit["StateDirectory"])
-        state.mkdir(exist_ok=True)
-        os.chown(state, user.pw_uid, user.pw_gid)
+        for parent, setting in (("/var/lib", "StateDirectory"), ("/run", "RuntimeDirectory")):
+            if setting in self.unit:
+                folder = pathlib.Path(parent, self.unit[setting])
+                folder.mkdir(exist_ok=True)
+                os.chown(folder, user.pw_uid, user.pw_gid)
         text = pathlib.Path(self.unit["EnvironmentFile"]).read_text()
         self.environment = dict(line.split("=", 1) for line in text.splitlines())
         self.options = {

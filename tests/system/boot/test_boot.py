@@ -132,7 +132,7 @@ def test_the_server_runs_as_its_own_user_with_the_settings_of_the_template(world
 
     assert owner != 0
     assert settings == server_settings(SETTINGS)
-    assert (world.root / "var/lib/rse-pf/keys.json").read_text() == KEY.key_set().to_json()
+    assert (world.root / "run/rse-pf/keys.json").read_text() == KEY.key_set().to_json()
 
 
 def test_systemd_itself_finds_the_units_sound(world: World) -> None:

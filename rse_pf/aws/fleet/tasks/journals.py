@@ -36,7 +36,7 @@ def piece_name(instance: str, first_us: int) -> str:
 def _ship(context: AgentContext) -> None:
     if context.journal is None:
         return
-    file = context.config.keys_file.with_name(_CURSOR_FILE)
+    file = context.config.state_folder / _CURSOR_FILE
     for _ in range(_MAX_PIECES):
         cursor = file.read_text(encoding="utf-8") if file.exists() else ""
         batch = make_batch(context.journal(cursor))

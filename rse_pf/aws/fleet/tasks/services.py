@@ -23,13 +23,13 @@ from rse_pf.services.custom.publishing import (
 __all__ = ["FOLDER", "task"]
 
 FOLDER = "services"
-"""Beside the public keys; the units name it, too."""
+"""In the agent's state folder; the units name it, too."""
 _EMPTY = msgspec.json.encode(PublishedList())
 
 
 def task(context: AgentContext) -> Task:
     """Install the services of the list if it changed, and have the server load them."""
-    folder = PublishedFolder(context.config.keys_file.parent / FOLDER)
+    folder = PublishedFolder(context.config.state_folder / FOLDER)
     refused, loaded = b"", b""
 
     def fetch(entry: PublishedService) -> bytes:
