@@ -14,7 +14,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from rse_pf.auth.trust_store import AccessControlStore
+from rse_pf.auth.trust_store import DENY_NAME, ROBOTS_NAME, AccessControlStore
 from rse_pf.disk_reserve import DiskReserve
 from rse_pf.errors import RsePfError
 from rse_pf.files import replace_file
@@ -32,7 +32,7 @@ Level = Literal["ok", "low", "full"]
 LOOK_S = 0.5
 # Below this free space a disk counts as full: a server that starts writes about as much.
 _FULL_BYTES = 1 << 20
-# A disk must gain a tenth above a threshold before it is called better, so that levels do not alternate.
+# A level ends once the free space is a tenth above its threshold, so that levels do not alternate.
 _HYSTERESIS = 1.1
 _DIRECTORY = "dir:"
 _MIB = 1 << 20
@@ -167,7 +167,8 @@ class DiskWatch:
 
     def _refill(self) -> None:
         with contextlib.suppress(OSError):  # the disk is full again, or the folder was removed
-            _reserve(self._state).fill()
+            sizes = ((self._state / name).stat().st_size for name in (ROBOTS_NAME, DENY_NAME))
+            _reserve(self._state).fill(sum(sizes))
 
 
 def _reserve(state: Path) -> DiskReserve:
