@@ -45,7 +45,11 @@ SMOOTHING = 0.1  # weight of the last command in that share: about ten commands 
 
 
 class QueuedCommand(msgspec.Struct, eq=False):
-    """One command from its arrival to its answer; ``owner`` is the connection that waits for the answer."""
+    """One command from its arrival to its answer; ``owner`` is the connection that waits for the answer.
+
+    A frame that replaces a waiting one inherits its ``position`` in the queue and ``queued_s``, the time at
+    which that position was taken.
+    """
 
     owner: Any
     robot: RobotId
@@ -55,6 +59,7 @@ class QueuedCommand(msgspec.Struct, eq=False):
     deadline_s: float
     started_s: float = 0.0
     position: int = 1
+    queued_s: float = 0.0
 
     @property
     def allowed_s(self) -> float:
@@ -123,11 +128,11 @@ class Scheduler:
         if older is not None:
             if queued.command.seq < older.command.seq:
                 return [_stale(queued)]
-            queued.position = older.position
+            queued.position, queued.queued_s = older.position, older.queued_s
             waiting[waiting.index(older)] = queued
             return [_stale(older)]
         self._overload.note_accepted(queued.robot.tenant, queued.received_s)
-        queued.position = self._queue.position(queued.robot)
+        queued.position, queued.queued_s = self._queue.position(queued.robot), queued.received_s
         self._queue.add(queued.robot, queued)
         return []
 
@@ -135,7 +140,7 @@ class Scheduler:
         """Return the command whose turn it is, now running, and those that were given up on the way."""
         refusals: list[RefusedCommand] = []
         while (queued := self._queue.take()) is not None:
-            self._turn.note(now - queued.received_s, queued.position)
+            self._turn.note(now - queued.queued_s, queued.position)
             if queued.deadline_s > now and not is_too_late(now - queued.received_s, queued.allowed_s):
                 queued.started_s = now
                 self.running += 1

@@ -151,6 +151,20 @@ def test_a_frame_that_may_replace_a_waiting_one_is_never_refused():
     assert scheduler.backlog(newer) == (0, 0.0)
 
 
+def test_a_frame_that_replaces_a_waiting_one_does_not_make_the_expected_wait_shorter():
+    scheduler = Scheduler()
+    for begin in range(400):  # each position in the queue takes one second, and each frame waits for a tenth
+        for seq, at in enumerate((0.0, 0.9)):
+            scheduler.submit(queued("a", at=begin + at, within=60.0, stream="cam", seq=seq))
+        started, _ = scheduler.start(begin + 1.0)
+        assert started is not None
+        scheduler.done(started, begin + 1.0)
+    scheduler.submit(queued("a", at=400.0))
+
+    assert scheduler.backlog(queued("b", at=400.0, within=2.0)).pause_s > 0.0
+    assert scheduler.backlog(queued("b", at=400.0, within=6.0)).pause_s == 0.0
+
+
 def test_the_age_of_the_oldest_command_is_reported():
     scheduler = Scheduler()
     assert scheduler.oldest_wait_s(5.0) == 0.0
