@@ -1,8 +1,9 @@
 """Decide whose work is next: fair between tenants, then between the robots of a tenant.
 
-The tenant with the fewest running items goes first, of several the one that was served least recently; within
-a tenant the same holds for its robots.  So a tenant with many robots, or with slow work, takes no more than
-another tenant that waits.  The items of a robot keep their order.
+The tenant with the fewest running items goes first, of several the first in line: who arrives, and who begins
+or ends an item, goes to the end of the line.  Within a tenant the same holds for its robots.  So a tenant
+with many robots, or with slow work, takes no more than another tenant that waits.  The items of a robot keep
+their order.
 
 Pure: no thread and no clock.
 """
@@ -97,10 +98,11 @@ class FairQueue(Generic[Item]):
         return removed
 
     def position(self, robot: RobotId) -> int:
-        """Return the position, from 1, that one more item of *robot* would have in the queue: an upper bound.
+        """Return the greatest position, from 1, that one more item of *robot* would have in the queue.
 
         Before each of the robot's items at most one of each robot of its tenant is served, and before each of
-        these at most one of each tenant.
+        these at most one of each tenant.  This holds if one item runs at a time and no other item arrives; it
+        is an estimate otherwise.
         """
         robots = self._tenants.get(robot.tenant, OrderedDict[RobotId, deque[Item]]())
         rounds = 1 + len(robots.get(robot, ()))

@@ -18,13 +18,15 @@ def robot_of(text: str) -> RobotId:
 
 def served(queue: FairQueue[str], count: int) -> str:
     """Serve *count* items, one after the other, and return the first letter of each."""
-    letters = ""
-    for _ in range(count):
-        item = queue.take()
-        assert item is not None
-        queue.release(robot_of(item.split(":")[0]))
-        letters += item[0]
-    return letters
+    return "".join(served_item(queue)[0] for _ in range(count))
+
+
+def served_item(queue: FairQueue[str]) -> str:
+    """Serve the next item to its end."""
+    item = queue.take()
+    assert item is not None
+    queue.release(robot_of(item.split(":")[0]))
+    return item
 
 
 @pytest.mark.parametrize(
@@ -147,6 +149,29 @@ def test_the_position_counts_one_item_of_each_robot_and_tenant_for_each_own_item
             queue.add(robot_of(name), name)
 
     assert queue.position(robot_of(robot)) == position
+
+
+@given(
+    st.lists(st.sampled_from(["x/1", "x/2", "y/1", "y/2", "z/1"]), max_size=30),
+    st.integers(0, 10),
+    st.sampled_from(["x/1", "z/1", "new/1"]),
+)
+def test_no_item_is_served_after_its_position_while_one_runs_at_a_time_and_none_arrives(
+    comers: list[str], first_served: int, robot: str
+):
+    queue: FairQueue[str] = FairQueue(max_running_per_robot=1)
+    for name in comers:
+        queue.add(robot_of(name), f"{name}:")
+    served(queue, min(first_served, len(queue)))
+    running = queue.take()
+    position = queue.position(robot_of(robot))
+    queue.add(robot_of(robot), f"{robot}:last")
+    if running is not None:
+        queue.release(robot_of(running.split(":")[0]))
+
+    order = [served_item(queue) for _ in range(len(queue))]
+
+    assert order.index(f"{robot}:last") + 1 <= position
 
 
 @pytest.mark.parametrize(
