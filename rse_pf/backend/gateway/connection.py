@@ -135,7 +135,9 @@ class RobotConnection:
         self.paused_until_s = float("-inf")
         """Until when the robot has to pause, because the server has more to do than it can."""
         self.ignores_pauses = False
-        """Whether it sent on in a pause: it is not refused any more, but read one command at a time."""
+        """Whether it sent on in a pause: while commands wait, it is not refused any more, but read one
+        command at a time.  This holds until the robot connects again: it would ignore the next pause, too.
+        """
         self._early_commands = 0
         self._awaited_id: int | None = None
         self.commands = 0

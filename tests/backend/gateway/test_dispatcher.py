@@ -252,6 +252,11 @@ def test_a_robot_that_ignores_its_pause_is_read_one_command_at_a_time(worker: Wo
     assert [result.id for result in results(wire)[-3:]] == [40, 41, 42]
     assert wire.holds == 0
 
+    for number in range(50, 53):
+        worker.say(connection, echo(number))
+        assert wire.holds == 0, "while nothing waits it is served as any other robot"
+        assert results(wire)[-1].id == number
+
 
 def test_hellos_pings_and_unknown_services_are_decoded_even_behind(worker: WorkerParts):
     overload(worker)
