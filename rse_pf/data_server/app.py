@@ -31,7 +31,6 @@ from rse_pf.data_server.http import (
     MethodNotAllowed,
     Receive,
     Send,
-    TooManyRequests,
     failure_reply,
 )
 from rse_pf.data_server.map_describer import MapDescriber
@@ -93,7 +92,7 @@ class DataServer:
             describe: Returns what the map in an object that a robot sent holds; None starts a process with
                 limits for it.
             localiser: Localises photos; None starts processes with limits for it.
-            pause: Waits for so many seconds before a robot above its rate gets its refusal.
+            pause: Waits for so many seconds before a robot above one of its limits gets its refusal.
         """
         self._audit = audit
         self._refusals = RefusalLimiter()
@@ -184,11 +183,13 @@ class DataServer:
         has_body = route.body is not None
         try:
             self._limits.begin(request, claims.robot, route.cost, self._clock(), has_body=has_body)
-        except TooManyRequests:
+        except Busy:
             await self._pause(_REFUSAL_PAUSE_S)  # each of its connections asks again only after this
             raise
         if not has_body and not await request.drain(self._settings.data.part_bytes):
-            raise BadRequest("this request takes no body", hint="leave it out")
+            raise BadRequest(
+                "this request takes no body, and its body is too long or too slow", hint="leave it out"
+            )
         try:
             return await handler(request, claims, path)
         except RsePfError:

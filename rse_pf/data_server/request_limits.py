@@ -55,7 +55,7 @@ class RequestLimits:
         return len(self._robots)
 
     def begin(self, request: HttpRequest, robot: RobotId, cost: float, now: float, *, has_body: bool) -> None:
-        """Take a request of *robot*, until `end`.
+        """Take a request of *robot*, until `end`; one whose body gets no place counts for its rate, too.
 
         Args:
             request: What it sends.
@@ -83,25 +83,27 @@ class RequestLimits:
                 hint="send fewer and larger ones",
                 retry_after_ms=1000 * wait_s,
             )
+        state.bucket.spend(cost, now)
         if has_body:
             self._make_room(robot, now)
             self._bodies[request] = robot
-        state.bucket.spend(cost, now)
         state.requests += 1
         self._in_progress[request] = robot
 
     def end(self, request: HttpRequest) -> None:
-        """Give back what `begin` took, except for the rate; a request that was not taken took nothing."""
+        """Give back what `begin` took, except for the rate."""
         robot = self._in_progress.pop(request, None)
         if robot is not None:
             self._robots[robot].requests -= 1
             self._bodies.pop(request, None)
 
     def charge_refused(self, robot: RobotId, body_bytes: int, now: float) -> None:
-        """Count the body of a request that was refused: it is read and dropped, which takes time from others.
+        """Count the body of a request that began and was refused: reading it takes time from others.
+
+        Bodies that `begin` refuses are not counted: their connections pause, and their robots may come back.
 
         Args:
-            robot: Who sent it, whose request has begun.
+            robot: Who sent it.
             body_bytes: How long the body is, or says that it is.
             now: Monotonic seconds.
         """
@@ -153,7 +155,7 @@ class RequestLimits:
         if slowest is None or held < own + 2 or reached is limits[0]:
             count, limit, whose = reached
             raise Busy(
-                f"{count} uploads of {whose} are in progress, the limit is {limit}",
+                f"{count} request bodies of {whose} are in progress, the limit is {limit}",
                 hint="retry later",
                 retry_after_ms=_RETRY_AFTER_MS,
             )

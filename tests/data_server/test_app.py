@@ -242,6 +242,36 @@ def test_a_robot_above_its_rate_gets_429_and_others_are_served() -> None:
     assert service.ask("GET", OBJECT).status == 404
 
 
+async def test_a_robot_that_repeats_a_body_without_a_place_comes_above_its_rate() -> None:
+    service = Service(small_settings(max_requests_per_s=0.5, max_uploads=1), MemoryStore())
+    held, done = asyncio.Event(), asyncio.Event()
+
+    async def receive() -> dict[str, Any]:
+        held.set()
+        await done.wait()
+        return {"type": "http.disconnect"}
+
+    async def send(message: Mapping[str, Any]) -> None:
+        raise AssertionError("nobody reads this")
+
+    scope = {
+        "type": "http", "method": "PUT", "path": OBJECT, "query_string": b"",
+        "headers": [
+            (b"authorization", f"Bearer {service.token('slow')}".encode()), (b"content-length", b"1024"),
+        ],
+    }  # fmt: skip
+    holder = asyncio.ensure_future(service.app(scope, receive, send))
+    await held.wait()
+
+    began_s = service.now
+    statuses = [(await asyncio.to_thread(service.ask, "PUT", OBJECT, DATA)).status for _ in range(4)]
+
+    assert statuses == [503, 503, 429, 429]
+    assert service.now - began_s == pytest.approx(4 * 0.25), "each refusal comes after a pause"
+    done.set()
+    await asyncio.wait([holder])
+
+
 def test_a_list_costs_more_than_a_plain_request() -> None:
     service = Service(small_settings(max_requests_per_s=1.0), MemoryStore())
 

@@ -102,15 +102,17 @@ def test_bodies_are_limited_for_a_robot_its_tenant_and_all() -> None:
     begin(gate, OTHER, body=True)
 
 
-def test_a_refused_request_takes_nothing() -> None:
+def test_a_refused_body_takes_no_place_and_counts_for_the_rate() -> None:
     gate = admission(max_uploads=4)
     request = begin(gate, ROBOT, body=True)
-    for _ in range(1000):
-        with pytest.raises(Busy):
+    for _ in range(38):
+        with pytest.raises(Busy, match="request bodies"):
             begin(gate, ROBOT, body=True)
     gate.end(request)
 
-    ask(gate, ROBOT, now=0.0, cost=39.0)
+    gate.end(begin(gate, ROBOT, body=True))
+    with pytest.raises(TooManyRequests, match="10 requests a second"):
+        begin(gate, ROBOT, body=True)
 
 
 def test_the_names_of_robots_that_come_and_go_take_no_memory() -> None:
