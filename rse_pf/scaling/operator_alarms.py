@@ -7,6 +7,7 @@ purpose: alarms about servers then stay quiet, because they compare with the wan
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from rse_pf.config import PlatformSettings
@@ -122,7 +123,8 @@ _BLOCKED = Series(
 def operator_alarms(settings: PlatformSettings) -> tuple[OperatorAlarm, ...]:
     """Return the alarms of a deployment with *settings*."""
     floor, slow_ms = settings.scaling.min_servers, LAMBDA_TIMEOUT_S * 1e3 * _SLOW_SHARE
-    samples = _LONG_PERIOD_S // cadence_of(settings.scaling).period_s
+    sample_s = cadence_of(settings.scaling).period_s
+    silent_s = sample_s * math.ceil(_LONG_PERIOD_S / sample_s)
     alarms = [
         OperatorAlarm(
             name="few-servers",
@@ -157,8 +159,8 @@ def operator_alarms(settings: PlatformSettings) -> tuple[OperatorAlarm, ...]:
             meaning="a server in service publishes no metrics: its agent is down, or cannot reach AWS",
             series=(_REPORTS, _SERVING),
             # Each server reports once in a sample; half of the reports of one server may be late.
-            expression=f"IF(FILL(reports, 0) < (FILL(serving, 0) - 0.5) * {samples}, 1, 0)",
-            period_s=_LONG_PERIOD_S,
+            expression=f"IF(FILL(reports, 0) < (FILL(serving, 0) - 0.5) * {silent_s // sample_s}, 1, 0)",
+            period_s=silent_s,
             periods=2,
             datapoints=2,
         ),
@@ -175,6 +177,7 @@ def operator_alarms(settings: PlatformSettings) -> tuple[OperatorAlarm, ...]:
             meaning=f"less than {LOW_DISK_PERCENT:g} % of a server's disk are free",
             series=(_DISK_LOW,),
             expression="IF(low >= 1, 1, 0)",
+            period_s=max(_PERIOD_S, sample_s),  # agents publish once in a sample
         ),
         OperatorAlarm(
             name="lambda-errors",

@@ -13,6 +13,7 @@ import pytest
 from scaling.fleet_traffic import Robot, measure_traffic
 
 from rse_pf.auth.roster import SYNTHETIC
+from rse_pf.config import PlatformSettings
 from rse_pf.scaling.alarms import CPU
 from rse_pf.scaling.operator_alarms import operator_alarms
 from rse_pf.scaling.profile import cadence_of
@@ -141,6 +142,36 @@ def test_an_alarm_is_quiet_fires_on_its_fault_and_resolves(
         "it fires within its periods, and those that AWS searches"
     )
     assert told[-1] == "OK"
+
+
+@pytest.mark.parametrize("sample_s", [10, 60, 120, 600])
+@pytest.mark.parametrize(
+    ("name", "quiet", "wrong"),
+    [("disk", {}, {"low": 1.0}), ("silent-agent", {"reports": 2.0}, {"reports": 1.0})],
+)
+def test_an_alarm_of_what_agents_publish_fires_whatever_their_period_is(
+    sample_s: int, name: str, quiet: Mapping[str, float], wrong: Mapping[str, float]
+) -> None:
+    settings = PlatformSettings.from_dict({"scaling": {"period_s": sample_s, "idle_s": 600}})
+    (alarm,) = [each for each in operator_alarms(settings) if each.name == name]
+    rule = AlarmRule(
+        expression=alarm.expression, comparison=alarm.comparison, threshold=alarm.threshold,
+        periods=alarm.periods, datapoints=alarm.datapoints, missing=alarm.missing,
+    )  # fmt: skip
+    hour = range(0, 3600, sample_s)
+
+    def after(published: Mapping[str, float]) -> State:
+        """Return the state at the end of an hour; *published* is the sum of two servers in each sample."""
+        series: dict[str, list[Value]] = {"serving": [2.0] * (3600 // alarm.period_s)}
+        for metric in {*quiet, *wrong}:
+            buckets: list[Value] = [None] * (3600 // alarm.period_s)
+            for at in hour if metric in published else ():
+                bucket = at // alarm.period_s
+                buckets[bucket] = published[metric] + (buckets[bucket] or 0.0)
+            series[metric] = buckets
+        return replay(rule, series, "OK")[-1]
+
+    assert (after(quiet), after(wrong)) == ("OK", "ALARM")
 
 
 @pytest.mark.parametrize("name", QUIET_WHEN_PARKED)
