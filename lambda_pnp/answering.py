@@ -40,7 +40,7 @@ __all__ = ["Answering", "LambdaAnswer", "load_answering"]
 
 _ROOT = Path(__file__).resolve().parents[1]
 _SERVER = "lambda"
-# How long a revoked token may still be accepted; there is no connection that could be closed.
+# How long a revoked token may still be accepted while S3 answers: no connection could be closed earlier.
 _MAX_STALE_S = 30.0
 _MAX_HEADERS = 200
 _RIGHT = "services:pnp"

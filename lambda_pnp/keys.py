@@ -1,7 +1,8 @@
 """Read the public keys, the roster and the deny list from the artifact bucket, without an AWS SDK.
 
 The package stays small and its import fast.  A function may run for hours, so everything is fetched again
-once in a period.  Each fetch is one signed GET without retries; if it fails, the previous values are kept.
+once in a period.  Each fetch is one signed GET without retries.  While it fails, the previous values are kept
+without a limit in time, as servers do: see docs/decisions/identity.md.
 """
 
 from __future__ import annotations

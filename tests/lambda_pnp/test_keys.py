@@ -89,6 +89,7 @@ def test_an_unreachable_bucket_keeps_the_keys_and_is_retried_soon(
     assert bucket.reads == 2
     keys.at(65.0)
     assert bucket.reads == 3
+    assert keys.at(86_400.0).get("a") is not None, "as on servers, there is no limit in time"
 
 
 def test_before_the_first_key_every_token_is_refused(
