@@ -1,13 +1,12 @@
-"""Slots to run a job, shared by all workers of a server: a pipe with one byte for each free slot.
+"""Slots to run a job, shared by all workers of a server: a record lock on one byte of a file for each slot.
 
-Within a worker the order is that of `FairQueue`.  A slot is freed by `release`, or by the end of the server.
-
-Source:
-    The jobserver of GNU make.
+The kernel releases the locks of a process that ends, so a worker that crashes gives its slots back.  Within a
+worker the order is that of `FairQueue`.
 """
 
 from __future__ import annotations
 
+import fcntl
 import os
 import threading
 from collections.abc import Callable
@@ -15,24 +14,29 @@ from collections.abc import Callable
 from rse_pf.fair_queue import FairQueue
 from rse_pf.identity import RobotId
 
-__all__ = ["JobSlots", "make_pipe"]
+__all__ = ["JobSlots", "make_slot_file"]
 
 _POLL_S = 0.1
 
 
-def make_pipe(count: int) -> tuple[int, int]:
-    """Return both ends of a pipe that holds *count* slots."""
-    ours, theirs = os.pipe()
-    os.set_blocking(ours, False)
-    os.write(theirs, b"j" * count)
-    return ours, theirs
+def make_slot_file() -> int:
+    """Return the descriptor of a file in memory, which every worker of a server inherits."""
+    return os.memfd_create("job-slots")
 
 
 class JobSlots:
-    """The slots as one worker sees them; used by its threads."""
+    """The slots as one worker sees them; used by its threads, and once in each process."""
 
-    def __init__(self, pipe: tuple[int, int]) -> None:
-        self._read, self._write = pipe
+    def __init__(self, file: int, count: int) -> None:
+        """Take no slot yet.
+
+        Args:
+            file: Of `make_slot_file`; closing a descriptor of it would release the slots of this process.
+            count: Number of slots of the server.
+        """
+        self._file, self._count = file, count
+        self._taken: set[int] = set()
+        """Slots of this worker: the kernel would grant their locks to the same process again."""
         self._queue: FairQueue[object] = FairQueue()
         self._lock = threading.Lock()
 
@@ -51,18 +55,25 @@ class JobSlots:
                 self._queue.remove(lambda waiting: waiting is ticket)
 
     def release(self) -> None:
-        """Free a slot."""
-        os.write(self._write, b"j")
+        """Free a slot of this worker."""
+        with self._lock:
+            fcntl.lockf(self._file, fcntl.LOCK_UN, 1, self._taken.pop())
 
     def _take(self, robot: RobotId, ticket: object) -> bool:
         with self._lock:
-            if self._queue.peek() is not ticket:
+            if self._queue.peek() is not ticket or not self._take_any():
                 return False
-            try:
-                is_taken = bool(os.read(self._read, 1))
-            except BlockingIOError:
-                return False
-            if is_taken:
-                self._queue.take()
-                self._queue.release(robot)  # a slot is freed without a name: only the order counts
-            return is_taken
+            self._queue.take()
+            self._queue.release(robot)  # a slot is freed without a name: only the order counts
+            return True
+
+    def _take_any(self) -> bool:
+        for slot in range(self._count):
+            if slot not in self._taken:
+                try:
+                    fcntl.lockf(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB, 1, slot)
+                except (BlockingIOError, PermissionError):
+                    continue  # another worker has it
+                self._taken.add(slot)
+                return True
+        return False

@@ -25,7 +25,7 @@ from rse_pf.auth.tokens import KeySet
 from rse_pf.auth.trust_store import TrustStore
 from rse_pf.backend.gateway.audit_recorder import ServerAudit
 from rse_pf.backend.gateway.migration import plan
-from rse_pf.backend.jobs.slots import make_pipe
+from rse_pf.backend.jobs.slots import make_slot_file
 from rse_pf.backend.log import JsonLog
 from rse_pf.backend.metrics import merge, merge_isolation, render, tenant_cpu_s
 from rse_pf.backend.rosbridge.peers import peer_channels
@@ -119,7 +119,7 @@ def serve(
     check_authentication(settings, keys, conformance_echo)
     raise_descriptor_limit()
     count = settings.serving.workers or len(os.sched_getaffinity(0))
-    slots = make_pipe(settings.serving.max_running_jobs)
+    slots = make_slot_file()
     peers = peer_channels(count if settings.serving.rosbridge else 0) or [(-1, ())] * count
     with ServerRecording(settings, server_id, recording_key) as recording:
         plans = [

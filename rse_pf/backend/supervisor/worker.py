@@ -115,7 +115,7 @@ class WorkerPlan:
     services: str
     workers: int
     index: int
-    job_slots: tuple[int, int]
+    job_slots: int
     supervisor: int
     conformance_echo: bool = False
     audit: bool = False
@@ -385,7 +385,7 @@ class _Worker:
         store = open_data_store(settings)
         context = JobContext(
             store=store,
-            slots=JobSlots(plan.job_slots),
+            slots=JobSlots(plan.job_slots, settings.serving.max_running_jobs),
             settings=settings,
             server_id=plan.server_id,
             start=spawner(plan.services, settings),

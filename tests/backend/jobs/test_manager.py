@@ -18,7 +18,7 @@ from rse_pf.backend.jobs.lease import JobRecord
 from rse_pf.backend.jobs.manager import JobManager
 from rse_pf.backend.jobs.process import JobRequest
 from rse_pf.backend.jobs.runner import JobContext
-from rse_pf.backend.jobs.slots import JobSlots, make_pipe
+from rse_pf.backend.jobs.slots import JobSlots, make_slot_file
 from rse_pf.backend.scheduling.scheduler import QueuedCommand
 from rse_pf.config import PlatformSettings
 from rse_pf.identity import RobotId
@@ -66,7 +66,7 @@ class Bench:
         self.store = MemoryStore()
         context = JobContext(
             store=self.store, server_id="s",
-            slots=JobSlots(make_pipe(self.settings.serving.max_running_jobs)),
+            slots=JobSlots(make_slot_file(), self.settings.serving.max_running_jobs),
             settings=self.settings, start=self.start, clock=lambda: self.loop.now,
         )  # fmt: skip
         self.jobs = JobManager(

@@ -16,7 +16,7 @@ import pytest
 from rse_pf.backend.jobs.lease import JobLease, JobRecord, record_name
 from rse_pf.backend.jobs.process import JobRequest
 from rse_pf.backend.jobs.runner import JobContext, JobOutcome, JobSignals, run_job
-from rse_pf.backend.jobs.slots import JobSlots, make_pipe
+from rse_pf.backend.jobs.slots import JobSlots, make_slot_file
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import Conflict, StoreError
 from rse_pf.identity import RobotId, object_name
@@ -82,7 +82,7 @@ class Bench:
         self.scripts: list[Callable[[], FakeProcess]] = []
         self.told: list[tuple[float, str]] = []
         self.signals = JobSignals()
-        self.pipe = make_pipe(1)
+        self.slots = JobSlots(make_slot_file(), 1)
 
     def start(self, wanted: JobRequest) -> FakeProcess:
         self.processes.append(self.scripts.pop(0)())
@@ -91,7 +91,7 @@ class Bench:
     def run(self, *scripts: Callable[[], FakeProcess]) -> JobOutcome:
         self.scripts += scripts
         context = JobContext(
-            store=self.store, slots=JobSlots(self.pipe), settings=SETTINGS, server_id="s",
+            store=self.store, slots=self.slots, settings=SETTINGS, server_id="s",
             start=self.start, clock=Clock(),
         )  # fmt: skip
 

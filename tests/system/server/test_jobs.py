@@ -14,11 +14,12 @@ import pytest
 import client_sdk
 from rse_pf.errors import Busy, Cancelled, Crashed, Expired
 from rse_pf.object_store import DirectoryStore, digest_of
+from rse_pf.wire import Command
 
 pytestmark = pytest.mark.system
 
 _SERVICES = '''
-import os, signal, time
+import ctypes, os, signal, time
 from pathlib import Path
 from typing import Any
 import msgspec
@@ -39,6 +40,11 @@ class Done(msgspec.Struct, frozen=True, kw_only=True):
 def make(settings):
     registry = Registry()
     echo.register(registry)
+
+    @registry.service("crash")
+    def crash(request: Work) -> Done:
+        ctypes.string_at(0)
+        return Done()
 
     @registry.service("long", kind="long")
     def long(request: Work, *, report: Report) -> Done:
@@ -279,6 +285,23 @@ async def test_a_job_that_crashes_is_a_typed_failure_and_the_server_keeps_runnin
         with pytest.raises(Crashed, match="SIGSEGV" if fate == "crash" else "memory"):
             await robot.call("long", {"fate": fate}, on_progress=Heard())
         assert (await robot.call("echo", {"value": 1})).reply == {"value": 1}
+
+
+async def test_a_job_whose_worker_another_robot_crashed_runs_again_on_that_server(platform, runs, tmp_path):
+    server, heard = platform(), Heard()
+    async with client_sdk.connect(server.url, token=server.token()) as robot:
+        task = asked(robot, heard)
+        await heard.until("half")
+        async with server.robot(token=server.token("culprit")) as culprit:
+            await culprit.send(Command(id=1, service="crash"))
+            await asyncio.wait_for(culprit.socket.wait_closed(), 5.0)
+        while len(runs()) < 2:
+            await heard.until("half")
+        (tmp_path / "job").touch()
+        answer = await task
+
+    assert answer.reply == {"filling": ""}
+    assert server.process.poll() is None
 
 
 @pytest.mark.slow
