@@ -1,8 +1,8 @@
 """Replace a worker that native code ended, and refuse a robot whose bytes do that.
 
-The processes that take over were forked with the workers, before any loop and thread, and wait.  After many
-crashes a successor begins later (`restart_delay_s`).  A server has a few of these processes; when they are
-used up, or a worker ends in another way, the server ends with its worker.
+The spare processes that take over were forked with the workers, before any loop and thread.  After many
+crashes a successor begins later (`restart_delay_s`).  A server forks no further spares in its life: when they
+are used up, or a worker ends in another way, the server ends with its worker.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from rse_pf.identity import RobotId
 __all__ = ["CrashRecovery", "restart_delay_s", "spare_plans"]
 
 _SPARES = 5
-"""Processes that wait for a crash."""
+"""Crashes that a server survives in its life: one process waits for each."""
 _PROMPT_RESTARTS = 2
 """Crashes within `WINDOW_S` whose successors begin at once; one robot that causes as many is refused."""
 
@@ -75,9 +75,12 @@ class CrashRecovery:
         """Crashes since the start."""
 
     def replace(self, worker: WorkerProcess, now: float) -> WorkerProcess | None:
-        """Return the process that takes the place of *worker*, which ended at *now* (s), or None."""
+        """Record the crash of *worker*, which ended at *now* (s), and return its successor.
+
+        None if no spare is left, or if native code did not end the worker; the latter is not recorded.
+        """
         code = worker.exit_code(0)
-        if code is None or -code not in CRASH_SIGNALS or not self._spares:
+        if code is None or -code not in CRASH_SIGNALS:
             return None
         crash = worker.crash.read()
         robot = crash.robot or self._registry.robot_of(crash.number)

@@ -100,6 +100,15 @@ def test_processes_that_wait_and_have_ended_are_passed_over_until_none_is_left()
     assert server.crash() is None
 
 
+def test_a_crash_that_no_spare_is_left_for_is_counted_and_blamed_like_any_other() -> None:
+    server = Server(spares=1)
+    server.crash(ONE)
+
+    assert server.crash(ONE) is None
+    assert server.recovery.count == 2
+    assert server.actions() == ["server.worker-crashed", "server.worker-crashed", "server.robot-shut-out"]
+
+
 def test_two_crashes_by_one_robot_shut_it_out_everywhere_for_a_while() -> None:
     server = Server()
     other = server.workers[1]

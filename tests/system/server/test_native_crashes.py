@@ -87,3 +87,18 @@ async def test_a_crash_during_a_drain_takes_no_answer_from_the_robots_of_the_oth
         assert [type(await staying.receive()) for _ in range(2)] == [Move, Result]
     assert await asyncio.to_thread(server.process.wait, 10.0) == 0
     assert server.wait_for_log("worker-crashed")["robot"] == "culprit"
+
+
+@pytest.mark.slow
+async def test_a_server_records_the_crash_that_it_does_not_survive(start_server):
+    server = start_server(keys=True)
+
+    for robot in ("a", "b", "c", "d", "e"):
+        await crash(server, robot)
+    async with server.robot(token=server.token("f")) as sender:
+        await sender.send(Command(id=1, service="crash"))
+        assert await asyncio.to_thread(server.process.wait, PROMPT_S) == 1
+
+    server.wait_for_log("worker-lost")
+    crashes = [line["robot"] for line in server.lines if line["event"] == "worker-crashed"]
+    assert crashes == ["a", "b", "c", "d", "e", "f"]
