@@ -26,7 +26,10 @@ _MAX_ROBOTS = 10_000
 
 
 class CrashRecord:
-    """The crashes that the robots of one server or worker caused; may be used by several threads."""
+    """The crashes that the robots of one server or worker caused; may be used by several threads.
+
+    A supervisor uses `note_crash` and `blocked` for its workers, a worker `refusal` for limited services.
+    """
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -57,10 +60,11 @@ class CrashRecord:
                 self._crashes_s.popitem(last=False)
             return len(crashes) == MAX_CRASHES and crashes[-1] == now
 
-    def blocked(self, now: float) -> list[RobotId]:
-        """Return the robots that are refused now."""
+    def blocked(self, now: float) -> list[tuple[RobotId, float]]:
+        """Return the robots that are refused at *now*, each with the seconds that are left."""
         with self._lock:
-            return [robot for robot, crashes in self._crashes_s.items() if _rest_s(crashes, now) > 0]
+            rests_s = [(robot, _rest_s(crashes_s, now)) for robot, crashes_s in self._crashes_s.items()]
+        return [(robot, rest_s) for robot, rest_s in rests_s if rest_s > 0]
 
 
 def _rest_s(crashes_s: tuple[float, ...], now: float) -> float:

@@ -27,7 +27,7 @@ def test_a_robot_of_that_name_in_another_tenant_is_not_kept_out():
     assert not record.note_crash(NAMESAKE, 0.0)
     assert record.note_crash(ALICE, 0.0)
     assert record.refusal(NAMESAKE, 0.0) is None
-    assert record.blocked(0.0) == [ALICE]
+    assert record.blocked(20.0) == [(ALICE, BLOCK_S - 20.0)]
 
 
 def test_crashes_that_lie_far_apart_do_not_count_together():

@@ -97,7 +97,7 @@ class CrashRecovery:
         self._times.append(now)
         wait_s = restart_delay_s(sum(now - at_s <= WINDOW_S for at_s in self._times))
         snapshot = "" if self._trust is None else self._trust.snapshot
-        order = BeginOrder(index, wait_s, snapshot, self._crashes.blocked(now), BLOCK_S)
+        order = BeginOrder(index, wait_s, snapshot, self._crashes.blocked(now + wait_s))
         while self._spares:
             spare = self._workers[index] = self._spares.pop()
             if spare.begin(order):

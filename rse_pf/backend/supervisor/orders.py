@@ -81,14 +81,13 @@ class BeginOrder(msgspec.Struct, tag="begin", tag_field="do", frozen=True):
     """Take the place of worker *index*, which has crashed; the first order of a process that waits for one.
 
     It begins after *wait_s*.  ``snapshot`` is the text of a `TrustStore`, "" for the keys of the server's
-    start; the robots ``banned`` are refused for *seconds*.
+    start; each robot in ``banned`` is refused for its number of seconds from then on.
     """
 
     index: int
     wait_s: float
     snapshot: str
-    banned: list[RobotId]
-    seconds: float
+    banned: list[tuple[RobotId, float]]
 
 
 class LeaveOrder(msgspec.Struct, tag="leave", tag_field="do", frozen=True):

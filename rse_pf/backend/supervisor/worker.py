@@ -157,8 +157,8 @@ def run_worker(plan: WorkerPlan, data: socket.socket, control: socket.socket) ->
     asyncio.set_event_loop(loop)
     worker = _Worker(plan, data, control, loop)
     if begin is not None:
-        for robot in begin.banned:
-            worker.ban(robot, begin.seconds)
+        for robot, seconds in begin.banned:
+            worker.ban(robot, seconds)
     loop.run_until_complete(worker.run())
 
 

@@ -119,13 +119,14 @@ def test_two_crashes_by_one_robot_shut_it_out_everywhere_for_a_while() -> None:
 
     assert other.orders == [BanOrder(ONE, BLOCK_S)]
     assert heir is not None
-    assert heir.orders[0].banned == [ONE]
+    assert heir.orders[0].banned == [(ONE, BLOCK_S)]
     assert ("server.robot-shut-out", {"robot": "acme/one", "seconds": BLOCK_S}) in server.noted
     assert ("cut-off", {"robot": ONE, "reason": "crashes"}) in server.said
-    server.now += BLOCK_S
-    late = server.crash(TWO)
-    assert late is not None
-    assert late.orders[0].banned == []
+    for later_s, other, banned in ((20.0, TWO, [(ONE, BLOCK_S - 20.0 - 1.0)]), (BLOCK_S - 20.0, THREE, [])):
+        server.now += later_s
+        successor = server.crash(other)
+        assert successor is not None
+        assert successor.orders[0].banned == banned, "its wait of 1 s counts"
 
 
 @pytest.mark.parametrize("other", [TWO, RobotId("rival", "one")])
