@@ -14,7 +14,7 @@ from rse_pf.config import PlatformSettings
 from rse_pf.identity import RobotId
 from rse_pf.recording.tap import RecordingTap
 
-__all__ = ["Clocks", "CrashMarks", "Log", "SlowReader", "Wire", "WorkerContext"]
+__all__ = ["Clocks", "CrashMarks", "Log", "NoCrashMarks", "SlowReader", "Wire", "WorkerContext"]
 
 
 class Wire(Protocol):
@@ -57,8 +57,25 @@ class CrashMarks(Protocol):
     def enter(self, number: int, robot: RobotId) -> None:
         """Note the robot of the new connection *number*."""
 
-    def compute_for(self, number: int) -> None:
-        """Note that this thread works for the connection *number* from now on, 0 for none."""
+    def compute_for(self, number: int) -> int:
+        """Note that this thread works for the connection *number* from now on; return the one before.
+
+        0 stands for none.
+        """
+
+
+class NoCrashMarks:
+    """The marks of a process that nobody replaces."""
+
+    def __init__(self) -> None:
+        self.of_loop = memoryview(bytearray(8)).cast("Q")
+
+    def enter(self, number: int, robot: RobotId) -> None:
+        """Note nothing."""
+
+    def compute_for(self, number: int) -> int:
+        """Note nothing."""
+        return 0
 
 
 class SlowReader(Protocol):
@@ -116,7 +133,7 @@ class WorkerContext:
         log: The log of the worker.
         metrics: The counters of the worker.
         tap: Takes the messages of all connections for a recording; None where nothing is recorded.
-        crash: Knows for whom this process computes, if it crashes; None in tests.
+        crash: Knows for whom this process computes, if it crashes.
         new_session_id: Makes the id of a session, which goes into its welcome.
     """
 
@@ -127,5 +144,5 @@ class WorkerContext:
     log: JsonLog
     metrics: Metrics = field(default_factory=Metrics)
     tap: RecordingTap | None = None
-    crash: CrashMarks | None = None
+    crash: CrashMarks = field(default_factory=NoCrashMarks)
     new_session_id: Callable[[], str] = make_session_id

@@ -75,8 +75,13 @@ class Answers:
 
         It may run in the event loop or in a thread, because it changes nothing that they share.
         """
-        if self._crash is not None:
-            self._crash.compute_for(queued.owner.number)
+        before = self._crash.compute_for(queued.owner.number)
+        try:
+            return self._compute(queued)
+        finally:
+            self._crash.compute_for(before)
+
+    def _compute(self, queued: QueuedCommand) -> EncodedAnswer:
         command = queued.command
         if command.service in self.with_objects:
             return self._compute_with_objects(queued)

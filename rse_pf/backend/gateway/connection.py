@@ -296,12 +296,21 @@ class RobotConnection:
         self._handler.disconnect(self)
 
     def _take(self, data: bytes, is_text: bool, now: float) -> None:
-        """Take one whole message: defer, echo, refuse, decode at once, or pass to the decoder thread."""
+        """Take one whole message, or defer it."""
         self.last_heard_s = now
-        handler, session = self._handler, self.session
         if self._deferred is not None:
             self._deferred.append((data, is_text))
             return
+        works_for = self._context.crash.of_loop
+        works_for[0] = self.number
+        try:
+            self._process(data, is_text, now)
+        finally:
+            works_for[0] = 0
+
+    def _process(self, data: bytes, is_text: bool, now: float) -> None:
+        """Echo or refuse one whole message, decode it at once, or pass it to the decoder thread."""
+        handler, session = self._handler, self.session
         metrics = self._context.metrics
         metrics.bytes_in += len(data)
         if self.tap is not None:
@@ -332,13 +341,20 @@ class RobotConnection:
 
         def follow_decoded(message: FromRobot | ProtocolError) -> None:
             if self.is_connected and not self._assembler.closed:
-                decisions = session.take(message, now, data)
-                self._follow(session, decisions, len(data), now, state, suspicion)
+                works_for = self._context.crash.of_loop
+                works_for[0] = self.number
+                try:
+                    decisions = session.take(message, now, data)
+                    self._follow(session, decisions, len(data), now, state, suspicion)
+                finally:
+                    works_for[0] = 0
             self._read_deferred()
 
         self._deferred = deque()
         self._wire.hold()
-        self._handler.decoder.begin(session.codec, data, suspicion=suspicion, done=follow_decoded)
+        self._handler.decoder.begin(
+            session.codec, data, number=self.number, suspicion=suspicion, done=follow_decoded
+        )
 
     def _follow(
         self,

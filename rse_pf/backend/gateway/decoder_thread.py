@@ -12,6 +12,7 @@ import heapq
 import threading
 from collections.abc import Callable
 
+from rse_pf.backend.ports import CrashMarks
 from rse_pf.backend.scheduling.scheduler import INLINE_BYTES
 from rse_pf.errors import ProtocolError
 from rse_pf.wire import Codec
@@ -29,32 +30,34 @@ Done = Callable[[FromRobot | ProtocolError], None]
 class DecoderThread:
     """The decoder thread of one worker; it starts with the first long message."""
 
-    def __init__(self, call_soon_threadsafe: Callable[..., object]) -> None:
+    def __init__(self, call_soon_threadsafe: Callable[..., object], crash: CrashMarks) -> None:
         self.short_bytes = INLINE_BYTES
         """A message up to this size, on the wire, is tried in the event loop."""
         self.short_inflated_bytes = _MAX_INLINE_RATIO * INLINE_BYTES
         self.unread_bytes = 0
         """Length of the messages that wait or are being decoded."""
         self._call = call_soon_threadsafe
+        self._crash = crash
         self._count = 0
-        self._waiting: list[tuple[int, int, Codec, bytes, Done]] = []
+        self._waiting: list[tuple[int, int, int, Codec, bytes, Done]] = []
         self._changed = threading.Condition()
         self._is_closed = False
         self._thread: threading.Thread | None = None
 
-    def begin(self, codec: Codec, data: bytes, *, suspicion: int, done: Done) -> None:
+    def begin(self, codec: Codec, data: bytes, *, number: int, suspicion: int, done: Done) -> None:
         """Decode *data* and call *done* once, in the event loop.
 
         Args:
             codec: The codec of the robot.
             data: One whole message, which `Admission.may_wait` let pass.
+            number: Of the connection of the robot.
             suspicion: How many messages of the robot could not be decoded; robots with fewer come first.
             done: Takes the message, or why it is none.
         """
         with self._changed:
             self.unread_bytes += len(data)
             self._count += 1
-            heapq.heappush(self._waiting, (suspicion, self._count, codec, data, done))
+            heapq.heappush(self._waiting, (suspicion, self._count, number, codec, data, done))
             self._changed.notify()
         if self._thread is None:
             self._thread = threading.Thread(target=self._work, name="decoder", daemon=True)
@@ -72,12 +75,15 @@ class DecoderThread:
                 self._changed.wait_for(lambda: self._waiting or self._is_closed)
                 if self._is_closed:
                     return
-                _, _, codec, data, done = heapq.heappop(self._waiting)
+                _, _, number, codec, data, done = heapq.heappop(self._waiting)
             message: FromRobot | ProtocolError
+            self._crash.compute_for(number)
             try:
                 message = codec.decode_from_robot(data)
             except ProtocolError as error:
                 message = error
+            finally:
+                self._crash.compute_for(0)
             with self._changed:
                 self.unread_bytes -= len(data)
             self._call(done, message)

@@ -72,7 +72,7 @@ class Dispatcher:
         self.connections = token_watch.connections
         self.admission = Admission(settings.session)
         self.rates = self.admission.rates
-        self.decoder = DecoderThread(context.loop.call_soon_threadsafe)
+        self.decoder = DecoderThread(context.loop.call_soon_threadsafe, context.crash)
         self.stateless = StatelessQueue(context, answers)
         self._queues: tuple[CommandQueue, ...] = (*queues, self.stateless)
         self._answers = answers

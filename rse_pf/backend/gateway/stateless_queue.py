@@ -47,6 +47,7 @@ class StatelessQueue(CommandQueue):
         clocks, loop = context.clocks, context.loop
         self.scheduler = Scheduler()
         self._answers = answers
+        self._crash = context.crash
         self._registry = answers.registry
         services = [
             service for service in self._registry if service.kind == "stateless" and not service.limited
@@ -89,6 +90,7 @@ class StatelessQueue(CommandQueue):
 
     def submit(self, queued: QueuedCommand, now: float) -> None:
         """Queue *queued*, which was admitted, and start the commands whose turn it is."""
+        self._crash.compute_for(0)  # answers to other robots are sent, too; `Answers.compute` marks its own
         self._refuse(self.scheduler.submit(queued), now)
         self._start()
 

@@ -30,7 +30,6 @@ from rse_pf.backend.gateway.handshake import (
 )
 from rse_pf.backend.gateway.rate_limits import SourceRates
 from rse_pf.backend.gateway.socket_poller import SocketPoller
-from rse_pf.backend.ports import CrashMarks
 from rse_pf.backend.scheduling.deferred_work import DeferredWork
 from rse_pf.config import ServingSettings
 from rse_pf.config.front_door import MAX_HANDSHAKE_BYTES, WRITE_BUFFER_BYTES
@@ -171,7 +170,7 @@ class RobotSockets:
         self._steps = DeferredWork(self._context.loop, clock=clock, bound_s=_HANDSHAKES_S)
         max_bytes = self._context.settings.session.max_message_bytes
         self._protocol = protocol_type(picows, max_bytes, self._poller)
-        self._listener = listener_type(picows, self._context.loop, serving, self._context.crash)
+        self._listener = listener_type(picows, self._context.loop, serving)
 
     @property
     def is_behind(self) -> bool:
@@ -406,11 +405,8 @@ def protocol_type(picows: Any, max_frame_bytes: int, poller: SocketPoller) -> An
     return Protocol
 
 
-def listener_type(
-    picows: Any, loop: asyncio.AbstractEventLoop, serving: ServingSettings, crash: CrashMarks | None = None
-) -> Any:
+def listener_type(picows: Any, loop: asyncio.AbstractEventLoop, serving: ServingSettings) -> Any:
     """Return the subclass of picows' listener that passes frames between a socket and the dispatcher."""
-    works_for = memoryview(bytearray(8)).cast("Q") if crash is None else crash.of_loop
     text, binary = int(picows.WSMsgType.TEXT), int(picows.WSMsgType.BINARY)
 
     class Listener(picows.WSListener):  # type: ignore[misc]
@@ -433,19 +429,15 @@ def listener_type(
             transport.underlying_transport.set_write_buffer_limits(
                 high=WRITE_BUFFER_BYTES, low=WRITE_BUFFER_BYTES // 4
             )
-            if crash is not None and self._accepted.claims is not None:
-                crash.enter(self._number, self._accepted.robot)
+            if self._accepted.claims is not None:
+                self._dispatcher.context.crash.enter(self._number, self._accepted.robot)
             self._connection = self._dispatcher.connect(self, self._accepted, self._number)
 
         def on_ws_frame(self, transport: Any, frame: Any) -> None:
             if self._connection is not None:
                 rsv = bool(frame.rsv1 or frame.rsv2 or frame.rsv3)
                 payload = frame.get_payload_as_bytes()
-                works_for[0] = self._number
-                try:
-                    self._connection.receive_frame(frame.msg_type, bool(frame.fin), rsv, payload)
-                finally:
-                    works_for[0] = 0
+                self._connection.receive_frame(frame.msg_type, bool(frame.fin), rsv, payload)
 
         def on_ws_disconnected(self, transport: Any) -> None:
             for timer in (self._cut, self._pause, self._linger):

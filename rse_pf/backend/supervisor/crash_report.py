@@ -1,13 +1,14 @@
 """What a worker leaves behind when native code ends its process: which robot it computed for, and where.
 
-The report is memory that worker and supervisor share.  The worker writes the number of a connection there
-before it decodes or computes for it; the traceback of the crash is written by `faulthandler`, whose handler
-costs nothing before.  Nobody is named for a crash in any other thread.
+The report is memory that worker and supervisor share.  While a thread of the worker decodes messages of a
+connection or computes for it, the number of the connection is there; the traceback of the crash is written by
+`faulthandler`, whose handler costs nothing before.  Nobody is named for a crash at any other time.
 """
 
 from __future__ import annotations
 
 import faulthandler
+import itertools
 import mmap
 import os
 import re
@@ -25,13 +26,17 @@ __all__ = ["CRASH_SIGNALS", "Crash", "CrashReport"]
 
 CRASH_SIGNALS = (signal.SIGSEGV, signal.SIGBUS, signal.SIGFPE, signal.SIGILL, signal.SIGABRT)
 """How native code ends a process; an operator or the kernel uses other signals."""
-_LOOP, _SOLVER = 0, 1
-_LOOP_THREAD, _SOLVER_THREAD = 2, 3
-"""Words of the memory: connection numbers, and the threads that compute for them."""
+_MAX_THREADS = 4
+"""Threads of a worker that are recorded: event loop, solver and decoder are three."""
+_THREADS = _MAX_THREADS
+"""Index of the first word with the id of a thread; as many words before hold the numbers of connections."""
 _ENTRY = struct.Struct("@QH")
-_ENTRY_BYTES, _ENTRIES = 640, 128
-"""The robots of the newest connections, which the supervisor may not have heard of yet."""
-_TABLE = 64
+_ENTRY_BYTES = 640
+"""Size of an entry: the number of a connection and the name of its robot, as JSON."""
+_ENTRIES = 128
+"""Connections whose robots are in the table; the registry of the supervisor knows those of older ones."""
+_TABLE = 8 * 2 * _MAX_THREADS
+"""Offset of the table of robots behind the words, in bytes."""
 _TEXT = mmap.PAGESIZE * -(-(_TABLE + _ENTRY_BYTES * _ENTRIES) // mmap.PAGESIZE)
 _MAX_TEXT_BYTES = 1 << 17
 _THREAD = re.compile(rb"Current thread 0x([0-9a-f]{1,16}) ")
@@ -60,15 +65,17 @@ class CrashReport:
         os.lseek(self._file, _TEXT, os.SEEK_SET)
         self._memory = mmap.mmap(self._file, _TEXT)
         self._words = memoryview(self._memory)[:_TABLE].cast("Q")
-        self.of_loop = self._words[_LOOP : _LOOP + 1]
+        self.of_loop = self._words[:1]
         """The connection for which the thread of the event loop works, in its only element; 0 for none."""
-        self._loop_thread = 0
+        self._indices: dict[int, int] = {}
+        """Which word belongs to a thread."""
+        self._unused = itertools.count()
 
     # --- in the worker -------------------------------------------------------------------------------------
 
     def begin(self) -> None:
         """Report crashes of this process from now on; called in the thread of its event loop."""
-        self._loop_thread = self._words[_LOOP_THREAD] = get_ident()
+        self.compute_for(0)
         faulthandler.enable(self._file)
 
     def enter(self, number: int, robot: RobotId) -> None:
@@ -77,13 +84,22 @@ class CrashReport:
         at = _TABLE + number % _ENTRIES * _ENTRY_BYTES
         self._memory[at : at + _ENTRY.size + len(name)] = _ENTRY.pack(number, len(name)) + name
 
-    def compute_for(self, number: int) -> None:
-        """Note that this thread works for the connection *number* from now on, 0 for none."""
+    def compute_for(self, number: int) -> int:
+        """Note that this thread works for the connection *number* from now on; return the one before.
+
+        0 stands for none.
+        """
         thread = get_ident()
-        if thread == self._loop_thread:
-            self._words[_LOOP] = number
-        else:
-            self._words[_SOLVER_THREAD], self._words[_SOLVER] = thread, number
+        index = self._indices.get(thread)
+        if index is None:
+            index = self._indices[thread] = next(self._unused)
+            if index < _MAX_THREADS:
+                self._words[_THREADS + index] = thread
+        if index >= _MAX_THREADS:
+            return 0
+        before = self._words[index]
+        self._words[index] = number
+        return before
 
     # --- in the supervisor ---------------------------------------------------------------------------------
 
@@ -93,11 +109,8 @@ class CrashReport:
         found = _THREAD.search(text)
         frame = None if found is None else _FRAME.search(text, found.end())
         thread = 0 if found is None else int(found[1], 16)
-        number = 0
-        if thread and thread == self._words[_LOOP_THREAD]:
-            number = self._words[_LOOP]
-        elif thread and thread == self._words[_SOLVER_THREAD]:
-            number = self._words[_SOLVER]
+        threads = self._words[_THREADS:].tolist()
+        number = self._words[threads.index(thread)] if thread and thread in threads else 0
         place = b"" if frame is None else b"%b:%b %b" % (frame[1], frame[2], frame[3])
         return Crash(number, self._robot_of(number), place.decode(errors="replace"))
 

@@ -10,6 +10,7 @@ import pytest
 from fakes import FakeLoop
 
 from rse_pf.backend.gateway.decoder_thread import DecoderThread
+from rse_pf.backend.ports import NoCrashMarks
 from rse_pf.errors import LimitExceeded
 
 DEADLINE_S = 10.0
@@ -22,7 +23,7 @@ def loop() -> FakeLoop:
 
 @pytest.fixture
 def decoder(loop: FakeLoop) -> Iterator[DecoderThread]:
-    made = DecoderThread(loop.call_soon_threadsafe)
+    made = DecoderThread(loop.call_soon_threadsafe, NoCrashMarks())
     yield made
     made.close()
 
@@ -50,10 +51,10 @@ def test_a_robot_that_sent_undecodable_messages_comes_last_whatever_came_first(
     codec: Any = HeldCodec()
     heard: list[Any] = []
 
-    decoder.begin(codec, b"first", suspicion=0, done=heard.append)
+    decoder.begin(codec, b"first", number=1, suspicion=0, done=heard.append)
     assert codec.has_begun.wait(DEADLINE_S)
     for data, suspicion in ((b"worst", 2), (b"suspect", 1), (b"honest", 0), (b"honest too", 0)):
-        decoder.begin(codec, data, suspicion=suspicion, done=heard.append)
+        decoder.begin(codec, data, number=1, suspicion=suspicion, done=heard.append)
     assert decoder.unread_bytes == len(b"firstworstsuspecthonesthonest too")
     codec.may_decode.set()
     loop.run_until(lambda: len(heard) == 5)

@@ -52,7 +52,7 @@ def test_a_socket_that_the_robot_has_reset_can_be_closed():
 
     loop = FakeLoop(0.0)
     dispatcher = SimpleNamespace(connect=lambda *arguments: None)
-    listener = listener_type(picows, loop, ServingSettings())(dispatcher, None, 1)
+    listener = listener_type(picows, loop, ServingSettings())(dispatcher, SimpleNamespace(claims=None), 1)
     listener.on_ws_connected(Transport())
 
     listener.close(4403, "revoked")

@@ -51,11 +51,19 @@ def test_the_robot_is_named_for_which_the_crashing_thread_computed(
         report.enter(7, RobotId("acme", "another"))
         report.enter(300, ROBOT)
         report.compute_for(7)
+        working = threading.Barrier(2)
+
+        def work_for_another() -> None:
+            report.compute_for(7)
+            working.wait()
+            threading.Event().wait()
 
         def compute() -> None:
             report.compute_for(300)
             read_at_zero()
 
+        threading.Thread(target=work_for_another, daemon=True).start()
+        working.wait()
         runs(compute)
 
     crash = crash_after(act)
@@ -72,8 +80,7 @@ def test_nobody_is_named_for_a_crash_of_another_thread_or_after_the_work() -> No
 
     def afterwards(report: CrashReport) -> None:
         report.enter(7, ROBOT)
-        report.compute_for(7)
-        report.compute_for(0)
+        report.compute_for(report.compute_for(7))
         read_at_zero()
 
     for act in (elsewhere, afterwards):

@@ -14,6 +14,45 @@ from rse_pf.wire import Command, Move, Result
 pytestmark = pytest.mark.system
 
 PROMPT_S = 5.0
+_FRAGILE = """
+import asyncio
+from rse_pf.wire import make_codec
+
+make_whole = make
+kind = type(make_codec("bin"))
+decode = kind.decode_from_robot
+
+def decode_or_crash(self, data):
+    if b"crash-decoder" in data:
+        ctypes.string_at(0)
+    return decode(self, data)
+
+kind.decode_from_robot = decode_or_crash
+
+def make(settings):
+    registry = make_whole(settings)
+
+    @registry.service("burn", cheap=True)
+    def burn(request: Work) -> Done:
+        time.sleep(0.01)
+        return Done()
+
+    @registry.service("fuse", cheap=True)
+    def fuse(request: Work) -> Done:
+        asyncio.get_event_loop().call_soon(ctypes.string_at, 0)
+        return Done()
+
+    return registry
+"""
+"""Makes the decoder of a server crash where a message says so; the service `fuse` crashes after it."""
+
+
+@pytest.fixture
+def fragile(start_server, tmp_path):
+    """A server whose decoder crashes where a message says so."""
+    services = tmp_path / "served_in_tests.py"
+    services.write_text(services.read_text() + _FRAGILE)
+    return start_server(keys=True)
 
 
 async def answered(server) -> None:
@@ -87,6 +126,33 @@ async def test_a_crash_during_a_drain_takes_no_answer_from_the_robots_of_the_oth
         assert [type(await staying.receive()) for _ in range(2)] == [Move, Result]
     assert await asyncio.to_thread(server.process.wait, 10.0) == 0
     assert server.wait_for_log("worker-crashed")["robot"] == "culprit"
+
+
+@pytest.mark.parametrize(
+    "letters", [(10,), (50_000,), (50_000, 10)], ids=["short", "long", "short and deferred by a long one"]
+)
+async def test_a_crash_while_a_message_is_decoded_is_blamed_on_its_robot(fragile, letters):
+    texts = ["x" * length for length in letters[:-1]] + ["crash-decoder" + "x" * letters[-1]]
+    async with (
+        fragile.robot(token=fragile.token("innocent")) as innocent,
+        fragile.robot(token=fragile.token("culprit")) as culprit,
+    ):
+        await innocent.ask(1, "echo")
+        for number, text in enumerate(texts):
+            await culprit.send(Command(id=number + 1, service="echo", payload=text))
+        await asyncio.wait_for(innocent.socket.wait_closed(), PROMPT_S)
+
+    assert fragile.wait_for_log("worker-crashed")["robot"] == "culprit"
+
+
+async def test_a_crash_between_two_messages_is_blamed_on_nobody(fragile):
+    async with fragile.robot(token=fragile.token("innocent")) as innocent:
+        await asyncio.gather(
+            innocent.send(Command(id=1, service="burn")), innocent.send(Command(id=2, service="fuse"))
+        )
+        await asyncio.wait_for(innocent.socket.wait_closed(), PROMPT_S)
+
+    assert "robot" not in fragile.wait_for_log("worker-crashed")
 
 
 @pytest.mark.slow
