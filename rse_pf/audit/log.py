@@ -1,9 +1,10 @@
 """The files of the audit log: append to one log, and read any.
 
 A writer appends to ``WHO.jsonl``; a file that has grown large is renamed to ``WHO.NUMBER.jsonl``.  Nothing
-here changes or removes a line.  Recording never waits for a disk; entries are durable when `AuditLog.flush`
-returns.  While the disk is full, entries wait in memory; the number of those that did not fit is recorded
-once there is space again.
+here changes or removes a line, but whoever may write the folder can; Object Lock in S3 protects the copies
+there.  Recording never waits for a disk; entries are durable when `AuditLog.flush` returns True.  While the
+disk is full, entries wait in memory; the number of those that did not fit is recorded once there is space
+again.
 """
 
 from __future__ import annotations
@@ -39,13 +40,14 @@ CONTROL_PLANE = "control-plane"
 OPERATOR = "operator"
 """Name of the log of operators' commands."""
 SYNC_S = 0.1
-"""Time between two writes to the disk: at most so much is lost when the machine fails."""
+"""Time between two writes to the disk.  A worker waits as long before it sends entries to its supervisor, so
+a machine that fails loses the entries of 0.2 s at most."""
 _RETRY_S = 1.0
 """Time between two attempts to write to a disk that is full."""
 _GAP = "log.gap"
 """Action of an entry that says how many entries were lost."""
 _MAX_FILE_BYTES = 16 << 20
-"""A file that has grown longer is renamed, and the log goes on in a new one."""
+"""A file that is longer is renamed before the next line; it exceeds this by one line at most."""
 _MAX_WAITING = 20_000
 """Entries that wait for the disk; further ones are lost, and counted."""
 _MAX_LINE_BYTES = 1 << 18
@@ -63,7 +65,7 @@ class AuditLog:
         who: str,
         *,
         wall_clock: Callable[[], float],
-        on_problem: Callable[[str], None] = lambda problem: None,
+        on_problem: Callable[[str], None],
         max_bytes: int = _MAX_FILE_BYTES,
     ) -> None:
         """Describe a log; nothing is opened yet.
@@ -72,11 +74,12 @@ class AuditLog:
             folder: Created with mode 0700 if it is missing.
             who: Names the writer; letters that a file name may not have become ``_``.
             wall_clock: Unix seconds.
-            on_problem: Called with a sentence when writing begins to fail.
-            max_bytes: A file that has grown longer is renamed.
+            on_problem: Called with a sentence, in any thread, when writing begins to fail, and when the log
+                is closed without entries that could not be written.
+            max_bytes: A file that is longer is renamed before the next line.
         """
         self.who = _UNSAFE.sub("_", who)[:64]
-        self.on_problem = on_problem
+        self._on_problem = on_problem
         self._folder = folder
         self._path = folder / f"{self.who}.jsonl"
         self._wall_clock = wall_clock
@@ -129,16 +132,17 @@ class AuditLog:
         self._wake.set()
 
     def flush(self) -> bool:
-        """Write what waits, and return whether all of it is on the disk; what is not goes on waiting."""
+        """Write what waits, and return whether all of it is on the disk; what is not goes on waiting.
+
+        Where only `fsync` fails, entries are written again, and may be in the log twice.
+        """
         with self._writing:
             try:
-                while entry := self._next_entry():
-                    self._append(entry_line(entry))
-                    self._forget(entry)
-                os.fsync(self._fd)
+                while batch := self._next_batch():
+                    self._write(batch)
             except OSError as error:
                 if not self._is_failing:
-                    self.on_problem(f"the audit log of {self.who} cannot be written: {error.strerror}")
+                    self._on_problem(f"the audit log of {self.who} cannot be written: {error.strerror}")
                 self._is_failing = True
             else:
                 self._is_failing = False
@@ -151,18 +155,37 @@ class AuditLog:
         if self._thread is not None:
             self._thread.join()
         is_written = self.flush()
+        if not is_written:
+            count = len(self._waiting) + self._lost
+            self._on_problem(f"the audit log of {self.who} ends without its last {count} entries")
         os.close(self._fd)
         return is_written
 
-    def _next_entry(self) -> Entry | None:
-        """Return the oldest entry that waits; after the last one, how many were lost."""
+    def _next_batch(self) -> list[Entry]:
+        """Return the entries that wait, and behind them one that says how many were lost, if any were."""
         with self._buffer_lock:
-            if self._waiting:
-                return self._waiting[0]
+            batch = list(self._waiting)
             if self._lost:
                 detail = {"entries": self._lost}
-                return Entry(time=self._wall_clock(), actor=self.who, action=_GAP, detail=detail)
-            return None
+                batch.append(Entry(time=self._wall_clock(), actor=self.who, action=_GAP, detail=detail))
+            return batch
+
+    def _write(self, batch: list[Entry]) -> None:
+        """Append entries of *batch* until the file is full, and forget those that are on the disk."""
+        if self._is_full():
+            self._rotate()
+        count = 0
+        try:
+            while count < len(batch) and not (count and self._is_full()):
+                self._append(entry_line(batch[count]))
+                count += 1
+        finally:
+            os.fsync(self._fd)
+            for entry in batch[:count]:
+                self._forget(entry)
+
+    def _is_full(self) -> bool:
+        return os.fstat(self._fd).st_size > self._max_bytes
 
     def _forget(self, written: Entry) -> None:
         with self._buffer_lock:
@@ -173,8 +196,6 @@ class AuditLog:
 
     def _append(self, line: bytes) -> None:
         """Append one line by one call, so that lines of several writers do not mix."""
-        if os.fstat(self._fd).st_size > self._max_bytes:
-            self._rotate()
         if self._is_line_cut:  # what was written of it stays a line of its own, which no reader takes
             line = b"\n" + line
         count = os.write(self._fd, line)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import subprocess
 import sys
 import threading
@@ -16,8 +18,12 @@ from rse_pf.audit.log import AuditLog, log_files, log_names, read_entries, read_
 from rse_pf.errors import ConfigurationError
 
 
-def log_in(folder: Path, *, max_bytes: int = 1 << 20) -> AuditLog:
-    return AuditLog(folder, "server-1", wall_clock=lambda: 1e9, max_bytes=max_bytes).open()
+def log_in(
+    folder: Path, *, max_bytes: int = 1 << 20, on_problem: Callable[[str], object] = pytest.fail
+) -> AuditLog:
+    return AuditLog(
+        folder, "server-1", wall_clock=lambda: 1e9, on_problem=on_problem, max_bytes=max_bytes
+    ).open()
 
 
 def write(folder: Path, subjects: range, max_bytes: int = 1 << 20) -> None:
@@ -112,7 +118,8 @@ def test_logs_are_read_in_the_order_of_time(tmp_path: Path):
 def test_a_writer_that_is_killed_leaves_whole_lines(tmp_path: Path):
     code = (
         "import sys, time; from pathlib import Path; from rse_pf.audit.log import AuditLog\n"
-        "log = AuditLog(Path(sys.argv[1]), 'server-1', wall_clock=time.time, max_bytes=20000).open()\n"
+        "log = AuditLog(Path(sys.argv[1]), 'server-1', wall_clock=time.time, on_problem=print,\n"
+        "    max_bytes=20000).open()\n"
         "for number in range(10**6):\n"
         "    log.record('auth.accepted', str(number)); log.flush()\n"
         "    if number == 300: print(flush=True)\n"
@@ -138,7 +145,7 @@ def test_entries_wait_in_memory_while_the_disk_is_full_and_those_beyond_the_limi
 ):
     folder = small_disk("4m")
     problems: list[str] = []
-    log = AuditLog(folder, "server-1", wall_clock=lambda: 1e9, on_problem=problems.append).open()
+    log = log_in(folder, on_problem=problems.append)
     hog = fill(folder)
     for number in range(20_100):
         log.record("auth.cut-off", str(number))
@@ -151,6 +158,44 @@ def test_entries_wait_in_memory_while_the_disk_is_full_and_those_beyond_the_limi
     assert problems == ["the audit log of server-1 cannot be written: No space left on device"]
     assert [int(entry.subject) for entry in written] == list(range(20_000))
     assert (gap.action, gap.detail) == ("log.gap", {"entries": 100})
+
+
+def test_a_log_that_is_closed_on_a_full_disk_says_how_many_entries_it_lacks(
+    small_disk: Callable[[str], Path], fill: Callable[[Path], Path]
+):
+    folder = small_disk("4m")
+    problems: list[str] = []
+    log = log_in(folder, on_problem=problems.append)
+    fill(folder)
+    for number in range(200):
+        log.record("auth.cut-off", str(number), source="10.0.0.7")
+
+    assert not log.close()
+    lacks = 200 - len(entries(folder))
+    assert lacks > 0
+    assert problems == [
+        "the audit log of server-1 cannot be written: No space left on device",
+        f"the audit log of server-1 ends without its last {lacks} entries",
+    ]
+
+
+def test_entries_wait_while_the_disk_does_not_confirm_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    problems: list[str] = []
+    log = log_in(tmp_path, on_problem=problems.append)
+
+    def fail(fd: int) -> None:
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    for number in range(3):
+        log.record("auth.accepted", str(number))
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", fail)
+        assert not log.flush()
+    (tmp_path / "server-1.jsonl").write_bytes(b"")  # as a machine that fails leaves it
+
+    assert log.close()
+    assert subjects(tmp_path) == [0, 1, 2]
+    assert problems == ["the audit log of server-1 cannot be written: Input/output error"]
 
 
 def test_an_action_that_could_not_be_recorded_is_an_error(

@@ -64,7 +64,7 @@ def place(platform: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     for name in ("a", "b"):
         first = maps.commit(name, hostile_map(), parent=None, author=NAME, created_s=1e9, note=HOSTILE[:60])
         maps.commit(name, hostile_map(3), parent=first.id, author=NAME, created_s=2e9, note=HOSTILE[:60])
-    log = AuditLog(audit_folder(platform), "server-1", wall_clock=lambda: 1e9).open()
+    log = AuditLog(audit_folder(platform), "server-1", wall_clock=lambda: 1e9, on_problem=pytest.fail).open()
     detail = {HOSTILE: HOSTILE}
     log.add([Entry(time=1e9, actor=HOSTILE, action=HOSTILE, subject=HOSTILE, detail=detail)])
     log.close()

@@ -25,7 +25,7 @@ class Recorded(Service):
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self.log = AuditLog(folder, "data", wall_clock=lambda: 1e9).open()
+        self.log = AuditLog(folder, "data", wall_clock=lambda: 1e9, on_problem=pytest.fail).open()
         super().__init__(small_settings(), MemoryStore())
 
     def restart(self) -> None:

@@ -32,7 +32,8 @@ from rse_pf.backend.supervisor import serve
 from rse_pf.config import PlatformSettings
 o = json.loads(sys.argv[1])
 sys.exit(serve(PlatformSettings.from_dict(o["settings"]), keys=o["keys"] and KeySet.from_json(o["keys"]),
-    server_id=o["server"], announce=Path(o["announce"]), conformance_echo=o["echo"], services=o["services"]))
+    server_id=o["server"], announce=Path(o["announce"]), conformance_echo=o["echo"], services=o["services"],
+    audit=o["audit"] and Path(o["audit"])))
 """
 
 _SERVICES = """
@@ -91,8 +92,8 @@ class Server:
         self.lines: list[dict[str, Any]] = []
         self.text = ""
         self._heard = threading.Condition()
-        self._listener = threading.Thread(target=self._listen, daemon=True)
-        self._listener.start()
+        self.listener = threading.Thread(target=self._listen, daemon=True)
+        self.listener.start()
         self.wait_for_log("server-ready", START_S)
         self.identity = json.loads(announce.read_text())
         self.port: int = self.identity["port"]
@@ -155,7 +156,7 @@ class Server:
         with contextlib.suppress(ProcessLookupError):
             self.process.kill()
         self.process.wait()
-        self._listener.join(5)
+        self.listener.join(5)
         assert self.process.stderr is not None
         self.process.stderr.close()
 
@@ -205,13 +206,16 @@ def start_server(tmp_path):
     (tmp_path / "served_in_tests.py").write_text(_SERVICES)
     started: list[Server] = []
 
-    def start(*, keys: bool = False, echo: bool = False, **groups: dict[str, Any]) -> Server:
+    def start(
+        *, keys: bool = False, echo: bool = False, audit: Path | None = None, **groups: dict[str, Any]
+    ) -> Server:
         groups["serving"] = {"port": 0, "control_port": 0, "workers": 1, **groups.get("serving", {})}
         groups["auth"] = {"required": keys, **groups.get("auth", {})}
         announce = tmp_path / f"announce-{len(started)}.json"
         order = {
             "settings": groups, "keys": KEY.key_set().to_json() if keys else None, "echo": echo,
             "server": f"server-{len(started)}", "announce": str(announce), "services": "served_in_tests:make",
+            "audit": audit and str(audit),
         }  # fmt: skip
         process = subprocess.Popen(
             [sys.executable, "-c", _SERVE, json.dumps(order)],

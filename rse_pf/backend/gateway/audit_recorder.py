@@ -120,14 +120,13 @@ class AuditRecorder:
 class ServerAudit:
     """The audit log of one server; without a folder for it, nothing is recorded."""
 
-    def __init__(self, folder: Path | None, server_id: str) -> None:
+    def __init__(self, folder: Path | None, server_id: str, *, on_problem: Callable[[str], None]) -> None:
         """Open nothing yet; entering raises ConfigurationError if the log cannot be kept."""
-        self._log = None if folder is None else AuditLog(folder, server_id, wall_clock=time.time)
-
-    def complain_to(self, say: Callable[[str], None]) -> None:
-        """Call *say*, from any thread, when the log cannot be written."""
-        if self._log is not None:
-            self._log.on_problem = say
+        self._log = (
+            None
+            if folder is None
+            else AuditLog(folder, server_id, wall_clock=time.time, on_problem=on_problem)
+        )
 
     def note(self, action: str, **detail: Value) -> None:
         """Record an action of this server."""

@@ -15,7 +15,7 @@ import signal
 import socket
 import time
 from collections.abc import Awaitable, Callable, Mapping
-from contextlib import suppress
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -136,13 +136,19 @@ def serve(
             workers, spares = processes[:count], processes[count:]
             recording.hand_over()
             try:
-                with ServerAudit(audit, server_id) as records:
+                log = JsonLog(level=settings.serving.log_level, server=server_id, wall_clock=time.time)
+                with (
+                    closing(log),
+                    ServerAudit(
+                        audit, server_id, on_problem=lambda problem: log.error("audit-failed", reason=problem)
+                    ) as records,
+                ):
                     identity = _Identity(
                         server_id=server_id, digest=digest, announce=announce, control_token=control_token
                     )
                     supervisor = _Supervisor(
                         settings, identity, _Processes(workers=workers, spares=spares, others=recording.pids),
-                        trust=trust, listener=listener, records=records,
+                        trust=trust, listener=listener, log=log, records=records,
                     )  # fmt: skip
                     return run_in_loop(supervisor.run())
             finally:
@@ -181,6 +187,7 @@ class _Supervisor:
         *,
         trust: TrustStore | None,
         listener: socket.socket,
+        log: JsonLog,
         records: ServerAudit,
     ) -> None:
         self._settings = settings
@@ -208,8 +215,7 @@ class _Supervisor:
         )  # fmt: skip
         self._control_refused = 0
         self._control_token = identity.control_token
-        self._log = JsonLog(level=settings.serving.log_level, server=identity.server_id, wall_clock=time.time)
-        records.complain_to(lambda problem: self._log.error("audit", reason=problem))
+        self._log = log
         self._workers = processes.workers
         self._registry = SessionRegistry()
         self._on_robot = records.message_handler(self._registry.handle)
@@ -238,7 +244,6 @@ class _Supervisor:
             code = self._over.result() if self._over.done() else None
             self._log.info("server-over", exit_code=code)
             self._records.note("server.over", exit_code=code)
-            self._log.close()
 
     async def _start(self, loop: asyncio.AbstractEventLoop) -> None:
         readiness = [

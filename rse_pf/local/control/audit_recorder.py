@@ -7,7 +7,7 @@ platform.
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +20,10 @@ __all__ = ["PlatformAudit"]
 class PlatformAudit:
     """The log of one control plane, between `open` and `close`."""
 
-    def __init__(self, state: Path) -> None:
+    def __init__(self, state: Path, *, on_problem: Callable[[str], None]) -> None:
+        """Open nothing yet; *on_problem* is called as `AuditLog` says."""
         self._is_open = False
-        self._log = AuditLog(audit_folder(state), CONTROL_PLANE, wall_clock=time.time)
+        self._log = AuditLog(audit_folder(state), CONTROL_PLANE, wall_clock=time.time, on_problem=on_problem)
 
     def open(self) -> None:
         """Begin to record; raises ConfigurationError."""

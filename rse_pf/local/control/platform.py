@@ -123,7 +123,7 @@ class LocalPlatform:
         self._on_event = on_event
         self.lan = LanListener(address=lan, folder=self.state) if lan else None
         self._lock = PlatformLock(self.state)
-        self._audit = PlatformAudit(self.state)
+        self._audit = PlatformAudit(self.state, on_problem=self._report_unwritten_audit)
         self._metrics_port = metrics_port
         self._key: SigningKey | None = None
         self.backend_servers = LocalBackendServers(
@@ -203,6 +203,7 @@ class LocalPlatform:
             if self.lan is not None:
                 check_lan_settings(self.settings)
                 self.lan.prepare(self.name, now_s=time.time())
+            self._loop = asyncio.get_running_loop()
             self._audit.open()
         except ConfigurationError:
             self._lock.release()
@@ -582,10 +583,15 @@ class LocalPlatform:
             self._recording.close()
             self._audit.close()
             self._lock.release()
+        await asyncio.sleep(0)  # the end of the audit log may have had something to report
         self._emit("platform-gone")
 
     def _report_unwritten_state(self, problem: str) -> None:
         self._emit("not-written", reason=problem)
+
+    def _report_unwritten_audit(self, problem: str) -> None:
+        """Report *problem* in the event loop; the thread of the audit log calls this."""
+        self._loop.call_soon_threadsafe(self._report_unwritten_state, problem)
 
     def _emit(self, event: str, **details: Any) -> None:
         entry = {"event": event, **details}

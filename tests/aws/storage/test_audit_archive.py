@@ -63,7 +63,9 @@ class ShipperSetup:
 
     def write(self, count: int, who: str = INSTANCE) -> None:
         """Write *count* entries with ascending subjects; files are renamed on the way."""
-        log = AuditLog(self.folder, who, wall_clock=lambda: 1e9 + self.written, max_bytes=SMALL).open()
+        log = AuditLog(
+            self.folder, who, wall_clock=lambda: 1e9 + self.written, on_problem=pytest.fail, max_bytes=SMALL
+        ).open()
         for _ in range(count):
             log.record("auth.accepted", str(self.written))
             self.written += 1

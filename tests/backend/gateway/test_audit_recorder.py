@@ -142,7 +142,7 @@ def test_without_a_folder_notes_are_dropped(
     message: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.chdir(tmp_path)
-    with ServerAudit(None, "server-1") as records:
+    with ServerAudit(None, "server-1", on_problem=pytest.fail) as records:
         records.message_handler(lambda worker, other: None)("worker", message)
         records.note("server.over")
     assert list(tmp_path.iterdir()) == []

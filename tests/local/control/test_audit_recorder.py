@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
+
+import pytest
 
 from rse_pf.audit.log import audit_folder, read_entries
 from rse_pf.local.control.audit_recorder import PlatformAudit
 
 
 def test_the_events_of_the_platform_are_recorded_while_the_log_is_open(tmp_path: Path) -> None:
-    audit = PlatformAudit(tmp_path)
+    audit = PlatformAudit(tmp_path, on_problem=pytest.fail)
 
     audit.record({"event": "early"})
     audit.open()
@@ -21,4 +24,24 @@ def test_the_events_of_the_platform_are_recorded_while_the_log_is_open(tmp_path:
     assert [(entry.action, entry.subject, entry.detail) for entry in entries] == [
         ("platform.server-ready", "server-1", {"ports": "1,2"}),
         ("platform.over", "", {}),
+    ]
+
+
+def test_an_operator_learns_that_entries_cannot_be_written_and_how_many_are_lacking_at_the_end(
+    small_disk: Callable[[str], Path], fill: Callable[[Path], Path]
+) -> None:
+    state = small_disk("4m")
+    problems: list[str] = []
+    audit = PlatformAudit(state, on_problem=problems.append)
+    audit.open()
+    fill(state)
+    for number in range(200):
+        audit.record({"event": "server-ready", "server": f"server-{number}"})
+
+    audit.close()
+
+    written = len(list(read_entries(audit_folder(state) / "control-plane.jsonl")))
+    assert problems == [
+        "the audit log of control-plane cannot be written: No space left on device",
+        f"the audit log of control-plane ends without its last {201 - written} entries",
     ]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import re
 import signal
 
 import pytest
@@ -53,6 +54,27 @@ async def test_robots_that_do_not_move_get_their_answers_before_the_socket_close
     assert isinstance(result, Result)
     assert code == 1001
     assert server.process.wait(PROMPT_S) == 0
+
+
+async def test_a_server_on_a_full_disk_says_that_its_audit_log_fails_and_what_it_lacks_at_the_end(
+    start_server, small_disk, fill
+):
+    disk = small_disk("4m")
+    server = start_server(keys=True, audit=disk / "audit")
+    fill(disk)
+
+    for _ in range(50):  # the last block of the file has space for some entries
+        async with server.robot(token=server.token()):
+            pass
+    await in_thread(server.wait_for_log, "audit-failed")
+    server.process.send_signal(signal.SIGTERM)
+    assert server.process.wait(PROMPT_S) == 0
+    server.listener.join(PROMPT_S)
+    reasons = [line["reason"] for line in server.lines if line["event"] == "audit-failed"]
+    lacks = r"the audit log of server-0 ends without its last [1-9]\d* entries"
+    assert reasons[0] == "the audit log of server-0 cannot be written: No space left on device"
+    assert len(reasons) == 2
+    assert re.fullmatch(lacks, reasons[1])
 
 
 async def test_a_draining_server_is_not_ready_but_still_accepts(start_server):
