@@ -29,7 +29,7 @@ _RENEWALS_PER_LEASE = 5
 _MAX_RENEWAL_S = 1.0
 """Who follows a job of another server sees its progress no later than this."""
 MAX_TRIES = 3
-"""A job whose servers crashed this often is not run again: it may be the cause."""
+"""A job whose owners stopped renewing their lease this often is not run again: it may have crashed them."""
 
 State = Literal["running", "given-up", "done", "failed", "swept"]
 Verdict = Literal["take", "follow", "done", "failed", "poison"]
@@ -93,7 +93,9 @@ def renewal_s(lease_s: float) -> float:
     return min(_MAX_RENEWAL_S, lease_s / _RENEWALS_PER_LEASE)
 
 
-def verdict_on(record: JobRecord | None, *, unchanged_s: float, lease_s: float, is_watched: bool) -> Verdict:
+def verdict_on(
+    record: JobRecord | None, *, unchanged_s: float, lease_s: float, is_watched: bool, is_ours: bool = False
+) -> Verdict:
     """Return the action that follows from the record of a job that a robot asked for.
 
     Args:
@@ -102,8 +104,10 @@ def verdict_on(record: JobRecord | None, *, unchanged_s: float, lease_s: float, 
         lease_s: After this time without a renewal the owner is considered dead.
         is_watched: Whether this process waits for the run that the record describes; the failure of an
             earlier run is tried again.
+        is_ours: Whether this process, which does not run the job now, is its owner: its run failed before
+            it could write how it ended.
     """
-    if record is None or record.state == "given-up":
+    if record is None or record.state == "given-up" or (record.state == "running" and is_ours):
         return "take"
     if record.state == "done":
         return "done"
@@ -125,7 +129,7 @@ class JobLease:
         Args:
             store: Shared by all servers.
             name: Name of the record.
-            owner: Name that is unique to this process and this job.
+            owner: Name that is unique to this process.
             clock: Seconds, monotonic.
         """
         self.is_watched = False
@@ -154,10 +158,12 @@ class JobLease:
     def take(self) -> bool:
         """Become the owner; False if another process did first.
 
-        A run whose owner crashed counts as a try; one that was given up or that failed does not.
+        A run whose owner stopped renewing the lease counts as a try; one that was given up or that failed, or
+        that of an owner that lives, does not.
         """
-        before = self.record
-        tries = before.tries + 1 if before is not None and before.state == "running" else 1
+        before, tries = self.record, 1
+        if before is not None and before.state == "running":
+            tries = before.tries + (not self.is_ours)
         return self._write(JobRecord(state="running", owner=self._owner, tries=tries))
 
     def renew(self, share: float, what: str) -> bool:

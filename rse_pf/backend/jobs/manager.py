@@ -73,7 +73,7 @@ class JobManager(CommandQueue):
         log: Log,
         answer: Callable[[QueuedCommand, Result | Failure], None],
         progress: Callable[[Any, Progress], None],
-        new_owner: Callable[[], str],
+        owner: str,
     ) -> None:
         """Start nothing yet.
 
@@ -85,7 +85,7 @@ class JobManager(CommandQueue):
             answer: Called exactly once for each submitted command whose robot stays connected, unless the
                 server drains before the job's end.
             progress: Called with the connection of a command, and its progress.
-            new_owner: Returns a name that is unique among all servers.
+            owner: Name of this worker that is unique among all workers of all servers.
         """
         self._context = context
         self._serving = context.settings.serving
@@ -93,7 +93,7 @@ class JobManager(CommandQueue):
         self._log = log
         self._answer = answer
         self._progress = progress
-        self._new_owner = new_owner
+        self._owner = owner
         self._entries: dict[tuple[RobotId, str], _Entry] = {}
         self._cpu_s: defaultdict[str, float] = defaultdict(float)
         self._leaving = False
@@ -204,8 +204,6 @@ class JobManager(CommandQueue):
         return True
 
     def _begin(self, entry: _Entry) -> None:
-        owner = self._new_owner()
-
         def work() -> None:
             in_loop = self._loop.call_soon_threadsafe
 
@@ -213,7 +211,7 @@ class JobManager(CommandQueue):
                 in_loop(self._on_progress, entry, done, what)
 
             try:
-                outcome = run_job(entry.request, self._context, entry.signals, tell, owner)
+                outcome = run_job(entry.request, self._context, entry.signals, tell, self._owner)
             except Exception as error:  # noqa: BLE001  a defect must not leave the robot without an answer
                 self._log.error("job-defect", service=entry.request.service, reason=repr(error))
                 outcome = JobOutcome(error=RsePfError("the job failed", hint="the server's log has it"))

@@ -11,6 +11,7 @@ import select
 import socket
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -135,7 +136,7 @@ def run_job(
         context: Of the worker.
         signals: Set by the event loop of the worker.
         tell: Called in this thread with the share that is done, and what is being done.
-        owner: Name that is unique to this process and this call.
+        owner: Name that is unique to this process, which runs a job once at a time.
     """
     name = record_name(request.robot, request.key)
     lease = JobLease(ObjectRecords(context.store), name, owner, context.clock)
@@ -157,8 +158,9 @@ def _follow_or_run(
             lease.ask_to_cancel()
             return JobOutcome(error=_cancelled_error())
         verdict = verdict_on(
-            record, unchanged_s=lease.unchanged_s, lease_s=serving.job_lease_s, is_watched=lease.is_watched
-        )
+            record, unchanged_s=lease.unchanged_s, lease_s=serving.job_lease_s,
+            is_watched=lease.is_watched, is_ours=lease.is_ours,
+        )  # fmt: skip
         if verdict == "follow" and record is not None:
             tell(record.share, record.what)
             signals.wait(renewal_s(serving.job_lease_s) * _POLL_SHARE)
@@ -166,8 +168,10 @@ def _follow_or_run(
         if verdict == "failed" and record is not None:
             return JobOutcome(error=error_from_code(record.code, record.message, hint=record.hint))
         if verdict == "poison":
-            reason = f"{MAX_TRIES} servers crashed while they ran this job"
-            return JobOutcome(error=Poison(reason, hint="send less at once; tell the operator"))
+            reason = f"{MAX_TRIES} workers ended, or did not reach the store, while they ran this job"
+            name = record_name(request.robot, request.key)
+            hint = f"send less at once; the operator can allow it again by deleting the object {name}"
+            return JobOutcome(error=Poison(reason, hint=hint))
         if verdict == "done" and record is not None:
             stored = _stored_outcome(request, context, record)
             if stored is not None:
@@ -252,7 +256,7 @@ class _JobRun:
     def _supervise(self, process: Child) -> Literal["over", "lost", "given-up", "cancelled", "late"]:
         """Read from the process and renew the lease until the run ends."""
         serving, clock, signals = self._context.settings.serving, self._context.clock, self._signals
-        began = renewed = clock()
+        began = clock()
         next_heartbeat, killed_s = began + renewal_s(serving.job_lease_s), float("inf")
         while not self._is_over:
             now = clock()
@@ -267,9 +271,8 @@ class _JobRun:
                 return "late"
             if now >= next_heartbeat:
                 next_heartbeat = now + renewal_s(serving.job_lease_s)
-                if self._renew():
-                    renewed = clock()
-                elif not self._lease.is_ours or clock() - renewed >= serving.job_lease_s:
+                self._renew()
+                if not self._lease.is_ours:
                     return "lost"
             signals.wait(min(next_heartbeat, killed_s) - clock(), process.connection)
             self._read(process)
@@ -280,12 +283,10 @@ class _JobRun:
         record = self._lease.record
         return self._signals.cancelled or (record is not None and self._lease.is_ours and record.cancel)
 
-    def _renew(self) -> bool:
-        """Return whether the lease was renewed; a store that fails for less than a lease does no harm."""
-        try:
-            return self._lease.renew(self._done, self._what)
-        except StoreError:
-            return False
+    def _renew(self) -> None:
+        """Renew the lease; while the store fails, the job runs on, unless another server takes it."""
+        with suppress(StoreError):
+            self._lease.renew(self._done, self._what)
 
     def _read(self, process: Child) -> None:
         try:

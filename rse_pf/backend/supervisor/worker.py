@@ -395,7 +395,7 @@ class _Worker:
         return JobManager(
             context, loop=self._loop, log=self._log, answer=answers.send_message,
             progress=RobotConnection.write_progress,
-            new_owner=lambda: f"{plan.server_id}-{secrets.token_hex(8)}",
+            owner=f"{plan.server_id}-{secrets.token_hex(8)}",
         )  # fmt: skip
 
     async def run(self) -> None:

@@ -40,8 +40,9 @@ def looked(store: MemoryStore, owner: str, clock: Clock) -> JobLease:
 
 def verdict(lease: JobLease) -> str:
     return verdict_on(
-        lease.read(), unchanged_s=lease.unchanged_s, lease_s=LEASE_S, is_watched=lease.is_watched
-    )
+        lease.read(), unchanged_s=lease.unchanged_s, lease_s=LEASE_S, is_watched=lease.is_watched,
+        is_ours=lease.is_ours,
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize(
@@ -89,7 +90,7 @@ def test_an_owner_that_renews_keeps_the_job_and_one_that_does_not_loses_it(store
     assert not one.renew(0.6, "late")
     assert not one.is_ours
     assert not one.end(JobRecord(state="done", owner="", reply="cd"))
-    assert verdict(other) == "follow"
+    assert verdict(one) == "follow"
 
 
 def test_a_process_that_reads_a_record_for_the_first_time_waits_a_whole_lease(store, clock):

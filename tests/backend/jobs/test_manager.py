@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import itertools
 import os
 import queue
@@ -60,6 +61,7 @@ class Bench:
     def __init__(self, **serving: Any) -> None:
         self.settings = PlatformSettings.from_dict({"serving": {"job_lease_s": 0.25, **serving}})
         self.loop = FakeLoop()
+        self.failing_starts = 0
         self.started: queue.SimpleQueue[FakeProcess] = queue.SimpleQueue()
         self.answers: dict[int, Result | Failure] = {}
         self.progress: list[tuple[int, float, str]] = []
@@ -71,12 +73,15 @@ class Bench:
         )  # fmt: skip
         self.jobs = JobManager(
             context, loop=self.loop, log=FakeLog(),
-            new_owner=lambda: os.urandom(4).hex(),
+            owner="s-1",
             answer=lambda job, answer: self.answers.__setitem__(job.command.id, answer),
             progress=lambda _, told: self.progress.append((told.id, told.done, told.what)),
         )  # fmt: skip
 
     def start(self, request: JobRequest) -> FakeProcess:
+        if self.failing_starts:
+            self.failing_starts -= 1
+            raise OSError(errno.EAGAIN, os.strerror(errno.EAGAIN))
         process = FakeProcess(request)
         self.started.put(process)
         return process
@@ -148,6 +153,20 @@ def test_the_same_request_of_another_robot_or_tenant_is_another_job(make):
     asked = [bench.process() for _ in range(3)]
 
     assert len({each.request.robot for each in asked}) == 3
+
+
+def test_a_process_that_cannot_be_started_does_not_count_as_a_crash_of_the_server(make):
+    bench, owner = make(), robot()
+    bench.failing_starts = 5
+    for identity in range(5):
+        ask(bench, owner, identity)
+        bench.run_until(lambda identity=identity: identity in bench.answers)
+
+    ask(bench, owner, 5)
+    bench.process().done()
+    bench.run_until(lambda: 5 in bench.answers)
+
+    assert [code(bench.answers[identity]) for identity in range(6)] == ["error"] * 5 + ["ok"]
 
 
 def test_the_newest_job_of_a_robot_with_many_is_displaced_by_another_robot(make):

@@ -289,11 +289,13 @@ class Faulty(MemoryStore):
         super().compare_and_swap(name, expected, data)
 
 
-def test_a_short_failure_of_the_store_does_not_end_a_job(bench):
-    bench.store = Faulty(2, lambda: bench.processes[0].theirs.sendall(encode_message(DONE)))
+@pytest.mark.parametrize("failures", [2, 20], ids=["shorter than the lease", "longer than the lease"])
+def test_a_failure_of_the_store_does_not_end_a_job(bench, failures):
+    bench.store = Faulty(failures, lambda: bench.processes[0].theirs.sendall(encode_message(DONE)))
 
     assert code(bench.run(lambda: FakeProcess([], ends=False))) == "ok"
     assert bench.store.failures == 0
+    assert bench.record.tries == 1
 
 
 def test_a_store_that_fails_is_a_typed_failure(bench):
