@@ -84,6 +84,7 @@ def row_of(drive: CheckedDrive, fault: Fault | None) -> dict[str, Any]:
     row: dict[str, Any] = {
         "drive": drive.name, "frames": len(frames), "check_s": took_s, "findings": found,
         "cannot_tell": [each.kind.value for each in report.cannot_tell],
+        "doubts": [each.name.value for each in report.doubts],
     }  # fmt: skip
     if fault is not None:
         own = next((each for each in found if each["kind"] == fault.kind.value), None)
@@ -133,11 +134,14 @@ def table(
         for fault in (None, *(each for each in chosen if can_have(drive, each))):
             row = row_of(drive, fault) | {"is_recorded": drive.name in _RECORDINGS}
             rows.append(row)
-            said = ", ".join(f"{e['kind']} {e['value']:.3g}+-{e['deviation']:.2g}" for e in row["findings"])
+            said = ", ".join(
+                [f"{e['kind']} {e['value']:.3g}+-{e['deviation']:.2g}" for e in row["findings"]]
+                + [f"doubt {name}" for name in row["doubts"]]
+            )
             say(f"{drive.name} {'healthy' if fault is None else fault.name}: {said or 'nothing'}")
     planted = [row for row in rows if "fault" in row]
     healthy = [row for row in rows if "fault" not in row]
-    with_finding = sum(bool(row["findings"]) for row in healthy)
+    with_finding = sum(bool(row["findings"] or row["doubts"]) for row in healthy)
     by_fault: dict[str, list[dict[str, Any]]] = defaultdict(list)
     for row in planted:
         by_fault[row["fault"].rpartition("-")[0]].append(row)
