@@ -36,6 +36,7 @@ from client_sdk.bags.index import (
     read_index,
 )
 from client_sdk.bags.lens import Lens, Rectifier, lens_of
+from client_sdk.bags.lens_change import mismatch_px
 from client_sdk.bags.message_types import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, POSE
 from client_sdk.bags.realsense_recording import stated_depth_unit_m, stated_T_colour_depth
 from client_sdk.bags.registration import register_depth
@@ -65,6 +66,9 @@ __all__ = ["Bag", "BagOptions", "open_bag"]
 
 _USUAL_DEPTH_SCALE = 1000.0  # units of 16-bit depth in a metre: millimetres (REP 118)
 _SAME_VIEW = 0.01  # focal lengths and principal points of one view differ by less of the image's size
+_MOST_CHANGES = 5  # of the stated camera that are compared with the images; an autofocus changes it always
+_MISMATCH_PX = 3.0  # a change of the camera that the images contradict misses by more than this
+_MISMATCH_RATIO = 2.0  # and by more than this times what an unchanged camera misses by
 _ESTIMATED_FRAMES = {"odom", "map"}
 """Roots of tf whose poses another SLAM system or an odometry estimated."""
 
@@ -300,6 +304,7 @@ def _open(file: BagFile, options: BagOptions) -> Bag:
         times=[TimeFacts(stated_by=chosen.colour.name, stamps_s=np.array(bag.timestamps_s))],
         doubts=(*doubts, *_changes(chosen, lenses, lens)),
     )
+    _check_changes(bag, lenses, times)
     bag.log = DoubtLog(check_source(facts))
     return bag
 
@@ -352,6 +357,37 @@ def _changes(chosen: ChosenTopics, lenses: Sequence[Lens], lens: Lens) -> tuple[
     )
     hint = "give one calibration with --intrinsics, if the lens was not moved"
     return (Doubt(name=DoubtName.CAMERA_CHANGES, sentence=sentence, hint=hint),)
+
+
+def _check_changes(bag: Bag, lenses: Sequence[Lens], times: CameraTimes) -> None:
+    """Refuse cameras of which the images around a change say that it was none: one of both is wrong.
+
+    Raises:
+        UsageError: The images contradict the change.
+    """
+    if len(lenses) < 2:
+        return
+    valid = [times.row_at(stamp_ns, log_ns) for (_, stamp_ns, log_ns), *_ in bag._pairs]
+    changes = [row for row in range(1, len(valid)) if valid[row] != valid[row - 1]]
+    for row in changes[:_MOST_CHANGES]:
+        lens, other = lenses[valid[row - 1]], lenses[valid[row]]
+        try:
+            images = [decode_colour(bag._file.parse(bag._stream.take(bag._pairs[each])[0]))
+                      for each in (row - 1, row)]  # fmt: skip
+        except BrokenMessage:
+            continue
+        mismatches_px = mismatch_px(images[0], images[1], lens, other)
+        if mismatches_px is None:
+            continue
+        changed_px, unchanged_px = mismatches_px
+        if changed_px > max(_MISMATCH_RATIO * unchanged_px, unchanged_px + _MISMATCH_PX):
+            topic = _stated_by(bag.chosen, BagOptions())
+            raise UsageError(
+                f"{topic} states fx {lens.camera.fx:g} before {bag.timestamps_s[row]:.3f} s and "
+                f"fx {other.camera.fx:g} from then on, but the lens did not change: the images before and "
+                f"after miss by {changed_px:.0f} px with both cameras, and by {unchanged_px:.0f} px with one",
+                hint="give the calibration that is right: --intrinsics intrinsics.json",
+            )
 
 
 def _unit_note(unit_m: float | None, options: BagOptions, depth_scale: float) -> tuple[str, ...]:

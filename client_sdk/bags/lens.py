@@ -40,6 +40,16 @@ class Lens:
             is_fisheye=intrinsics.model == "fisheye",
         )
 
+    def rays(self, pixels: Array) -> Array:
+        """Return the directions ``(n, 3)``, of length 1, of what is seen at ``(n, 2)`` *pixels*."""
+        cv2 = load_opencv()
+        undistort = cv2.fisheye.undistortPoints if self.is_fisheye else cv2.undistortPoints
+        distortion = np.array(self.distortion or (0.0, 0.0, 0.0, 0.0))
+        seen = undistort(pixels.reshape(-1, 1, 2), self.camera.matrix, distortion).reshape(-1, 2)
+        rays = np.column_stack((seen, np.ones(len(seen))))
+        directions: Array = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+        return directions
+
 
 def lens_or_rig(file: Path) -> tuple[Lens | None, Rig | None]:
     """Return what a file of intrinsics, or of a rig, holds: ``lens`` and ``rig`` of `BagOptions`.

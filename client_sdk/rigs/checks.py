@@ -16,7 +16,7 @@ from client_sdk.frontend import DescribedPixels, Frame, describe, load_opencv
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Array
 
-__all__ = ["PairFault", "check_pairs", "fault_of_pairs", "spread_pairs"]
+__all__ = ["PairFault", "check_pairs", "fault_of_pairs", "match_features", "spread_pairs"]
 
 _FEATURES = 600
 _RATIO = 0.8
@@ -114,11 +114,11 @@ def _measured(pairs: Iterable[tuple[Frame, Frame]]) -> tuple[list[Array], list[A
         gray = np.repeat(frame.stereo.gray[:, :, None], 3, axis=2)
         left, right = (describe(image, _FEATURES) for image in (frame.rgb, gray))
         after = describe(later.rgb, _FEATURES)
-        rows, others = _matches(left, right)
+        rows, others = match_features(left, right)
         offset = left.pixels[rows] - right.pixels[others]
         good = np.abs(offset[:, 1]) < _MAX_ROWS_PX
         moved = np.full(len(left.pixels), np.nan)
-        seen, again = _matches(left, after)
+        seen, again = match_features(left, after)
         seconds = later.timestamp_s - frame.timestamp_s
         if seconds > 0.0:
             moved[seen] = (after.pixels[again, 1] - left.pixels[seen, 1]) / seconds
@@ -152,7 +152,7 @@ def _late_s(off_px: Array, flow_px_s: Array) -> float | None:
     return late_s if is_late else None
 
 
-def _matches(
+def match_features(
     one: DescribedPixels, other: DescribedPixels
 ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
     """Return the rows of features that are each other's nearest, and clearly so."""

@@ -38,6 +38,7 @@ from tests.client_sdk.bags.small_bags import (  # noqa: E402
     stamp_of,
     write_bag,
 )
+from tests.client_sdk.mapper.flat_world import CAMERA, frame_at  # noqa: E402
 
 INFO = "/camera/color/camera_info"
 COLOURS_MM = (-150.0, 0.0, 0.0)
@@ -135,6 +136,30 @@ def recorded_by_realsense(w: BagWriter) -> list[Message]:
     return found
 
 
+def plane_frames(stated_fx: Callable[[int], float], zoom: Callable[[int], float] = lambda row: 1.0) -> Make:
+    """Return what makes the drive of `flat_world` with a stated focal length, and a zoom, of each row."""
+
+    def make(w: BagWriter) -> list[Message]:
+        found: list[Message] = []
+        for row in range(FRAMES):
+            stamp, frame, fx = stamp_of(row), frame_at(row, depth=True), stated_fx(row)
+            centre, size = (CAMERA.cx, CAMERA.cy), (CAMERA.width, CAMERA.height)
+            larger = cv2.getRotationMatrix2D(centre, 0.0, zoom(row))
+            rgb = cv2.warpAffine(frame.rgb, larger, size)
+            depth_m = cv2.warpAffine(frame.depth_m, larger, size, flags=cv2.INTER_NEAREST)
+            k = np.array([fx, 0, CAMERA.cx, 0, fx, CAMERA.cy, 0, 0, 1.0])
+            lens = camera_info(w, stamp, k=k, width=CAMERA.width, height=CAMERA.height)
+            depth_mm = np.rint(1e3 * depth_m).astype(np.uint16)
+            found += [
+                (INFO, CAMERA_INFO, stamp, lens),
+                (COLOUR, IMAGE, stamp, raw_image(w, stamp, rgb, "rgb8")),
+                (DEPTH, IMAGE, stamp, raw_image(w, stamp, depth_mm, "16UC1")),
+            ]
+        return found
+
+    return make
+
+
 @pytest.mark.parametrize("step_ns", [250_000_000, 300_000_000, 3_600_000_000_000])
 def test_frames_keep_their_order_where_the_clock_is_set_back(tmp_path: Path, step_ns: int) -> None:
     make = frames(stamp=lambda row: stamp_of(row) - (step_ns if row > 2 else 0))
@@ -204,6 +229,30 @@ def test_images_of_a_camera_that_changes_are_resampled_and_told(tmp_path: Path) 
         assert inner.mean() < 8.0
         assert not first.rgb[:8].any()
         assert (second.rgb == scene().colours[1]).all()
+
+
+@pytest.mark.parametrize("stated_fx", [700.0, 400.0, 560.0])
+@pytest.mark.parametrize("first", [1, 4])
+def test_a_change_of_the_camera_that_the_images_contradict_is_refused(
+    tmp_path: Path, stated_fx: float, first: int
+) -> None:
+    make = plane_frames(stated_fx=lambda row: CAMERA.fx if row < first else stated_fx)
+
+    with pytest.raises(UsageError, match=rf"fx {CAMERA.fx:g} before .* and fx {stated_fx:g} from") as refused:
+        open_bag(write_bag(tmp_path, make=make))
+    assert "the lens did not change" in refused.value.message
+    assert "--intrinsics" in refused.value.hint
+
+
+@pytest.mark.parametrize("zoom", [1.4, 1.1])
+def test_a_change_of_the_camera_that_the_images_show_is_a_finding(tmp_path: Path, zoom: float) -> None:
+    make = plane_frames(
+        stated_fx=lambda row: CAMERA.fx * (zoom if row > 2 else 1.0),
+        zoom=lambda row: zoom if row > 2 else 1.0,
+    )
+
+    with open_bag(write_bag(tmp_path, make=make)) as bag:
+        assert [doubt.name.value for doubt in bag.log.doubts] == ["camera-changes"]
 
 
 def test_a_recorder_of_realsense_states_unit_cameras_and_mounts(tmp_path: Path) -> None:
