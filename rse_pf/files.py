@@ -17,8 +17,8 @@ from typing import Any
 from rse_pf.errors import UsageError
 
 __all__ = [
-    "OWNER_ONLY", "TEMPORARY_PREFIX", "create_private_file", "read_private_file", "read_regular_file",
-    "replace_file", "replace_json", "sync_folder",
+    "OWNER_ONLY", "TEMPORARY_PREFIX", "check_exists", "create_private_file", "read_private_file",
+    "read_regular_file", "replace_file", "replace_json", "sync_folder",
 ]  # fmt: skip
 
 OWNER_ONLY = 0o600
@@ -28,6 +28,19 @@ TEMPORARY_PREFIX = ".part-"
 _BY_UMASK = 0o666
 _OTHERS = 0o077
 _MAX_BYTES = 1 << 20
+
+
+def check_exists(path: Path | str, hint: str) -> None:
+    """Refuse a path that does not exist, and name the first folder of it that is missing.
+
+    Raises:
+        UsageError: Neither a file nor a folder is there.
+    """
+    path = Path(path)
+    missing = [each for each in (path, *path.parents) if not each.exists()]
+    if missing:
+        where = f": there is no folder {missing[-1]}" if len(missing) > 1 else ""
+        raise UsageError(f"{path} does not exist{where}", hint=hint)
 
 
 def replace_file(

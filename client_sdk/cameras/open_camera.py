@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from client_sdk.cameras.folder import list_folder, list_pairs
-from client_sdk.cameras.opencv_video import is_video_file, open_video
+from client_sdk.cameras.opencv_video import open_video
 from client_sdk.cameras.pairs import open_pair_videos, split_pairs
 from client_sdk.cameras.realsense import open_realsense, open_realsense_stereo
 from client_sdk.cameras.source import (
@@ -28,11 +28,14 @@ from client_sdk.rigs.rig import Rig
 from client_sdk.rigs.rig_file import read_calibration, read_rig
 from client_sdk.source_facts import CameraFacts, DoubtLog, SourceFacts, check_source
 from rse_pf.errors import UsageError
+from rse_pf.files import check_exists
 from rse_pf.geometry import Camera
 
 __all__ = ["is_recording", "open_camera", "source_of_frames"]
 
 _ROS = {".mcap", ".db3"}
+_REALSENSE = ("realsense", "realsense-stereo")  # words for devices
+_SOURCES = "name a device by its number, a video, a folder or a recording that exists"
 
 
 def open_camera(
@@ -64,6 +67,9 @@ def open_camera(
     """
     word = str(source)
     path = Path(word)
+    for name in (word,) if path.exists() or word.count(",") != 1 else word.split(","):
+        if not name.isdigit() and "://" not in name and name not in _REALSENSE:
+            check_exists(name, _SOURCES)
     own = read_calibration(intrinsics) if isinstance(intrinsics, Path | str) else intrinsics
     stated_by = str(intrinsics) if isinstance(intrinsics, Path | str) else f"the intrinsics of {word}"
     if word == "realsense-stereo":
@@ -113,7 +119,6 @@ def open_camera(
             f"{word} names two cameras, and no rig",
             hint=f"rse-pf camera calibrate --stereo {word.replace(',', ' ')}; then --intrinsics rig.json",
         )
-    is_video_file(word)  # a name that is wrong is told before intrinsics that are missing
     if own is None:
         raise UsageError(f"the intrinsics of {word} are not known", hint=TYPICAL_HINT)
     facts = _facts_of_lens(word, own, stated_by)

@@ -15,9 +15,10 @@ from typing import Any
 from client_sdk.cameras.source import RawFrame
 from client_sdk.datasets.images import colour_of
 from rse_pf.errors import UsageError
+from rse_pf.files import check_exists
 from rse_pf.images import MAX_IMAGE_PIXELS, load_opencv
 
-__all__ = ["Video", "is_video_file", "open_video"]
+__all__ = ["Video", "open_video"]
 
 _LOOKED_AT = 3  # frames that are read to see whether a file has presentation times
 _MAX_MISSES = 30
@@ -44,18 +45,6 @@ class Video:
         return (0.0, self.frames * self.period_s) if self.frames else None
 
 
-def is_video_file(source: str) -> bool:
-    """Say whether a source is a file, neither a device nor a stream.
-
-    Raises:
-        UsageError: There is no such file.
-    """
-    is_file = not source.isdigit() and "://" not in source
-    if is_file and not Path(source).is_file():
-        raise UsageError(f"there is no video {source}", hint="name a device number, a video or a folder")
-    return is_file
-
-
 def open_video(source: str, clock: Callable[[], float] = time.monotonic) -> Video:
     """Open a device (``0``), a video file or a stream.
 
@@ -64,7 +53,14 @@ def open_video(source: str, clock: Callable[[], float] = time.monotonic) -> Vide
         MissingExtra: OpenCV is not installed.
     """
     cv2 = load_opencv()
-    is_device, is_file = source.isdigit(), is_video_file(source)
+    is_device, is_file = source.isdigit(), not source.isdigit() and "://" not in source
+    if is_file:
+        check_exists(source, "name a device by its number, or a video")
+    if is_file and not Path(source).is_file():
+        raise UsageError(
+            f"there is no video {source}: it is no regular file",
+            hint="name a video, or a device by its number, such as 0",
+        )
     if is_file and _is_text(Path(source)):
         raise UsageError(
             f"{source} is a text, not a video", hint="a playlist names other files: name the video itself"
@@ -74,9 +70,15 @@ def open_video(source: str, clock: Callable[[], float] = time.monotonic) -> Vide
     if not capture.isOpened():
         capture.release()
         if is_device:
+            device = Path(f"/dev/video{int(source)}")
+            if device.parent.is_dir() and not device.exists():
+                raise UsageError(
+                    f"camera {source} cannot be opened: {device} does not exist",
+                    hint="connect the camera; ls /dev/video* lists those that are there",
+                )
             raise UsageError(
                 f"camera {source} cannot be opened",
-                hint="see ls /dev/video*; close other programs that use it; add yourself to the group video",
+                hint="close other programs that use it, and add yourself to the group video",
             )
         raise UsageError(f"{source} is not a video that OpenCV can read", hint="convert it, such as to mp4")
     width, height = (

@@ -38,7 +38,7 @@ from client_sdk.source_facts import (
     stamps_in_seconds,
 )
 from rse_pf.errors import UsageError
-from rse_pf.files import read_regular_file
+from rse_pf.files import check_exists, read_regular_file
 from rse_pf.geometry import Camera
 
 __all__ = ["associate_stamps", "dataset_of_bag", "is_listed", "open_dataset"]
@@ -88,6 +88,7 @@ def open_dataset(
         MissingExtra: OpenCV, h5py or rosbags is needed and not installed.
     """
     path = Path(path)
+    check_exists(path, "name a folder of TUM (rgb.txt, depth.txt, images), EuRoC or KITTI, or a ROS bag")
     if intrinsics is not None and not (_is_bag(path) or is_listed(path)):
         raise UsageError(
             f"{path} has a calibration of its own format", hint="leave out --intrinsics, or change that file"
@@ -128,11 +129,6 @@ def _open_single(path: Path, scene: str | None, intrinsics: Path | None) -> Data
         if path.suffix != ".mat":
             raise UsageError(f"{path} is not a recording", hint="name a folder, a ROS bag or the .mat file")
         return _open_labelled(path, scene)
-    if not path.is_dir():
-        raise UsageError(
-            f"no folder {path}",
-            hint="name a folder of TUM (rgb.txt, depth.txt, images), EuRoC or KITTI",
-        )
     if scene is not None:
         raise UsageError(f"{path} has no scenes", hint="name scenes for the labelled .mat file only")
     if not is_listed(path) and any(path.glob("d-*.pgm")):
