@@ -550,7 +550,7 @@ class Mapper:
         if pose is None and not reason:
             reason = f"only {tracked.matches} matches, or their pose is not plausible"
             if not tracked.matches:
-                reason = "no matches: a dark or blurred image, or a place that was not seen just before"
+                reason = "no matches: it shows nothing that was seen just before"
         if pose is not None and answer is not None and answer.solution.verdict == "weak":
             reason = answer.solution.reason
         status = tracked.status

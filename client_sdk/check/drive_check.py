@@ -66,6 +66,11 @@ class DriveCheck:
         if observer is not None:
             self._tried(lambda: observer.add(frame, tracked))
 
+    def cause_of_loss(self) -> str | None:
+        """Return why most lost frames have no pose, if their images show it and are checked."""
+        observer = self._observer
+        return None if observer is None else self._tried(observer.cause_of_loss)
+
     def finish(
         self,
         reference: MotionReference | None = None,

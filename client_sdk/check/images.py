@@ -15,6 +15,9 @@ from rse_pf.geometry import Array
 __all__ = ["FrameStatistics", "sharpness"]
 
 _Image = npt.NDArray[np.uint8]
+_SHARPEN = "drive more slowly, shorten the exposure or add light, and focus the lens"
+_LIGHTEN = "add light, lengthen the exposure, or uncover the lens"
+_SHOW_TEXTURE = "point the camera at things with texture, not at a bare wall or the sky alone"
 
 _LINES, _THUMBNAIL = 60, 32
 """So many rows and columns of an image are looked at, and pixels along a side are compared with the last."""
@@ -26,6 +29,7 @@ _LEAST_SHARE = {FaultKind.BLUR: 0.3, FaultKind.DARK: 0.05, FaultKind.REPEATED: 0
 _LEAST_FRAMES = 3
 _STILL, _LONGEST_RUN = 0.3, 10
 _FROZEN_JUMP = 1.7  # times the usual change; a camera that was at rest drives on with less
+_MOSTLY = 0.5  # of the lost frames have a cause in common
 _NEAR_WHOLE, _LEAST_JITTER, _LONGEST_GAP = 0.15, 0.15, 50.0
 
 
@@ -69,11 +73,11 @@ class FrameStatistics:
         found = [
             self._share(
                 FaultKind.BLUR, self.blurred(), "blurred: their edges are wider than 7 px",
-                "drive more slowly, shorten the exposure or add light, and focus the lens",
+                _SHARPEN,
             ),
             self._share(
                 FaultKind.DARK, self.dark(), "dark: they show nothing",
-                "add light, lengthen the exposure, or uncover the lens",
+                _LIGHTEN,
             ),
             self._share(
                 FaultKind.REPEATED, self.repeated(), "the image before once more, with a new time stamp",
@@ -107,6 +111,25 @@ class FrameStatistics:
         """Return which frames ``(n,)`` show no edge at all: a plain wall, or nothing."""
         empty: npt.NDArray[np.bool_] = np.isnan(np.array(self._sharpness).reshape(-1, 2)).all(axis=1)
         return empty
+
+    def cause_of_loss(self, is_lost: npt.NDArray[np.bool_]) -> str | None:
+        """Return what most of the lost frames ``(n,)`` lack and what to do; None if they show enough.
+
+        A dark image has no edges either, and a strong blur leaves few, so that darkness counts first, and the
+        most frequent cause is named.
+        """
+        is_dark = self.dark()
+        is_plain = self.empty() & ~is_dark
+        causes = (
+            (is_dark, "are dark", _LIGHTEN), (is_plain, "show no texture", _SHOW_TEXTURE),
+            (self.blurred() & ~is_dark & ~is_plain, "are blurred", _SHARPEN),
+        )  # fmt: skip
+        counts = [int(np.count_nonzero(rows & is_lost)) for rows, *_ in causes]
+        total = int(np.count_nonzero(is_lost))
+        if sum(counts) <= _MOSTLY * total:
+            return None
+        _, what, fix = causes[int(np.argmax(counts))]
+        return f"{max(counts)} of {total} frames without a pose {what}: {fix}"
 
     def repeated(self) -> npt.NDArray[np.bool_]:
         """Return which frames ``(n,)`` have the image of the frame before, while the camera moves."""

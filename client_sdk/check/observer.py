@@ -54,6 +54,7 @@ class DriveObserver:
         self._scene = SceneWatch()
         self._history: ImuHistory | None = None
         self._poses: list[tuple[float, Array, int]] = []
+        self._is_lost: list[bool] = []
         self._has_depth = self._has_stereo = self._is_metric = False
         self._pair_fault: PairFault | None = None
         self._pair_offsets: Mapping[int, StereoAdjustment] = {}
@@ -65,6 +66,7 @@ class DriveObserver:
             MissingExtra: OpenCV is not installed.
         """
         self._images.add(frame.timestamp_s, frame.rgb)
+        self._is_lost.append(tracked is None or tracked.T_world_camera is None)
         found = None if tracked is None else tracked.features
         self._store.add(frame, None if tracked is None else tracked.T_world_camera, found)
         self._has_stereo |= frame.stereo is not None
@@ -85,6 +87,10 @@ class DriveObserver:
     def add_offsets(self, found: Mapping[int, StereoAdjustment]) -> None:
         """Take what `Mapper.adjust_pairs` found in a stereo drive, by segment, before `finish`."""
         self._pair_offsets = found
+
+    def cause_of_loss(self) -> str | None:
+        """Return why most frames without a pose have none, with what to do, if their images show it."""
+        return self._images.cause_of_loss(np.array(self._is_lost, dtype=bool))
 
     def finish(self, doubts: Sequence[Doubt] = (), accepted: Iterable[str] = ()) -> CheckReport:
         """Return what is wrong with the drive, worst first, and what it cannot tell.

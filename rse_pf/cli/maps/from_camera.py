@@ -12,7 +12,7 @@ import contextlib
 import json
 import signal
 import time
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from client_sdk.frontend import Frame
     from client_sdk.mapper import Mapper
     from client_sdk.mapping import Trajectory
+    from client_sdk.source_facts import Doubt
     from rse_pf.geometry import Array
 
 __all__ = [
@@ -237,7 +238,7 @@ def map_source(
         raise CommandFailed(
             f"{report['frames'] - posed} of {report['frames']} frames have no pose: {report['lost_frames']} "
             f"lost, {report['frames_before_start']} before the start",
-            hint=_advice(mapper, source),
+            hint=_advice(mapper, source, check, doubts),
         )
     return 0
 
@@ -427,7 +428,13 @@ class _Status:
         show_progress(self._last, is_over=True)
 
 
-def _advice(mapper: Mapper, source: FrameStream) -> str:
+def _advice(mapper: Mapper, source: FrameStream, check: DriveCheck, doubts: Sequence[Doubt]) -> str:
+    """Return what to do about frames without a pose: by what the images show, a finding, or the sensors."""
+    cause = check.cause_of_loss()
+    if cause is not None:
+        return cause
+    if doubts:
+        return f"settle the finding {doubts[0].name.value} first: {doubts[0].hint}"
     if mapper.keyframes == 0 and not source.has_depth and not source.has_stereo:
         return "without depth the camera must move sideways, over things with texture; or use a depth camera"
-    return "move more slowly, with more light, and check the intrinsics; see frames.csv for the reasons"
+    return f"move more slowly, and compare the intrinsics with the camera; {FRAMES_FILE} has the reasons"

@@ -7,6 +7,7 @@ import contextlib
 import csv
 import json
 from collections.abc import AsyncIterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -134,6 +135,33 @@ def test_a_source_that_fails_keeps_what_was_mapped(folder: Path, capsys: pytest.
     assert "finding ended-early: the source failed after 4 frames, which are kept" in shown.out
     assert "is 32x24 px, the camera of the recording 320x240 px" in shown.err
     assert len(read_trajectory(folder / "out/trajectory.txt")) == 4
+
+
+RNG = np.random.default_rng(3)
+
+
+@pytest.mark.parametrize(
+    ("seen", "hint"),
+    [
+        (lambda image: RNG.normal(170, 2, image.shape), "show no texture: point the camera at things with"),
+        (lambda image: np.full_like(image, 255), "show no texture"),
+        (lambda image: 0.04 * image, "are dark: add light"),
+        (lambda image: RNG.normal(6, 2, image.shape), "are dark: add light"),
+        (lambda image: cv2.blur(np.kron(RNG.integers(0, 256, (8, 10, 3)), np.ones((30, 32, 1))), (25, 25)),
+         "are blurred: drive more slowly"),
+        (lambda image: image[RNG.permutation(240)], "compare the intrinsics"),
+    ],
+)  # fmt: skip
+def test_the_hint_of_a_lost_drive_names_what_its_images_show(
+    folder: Path, seen: Any, hint: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    frames = [frame_at(row, depth=True) for row in range(12)]
+    lost = [replace(frame, rgb=np.clip(seen(frame.rgb), 0, 255).astype(np.uint8)) for frame in frames]
+    write_tum(folder / "drive", lost, Trajectory(np.arange(12) / 10, np.tile(np.eye(4), (12, 1, 1))))
+
+    assert main(["map", "from-camera", "drive", *PLATFORM]) == 1
+
+    assert hint in capsys.readouterr().err.splitlines()[-1]
 
 
 def test_a_path_without_scale_has_no_error_in_centimetres(
