@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from client_sdk.source_facts import doubt_line
@@ -19,8 +19,11 @@ __all__ = ["DriveCheck", "check_lines"]
 _T = TypeVar("_T")
 
 
-def check_lines(told: Mapping[str, Any], *, is_whole: bool = False) -> list[str]:
-    """Return a report for people: each finding with its fix; *is_whole* adds cost and what cannot be told."""
+def check_lines(told: Mapping[str, Any], *, is_whole: bool = False, shown: Collection[str] = ()) -> list[str]:
+    """Return a report for people: each finding with its fix.
+
+    *is_whole* adds cost and what cannot be told; doubts whose lines were *shown* before are left out.
+    """
     findings: Sequence[Mapping[str, Any]] = told.get("findings") or []
     untold: Sequence[Mapping[str, Any]] = told.get("cannot_tell") or []
     lines = []
@@ -30,7 +33,7 @@ def check_lines(told: Mapping[str, Any], *, is_whole: bool = False) -> list[str]
         lines.append(f"check: {each.get('sentence')}{bends}; {each.get('fix')}")
     kinds = sorted({str(each.get("kind")) for each in untold})
     doubts: Sequence[Mapping[str, Any]] = told.get("source") or []
-    lines += [doubt_line(each) for each in doubts]
+    lines += [line for each in doubts if (line := doubt_line(each)) not in shown]
     if doubts:
         lines.append(
             "check: no advice on the calibration while the source has a finding that is not accepted"
@@ -93,12 +96,16 @@ class DriveCheck:
         return {"failed": self._failed} if self._failed else None
 
     @staticmethod
-    def lines(told: Mapping[str, Any] | None) -> list[str]:
-        """Return the short form of what `finish` returned."""
+    def lines(told: Mapping[str, Any] | None, shown: Collection[str] = ()) -> list[str]:
+        """Return the short form of what `finish` returned, without doubts that were *shown* before."""
         if told is None:
             return []
         failed = told.get("failed")
-        return [f"check: it failed ({failed}); --no-check leaves it out"] if failed else check_lines(told)
+        return (
+            [f"check: it failed ({failed}); --no-check leaves it out"]
+            if failed
+            else check_lines(told, shown=shown)
+        )
 
     def _tried(self, work: Callable[[], _T]) -> _T | None:
         try:

@@ -88,7 +88,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
             raise UsageError(
                 f"cannot make {args.out}: {error.strerror}", hint="name another --out"
             ) from error
-    report, own = _checked(args, settings)
+    report, own, shown = _checked(args, settings)
     told = report.to_dict()
     if args.out is not None:
         replace_file(args.out / "report.json", (json.dumps(told, indent=2) + "\n").encode())
@@ -96,7 +96,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     if args.json:
         show_json(told, indent=2)
     else:
-        show(*check_lines(told, is_whole=True), *written)
+        show(*check_lines(told, is_whole=True, shown=shown), *written)
     return 1 if report.findings or report.doubts or report.poses == 0 else 0
 
 
@@ -122,8 +122,10 @@ def _show_results(args: argparse.Namespace, file: Path) -> int:
     return 1 if told.get("findings") or told.get("source") or told.get("poses") == 0 else 0
 
 
-def _checked(args: argparse.Namespace, settings: PlatformSettings) -> tuple[CheckReport, Intrinsics]:
-    """Track the source, and return what is wrong with it and the intrinsics that it has now."""
+def _checked(
+    args: argparse.Namespace, settings: PlatformSettings
+) -> tuple[CheckReport, Intrinsics, tuple[str, ...]]:
+    """Track the source, and return what is wrong with it, its intrinsics, and the lines that were shown."""
     from client_sdk.bags import is_bag
     from client_sdk.cameras import open_camera
     from client_sdk.cameras.open_camera import is_recording
@@ -139,11 +141,11 @@ def _checked(args: argparse.Namespace, settings: PlatformSettings) -> tuple[Chec
         ) as source:
             most = args.frames or (_MOST_LIVE if str(args.source).isdigit() else None)
             log = _compared(source.log, reference, source.span_s)
-            show_source(source.notes, unresolved(log.doubts, args.accept))
+            shown = show_source(source.notes, unresolved(log.doubts, args.accept))
             report = _watched(
                 source, settings, reference, None, log, args.accept, has_depth=source.has_depth, most=most
             )
-            return report, _base(args, Intrinsics(camera=source.camera))
+            return report, _base(args, Intrinsics(camera=source.camera)), shown
     dataset = open_dataset(path, camera=args.camera, imu=args.imu, intrinsics=args.intrinsics)
     fault: PairFault | None = None
     if dataset.has_stereo:
@@ -153,12 +155,12 @@ def _checked(args: argparse.Namespace, settings: PlatformSettings) -> tuple[Chec
     truth = MotionReference.of_truth(dataset.truth, dataset.truth_kind, is_camera=not is_bag(path))
     reference = _reference(args, truth)
     log = dataset.log if reference is truth else _compared(dataset.log, reference, dataset.span_s)
-    show_source(dataset.notes, unresolved(log.doubts, args.accept))
+    shown = show_source(dataset.notes, unresolved(log.doubts, args.accept))
     has_depth = dataset.has_depth and not args.no_depth
     report = _watched(
         iter(dataset), settings, reference, fault, log, args.accept, has_depth=has_depth, most=args.frames
     )
-    return report, _base(args, Intrinsics(camera=dataset.camera))
+    return report, _base(args, Intrinsics(camera=dataset.camera)), shown
 
 
 def _compared(

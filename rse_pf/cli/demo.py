@@ -127,13 +127,14 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     from rse_pf.experiments.demo.run import DemoOptions, run_demo
     from rse_pf.pnp import usable_engine
 
+    shown: tuple[str, ...] = ()
     if args.data is not None:
         from client_sdk.datasets import open_dataset
 
         check_accepted(args.accept)
         dataset = open_dataset(args.data, camera=args.camera, imu=args.imu)
         dataset.check()
-        show_source(dataset.notes, unresolved(dataset.log.doubts, args.accept))
+        shown = show_source(dataset.notes, unresolved(dataset.log.doubts, args.accept))
         thinned = dataset.thinned(args.rate)
         if len(thinned) < len(dataset):
             show(
@@ -160,5 +161,6 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
         quiet=args.quiet,
         check=args.check,
         accepted=tuple(args.accept),
+        shown=shown,
     )
     return run_demo(options, settings)

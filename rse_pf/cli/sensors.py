@@ -41,6 +41,12 @@ def add_accept_argument(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
 
 
-def show_source(notes: Iterable[str], doubts: Iterable[Doubt]) -> None:
-    """Show what was assumed about a source, and what is unlikely, before it is used."""
-    show(*(f"note: {note}" for note in notes), *(doubt.line() for doubt in doubts), error=True)
+def show_source(notes: Iterable[str], doubts: Iterable[Doubt]) -> tuple[str, ...]:
+    """Show what was assumed about a source, and what is unlikely, before it is used.
+
+    Returns:
+        The lines of the doubts, which need not be shown again.
+    """
+    lines = tuple(doubt.line() for doubt in doubts)
+    show(*(f"note: {note}" for note in notes), *lines, error=True)
+    return lines

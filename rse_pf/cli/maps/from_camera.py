@@ -192,7 +192,7 @@ def map_source(
             images.add(tracked)
 
     check_accepted(args.accept)
-    show_source(source.notes, unresolved(source.log.doubts, args.accept))
+    shown = show_source(source.notes, unresolved(source.log.doubts, args.accept))
     mapper, failed = asyncio.run(_drive(args, settings, source, scale, frames, watch))
     if failed is not None:
         source.log.add(ended_early(failed, mapper.frames))
@@ -226,8 +226,8 @@ def map_source(
         *accuracy_lines(report),
         *frames.lines(),
         *([f"the IMU is {report['imu']}"] if str(report.get("imu") or "").startswith("not") else []),
-        *([] if args.check else [doubt.line() for doubt in doubts]),
-        *check.lines(checked),
+        *([] if args.check else [line for doubt in doubts if (line := doubt.line()) not in shown]),
+        *check.lines(checked, shown),
         f"results: {args.out}/map.ply, map.png, trajectory.txt, {FRAMES_FILE}, report.json",
         kept_line,
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -94,8 +94,8 @@ def demo_page(report: Mapping[str, Any]) -> str:
     )
 
 
-def closing_lines(report: Mapping[str, Any], folder: Path) -> str:
-    """Return what the terminal shows at the end; the last line names the files."""
+def closing_lines(report: Mapping[str, Any], folder: Path, shown: Collection[str] = ()) -> str:
+    """Return what the terminal shows at the end, without doubts that were *shown*; files come last."""
     trip, commands = report["round_trip_ms"], report["commands"]
     times = f"round trip p50 {trip['p50']} ms, p99 {trip['p99']} ms"
     first = (
@@ -122,7 +122,7 @@ def closing_lines(report: Mapping[str, Any], folder: Path) -> str:
         files = f"{shown}/map_merged.png, {shown}/merged.ply, "
         third += f"show the merged map: rse-pf map show merged --store dir:{shown}/platform/objects\n"
     for name, told in report.get("checks", {}).items():
-        third += "".join(f"{name}: {line}\n" for line in DriveCheck.lines(told))
+        third += "".join(f"{name}: {line}\n" for line in DriveCheck.lines(told, shown))
     if "live" in report:
         third += live_lines(report["live"], report["robots"])
     return (

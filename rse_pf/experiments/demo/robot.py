@@ -74,6 +74,8 @@ class DemoOptions:
     """Whether drives of a recording are checked."""
     accepted: tuple[str, ...] = ()
     """Names of doubts about the recording that the user takes for right."""
+    shown: tuple[str, ...] = ()
+    """Lines of doubts about the recording that the user has seen before the drive."""
 
     @property
     def frame_count(self) -> int:

@@ -99,7 +99,7 @@ def run_demo(options: DemoOptions, settings: PlatformSettings, fault: LiveFault 
         chosen = fault.settings(chosen)
     with (folder / EVENTS).open("w", encoding="utf-8") as file:
         report = asyncio.run(_run(options, chosen, folder, EventLog(file), fault))
-    show_page(closing_lines(report, folder))
+    show_page(closing_lines(report, folder, options.shown))
     return 1 if is_lost(report) else 0
 
 

@@ -137,6 +137,21 @@ def test_a_source_that_fails_keeps_what_was_mapped(folder: Path, capsys: pytest.
     assert len(read_trajectory(folder / "out/trajectory.txt")) == 4
 
 
+def test_a_finding_about_the_source_is_shown_once(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    frames = [frame_at(row, depth=True) for row in range(6)]
+    write_tum(folder / "drive", frames, Trajectory(np.arange(6) + 50.0, np.tile(np.eye(4), (6, 1, 1))))
+    (folder / "drive/rgb/003.png").write_bytes(b"")
+
+    main(["map", "from-camera", "drive", *PLATFORM])
+
+    shown = capsys.readouterr()
+    assert shown.err.count("finding reference-times: ") == 1
+    assert "finding reference-times: " not in shown.out
+    assert shown.out.count("finding left-out: 1 image left out, damaged or empty: 003.png") == 1
+    report = json.loads(Path("out-camera/report.json").read_text())
+    assert [each["name"] for each in report["check"]["source"]] == ["reference-times", "left-out"]
+
+
 RNG = np.random.default_rng(3)
 
 
