@@ -22,7 +22,7 @@ from rse_pf.errors import RsePfError, UsageError
 from rse_pf.geometry import Array, Camera
 
 __all__ = [
-    "CameraFacts", "DepthFacts", "Doubt", "DoubtLog", "DoubtName", "SourceFacts", "TimeFacts",
+    "CameraFacts", "DepthFacts", "Doubt", "DoubtLog", "DoubtName", "SourceFacts", "TimeFacts", "VideoFacts",
     "check_accepted", "check_reference", "check_source", "doubt_line", "ended_early", "is_since_1970",
     "median_depth_m", "rows_in_time", "some_names", "stamps_in_seconds", "time_unit_s", "unresolved",
 ]  # fmt: skip
@@ -37,6 +37,7 @@ MIN_INTERVAL_S = 1e-4  # no camera is faster than 10,000 Hz
 MAX_INTERVAL_S = 1e3  # slower than any drive: the unit of the time stamps is wrong
 _EPOCH_S = (1e9, 1e10)  # seconds since 1970 of the years 2001 to 2286
 _UNITS_S = {"seconds": 1.0, "milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9}
+_MAX_APART = 0.5  # frames between the last images of two videos that were recorded together
 _MAX_NAMED = 12  # files that one sentence names at most
 
 
@@ -45,7 +46,6 @@ class DoubtName(str, Enum):
 
     TIME_ORDER = "time-order"  # time stamps go back: the clock was set in the drive
     EQUAL_STAMPS = "equal-stamps"  # several images have one time stamp
-    COUNTS = "counts"  # two lists that belong together have different lengths
     REFERENCE_TIMES = "reference-times"  # truth or odometry has no time stamp within the recording
     LEFT_OUT = "left-out"  # images were damaged, empty or without a partner
     ENDED_EARLY = "ended-early"  # the source failed in the drive
@@ -103,6 +103,19 @@ class DepthFacts:
     is_registered: bool | None = None
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class VideoFacts:
+    """How many images a video states, and the mean time between them."""
+
+    frames: int
+    period_s: float
+
+    @property
+    def last_s(self) -> float:
+        """When the last image is shown, seconds after the first."""
+        return (self.frames - 1) * self.period_s
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class TimeFacts:
     """Time stamps ``(n,)`` in seconds, in the order of the source; *stated_by* is a file or topic."""
@@ -120,7 +133,7 @@ class SourceFacts:
         cameras: As they are stated, before undistortion and rectification.
         depth: None without depth.
         times: Of the images, of each camera that has its own.
-        counts: Lengths of lists without a key that belong together, by their names.
+        videos: Of the two videos of a pair, by their names.
         references: Times of the truth and of the odometry.
         doubts: What the reader itself met.
         assumed: Sentences on what the source does not state.
@@ -130,7 +143,7 @@ class SourceFacts:
     cameras: Sequence[CameraFacts] = ()
     depth: DepthFacts | None = None
     times: Sequence[TimeFacts] = ()
-    counts: Mapping[str, int] = field(default_factory=dict)
+    videos: Mapping[str, VideoFacts] = field(default_factory=dict)
     references: Sequence[TimeFacts] = ()
     doubts: Sequence[Doubt] = ()
     assumed: tuple[str, ...] = ()
@@ -391,15 +404,22 @@ def _check_times(facts: SourceFacts) -> Iterator[Doubt]:
             )
 
 
-def _check_counts(facts: SourceFacts) -> Iterator[Doubt]:
-    if len(set(facts.counts.values())) > 1:
-        counted = ", ".join(f"{count} in {name}" for name, count in facts.counts.items())
-        yield Doubt(
-            name=DoubtName.COUNTS,
-            sentence=f"{facts.name} has lists of different lengths: {counted}; nothing says which "
-            "row is missing",
-            hint="give rows that belong together one number or one time stamp",
-        )
+def _check_videos(facts: SourceFacts) -> Iterable[Doubt]:
+    """Refuse two videos whose last images have different times: where the times differ, no one can tell.
+
+    A camera that lost an image delivers a shorter video with times in equal steps, as one does that was
+    stopped earlier.  Where the times have a gap for the lost image, both videos end at the same time.
+    """
+    if len(facts.videos) == 2:
+        (name, video), (other_name, other) = facts.videos.items()
+        if abs(video.last_s - other.last_s) > _MAX_APART * min(video.period_s, other.period_s):
+            raise UsageError(
+                f"{name} has {video.frames} images until {video.last_s:.3f} s, {other_name} {other.frames} "
+                f"until {other.last_s:.3f} s: their times do not say which images belong together",
+                hint="record the time of each image (MP4, MKV or a bag), cut both videos to the same images, "
+                "or take one: --camera left",
+            )
+    return ()
 
 
 def _check_references(facts: SourceFacts) -> Iterator[Doubt]:
@@ -410,5 +430,5 @@ def _check_references(facts: SourceFacts) -> Iterator[Doubt]:
 
 
 _RULES: tuple[Callable[[SourceFacts], Iterable[Doubt]], ...] = (
-    _check_cameras, _check_depth, _check_times, _check_counts, _check_references,
+    _check_cameras, _check_depth, _check_times, _check_videos, _check_references,
 )  # fmt: skip

@@ -227,8 +227,8 @@ def _pair(
     """Return the frames of a pair that has passed the gate, or those of its left camera."""
     if camera == "left":
         return _single(
-            facts, lambda log: ((stamp, left, None) for stamp, left, _ in pairs(log)), rig.left.lens, rate_hz,
-            False, close, span_s,
+            replace(facts, videos={}), lambda log: ((stamp, left, None) for stamp, left, _ in pairs(log)),
+            rig.left.lens, rate_hz, False, close, span_s,
         )  # fmt: skip
     right = rig.left if rig.right is None else rig.right
     of_right = _facts_of_lens(facts.name, right.lens, f"the right camera of {facts.name}").cameras

@@ -12,7 +12,7 @@ import numpy as np
 
 from client_sdk.cameras.opencv_video import Video, open_video
 from client_sdk.cameras.source import RawFrame, RawPair
-from client_sdk.source_facts import DoubtLog, SourceFacts
+from client_sdk.source_facts import DoubtLog, SourceFacts, VideoFacts
 from rse_pf.errors import UsageError
 
 __all__ = ["PairVideos", "open_pair_videos", "split_pairs"]
@@ -29,17 +29,20 @@ class PairVideos:
     right: Video
 
     def facts(self, names: tuple[str, str]) -> SourceFacts:
-        """Return how many images both videos state, and what was assumed."""
-        frames = (self.left.frames, self.right.frames)
-        counts = dict(zip(names, frames, strict=True)) if all(frames) else {}
-        return SourceFacts(name=self.name, counts=counts, assumed=(*self.left.notes, *self.right.notes))
+        """Return what both videos state, and what was assumed."""
+        stated = {
+            name: VideoFacts(frames=video.frames, period_s=video.period_s)
+            for name, video in zip(names, (self.left, self.right), strict=True)
+            if video.frames
+        }
+        return SourceFacts(name=self.name, videos=stated, assumed=(*self.left.notes, *self.right.notes))
 
     def pairs(self, log: DoubtLog) -> Iterator[RawPair]:
         """Yield images of devices as they come, and images of files that have one time.
 
         *log* counts images of files without a partner.
         """
-        within_s = _MAX_APART * self.left.period_s
+        within_s = _MAX_APART * min(self.left.period_s, self.right.period_s)
         left, right = next(self.left.images, None), next(self.right.images, None)
         while left is not None and right is not None:
             apart_s = right[0] - left[0]

@@ -37,7 +37,7 @@ def add_accept_argument(parser: argparse.ArgumentParser) -> None:
     """Declare ``--accept``."""
     parser.add_argument(
         "--accept", action="append", default=[], metavar="NAME",
-        help="take a finding about the source for right: NAME stands before it, such as counts",
+        help="take a finding about the source for right: NAME stands before it, such as left-out",
     )  # fmt: skip
 
 

@@ -278,7 +278,7 @@ def test_poses_of_kitti_belong_to_the_numbers_of_images(tmp_path: Path) -> None:
     assert any("joined in their order" in note for note in cut.notes)
 
 
-def _pair_videos(path: Path, lefts: int, rights: int) -> FrameStream:
+def _pair_videos(path: Path, lefts: int, rights: int, **options: Any) -> FrameStream:
     for name, frames in (("left", lefts), ("right", rights)):
         writer = cv2.VideoWriter(str(path / f"{name}.avi"), cv2.VideoWriter_fourcc(*"MJPG"), 10.0, (64, 48))
         for row in range(frames):
@@ -289,14 +289,27 @@ def _pair_videos(path: Path, lefts: int, rights: int) -> FrameStream:
     cameras = [{**LENS, "name": "left", "T_body_camera": np.eye(4).tolist()},
                {**LENS, "name": "right", "T_body_camera": right.tolist()}]  # fmt: skip
     (path / "rig.json").write_text(json.dumps({"cameras": cameras}))
-    return open_camera(f"{path / 'left.avi'},{path / 'right.avi'}", intrinsics=path / "rig.json")
+    names = f"{path / 'left.avi'},{path / 'right.avi'}"
+    return open_camera(names, intrinsics=path / "rig.json", **options)
 
 
-@pytest.mark.parametrize(("rights", "names"), [(5, []), (4, ["counts"])])
-def test_two_videos_of_different_lengths_are_a_finding(tmp_path: Path, rights: int, names: list[str]) -> None:
-    source = _pair_videos(tmp_path, 5, rights)
-    assert [doubt.name.value for doubt in source.log.doubts] == names
-    assert len(rows_of(source)) == rights
+@pytest.mark.parametrize("rights", [5, 3, 12])
+def test_two_videos_of_different_lengths_are_refused(tmp_path: Path, rights: int) -> None:
+    with pytest.raises(UsageError) as refused:
+        _pair_videos(tmp_path, 6, rights)
+    assert f"left.avi has 6 images until 0.500 s, {tmp_path / 'right.avi'} {rights} " in refused.value.message
+    assert "--camera left" in refused.value.hint
+
+
+def test_two_videos_of_one_length_are_joined(tmp_path: Path) -> None:
+    source = _pair_videos(tmp_path, 5, 5)
+    assert source.log.doubts == ()
+    assert len(rows_of(source)) == 5
+
+
+def test_one_of_two_videos_of_different_lengths_can_be_taken(tmp_path: Path) -> None:
+    source = _pair_videos(tmp_path, 6, 5, camera="left")
+    assert rows_of(source)[:5] == [(row / 10, row, -1) for row in range(5)]
 
 
 def _sensor(path: Path, model: str) -> Path:
