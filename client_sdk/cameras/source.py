@@ -19,7 +19,7 @@ import numpy.typing as npt
 from client_sdk.closing import Closing
 from client_sdk.datasets.thinning import Thinning
 from client_sdk.frontend import Frame, load_opencv
-from client_sdk.rigs.checks import check_pairs
+from client_sdk.rigs.checks import PairLook, check_pairs, fault_of_looks, measure_pair
 from client_sdk.rigs.intrinsics import Intrinsics, Undistortion
 from client_sdk.rigs.rectification import Rectification
 from client_sdk.rigs.rig import Rig
@@ -34,6 +34,8 @@ __all__ = [
 
 _LOOKED_AT = 8
 """Frames of a pair of cameras whose images are compared at the start."""
+_LOOK_EVERY = 5  # frames of a pair of cameras between two that are looked at in the drive
+_LOOKS = 2  # in succession that say the same: one of them may be of a blurred image
 _Item = TypeVar("_Item", bound=tuple[Any, ...])
 
 RawFrame = tuple[float, npt.NDArray[np.uint8], "npt.NDArray[np.float32] | None"]
@@ -222,9 +224,12 @@ class StereoSource(FrameStream):
         super().__init__(about, raw, self._frame, rate_hz=rate_hz, close=close)
         self._no_depth = no_depth(self.camera)
         self._ahead: deque[Frame] | None = None
+        self._given = 0
+        self._last: Frame | None = None
+        self._looks: deque[PairLook] = deque(maxlen=_LOOKS)
 
     def __next__(self) -> Frame:
-        """Return the next frame; the first ones are compared before one is given out."""
+        """Return the next frame; the first ones are compared before one is given out, and some later ones."""
         if self._ahead is None:
             self._ahead = deque()
             for _ in range(_LOOKED_AT):
@@ -233,7 +238,27 @@ class StereoSource(FrameStream):
                 except StopIteration:
                     break
             check_pairs(itertools.pairwise(self._ahead), self.name)
-        return self._ahead.popleft() if self._ahead else super().__next__()
+        frame = self._ahead.popleft() if self._ahead else super().__next__()
+        self._look_at(frame)
+        return frame
+
+    def _look_at(self, frame: Frame) -> None:
+        """Refuse pairs that have come apart: a camera that lost an image shows another moment from then on.
+
+        Raises:
+            UsageError: The rows of two images in succession do not fit any more.
+        """
+        if self._given % _LOOK_EVERY == 1 and self._last is not None:
+            self._looks.append(measure_pair(self._last, frame))
+            fault = fault_of_looks(self._looks)
+            if fault is not None and len(self._looks) == _LOOKS:
+                raise UsageError(
+                    f"{self.name}: the pairs of images fit at the start, and no longer before "
+                    f"{frame.timestamp_s:.3f} s, as if a camera had lost an image: {fault.message}",
+                    hint="record the time of each image (MP4, MKV or a bag), or take one: --camera left",
+                )
+        self._given += 1
+        self._last = frame
 
     def _frame(self, raw: RawPair) -> Frame:
         timestamp_s, left, right = raw

@@ -16,7 +16,10 @@ from client_sdk.frontend import DescribedPixels, Frame, describe, load_opencv
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Array
 
-__all__ = ["PairFault", "check_pairs", "fault_of_pairs", "match_features", "spread_pairs"]
+__all__ = [
+    "PairFault", "PairLook", "check_pairs", "fault_of_looks", "fault_of_pairs", "match_features",
+    "measure_pair", "spread_pairs",
+]  # fmt: skip
 
 _FEATURES = 600
 _RATIO = 0.8
@@ -31,6 +34,10 @@ _MAX_OFF_PX = 1.5
 _LEAST_LATE_S, _LEAST_LATE_PX, _LEAST_EXPLAINED = 0.004, 0.7, 0.3
 _FAST_PX_S, _KEPT_PX, _MOSTLY = 15.0, 2.0, 0.9
 _PAIRS = 14
+
+
+PairLook = tuple[Array, Array, Array]
+"""Of the features of one pair: disparities and differences of the rows (px), motion of the rows (px/s)."""
 
 
 def spread_pairs(rows: Sequence[int]) -> list[tuple[int, int]]:
@@ -70,7 +77,15 @@ def fault_of_pairs(pairs: Iterable[tuple[Frame, Frame]]) -> PairFault | None:
     Raises:
         MissingExtra: OpenCV is not installed.
     """
-    across, off, flow = (np.concatenate(each) for each in _measured(pairs))
+    return fault_of_looks(measure_pair(frame, later) for frame, later in pairs)
+
+
+def fault_of_looks(looks: Iterable[PairLook]) -> PairFault | None:
+    """Return what is wrong with a rig, by what some of its pairs show; None where they show too little."""
+    known_looks = list(looks)
+    if not known_looks:
+        return None
+    across, off, flow = (np.concatenate([each[part] for each in known_looks]) for part in range(3))
     if len(off) < _FEWEST:
         return None
     swapped = float(np.mean(across < _SWAPPED_PX))
@@ -105,27 +120,26 @@ def fault_of_pairs(pairs: Iterable[tuple[Frame, Frame]]) -> PairFault | None:
     return None
 
 
-def _measured(pairs: Iterable[tuple[Frame, Frame]]) -> tuple[list[Array], list[Array], list[Array]]:
-    """Return disparities, differences of the rows (px), and the motion of the rows (px/s, NaN if unknown)."""
-    across, off, flow = [np.empty(0)], [np.empty(0)], [np.empty(0)]
-    for frame, later in pairs:
-        if frame.stereo is None:
-            continue
-        gray = np.repeat(frame.stereo.gray[:, :, None], 3, axis=2)
-        left, right = (describe(image, _FEATURES) for image in (frame.rgb, gray))
-        after = describe(later.rgb, _FEATURES)
-        rows, others = match_features(left, right)
-        offset = left.pixels[rows] - right.pixels[others]
-        good = np.abs(offset[:, 1]) < _MAX_ROWS_PX
-        moved = np.full(len(left.pixels), np.nan)
-        seen, again = match_features(left, after)
-        seconds = later.timestamp_s - frame.timestamp_s
-        if seconds > 0.0:
-            moved[seen] = (after.pixels[again, 1] - left.pixels[seen, 1]) / seconds
-        across.append(offset[good, 0])
-        off.append(offset[good, 1])
-        flow.append(moved[rows[good]])
-    return across, off, flow
+def measure_pair(frame: Frame, later: Frame) -> PairLook:
+    """Return what a stereo frame and a later one show of their rig; nothing of a frame without a pair.
+
+    Raises:
+        MissingExtra: OpenCV is not installed.
+    """
+    if frame.stereo is None:
+        return np.empty(0), np.empty(0), np.empty(0)
+    gray = np.repeat(frame.stereo.gray[:, :, None], 3, axis=2)
+    left, right = (describe(image, _FEATURES) for image in (frame.rgb, gray))
+    after = describe(later.rgb, _FEATURES)
+    rows, others = match_features(left, right)
+    offset = left.pixels[rows] - right.pixels[others]
+    good = np.abs(offset[:, 1]) < _MAX_ROWS_PX
+    moved = np.full(len(left.pixels), np.nan)
+    seen, again = match_features(left, after)
+    seconds = later.timestamp_s - frame.timestamp_s
+    if seconds > 0.0:
+        moved[seen] = (after.pixels[again, 1] - left.pixels[seen, 1]) / seconds
+    return offset[good, 0], offset[good, 1], moved[rows[good]]
 
 
 def _late_s(off_px: Array, flow_px_s: Array) -> float | None:

@@ -312,6 +312,42 @@ def test_one_of_two_videos_of_different_lengths_can_be_taken(tmp_path: Path) -> 
     assert rows_of(source)[:5] == [(row / 10, row, -1) for row in range(5)]
 
 
+def _pair_folders(path: Path, lost: Sequence[int]) -> FrameStream:
+    """Return pairs of a camera that moves down; the numbers of right images skip none that was lost."""
+    texture = np.kron(np.random.default_rng(5).integers(0, 256, (90, 60)), np.ones((6, 6))).astype(np.uint8)
+    rights = [row for row in range(40) if row not in lost]
+    for number, right in enumerate(rights):
+        for side, row, column in (("left", number, 30), ("right", right, 40)):
+            (path / side).mkdir(exist_ok=True)
+            cv2.imwrite(str(path / side / f"{number}.png"), texture[5 * row :][:240, column:][:, :320])
+    lens = {"fx": 300.0, "fy": 300.0, "cx": 159.5, "cy": 119.5, "width": 320, "height": 240}
+    poses = [np.eye(4), np.eye(4)]
+    poses[1][0, 3] = 0.1
+    cameras = [{**lens, "name": name, "T_body_camera": pose.tolist()}
+               for name, pose in zip(("left", "right"), poses, strict=True)]  # fmt: skip
+    (path / "rig.json").write_text(json.dumps({"cameras": cameras}))
+    return open_camera(path)
+
+
+@pytest.mark.parametrize(("lost", "most"), [((15,), 30), ((12, 13, 14), 25)])
+def test_a_pair_whose_camera_loses_an_image_ends_there(
+    tmp_path: Path, lost: Sequence[int], most: int
+) -> None:
+    frames = []
+    with (
+        _pair_folders(tmp_path, lost) as source,
+        pytest.raises(UsageError, match="fit at the start, and no longer before") as refused,
+    ):
+        frames.extend(source)
+    assert lost[0] < len(frames) <= most
+    assert "--camera left" in refused.value.hint
+
+
+def test_a_pair_that_loses_no_image_is_whole(tmp_path: Path) -> None:
+    with _pair_folders(tmp_path, ()) as source:
+        assert len(list(source)) == 40
+
+
 def _sensor(path: Path, model: str) -> Path:
     from tests.client_sdk.datasets.test_rig_recordings import write_euroc
 
