@@ -22,9 +22,10 @@ from rse_pf.errors import RsePfError, UsageError
 from rse_pf.geometry import Array, Camera
 
 __all__ = [
-    "CameraFacts", "DepthFacts", "Doubt", "DoubtLog", "DoubtName", "SourceFacts", "TimeFacts", "VideoFacts",
-    "check_accepted", "check_reference", "check_source", "doubt_line", "ended_early", "is_since_1970",
-    "median_depth_m", "rows_in_time", "some_names", "stamps_in_seconds", "time_unit_s", "unresolved",
+    "CameraFacts", "DepthFacts", "Doubt", "DoubtLog", "DoubtName", "LossFacts", "SourceFacts", "TimeFacts",
+    "VideoFacts", "check_accepted", "check_reference", "check_source", "doubt_line", "ended_early",
+    "is_since_1970", "median_depth_m", "rows_in_time", "some_names", "stamps_in_seconds", "time_unit_s",
+    "unresolved",
 ]  # fmt: skip
 
 MIN_FIELD_OF_VIEW_DEG = 20.0  # a longer lens is not used for SLAM; a mistake in the unit gives less
@@ -37,6 +38,7 @@ MIN_INTERVAL_S = 1e-4  # no camera is faster than 10,000 Hz
 MAX_INTERVAL_S = 1e3  # slower than any drive: the unit of the time stamps is wrong
 _EPOCH_S = (1e9, 1e10)  # seconds since 1970 of the years 2001 to 2286
 _UNITS_S = {"seconds": 1.0, "milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9}
+_USUAL_LOSS = 0.1  # of the images of a camera that runs freely beside another find no partner
 _MAX_APART = 0.5  # frames between the last images of two videos that were recorded together
 _MAX_NAMED = 12  # files that one sentence names at most
 
@@ -104,6 +106,19 @@ class DepthFacts:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class LossFacts:
+    """Images that a source states and does not deliver: *lost* of *total*; *sentence* says which, and why.
+
+    ``is_usual`` says that a few of them are lost by all recorders: two cameras that run freely lose partners.
+    """
+
+    sentence: str
+    lost: int
+    total: int
+    is_usual: bool = False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class VideoFacts:
     """How many images a video states, and the mean time between them."""
 
@@ -135,6 +150,7 @@ class SourceFacts:
         times: Of the images, of each camera that has its own.
         videos: Of the two videos of a pair, by their names.
         references: Times of the truth and of the odometry.
+        losses: Images that are left out.
         doubts: What the reader itself met.
         assumed: Sentences on what the source does not state.
     """
@@ -145,8 +161,14 @@ class SourceFacts:
     times: Sequence[TimeFacts] = ()
     videos: Mapping[str, VideoFacts] = field(default_factory=dict)
     references: Sequence[TimeFacts] = ()
+    losses: Sequence[LossFacts] = ()
     doubts: Sequence[Doubt] = ()
     assumed: tuple[str, ...] = ()
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What is said about the source and needs no action: what was assumed, and losses that are usual."""
+        return (*self.assumed, *(loss.sentence for loss in self.losses if not _is_finding(loss)))
 
     @property
     def span_s(self) -> tuple[float, float] | None:
@@ -404,6 +426,19 @@ def _check_times(facts: SourceFacts) -> Iterator[Doubt]:
             )
 
 
+def _is_finding(loss: LossFacts) -> bool:
+    return loss.lost > (_USUAL_LOSS * loss.total if loss.is_usual else 0)
+
+
+def _check_losses(facts: SourceFacts) -> Iterator[Doubt]:
+    for loss in facts.losses:
+        if _is_finding(loss):
+            yield Doubt(
+                name=DoubtName.LEFT_OUT, sentence=loss.sentence,
+                hint="copy the recording again, or record it again",
+            )  # fmt: skip
+
+
 def _check_videos(facts: SourceFacts) -> Iterable[Doubt]:
     """Refuse two videos whose last images have different times: where the times differ, no one can tell.
 
@@ -430,5 +465,5 @@ def _check_references(facts: SourceFacts) -> Iterator[Doubt]:
 
 
 _RULES: tuple[Callable[[SourceFacts], Iterable[Doubt]], ...] = (
-    _check_cameras, _check_depth, _check_times, _check_videos, _check_references,
+    _check_cameras, _check_depth, _check_times, _check_losses, _check_videos, _check_references,
 )  # fmt: skip

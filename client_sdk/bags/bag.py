@@ -17,7 +17,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from client_sdk.bags.bag_file import BagFile, BrokenMessage, RawMessage, open_bag_file
+from client_sdk.bags.bag_file import BagFile, BrokenMessage, RawMessage, Topic, open_bag_file
 from client_sdk.bags.choose import (
     ChosenTopics,
     choose_topics,
@@ -54,6 +54,7 @@ from client_sdk.source_facts import (
     Doubt,
     DoubtLog,
     DoubtName,
+    LossFacts,
     SourceFacts,
     TimeFacts,
     check_source,
@@ -273,10 +274,10 @@ def _open(file: BagFile, options: BagOptions) -> Bag:
             *_notes(chosen, formats, lens, options),
             *_pair_note(rectification),
             *imu_notes,
-            *_unit_note(unit_m, options, depth_scale),
+            *_unit_note(unit_m, options, depth_scale, None if is_float else chosen.depth),
             *_registration_note(chosen, registration),
             truth_note,
-            *_losses(index, pairs, chosen, options),
+            *_order_notes(index),
         ),
         chosen=chosen,
         imu=imu,
@@ -302,8 +303,10 @@ def _open(file: BagFile, options: BagOptions) -> Bag:
             bag, is_unit_stated=is_float or unit_m is not None or options.depth_scale is not None
         ),
         times=[TimeFacts(stated_by=chosen.colour.name, stamps_s=np.array(bag.timestamps_s))],
+        losses=tuple(_losses(index, pairs, chosen, options)),
         doubts=(*doubts, *_changes(chosen, lenses, lens)),
     )
+    bag.notes += facts.notes
     _check_changes(bag, lenses, times)
     bag.log = DoubtLog(check_source(facts))
     return bag
@@ -390,11 +393,16 @@ def _check_changes(bag: Bag, lenses: Sequence[Lens], times: CameraTimes) -> None
             )
 
 
-def _unit_note(unit_m: float | None, options: BagOptions, depth_scale: float) -> tuple[str, ...]:
-    if unit_m is None:
+def _unit_note(
+    unit_m: float | None, options: BagOptions, depth_scale: float, depth: Topic | None
+) -> tuple[str, ...]:
+    """Return what is said about the unit of *depth*, None for floats, which are metres by REP 118."""
+    if unit_m is not None:
+        used = "" if options.depth_scale is None else f", but depth_scale {depth_scale:g} is used"
+        return (f"the recorder states depth in units of {1000.0 * unit_m:g} mm{used}",)
+    if depth is None or options.depth_scale is not None:
         return ()
-    used = "" if options.depth_scale is None else f", but depth_scale {depth_scale:g} is used"
-    return (f"the recorder states depth in units of {1000.0 * unit_m:g} mm{used}",)
+    return (f"nothing states the unit of {depth.name}: {depth_scale:g} units a metre are assumed (REP 118)",)
 
 
 def _registration_note(chosen: ChosenTopics, registration: tuple[Camera, Array] | None) -> tuple[str, ...]:
@@ -720,36 +728,46 @@ def _pair_note(rectification: Rectification | None) -> tuple[str, ...]:
 
 
 def _losses(
-    index: BagIndex, pairs: list[_Pair], chosen: ChosenTopics, options: BagOptions
-) -> tuple[str, ...]:
-    """Return a sentence for each thing that was left out or put right."""
-    names = []
+    index: BagIndex, pairs: Sequence[_Pair], chosen: ChosenTopics, options: BagOptions
+) -> Iterator[LossFacts]:
+    """Yield what was left out."""
+    images = [index.colour] if chosen.second is None else [index.colour, index.second]
+    total = sum(len(each.stamps_ns) for each in images)
+    if index.broken:
+        sentence = f"{_count(index.broken, 'broken message')} left out; the first: {index.first_broken}"
+        yield LossFacts(sentence=sentence, lost=index.broken, total=total)
+    copies = sum(each.copies for each in images)
+    if copies:
+        sentence = f"{_count(copies, 'message')} with the time stamp of another left out"
+        yield LossFacts(sentence=sentence, lost=copies, total=total)
+    unstamped = sum(each.unstamped for each in images)
+    if unstamped:
+        sentence = f"{_count(unstamped, 'image')} with the time stamp 0 left out"
+        yield LossFacts(sentence=sentence, lost=unstamped, total=total)
+    if index.ended:
+        sentence = f"the bag cannot be read to its end ({index.ended}); what comes before is used"
+        yield LossFacts(sentence=sentence, lost=1, total=total)
     unpaired = len(index.colour.stamps_ns) - len(pairs)
     if unpaired:
-        names.append(
-            f"{_count(unpaired, 'colour image' if chosen.right is None else 'left image')} without "
-            f"{_partner(chosen)} within {options.pair_within_s:g} s left out"
-        )
-    if index.broken:
-        names.append(f"{_count(index.broken, 'broken message')} left out; the first: {index.first_broken}")
-    copies = index.colour.copies + (index.second.copies if chosen.second is not None else 0)
-    if copies:
-        names.append(f"{_count(copies, 'message')} with the time stamp of another left out")
-    unstamped = index.colour.unstamped + (index.second.unstamped if chosen.second is not None else 0)
-    if unstamped:
-        names.append(f"{_count(unstamped, 'image')} with the time stamp 0 left out")
+        noun = "colour image" if chosen.right is None else "left image"
+        yield LossFacts(
+            sentence=f"{_count(unpaired, noun)} of {len(index.colour.stamps_ns)} without {_partner(chosen)} "
+            f"within {options.pair_within_s:g} s left out",
+            lost=unpaired, total=len(index.colour.stamps_ns), is_usual=True,
+        )  # fmt: skip
+
+
+def _order_notes(index: BagIndex) -> Iterator[str]:
+    """Yield what was put right, without a loss."""
     if index.colour.clock_step_ns:
-        names.append(
+        yield (
             f"the clock of the time stamps was set back by {index.colour.clock_step_ns / 1e9:.3f} s in the "
             "drive; the times of recording bridge it"
         )
     if not (index.colour.was_in_order and index.second.was_in_order):
-        names.append("the time stamps were not in order; frames are sorted by them")
+        yield "the time stamps were not in order; frames are sorted by them"
     if index.uses_log_time:
-        names.append("a topic has no time stamp but 0; the times of recording are used")
-    if index.ended:
-        names.append(f"the bag cannot be read to its end ({index.ended}); what comes before is used")
-    return tuple(names)
+        yield "a topic has no time stamp but 0; the times of recording are used"
 
 
 def _count(number: int, noun: str) -> str:

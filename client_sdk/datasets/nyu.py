@@ -30,6 +30,7 @@ __all__ = [
     "raw_files",
     "read_pnm",
     "register_depth",
+    "truncated_files",
 ]
 
 COLOUR_CAMERA = Camera(
@@ -124,16 +125,23 @@ def register_depth(depth_m: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
 
 
 def raw_files(folder: Path, prefix: str) -> list[RawFile]:
-    """Return the images ``prefix-SECONDS-TICKS.p?m`` of a raw dump by time; empty ones are left out.
+    """Return the images ``prefix-SECONDS-TICKS.p?m`` of a raw dump by time, without `truncated_files`."""
+    return [file for file in _stamped_files(folder, prefix) if not _is_truncated(file)]
 
-    The published dump holds some truncated files.
-    """
-    files = []
-    for path in folder.glob(f"{prefix}-*.p[gp]m"):
-        stamp = _STAMPED.match(path.name)
-        if stamp and path.stat().st_size > COLOUR_CAMERA.width * COLOUR_CAMERA.height:
-            files.append(RawFile(float(stamp[1]), path))
-    return sorted(files)
+
+def truncated_files(folder: Path) -> list[str]:
+    """Return the names of images that are too small; the published dump holds some."""
+    files = [*_stamped_files(folder, "d"), *_stamped_files(folder, "r")]
+    return [file.path.name for file in files if _is_truncated(file)]
+
+
+def _stamped_files(folder: Path, prefix: str) -> list[RawFile]:
+    stamped = [(_STAMPED.match(path.name), path) for path in folder.glob(f"{prefix}-*.p[gp]m")]
+    return sorted(RawFile(float(stamp[1]), path) for stamp, path in stamped if stamp)
+
+
+def _is_truncated(file: RawFile) -> bool:
+    return file.path.stat().st_size <= COLOUR_CAMERA.width * COLOUR_CAMERA.height
 
 
 def read_pnm(path: Path) -> npt.NDArray[Any]:

@@ -6,8 +6,9 @@ An image is read only when its frame is needed.  A path that cannot be used is r
 
 from __future__ import annotations
 
+import contextlib
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -30,11 +31,13 @@ from client_sdk.source_facts import (
     CameraFacts,
     DepthFacts,
     DoubtLog,
+    LossFacts,
     SourceFacts,
     TimeFacts,
     check_source,
     median_depth_m,
     rows_in_time,
+    some_names,
     stamps_in_seconds,
 )
 from rse_pf.errors import UsageError
@@ -179,7 +182,7 @@ class _List:
 
 def _open_tum(folder: Path, of_camera: Path) -> Dataset:
     colours, depths = _read_lists(folder)
-    intrinsics, notes = _intrinsics(folder, of_camera, has_depth=depths is not None)
+    intrinsics, is_unit_stated, notes = _intrinsics(folder, of_camera, has_depth=depths is not None)
     pairs = [(row, row) for row in range(len(colours.images))]
     if depths is not None:
         pairs = associate_stamps(colours.stamps_s, depths.stamps_s, _MAX_STAMP_DIFFERENCE_S)
@@ -189,13 +192,12 @@ def _open_tum(folder: Path, of_camera: Path) -> Dataset:
                 f"colours begin at {colours.stamps_s[0]:.3f} s, depth at {depths.stamps_s[0]:.3f} s",
                 hint="check that rgb.txt and depth.txt use the same clock",
             )
-        unpaired = len(colours.images) - len(pairs)
-        if unpaired:
-            notes = (
-                *notes,
-                f"{unpaired} of {len(colours.images)} colour images of {folder} have no depth image of their "
-                f"own within {_MAX_STAMP_DIFFERENCE_S:g} s and are left out",
-            )
+    total, lost = len(colours.images), len(colours.images) - len(pairs)
+    unpaired = LossFacts(
+        sentence=f"{lost} of {total} colour images of {folder} have no depth image of their own within "
+        f"{_MAX_STAMP_DIFFERENCE_S:g} s and are left out",
+        lost=lost, total=total, is_usual=True,
+    )  # fmt: skip
     camera, undistort = intrinsics.camera, Undistortion(intrinsics)
     units_per_m = intrinsics.depth_units_per_m
     no_depth: npt.NDArray[np.float32] = np.zeros((camera.height, camera.width), dtype=np.float32)
@@ -224,7 +226,7 @@ def _open_tum(folder: Path, of_camera: Path) -> Dataset:
     is_fisheye = intrinsics.model == "fisheye"
     probed = probe(range(len(pairs)), depth_of)
     depth = DepthFacts(
-        median_m=median_depth_m(probed), units_per_m=units_per_m, is_unit_stated=True,
+        median_m=median_depth_m(probed), units_per_m=units_per_m, is_unit_stated=is_unit_stated,
         is_registered=intrinsics.is_depth_registered,
     )  # fmt: skip
     lists = (colours,) if depths is None else (colours, depths)
@@ -234,6 +236,7 @@ def _open_tum(folder: Path, of_camera: Path) -> Dataset:
         depth=None if depths is None else depth,
         times=tuple(each.times for each in lists),
         references=() if truth is None else (TimeFacts(stated_by=of_truth[0], stamps_s=truth.timestamps_s),),
+        losses=(unpaired,) if unpaired.lost else (),
         assumed=(*notes, *(note for each in lists for note in each.notes), *of_truth[1:]),
     )
     return Dataset(
@@ -246,7 +249,7 @@ def _open_tum(folder: Path, of_camera: Path) -> Dataset:
         read=read,
         has_depth=depths is not None,
         log=DoubtLog(check_source(facts)),
-        notes=facts.assumed,
+        notes=facts.notes,
     )
 
 
@@ -313,8 +316,12 @@ def _read_rows(path: Path, columns: int) -> list[list[str]]:
     return rows
 
 
-def _intrinsics(folder: Path, file: Path, *, has_depth: bool) -> tuple[Intrinsics, tuple[str, ...]]:
-    """Return the intrinsics of a file, and notes on what was assumed where the folder has none."""
+def _intrinsics(folder: Path, file: Path, *, has_depth: bool) -> tuple[Intrinsics, bool, tuple[str, ...]]:
+    """Return the intrinsics of a file, and notes on what was assumed where the folder has none.
+
+    Between both stands whether the unit of depth is stated: by the file, or by the benchmark that *folder*
+    is named after.
+    """
     if file.exists() or file.parent != folder:
         found = read_calibration(file)
         lens = found.left.lens if isinstance(found, Rig) else found
@@ -322,7 +329,7 @@ def _intrinsics(folder: Path, file: Path, *, has_depth: bool) -> tuple[Intrinsic
             raise UsageError(
                 f"{file} has no depth_scale", hint="state it: 5000 for TUM, 1000 for millimetres"
             )
-        return lens, ()
+        return lens, True, ()
     name = next(key for key in _FREIBURG if key in folder.resolve().name)
     fx, fy, cx, cy, distortion = _FREIBURG[name]
     camera = Camera(fx=fx, fy=fy, cx=cx, cy=cy, width=640, height=480)
@@ -332,7 +339,7 @@ def _intrinsics(folder: Path, file: Path, *, has_depth: bool) -> tuple[Intrinsic
         f"{camera.width}x{camera.height} px, depth_scale {_FREIBURG_DEPTH_SCALE:g}"
     )
     assumed = Intrinsics(camera=camera, distortion=distortion, depth_scale=_FREIBURG_DEPTH_SCALE)
-    return assumed, (note,)
+    return assumed, bool(name), (note,)
 
 
 def _read_truth(
@@ -381,15 +388,16 @@ def _open_raw(folder: Path) -> Dataset:
             camera=nyu.COLOUR_CAMERA,
         )
 
-    return Dataset(
-        name=folder.name,
-        camera=nyu.COLOUR_CAMERA,
-        timestamps_s=tuple(depths[row].timestamp_s for row, _ in pairs),
-        truth=None,
-        truth_kind="none",
-        rows=tuple(range(len(pairs))),
-        read=read,
-    )
+    truncated, unpaired = nyu.truncated_files(folder), len(depths) - len(pairs)
+    losses = (
+        LossFacts(sentence=f"{len(truncated)} truncated images of {folder} left out: {some_names(truncated)}",
+                  lost=len(truncated), total=len(depths) + len(colours)),
+        LossFacts(sentence=f"{unpaired} of {len(depths)} depth images of {folder} have no colour image "
+                  f"within {_MAX_RAW_STAMP_DIFFERENCE_S:g} s and are left out",
+                  lost=unpaired, total=len(depths), is_usual=True),
+    )  # fmt: skip
+    stamps_s = [depths[row].timestamp_s for row, _ in pairs]
+    return _nyu_dataset(folder.name, stamps_s, read, [loss for loss in losses if loss.lost])
 
 
 def _open_labelled(path: Path, scene: str | None) -> Dataset:
@@ -401,12 +409,46 @@ def _open_labelled(path: Path, scene: str | None) -> Dataset:
         rgb, depth_m = file.read(rows[row])
         return Frame(timestamp_s=float(row), rgb=rgb, depth_m=depth_m, camera=nyu.COLOUR_CAMERA)
 
+    stamps_s = [float(row) for row in range(len(rows))]
+    assumed = f"{path} holds no time stamps: 1 s between images is assumed"
+    return _nyu_dataset(scene or path.stem, stamps_s, read, assumed=(assumed,))
+
+
+def _nyu_dataset(
+    name: str,
+    stamps_s: Sequence[float],
+    read: Callable[[int], Frame],
+    losses: Sequence[LossFacts] = (),
+    assumed: tuple[str, ...] = (),
+) -> Dataset:
+    """Return frames of NYU Depth V2, whose camera and depth its toolbox states."""
+    camera = nyu.COLOUR_CAMERA
+    depths_m = []
+    for row in sorted({0, len(stamps_s) // 2, len(stamps_s) - 1}):
+        with contextlib.suppress(UsageError):  # of an image that cannot be read, when it is its turn
+            depths_m.append(read(row).depth_m)
+    whose = (
+        f"the camera of {name} is that of the toolbox of NYU Depth V2: fx {camera.fx:.2f} fy {camera.fy:.2f} "
+        f"cx {camera.cx:.2f} cy {camera.cy:.2f}"
+    )
+    facts = SourceFacts(
+        name=name,
+        cameras=(CameraFacts(stated_by="the toolbox of NYU Depth V2", camera=camera),),
+        depth=DepthFacts(
+            median_m=median_depth_m(depths_m), units_per_m=1.0, is_unit_stated=True, is_registered=True
+        ),
+        times=(TimeFacts(stated_by=name, stamps_s=np.array(stamps_s)),),
+        losses=losses,
+        assumed=(whose, *assumed),
+    )
     return Dataset(
-        name=scene or path.stem,
-        camera=nyu.COLOUR_CAMERA,
-        timestamps_s=tuple(float(row) for row in range(len(rows))),
+        name=name,
+        camera=camera,
+        timestamps_s=tuple(stamps_s),
         truth=None,
         truth_kind="none",
-        rows=tuple(range(len(rows))),
+        rows=tuple(range(len(stamps_s))),
         read=read,
+        notes=facts.notes,
+        log=DoubtLog(check_source(facts)),
     )

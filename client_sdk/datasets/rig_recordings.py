@@ -34,6 +34,7 @@ from client_sdk.source_facts import (
     Doubt,
     DoubtLog,
     DoubtName,
+    LossFacts,
     SourceFacts,
     TimeFacts,
     check_source,
@@ -78,6 +79,7 @@ class _Files:
     stated_by: tuple[str, str]
     truth: str = ""
     notes: tuple[str, ...] = ()
+    losses: tuple[LossFacts, ...] = ()
     doubts: tuple[Doubt, ...] = ()
 
 
@@ -100,11 +102,11 @@ def open_euroc(folder: Path, camera: CameraChoice | None = None, imu: bool | Non
     cameras = [read_euroc_camera(folder / "cam0" / "sensor.yaml", "left")]
     paths, stamps_s, notes, doubts = _euroc_images(folder / "cam0")
     rights: list[Path] | None = None
+    losses: tuple[LossFacts, ...] = ()
     if stereo:
         cameras.append(read_euroc_camera(folder / "cam1" / "sensor.yaml", "right"))
         others, others_s, *_ = _euroc_images(folder / "cam1")
-        pairs, of_pairs = _pairs(stamps_s, others_s, folder.parent.name)
-        notes += of_pairs
+        pairs, losses = _pairs(stamps_s, others_s, folder.parent.name)
         paths, stamps_s = [paths[row] for row, _ in pairs], stamps_s[[row for row, _ in pairs]]
         rights = [others[row] for _, row in pairs]
     rig = Rig(
@@ -131,7 +133,7 @@ def open_euroc(folder: Path, camera: CameraChoice | None = None, imu: bool | Non
     stated_by = str(folder / "cam0" / "sensor.yaml"), str(folder / "cam0" / "data.csv")
     files = _Files(
         lefts=paths, rights=rights, stamps_s=stamps_s, notes=notes, doubts=doubts, stated_by=stated_by,
-        truth=_EUROC_TRUTH,
+        truth=_EUROC_TRUTH, losses=losses,
     )  # fmt: skip
     return _dataset(name or folder.name, rig, files, bodies, samples)
 
@@ -289,7 +291,7 @@ def _dataset(name: str, rig: Rig, files: _Files, bodies: Trajectory | None, samp
         for each in rig.cameras
     ]  # fmt: skip
     facts = SourceFacts(
-        name=name, cameras=stated, doubts=files.doubts, assumed=files.notes,
+        name=name, cameras=stated, losses=files.losses, doubts=files.doubts, assumed=files.notes,
         times=(TimeFacts(stated_by=files.stated_by[1], stamps_s=stamps_s),),
         references=() if truth is None else (TimeFacts(stated_by=files.truth, stamps_s=truth.timestamps_s),),
     )  # fmt: skip
@@ -301,7 +303,7 @@ def _dataset(name: str, rig: Rig, files: _Files, bodies: Trajectory | None, samp
         truth_kind="none" if truth is None else "ground truth",
         rows=tuple(range(len(paths))),
         read=read,
-        notes=facts.assumed,
+        notes=facts.notes,
         log=DoubtLog(check_source(facts)),
         has_depth=False,
         has_stereo=rectify is not None,
@@ -310,8 +312,8 @@ def _dataset(name: str, rig: Rig, files: _Files, bodies: Trajectory | None, samp
     )
 
 
-def _pairs(lefts_s: Array, rights_s: Array, name: str) -> tuple[list[tuple[int, int]], tuple[str, ...]]:
-    """Return rows of images that were taken together, and a note where a camera lost some."""
+def _pairs(lefts_s: Array, rights_s: Array, name: str) -> tuple[list[tuple[int, int]], tuple[LossFacts, ...]]:
+    """Return rows of images that were taken together, and what a camera lost."""
     pairs = pair_stamps(lefts_s, rights_s, _MAX_PAIR_S)
     if not pairs:
         raise UsageError(
@@ -321,7 +323,8 @@ def _pairs(lefts_s: Array, rights_s: Array, name: str) -> tuple[list[tuple[int, 
         )
     alone = len(lefts_s) - len(pairs)
     note = f"{alone} of {len(lefts_s)} images of {name}'s left camera have no right one, and are left out"
-    return pairs, (note,) if alone else ()
+    loss = LossFacts(sentence=note, lost=alone, total=len(lefts_s), is_usual=True)
+    return pairs, (loss,) if alone else ()
 
 
 def _takes(path: Path, wanted: bool | None, name: str) -> bool:

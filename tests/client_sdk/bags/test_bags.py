@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import struct
 from pathlib import Path
 from types import SimpleNamespace
@@ -113,7 +114,8 @@ def test_colour_and_depth_are_paired_within_the_bound(tmp_path: Path) -> None:
     path = write_bag(tmp_path, change=delayed)
     with open_bag(path, BagOptions(pair_within_s=0.0125)) as bag:
         assert len(bag) == 3
-        assert "2 colour images without depth within 0.0125 s left out" in bag.notes
+        (doubt,) = bag.log.doubts
+        assert re.search(r"^2 colour images of \d+ without depth within 0.0125 s left out", doubt.sentence)
     with open_bag(path) as bag:
         assert_is_the_scene(bag)
 

@@ -183,7 +183,8 @@ def test_one_topic_without_time_stamps_is_paired_by_the_times_of_recording(tmp_p
 def test_an_image_without_a_time_stamp_among_others_is_left_out(tmp_path: Path) -> None:
     with open_bag(write_bag(tmp_path, make=frames(stamp=lambda row: stamp_of(row) if row else 0))) as bag:
         assert len(bag) == FRAMES - 1
-        assert "2 images with the time stamp 0 left out" in bag.notes
+        (doubt,) = bag.log.doubts
+        assert (doubt.name.value, doubt.sentence) == ("left-out", "2 images with the time stamp 0 left out")
 
 
 @pytest.mark.parametrize(
@@ -200,6 +201,16 @@ def test_what_contradicts_the_bag_is_refused_with_both_numbers(
     with pytest.raises(UsageError, match=expected) as refused:
         open_bag(write_bag(tmp_path, make=make))
     assert refused.value.hint
+
+
+@pytest.mark.parametrize(
+    ("options", "is_assumed"), [(BagOptions(), True), (BagOptions(depth_scale=1000.0), False)]
+)
+def test_a_unit_of_depth_that_is_assumed_is_a_note(
+    tmp_path: Path, options: BagOptions, is_assumed: bool
+) -> None:
+    with open_bag(write_bag(tmp_path, make=frames()), options) as bag:
+        assert any("1000 units a metre are assumed" in note for note in bag.notes) is is_assumed
 
 
 def test_the_unit_of_floats_can_be_given(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -220,8 +221,12 @@ def test_a_raw_dump_is_paired_by_the_times_in_its_names(tmp_path: Path):
         body[..., 0] = red
         (tmp_path / f"r-{stamp}-7.ppm").write_bytes(b"P6\n640 480\n255\n" + body.tobytes())
 
-    frames = list(open_dataset(tmp_path))
+    dataset = open_dataset(tmp_path)
+    frames = list(dataset)
 
+    (doubt,) = dataset.doubts
+    assert doubt.sentence.endswith("left out: d-100.066000-5.pgm")
+    assert any("is that of the toolbox of NYU Depth V2: fx 518.86" in note for note in dataset.notes)
     assert [frame.timestamp_s for frame in frames] == [100.0, 100.033]
     assert [frame.rgb[240, 320].tolist() for frame in frames] == [[10, 0, 0], [20, 0, 0]]
     assert np.median(frames[0].depth_m) == pytest.approx(0.999, abs=0.01)
@@ -248,6 +253,7 @@ def test_the_labelled_file_is_read_with_its_axes_turned(tmp_path: Path):
     assert (len(cafe), len(open_dataset(tmp_path / "nyu.mat"))) == (2, 3)
     assert frame.rgb[50, 100].tolist() == [0, 0, 77]
     assert frame.depth_m[50, 100] == 2.5
+    assert any("1 s between images is assumed" in note for note in cafe.notes)
     with pytest.raises(UsageError, match="no scene attic"):
         open_dataset(tmp_path / "nyu.mat", scene="attic")
 
@@ -293,6 +299,29 @@ def test_named_intrinsics_of_a_folder_with_depth_say_its_scale(tmp_path: Path):
         open_dataset(folder, intrinsics=tmp_path / "none.json")
 
 
+@pytest.mark.parametrize(
+    ("name", "units", "refused"),
+    [
+        ("mine", 800, "0.16 m at assumed 5000 units a metre, not within 0.2..6 m"),
+        ("mine", 35_000, "7 m at assumed 5000 units a metre"),
+        ("mine", 5000, ""),
+        ("rgbd_dataset_freiburg2_hall", 35_000, ""),  # the benchmark states the unit
+        ("rgbd_dataset_freiburg2_hall", 200, "0.04 m at 5000 units a metre, not within 0.05..30 m"),
+    ],
+)
+def test_a_unit_of_depth_that_is_assumed_has_narrow_limits(
+    tmp_path: Path, name: str, units: int, refused: str
+) -> None:
+    folder = write_tum(tmp_path / name, [0.0], size=(480, 640), intrinsics=False)
+    cv2.imwrite(str(folder / "depth/0.png"), np.full((480, 640), units, np.uint16))
+
+    if refused:
+        with pytest.raises(UsageError, match=re.escape(refused)):
+            open_dataset(folder)
+    else:
+        assert open_dataset(folder).has_depth
+
+
 def test_assumed_intrinsics_are_told(tmp_path: Path):
     folder = write_tum(tmp_path / "mine", [0.0])
     for path in (folder / "rgb/0.png", folder / "depth/0.png"):
@@ -322,4 +351,15 @@ def test_colour_images_without_depth_are_left_out_and_counted(tmp_path: Path) ->
     dataset = open_dataset(folder)
 
     assert len(dataset) == 3
-    assert any(note.startswith("2 of 5 colour images") for note in dataset.notes)
+    assert dataset.doubts[0].sentence.startswith("2 of 5 colour images")
+
+
+def test_a_few_images_without_a_partner_are_a_note(tmp_path: Path) -> None:
+    folder = write_tum(tmp_path / "drive", [row / 10 for row in range(20)])
+    lines = (folder / "depth.txt").read_text().splitlines()
+    (folder / "depth.txt").write_text("\n".join(lines[:-1]) + "\n")
+
+    dataset = open_dataset(folder)
+
+    assert dataset.doubts == ()
+    assert any(note.startswith("1 of 20 colour images") for note in dataset.notes)
