@@ -19,8 +19,8 @@ __all__ = ["FIRST_RETRY_S", "OwnerThreads", "Sleep", "Threads", "Urgency", "next
 
 _LOOKING = 3
 """Two measure keyframes, one may look for a robot that is lost; matching and solving free the GIL."""
-_CALM_NICE = 10
-"""Of threads whose work poses do not wait for."""
+_BACKGROUND_NICE = 10
+"""Nobody waits for snapshots.  Corrections wait for measurements, whose threads keep the normal priority."""
 FIRST_RETRY_S, _LAST_RETRY_S = 0.05, 1.0
 Sleep = Callable[[float], Coroutine[Any, Any, None]]
 """Waits for seconds."""
@@ -63,8 +63,8 @@ class OwnerThreads:
         self._store, self._lease = (
             ThreadPoolExecutor(1, thread_name_prefix=name) for name in ("store", "lease")
         )
-        self._background = ThreadPoolExecutor(1, thread_name_prefix="background", initializer=_calm)
-        self._look = ThreadPoolExecutor(_LOOKING, thread_name_prefix="look", initializer=_calm)
+        self._background = ThreadPoolExecutor(1, thread_name_prefix="background", initializer=_lower_priority)
+        self._look = ThreadPoolExecutor(_LOOKING, thread_name_prefix="look")
         self._waiting: PriorityQueue[tuple[int, int, Callable[[], None]]] = PriorityQueue()
         self._count = itertools.count()
         threading.Thread(target=self._compute_on, name="map", daemon=True).start()
@@ -108,9 +108,9 @@ class OwnerThreads:
             self._waiting.get()[2]()
 
 
-def _calm() -> None:
+def _lower_priority() -> None:
     """Lower the priority of the calling thread, which Linux has for each thread."""
-    os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _CALM_NICE)
+    os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _BACKGROUND_NICE)
 
 
 def next_retry_s(wait_s: float) -> float:
