@@ -7,6 +7,7 @@ if frames were lost.
 from __future__ import annotations
 
 import asyncio
+import os
 import time
 from collections.abc import Callable, Sequence
 from contextlib import AsyncExitStack
@@ -41,6 +42,8 @@ if TYPE_CHECKING:
 
 __all__ = ["DemoOptions", "FrameDone", "RobotFinished", "RobotSpec", "run_robot"]
 
+_ROBOT_NICE = 5
+"""Robots of the demo share a machine with the servers, which go first; elsewhere a robot has its own."""
 _MIN_READINGS = 2
 _OWN_SOLVER_S = 0.2
 """A robot whose cloud does not answer begins so long before the deadline: it shares the machine with all."""
@@ -176,6 +179,7 @@ class _Loaded:
 
 def run_robot(spec: RobotSpec, pipe: Connection) -> None:
     """Load the frames, connect, wait for the start, track; the entry point of the process."""
+    os.nice(_ROBOT_NICE)
     parent = ParentPipe(pipe, spec.name)
     parent.listen()
     try:
