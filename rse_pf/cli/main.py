@@ -19,6 +19,7 @@ from typing import Any, NoReturn
 from rse_pf.config import load_settings
 from rse_pf.config.validation import did_you_mean
 from rse_pf.errors import ConfigurationError, RsePfError, SettingsError, UsageError, error_of_system
+from rse_pf.one_thread import ONE_THREAD
 from rse_pf.terminal import show, show_error, show_page
 
 __all__ = ["VERBS", "Parser", "main", "parser_of", "verb_module"]
@@ -111,6 +112,8 @@ class Parser(argparse.ArgumentParser):
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one verb and return the exit code."""
+    # Before a verb imports numpy.  A robot's matrices are small: a second thread of BLAS only spins.
+    os.environ.update({**ONE_THREAD, **os.environ})
     words = list(sys.argv[1:] if argv is None else argv)
     try:
         code = _run(words)

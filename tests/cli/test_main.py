@@ -209,3 +209,24 @@ def test_the_page_of_settings_is_the_one_in_the_documentation(
 
     page = (repository / "docs" / "settings.md").read_text(encoding="utf-8")
     assert capsys.readouterr().out == page, "run make docs"
+
+
+def test_a_verb_computes_with_one_thread_of_blas() -> None:
+    """A robot's matrices are small: OpenBLAS would spin on all cores."""
+    script = """
+import sys
+from pathlib import Path
+from rse_pf.cli.main import main
+main(["errors", "E-NONE"])
+assert "numpy" not in sys.modules
+import numpy as np
+np.ones((500, 500)) @ np.ones((500, 500))
+print(len(list(Path("/proc/self/task").iterdir())))
+"""
+    free = {name: value for name, value in os.environ.items() if not name.endswith("_NUM_THREADS")}
+
+    done = subprocess.run(
+        [sys.executable, "-c", script], env=free, capture_output=True, text=True, check=True, timeout=60
+    )
+
+    assert done.stdout.split()[-1] == "1"
