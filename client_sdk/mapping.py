@@ -24,6 +24,7 @@ from rse_pf.geometry import (
     to_quaternion,
     transform,
 )
+from rse_pf.native_cloud import CloudCore, VoxelArrays, cloud_core
 from rse_pf.slam.ply import decode_ply, encode_ply
 
 if TYPE_CHECKING:
@@ -105,8 +106,18 @@ class PointMap:
 
     def add(self, frame: Frame, T_world_camera: Array) -> int:
         """Add *frame*, seen from *T_world_camera*, to the map; return the number of points used."""
-        points, colours = frame_points(frame, self.options)
-        return self.add_points(transform(T_world_camera, points), colours)
+        options = self.options
+        core = self._core_for(frame.depth_m[:: options.every_px, :: options.every_px].size)
+        if core is None:
+            points, colours = frame_points(frame, options)
+            return self.add_points(transform(T_world_camera, points), colours)
+        chosen = (options.min_depth_m, options.max_depth_m, options.edge_percent / 100.0, options.every_px)
+        return self._added(
+            core.add_frame(
+                frame.depth_m, frame.rgb, frame.camera, T_world_camera, chosen, self._voxels(), self._size,
+                options.voxel_m, _REACH,
+            )
+        )  # fmt: skip
 
     def take(self, other: PointMap, T_world_other: Array) -> None:
         """Add all voxels of another map, seen in its frame, each with its readings."""
@@ -120,6 +131,14 @@ class PointMap:
 
     def _add(self, points_world: Array, colours: npt.NDArray[Any], readings: npt.NDArray[np.int32]) -> int:
         """Add points that stand for so many readings each; return how many readings were used."""
+        core = self._core_for(len(points_world))
+        if core is not None:
+            return self._added(
+                core.add(
+                    points_world, colours.astype(np.float32), readings, self._voxels(), self._size,
+                    self.options.voxel_m, _REACH,
+                )
+            )  # fmt: skip
         index = np.floor(points_world / self.options.voxel_m)
         inside = (np.abs(index) < _REACH).all(axis=1)
         index = index[inside].astype(np.int64) + _REACH
@@ -137,6 +156,20 @@ class PointMap:
         has_row = rows >= 0
         self._average(rows[has_row], sums[has_row], counts[has_row])
         return int(counts[has_row].sum())
+
+    def _core_for(self, rows: int) -> CloudCore | None:
+        """Return the native core with room for *rows* new voxels; None without it, or if they may not fit."""
+        core = cloud_core()
+        if core is None or self._size + rows > self.options.max_points:
+            return None
+        self._grow(rows)
+        return core
+
+    def _added(self, added: tuple[int, int, int]) -> int:
+        """Take the number of voxels and of slots that were read; return how many readings were used."""
+        self._size, used, probes = added
+        self.probes += probes
+        return used
 
     def points(self, min_readings: int = 1) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.uint8]]:
         """Return ``(n, 3)`` float32 points in metres and their ``(n, 3)`` uint8 colours.
@@ -198,14 +231,31 @@ class PointMap:
         wanted = min(self._size + more, self.options.max_points)
         if wanted > len(self._counts):
             capacity = min(max(2 * len(self._counts), wanted), self.options.max_points)
-            self._keys = np.resize(self._keys, capacity)
-            self._means = np.resize(self._means, (capacity, 6))
-            self._counts = np.resize(self._counts, capacity)
+            self._keys, self._means, self._counts = (
+                _grown(array, capacity) for array in (self._keys, self._means, self._counts)
+            )
         if 2 * wanted > len(self._slot_keys):
             slots = 1 << (2 * wanted - 1).bit_length()
             self._slot_keys = np.full(slots, _EMPTY, dtype=np.int64)
             self._slot_rows = np.zeros(slots, dtype=np.int32)
-            self._insert(self._keys[: self._size].copy(), np.arange(self._size))
+            core = cloud_core()
+            if core is not None:
+                self.probes += core.index(self._voxels(), self._size)
+            else:
+                self._insert(self._keys[: self._size].copy(), np.arange(self._size))
+
+    def _voxels(self) -> VoxelArrays:
+        return VoxelArrays(
+            slot_keys=self._slot_keys, slot_rows=self._slot_rows, keys=self._keys, means=self._means,
+            counts=self._counts,
+        )  # fmt: skip
+
+
+def _grown(array: npt.NDArray[Any], capacity: int) -> npt.NDArray[Any]:
+    """Return a copy with room for *capacity* rows, of which those beyond mean nothing."""
+    larger = np.empty((capacity, *array.shape[1:]), dtype=array.dtype)
+    larger[: len(array)] = array
+    return larger
 
 
 def frame_points(frame: Frame, options: MapOptions) -> tuple[Array, npt.NDArray[np.uint8]]:

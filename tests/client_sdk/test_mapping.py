@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from client_sdk import mapping
 from client_sdk.frontend import Frame
 from client_sdk.mapping import (
     MapOptions,
@@ -21,6 +22,15 @@ from rse_pf.errors import UsageError
 from rse_pf.geometry import Camera, exp_se3
 
 CAMERA = Camera(fx=20.0, fy=20.0, cx=9.5, cy=7.5, width=20, height=16)
+
+
+@pytest.fixture(autouse=True, params=["native", "numpy"])
+def either(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Run each test with the native core, and without."""
+    if request.param == "numpy":
+        monkeypatch.setattr(mapping, "cloud_core", lambda: None)
+    elif mapping.cloud_core() is None:
+        pytest.skip("the native core is not built: make -C native")
 
 
 def flat_frame(depth_m: float = 2.0) -> Frame:
