@@ -401,7 +401,7 @@ def _near_directly(
     near, distinct = _functions()["rse_pf_match_near"], _functions()["rse_pf_distinct"]
     m, n = len(sought[0]), len(image[0])
     arrays = [np.array(each) for each in (*sought, *image)]
-    rooms = Room(8 * (m + 2 * n + 4200)), Room(8 * min(m, n)), Room(8 * min(m, n))
+    rooms = Room(8 * (m + 12 * n + 16_400)), Room(8 * min(m, n)), Room(8 * min(m, n))
 
     def called(abi: int, sought_rows: int, rows: int, radius_px: float) -> int:
         request = np.zeros(2 + 1 + 9 + 5 + 1, dtype=np.int64)
@@ -413,14 +413,14 @@ def _near_directly(
         answer: int = near(address_of(request), *(room.at for room in rooms))
         return answer
 
-    expect(called(1, m, n, limits[0]) == count, "another number of matches without the binding")
-    expect(called(2, m, n, limits[0]) == -1, "another ABI is not refused")
+    expect(called(2, m, n, limits[0]) == count, "another number of matches without the binding")
+    expect(called(3, m, n, limits[0]) == -1, "another ABI is not refused")
     for size in HOSTILE_SIZES:
-        expect(called(1, size, n, 1.0) == called(1, m, size, 1.0) == -1, f"{size} rows are not refused")
+        expect(called(2, size, n, 1.0) == called(2, m, size, 1.0) == -1, f"{size} rows are not refused")
         answer = distinct(address_of(arrays[7]), address_of(arrays[4]), size, 6.0, rooms[0].at)
         expect(answer == -1, f"{size} rows have distances")
     for radius_px in (-1.0, float("nan"), float("inf")):
-        expect(called(1, m, n, radius_px) == -1, f"a radius of {radius_px} is not refused")
+        expect(called(2, m, n, radius_px) == -1, f"a radius of {radius_px} is not refused")
     for room in rooms:
         room.check()
 
@@ -463,7 +463,7 @@ def _fit(core: TrackCore, data: bytes, meter: Meter) -> None:
     arrays = [np.array(each) for each in (*rows, *measured)]
     for size in HOSTILE_SIZES:
         request = np.zeros(2 + 6 + 6 + 16, dtype=np.int64)
-        request[:1].view(np.uint32)[:] = (1, 0)
+        request[:1].view(np.uint32)[:] = (2, 0)
         request[1] = size
         request[2:8] = [address_of(each) for each in arrays]
         request[8:14].view(np.float64)[:] = (300.0, 300.0, 1.0, 1.0, 6.25, 11.3)
@@ -557,7 +557,7 @@ def _functions() -> dict[str, Any]:
     (refine,) = load_part(path, "depth", 1, "rse_pf_depth_refine")
     refine.argtypes, refine.restype = (pointer,) * 3, None
     names = ("rse_pf_distinct", "rse_pf_match_near", "rse_pf_fit_pose")
-    found.update(zip(names, load_part(path, "track", 1, *names), strict=True))
+    found.update(zip(names, load_part(path, "track", 2, *names), strict=True))
     found["rse_pf_distinct"].argtypes = (pointer, pointer, size, number, pointer)
     found["rse_pf_match_near"].argtypes, found["rse_pf_match_near"].restype = (pointer,) * 4, size
     found["rse_pf_fit_pose"].argtypes = (pointer,) * 3

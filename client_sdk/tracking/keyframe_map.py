@@ -16,16 +16,14 @@ from client_sdk.tracking.place import Place
 from rse_pf.geometry import Array, Camera, inverse, transform
 from rse_pf.maps.descriptors import Descriptors
 from rse_pf.pnp import DepthNoise
-from rse_pf.slam.tracking import ImageFeatures, SoughtFeatures
+from rse_pf.slam.tracking import ImageFeatures, LandmarkLooks, NearLimits, seek_near
 
 __all__ = [
     "NO_LANDMARK",
-    "Expected",
     "KeyframeMap",
     "Landmarks",
     "View",
     "between",
-    "expect",
     "measure_points",
 ]
 
@@ -33,9 +31,6 @@ Rows = npt.NDArray[np.int64]
 
 NO_LANDMARK = -1
 _FIRST_ROOM = 4096
-_MIN_COSINE, _MAX_NEARER, _MAX_FARTHER = 0.6, 2.0, 2.0
-"""A landmark is not sought from a direction, or a distance, from which it would look different."""
-_NEAREST_M = 0.1
 _DEG_PER_M = 30.0
 """A view that is turned by so many degrees shows as little of another one as a view a metre away."""
 _FUSED_FLOOR_M2 = 0.003**2 / 20.0
@@ -79,13 +74,21 @@ class Landmarks:
     numbers: Rows
     sways: Array = field(default_factory=lambda: np.empty((0, 3)))
 
+    @property
+    def looks(self) -> LandmarkLooks:
+        """How they looked."""
+        return LandmarkLooks(
+            points=self.points, rays=self.rays, turns=self.turns, sizes=self.sizes,
+            descriptors=self.descriptors,
+        )  # fmt: skip
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Expected:
-    """Landmarks as a pose expects them in its image: ``rows`` of the landmarks, and the features."""
-
-    rows: Rows
-    features: SoughtFeatures
+    def seek(
+        self, T_camera_world: Array, camera: Camera, image: ImageFeatures, limits: NearLimits,
+        margin_px: float,
+    ) -> tuple[Rows, Rows]:  # fmt: skip
+        """Return their rows, and those of an image's features, that match where a pose expects them."""
+        every = np.arange(len(self.points))
+        return seek_near(self.looks, every, T_camera_world, camera, image, limits, margin_px)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -222,16 +225,41 @@ class KeyframeMap:
         alike: list[int] = np.argsort(-(self._places @ place.vector()), kind="stable").tolist()
         return alike[:count]
 
+    def landmarks(self, numbers: Rows) -> Landmarks:
+        """Return landmarks by their numbers."""
+        return Landmarks(
+            points=self._points[numbers], spreads=self._spreads[numbers], sways=self._sways[numbers],
+            descriptors=self._descriptors[numbers], rays=self._rays[numbers], turns=self._turns[numbers],
+            sizes=self._sizes[numbers], numbers=numbers,
+        )  # fmt: skip
+
     def landmarks_of(self, keyframes: list[int]) -> Landmarks:
         """Return the landmarks that any of the keyframes sees."""
-        own = [self._keyframes[number].own for number in keyframes]
-        return self._landmarks(np.unique(np.concatenate(own)) if own else np.empty(0, dtype=np.int64))
+        return self.landmarks(self._seen_by(keyframes))
+
+    def seek(
+        self, keyframes: list[int], T_camera_world: Array, view: View, limits: NearLimits, margin_px: float
+    ) -> tuple[Rows, Rows]:
+        """Match the landmarks that any of the keyframes sees with an image where a pose expects them.
+
+        Returns:
+            The landmarks, and the rows of the image's features.
+        """
+        numbers, count = self._seen_by(keyframes), self._count
+        looks = LandmarkLooks(
+            points=self._points[:count], rays=self._rays[:count], turns=self._turns[:count],
+            sizes=self._sizes[:count], descriptors=self._descriptors[:count],
+        )  # fmt: skip
+        rows, features = seek_near(
+            looks, numbers, T_camera_world, view.camera, view.features, limits, margin_px
+        )
+        return numbers[rows], features
 
     def landmarks_in(self, keyframe: int) -> tuple[Landmarks, Descriptors]:
         """Return the landmarks of one keyframe, with the descriptors that this keyframe has of them."""
         record = self._keyframes[keyframe]
         rows = np.flatnonzero(record.landmarks != NO_LANDMARK)
-        return self._landmarks(record.landmarks[rows]), record.view.features.descriptors[rows]
+        return self.landmarks(record.landmarks[rows]), record.view.features.descriptors[rows]
 
     def landmarks_of_view(
         self, view: View, T_world_camera: Array, landmarks: Rows, noise: DepthNoise, pixel_px: float
@@ -326,12 +354,12 @@ class KeyframeMap:
             mine[first : self._count] = theirs[: other._count]
         return first
 
-    def _landmarks(self, numbers: Rows) -> Landmarks:
-        return Landmarks(
-            points=self._points[numbers], spreads=self._spreads[numbers], sways=self._sways[numbers],
-            descriptors=self._descriptors[numbers], rays=self._rays[numbers], turns=self._turns[numbers],
-            sizes=self._sizes[numbers], numbers=numbers,
-        )  # fmt: skip
+    def _seen_by(self, keyframes: list[int]) -> Rows:
+        """Return the landmarks that any of the keyframes sees, ascending."""
+        is_seen = np.zeros(self._count, dtype=bool)
+        for number in keyframes:
+            is_seen[self._keyframes[number].own] = True
+        return np.flatnonzero(is_seen)
 
     def _note_look(self, numbers: Rows, view: View, T_world_camera: Array, rows: Rows) -> None:
         """Take how landmarks look in the newest keyframe that sees them."""
@@ -383,35 +411,6 @@ class KeyframeMap:
         ]
         self._poses, self._places = self._poses[stays], self._places[stays]
         return numbers[current]
-
-
-def expect(landmarks: Landmarks, T_camera_world: Array, camera: Camera, margin_px: float) -> Expected:
-    """Return what a pose sees of landmarks: those ahead, in the image, and seen from such a place before."""
-    points = transform(T_camera_world, landmarks.points)
-    ahead = np.flatnonzero(points[:, 2] > _NEAREST_M)
-    pixels = camera.project(points[ahead])
-    u, v = pixels.T
-    inside = (
-        (u > -margin_px) & (u < camera.width + margin_px) & (v > -margin_px) & (v < camera.height + margin_px)
-    )
-    ahead, pixels = ahead[inside], pixels[inside]
-    distances = np.linalg.norm(points[ahead], axis=1)
-    # The ray of the last look, in this camera's frame.
-    rays = landmarks.rays[ahead] @ T_camera_world[:3, :3].T
-    before = np.linalg.norm(rays, axis=1)
-    cosines = (rays * points[ahead]).sum(axis=1) / np.maximum(distances * before, 1e-9)
-    is_alike = (
-        (cosines > _MIN_COSINE) & (distances < _MAX_FARTHER * before) & (before < _MAX_NEARER * distances)
-    )
-    rows, pixels = ahead[is_alike], pixels[is_alike]
-    turns = landmarks.turns[rows] @ T_camera_world[:2, :3].T
-    features = SoughtFeatures(
-        pixels=pixels,
-        descriptors=landmarks.descriptors[rows],
-        turns=turns / np.maximum(np.linalg.norm(turns, axis=1), 1e-9)[:, None],
-        sizes=landmarks.sizes[rows] * before[is_alike] / np.maximum(distances[is_alike], 1e-9),
-    )
-    return Expected(rows=rows, features=features)
 
 
 def _turns_in_world(view: View, T_world_camera: Array, rows: Rows) -> Array:

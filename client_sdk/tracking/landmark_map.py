@@ -13,12 +13,12 @@ import numpy as np
 import numpy.typing as npt
 
 from client_sdk.monocular.bundle import Adjuster, Bundle, adjust
-from client_sdk.tracking.keyframe_map import NO_LANDMARK, Landmarks, expect
+from client_sdk.tracking.keyframe_map import NO_LANDMARK, Landmarks
 from client_sdk.tracking.place import Place
 from rse_pf.geometry import Array, Camera, exp_se3, inverse, log_se3, scaled, transform
 from rse_pf.maps.descriptors import Descriptors
 from rse_pf.slam.places import PlaceVector
-from rse_pf.slam.tracking import ImageFeatures, NearLimits, match_near
+from rse_pf.slam.tracking import ImageFeatures, NearLimits
 from rse_pf.slam.triangulation import parallax_deg, reprojection_errors, triangulate
 
 __all__ = ["MIN_SHARED", "LandmarkLimits", "LandmarkMap", "ViewFeatures"]
@@ -269,11 +269,11 @@ class LandmarkMap:
         """
         keyframe = self.keyframes[number]
         landmarks = landmarks[self.is_alive[landmarks] & ~np.isin(landmarks, keyframe.landmarks)]
-        expected = expect(self.landmarks(landmarks), keyframe.T_camera_world, self.camera, 0.0)
-        rows, columns = match_near(
-            expected.features, keyframe.features.image, NearLimits(radius_px=radius_px, ratio=0.9)
-        )
-        landmarks, same = landmarks[expected.rows[rows]], keyframe.landmarks[columns]
+        rows, columns = self.landmarks(landmarks).seek(
+            keyframe.T_camera_world, self.camera, keyframe.features.image,
+            NearLimits(radius_px=radius_px, ratio=0.9), 0.0,
+        )  # fmt: skip
+        landmarks, same = landmarks[rows], keyframe.landmarks[columns]
         is_free = same == NO_LANDMARK
         keyframe.landmarks[columns[is_free]] = landmarks[is_free]
         becomes = np.arange(len(self.points) + 1)
@@ -358,23 +358,23 @@ class LandmarkMap:
             rays=points - T_world_two[:3, 3], turns=image.turns[free] @ T_world_two[:3, :2].T,
             sizes=image.sizes[free], numbers=free,
         )  # fmt: skip
-        expected = expect(looks, one.T_camera_world, self.camera, self.limits.search_px)
-        rows, columns = match_near(
-            expected.features, one.features.image, NearLimits(radius_px=self.limits.search_px)
-        )
+        rows, columns = looks.seek(
+            one.T_camera_world, self.camera, one.features.image,
+            NearLimits(radius_px=self.limits.search_px), self.limits.search_px,
+        )  # fmt: skip
         is_free = one.landmarks[columns] == NO_LANDMARK
-        return columns[is_free], free[expected.rows[rows[is_free]]]
+        return columns[is_free], free[rows[is_free]]
 
     def _observe_again(self, number: int, landmarks: Rows) -> None:
         """Let a keyframe see *landmarks* where its free features look alike at the projected pixels."""
         keyframe = self.keyframes[number]
         landmarks = landmarks[self.is_alive[landmarks] & ~np.isin(landmarks, keyframe.landmarks)]
-        expected = expect(self.landmarks(landmarks), keyframe.T_camera_world, self.camera, 0.0)
-        rows, columns = match_near(
-            expected.features, keyframe.features.image, NearLimits(radius_px=3.0, ratio=0.9)
-        )
+        rows, columns = self.landmarks(landmarks).seek(
+            keyframe.T_camera_world, self.camera, keyframe.features.image,
+            NearLimits(radius_px=3.0, ratio=0.9), 0.0,
+        )  # fmt: skip
         is_free = keyframe.landmarks[columns] == NO_LANDMARK
-        keyframe.landmarks[columns[is_free]] = landmarks[expected.rows[rows[is_free]]]
+        keyframe.landmarks[columns[is_free]] = landmarks[rows[is_free]]
 
     def median_depth(self, number: int) -> float:
         """Return the median depth of the landmarks that a keyframe sees, 1 if it sees none."""

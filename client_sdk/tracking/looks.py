@@ -9,10 +9,11 @@ from __future__ import annotations
 import numpy as np
 
 from client_sdk.frontend import Frame
-from client_sdk.tracking.keyframe_map import Landmarks, expect
+from client_sdk.tracking.keyframe_map import Landmarks
 from rse_pf.geometry import Array, inverse, transform
 from rse_pf.slam.descriptors import distances_of_pairs
 from rse_pf.slam.orb import describe_at
+from rse_pf.slam.tracking import expect
 
 __all__ = ["share_alike"]
 
@@ -31,7 +32,8 @@ def share_alike(frame: Frame, landmarks: Landmarks, T_world_camera: Array) -> tu
     Landmarks that something nearer hides do not count; at most 300 are looked at.  Right poses of the
     recordings have 0.43 and more, also with blur; poses at another wall of the same paper have 0.13.
     """
-    expected = expect(landmarks, inverse(T_world_camera), frame.camera, -_EDGE_PX)
+    every = np.arange(len(landmarks.points))
+    expected = expect(landmarks.looks, every, inverse(T_world_camera), frame.camera, -_EDGE_PX)
     sought = expected.features
     columns, rows = np.rint(sought.pixels).astype(np.int64).T
     measured_m = frame.depth_m[rows, columns]

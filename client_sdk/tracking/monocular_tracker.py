@@ -28,7 +28,7 @@ from client_sdk.monocular.bundle import adjust
 from client_sdk.monocular.descriptors import match_all
 from client_sdk.monocular.two_view import TwoViewStart, start_from_two_views
 from client_sdk.slots import Slots
-from client_sdk.tracking.keyframe_map import NO_LANDMARK, expect
+from client_sdk.tracking.keyframe_map import NO_LANDMARK
 from client_sdk.tracking.landmark_map import MIN_SHARED, LandmarkLimits, LandmarkMap, ViewFeatures
 from client_sdk.tracking.place import place_of
 from client_sdk.tracking.queries import Answer, OneQuery, Steps
@@ -42,7 +42,6 @@ from rse_pf.slam.tracking import (
     Observations,
     distinct_distances,
     fit_pose,
-    match_near,
 )
 
 __all__ = ["MonocularOptions", "MonocularTracker", "SeenKeyframe"]
@@ -858,9 +857,10 @@ def _matched_near(
     """Match the landmarks around a keyframe, that of reference by default, near the pixels of a pose."""
     own = segment.map
     numbers = own.around(segment.reference if around is None else around)
-    expected = expect(own.landmarks(numbers), T_camera_world, own.camera, limits.radius_px)
-    rows, columns = match_near(expected.features, features.image, limits)
-    return _Matched(landmarks=numbers[expected.rows[rows]], features=columns)
+    rows, columns = own.landmarks(numbers).seek(
+        T_camera_world, own.camera, features.image, limits, limits.radius_px
+    )
+    return _Matched(landmarks=numbers[rows], features=columns)
 
 
 def _agree(one: _Similarity, two: _Similarity, centre: Array, depth: float) -> bool:

@@ -8,12 +8,13 @@ out.
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
 
 from client_sdk.frontend import Features
-from rse_pf.geometry import Array, Camera, inverse, log_se3, skew
+from rse_pf.geometry import Array, Camera, log_se3, skew
 
 __all__ = ["ReadoutEstimate", "sways", "turn_rate", "without_shutter"]
 
@@ -21,6 +22,7 @@ _MOST_S = 0.05
 _FIRST_DEV_S = 0.02
 """Deviation of the readout from none, before any image was seen."""
 _LEAST_RATE = 0.2
+_LEAST_SINE = 1e-5  # an angle below it is its sine
 _TURN_DEV = 0.01
 """Deviation, in radians, of the turn that an image tells of: its features err together."""
 _DRIFT_S = 0.0003
@@ -37,13 +39,12 @@ def without_shutter(features: Features, camera: Camera, turn: Array) -> Features
     """
     if not turn.any():
         return features
-    ones = np.ones(len(features.pixels))
-    rays = np.column_stack([(features.pixels - (camera.cx, camera.cy)) / (camera.fx, camera.fy), ones])
-    rotations = _rotations(_shares(features.pixels, camera)[:, None] * turn)
+    rays = camera.back_project(features.pixels, np.ones(len(features.pixels)))
+    shares = _shares(features.pixels, camera)
     return replace(
         features,
-        pixels=camera.project(np.einsum("nij,nj->ni", rotations, rays)),
-        points_camera=np.einsum("nij,nj->ni", rotations, features.points_camera),
+        pixels=camera.project(_turned(rays, shares, turn)),
+        points_camera=_turned(features.points_camera, shares, turn),
     )
 
 
@@ -56,7 +57,7 @@ def sways(features: Features, points_camera: Array, camera: Camera, rate: Array)
         camera: Its intrinsics.
         rate: ``(3,)`` radians a second at which the camera turns, in its own frame.
     """
-    moved: Array = _shares(features.pixels, camera)[:, None] * np.cross(rate, points_camera)
+    moved: Array = _shares(features.pixels, camera)[:, None] * (points_camera @ skew(rate).T)
     return moved
 
 
@@ -69,7 +70,7 @@ def turn_rate(T_world_first: Array, T_world_second: Array, interval_s: float, be
         interval_s: From the one to the other, above 0.
         before: ``(3,)``, the rate in the first pose; 0 if it is not known.
     """
-    mean: Array = log_se3((inverse(T_world_first) @ T_world_second)[None])[0, 3:] / interval_s
+    mean = _rotation_vector(T_world_first[:3, :3].T @ T_world_second[:3, :3]) / interval_s
     # The rate between the two poses is that in the middle; a whole step beyond it carries too much noise.
     return mean + 0.5 * (mean - before) if before.any() else mean
 
@@ -107,9 +108,23 @@ def _shares(pixels: Array, camera: Camera) -> Array:
     return shares
 
 
-def _rotations(angles: Array) -> Array:
-    """Return the ``(n, 3, 3)`` rotations by ``(n, 3)`` angles; to 1e-5 below half a radian."""
-    theta2 = (angles**2).sum(axis=1)[:, None, None]
-    K = skew(angles)
-    rotations: Array = np.eye(3) + (1.0 - theta2 / 6.0) * K + (0.5 - theta2 / 24.0) * (K @ K)
-    return rotations
+def _turned(points: Array, shares: Array, turn: Array) -> Array:
+    """Return ``(n, 3)`` points, each rotated by its share of a turn; to 1e-5 below half a radian."""
+    K = skew(turn)
+    theta2 = shares**2 * float(turn @ turn)
+    along, across = shares * (1.0 - theta2 / 6.0), shares**2 * (0.5 - theta2 / 24.0)
+    turned: Array = points + along[:, None] * (points @ K.T) + across[:, None] * (points @ (K @ K).T)
+    return turned
+
+
+def _rotation_vector(R: Array) -> Array:
+    """Return the ``(3,)`` logarithm of a rotation; as that of `log_se3`, in a tenth of its time."""
+    (a, b, c), (d, e, f), (g, h, i) = R.tolist()
+    x, y, z = 0.5 * (h - f), 0.5 * (c - g), 0.5 * (d - b)
+    sine, cosine = math.sqrt(x * x + y * y + z * z), 0.5 * (a + e + i - 1.0)
+    if cosine < 0.0:
+        T = np.eye(4)
+        T[:3, :3] = R
+        return log_se3(T[None])[0, 3:]
+    scale = 1.0 if sine < _LEAST_SINE else math.atan2(sine, cosine) / sine
+    return np.array([scale * x, scale * y, scale * z])

@@ -25,7 +25,7 @@ from client_sdk.frontend import (
 from client_sdk.monocular.descriptors import match_all
 from client_sdk.slots import Slots
 from client_sdk.stereo.depth import with_offset
-from client_sdk.tracking.keyframe_map import NO_LANDMARK, KeyframeMap, Landmarks, View, between, expect
+from client_sdk.tracking.keyframe_map import NO_LANDMARK, KeyframeMap, Landmarks, View, between
 from client_sdk.tracking.looks import share_alike
 from client_sdk.tracking.noise import NoiseEstimate
 from client_sdk.tracking.place import place_of
@@ -43,7 +43,6 @@ from rse_pf.slam.tracking import (
     distinct_distances,
     fit_pose,
     fit_sway,
-    match_near,
 )
 
 __all__ = ["Join", "Tracker"]
@@ -62,6 +61,9 @@ _CLEAR_INLIERS = 40
 _ALIKE_SHARE = 0.25
 """Of the landmarks that the pose of a recognised place expects, so many look as expected at their pixels."""
 _CONFIRM_PX = 8.0
+_NEAR_LOWE_RATIO, _CONFIRM_LOWE_RATIO = 0.8, 0.9
+"""The best match must be this much nearer than the second within the radius: around a prediction, and around
+a pose, where the radius is small."""
 _FAR_PX = 160.0
 """Radius of the last search around the last pose: a camera that turned otherwise is 10 degrees off."""
 _ALL_RATIO, _ALL_DISTANCE = 0.8, 64
@@ -99,14 +101,16 @@ class Join:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Seen:
-    """Landmarks that an image shows: rows of *landmarks*, and of its features."""
+    """Landmarks that an image shows, and the rows of its features that show them; rows as in `Landmarks`."""
 
-    landmarks: Landmarks
-    rows: Rows
+    points: Array
+    spreads: Array
+    sways: Array
+    numbers: Rows
     features: Rows
 
     def __len__(self) -> int:
-        return len(self.rows)
+        return len(self.features)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -323,7 +327,7 @@ class Tracker:
         T_reference = self._expected() if how == "map" else self._T_last
         if how != "frame":
             radius_px = self.options.search_px if how == "map" else _FAR_PX
-            seen = self._seen(view, T_reference, radius_px, _NEAR)
+            seen = self._seen(view, T_reference, radius_px, _NEAR_LOWE_RATIO)
             if len(seen) < (_MANY if how == "map" else 1) * least:
                 return None, len(seen)
         else:
@@ -453,7 +457,7 @@ class Tracker:
         return self._of_last().descriptors
 
     def _seen(
-        self, view: View, T_world_camera: Array, radius_px: float, limits: NearLimits,
+        self, view: View, T_world_camera: Array, radius_px: float, ratio: float,
         known: KeyframeMap | None = None, enough: int = 1_000_000,
     ) -> _Seen:  # fmt: skip
         """Match landmarks of the nearest keyframes and of the last frame near the pixels that a pose expects.
@@ -461,34 +465,36 @@ class Tracker:
         A feature that both show is taken as the last frame shows it.
         """
         T_camera_world = inverse(T_world_camera)
+        limits = NearLimits(radius_px=radius_px, ratio=ratio)
         own = known is None or known is self._map()
         if known is None:
             known = self._map()
-        landmarks = known.landmarks_of(known.nearest(T_world_camera, _LOCAL))
-        rows, features = _match(landmarks, T_camera_world, view, radius_px, limits)
-        if self._last is None or not own or self._lost_in_a_row or len(rows) >= enough:
-            return _Seen(landmarks=landmarks, rows=rows, features=features)
+        nearest = known.nearest(T_world_camera, _LOCAL)
+        numbers, features = known.seek(nearest, T_camera_world, view, limits, radius_px)
+        if self._last is None or not own or self._lost_in_a_row or len(features) >= enough:
+            return _seen_rows(known.landmarks(numbers), np.arange(len(numbers)), features)
         recent = self._of_last()
-        recent_rows, recent_features = _match(recent, T_camera_world, view, radius_px, limits)
-        again = np.isin(features, recent_features) | np.isin(
-            landmarks.numbers[rows], recent.numbers[recent_rows]
-        )
-        rows, features = rows[~again], features[~again]
+        rows, recent_features = recent.seek(T_camera_world, view.camera, view.features, limits, radius_px)
+        again = np.isin(features, recent_features) | np.isin(numbers, recent.numbers[rows])
+        numbers, features = numbers[~again], features[~again]
+        first = _seen_rows(known.landmarks(numbers), np.arange(len(numbers)), features)
+        second = _seen_rows(recent, rows, recent_features)
         return _Seen(
-            landmarks=_joined(landmarks, recent),
-            rows=np.concatenate([rows, len(landmarks.numbers) + recent_rows]),
-            features=np.concatenate([features, recent_features]),
+            points=np.concatenate([first.points, second.points]),
+            spreads=np.concatenate([first.spreads, second.spreads]),
+            sways=np.concatenate([first.sways, second.sways]),
+            numbers=np.concatenate([first.numbers, second.numbers]),
+            features=np.concatenate([first.features, second.features]),
         )
 
     def _make_query(self, view: View, seen: _Seen, T_reference: Array, against: str) -> PoseQuery:
-        rows, features, most = seen.rows, seen.features, self._most_matches()
+        rows, most = np.arange(len(seen)), self._most_matches()
         if len(rows) > most:
-            even = np.linspace(0, len(rows) - 1, most).astype(np.int64)
-            rows, features = rows[even], features[even]
-        leftmost = np.argsort(view.features.pixels[features, 0], kind="stable")
-        rows, features = rows[leftmost], features[leftmost]
+            rows = np.linspace(0, len(rows) - 1, most).astype(np.int64)
+        rows = rows[np.argsort(view.features.pixels[seen.features[rows], 0], kind="stable")]
+        features = seen.features[rows]
         points, pixels = round_for_wire(
-            transform(inverse(T_reference), seen.landmarks.points[rows]), view.features.pixels[features]
+            transform(inverse(T_reference), seen.points[rows]), view.features.pixels[features]
         )
         depths_m = np.nan_to_num(view.points_camera[features, 2], posinf=0.0, neginf=0.0).round(3)
         if len(points) and points[:, 2].min() <= 0.01:
@@ -546,7 +552,7 @@ class Tracker:
 
         *is_next* says that the camera moved here from its last pose.
         """
-        seen = self._seen(view, T_world_camera, _CONFIRM_PX, _CONFIRM, known, _ENOUGH)
+        seen = self._seen(view, T_world_camera, _CONFIRM_PX, _CONFIRM_LOWE_RATIO, known, _ENOUGH)
         least = self.options.min_inliers
         if len(seen) < least:
             return None
@@ -572,7 +578,7 @@ class Tracker:
         inliers = np.flatnonzero(fitted.is_inlier)
         self.noise.add(observed, inliers, T_camera_world)
         landmarks = np.full(len(view.features), NO_LANDMARK)
-        landmarks[seen.features[inliers]] = seen.landmarks.numbers[seen.rows[inliers]]
+        landmarks[seen.features[inliers]] = seen.numbers[inliers]
         return _Posed(
             view=view, T_world_camera=inverse(T_camera_world), landmarks=landmarks, inliers=agreeing,
             matches=max(matches, len(seen)), is_weak=answer.is_weak, is_next=is_next,
@@ -594,10 +600,10 @@ class Tracker:
         noise: DepthNoise = self.noise.noise
         at_m = z
         if view.is_stereo:
-            at_m = between(z, transform(inverse(T_world_camera), seen.landmarks.points[seen.rows])[:, 2])
+            at_m = between(z, transform(inverse(T_world_camera), seen.points)[:, 2])
         return Observations(
-            points=seen.landmarks.points[seen.rows],
-            spreads=seen.landmarks.spreads[seen.rows],
+            points=seen.points,
+            spreads=seen.spreads,
             pixels=view.features.pixels[seen.features],
             pixels_px=_PIXEL_PX * view.features.sizes[seen.features],
             depths_m=z,
@@ -653,7 +659,7 @@ class Tracker:
         rows = np.flatnonzero(fitted.is_inlier & (observed.depths_m > 0.0))
         if len(rows) < _LEAST_ROWS:
             return
-        known = seen.landmarks.sways[seen.rows[rows]] @ fitted.T_camera_world[:3, :3].T
+        known = seen.sways[rows] @ fitted.T_camera_world[:3, :3].T
         more_s, information = fit_sway(
             observed.only(rows), known - view.sways[seen.features[rows]], view.camera, fitted.T_camera_world
         )
@@ -753,38 +759,20 @@ class Tracker:
         )  # fmt: skip
 
 
-_NEAR = NearLimits(radius_px=1.0)
-_CONFIRM = NearLimits(radius_px=1.0, ratio=0.9)
-
-
-def _match(
-    landmarks: Landmarks, T_camera_world: Array, view: View, radius_px: float, limits: NearLimits
-) -> tuple[Rows, Rows]:
-    expected = expect(landmarks, T_camera_world, view.camera, radius_px)
-    limits = NearLimits(radius_px=radius_px, ratio=limits.ratio)
-    rows, features = match_near(expected.features, view.features, limits)
-    return expected.rows[rows], features
-
-
 def _seen_anywhere(landmarks: Landmarks, descriptors: Descriptors, view: View) -> _Seen:
     """Match landmarks with the features of an image by appearance alone."""
     rows, features = match_all(
         descriptors, view.features.descriptors, ratio=_ALL_RATIO, max_distance=_ALL_DISTANCE
     )
-    return _Seen(landmarks=landmarks, rows=rows, features=features)
+    return _seen_rows(landmarks, rows, features)
 
 
-def _joined(first: Landmarks, second: Landmarks) -> Landmarks:
-    return Landmarks(
-        points=np.concatenate([first.points, second.points]),
-        spreads=np.concatenate([first.spreads, second.spreads]),
-        sways=np.concatenate([first.sways, second.sways]),
-        descriptors=np.concatenate([first.descriptors, second.descriptors]),
-        rays=np.concatenate([first.rays, second.rays]),
-        turns=np.concatenate([first.turns, second.turns]),
-        sizes=np.concatenate([first.sizes, second.sizes]),
-        numbers=np.concatenate([first.numbers, second.numbers]),
-    )
+def _seen_rows(landmarks: Landmarks, rows: Rows, features: Rows) -> _Seen:
+    """Return some rows of landmarks as an image shows them."""
+    return _Seen(
+        points=landmarks.points[rows], spreads=landmarks.spreads[rows], sways=landmarks.sways[rows],
+        numbers=landmarks.numbers[rows], features=features,
+    )  # fmt: skip
 
 
 def _rotation_made(T: Array) -> Array:

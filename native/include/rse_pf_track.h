@@ -11,7 +11,7 @@
 extern "C" {
 #endif
 
-#define RSE_PF_TRACK_ABI 1
+#define RSE_PF_TRACK_ABI 2
 
 /* Return RSE_PF_TRACK_ABI of the library, to compare with the header's. */
 uint32_t rse_pf_track_abi(void);
@@ -45,7 +45,7 @@ typedef struct rse_pf_near_request {
 } rse_pf_near_request;
 
 /* Numbers of 8 bytes that rse_pf_match_near works in. */
-#define RSE_PF_NEAR_WORKSPACE(sought_rows, rows) ((sought_rows) + 2 * (rows) + 4200)
+#define RSE_PF_NEAR_WORKSPACE(sought_rows, rows) ((sought_rows) + 12 * (rows) + 16400)
 
 /* Match sought features to features of an image near predicted pixels; return the number of matches, -1 if a size
  * does not fit.  The first of equals is taken; of the sought features that take one feature the nearest stays, the
@@ -53,6 +53,32 @@ typedef struct rse_pf_near_request {
  * min(sought_rows, rows). */
 int64_t rse_pf_match_near(const rse_pf_near_request *request, uint64_t *workspace, int64_t *sought_matched,
                           int64_t *matched);
+
+typedef struct rse_pf_seek_request {
+    uint32_t abi;
+    uint32_t flags;             /* 0 */
+    int64_t rows, landmarks;    /* of the sought numbers; of the arrays of landmarks */
+    const int64_t *numbers;     /* rows: landmarks that are sought; none is beyond the arrays */
+    const double *points;       /* landmarks x 3, metres, world */
+    const double *rays;         /* landmarks x 3: from the camera that saw a landmark last to it, metres, world */
+    const double *turns;        /* landmarks x 3: its orientation in that image, world */
+    const double *sizes;        /* landmarks: its size in that image, above 0 */
+    const uint8_t *descriptors; /* landmarks x 32 */
+    double fx, fy, cx, cy, width, height;
+    double margin_px;           /* around the image */
+    double nearest_m;           /* along the optical axis */
+    double min_cosine;          /* between the rays of now and of then */
+    double max_nearer, max_farther; /* ratio of the distances of then and now, and of now and then */
+    double T_camera_world[16];  /* row-major */
+} rse_pf_seek_request;
+
+/* Numbers of 8 bytes that rse_pf_seek works in. */
+#define RSE_PF_SEEK_WORKSPACE(rows, image_rows) (10 * (rows) + RSE_PF_NEAR_WORKSPACE(rows, image_rows))
+
+/* Find landmarks in an image as a pose expects them there, and match them as rse_pf_match_near does; what image says
+ * of sought features is not read.  Writes the row of the numbers and that of the image for each match. */
+int64_t rse_pf_seek(const rse_pf_seek_request *request, const rse_pf_near_request *image, uint64_t *workspace,
+                    int64_t *sought_matched, int64_t *matched);
 
 typedef struct rse_pf_fit_request {
     uint32_t abi;
@@ -79,6 +105,11 @@ typedef struct rse_pf_fit_result {
 /* Fit the pose to pixels and depths by the noise of both and of the points, robustly, and write which rows are
  * inliers (rows bytes, 0 or 1); return 0, 1 if some motion is free, -1 if a size or a number does not fit. */
 int32_t rse_pf_fit_pose(const rse_pf_fit_request *request, uint8_t *is_inlier, rse_pf_fit_result *result);
+
+/* Write by how much motions of the points (rows x 3, in the camera's frame) explain what is left of the errors at the
+ * pose, solved together with the pose by one step, and the information of that number; both 0 where a motion of the
+ * camera explains the same.  Return 0, -1 if a size or a number does not fit.  gate2 is not read. */
+int32_t rse_pf_fit_sway(const rse_pf_fit_request *request, const double *sways, double *more, double *information);
 
 #ifdef __cplusplus
 }

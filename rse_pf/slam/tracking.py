@@ -6,31 +6,36 @@ poses agree to rounding.  Which landmarks are sought, and what is done with a po
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from rse_pf.errors import BadRequest
-from rse_pf.geometry import Array, Camera, exp_se3, skew
+from rse_pf.geometry import Array, Camera, exp_se3, skew, transform
 from rse_pf.maps.descriptors import ORB, Descriptors
 from rse_pf.native_tracker import track_core
 from rse_pf.slam.descriptors import distance_matrix, distances_of_pairs, no_distance
 
 __all__ = [
+    "ExpectedFeatures",
     "FittedPose",
     "ImageFeatures",
+    "LandmarkLooks",
     "NearLimits",
     "Observations",
     "SoughtFeatures",
     "distinct_by_numpy",
     "distinct_distances",
+    "expect",
     "fit_pose",
     "fit_pose_by_numpy",
     "fit_sway",
+    "fit_sway_by_numpy",
     "match_near",
     "match_near_by_numpy",
     "pairs_within",
+    "seek_near",
 ]
 
 Rows = npt.NDArray[np.int64]
@@ -42,6 +47,9 @@ _NEAR_M = 0.05
 _MAX_ABS, _MAX_TWIST, _MAX_DISTANCE2 = 1e9, 1e6, 1e300
 _FREE = 1e-12
 _OWN = 1e-9
+_NEAREST_M = 0.1  # nearer landmarks are not sought
+_MIN_COSINE = 0.6  # between the rays of two looks: from other directions a landmark looks different
+_MAX_NEARER, _MAX_FARTHER = 2.0, 2.0  # ratios of distances: from others a landmark looks different
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -77,6 +85,29 @@ class SoughtFeatures:
     descriptors: Descriptors
     turns: Array
     sizes: Array
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LandmarkLooks:
+    """Points of the world, and how they looked in the last image that showed them.
+
+    ``points`` ``(n, 3)``; ``rays`` ``(n, 3)`` from the camera that saw them last, and ``turns`` ``(n, 3)``
+    their orientation there, in the world; ``sizes`` ``(n,)``; ``descriptors`` ``(n, d)``.
+    """
+
+    points: Array
+    rays: Array
+    turns: Array
+    sizes: Array
+    descriptors: Descriptors
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ExpectedFeatures:
+    """Landmarks as a pose expects them in its image: ``rows`` of the landmarks, and the features."""
+
+    rows: Rows
+    features: SoughtFeatures
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -207,20 +238,89 @@ def match_near(sought: SoughtFeatures, image: ImageFeatures, limits: NearLimits)
         )
     if not 0.0 <= limits.radius_px <= _MAX_ABS:
         raise BadRequest(f"a radius of {limits.radius_px:g} px", hint="give 0 to 1e9 px")
-    if not image.is_oriented:
-        limits = replace(limits, min_cosine=-np.inf)
-    if not image.is_scaled:
-        limits = replace(limits, max_size_ratio=np.inf)
     core = track_core()
     if core is None or not ORB.describes(image.descriptors):
         return match_near_by_numpy(sought, image, limits)
     return core.match_near(
         (sought.pixels, sought.turns, sought.sizes, sought.descriptors),
         (image.pixels, image.turns, image.sizes, image.descriptors, image.distinct),
-        (
-            limits.radius_px, limits.ratio, limits.distinct_ratio, limits.min_cosine,
-            limits.max_size_ratio, limits.max_distance,
-        ),
+        _numbers_of(limits, image),
+    )  # fmt: skip
+
+
+def expect(
+    looks: LandmarkLooks, numbers: Rows, T_camera_world: Array, camera: Camera, margin_px: float
+) -> ExpectedFeatures:
+    """Return what a pose sees of landmarks: those ahead, in the image, and seen from such a place before.
+
+    Args:
+        looks: Of landmarks.
+        numbers: ``(m,)`` rows of *looks*.
+        T_camera_world: ``(4, 4)``.
+        camera: Its intrinsics.
+        margin_px: Around its image.
+    """
+    points = transform(T_camera_world, looks.points[numbers])
+    ahead = np.flatnonzero(points[:, 2] > _NEAREST_M)
+    pixels = camera.project(points[ahead])
+    u, v = pixels.T
+    inside = (
+        (u > -margin_px) & (u < camera.width + margin_px) & (v > -margin_px) & (v < camera.height + margin_px)
+    )
+    ahead, pixels = ahead[inside], pixels[inside]
+    distances = np.linalg.norm(points[ahead], axis=1)
+    # The ray of the last look, in this camera's frame.
+    rays = looks.rays[numbers[ahead]] @ T_camera_world[:3, :3].T
+    before = np.linalg.norm(rays, axis=1)
+    cosines = (rays * points[ahead]).sum(axis=1) / np.maximum(distances * before, 1e-9)
+    is_alike = (
+        (cosines > _MIN_COSINE) & (distances < _MAX_FARTHER * before) & (before < _MAX_NEARER * distances)
+    )
+    rows, pixels = ahead[is_alike], pixels[is_alike]
+    turns = looks.turns[numbers[rows]] @ T_camera_world[:2, :3].T
+    features = SoughtFeatures(
+        pixels=pixels,
+        descriptors=looks.descriptors[numbers[rows]],
+        turns=turns / np.maximum(np.linalg.norm(turns, axis=1), 1e-9)[:, None],
+        sizes=looks.sizes[numbers[rows]] * before[is_alike] / np.maximum(distances[is_alike], 1e-9),
+    )
+    return ExpectedFeatures(rows=rows, features=features)
+
+
+def seek_near(
+    looks: LandmarkLooks, numbers: Rows, T_camera_world: Array, camera: Camera, image: ImageFeatures,
+    limits: NearLimits, margin_px: float,
+) -> tuple[Rows, Rows]:  # fmt: skip
+    """Return rows of *numbers* and of *image* that match where a pose expects landmarks, as `match_near`.
+
+    Args:
+        looks: Of landmarks.
+        numbers: ``(m,)`` rows of *looks* that are sought.
+        T_camera_world: ``(4, 4)``.
+        camera: Its intrinsics.
+        image: Where they are sought.
+        limits: When a feature is the expected one.
+        margin_px: Landmarks are expected so far around the image, too.
+    """
+    core = track_core()
+    if core is None or not ORB.describes(image.descriptors):
+        expected = expect(looks, numbers, T_camera_world, camera, margin_px)
+        rows, features = match_near(expected.features, image, limits)
+        return expected.rows[rows], features
+    return core.seek(
+        (looks.points, looks.rays, looks.turns, looks.sizes, looks.descriptors), numbers,
+        (T_camera_world, camera, margin_px), (_NEAREST_M, _MIN_COSINE, _MAX_NEARER, _MAX_FARTHER),
+        (image.pixels, image.turns, image.sizes, image.descriptors, image.distinct),
+        _numbers_of(limits, image),
+    )  # fmt: skip
+
+
+def _numbers_of(limits: NearLimits, image: ImageFeatures) -> tuple[float, float, float, float, float, int]:
+    """Return the limits in the order of the native core; features without turns have no limit of them."""
+    return (
+        limits.radius_px, limits.ratio, limits.distinct_ratio,
+        limits.min_cosine if image.is_oriented else -np.inf,
+        limits.max_size_ratio if image.is_scaled else np.inf, limits.max_distance,
     )  # fmt: skip
 
 
@@ -228,25 +328,26 @@ def match_near_by_numpy(
     sought: SoughtFeatures, image: ImageFeatures, limits: NearLimits
 ) -> tuple[Rows, Rows]:
     """Return what `match_near` does, without the native core, whose oracle this is."""
+    radius_px, ratio, distinct_ratio, min_cosine, max_size_ratio, max_distance = _numbers_of(limits, image)
     empty = np.empty(0, dtype=np.int64)
     if not len(sought.pixels) or not len(image):
         return empty, empty
     with np.errstate(invalid="ignore", over="ignore"):
         rows, columns = pairs_within(
-            np.asarray(sought.pixels, np.float64), np.asarray(image.pixels, np.float64), limits.radius_px
+            np.asarray(sought.pixels, np.float64), np.asarray(image.pixels, np.float64), radius_px
         )
         a, b = np.asarray(sought.turns, np.float64)[rows], np.asarray(image.turns, np.float64)[columns]
         expected = np.asarray(sought.sizes, np.float64)[rows]
         size = np.asarray(image.sizes, np.float64)[columns]
         fits = (
-            (a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1] >= limits.min_cosine)
-            & (size <= limits.max_size_ratio * expected) & (expected <= limits.max_size_ratio * size)
+            (a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1] >= min_cosine)
+            & (size <= max_size_ratio * expected) & (expected <= max_size_ratio * size)
         )  # fmt: skip
     rows, columns = rows[fits], columns[fits]
     if not len(rows):
         return empty, empty
     distances = distances_of_pairs(sought.descriptors[rows], image.descriptors[columns])
-    most = limits.max_distance * image.descriptors.shape[1] // ORB.size
+    most = max_distance * image.descriptors.shape[1] // ORB.size
     if image.descriptors.dtype != np.uint8:
         most = no_distance(image.descriptors)
     order = np.lexsort((columns, distances, rows))
@@ -257,8 +358,8 @@ def match_near_by_numpy(
     best = distances[starts]
     clear = (
         (best <= most)
-        & (best < limits.distinct_ratio * image.distinct[columns[starts]])
-        & (~has_second | (best < limits.ratio * distances[follows]))
+        & (best < distinct_ratio * image.distinct[columns[starts]])
+        & (~has_second | (best < ratio * distances[follows]))
     )
     rows, columns, best = rows[starts][clear], columns[starts][clear], best[clear]
     nearest_first = np.argsort(best, kind="stable")
@@ -305,15 +406,17 @@ def fit_pose(
     core = track_core()
     if core is None:
         return fit_pose_by_numpy(observed, camera, T_camera_world, cauchy=cauchy, gate2=gate2)
-    upper = observed.spreads[:, (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2)]
-    fitted = core.fit_pose(
-        (observed.points, upper),
-        (observed.pixels, observed.pixels_px, observed.depths_m, observed.depths_dev_m),
-        camera, (cauchy * cauchy, gate2), T_camera_world,
-    )  # fmt: skip
+    fitted = core.fit_pose(*_packed(observed), camera, (cauchy * cauchy, gate2), T_camera_world)
     if fitted is None:
         return None
     return FittedPose(T_camera_world=fitted[0], information=fitted[1], is_inlier=fitted[2])
+
+
+def _packed(observed: Observations) -> tuple[tuple[Array, Array], tuple[Array, Array, Array, Array]]:
+    """Return points with the upper triangles of their covariances, and what was measured of them."""
+    upper = observed.spreads.reshape(-1, 9)[:, (0, 1, 2, 4, 5, 8)]
+    measured = observed.pixels, observed.pixels_px, observed.depths_m, observed.depths_dev_m
+    return (observed.points, upper), measured
 
 
 def fit_pose_by_numpy(
@@ -361,6 +464,16 @@ def fit_sway(
         T_camera_world: ``(4, 4)``, the pose that fits.
         cauchy: As in `fit_pose`.
     """
+    core = track_core()
+    if core is None:
+        return fit_sway_by_numpy(observed, sways, camera, T_camera_world, cauchy=cauchy)
+    return core.fit_sway(*_packed(observed), sways, camera, cauchy * cauchy, T_camera_world)
+
+
+def fit_sway_by_numpy(
+    observed: Observations, sways: Array, camera: Camera, T_camera_world: Array, *, cauchy: float
+) -> tuple[float, float]:
+    """Return what `fit_sway` does, without the native core, whose oracle this is."""
     J, W, residual, distance2, _ = _linearised(observed, camera, T_camera_world, np.inf)
     slopes = np.concatenate([J, J[:, :, :3] @ sways[:, :, None]], axis=2)
     weighted = (W @ slopes) / (1.0 + distance2 / cauchy**2)[:, None, None]

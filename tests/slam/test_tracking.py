@@ -19,15 +19,20 @@ from rse_pf.slam import tracking
 from rse_pf.slam.tracking import (
     FittedPose,
     ImageFeatures,
+    LandmarkLooks,
     NearLimits,
     Observations,
     SoughtFeatures,
     distinct_by_numpy,
     distinct_distances,
+    expect,
     fit_pose,
     fit_pose_by_numpy,
+    fit_sway,
+    fit_sway_by_numpy,
     match_near,
     match_near_by_numpy,
+    seek_near,
 )
 
 CAMERA = Camera(fx=525.0, fy=520.0, cx=319.5, cy=239.5, width=640, height=480)
@@ -42,6 +47,47 @@ def either(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> N
     """Run a test with the native core, and without."""
     if request.param == "numpy":
         monkeypatch.setattr(tracking, "track_core", lambda: None)
+
+
+# --- landmarks where a pose expects them ---------------------------------------------------------
+
+
+def looks_of(rng: np.random.Generator, n: int) -> LandmarkLooks:
+    """Return landmarks around a camera at the origin, seen before from cameras near and far from it."""
+    points = rng.uniform((-3.0, -3.0, -1.0), (3.0, 3.0, 6.0), (n, 3))
+    points[rng.random(n) < 0.05] = np.nan
+    angle = rng.uniform(-0.5, 0.5, n)
+    return LandmarkLooks(
+        points=points, rays=points * rng.choice([0.3, 0.9, 1.1, 3.0, -1.0], (n, 1)),
+        turns=np.column_stack([np.cos(angle), np.sin(angle), 0.1 * angle]),
+        sizes=rng.choice([1.0, 1.2, 2.0], n), descriptors=descriptors_of(rng, n, n // 3 + 1),
+    )  # fmt: skip
+
+
+@needs_library
+@pytest.mark.parametrize("seed", range(20))
+def test_landmarks_that_a_pose_expects_are_those_of_numpy(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(seed)
+    looks = looks_of(rng, 400)
+    T = exp_se3(rng.normal(0.0, 0.1, 6))
+    seen = expect(looks, np.arange(400), T, CAMERA, 10.0)
+    shown = rng.permutation(len(seen.rows))[:100]
+    image = ImageFeatures(
+        pixels=seen.features.pixels[shown] + rng.normal(0.0, 3.0, (len(shown), 2)),
+        descriptors=seen.features.descriptors[shown], turns=seen.features.turns[shown],
+        sizes=seen.features.sizes[shown], distinct=np.full(len(shown), 256, dtype=np.int32),
+        is_oriented=seed % 2 == 0, is_scaled=seed % 3 == 0,
+    )  # fmt: skip
+    numbers = np.sort(rng.choice(400, 300, replace=False))
+    limits = NearLimits(radius_px=8.0)
+
+    rows, features = seek_near(looks, numbers, T, CAMERA, image, limits, 10.0)
+
+    monkeypatch.setattr(tracking, "track_core", lambda: None)
+    expected = seek_near(looks, numbers, T, CAMERA, image, limits, 10.0)
+    assert len(rows) > 5
+    np.testing.assert_array_equal(rows, expected[0])
+    np.testing.assert_array_equal(features, expected[1])
 
 
 # --- matches -----------------------------------------------------------------------------------
@@ -327,6 +373,19 @@ def test_poses_are_those_of_numpy(has_depth: bool, outliers: float) -> None:
         assert found.is_inlier.tolist() == expected.is_inlier.tolist()
         scale = np.abs(expected.information).max()
         np.testing.assert_allclose(found.information, expected.information, rtol=0, atol=1e-9 * scale)
+
+
+@needs_library
+@pytest.mark.parametrize("has_depth", [True, False])
+def test_motions_of_points_are_fitted_as_by_numpy(has_depth: bool) -> None:
+    observed, T, _ = observations(5, n=80, has_depth=has_depth)
+    sways = np.random.default_rng(5).normal(0.0, 1.0, (80, 3))
+
+    more, information = fit_sway(observed, sways, CAMERA, T)
+
+    expected = fit_sway_by_numpy(observed, sways, CAMERA, T, cauchy=2.5)
+    assert information > 0.0
+    assert (more, information) == pytest.approx(expected, rel=1e-8)
 
 
 @pytest.mark.usefixtures("either")
