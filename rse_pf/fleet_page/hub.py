@@ -65,11 +65,6 @@ class Hub:
                 page.newest[name] = None
                 page.woken.set()
 
-    def drop(self, topic: str) -> None:
-        """Forget all values of *topic*."""
-        for name in [name for name in self._values if name[0] == topic]:
-            del self._values[name]
-
     def append(self, topic: str, row: Any) -> None:
         """Add one row to *topic*; the oldest rows are forgotten."""
         message = _message(topic, "", row)

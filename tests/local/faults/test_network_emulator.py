@@ -236,6 +236,5 @@ async def test_a_link_in_its_own_process_relays_cuts_and_heals() -> None:
             await asyncio.wait_for(reader.read(1), 0.2)
         await link.heal()
         assert await asyncio.wait_for(reader.readexactly(6), SOON_S) == b"during"
-        assert 0.0 < await link.read_cpu_s() < 10.0
         writer.close()
         await asyncio.wait_for(server.ended.wait(), SOON_S)
