@@ -15,7 +15,7 @@ import msgspec
 from rse_pf.errors import Conflict, NotFound
 from rse_pf.object_store import ObjectStore
 
-__all__ = ["Lease", "ObjectRecords", "OwnedRecord", "Versioned", "VersionedStore"]
+__all__ = ["Lease", "ObjectRecords", "OwnedRecord", "Versioned"]
 
 
 class Versioned(msgspec.Struct, frozen=True):
@@ -25,23 +25,8 @@ class Versioned(msgspec.Struct, frozen=True):
     version: bytes
 
 
-class VersionedStore(Protocol):
-    """The store of leases; a table with conditional writes can take the place of objects."""
-
-    def get(self, name: str) -> Versioned | None:
-        """Return what is stored, None if there is nothing; raises StoreError."""
-
-    def put(self, name: str, data: bytes, version: bytes | None) -> Versioned:
-        """Replace what has *version* (None: is missing), and return what is stored now.
-
-        Raises:
-            Conflict: There is another version.
-            StoreError: The store fails; the write may have been done.
-        """
-
-
 class ObjectRecords:
-    """A `VersionedStore` in an object store, where the bytes of an object are its version."""
+    """The records of leases in an object store, where the bytes of an object are its version."""
 
     def __init__(self, store: ObjectStore) -> None:
         self._store = store
@@ -84,7 +69,7 @@ class Lease(Generic[R]):
 
     def __init__(
         self,
-        store: VersionedStore,
+        store: ObjectRecords,
         name: str,
         decode: Callable[[str, bytes], R],
         clock: Callable[[], float],

@@ -9,10 +9,10 @@ import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from datetime import datetime, timezone
-from typing import Protocol
 
 from rse_pf.aws.account import Account
 from rse_pf.aws.fleet.group import read_group
+from rse_pf.aws.lifecycle.cdk_tools import CdkTools
 from rse_pf.aws.lifecycle.deployment import ParkNote, read_note, read_sizes
 from rse_pf.aws.lifecycle.parking import (
     delete_note,
@@ -30,7 +30,7 @@ from rse_pf.config.schedule import minimum_at, parse_schedule, zone_named
 from rse_pf.errors import DeploymentFailed
 from rse_pf.scaling.health import DRAIN_S, GRACE_S
 
-__all__ = ["StepContext", "Tools", "carry_out"]
+__all__ = ["StepContext", "carry_out"]
 
 _POLL_S = 5.0
 _STACK_S = 2400.0
@@ -39,26 +39,13 @@ _EMPTY_S = 600.0
 _HEALTHY_S = 600.0
 
 
-class Tools(Protocol):
-    """What runs on this machine, and not in the account."""
-
-    def build(self) -> None:
-        """Build the packages."""
-
-    def bootstrap(self) -> None:
-        """Prepare the account and region for the CDK."""
-
-    def deploy(self, stack: str) -> None:
-        """Deploy one stack, and nothing that it depends on."""
-
-
 @dataclass(frozen=True, kw_only=True)
 class StepContext:
     """What the steps act on."""
 
     account: Account
     settings: PlatformSettings
-    tools: Tools
+    tools: CdkTools
     tell: Callable[[str], None]
     clock: Callable[[], float] = time.monotonic
     sleep: Callable[[float], None] = time.sleep

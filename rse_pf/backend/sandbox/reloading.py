@@ -13,7 +13,7 @@ from asyncio import TimerHandle
 from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any
 
 from rse_pf.backend.sandbox.circuit_breaker import Block
 from rse_pf.backend.sandbox.manager import SandboxHost, SandboxManager
@@ -30,12 +30,8 @@ Answer = Callable[[QueuedCommand, Result | Failure], None]
 OnReady = Callable[[tuple[str, ...] | None], None]
 
 
-class MakeSandboxes(Protocol):
-    """Makes the sandboxes of some services; blocks until they are ready unless *on_ready* is given."""
-
-    def __call__(
-        self, services: Sequence[InstalledService], *, answer: Answer, on_ready: OnReady | None
-    ) -> SandboxManager: ...
+MakeSandboxes = Callable[..., SandboxManager]
+"""Makes the sandboxes of some services; blocks until they are ready unless *on_ready* is given."""
 
 
 @dataclass(eq=False, slots=True)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from rse_pf.aws.account import Account
 from rse_pf.aws.lifecycle.cdk_tools import CdkTools
-from rse_pf.aws.lifecycle.execution import StepContext, Tools, carry_out
+from rse_pf.aws.lifecycle.execution import StepContext, carry_out
 from rse_pf.aws.lifecycle.plan import Step
 from rse_pf.aws.money.costs import HOURS, Bill, bill_of, parked
 from rse_pf.aws.money.prices import Prices, operators_prices
@@ -69,7 +69,7 @@ def make_tools(account: Account, settings: PlatformSettings, args: argparse.Name
     return CdkTools(Path.cwd(), settings, str(caller.get("Account", "")), args.settings)
 
 
-def open_world(account: Account, settings: PlatformSettings, tools: Tools) -> StepContext:
+def open_world(account: Account, settings: PlatformSettings, tools: CdkTools) -> StepContext:
     """Return what steps act on."""
     return StepContext(account=account, settings=settings, tools=tools, tell=lambda text: show(f"  {text}"))
 

@@ -9,7 +9,7 @@ from typing import Literal
 import msgspec
 
 from rse_pf.errors import BadRequest, StoreError
-from rse_pf.lease import Lease, Versioned, VersionedStore
+from rse_pf.lease import Lease, ObjectRecords, Versioned
 from rse_pf.object_store import name_segment
 
 __all__ = [
@@ -117,7 +117,7 @@ class OwnerLease:
     """The lease in the hands of the process that claims it.  Blocking; for one thread at a time."""
 
     def __init__(
-        self, store: VersionedStore, name: str, *, owner: str, server: str, clock: Callable[[], float]
+        self, store: ObjectRecords, name: str, *, owner: str, server: str, clock: Callable[[], float]
     ) -> None:
         """Read nothing yet.
 
