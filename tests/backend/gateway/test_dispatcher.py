@@ -460,3 +460,18 @@ def test_a_round_computes_for_as_long_as_it_may(since_s: float, leaves_unread: b
         worker.loop.turn()
 
         assert sum(len(results(wire)) for _, wire in asked) - before == computed
+
+
+def test_a_connection_that_ends_drops_its_waiting_commands(worker: WorkerParts):
+    connection, wire = worker.join()
+    other, _ = worker.join("other")
+    worker.say(other, half(1))
+    worker.say(other, half(2))
+    worker.say(connection, echo(2))
+
+    connection.on_socket_end()
+    worker.loop.advance()
+
+    assert worker.metrics.requests["echo", "disconnected"] == 1
+    assert results(wire) == []
+    assert worker.dispatcher.connections == {other}

@@ -109,6 +109,18 @@ def test_a_stateless_command_whose_sandbox_crashed_is_tried_once_more_in_a_new_o
     assert outcomes(policy.on_reply(2, OK, 2.0)) == [(call, "ok")]
 
 
+def test_a_command_is_tried_twice_and_no_more():
+    policy, call = make_policy(poison_crashes=10), make_call()
+    start(policy, call)
+    number = created(policy.on_exit(1, "exit code 1", 1.0))
+    policy.on_ready(number, 1.0)
+
+    actions = policy.on_exit(number, "exit code 1", 2.0)
+
+    assert outcomes(actions) == [(call, "worker-lost")]
+    assert policy.sandboxes == 0
+
+
 def test_an_open_circuit_breaker_refuses_what_waits_as_well():
     policy = make_policy(breaker_crashes=2, poison_crashes=1)
     first, second, waiting = (make_call(payload=name) for name in "123")
