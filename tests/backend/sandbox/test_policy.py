@@ -356,6 +356,17 @@ def test_the_sandbox_of_a_robot_stays_when_one_of_the_same_name_in_another_tenan
     assert policy.tick(2.0 + GRACE_S) == [ReleaseSandbox(2)]
 
 
+def test_a_robot_that_reconnects_within_the_grace_period_keeps_its_sandbox():
+    policy = make_policy()
+    start(policy, make_call())
+    policy.on_reply(1, OK, 1.0)
+    policy.remove_connection(A, 2.0)
+    policy.add_connection(A)
+
+    assert policy.tick(100.0) == []
+    assert policy.submit(make_call(payload="2", now=100.0), 100.0) == [SendMessage(1, b"2")]
+
+
 def test_commands_that_wait_for_a_robot_that_left_are_dropped_and_not_moved():
     policy = make_policy()
     start(policy, make_call(payload="1"))
@@ -373,6 +384,17 @@ def test_an_idle_sandbox_in_its_grace_period_gives_its_place_to_another_robot():
     policy.remove_connection(A, 1.0)
 
     assert policy.submit(make_call(B), 1.5) == [ReleaseSandbox(1), CreateSandbox(2, B)]
+
+
+def test_a_sandbox_that_works_or_whose_robot_is_connected_keeps_its_place():
+    policy = make_policy(max_sandboxes=2)
+    start(policy, make_call(A))
+    start(policy, make_call(B, payload="y"))
+    policy.on_reply(2, OK, 0.5)
+    policy.remove_connection(A, 1.0)
+    call = make_call(C)
+
+    assert outcomes(policy.submit(call, 1.5)) == [(call, "busy")]
 
 
 RIVALS = [RobotId("rival", name) for name in "abcd"]
