@@ -33,7 +33,7 @@ PAGES = tuple(name for name in pages(Path(__file__).parents[2]) if name != "docs
 OTHER_PROGRAMS = (
     "npx", "aws", "dask", "python", ".", "grep", "sudo", "g++", "cmake", "mkdir", "build/first_pose",
     "client_cpp/build/rse_pf_tum_robot", "roscore", "roslaunch", "rosbag",
-    "rse-pf-ros", "export", "pip", "python3.11", "ros2", "umask",
+    "rse-pf-ros", "export", "pip", "python3.11", "ros2", "sleep", "umask",
 )  # fmt: skip
 BLOCK = re.compile(r"^```(\w*)\n(.*?)^```", re.DOTALL | re.MULTILINE)
 IN_A_LINE = re.compile(r"`((?:rse-pf|make) [^`]*)`")
