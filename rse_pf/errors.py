@@ -467,11 +467,11 @@ class Conflict(StoreError, code="conflict"):
 
 
 class StoreFull(StoreError, code="store-full"):
-    """The disk or the quota is full; nothing was stored.
+    """The disk is full, or nearly full and the tenant holds its share of it; nothing was stored.
 
-    Cause: The disk of the store is full, or the robot's quota of bytes is used up.
-    Check: Run df on the folder of data.store, and compare the quota with data.quota_bytes.
-    Fix: Delete objects that are not needed, or raise the quota or the disk.
+    Cause: Less than 10 % of the store's disk is free, and the tenant holds more than its share of it.
+    Check: Run df on the folder of data.store.
+    Fix: Delete objects or maps of this tenant, or use a larger disk.
     """
 
 

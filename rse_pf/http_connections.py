@@ -31,8 +31,9 @@ __all__ = ["MAX_HEADERS", "MAX_HEAD_BYTES", "OneRequestProtocol", "bounded_proto
 
 MAX_HEAD_BYTES = 16384  # of one request: a token, the longest header, has at most 4 KiB
 MAX_HEADERS = 64  # of one request: browsers and load balancers send fewer than 30
-MAX_FRAMING_BYTES = 4096  # of a chunked body beside its chunks, so that short bodies may have short chunks
-FRAMING_SHIFT = 3  # a chunk of n bytes allows n / 8 bytes more: each chunk costs CPU, however short it is
+# A chunked body may be longer than its data by these bytes and an eighth: each chunk costs CPU.
+MAX_FRAMING_BYTES = 4096
+FRAMING_SHIFT = 3
 PARSED_AT_ONCE_BYTES = 16384  # bytes of a chunked body between two checks of its framing
 UNSENT_HIGH_BYTES = 1 << 19  # of a reply: the application waits for a client that has not read so many
 UNSENT_LOW_BYTES = 1 << 18  # of a reply: the application goes on when no more than these wait

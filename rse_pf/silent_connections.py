@@ -26,8 +26,8 @@ __all__ = [
 ]
 
 FIRST_REQUEST_S = 6.0
-"""Time from the acceptance of a connection to its first whole request, or hello.  With the time that it may
-wait to be accepted, and to be closed among 5,000 others, these are ten seconds."""
+"""Time from the acceptance of a connection to its first whole head of a request, or hello.  With the waits
+before the acceptance, and for the close among 5,000 others, a silent client is gone after ten seconds."""
 BACKLOG = 4096
 """Connections that wait to be accepted: above that the kernel drops them, also those of robots, and they are
 tried again after 1 and 3 s.  The kernel cuts it to net.core.somaxconn."""

@@ -31,7 +31,8 @@ _MAX_ATTEMPTS = 20
 
 _T = TypeVar("_T", Roster, DenyList)
 REFRESH_S = 0.5
-"""Pause between two reads of the deny list and the roster: a revoked robot is disconnected within 2 s."""
+"""Pause between two reads of deny list and roster, by servers and, before them, by the agents on AWS: a robot
+that is revoked is disconnected within 2 s."""
 
 
 class AccessControlStore:

@@ -1,8 +1,8 @@
 """Threads that work for robots in turn, so that the slow work of one robot delays no other for long.
 
 The order is that of `FairQueue`.  A robot never has more than one thread and a tenant never all of them, if
-there are several.  Work that is no longer wanted is not started; work that
-runs ends at its next call of `check_wanted`.
+there are several.  Work that is no longer wanted is not started; work that runs ends at its next call of
+`check_wanted`.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ __all__ = ["FairThreads", "check_wanted", "while_wanted"]
 
 _T = TypeVar("_T")
 _THREADS = 8
-_MAX_PER_TENANT = 6  # threads of one tenant: two are left for the others
+_MAX_PER_TENANT = 6  # threads of one tenant: of eight threads, two are left for the others
 
 
 @dataclass(slots=True, eq=False)

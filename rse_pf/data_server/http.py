@@ -60,8 +60,8 @@ _MIN_BODY_BYTES_PER_S = 1024  # a slower body is refused, also if nobody else wa
 _BODY_GRACE_S = 5.0  # in which a body may be slower: a robot in motion loses its network for as long
 _LEAST_TIME_S = 0.1  # for the rate of a body that has just begun
 _IN_PARTS = "send the object in parts: PUT an upload"
-_DRAIN_S = 0.1  # before a refusal: what is on its way can still be read, and the connection goes on
-_DISCARD_S = 2.0  # after a refusal, before the connection is closed
+_DRAIN_S = 0.1  # before a refusal is sent: what is on its way is read, so that the connection goes on
+_DISCARD_S = 2.0  # after a refusal was sent, before the connection is closed
 _MAX_DROPPED_BYTES = 32 << 20  # of a body that is too long: the photo of a phone is shorter
 
 

@@ -30,7 +30,7 @@ __all__ = ["LEAST_PROCESSES", "TARGET", "PhotoLocaliser", "make_handler"]
 
 TARGET = f"{__name__}:make_handler"
 LEAST_PROCESSES = 3
-"""A robot has one of them at most and a tenant all but one, so that others find one that is free."""
+"""A robot has one of them at most, and a tenant all but one and never more than six (`FairThreads`)."""
 _CACHED_MAPS = 4
 
 

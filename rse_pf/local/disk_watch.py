@@ -62,7 +62,10 @@ def folders_of(state: Path, store: str) -> list[Path]:
 
 
 def disk_spaces(folders: Iterable[Path]) -> list[DiskSpace]:
-    """Return the file systems of *folders*, each once; a folder that is missing counts as its parent."""
+    """Return the file systems of *folders*, each once; a folder that is missing counts as its parent.
+
+    Their levels are those of now, while the events of `DiskWatch` lag behind by `_HYSTERESIS`.
+    """
     spaces: dict[int, DiskSpace] = {}
     for folder in folders:
         there = next(path for path in (folder, *folder.parents) if path.exists())

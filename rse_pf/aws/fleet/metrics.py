@@ -92,7 +92,8 @@ def dimensions_of(group: str, server: str = "") -> list[dict[str, str]]:
 def datums(before: ServerMetrics, now: ServerMetrics, group: str, server: str) -> list[dict[str, Any]]:
     """Return the MetricData for PutMetricData: what instance *server* did between two samples.
 
-    Crashes of native code and a full disk are left out while there are none: their metrics then cost nothing.
+    Crashes of native code and disks that are nearly full are left out while there are none: their metrics
+    then cost nothing.
     """
     values = {
         ROBOTS: (now.robots, "Count"),

@@ -133,7 +133,7 @@ class RobotConnection:
         self.allowed_s = handler.context.settings.session.answer_timeout_s
         """Time that the last command had, from its arrival to its deadline."""
         self.paused_until_s = float("-inf")
-        """Until when the robot has to pause, because the server has more to do than it can."""
+        """Until when the robot has to pause, as long as commands wait."""
         self.ignores_pauses = False
         """Whether it sent on in a pause: while commands wait, it is not refused any more, but read one
         command at a time.  This holds until the robot connects again: it would ignore the next pause, too.

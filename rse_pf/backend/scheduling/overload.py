@@ -1,14 +1,14 @@
 """Decide which commands a server refuses because it has more to do than it can, and for how long.
 
-A command may wait for a part of the time that it has until its deadline.  One that is expected to wait for
-less than a lower bound is accepted.  From there to an upper bound the refused share grows in proportion, so
-that the queue settles, where a fixed threshold would swing; what is accepted and then waits for too long is
-given up.  No command is refused of a tenant of which fewer commands were accepted in the last second or two
-than of the average tenant.
+A command that is expected to wait for less than 20 % of the time until its deadline is accepted.  From there
+the refused share grows in proportion, so that the queue settles, where a fixed threshold would swing; at 50
+% or, if that is later, 1.5 s before the deadline, all are refused.  What is accepted and then waits for too
+long is given up.  Where there are several tenants, no command is refused of one of which fewer commands were
+accepted in the last second or two than of the average tenant.
 
-A refused robot pauses.  A pause spans several frames, so that most of what arrives is accepted: a refusal
-costs about half of what a small answer costs.  A robot that goes on sending is served one command at a time,
-and the network holds back the rest.
+A refused robot pauses.  A pause spans several frames, so that most of what arrives is accepted as long as
+robots obey: a refusal costs about half of what a small answer costs.  A robot that goes on sending is served
+one command at a time, and the network holds back the rest.
 
 Pure: times go in, decisions come out, and nothing is random.
 
@@ -25,11 +25,11 @@ __all__ = ["MAX_EARLY_COMMANDS", "PAUSE_S", "Overload", "TurnTime", "is_too_late
 MIN_WAIT_SHARE = 0.2  # of the time of a command: a shorter wait is no overload
 MAX_WAIT_SHARE = 0.5  # of the time of a command: the other half is for compute and network
 MAX_QUEUED_SHARE = 0.75  # of the time of a command: one that waited for longer would be answered too late
-RESERVE_S = 1.5  # enough for compute and network of any command: one with much time may wait for all but this
+RESERVE_S = 1.5  # for compute and network: a command with more than 3 s may wait for all but this
 PAUSE_S = 1.0  # mean pause of a refused robot: it spans five frames of a camera at 5 Hz
 MAX_EARLY_COMMANDS = 8  # within one pause: as many as were on their way when the robot was refused
 MEMORY_S = 1.0  # time after which what was accepted of a tenant counts half: some frames of each robot
-SMOOTHING = 0.01  # weight of the last turn: refusals, which make some turns long, must not cause refusals
+SMOOTHING = 0.01  # weight of the last turn: the time that some refusals take must not cause others
 GOLDEN_RATIO = 0.6180339887  # additive recurrence by it: any few numbers in a row are spread evenly
 
 
@@ -45,7 +45,7 @@ class Overload:
     def pause_s(self, tenant: str, expected_wait_s: float, allowed_s: float) -> float:
         """Return for how long a robot of *tenant* pauses whose command is refused; 0 accepts the command.
 
-        An accepted command is accepted again until `note_accepted` counts it or another one is refused, so
+        Asked again about an accepted command, before anything else is decided, the answer is the same, so
         that the rule may be asked before and after decoding.  Pauses differ by up to half of `PAUSE_S`, so
         that robots that are refused together do not return together.
 
@@ -85,7 +85,7 @@ class Overload:
 
 
 class TurnTime:
-    """The mean time that a command waits for each place in the queue, with those that are given up."""
+    """The mean time that a command waits for each position in the queue; those that are given up count."""
 
     def __init__(self) -> None:
         self.mean_s = 0.0

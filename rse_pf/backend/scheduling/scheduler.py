@@ -1,9 +1,9 @@
 """Decide which command runs next: fair between tenants and robots, newest frame of a stream first.
 
-At most one command of a robot runs, in the order of `FairQueue`.  Within a stream the newest frame replaces
-the one that waits, unless it says ``keep``.  A command whose deadline passed never runs, and `Overload` says
-what is refused because it would wait for too long.  The scheduler has no thread and no clock: commands and
-times go in, commands and refusals come out.
+At most one command of a robot runs, in the order of `FairQueue`; all that run may be of one tenant, since
+each has a deadline.  Within a stream the newest frame replaces the one that waits, unless it says ``keep``.
+A command whose deadline passed never runs, and `Overload` says what is refused because it would wait for too
+long.  The scheduler has no thread and no clock: commands and times go in, commands and refusals come out.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ __all__ = [
 ]
 
 BEHIND = "the server is behind with its work"
-BEHIND_HINT = "try again later; the server list may grow meanwhile"
+BEHIND_HINT = "try again later; another server may have been added"
 
 INLINE_BYTES = 16_384
 """A cheap command up to this size is computed in the event loop when nothing waits."""
