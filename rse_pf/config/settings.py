@@ -255,7 +255,7 @@ class CloudSettings:
     image_parameter: str = setting("/aws/service/debian/release/12/latest/amd64", doc="SSM parameter that names the machine image", source="Debian's public parameter")
     profile: str = setting("standard", doc="small: one zone for servers and endpoints, and one server of a small type unless you set these; see docs/operations.md", choices=("standard", "small"))
     canary: bool = setting(True, doc="a function that asks for one known pose through the load balancer every minute, and an alarm")
-    budget_per_month: float = setting(0.0, unit="USD", doc="cost of the account in a month above which the topic of alarms is told; 0 is off", low=0)
+    budget_per_month: float = setting(0.0, unit="USD", doc="cost of the account in a month: the topic of alarms is notified at 80 %, and when 100 % are forecast; 0 is off", low=0)
     s3_prefix_list: str = setting("", doc="prefix list of S3 in the region; empty: from the table in stacks/firewall.py")
     robot_cidr: str = setting("0.0.0.0/0", doc="addresses that robots may connect from")
     robots_per_site: int = setting(100, unit="robots", doc="WAF: robots behind one address that may all connect, and send data, in the same minute", low=1, high=100000)

@@ -47,7 +47,8 @@ DAY_H = 24.0
 # Size of the volume of a server.
 VOLUME_GB = 8
 NOT_INCLUDED = (
-    "taxes, data out to the robots (the same for both), requests to S3, stored maps and logs, copies in "
+    "taxes, data out to the robots (the same for fleet and Lambda), what the firewall inspects beside burst "
+    "commands, requests to S3, stored maps and logs, copies in "
     "other regions, live maps (0.04 USD an hour each, in S3), savings plans, the free tier"
 )
 
@@ -68,7 +69,7 @@ _FAST_BELOW_S = 60
 # Time that one call of the canary takes.
 _CANARY_S = 1.0
 
-Needs = Literal["servers", "balancer", "nothing"]
+Needs = Literal["servers", "balancer", "always"]
 """What a line is paid for: running servers, the load balancer with firewall and endpoints, or anyway."""
 
 
@@ -202,7 +203,7 @@ def _server_lines(settings: PlatformSettings, prices: Prices, load: Load) -> lis
     )
     warm_gb = settings.cloud.warm_servers * VOLUME_GB
     warm_row = ("backend servers", "volumes of stopped servers", warm_gb, "GB", prices.volume_per_gb_month)
-    return [*_lines("servers", rows), *_lines("nothing", [warm_row])]
+    return [*_lines("servers", rows), *_lines("always", [warm_row])]
 
 
 def _balancer_lines(settings: PlatformSettings, prices: Prices, load: Load) -> list[CostLine]:
@@ -246,7 +247,7 @@ def _standing_lines(settings: PlatformSettings, prices: Prices) -> list[CostLine
         gb_s = calls * _CANARY_S * CANARY_MB / 1024
         rows.append(("monitor", "canary, computing", gb_s, "GB-s", prices.lambda_per_gb_s))
         rows.append(("monitor", "canary, each minute", calls / 1e6, "million", prices.lambda_per_million))
-    return _lines("nothing", rows)
+    return _lines("always", rows)
 
 
 def _lambda_lines(prices: Prices, commands: float) -> list[CostLine]:
@@ -258,11 +259,11 @@ def _lambda_lines(prices: Prices, commands: float) -> list[CostLine]:
         ("Lambda", "computing", gb_s, "GB-s", prices.lambda_per_gb_s),
         ("Lambda", "inspection by the firewall", millions, "million", prices.firewall_per_million),
     )
-    return _lines("nothing", rows)
+    return _lines("always", rows)
 
 
 def _billed_ms(prices: Prices) -> int:
-    """Return the time of a warm execution, which AWS rounds up to a millisecond."""
+    """Return the time of a warm execution, rounded up to a millisecond; it was measured on a server."""
     return math.ceil(prices.command_cpu_ms)
 
 

@@ -1,7 +1,8 @@
 """The prices that an estimate is made from: one dated table for one region, without taxes.
 
 `rse_pf/aws/money/prices.json` holds the table of the release.  A file ``prices.json`` in the folder of
-cdk.json, or ``rse-pf cloud cost --prices FILE``, replaces all prices or some.
+cdk.json, or ``rse-pf cloud cost --prices FILE``, replaces all prices or some; it should also name its own
+``as_of``, ``region`` and ``source``.
 """
 
 from __future__ import annotations
@@ -54,7 +55,9 @@ class Prices(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         address_per_hour: One public IPv4 address.
         endpoint_per_hour: One interface endpoint in one zone.
         firewall_per_month: One web ACL.
+        firewall_rule_per_month: One rule of it.
         firewall_per_million: A million requests that the web ACL inspects.
+        secret_per_month: One secret.
         stored_per_gb_month: One GB in S3, standard storage.
         lambda_per_million: A million executions.
         lambda_per_gb_s: A gigabyte of memory for a second, x86-64.
@@ -97,7 +100,7 @@ class Prices(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         return price
 
     def vcpus(self, instance_type: str) -> int:
-        """Return the vCPUs of an EC2 type, by its size where the table does not have the type."""
+        """Return the vCPUs of an EC2 type, by its size where the table lacks it: 2 without ``xlarge``."""
         price = self.servers.get(instance_type)
         size = re.search(r"\.(\d*)xlarge$", instance_type)
         return price.vcpus if price else 4 * int(size[1] or 1) if size else 2
