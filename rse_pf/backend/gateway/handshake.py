@@ -35,7 +35,10 @@ from rse_pf.identity import DEFAULT_TENANT, RobotId
 from rse_pf.wire import SUBPROTOCOLS, codec_for
 from rse_pf.wire.refusal import CUT_OFF, refusal_body
 
-__all__ = ["HEALTH", "Accepted", "HandshakePolicy", "HandshakeRequest", "Rejected", "RequestHead"]
+__all__ = [
+    "HEALTH", "Accepted", "HandshakePolicy", "HandshakeRequest", "Rejected", "RequestHead",
+    "banned_rejection",
+]  # fmt: skip
 
 HEALTH = "health"
 """Result of a request for the health page."""
@@ -151,6 +154,16 @@ def _rejection(status: int, code: str, message: str, hint: str, **headers: str) 
     return _http_answer(status, code, body, {**_JSON, **{k.replace("_", "-"): v for k, v in headers.items()}})
 
 
+def banned_rejection(seconds: float) -> Rejected:
+    """Return the rejection of a robot that was cut off and is refused for *seconds* more."""
+    wait_s = math.ceil(seconds)
+    rejected = _rejection(
+        429, "quota", f"this robot was cut off, and is refused for another {wait_s} s",
+        "wait, and slow down; the server's log says why", Retry_After=str(wait_s),
+    )  # fmt: skip
+    return replace(rejected, reason="robot-cut-off")
+
+
 def _proven_rejection(proven: ProvenRefusal, now_s: float) -> Rejected | None:
     """Return the rejection of a robot that proved its key; None if the cause is kept from it, too."""
     members: dict[str, float] = {"server_s": round(now_s, 3)}
@@ -220,7 +233,7 @@ class HandshakePolicy:
             Retry_After=str(_RETRY_AFTER_S),
         )  # fmt: skip
         self.too_fast = _rejection(
-            429, "quota", "too many messages, or handshakes of this address", "wait, and slow down",
+            429, "quota", "too many handshakes of this address", "wait, and slow down",
             Retry_After=str(max(1, math.ceil(RATE_BAN_S))),
         )  # fmt: skip
         self._no_token = _rejection(

@@ -27,6 +27,7 @@ from rse_pf.backend.gateway.handshake import (
     HandshakeRequest,
     Rejected,
     RequestHead,
+    banned_rejection,
 )
 from rse_pf.backend.gateway.rate_limits import SourceRates
 from rse_pf.backend.gateway.socket_poller import SocketPoller
@@ -310,8 +311,9 @@ class RobotSockets:
             now_s=self._context.clocks.wall(),
         )
         if isinstance(verdict, Accepted):
-            if self._dispatcher.rates.banned_s(verdict.robot, now) > 0:
-                return replace(self._handshake.too_fast, reason="robot-cut-off")
+            banned_s = self._dispatcher.rates.banned_s(verdict.robot, now)
+            if banned_s > 0:
+                return banned_rejection(banned_s)
             if not head.websocket_key:
                 return self._handshake.no_request
             if verdict.awaits_token:

@@ -88,6 +88,7 @@ async def test_a_robot_that_crashes_twice_is_refused_and_others_are_answered_aft
     print(f"seconds until a robot is answered after a crash: {away_s}")
     assert max(away_s) < PROMPT_S
     assert refused.value.response.status_code == 429
+    assert 60.0 - PROMPT_S < float(refused.value.response.headers["Retry-After"]) <= 60.0
     crashes = [line for line in server.lines if line["event"] == "worker-crashed"]
     assert [line["robot"] for line in crashes] == ["culprit", "culprit", "third"]
     assert all("string_at" in line["at"] and line["signal"] == signal.SIGSEGV for line in crashes)
