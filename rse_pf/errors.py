@@ -360,11 +360,12 @@ class Crashed(CommandFailed, code="crashed"):
 
 
 class Poison(CommandFailed, code="poison"):
-    """This request crashed two sandboxes and is not tried again within ten minutes.
+    """This request ended the processes that computed it, and is refused for a while.
 
-    Cause: Two sandboxes crashed on this same request, so the circuit breaker refuses it for ten minutes.
-    Check: Run rse-pf service status: it shows what is refused, to whom and for how long.
-    Fix: Correct the service and install it again, then run rse-pf service unblock SERVICE.
+    Cause: Two sandboxes crashed on it (refused for ten minutes), or three owners of its job (for a week).
+    Check: Run rse-pf service status: it shows what sandboxes refuse, to whom and for how long.
+    Fix: Correct the service, install it again and run rse-pf service unblock SERVICE; for a job, send less,
+        or delete the object that the hint names.
     """
 
 

@@ -27,9 +27,9 @@ __all__ = [
 Value = str | int | float | bool | None
 
 REFUSALS_PER_S = 2.0
-"""Refused tokens that one writer records one by one in the long run; the others are counted."""
+"""Refused tokens that a worker or data service records one by one in the long run; others are counted."""
 REFUSAL_BURST = 50
-"""Refused tokens that one writer records one by one at once."""
+"""Refused tokens that a worker or data service records one by one at once."""
 _MAX_CHARACTERS = 200
 """Characters of one string; longer ones are cut."""
 _MAX_DETAILS = 64

@@ -1,7 +1,8 @@
 """The engine of parts on Dask: with processes of its own on this machine, or a scheduler that runs already.
 
-Dask is told names only.  A worker of its own that ends is replaced, and its part is given to another; a
-scheduler that is lost is started or connected again, and the parts that are not stored yet are handed to it.
+Dask carries settings, and the names and arguments of parts.  A worker of its own that ends is replaced, and
+its part is given to another; a scheduler that is lost is started or connected again, and the parts that are
+not stored yet are handed to it.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ __all__ = [
 ]
 
 PART_TRIES = 3
-"""A part whose workers ended this often is not tried again."""
+"""A part whose workers ended this often is not tried again; with ``--scheduler`` Dask's own limit counts."""
 _SCHEDULER_RESTARTS = 3
 """How often a lost scheduler is started again."""
 _START_TIMEOUT_S = 60.0
@@ -79,7 +80,6 @@ class Cluster(Protocol):
     """A scheduler with workers."""
 
     address: str
-    part_tries: int
 
     @property
     def is_lost(self) -> bool:
@@ -102,7 +102,6 @@ class RemoteCluster:
     """A scheduler and workers that somebody else has started; TLS is that of Dask's configuration."""
 
     is_lost = False
-    part_tries = PART_TRIES
 
     def __init__(self, address: str) -> None:
         """Connect to nothing yet; raises UsageError if *address* is none of a scheduler."""
@@ -165,7 +164,6 @@ class LocalCluster:
             part_tries: A part whose workers ended this often is not tried again.
         """
         self.address = ""
-        self.part_tries = part_tries
         self._key = new_cluster_key()
         self._count = workers
         self._environment = {
@@ -344,7 +342,7 @@ class DaskEngine:
             answer: list[str] = future.result(timeout=_START_TIMEOUT_S)
         except KilledWorker as error:
             raise Crashed(
-                f"a part ended {self._cluster.part_tries} workers",
+                f"a part ended {error.allowed_failures + 1} workers",
                 hint="look at the memory of the workers; use fewer, or merge fewer maps",
             ) from error
         return answer

@@ -37,11 +37,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     common = argparse.ArgumentParser(add_help=False)
     common.add_argument("--store", help="store of the maps: dir:PATH or s3:BUCKET (default: data.store)")
     run_ = actions.add_parser(
-        "run", help="run one job in parts", description="Run one job in parts.",
+        "run", help="run one long computation in parts", description="Run one long computation in parts.",
         epilog="example:\n  rse-pf batch run merge robot-1 robot-2 --out kitchen --store dir:objects",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )  # fmt: skip
-    jobs = run_.add_subparsers(dest="job", required=True, metavar="JOB")
+    jobs = run_.add_subparsers(dest="job", required=True, metavar="WHAT")
     merge = jobs.add_parser(
         "merge", parents=[common], help="merge several maps into one, or close the loops of one map",
         description="Merge several maps into one, or close the loops of one map.",
@@ -69,8 +69,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     merge.add_argument("--note", default="", help="note of the new version")
     merge.add_argument("--json", action="store_true", help="print JSON")
     actions.add_parser(
-        "clean", parents=[common], help="delete the parts of jobs that were not finished",
-        description="Delete the parts of jobs that were not finished; no job may be running.",
+        "clean", parents=[common], help="delete the parts of runs that were not finished",
+        description="Delete the parts of runs that were not finished; one that is under way fails then.",
         epilog="example:\n  rse-pf batch clean --store dir:objects",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )  # fmt: skip

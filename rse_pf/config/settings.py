@@ -78,10 +78,10 @@ class ServingSettings:
     max_compute_memory_bytes: int = setting(1073741824, unit="bytes", doc="memory of one command of a map service; the process of one that needs more is ended", low=67108864)
     max_compute_s: float = setting(20.0, unit="s", doc="CPU time of one command of a map service; the process of one that needs more is ended", low=0.1)
     max_running_jobs: int = setting(1, doc="long jobs that run at the same time on one server; 0 turns long services off", low=0, high=64)
-    max_waiting_jobs: int = setting(8, doc="further jobs of one worker that wait, or that it follows on another server; more are refused", low=0, high=1000)
+    max_waiting_jobs: int = setting(8, doc="further jobs in each worker, which wait or run on another server; more are refused", low=0, high=1000)
     max_job_memory_bytes: int = setting(2147483648, unit="bytes", doc="memory of one job; a job that needs more is ended", low=134217728)
-    job_lease_s: float = setting(5.0, unit="s", doc="another server takes a job over when its lease was not renewed for this long", low=0.1)
-    max_job_s: float = setting(3600.0, unit="s", doc="a job that takes longer is ended", low=1)
+    job_lease_s: float = setting(5.0, unit="s", doc="after this time without a renewal, a job begins anew on the server where its robot asks", low=0.1)
+    max_job_s: float = setting(3600.0, unit="s", doc="a job that runs longer is ended; waiting has no limit", low=1)
     drain_wait_s: float = setting(1.0, unit="s", doc="a draining server reports not ready for this long before it moves its robots", low=0)
     drain_within_ms: float = setting(5000.0, unit="ms", doc="time that robots get to move to another server", low=100)
     log_level: str = setting("info", doc="least level of the lines that are logged", choices=("debug", "info", "warning", "error"))
@@ -266,7 +266,7 @@ class CloudSettings:
     deleted_days: int = setting(30, unit="days", doc="an object of the map or artifact bucket that was overwritten or deleted can be restored for this long", low=1)
     replica_maps: str = setting("", doc="map buckets of deployments in other regions, with spaces between; new versions of maps are copied there")
     replica_artifacts: str = setting("", doc="artifact buckets of deployments in other regions, with spaces between; public keys, roster, deny list and published services are copied there")
-    audit_days: int = setting(365, unit="days", doc="an audit log in the bucket cannot be changed or deleted for this long, and is then deleted", low=1)
+    audit_days: int = setting(365, unit="days", doc="an audit log in the bucket is locked for this long, and deleted a day later", low=1)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -2,12 +2,12 @@
 
 The new lines of a file become one object, a piece, ``audit/INSTANCE/WHO.TIME.DIGEST.jsonl``: TIME is that of
 its first entry in Unix seconds, DIGEST the beginning of its sha256.  `Shipper` writes each name once, and
-reads and deletes nothing in the bucket, where Object Lock keeps what was written.  After a crash pieces may
-overlap, but no entry is missing.
+reads and deletes nothing in the bucket, where Object Lock keeps what was written.  After a crash of the
+agent pieces may overlap, but no entry is missing.
 
-`fetch_audit` only reads.  It joins the pieces of each writer to one file, without repeated lines.  A log is
-named after its instance: ``INSTANCE`` is the backend server's own, ``INSTANCE_WHO`` belongs to another writer
-on that instance.
+`fetch_audit` only reads.  It joins the pieces of each writer to one file; of equal lines in several
+pieces it keeps one.  A log is named after its instance: ``INSTANCE`` is the backend server's own,
+``INSTANCE_WHO`` belongs to another writer on that instance.
 """
 
 from __future__ import annotations

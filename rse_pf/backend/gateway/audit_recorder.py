@@ -31,7 +31,7 @@ _W = TypeVar("_W")
 
 
 class AuditRecorder:
-    """The notes of one worker, sent to the supervisor in batches."""
+    """The notes of one worker, sent to the supervisor in batches; those that wait are lost if it crashes."""
 
     def __init__(
         self,

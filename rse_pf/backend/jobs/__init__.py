@@ -1,5 +1,5 @@
-"""Long commands: leases in the store, processes, and their turn on a server.
+"""Long commands of robots: leases in the store, processes, and their turn on a server.
 
 What a job computes belongs to `rse_pf.services`; anything that answers within a frame belongs to
-`scheduling`.
+`scheduling`.  What operators compute in parts belongs to `rse_pf.batch`.
 """

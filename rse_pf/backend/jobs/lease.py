@@ -1,4 +1,7 @@
-"""The record of a job, and who may run it: what a lease (`rse_pf.lease`) means for jobs."""
+"""The record of a job, and who may run it: what a lease (`rse_pf.lease`) means for jobs.
+
+Nobody looks for jobs without an owner: one that lost its owner begins anew where its robot asks again.
+"""
 
 from __future__ import annotations
 

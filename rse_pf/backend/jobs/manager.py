@@ -106,7 +106,7 @@ class JobManager(CommandQueue):
         self._settings_digest = _settings_digest(context.settings)
 
     held = 0
-    """No job keeps a server from ending: others go on with it."""
+    """Commands for which a server that drains waits: none, because other servers run these jobs anew."""
 
     def offers(self, service: str) -> bool:
         """Return whether *service* is a long one."""

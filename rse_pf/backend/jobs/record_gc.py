@@ -21,7 +21,7 @@ from rse_pf.object_store import ObjectStore
 __all__ = ["RECORD_TTL_S", "RecordCollector"]
 
 RECORD_TTL_S = 604_800.0
-"""A record that was not used for a week is deleted; the same request then runs again."""
+"""A record that was not written for a week is deleted; the same request then runs again."""
 _PREFIX = "jobs/"
 _LIST_INTERVAL_S = 3600.0
 _BATCH = 64
@@ -43,7 +43,7 @@ class RecordCollector:
 
         Args:
             store: Shared by all servers; their collections do not disturb each other.
-            ttl_s: A record that was not used for this long is deleted.
+            ttl_s: A record that its owner did not write for this long is deleted.
             clock: Monotonic seconds.
             wall_clock: Unix seconds; may differ between machines by far less than *ttl_s*.
         """

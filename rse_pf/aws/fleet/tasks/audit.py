@@ -7,7 +7,7 @@ from rse_pf.aws.fleet.task import AgentContext, Task
 __all__ = ["AUDIT_SHIP_S", "task"]
 
 AUDIT_SHIP_S = 60.0
-"""Time between two uploads; a machine that fails loses at most this much."""
+"""Time between two uploads; a machine that fails loses at most this much, if it could reach S3."""
 
 
 def task(context: AgentContext) -> Task:
