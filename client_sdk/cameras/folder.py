@@ -226,7 +226,7 @@ def _named_times(paths: Sequence[Path], name: str) -> tuple[Array | None, tuple[
         nanoseconds = _seconds_and_nanoseconds(words)
         if nanoseconds is not None and _unevenness(nanoseconds) < _unevenness(values):
             return nanoseconds, (f"names in {name} are taken as seconds, a point and whole nanoseconds",)
-        return values, ()
+        return stamps_in_seconds(values, f"names in {name}")
     stamps_s, assumed = stamps_in_seconds(values, f"names in {name}", "seconds")
     return (stamps_s, assumed) if is_since_1970(stamps_s) else (None, ())
 
