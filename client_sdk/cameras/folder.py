@@ -43,10 +43,11 @@ from client_sdk.source_facts import (
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Array
 
-__all__ = ["FolderImages", "list_folder", "list_pairs"]
+__all__ = ["FolderImages", "list_folder", "list_pairs", "pair_folders"]
 
 _COLOUR_FOLDERS = ("rgb", "color", "colour", "image", "images", "results")
 _DEPTH_FOLDERS = ("depth", "depths", "aligned_depth", "depth_image", "depth_images")
+_PAIR_FOLDERS = ("{}", "image_{}", "images_{}", "{}_images", "img_{}", "rgb_{}")  # of left and right
 _PERIOD_S = 0.1  # between images that state neither time nor rate
 _MAX_APART_S = 0.02  # of a colour and a depth image that are paired by time
 _NANOSECOND_DIGITS = 9  # ROS writes seconds, a point and nanoseconds, often without their leading zeros
@@ -133,17 +134,25 @@ def list_folder(folder: Path, rate_hz: float | None = None) -> FolderImages:
     return _listed(str(folder), colours, depths or None, "depth image", rate_hz)
 
 
+def pair_folders(folder: Path) -> tuple[Path, Path] | None:
+    """Return the folders of the left and of the right images; None if there are not both."""
+    for name in _PAIR_FOLDERS:
+        left, right = (folder / name.format(side) for side in ("left", "right"))
+        if left.is_dir() and right.is_dir():
+            return left, right
+    return None
+
+
 def list_pairs(folder: Path, rate_hz: float | None = None) -> FolderImages:
-    """Return the images of ``left/`` and ``right/`` that belong together.
+    """Return the images of `pair_folders` that belong together.
 
     Raises:
         UsageError: There is no image, or none of the left has a partner.
     """
-    lefts, rights = (image_files(folder / side) for side in ("left", "right"))
+    left, right = pair_folders(folder) or (folder / "left", folder / "right")
+    lefts, rights = image_files(left), image_files(right)
     if not lefts:
-        raise UsageError(
-            f"{folder / 'left'} holds no image", hint="put the images of the left camera into it"
-        )
+        raise UsageError(f"{left} holds no image", hint="put the images of the left camera into it")
     return _listed(str(folder), lefts, rights, "right image", rate_hz)
 
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
-from client_sdk.cameras.folder import list_folder, list_pairs
+from client_sdk.cameras.folder import list_folder, list_pairs, pair_folders
 from client_sdk.cameras.opencv_video import open_video
 from client_sdk.cameras.pairs import open_pair_videos, split_pairs
 from client_sdk.cameras.realsense import open_realsense, open_realsense_stereo
@@ -76,7 +76,7 @@ def open_camera(
         pairs, rig, close = open_realsense_stereo()
         facts = SourceFacts(name=word)
         return _pair(facts, lambda log: pairs, own if isinstance(own, Rig) else rig, rate_hz, camera, close)
-    if (path / "left").is_dir() and (path / "right").is_dir():
+    if pair_folders(path) is not None:
         rig = own if isinstance(own, Rig) else read_rig(path / "rig.json")
         images = list_pairs(path, rig.left.lens.rate_hz)
         facts = images.facts(rig.left.lens, str(intrinsics or path / "rig.json"), has_depth=False)
@@ -104,6 +104,11 @@ def open_camera(
         )  # fmt: skip
     if isinstance(own, Rig) and own.right is None:
         own = own.left.lens
+    if isinstance(own, Rig) and path.is_dir():
+        raise UsageError(
+            f"{word} has no two folders of images, such as left/ and right/ or image_left/ and image_right/",
+            hint="give the intrinsics of one camera, or name the folder above both",
+        )
     if isinstance(own, Rig):
         return _stereo_video(word, own, rate_hz, camera, stated_by)
     if camera == "stereo":

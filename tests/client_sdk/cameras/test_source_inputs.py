@@ -314,14 +314,15 @@ def test_one_of_two_videos_of_different_lengths_can_be_taken(tmp_path: Path) -> 
     assert rows_of(source)[:5] == [(row / 10, row, -1) for row in range(5)]
 
 
-def _pair_folders(path: Path, lost: Sequence[int]) -> FrameStream:
+def _pair_folders(path: Path, lost: Sequence[int], names: str = "{}") -> FrameStream:
     """Return pairs of a camera that moves down; the numbers of right images skip none that was lost."""
     texture = np.kron(np.random.default_rng(5).integers(0, 256, (90, 60)), np.ones((6, 6))).astype(np.uint8)
     rights = [row for row in range(40) if row not in lost]
     for number, right in enumerate(rights):
         for side, row, column in (("left", number, 30), ("right", right, 40)):
-            (path / side).mkdir(exist_ok=True)
-            cv2.imwrite(str(path / side / f"{number}.png"), texture[5 * row :][:240, column:][:, :320])
+            folder = path / names.format(side)
+            folder.mkdir(exist_ok=True)
+            cv2.imwrite(str(folder / f"{number:03}_{side}.png"), texture[5 * row :][:240, column:][:, :320])
     lens = {"fx": 300.0, "fy": 300.0, "cx": 159.5, "cy": 119.5, "width": 320, "height": 240}
     poses = [np.eye(4), np.eye(4)]
     poses[1][0, 3] = 0.1
@@ -345,8 +346,9 @@ def test_a_pair_whose_camera_loses_an_image_ends_there(
     assert "--camera left" in refused.value.hint
 
 
-def test_a_pair_that_loses_no_image_is_whole(tmp_path: Path) -> None:
-    with _pair_folders(tmp_path, ()) as source:
+@pytest.mark.parametrize("names", ["{}", "image_{}", "{}_images"])
+def test_a_pair_of_folders_that_loses_no_image_is_whole(tmp_path: Path, names: str) -> None:
+    with _pair_folders(tmp_path, (), names) as source:
         assert len(list(source)) == 40
 
 
