@@ -85,15 +85,20 @@ class FolderImages:
             )  # fmt: skip
             if not depth.is_unit_stated:
                 assumed += (f"{stated_by} states no depth_scale: {units_per_m:g} units a metre are assumed",)
-        height, width = probe(self.images, read_colour)[0].shape[:2]
         camera = CameraFacts(
             stated_by=stated_by, camera=lens.camera, is_fisheye=lens.model == "fisheye",
-            image_size_px=(width, height),
+            image_size_px=self.size_px,
         )  # fmt: skip
         return SourceFacts(
             name=self.name, cameras=(camera,), depth=depth, doubts=self.doubts, assumed=assumed,
             times=(TimeFacts(stated_by=self.name, stamps_s=self.stamps_s),),
         )  # fmt: skip
+
+    @property
+    def size_px(self) -> tuple[int, int]:
+        """Width and height of the images; raises UsageError where none can be read."""
+        height, width = probe(self.images, read_colour)[0].shape[:2]
+        return width, height
 
     def frames(self, log: DoubtLog, depth_units_per_m: float | None) -> Iterator[RawFrame]:
         """Yield the frames, without depth if its unit is None; *log* counts images that cannot be read."""

@@ -26,6 +26,7 @@ from client_sdk.frontend import Frame
 from client_sdk.rigs.intrinsics import TYPICAL_HINT, Intrinsics, read_intrinsics
 from client_sdk.rigs.rig import Rig
 from client_sdk.rigs.rig_file import read_calibration, read_rig
+from client_sdk.rigs.stated_camera import stated_camera
 from client_sdk.source_facts import CameraFacts, DoubtLog, SourceFacts, check_source
 from rse_pf.errors import UsageError
 from rse_pf.files import check_exists
@@ -117,7 +118,10 @@ def open_camera(
         raise UsageError(f"{word} has no IMU", hint="leave out --imu")
     if path.is_dir():
         if own is None:
-            own, stated_by = read_intrinsics(path / "intrinsics.json"), str(path / "intrinsics.json")
+            file = path / "intrinsics.json"
+            found = None if file.exists() else stated_camera(path, lambda: list_folder(path).size_px)
+            file, own = (file, read_intrinsics(file)) if found is None else found
+            stated_by = str(file)
         return _folder(path, own, stated_by, rate_hz, depth)
     if word.count(",") == 1 and not path.exists():
         raise UsageError(

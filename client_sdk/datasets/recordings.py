@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -27,6 +27,7 @@ from client_sdk.mapping import Trajectory, read_trajectory
 from client_sdk.rigs.intrinsics import Intrinsics, Undistortion
 from client_sdk.rigs.rig import Rig
 from client_sdk.rigs.rig_file import read_calibration
+from client_sdk.rigs.stated_camera import stated_camera
 from client_sdk.source_facts import (
     CameraFacts,
     DepthFacts,
@@ -182,7 +183,16 @@ class _List:
 
 def _open_tum(folder: Path, of_camera: Path) -> Dataset:
     colours, depths = _read_lists(folder)
-    intrinsics, is_unit_stated, notes = _intrinsics(folder, of_camera, has_depth=depths is not None)
+
+    def size_px() -> tuple[int, int]:
+        height, width = probe(colours.images, lambda name: read_colour(folder / name))[0].shape[:2]
+        return width, height
+
+    stated = None if of_camera.exists() or of_camera.parent != folder else stated_camera(folder, size_px)
+    of_camera = of_camera if stated is None else stated[0]
+    intrinsics, is_unit_stated, notes = _intrinsics(
+        folder, of_camera, None if stated is None else stated[1], has_depth=depths is not None
+    )
     pairs = [(row, row) for row in range(len(colours.images))]
     if depths is not None:
         pairs = associate_stamps(colours.stamps_s, depths.stamps_s, _MAX_STAMP_DIFFERENCE_S)
@@ -316,12 +326,21 @@ def _read_rows(path: Path, columns: int) -> list[list[str]]:
     return rows
 
 
-def _intrinsics(folder: Path, file: Path, *, has_depth: bool) -> tuple[Intrinsics, bool, tuple[str, ...]]:
-    """Return the intrinsics of a file, and notes on what was assumed where the folder has none.
+def _intrinsics(
+    folder: Path, file: Path, stated: Intrinsics | None, *, has_depth: bool
+) -> tuple[Intrinsics, bool, tuple[str, ...]]:
+    """Return the intrinsics of a file, or those *stated* by one of another program, and notes.
 
     Between both stands whether the unit of depth is stated: by the file, or by the benchmark that *folder*
     is named after.
     """
+    if stated is not None:
+        note = (
+            f"{file} states no unit of depth: {_FREIBURG_DEPTH_SCALE:g} units a metre are assumed, as TUM's"
+        )
+        has_unit = stated.depth_scale is not None or not has_depth
+        lens = stated if has_unit else replace(stated, depth_scale=_FREIBURG_DEPTH_SCALE)
+        return lens, has_unit, () if has_unit else (note,)
     if file.exists() or file.parent != folder:
         found = read_calibration(file)
         lens = found.left.lens if isinstance(found, Rig) else found

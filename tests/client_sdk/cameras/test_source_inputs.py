@@ -136,6 +136,38 @@ def test_other_names_of_fields_are_read(
         assert np.array_equal(next(first).rgb, next(second).rgb)
 
 
+@pytest.mark.parametrize("is_listed", [False, True])
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("camera_intrinsic.json",
+         '{"width": 64, "height": 48, "intrinsic_matrix": [50, 0, 0, 0, 51, 0, 30, 20, 1]}'),
+        ("calibration.txt", "50 51 30 20\n"),
+        ("intrinsics.txt", "50 0 30\n0 51 20\n0 0 1\n"),
+        ("intrinsic/intrinsic_color.txt", "50 0 30 0\n0 51 20 0\n0 0 1 0\n0 0 0 1\n"),
+    ],
+)  # fmt: skip
+def test_the_camera_that_a_folder_states_is_used(
+    tmp_path: Path, name: str, text: str, is_listed: bool
+) -> None:
+    tum(tmp_path, ["0", "0.1"])
+    (tmp_path / "intrinsics.json").unlink()
+    for row in range(2):
+        cv2.imwrite(str(tmp_path / f"depth/{row}.png"), np.full((48, 64), 5000, np.uint16))
+    for file in () if is_listed else ("rgb.txt", "depth.txt"):
+        (tmp_path / file).unlink()
+    (tmp_path / name).parent.mkdir(exist_ok=True)
+    (tmp_path / name).write_text(text)
+
+    with open_camera(tmp_path) as source:
+        camera, depth_m = source.camera, next(source).depth_m
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (50.0, 51.0, 30.0, 20.0)
+    assert (camera.width, camera.height) == (64, 48)
+    units_per_m = 5000 if is_listed else 1000  # TUM's and most cameras'
+    assert float(depth_m[20, 20]) == pytest.approx(5000 / units_per_m)
+    assert any(f"{units_per_m} units a metre are assumed" in note for note in source.notes)
+
+
 def _open3d(path: Path) -> Path:
     (folder_of(path, ["0.png"]) / "intrinsics.json").write_text(
         json.dumps({"width": 64, "height": 48, "intrinsic_matrix": [60, 0, 0, 0, 60, 0, 31.5, 23.5, 1]})
@@ -375,6 +407,9 @@ def _sensor(path: Path, model: str) -> Path:
         (lambda path: tum(path, ["0", "0.2", "0.1", "0.3", "0.2"]), "2 of 5 time stamps are earlier"),
         (lambda path: kitti(path, (0, 1, 2), 2, 5),
          "3 images with numbers up to 000002, 2 lines in times.txt, 5 lines in poses.txt"),
+        (lambda path: (tum(path, ["0"]) / "intrinsics.json").rename(path / "calibration.txt") and
+         (path / "calibration.txt").write_text("50 51 30 20 0.1") and path,
+         "calibration.txt holds 5 numbers, neither fx fy cx cy nor a matrix"),
         (lambda path: _sensor(path, "double-sphere"), "the lens model 'double-sphere' is not known"),
     ],
 )  # fmt: skip
