@@ -99,7 +99,8 @@ class CloudCore:
         """Fill the hash table with the keys of *size* voxels; return how many slots were read."""
         request = _request(_NO_READINGS, voxels, size, 1.0, 1)
         self._index(ctypes.byref(request))
-        return request.probes
+        probes: int = request.probes
+        return probes
 
 
 def _request(

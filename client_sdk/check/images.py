@@ -11,6 +11,7 @@ import numpy.typing as npt
 from client_sdk.check.findings import CannotTell, FaultKind, Finding
 from client_sdk.source_facts import Doubt, DoubtName
 from rse_pf.geometry import Array
+from rse_pf.native_check import check_core
 
 __all__ = ["FrameStatistics", "sharpness"]
 
@@ -62,7 +63,7 @@ class FrameStatistics:
         )
         self._last = small
         self._stamps_s.append(timestamp_s)
-        self._bright.append(float(np.percentile(small[:, :, 1], 98)))
+        self._bright.append(_percentile(small[:, :, 1], 98))
         self._sharpness.append(sharpness(green))
 
     def findings(self) -> tuple[list[Finding], list[CannotTell]]:
@@ -222,6 +223,14 @@ class FrameStatistics:
         return findings, []
 
 
+def _percentile(values: npt.NDArray[np.int16], percent: int) -> float:
+    """Return what `numpy.percentile` does of some numbers, in a fifth of its time."""
+    ordered = np.sort(values, axis=None)
+    row, rest = divmod(percent * (len(ordered) - 1), 100)
+    low, high = float(ordered[row]), float(ordered[min(row + 1, len(ordered) - 1)])
+    return low + (high - low) * rest / 100.0
+
+
 def sharpness(gray: _Image) -> tuple[float, float]:
     """Return how sharp the strongest edges of ``(h, w)`` uint8 are, along x and along y; NaN without edges.
 
@@ -229,16 +238,22 @@ def sharpness(gray: _Image) -> tuple[float, float]:
     pixels, and about ``2 / n`` for one that is blurred over *n*.  Texture changes it little.
     """
     rows, columns = (max(1, side // _LINES) for side in gray.shape)
-    return _edges(gray[::rows]), _edges(np.ascontiguousarray(gray[:, ::columns].T))
+    # Copied row by row, as the image lies in memory, before its columns become lines.
+    upright = np.ascontiguousarray(gray[:, ::columns]).T
+    return _edges(np.ascontiguousarray(gray[::rows])), _edges(np.ascontiguousarray(upright))
 
 
 def _edges(lines: _Image) -> float:
     """Return the sharpness along the rows of ``(n, w)`` uint8."""
-    values = lines.astype(np.int16)
-    if values.shape[1] < 6 * _HALF_PX:
+    if lines.shape[1] < 6 * _HALF_PX:
         return math.nan
+    strong = max(1, int(_STRONGEST * len(lines) * (lines.shape[1] - 2 * _HALF_PX)))
+    core = check_core()
+    found = None if core is None else core.edges(lines, strong, _LEAST_STEP, _MOST_EDGES)
+    if found is not None:
+        return float(np.median(found[1])) if found[0] >= _FEWEST_EDGES else math.nan
+    values = lines.astype(np.int16)
     whole = np.abs(values[:, 2 * _HALF_PX :] - values[:, : -2 * _HALF_PX])
-    strong = max(1, int(_STRONGEST * whole.size))
     limit = max(_LEAST_STEP, int(np.partition(whole.ravel(), -strong)[-strong]))
     row, column = np.nonzero(whole >= limit)
     if len(row) < _FEWEST_EDGES:

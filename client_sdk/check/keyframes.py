@@ -17,6 +17,7 @@ from client_sdk.monocular.descriptors import match_all
 from client_sdk.stereo.depth import stereo_points
 from rse_pf.geometry import Array, Camera, inverse, log_se3
 from rse_pf.maps.descriptors import ORB
+from rse_pf.native_check import check_core
 from rse_pf.pnp import DepthNoise
 
 __all__ = ["FLIPS", "Keyframe", "KeyframeStore", "Tracks", "tracks_of"]
@@ -109,7 +110,7 @@ class KeyframeStore:
 
     def _surround(self, frame: Frame) -> None:
         """Sample the new depth image at the features of the last keyframes, and keep it for those to come."""
-        if frame.stereo is not None or not frame.depth_m.any():
+        if frame.stereo is not None or not _has_depth(frame):
             return
         for keyframe in self.keyframes[-8:]:
             apart_s = frame.timestamp_s - keyframe.timestamp_s
@@ -147,7 +148,7 @@ class KeyframeStore:
                 else stereo_points(frame.rgb, frame.stereo, frame.camera, pixels)
             )
             keyframe.depths_m[0] = points[:, 2]
-        elif frame.depth_m.any():
+        elif _has_depth(frame):
             self.has_depth = True
             flipped = (
                 frame.depth_m, frame.depth_m[:, ::-1], frame.depth_m[::-1], frame.depth_m[::-1, ::-1]
@@ -231,8 +232,18 @@ def matched(one: Keyframe, other: Keyframe) -> tuple[Rows, Rows]:
     return a[kept], b[kept]
 
 
+def _has_depth(frame: Frame) -> bool:
+    """Return whether a depth image has readings; a few pixels of it say so nearly always."""
+    return bool(frame.depth_m[::16, ::16].any() or frame.depth_m.any())
+
+
 def depths_at(depth_m: npt.NDArray[np.float32], pixels: Array) -> Array:
     """Return ``(n,)`` medians of five depths around each pixel; NaN where one is missing, or on an edge."""
+    core = check_core()
+    if core is not None and depth_m.dtype == np.float32:
+        found = core.depths_at(depth_m, pixels, _SPREAD)
+        if found is not None:
+            return found
     height, width = depth_m.shape
     u = np.clip(np.rint(pixels[:, 0]).astype(np.int64), 2, width - 3)
     v = np.clip(np.rint(pixels[:, 1]).astype(np.int64), 2, height - 3)

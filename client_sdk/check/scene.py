@@ -8,6 +8,7 @@ a camera at rest.
 from __future__ import annotations
 
 import itertools
+import math
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -80,7 +81,8 @@ class SceneWatch:
         while len(self._views) > 2 and view.stamp_s - self._views[2].stamp_s >= _APART_S:
             self._views.popleft()
         before = [each for each in self._views if view.stamp_s - each.stamp_s >= _APART_S]
-        moved = [each for each in before if _moved_px(each, view, frame.camera, tracked) >= _MOVED_PX]
+        depth_m = _median_depth(tracked) if before else math.inf
+        moved = [each for each in before if _moved_px(each, view, frame.camera, depth_m) >= _MOVED_PX]
         if moved:
             self._compare(moved, view)
         self._views.append(view)
@@ -144,13 +146,17 @@ def _edges(rgb: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32] | None:
     return np.ascontiguousarray(blocks).reshape(_ROWS * _COLUMNS, -1)
 
 
-def _moved_px(before: _View, view: _View, camera: Camera, tracked: TrackedFrame) -> float:
-    """Return by how much the pose moves the image between two views, at the median depth of its features."""
-    moved_m, turned_deg = pose_difference(before.T_world_camera, view.T_world_camera)
+def _median_depth(tracked: TrackedFrame) -> float:
+    """Return the median depth of a frame's features, infinity where none has a depth."""
     points = None if tracked.features is None else tracked.features.points_camera[:, 2]
     depths_m = np.empty(0) if points is None else points[points > 0.0]
-    step = moved_m / float(np.median(depths_m)) if len(depths_m) else 0.0
-    return camera.fx * (step + float(np.radians(turned_deg)))
+    return float(np.median(depths_m)) if len(depths_m) else math.inf
+
+
+def _moved_px(before: _View, view: _View, camera: Camera, depth_m: float) -> float:
+    """Return by how much the pose moves the image between two views, at a depth."""
+    moved_m, turned_deg = pose_difference(before.T_world_camera, view.T_world_camera)
+    return camera.fx * (moved_m / depth_m + float(np.radians(turned_deg)))
 
 
 def doubts_of_depth(keyframes: Sequence[Keyframe]) -> tuple[Doubt, ...]:

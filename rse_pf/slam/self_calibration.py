@@ -313,6 +313,10 @@ class _System:
         self.moments = self.pixels[:, 1:] / self.camera.height - 0.5
         self.pixel_factor = self.depth_factor = 1.0
         self._of_keyframe = [np.flatnonzero(self.keyframes == row) for row in range(keyframes)]
+        # What no keyframe sees of a landmark stays 0 from one step to the next.
+        self._E = np.zeros((landmarks, 3, self._c * keyframes + self._m))
+        columns = self._c * self.keyframes[:, None, None] + np.arange(self._c)
+        self._seen_at = self.landmarks[:, None, None], np.arange(3)[:, None], columns
 
     def residuals(self, state: _State) -> tuple[Array, Array]:
         """Return ``(n, 3)`` residuals of pixel and depth in their units, and points in the camera."""
@@ -427,9 +431,7 @@ class _System:
             self._g[split:] += others.T @ r
         # (l, 3, size): a landmark's rows lie together, so that the product below is of one array with itself.
         J_pt = J_p.transpose(0, 2, 1)
-        self._E = np.zeros((self.l, 3, size))
-        columns = c * self.keyframes[:, None, None] + np.arange(c)
-        self._E[self.landmarks[:, None, None], np.arange(3)[:, None], columns] = J_pt @ J_c
+        self._E[self._seen_at] = J_pt @ J_c
         self._E[:, :, split:] = _summed(J_pt @ J_v, self.landmarks, self.l)
         self._Hpp = _summed(J_pt @ J_p, self.landmarks, self.l)
         self._gp = _summed((J_pt @ self._r[:, :, None])[:, :, 0], self.landmarks, self.l)
