@@ -162,8 +162,7 @@ def localise(
         T_map_camera = best.T_map_keyframe @ inverse(solution.T_camera_world)
     reason = _weakness(agreeing, others, solution, options)
     if options.fits_camera and view.depths_m is None:
-        points_map, pixels = _matches_of(agreeing)
-        fit = fit_camera(points_map, pixels, T_map_camera, view.camera)
+        fit = fit_camera(*_matches_of(agreeing), T_map_camera, view.camera)
         covariance = covariance + _uncertainty_of_camera(fit, T_map_camera)
         reason = reason or _camera_weakness(fit, T_map_camera)
     scale = None if view.is_metric else _scale_of(agreeing, options)
@@ -215,10 +214,12 @@ def _scale_of(placements: Sequence[_Placement], options: LocalisationOptions) ->
     return math.exp(float(weights @ [each.log_ratio for each in known] / weights.sum()))
 
 
-def _matches_of(placements: Sequence[_Placement]) -> tuple[Array, Array]:
-    """Return ``(n, 3)`` points of the map and ``(n, 2)`` pixels of all matches, agreeing or not."""
+def _matches_of(placements: Sequence[_Placement]) -> tuple[Array, Array, Array]:
+    """Return all matches, agreeing or not: points of the map, the places of their keyframes, and pixels."""
     points = [transform(each.T_map_keyframe, each.found.points_reference) for each in placements]
-    return np.concatenate(points), np.concatenate([each.found.pixels for each in placements])
+    origins = [np.tile(each.T_map_keyframe[:3, 3], (each.found.matches, 1)) for each in placements]
+    pixels = [each.found.pixels for each in placements]
+    return np.concatenate(points), np.concatenate(origins), np.concatenate(pixels)
 
 
 def _uncertainty_of_camera(fit: CameraFit, T_map_camera: Array) -> Array:
@@ -229,11 +230,17 @@ def _uncertainty_of_camera(fit: CameraFit, T_map_camera: Array) -> Array:
 
 
 def _camera_weakness(fit: CameraFit, T_map_camera: Array) -> str:
-    """Return "wrong-intrinsics" if the matches contradict the camera of the view, else ""."""
-    is_other_lens = abs(fit.log_focal) > _MAX_LOG_FOCAL + 2.0 * fit.log_focal_deviation
+    """Return "wrong-intrinsics" if the matches contradict the camera of the view, else "".
+
+    What the matches leave undetermined, such as the focal length before a flat wall, contradicts nothing.
+    """
     moved_m, turned_deg = pose_difference(fit.T_map_camera, T_map_camera)
-    has_moved = moved_m > _MAX_CAMERA_STEP_M or turned_deg > _MAX_CAMERA_TURN_DEG
-    return "wrong-intrinsics" if is_other_lens or has_moved else ""
+    is_contradicted = (
+        abs(fit.log_focal) > _MAX_LOG_FOCAL + fit.log_focal_deviation
+        or moved_m > _MAX_CAMERA_STEP_M + fit.position_deviation_m
+        or turned_deg > _MAX_CAMERA_TURN_DEG + fit.turn_deviation_deg
+    )
+    return "wrong-intrinsics" if is_contradicted else ""
 
 
 def _agree(one: _Placement, other: _Placement, options: LocalisationOptions) -> bool:

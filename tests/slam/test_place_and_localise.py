@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from rse_pf.config import PlatformSettings
-from rse_pf.geometry import Array, pose_difference
+from rse_pf.geometry import Array, Camera, exp_se3, inverse, pose_difference, transform
+from rse_pf.maps.descriptors import Descriptors
 from rse_pf.maps.format import Keyframe, MapVersion, encode_map
 from rse_pf.service import dispatch
 from rse_pf.services.builtin import builtin_services
@@ -104,6 +105,61 @@ def test_a_prior_narrows_the_search_and_a_wrong_one_finds_nothing() -> None:
 
     assert near.verdict == "ok"
     assert (nowhere.verdict, nowhere.reason) == ("lost", "no-candidates")
+
+
+def wall_view(factor: float, slope: float, seed: int) -> tuple[MapIndex, View, Array]:
+    """Return a map of a wall at 4 m that leaves its plane by 5 cm, a view of it, and where that is.
+
+    *slope* is the tangent of the wall's turn, *factor* that of the focal length that the view states.
+    """
+    rng = np.random.default_rng(seed)
+    points = rng.uniform([-2.4, -1.8, 3.95], [2.4, 1.8, 4.05], (300, 3))
+    points[:, 2] += slope * points[:, 0]
+    descriptors = rng.integers(0, 256, (300, 32), dtype=np.uint8)
+
+    def seen_from(T_map_camera: Array) -> tuple[Array, Array, Descriptors]:
+        inside = transform(inverse(T_map_camera), points)
+        pixels = 525.0 * inside[:, :2] / inside[:, 2:] + [319.5, 239.5] + rng.normal(0.0, 1.0, (300, 2))
+        depths_m = inside[:, 2] + rng.normal(0.0, 0.023, 300)  # a Kinect's noise at 4 m
+        rays = np.column_stack([(pixels - [319.5, 239.5]) / 525.0, np.ones(300)])
+        is_seen = ((pixels > 0.0) & (pixels < [640.0, 480.0])).all(axis=1)
+        return pixels[is_seen], (rays * depths_m[:, None])[is_seen], descriptors[is_seen]
+
+    camera = Camera(fx=525.0, fy=525.0, cx=319.5, cy=239.5, width=640, height=480)
+    keyframes = []
+    for number in range(4):
+        T = exp_se3(np.array([0.15 * number - 0.2, 0.05 * number, 0.0, 0.0, 0.0, 0.0]))
+        pixels, points_camera, described = seen_from(T)
+        keyframes.append(
+            Keyframe(
+                id=number, robot="map", timestamp_s=float(number), camera=camera, T_world_camera=T,
+                pixels=pixels.astype(np.float32), descriptors=described,
+                points_camera=points_camera.astype(np.float32),
+            )
+        )  # fmt: skip
+    truth = exp_se3(np.array([0.1, 0.05, 0.3, 0.02, 0.03, 0.01]))
+    pixels, _, described = seen_from(truth)
+    stated = Camera(fx=525.0 * factor, fy=525.0 * factor, cx=319.5, cy=239.5, width=640, height=480)
+    return MapIndex(keyframes), View(camera=stated, pixels=pixels, descriptors=described), truth
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("slope", [0.0, 0.36, 0.84])
+@pytest.mark.parametrize("factor", [0.9, 0.95, 1.0, 1.05, 1.1])
+def test_before_a_flat_wall_which_hides_the_focal_length_a_pose_knows_its_error(
+    factor: float, slope: float, seed: int
+) -> None:
+    index, view_of_wall, truth = wall_view(factor, slope, seed)
+
+    found = locate(index, view_of_wall)
+
+    assert factor != 1.0 or found.verdict == "ok", found.reason
+    if found.verdict == "ok":
+        assert found.T_map_camera is not None
+        assert found.covariance is not None
+        metres, _ = pose_difference(found.T_map_camera, truth)
+        sigma_m = float(np.sqrt(np.trace(found.covariance[:3, :3])))
+        assert metres <= max(0.05, 3.0 * sigma_m)
 
 
 def test_matches_are_closest_and_unambiguous_and_used_once() -> None:
