@@ -267,11 +267,10 @@ class KeyframeMap:
         """Return the landmarks of an image, and points of its own where it has depth and no landmark."""
         rows = np.flatnonzero((landmarks != NO_LANDMARK) | np.isfinite(view.points_camera[:, 2]))
         numbers = landmarks[rows]
-        points, spreads = measure_points(view, T_world_camera, rows, noise, pixel_px)
-        known = numbers != NO_LANDMARK
-        points[known], spreads[known] = self._points[numbers[known]], self._spreads[numbers[known]]
-        sways = view.sways[rows] @ T_world_camera[:3, :3].T
-        sways[known] = self._sways[numbers[known]]
+        points, spreads, sways = self._points[numbers], self._spreads[numbers], self._sways[numbers]
+        new = np.flatnonzero(numbers == NO_LANDMARK)
+        points[new], spreads[new] = measure_points(view, T_world_camera, rows[new], noise, pixel_px)
+        sways[new] = view.sways[rows[new]] @ T_world_camera[:3, :3].T
         return Landmarks(
             points=points, spreads=spreads, sways=sways, descriptors=view.features.descriptors[rows],
             rays=points - T_world_camera[:3, 3], turns=_turns_in_world(view, T_world_camera, rows),
@@ -289,7 +288,7 @@ class KeyframeMap:
         known = transform(inverse(T_world_camera), self._points[numbers])[:, 2] if view.is_stereo else None
         points, spreads = measure_points(view, T_world_camera, rows, noise, pixel_px, known)
         before = self._spreads[numbers]
-        gain = before @ np.linalg.inv(before + spreads)
+        gain = before @ _inverse_symmetric(before + spreads)
         sways = view.sways[rows] @ T_world_camera[:3, :3].T
         self._points[numbers] += np.einsum("nij,nj->ni", gain, points - self._points[numbers])
         self._sways[numbers] += np.einsum("nij,nj->ni", gain, sways - self._sways[numbers])
@@ -411,6 +410,16 @@ class KeyframeMap:
         ]
         self._poses, self._places = self._poses[stays], self._places[stays]
         return numbers[current]
+
+
+def _inverse_symmetric(matrices: Array) -> Array:
+    """Return the inverses of ``(n, 3, 3)`` symmetric matrices by their cofactors: LAPACK takes longer."""
+    a, b, c, d, e, f = matrices.reshape(-1, 9).T[[0, 1, 2, 4, 5, 8]]
+    ab, ac, bc = c * e - b * f, b * e - c * d, b * c - a * e
+    inverses = np.stack([d * f - e * e, ab, ac, ab, a * f - c * c, bc, ac, bc, a * d - b * b], axis=1)
+    inverses /= (a * inverses[:, 0] + b * ab + c * ac)[:, None]
+    found: Array = inverses.reshape(-1, 3, 3)
+    return found
 
 
 def _turns_in_world(view: View, T_world_camera: Array, rows: Rows) -> Array:

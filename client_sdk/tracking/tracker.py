@@ -475,8 +475,10 @@ class Tracker:
             return _seen_rows(known.landmarks(numbers), np.arange(len(numbers)), features)
         recent = self._of_last()
         rows, recent_features = recent.seek(T_camera_world, view.camera, view.features, limits, radius_px)
-        again = np.isin(features, recent_features) | np.isin(numbers, recent.numbers[rows])
-        numbers, features = numbers[~again], features[~again]
+        is_new, is_new_landmark = np.ones(len(view.features), bool), np.ones(known.landmark_count + 1, bool)
+        is_new[recent_features] = is_new_landmark[recent.numbers[rows]] = False  # NO_LANDMARK is the last row
+        stays = is_new[features] & is_new_landmark[numbers]
+        numbers, features = numbers[stays], features[stays]
         first = _seen_rows(known.landmarks(numbers), np.arange(len(numbers)), features)
         second = _seen_rows(recent, rows, recent_features)
         return _Seen(
