@@ -33,6 +33,9 @@ PLACE_WORDS_FILE = Path(__file__).with_name("place_words.bin")
 written by ``scripts/train_places.py``."""
 _FIRST_ROWS = 64
 _ROW_BYTES = 8 + 4 * PLACE_NUMBERS
+_ONE_THREAD_PRODUCTS = (
+    1 << 18
+)  # OpenBLAS computes a product of matrices with so many multiplications in one thread
 
 PlaceVector = npt.NDArray[np.float32]
 
@@ -52,18 +55,28 @@ def place_vector(descriptors: Descriptors) -> PlaceVector:
         # Vectors that are never negative lie all in one direction.
         numbers -= np.rint(numbers.sum(axis=0, dtype=np.float64) / len(numbers)).astype(np.float32)
     # Whole numbers below 2**24, so float32 is exact, in whatever order a machine adds them.
-    nearest = np.argmin(squares - (2.0 * _SCALE) * (numbers @ words.T), axis=1)
-    of_word = np.zeros((len(numbers), WORDS), dtype=np.float32)
-    of_word[np.arange(len(numbers)), nearest] = 1.0
-    residuals = _SCALE * (of_word.T @ numbers).astype(np.float64)
+    nearest = np.argmin(squares - (2.0 * _SCALE) * _product(numbers, words.T), axis=1)
+    counts = np.bincount(nearest, minlength=WORDS)
+    residuals = np.zeros((WORDS, numbers.shape[1]))
+    if len(numbers):
+        order, used = np.argsort(nearest, kind="stable"), np.flatnonzero(counts)
+        starts = (np.cumsum(counts) - counts)[used]
+        residuals[used] = _SCALE * np.add.reduceat(numbers[order], starts, axis=0).astype(np.float64)
     if is_orb:
-        residuals -= of_word.sum(axis=0, dtype=np.float64)[:, None] * words
+        residuals -= counts[:, None] * words
     parts = np.matmul(residuals[:, None, :], directions)[:, 0]
     parts = np.sign(parts) * np.rint(np.sqrt(np.abs(parts)))
     lengths = np.sqrt((parts * parts).sum(axis=1))
     parts /= np.maximum(lengths, 1.0)[:, None] * math.sqrt(max(1, int(np.count_nonzero(lengths))))
     vector: PlaceVector = parts.astype(np.float32).ravel()
     return vector
+
+
+def _product(numbers: npt.NDArray[np.float32], words: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    """Return the product by parts that BLAS does not share among threads: these spin for longer."""
+    rows = max(1, _ONE_THREAD_PRODUCTS // words.size)
+    parts = [numbers[first : first + rows] @ words for first in range(0, len(numbers), rows)]
+    return np.concatenate(parts) if parts else numbers @ words
 
 
 class PlaceIndex:
