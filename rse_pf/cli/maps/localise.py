@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import msgspec
 import numpy as np
 
 from rse_pf.errors import UsageError
@@ -25,7 +26,6 @@ if TYPE_CHECKING:
     from client_sdk.datasets import Dataset
     from client_sdk.slots import FeaturesSlot
     from client_sdk.transfer.data_client import DataClient
-    from rse_pf.services.mapping.localise import LocaliseReply
     from rse_pf.slam.relative_pose import View
 
 __all__ = ["add_localise_arguments", "is_remote", "localise_frames", "localise_photos"]
@@ -77,6 +77,7 @@ def is_remote(args: argparse.Namespace) -> bool:
 def localise_frames(args: argparse.Namespace, maps: MapRegistry) -> int:
     """Estimate the pose of each frame and print a line for it; the exit code is 1 if none has a pose."""
     from rse_pf.services.mapping.localise import locate
+    from rse_pf.services.mapping.photo import location_of
     from rse_pf.services.mapping.place import open_map
 
     if args.intrinsics is not None or args.token_file is not None or args.authority is not None:
@@ -96,8 +97,8 @@ def localise_frames(args: argparse.Namespace, maps: MapRegistry) -> int:
     frames = [each for word in args.frames for each in _frames(word, args.every)]
     found: list[dict[str, Any]] = []
     for each in frames:
-        location = locate(index, _view_of(each, version_map, args.camera, slot))
-        found.append(_location_document(each.label, location))
+        reply = locate(index, _view_of(each, version_map, args.camera, slot))
+        found.append(_location_document(each.label, location_of(reply, version or "head")))
         if not args.json:
             show(_location_line(found[-1]))
     return _finish(args, found)
@@ -115,12 +116,7 @@ def localise_photos(args: argparse.Namespace) -> int:
     found: list[dict[str, Any]] = []
     try:
         for label, photo in photos:
-            location = client.localise(args.name, photo, lens)
-            found.append(_location_document(label, location))
-            found[-1] |= {
-                name: getattr(location, name)
-                for name in ("version", "position_sigma_m", "turn_sigma_deg", "T_map_camera", "covariance")
-            }
+            found.append(_location_document(label, client.localise(args.name, photo, lens)))
             if not args.json:
                 show(_location_line(found[-1]))
     finally:
@@ -291,11 +287,10 @@ def _lens_of_map(version: MapVersion, width: int, height: int, label: str) -> Ca
     )
 
 
-def _location_document(label: str, location: LocaliseReply | PhotoLocation) -> dict[str, Any]:
+def _location_document(label: str, location: PhotoLocation) -> dict[str, Any]:
     T = None if location.T_map_camera is None else np.array(location.T_map_camera)
     return {
-        "frame": label, "verdict": location.verdict, "reason": location.reason, "inliers": location.inliers,
-        "rmse_px": round(location.rmse_px, 3), "keyframes": location.keyframes,
+        "frame": label, **msgspec.structs.asdict(location),
         "position_m": None if T is None else [round(float(x), 4) + 0.0 for x in T[:3, 3]],
         "quaternion_xyzw": None if T is None else [round(float(x), 6) for x in to_quaternion(T[:3, :3])],
         "turned_deg": None if T is None else round(rotation_angle_deg(T[:3, :3]), 2),
@@ -310,6 +305,7 @@ def _location_line(found: dict[str, Any]) -> str:
     reason = f" ({found['reason']})" if found["reason"] else ""
     keyframes = ", ".join(str(keyframe) for keyframe in found["keyframes"])
     return (
-        f"{start}  x {x:7.3f}  y {y:7.3f}  z {z:7.3f} m, turned {found['turned_deg']:6.2f} deg; "
+        f"{start}  x {x:7.3f}  y {y:7.3f}  z {z:7.3f} m, sigma {found['position_sigma_m']:.3f} m, "
+        f"turned {found['turned_deg']:6.2f} deg; "
         f"{found['inliers']} inliers, {found['rmse_px']:.2f} px, keyframes {keyframes}{reason}"
     )

@@ -79,7 +79,7 @@ def test_photos_are_sent_with_the_lens_and_each_has_a_line(
     lines = capsys.readouterr().out.splitlines()
     assert code == 0
     assert lines[0].startswith(
-        "known.jpg                ok    x   1.500  y  -2.000  z   0.250 m, turned   0.00"
+        "known.jpg                ok    x   1.500  y  -2.000  z   0.250 m, sigma 0.010 m, turned   0.00"
     )
     assert "lost  no-pose" in lines[1]
     assert lines[2] == "1 of 2 found"

@@ -155,9 +155,11 @@ def test_localise_uses_the_camera_of_the_map_for_an_image(
     assert found["verdict"] == "ok"
     assert found["inliers"] >= 30
     assert found["keyframes"] == [7]
-    estimate = np.eye(4)
-    estimate[:3, 3] = found["position_m"]
-    assert pose_difference(estimate, truth)[0] <= 0.01
+    moved_m, turned_deg = pose_difference(np.array(found["T_map_camera"]), truth)
+    assert moved_m <= 0.01
+    assert found["position_sigma_m"] > 0.0
+    assert moved_m <= 3.0 * found["position_sigma_m"]
+    assert turned_deg <= 3.0 * found["turn_sigma_deg"]
 
 
 def test_localise_prints_a_line_for_each_frame_and_exits_with_1_if_none_has_a_pose(
@@ -172,6 +174,7 @@ def test_localise_prints_a_line_for_each_frame_and_exits_with_1_if_none_has_a_po
     assert run(store, "localise", "room", str(image), str(tmp_path / "noise.png")) == 0
     lines = capsys.readouterr().out.splitlines()
     assert "ok" in lines[0]
+    assert "sigma" in lines[0]
     assert "inliers" in lines[0]
     assert "lost" in lines[1]
     assert lines[2] == "1 of 2 found"
