@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from client_sdk.check.keyframes import Keyframe, matched
+from client_sdk.check.keyframes import FLIPS, Keyframe, matched
 from client_sdk.frontend import Frame, TrackedFrame
 from client_sdk.source_facts import Doubt, DoubtName
 from rse_pf.geometry import Array, Camera, inverse, pose_difference, transform
@@ -163,13 +163,13 @@ def doubts_of_depth(keyframes: Sequence[Keyframe]) -> tuple[Doubt, ...]:
     """Return a doubt if the depth of a drive is measured along the ray, as some simulators write it.
 
     Such depth is too long by the length of the ray to a pixel, at depth 1.  Readings of one point from two
-    keyframes then differ by the ratio of both lengths; the slope of one logarithm over the other is 1.
+    keyframes then differ by the ratio of both lengths; the slope of one logarithm over the other is 1.  Depth
+    that is mirrored may have any slope; it agrees better where it is turned back.
     """
-    pairs = [_ratios(one, other) for one, other in itertools.pairwise(keyframes)]
-    known = [pair for pair in pairs if pair is not None]
-    if not known:
+    ratios = _all_ratios(keyframes, 0)
+    if ratios is None:
         return ()
-    rays, depths = (np.concatenate(each) for each in zip(*known, strict=True))
+    rays, depths = ratios
     slope, weights = 0.0, np.ones(len(rays))
     for _ in range(8):  # of least squares with the weights of a Cauchy loss
         slope = float((weights * rays * depths).sum() / max(1e-9, (weights * rays * rays).sum()))
@@ -179,6 +179,9 @@ def doubts_of_depth(keyframes: Sequence[Keyframe]) -> tuple[Doubt, ...]:
     deviation = spread / max(1e-9, float(np.sqrt((weights * rays * rays).sum())))
     if deviation > _RAY_DEVIATION or slope < _RAY_SLOPE:
         return ()
+    mirrored = [_all_ratios(keyframes, flip) for flip in range(1, len(FLIPS))]
+    if any(1.4826 * float(np.median(np.abs(each[1]))) < spread for each in mirrored if each is not None):
+        return ()
     sentence = (
         f"depth grows towards the corners of the image as if it were measured along the ray "
         f"({100 * slope:.0f} +- {100 * deviation:.0f} % of it), not along the optical axis"
@@ -187,12 +190,22 @@ def doubts_of_depth(keyframes: Sequence[Keyframe]) -> tuple[Doubt, ...]:
     return (Doubt(name=DoubtName.DEPTH_ALONG_RAY, sentence=sentence, hint=hint),)
 
 
-def _ratios(before: Keyframe, keyframe: Keyframe) -> tuple[Array, Array] | None:
+def _all_ratios(keyframes: Sequence[Keyframe], flip: int) -> tuple[Array, Array] | None:
+    """Return `_ratios` of all neighbours, with the depth images turned as in row *flip* of `FLIPS`."""
+    pairs = [_ratios(one, other, flip) for one, other in itertools.pairwise(keyframes)]
+    known = [pair for pair in pairs if pair is not None]
+    if not known:
+        return None
+    rays, depths = (np.concatenate(each) for each in zip(*known, strict=True))
+    return rays, depths
+
+
+def _ratios(before: Keyframe, keyframe: Keyframe, flip: int) -> tuple[Array, Array] | None:
     """Return logarithms ``(n,)``: of the ratio of a point's rays, and of its depth over the expected one."""
     if before.T_world_camera is None or keyframe.T_world_camera is None:
         return None
     one, other = matched(before, keyframe)
-    old_m, new_m = before.depths_m[0][one], keyframe.depths_m[0][other]
+    old_m, new_m = before.depths_m[flip][one], keyframe.depths_m[flip][other]
     is_known = np.isfinite(old_m) & np.isfinite(new_m)
     one, other, old_m, new_m = one[is_known], other[is_known], old_m[is_known], new_m[is_known]
     points = before.camera.back_project(before.pixels[one], old_m)

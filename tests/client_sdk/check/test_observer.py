@@ -124,10 +124,16 @@ def along_the_ray(frames: Sequence[Frame]) -> Iterator[Frame]:
     return (replace(frame, depth_m=(frame.depth_m * rays).astype(np.float32)) for frame in frames)
 
 
+def with_mirrored_depth(frames: Sequence[Frame]) -> Iterator[Frame]:
+    """Swap left and right of the depth images, which the check of the calibration names."""
+    return (replace(frame, depth_m=np.ascontiguousarray(frame.depth_m[:, ::-1])) for frame in frames)
+
+
 @pytest.mark.parametrize(
     ("change", "expected"),
     [
         (iter, []),
+        (with_mirrored_depth, []),
         (dotted, ["static-pattern"]),
         (covered_in_part, ["static-pattern"]),
         (passed_by, ["moving-objects"]),
