@@ -44,5 +44,5 @@ def test_two_recordings_of_one_name_are_refused() -> None:
 
 
 def test_a_wrong_path_is_one_line(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="no folder"):
+    with pytest.raises(UsageError, match="does not exist"):
         drives_of([str(tmp_path / "nothing")], [])
