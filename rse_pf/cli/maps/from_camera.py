@@ -37,7 +37,6 @@ if TYPE_CHECKING:
     from client_sdk.frontend import Frame
     from client_sdk.mapper import Mapper
     from client_sdk.mapping import Trajectory
-    from client_sdk.source_facts import Doubt
     from rse_pf.geometry import Array
 
 __all__ = [
@@ -235,10 +234,12 @@ def map_source(
         raise CommandFailed(f"the source failed after {report['frames']} frames: {failed.message}",
                             hint=failed.hint)  # fmt: skip
     if posed <= (1 - _MOST) * report["frames"]:
+        findings = (checked or {}).get("source") or [doubt.to_dict() for doubt in doubts]
         raise CommandFailed(
-            f"{report['frames'] - posed} of {report['frames']} frames have no pose: {report['lost_frames']} "
-            f"lost, {report['frames_before_start']} before the start",
-            hint=_advice(mapper, source, check, doubts),
+            f"{report['frames'] - posed} of {report['frames']} frames have no pose in the map: "
+            f"{report['lost_frames']} lost, {report['frames_before_start']} before the start, "
+            f"{report['frames_apart']} in parts of the drive that were not connected",
+            hint=_advice(mapper, source, check, findings),
         )
     return 0
 
@@ -428,13 +429,15 @@ class _Status:
         show_progress(self._last, is_over=True)
 
 
-def _advice(mapper: Mapper, source: FrameStream, check: DriveCheck, doubts: Sequence[Doubt]) -> str:
+def _advice(
+    mapper: Mapper, source: FrameStream, check: DriveCheck, findings: Sequence[Mapping[str, Any]]
+) -> str:
     """Return what to do about frames without a pose: by what the images show, a finding, or the sensors."""
     cause = check.cause_of_loss()
     if cause is not None:
         return cause
-    if doubts:
-        return f"settle the finding {doubts[0].name.value} first: {doubts[0].hint}"
+    if findings:
+        return f"settle the finding {findings[0]['name']} first: {findings[0]['hint']}"
     if mapper.keyframes == 0 and not source.has_depth and not source.has_stereo:
         return "without depth the camera must move sideways, over things with texture; or use a depth camera"
     return f"move more slowly, and compare the intrinsics with the camera; {FRAMES_FILE} has the reasons"
