@@ -150,7 +150,12 @@ def test_each_alarm_of_the_templates_fires_and_resolves(deployment: Deployment) 
 def agent_of(server: Server, cloudwatch: Any) -> Any:
     """Return what calls the tasks of the agent that publish the metrics of *server*."""
     config = AgentConfig(
-        group="rse-pf", hook="drain", launch_hook="launch", keys_name="keys.json", keys_file=Path("keys.json")
+        group="rse-pf",
+        hook="drain",
+        launch_hook="launch",
+        keys_name="keys.json",
+        keys_file=Path("keys.json"),
+        state_folder=Path("state"),
     )
     context = AgentContext(
         machine=server, clients={"cloudwatch": cloudwatch}, artifacts=MemoryStore(), settings=SETTINGS,
