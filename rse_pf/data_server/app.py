@@ -92,7 +92,7 @@ class DataServer:
             describe: Returns what the map in an object that a robot sent holds; None starts a process with
                 limits for it.
             localiser: Localises photos; None starts processes with limits for it.
-            pause: Waits for so many seconds before a robot above one of its limits gets its refusal.
+            pause: Waits, for a time in seconds, before the refusal of a robot above its limits is sent.
         """
         self._audit = audit
         self._refusals = RefusalLimiter()

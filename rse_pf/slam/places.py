@@ -33,9 +33,8 @@ PLACE_WORDS_FILE = Path(__file__).with_name("place_words.bin")
 written by ``scripts/train_places.py``."""
 _FIRST_ROWS = 64
 _ROW_BYTES = 8 + 4 * PLACE_NUMBERS
-_ONE_THREAD_PRODUCTS = (
-    1 << 18
-)  # OpenBLAS computes a product of matrices with so many multiplications in one thread
+_ONE_THREAD_PRODUCTS = 1 << 18
+"""Products of matrices with at most this number of multiplications take OpenBLAS one thread."""
 
 PlaceVector = npt.NDArray[np.float32]
 

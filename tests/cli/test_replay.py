@@ -1,4 +1,4 @@
-"""`rse-pf replay` on recordings, and on files from strangers."""
+"""`rse-pf replay` on recordings, and on files that anybody may have written."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Recordings of commands that strangers made or edited: a line or a report, in bounded memory and time."""
+"""Hostile recordings of commands end in one line or a report, in bounded memory and time."""
 
 from __future__ import annotations
 
