@@ -1,7 +1,8 @@
 """The native core: the whole PnP solver with its evidence in one call into a shared library.
 
-The library is looked for at first use, and everything works without it.  Nothing here compiles or installs
-it: ``native/README.md`` says how.  A call holds no interpreter lock, and equal requests give equal bytes.
+The library is loaded at first use, and is required wherever poses or features are computed.  Nothing here
+compiles or installs it: ``native/README.md`` says how.  A call holds no interpreter lock, and equal requests
+give equal bytes.
 """
 
 from __future__ import annotations
@@ -42,6 +43,7 @@ __all__ = [
     "address_of",
     "aligned",
     "find_library",
+    "load_core",
     "load_part",
     "native_solver",
     "open_found",
@@ -383,7 +385,7 @@ def load_part(path: Path, part: str, abi: int, *functions: str) -> list[Any]:
     Raises:
         ConfigurationError: It cannot be loaded, or was built for another version of this package.
     """
-    again = "build it again: make -C native"
+    again = "build it again: make native"
     try:
         library = ctypes.CDLL(str(path))
         version = library[f"rse_pf_{part}_abi"]
@@ -394,6 +396,21 @@ def load_part(path: Path, part: str, abi: int, *functions: str) -> list[Any]:
     if version() != abi:
         raise ConfigurationError(f"{path} has the {part} ABI {version()}, not {abi}", hint=again)
     return loaded
+
+
+def load_core(open_part: Callable[[Path], Part]) -> Part:
+    """Return the part that *open_part* opens in the native core.
+
+    Raises:
+        MissingExtra: The native core is not installed.
+        ConfigurationError: The native core cannot be loaded, or has another version.
+    """
+    path = find_library()
+    if path is None:
+        error = MissingExtra("the native core", "vision")
+        error.hint = f"make native in a checkout; {error.hint} on a robot"
+        raise error
+    return open_part(path)
 
 
 def open_found(open_part: Callable[[Path], Part]) -> Part | None:
@@ -415,15 +432,5 @@ def open_solver(path: Path) -> NativeSolver:
 
 @cache
 def native_solver() -> NativeSolver:
-    """Return the solver of the library that `find_library` finds; later calls return the same.
-
-    Raises:
-        MissingExtra: There is none.
-        ConfigurationError: It does not fit.
-    """
-    path = find_library()
-    if path is None:
-        error = MissingExtra("the native solver", "native")
-        error.hint = "build it: make -C native, or pip install ./native; or choose the engine poselib"
-        raise error
-    return open_solver(path)
+    """Return the solver of the native core, which is required."""
+    return load_core(open_solver)

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rse_pf.geometry import Array
-from rse_pf.native import address_of, aligned, load_part, open_found
+from rse_pf.native import address_of, aligned, load_core, load_part
 
 __all__ = ["CheckCore", "check_core", "open_check"]
 
@@ -66,6 +66,6 @@ def open_check(path: Path) -> CheckCore:
 
 
 @cache
-def check_core() -> CheckCore | None:
-    """Return the check's part of the library that `rse_pf.native` finds; None without one that fits."""
-    return open_found(open_check)
+def check_core() -> CheckCore:
+    """Return the image checks of the native core, which is required."""
+    return load_core(open_check)

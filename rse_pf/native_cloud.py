@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rse_pf.geometry import Array, Camera
-from rse_pf.native import address_of, aligned, load_part, open_found
+from rse_pf.native import address_of, aligned, load_core, load_part
 
 __all__ = ["CloudCore", "VoxelArrays", "cloud_core", "open_cloud"]
 
@@ -126,6 +126,6 @@ def open_cloud(path: Path) -> CloudCore:
 
 
 @cache
-def cloud_core() -> CloudCore | None:
-    """Return the cloud's part of the library that `rse_pf.native` finds; None without one that fits."""
-    return open_found(open_cloud)
+def cloud_core() -> CloudCore:
+    """Return the point cloud of the native core, which is required."""
+    return load_core(open_cloud)

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rse_pf.geometry import Array, Camera
-from rse_pf.native import address_of, aligned, load_part, open_found
+from rse_pf.native import address_of, aligned, load_core, load_part
 from rse_pf.native_matcher import MATCH_ABI, Lanes, MatchCore, Workspace, open_matcher
 
 __all__ = ["FrontEndCore", "Keypoints", "front_end_core", "open_front_end"]
@@ -239,6 +239,6 @@ def open_front_end(path: Path, lanes: Lanes = "avx512") -> FrontEndCore:
 
 
 @cache
-def front_end_core() -> FrontEndCore | None:
-    """Return the front end of the library that `rse_pf.native` finds; None without one that fits."""
-    return open_found(open_front_end)
+def front_end_core() -> FrontEndCore:
+    """Return the front end of the native core, which is required."""
+    return load_core(open_front_end)

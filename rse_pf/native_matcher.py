@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rse_pf.geometry import Array
-from rse_pf.native import address_of, aligned, load_part, open_found
+from rse_pf.native import address_of, aligned, load_core, load_part
 
 __all__ = ["MATCH_ABI", "Lanes", "MatchCore", "Workspace", "match_core", "open_matcher"]
 
@@ -120,6 +120,6 @@ def open_matcher(path: Path, lanes: Lanes = "avx512") -> MatchCore:
 
 
 @cache
-def match_core() -> MatchCore | None:
-    """Return the matcher of the library that `rse_pf.native` finds; None without one that fits."""
-    return open_found(open_matcher)
+def match_core() -> MatchCore:
+    """Return the matcher of the native core, which is required."""
+    return load_core(open_matcher)

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from rse_pf.errors import BadRequest
 from rse_pf.geometry import Array
-from rse_pf.native import address_of, aligned, load_part, open_found
+from rse_pf.native import address_of, aligned, load_core, load_part
 
 __all__ = ["StereoCore", "StereoRequest", "open_stereo", "stereo_core"]
 
@@ -87,6 +87,6 @@ def open_stereo(path: Path, *, portable: bool = False) -> StereoCore:
 
 
 @cache
-def stereo_core() -> StereoCore | None:
-    """Return the stereo part of the library that `rse_pf.native` finds; None without one that fits."""
-    return open_found(open_stereo)
+def stereo_core() -> StereoCore:
+    """Return the stereo matcher of the native core, which is required."""
+    return load_core(open_stereo)

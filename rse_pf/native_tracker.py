@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rse_pf.geometry import Array, Camera
-from rse_pf.native import address_of, aligned, load_part, open_found
+from rse_pf.native import address_of, aligned, load_core, load_part
 from rse_pf.native_matcher import Workspace
 
 __all__ = ["TrackCore", "open_tracker", "track_core"]
@@ -227,6 +227,6 @@ def open_tracker(path: Path) -> TrackCore:
 
 
 @cache
-def track_core() -> TrackCore | None:
-    """Return the tracker's part of the library that `rse_pf.native` finds; None without one that fits."""
-    return open_found(open_tracker)
+def track_core() -> TrackCore:
+    """Return the tracker of the native core, which is required."""
+    return load_core(open_tracker)

@@ -16,7 +16,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from rse_pf.geometry import Array, Camera
-from rse_pf.native import address_of, aligned, load_part, open_found
+from rse_pf.native import address_of, aligned, load_core, load_part
 from rse_pf.pnp.solver import PnpSolution
 
 __all__ = ["DepthCore", "RefinedPose", "depth_core", "open_depth"]
@@ -127,6 +127,6 @@ def open_depth(path: Path, *, portable: bool = False) -> DepthCore:
 
 
 @cache
-def depth_core() -> DepthCore | None:
-    """Return the refinement of the library that `rse_pf.native` finds; None without one that fits."""
-    return open_found(open_depth)
+def depth_core() -> DepthCore:
+    """Return the depth refinement of the native core, which is required."""
+    return load_core(open_depth)
