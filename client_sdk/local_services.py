@@ -10,7 +10,7 @@ from collections import deque
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
-from rse_pf.errors import MissingExtra, RsePfError
+from rse_pf.errors import RsePfError
 from rse_pf.service import Registry, dispatch, failure_of
 from rse_pf.wire import Command, Failure, Result, make_codec
 
@@ -77,23 +77,11 @@ class LocalServices:
         return sent
 
     def _prepare(self) -> None:
-        from rse_pf.pnp import available_engines
+        from rse_pf.config import PlatformSettings
+        from rse_pf.services.builtin import builtin_services
 
         if self._registry is None:
-            engines = available_engines()
-            if not engines:
-                raise MissingExtra("poselib", "solver")
-            self._registry = _builtin(engines)
-
-
-def _builtin(engines: tuple[str, ...]) -> Registry:
-    from rse_pf.config import PlatformSettings
-    from rse_pf.services.builtin import builtin_services
-
-    settings = PlatformSettings()
-    if settings.pnp.engine not in engines:
-        settings = settings.replace(pnp={"engine": engines[0]})
-    return builtin_services(settings)
+            self._registry = builtin_services(PlatformSettings())
 
 
 def _typical_command() -> Command:

@@ -71,7 +71,7 @@ export interface PnpRequest {
   /** 2n numbers: undistorted pixels of the same points. */
   pixels: Numbers;
   options?: {
-    engine?: "native" | "poselib" | "opencv" | null;
+    engine?: "native" | "opencv" | null;
     inlier_px?: number;
     max_iterations?: number;
     min_iterations?: number;

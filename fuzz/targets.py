@@ -169,7 +169,7 @@ def geometry(data: bytes, meter: Meter) -> None:
     """Check that any numbers give a rigid pose or a typed failure, and that points on a line are not ok."""
     if len(data) < 8:
         return
-    engine = ("poselib", "opencv", None)[data[0] % 3]
+    engine = ("opencv", None)[data[0] % 2]
     n = data[1] % 40
     numbers = _numbers(data[2] % 3, data[8:], 5 * n)
     points, pixels = numbers[: 3 * n], numbers[3 * n :]

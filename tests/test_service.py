@@ -11,10 +11,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rse_pf import native
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import Busy, ConfigurationError, DegenerateGeometry
-from rse_pf.pnp import PnpOptions, engines, solve_pnp
+from rse_pf.pnp import PnpOptions, solve_pnp
 from rse_pf.pnp.problems import KINECT, make_problem
 from rse_pf.service import Registry, Service, dispatch, failure_of
 from rse_pf.services.builtin import builtin_services
@@ -213,31 +212,6 @@ def test_a_pose_over_the_wire_is_the_pose_of_the_solver(codec: str) -> None:
         direct.reason,
         direct.engine,
     )
-
-
-@pytest.mark.parametrize("there", [True, False])
-def test_the_reply_names_poselib_where_the_native_library_is_missing(
-    monkeypatch: pytest.MonkeyPatch, there: bool
-) -> None:
-    if there and native.find_library() is None:
-        pytest.skip("the native core is not built")
-    if not there:
-        monkeypatch.setattr(native, "find_library", lambda: None)
-    forget_the_library()
-    problem = make_problem(seed=5)
-    try:
-        result = pnp(make_request(problem.points_world, problem.pixels, problem.camera))
-    finally:
-        forget_the_library()
-
-    assert isinstance(result, Result)
-    assert result.reply.engine == ("native" if there else "poselib")
-
-
-def forget_the_library() -> None:
-    """Let the next use look for the native library again."""
-    native.native_solver.cache_clear()
-    engines.ENGINES["native"].cache_clear()  # type: ignore[attr-defined]
 
 
 def request_of(n: int, **options: Any) -> PnpRequest:

@@ -51,9 +51,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--engine",
-        choices=("native", "poselib", "opencv"),
+        choices=("native", "opencv"),
         default="native",
-        help="PnP solver (default: native, or poselib where the native library is missing)",
+        help="PnP solver (default: native)",
     )
     parser.add_argument(
         "--codec",
@@ -125,7 +125,6 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     load_features(args.features)
     settings = with_recordings(settings, args.record)
     from rse_pf.experiments.demo.run import DemoOptions, run_demo
-    from rse_pf.pnp import usable_engine
 
     shown: tuple[str, ...] = ()
     if args.data is not None:
@@ -149,7 +148,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
         imu=args.imu,
         robots=robots,
         rate_hz=args.rate,
-        engine=usable_engine(args.engine),
+        engine=args.engine,
         codec=args.codec,
         out=args.out,
         frames=args.frames,

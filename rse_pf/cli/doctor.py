@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import functools
 import importlib
 import importlib.util
 import os
@@ -18,15 +17,14 @@ import platform
 import re
 import resource
 import subprocess
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from importlib import metadata
 from pathlib import Path
 
 from rse_pf.cli.extras import EXTRAS, VERBS_NEED, modules_of
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import ConfigurationError, MissingExtra
-from rse_pf.native import find_library, open_solver
+from rse_pf.native import load_core, open_solver
 from rse_pf.terminal import show
 
 __all__ = ["Finding", "add_arguments", "check_machine", "report", "run"]
@@ -38,7 +36,6 @@ _DESCRIPTORS_PER_ROBOT = 2
 _OTHER_DESCRIPTORS = 256
 _LITTLE_MEMORY_MIB = 1024
 _ENVOY_ANSWERS_S = 10.0
-_NATIVE_FIX = "make -C native, which needs a C++ compiler"
 _ISOLATION_FIX = "allow user namespaces: sysctl -w user.max_user_namespaces=10000"
 
 
@@ -77,7 +74,7 @@ def report(findings: Iterable[Finding], ready: str) -> int:
 def check_machine(settings: PlatformSettings) -> Iterator[Finding]:
     """Yield what is found, in the order in which it should be fixed."""
     checks: tuple[Callable[[PlatformSettings], Iterator[Finding]], ...] = (
-        _system, _extras, _native_library, _engines, _isolation, _balancer, _listener, _open_files, _size,
+        _system, _extras, _solver, _isolation, _balancer, _listener, _open_files, _size,
     )  # fmt: skip
     for check in checks:
         yield from check(settings)
@@ -117,31 +114,16 @@ def _verbs(absent: set[str]) -> Iterator[Finding]:
             yield _finding(title, MissingExtra.command(*lacks))
 
 
-def _native_library(settings: PlatformSettings) -> Iterator[Finding]:
-    path = find_library()
-    if path is None:
-        yield _finding("native library: not built, so poses take several times the CPU", _NATIVE_FIX)
-        return
+def _solver(settings: PlatformSettings) -> Iterator[Finding]:
+    from rse_pf.pnp.engines import engine_for
+
     try:
-        solver = open_solver(path)
+        core = load_core(open_solver)
+        engine_for(settings.pnp.engine)
     except ConfigurationError as error:
-        yield _finding(f"native library: {error.message}", error.hint)
+        yield _finding(f"solver: {error.message}", error.hint, is_required=True)
         return
-    yield _finding(f"native library: {solver.lanes} instructions, {path}")
-
-
-def _engines(settings: PlatformSettings) -> Iterator[Finding]:
-    from rse_pf.pnp import usable_engine
-
-    chosen = usable_engine(settings.pnp.engine)
-    yield _finding(f"engine in use: {chosen} (pnp.engine is {settings.pnp.engine})")
-    for engine, module, extra in (("poselib", "poselib", "solver"), ("opencv", "cv2", "vision")):
-        if _has(module):
-            yield Finding(grade="ok", what=f"engine {engine} {_version_of(module)}")
-        else:
-            needed = chosen == engine
-            title = f"engine {engine} is not installed" + (" but needed by pnp.engine" if needed else "")
-            yield _finding(title, MissingExtra.command(extra), is_required=needed)
+    yield _finding(f"solver: engine {settings.pnp.engine}, native core with {core.lanes} instructions")
 
 
 def _isolation(settings: PlatformSettings) -> Iterator[Finding]:
@@ -247,14 +229,3 @@ def _has(module: str) -> bool:
     except (ImportError, OSError):
         return False
     return True
-
-
-def _version_of(module: str) -> str:
-    names = _distributions().get(module, [])
-    return metadata.version(names[0]) if names else ""
-
-
-@functools.cache
-def _distributions() -> Mapping[str, list[str]]:
-    """Return the packages of each module; they are read once, as it takes 0.2 s."""
-    return metadata.packages_distributions()

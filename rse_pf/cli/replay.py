@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 __all__ = ["add_arguments", "run"]
 
 _SHOWN, _IN_PAGE, _LISTED_IN_JSON = 20, 5, 500
-_ENGINES = ("native", "poselib", "opencv")
+_ENGINES = ("native", "opencv")
 _IDENTITY = re.compile(r"([0-9a-f]{16}:)?\d{1,16}")
 
 

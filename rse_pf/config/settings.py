@@ -107,7 +107,7 @@ class SessionSettings:
 class PnpSettings:
     """The perspective-n-point service."""
 
-    engine: str = setting("native", doc="solver of a command that chooses none; poselib stands in where the native library is missing", choices=("native", "poselib", "opencv"))
+    engine: str = setting("native", doc="solver of a command that chooses none; opencv is the paper's, for comparisons", choices=("native", "opencv"))
     max_iterations: int = setting(1000, doc="RANSAC iterations a command may ask for", low=1, high=100000)
 
 

@@ -4,7 +4,7 @@ Estimating one camera pose belongs here; the messages of the service ``pnp`` bel
 """
 
 from rse_pf.pnp.depth_refinement import DepthNoise, refine_with_depth
-from rse_pf.pnp.engines import available_engines, usable_engine
+from rse_pf.pnp.engines import available_engines
 from rse_pf.pnp.options import PnpOptions, WeakLimits
 from rse_pf.pnp.solver import PnpSolution, solve_pnp
 
@@ -16,5 +16,4 @@ __all__ = [
     "available_engines",
     "refine_with_depth",
     "solve_pnp",
-    "usable_engine",
 ]

@@ -1,4 +1,4 @@
-"""Three robust PnP engines behind one contract: PoseLib, the paper's ``solvePnPRansac``, and the native core.
+"""Two robust PnP engines behind one contract: the native core, and the paper's ``solvePnPRansac`` of OpenCV.
 
 An engine proposes a pose; `rse_pf.pnp.solver` decides whether to accept it.  Engines are deterministic (fixed
 seeds, one thread) and raise no exceptions of their libraries.  The native core can also judge its pose in the
@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cache, lru_cache
-from typing import Any
 
 import numpy as np
 
@@ -25,7 +24,6 @@ __all__ = [
     "engine_for",
     "native_evidence",
     "native_options",
-    "usable_engine",
 ]
 
 # Refinements of the opencv engine, each on the inliers of the previous one.
@@ -59,55 +57,6 @@ def available_engines() -> tuple[str, ...]:
             continue
         found.append(name)
     return tuple(found)
-
-
-def usable_engine(name: str) -> str:
-    """Return *name*, or ``poselib`` where it is ``native`` and the library is missing or does not fit."""
-    if name == "native":
-        try:
-            _native_engine()
-        except ConfigurationError:
-            return "poselib"
-    return name
-
-
-@cache
-def _poselib_engine() -> Engine:
-    try:
-        import poselib
-    except ImportError as error:
-        raise MissingExtra("poselib", "solver") from error
-
-    estimate: Any = poselib.estimate_absolute_pose
-
-    @lru_cache(maxsize=64)
-    def model_of(camera: Camera) -> Any:
-        return poselib.Camera(
-            "PINHOLE", [camera.fx, camera.fy, camera.cx, camera.cy], camera.width, camera.height
-        )
-
-    @lru_cache(maxsize=64)
-    def settings_of(options: PnpOptions) -> dict[str, float]:
-        return {
-            "max_reproj_error": options.inlier_px,
-            "max_error": options.inlier_px,
-            "min_iterations": min(options.min_iterations, options.max_iterations),
-            "max_iterations": options.max_iterations,
-            "success_prob": options.confidence,
-            # Its default of 3 makes three times the trials that the confidence asks for.
-            "dyn_num_trials_mult": 1.0,
-        }
-
-    def solve(points_world: Array, pixels: Array, camera: Camera, options: PnpOptions) -> Array | None:
-        """LO-RANSAC with P3P, then robust refinement (Larsson, PoseLib)."""
-        try:
-            pose, _ = estimate(pixels, points_world, model_of(camera), settings_of(options))
-        except (RuntimeError, ValueError):
-            return None
-        found: Array = pose.Rt
-        return found
-
-    return solve
 
 
 @cache
@@ -197,7 +146,7 @@ def native_evidence(
         BadRequest: A number is not finite or absurd.
         DegenerateGeometry: The points lie on one line or coincide, or two poses fit alike.
         NoConsensus: No pose agrees with more correspondences than chance would give.
-        MissingExtra: The library is not built.
+        MissingExtra: The library is not installed.
         ConfigurationError: The library does not fit.
     """
     return native.native_solver().solve(points_world, pixels, camera, native_options(options, weak))
@@ -205,7 +154,6 @@ def native_evidence(
 
 _NO_LIMITS = WeakLimits()
 ENGINES: dict[str, Callable[[], Engine]] = {
-    "poselib": _poselib_engine,
-    "opencv": _opencv_engine,
     "native": _native_engine,
+    "opencv": _opencv_engine,
 }

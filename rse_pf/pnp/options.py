@@ -27,7 +27,7 @@ class PnpOptions(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
         BadRequest: A number is out of its range.
     """
 
-    engine: Literal["native", "poselib", "opencv"] | None = None
+    engine: Literal["native", "opencv"] | None = None
     inlier_px: float = 8.0
     max_iterations: int = 1000
     min_iterations: int = 10

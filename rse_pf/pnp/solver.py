@@ -12,7 +12,7 @@ import numpy.typing as npt
 from rse_pf.errors import BadRequest, DegenerateGeometry
 from rse_pf.geometry import Array, Camera
 from rse_pf.pnp import evidence
-from rse_pf.pnp.engines import Engine, engine_for, native_evidence, usable_engine
+from rse_pf.pnp.engines import Engine, engine_for, native_evidence
 from rse_pf.pnp.options import PnpOptions, WeakLimits
 from rse_pf.pnp.rules import PoseJudgement, too_few_matches
 
@@ -57,7 +57,7 @@ def solve_pnp(
     camera: Camera,
     options: PnpOptions | None = None,
     *,
-    default_engine: str | None = None,
+    default_engine: str = "native",
     weak: WeakLimits = _DEFAULT_LIMITS,
 ) -> PnpSolution:
     """Estimate the camera pose from 3-D to 2-D matches, some of which are wrong.
@@ -71,8 +71,7 @@ def solve_pnp(
         pixels: ``(n, 2)``, undistorted pixels; row *i* observes row *i* of *points_world*.
         camera: Intrinsics of the image the pixels come from.
         options: RANSAC settings; ``None`` means the defaults.
-        default_engine: The engine when *options* names none; ``None`` means the native core, or PoseLib
-            where its library is missing.
+        default_engine: The engine when *options* names none.
         weak: Where a pose stops being ``ok``.
 
     Raises:
@@ -87,7 +86,7 @@ def solve_pnp(
     """
     options = options or _DEFAULT_OPTIONS
     points_world, pixels = _checked(points_world, pixels)
-    engine = options.engine or default_engine or usable_engine("native")
+    engine = options.engine or default_engine
     if engine == "native":
         return _solved_natively(points_world, pixels, camera, options, weak)  # which checks the numbers
     _check_numbers(points_world, pixels)

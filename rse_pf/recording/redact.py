@@ -37,7 +37,7 @@ _TEXT_FIELDS = ("trace", "stream", "message", "hint", "what", "reason", "sdk")
 _VALUE_FIELDS = ("payload", "reply")
 PROTOCOL_WORDS = frozenset({
     "camera", "points_world", "pixels", "options", "depths_m", "depth_noise", "T_camera_world", "inliers",
-    "rmse_px", "covariance", "verdict", "reason", "engine", "native", "poselib", "opencv", "ok", "weak",
+    "rmse_px", "covariance", "verdict", "reason", "engine", "native", "opencv", "ok", "weak",
     "target", "source", "T_target_source", "overlap", "iterations",
 })  # fmt: skip
 """Words of requests and replies: a robot that has one for a name is not looked for in them."""

@@ -13,7 +13,7 @@ from rse_pf.config import PnpSettings
 from rse_pf.errors import LimitExceeded, TooFewCorrespondences
 from rse_pf.geometry import Camera
 from rse_pf.native import native_solver, open_found
-from rse_pf.pnp import DepthNoise, PnpOptions, PnpSolution, refine_with_depth, solve_pnp, usable_engine
+from rse_pf.pnp import DepthNoise, PnpOptions, PnpSolution, refine_with_depth, solve_pnp
 from rse_pf.pnp.engines import native_options
 from rse_pf.pnp.native_reply import open_reply_solver
 from rse_pf.pnp.options import WeakLimits
@@ -146,7 +146,7 @@ def wire_types(registry: Registry, *, stays_plain: bool = False) -> PnpTypes | N
 def register(registry: Registry, settings: PnpSettings) -> None:
     """Add ``pnp`` to *registry*, with the limits and the engine of *settings*."""
     defaults = PnpOptions(max_iterations=settings.max_iterations)
-    engine = usable_engine(settings.engine)
+    engine = settings.engine
     solver = native_solver() if engine == "native" else None
     plain = native_options(defaults, WeakLimits())
 

@@ -37,7 +37,7 @@ def test_this_machine_can_run_the_platform_and_every_complaint_has_a_fix() -> No
     assert {each.grade for each in found} <= {"ok", "warn", "fail"}
     assert all(bool(each.fix) == (each.grade != "ok") for each in found)
     assert only("Envoy", found).grade == "ok"
-    assert only("engine poselib", found).grade == "ok"
+    assert only("engine native", found).grade == "ok"
 
 
 def test_a_taken_front_door_is_a_warning() -> None:
@@ -52,53 +52,32 @@ def test_a_missing_required_extra_fails_and_an_optional_one_warns(monkeypatch: p
     present = doctor.importlib.import_module
 
     def without(name: str) -> object:
-        if name in ("picows", "matplotlib", "poselib"):
+        if name in ("picows", "matplotlib"):
             raise ImportError(name)
         return present(name)
 
     monkeypatch.setattr(doctor.importlib, "import_module", without)
-    found = findings(SETTINGS.replace(pnp={"engine": "poselib"}))
+    found = findings()
 
     assert only("extra backend: picows", found).grade == "fail"
     assert only("extra backend: picows", found).fix == "pip install 'rse-pf[backend]'"
     assert only("extra experiments: matplotlib", found).grade == "warn"
-    assert only("engine poselib", found).grade == "fail"
 
 
-def test_a_native_library_stands_in_for_a_missing_poselib(monkeypatch: pytest.MonkeyPatch) -> None:
-    present = doctor.importlib.import_module
+def test_a_missing_native_core_fails_with_the_command_that_builds_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rse_pf.native.find_library", lambda: None)
+    finding = only("the native core is not installed", findings())
 
-    def without(name: str) -> object:
-        if name == "poselib":
-            raise ImportError(name)
-        return present(name)
-
-    monkeypatch.setattr(doctor.importlib, "import_module", without)
-    monkeypatch.setattr("rse_pf.pnp.usable_engine", lambda name: name)
-    found = findings()
-
-    assert only("engine in use", found).what == "engine in use: native (pnp.engine is native)"
-    assert only("engine poselib", found).grade == "warn"
+    assert finding.grade == "fail"
+    assert "make native" in finding.fix
 
 
-def test_without_the_native_library_the_doctor_says_how_to_build_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("rse_pf.cli.doctor.find_library", lambda: None)
-    monkeypatch.setattr("rse_pf.pnp.usable_engine", lambda name: "poselib")
-    found = findings()
-
-    assert only("native library", found).grade == "warn"
-    assert "make -C native" in only("native library", found).fix
-    assert only("engine in use", found).what == "engine in use: poselib (pnp.engine is native)"
-
-
-def test_a_native_library_that_does_not_load_is_a_warning(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_a_native_core_that_does_not_load_fails(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     broken = tmp_path / "librse_pf_native.so"
     broken.write_bytes(b"no library")
-    monkeypatch.setattr("rse_pf.cli.doctor.find_library", lambda: broken)
+    monkeypatch.setattr("rse_pf.native.find_library", lambda: broken)
 
-    assert only("native library", findings()).grade == "warn"
+    assert only("cannot be loaded", findings()).grade == "fail"
 
 
 @pytest.mark.parametrize(("missing", "grade"), [([], "ok"), (["namespaces"], "warn")])
@@ -111,19 +90,6 @@ def test_the_means_of_isolation_are_listed(
     assert told.grade == grade
     assert "seccomp" in told.what
     assert ("missing: namespaces" in told.what) == bool(missing)
-
-
-def test_a_missing_solver_that_nobody_chose_is_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
-    present = doctor.importlib.import_module
-
-    def without(name: str) -> object:
-        if name == "poselib":
-            raise ImportError(name)
-        return present(name)
-
-    monkeypatch.setattr(doctor.importlib, "import_module", without)
-
-    assert only("engine poselib", findings(SETTINGS.replace(pnp={"engine": "opencv"}))).grade == "warn"
 
 
 def missing_envoy() -> str:

@@ -82,7 +82,7 @@ def _alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         ("demo --rate nan", "--rate nan is not within", "the paper"),
         ("demo --robots 0", "--robots 0 is not within", "at least one robot"),
         ("demo --robots two", "argument --robots: invalid int value", "rse-pf demo --help"),
-        ("demo --engine opencl", "'opencl' is not one of native, poselib, opencv", "did you mean opencv?"),
+        ("demo --engine opencl", "'opencl' is not one of native, opencv", "did you mean opencv?"),
         ("demo --codec xml", "'xml' is not one of zlib, json, bin", "rse-pf demo --help"),
         ("demo --frames 0", "--frames 0 is not within", "80"),
         ("demo --seed -1", "--seed -1 is below 0", "0 or more"),

@@ -10,9 +10,9 @@ import pytest
 from fake_platform import FakePlatform, echo_services
 
 import client_sdk
-from client_sdk.local_services import LocalServices
 from client_sdk.network.timings import ConnectTimings
 from client_sdk.stats import StatsKeeper
+from rse_pf import native
 from rse_pf.config import PlatformSettings, SessionSettings
 from rse_pf.errors import (
     BadMessage,
@@ -150,25 +150,14 @@ async def test_a_frame_without_a_pose_is_no_reason_to_solve_it_again():
             assert robot.stats.answered_by_robot == 0
 
 
-async def test_a_robot_without_a_solver_is_told_what_to_install(monkeypatch):
-    monkeypatch.setattr("rse_pf.pnp.available_engines", lambda: ())
-
+async def test_a_robot_without_the_native_core_is_told_what_to_install(monkeypatch):
     async with FakePlatform() as platform:
-        with pytest.raises(MissingExtra, match="poselib") as told:
+        monkeypatch.setattr(native, "find_library", lambda: None)
+        native.native_solver.cache_clear()
+        with pytest.raises(MissingExtra, match="the native core") as told:
             await connect(platform, offload=client_sdk.CloudFirst()).__aenter__()
-        assert "rse-pf[solver]" in told.value.hint
+        assert "rse-pf[vision]" in told.value.hint
         assert not platform.sockets
-
-
-def test_the_robots_own_services_take_the_engine_that_is_there(monkeypatch):
-    pytest.importorskip("cv2")
-    monkeypatch.setattr("rse_pf.pnp.available_engines", lambda: ("opencv",))
-    own = LocalServices(None, clock=lambda: 0.0)
-
-    asyncio.run(own.prepare())
-    own.close()
-
-    assert own.offers("pnp")
 
 
 async def test_the_stats_are_a_snapshot_that_nobody_can_change():

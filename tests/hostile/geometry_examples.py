@@ -26,7 +26,7 @@ from rse_pf.service import dispatch
 from rse_pf.services.builtin import builtin_services
 from rse_pf.wire import Command, Failure
 
-ENGINES = ("poselib", "opencv")
+ENGINES = ("native", "opencv")
 REGISTRY = builtin_services(PlatformSettings())
 
 any_number = st.floats(width=64, allow_nan=True, allow_infinity=True, allow_subnormal=True)

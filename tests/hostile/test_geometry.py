@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 from fuzz.targets import check_pose
-from rse_pf import native
 from rse_pf.config import PlatformSettings
 from rse_pf.service import dispatch
 from rse_pf.services.builtin import builtin_services
@@ -21,10 +20,7 @@ from rse_pf.wire import Command, Failure, make_codec
 
 SETTINGS = PlatformSettings()
 REGISTRY = builtin_services(SETTINGS)
-NATIVE = pytest.param(
-    "native", marks=pytest.mark.skipif(native.find_library() is None, reason="the native core is not built")
-)
-EVERY = pytest.mark.parametrize("engine", ["poselib", "opencv", NATIVE])
+EVERY = pytest.mark.parametrize("engine", ["native", "opencv"])
 
 _DEADLINE_S = SETTINGS.session.answer_timeout_s
 _ALLOWED_BEYOND_S = 0.1

@@ -19,10 +19,7 @@ from rse_pf.geometry import Array, Camera, exp_se3, inverse, pose_difference, tr
 from rse_pf.pnp import PnpOptions, WeakLimits, engines, solve_pnp
 from rse_pf.pnp.problems import DEGENERATE, KINECT, make_degenerate, make_problem
 
-NATIVE = pytest.param(
-    "native", marks=pytest.mark.skipif(native.find_library() is None, reason="the native core is not built")
-)
-EVERY = pytest.mark.parametrize("engine", ["poselib", "opencv", NATIVE])
+EVERY = pytest.mark.parametrize("engine", ["native", "opencv"])
 RIGHT_M, RIGHT_DEG = 0.1, 2.0
 KINDS = ("room", "room", "room", "room", "plane", "near-line", "few", "few")
 OPTIONS, LIMITS = PnpOptions(), WeakLimits()

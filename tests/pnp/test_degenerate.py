@@ -17,7 +17,7 @@ from rse_pf.pnp.problems import DEGENERATE, KINECT, make_degenerate, make_proble
 from tests.pnp.native_reference import EVERY
 
 
-def outcome(points, pixels, engine="poselib", **options):
+def outcome(points, pixels, engine="native", **options):
     try:
         solution = solve_pnp(points, pixels, KINECT, PnpOptions(engine=engine, **options))
     except RsePfError as error:
@@ -25,7 +25,7 @@ def outcome(points, pixels, engine="poselib", **options):
     return solution.verdict
 
 
-def outcomes(kind, engine="poselib", seeds=20, n=100, **options):
+def outcomes(kind, engine="native", seeds=20, n=100, **options):
     made = (make_degenerate(kind, seed=seed, n=n) for seed in range(seeds))
     return {outcome(problem.points_world, problem.pixels, engine, **options) for problem in made}
 
@@ -124,7 +124,7 @@ mild = st.floats(-10, 700, allow_nan=False)
 
 
 @settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.too_slow])
-@given(data=st.data(), n=st.integers(0, 40), engine=st.sampled_from(["poselib", "opencv"]))
+@given(data=st.data(), n=st.integers(0, 40), engine=st.sampled_from(["native", "opencv"]))
 def test_any_numbers_give_a_solution_or_a_typed_error_in_time(data, n, engine):
     elements = data.draw(st.sampled_from([numbers, mild, st.integers(-3, 3).map(float)]))
     points = data.draw(hnp.arrays(np.float64, (n, 3), elements=elements))

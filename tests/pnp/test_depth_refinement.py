@@ -13,23 +13,18 @@ from rse_pf.pnp import (
     DepthNoise,
     PnpOptions,
     PnpSolution,
-    available_engines,
     refine_with_depth,
     solve_pnp,
 )
 from rse_pf.pnp.problems import KINECT, TwoViews, make_two_views
 
-pytest.importorskip("poselib")
-
 _NOISE = DepthNoise()
 _options = PnpOptions(inlier_px=5.0)
 
 
-@pytest.fixture(autouse=True, params=["native", "poselib"])
+@pytest.fixture(autouse=True, params=["native", "opencv"])
 def options(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let both paths be tested: the core refines what it solved, numpy what PoseLib solved."""
-    if request.param not in available_engines():
-        pytest.skip("the native core is not built: make -C native")
+    """Let both paths be tested: the core refines what it solved, numpy what OpenCV solved."""
     monkeypatch.setitem(globals(), "_options", PnpOptions(inlier_px=5.0, engine=request.param))
 
 

@@ -6,10 +6,8 @@ import sys
 import threading
 
 import numpy as np
-import poselib
 import pytest
 
-from rse_pf import native
 from rse_pf.errors import BadRequest, MissingExtra
 from rse_pf.geometry import pose_difference
 from rse_pf.pnp import PnpOptions, available_engines, engines, solve_pnp
@@ -38,28 +36,8 @@ def test_both_engines_are_right_at_up_to_half_wrong_matches(engine, n, outlier_r
     assert share_right(engine, n=n, outlier_ratio=outlier_ratio, problems=60) >= 0.995
 
 
-def test_poselib_is_right_with_seventy_percent_wrong_matches():
-    assert share_right("poselib", n=200, outlier_ratio=0.7, problems=100) >= 0.995
-
-
-def poselib_pose(problem, trials_multiplier):
-    model = ["PINHOLE", [problem.camera.fx, problem.camera.fy, problem.camera.cx, problem.camera.cy]]
-    settings = {
-        "max_reproj_error": 8.0, "min_iterations": 10, "max_iterations": 1000, "success_prob": 0.999,
-        "dyn_num_trials_mult": trials_multiplier,
-    }  # fmt: skip
-    camera = poselib.Camera(*model, problem.camera.width, problem.camera.height)
-    return poselib.estimate_absolute_pose(problem.pixels, problem.points_world, camera, settings)[0].Rt
-
-
-def test_poselib_makes_the_trials_that_the_confidence_asks_for_and_no_more():
-    solve = engines.engine_for("poselib")
-    problems = [make_problem(seed=seed, outlier_ratio=0.7) for seed in range(20)]
-
-    poses = [solve(each.points_world, each.pixels, each.camera, PnpOptions()) for each in problems]
-
-    assert all(np.array_equal(a, poselib_pose(b, 1.0)) for a, b in zip(poses, problems, strict=True))
-    assert not all(np.array_equal(a, poselib_pose(b, 3.0)) for a, b in zip(poses, problems, strict=True))
+def test_the_native_core_is_right_with_seventy_percent_wrong_matches():
+    assert share_right("native", n=200, outlier_ratio=0.7, problems=100) >= 0.995
 
 
 def test_the_engines_agree_with_each_other():
@@ -68,7 +46,7 @@ def test_the_engines_agree_with_each_other():
 
         poses = [
             solve_pnp(problem.points_world, problem.pixels, problem.camera, PnpOptions(engine=engine))
-            for engine in ("poselib", "opencv")
+            for engine in available_engines()
         ]
 
         metres, degrees = pose_difference(poses[0].T_camera_world, poses[1].T_camera_world)
@@ -132,21 +110,18 @@ def test_an_unknown_engine_is_refused_by_name():
         engines.engine_for("magic")
 
 
-@pytest.mark.parametrize(("name", "module"), [("poselib", "poselib"), ("opencv", "cv2")])
-def test_a_missing_library_names_the_pip_command(monkeypatch, name, module):
-    make = engines.ENGINES[name]
+def test_without_opencv_its_engine_names_the_pip_command(monkeypatch):
+    make = engines.ENGINES["opencv"]
     make.cache_clear()
-    monkeypatch.setitem(sys.modules, module, None)
+    monkeypatch.setitem(sys.modules, "cv2", None)
     try:
         with pytest.raises(MissingExtra) as caught:
-            engines.engine_for(name)
+            engines.engine_for("opencv")
         assert "pip install 'rse-pf[" in caught.value.hint
-        assert name not in available_engines()
+        assert available_engines() == ("native",)
     finally:
         make.cache_clear()
 
 
-def test_both_engines_are_here_and_the_native_one_where_it_is_built():
-    built = () if native.find_library() is None else ("native",)
-
-    assert available_engines() == ("poselib", "opencv", *built)
+def test_both_engines_are_here():
+    assert available_engines() == ("native", "opencv")

@@ -211,7 +211,7 @@ def test_solutions_of_the_native_engine_are_refined_natively() -> None:
 
     found = refine_with_depth(case.solution, *case.arguments, KINECT)
     other = refine_with_depth(
-        msgspec.structs.replace(case.solution, engine="poselib"), *case.arguments, KINECT
+        msgspec.structs.replace(case.solution, engine="opencv"), *case.arguments, KINECT
     )
 
     assert found.T_camera_world.tobytes() == native_pose.T_camera_reference.tobytes()

@@ -17,8 +17,6 @@ from rse_pf.services.builtin import builtin_services
 from rse_pf.services.pnp import PnpReply, PnpRequest, make_request, wire_types
 from rse_pf.wire import CODECS, Command, Failure, Result, as_type, make_codec
 
-pytest.importorskip("poselib")
-
 _T = exp_se3([0.1, -0.05, 0.02, 0.03, -0.02, 0.05])
 _REGISTRY = builtin_services(PlatformSettings())
 

@@ -88,7 +88,7 @@ def test_every_kind_of_answer_has_the_bytes_of_python(codec: str) -> None:
     "change",
     [
         {"options": PnpOptions()},
-        {"options": PnpOptions(engine="poselib")},
+        {"options": PnpOptions(engine="opencv")},
         {"options": PnpOptions(max_iterations=100_000)},
         {"depths_m": np.linspace(0.5, 3.0, 40)},
         {"pixels": np.arange(79.0)},
@@ -116,7 +116,7 @@ def test_a_server_with_limits_or_another_engine_answers_as_before(monkeypatch: p
     monkeypatch.setattr("rse_pf.services.pnp.MAX_CORRESPONDENCES", 39)
     problem = make_problem(seed=1, n=40)
     request = make_request(problem.points_world, problem.pixels, problem.camera)
-    for registry in (registered(), registered("poselib")):
+    for registry in (registered(), registered("opencv")):
         expected, _ = answer_of(request, "json", plain=False, registry=registry)
         got, reply = answer_of(request, "json", plain=True, registry=registry)
 

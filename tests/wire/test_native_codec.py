@@ -86,7 +86,7 @@ def sample(codec: str, n: int = 20, options: PnpOptions | None = None, *, deep: 
 
 
 @pytest.mark.parametrize("codec", CODECS)
-@pytest.mark.parametrize("options", [None, PnpOptions(inlier_px=4.0, engine="poselib"), PnpOptions()])
+@pytest.mark.parametrize("options", [None, PnpOptions(inlier_px=4.0, engine="opencv"), PnpOptions()])
 def test_a_plain_command_is_read_at_once_and_means_the_same(codec: str, options: PnpOptions | None) -> None:
     data = sample(codec, 200, options, deep=options is None)
 

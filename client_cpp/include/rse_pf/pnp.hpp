@@ -20,7 +20,7 @@ struct Camera {
 
 /// Settings of RANSAC; what is empty is the server's choice.
 struct PnpOptions {
-    std::string engine{};  ///< `native`, `poselib` or `opencv`
+    std::string engine{};  ///< `native` or `opencv`
     std::optional<double> inlier_px{}, confidence{};
     std::optional<std::uint32_t> max_iterations{}, min_iterations{};
 };

@@ -17,7 +17,7 @@ from client_sdk.mapper import ask_robot
 from client_sdk.robot import Robot
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import error_from_code
-from rse_pf.pnp import PnpOptions, usable_engine
+from rse_pf.pnp import PnpOptions
 from rse_pf.service import dispatch
 from rse_pf.services.builtin import builtin_services
 from rse_pf.services.pnp import PnpReply, make_request
@@ -47,11 +47,10 @@ class InProcessSolver:
     """
 
     def __init__(self, settings: PlatformSettings) -> None:
-        chosen = settings.replace(pnp={"engine": usable_engine(settings.pnp.engine)})
         self.sent_bytes = 0
         self.server_s = 0.0
         self.inside_s = 0.0
-        self._registry = builtin_services(chosen)
+        self._registry = builtin_services(settings)
         self._codec = make_codec(_CODEC)
         self._commands = 0
 

@@ -40,7 +40,6 @@ _PACKAGES = (
     "numpy",
     "msgspec",
     "websockets",
-    "poselib",
     "opencv-python-headless",
     "picows",
     "uvloop",

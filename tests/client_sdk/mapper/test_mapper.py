@@ -79,7 +79,7 @@ def test_a_robot_that_cannot_ask_at_all_says_so_and_may_go_on() -> None:
 
     async def ask(query: PoseQuery) -> PoseAnswer:
         if fails:
-            raise MissingExtra("poselib", "solver")
+            raise MissingExtra("the native core", "vision")
         return await solve(query)
 
     mapper = Mapper(ask=ask)

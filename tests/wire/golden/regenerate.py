@@ -162,11 +162,8 @@ def golden_messages() -> dict[str, Any]:
 
 
 def golden_poses() -> dict[str, Any]:
-    """Return name -> pnp command and the reply that an ``ok`` server gives, as JSON values.
-
-    The engine is named, so that the poses are the same where the native core is not built.
-    """
-    options = PnpOptions(engine="poselib")
+    """Return name -> pnp command and the reply that an ``ok`` server gives, as JSON values."""
+    options = PnpOptions(engine="native")
     found = {}
     for name, arguments in POSES.items():
         problem = make_problem(**arguments)  # type: ignore[arg-type]
