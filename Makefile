@@ -28,8 +28,8 @@ assets: ## build the packages for AWS into build/, and the native core for aarch
 	@$(BIN)/python scripts/assets.py
 	@$(BIN)/python scripts/assets.py --arm || echo "assets: the packages for AWS are complete, without a core for ARM"
 
-native: ## compile the native core into native/build, and run its C++ checks
-	@$(MAKE) --no-print-directory -C native all check
+native: ## compile the native core into native/build; `make -C native check` runs its C++ checks
+	@sh scripts/native.sh
 
 sanitize: ## run the native core with the address and undefined-behaviour sanitizers
 	@$(SETUP) dev

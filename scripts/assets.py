@@ -13,8 +13,8 @@ platform.tar.gz holds ours.  Only a changed lock makes the first one anew.
 Both packages hold bytecode, because the processes that run them may not write it there.  That needs a Python
 of the same version (python3.11 for servers, python3.13 for the function); without one, each start compiles.
 
-The native core is compiled here and goes into both packages; without a C++ compiler they have PoseLib alone.
-With --arm its wheel for aarch64 is built, too, and lies with its hash in build/native.
+The native core is compiled here and goes into both packages.  With --arm its wheel for aarch64 is built, too,
+and lies with its hash in build/native.
 """
 
 from __future__ import annotations
@@ -81,15 +81,12 @@ def _packages(into: Path) -> int:
     try:
         with tempfile.TemporaryDirectory() as work:
             ours = _our_wheel(Path(work))
-            core = _native_wheels(into / "native", "x86_64")
-            _wheelhouse(into / "wheelhouse", [ours, *core], into / "downloads" / "boot")
-            _servers(into / "servers", [ours, *core], into / "downloads")
+            core = _native_wheel(into / "native", "x86_64")
+            _wheelhouse(into / "wheelhouse", [ours, core], into / "downloads" / "boot")
+            _servers(into / "servers", [ours, core], into / "downloads")
             _function(into / "lambda", ours, core, into / "downloads" / "lambda")
     except subprocess.CalledProcessError as error:
-        sys.stderr.write(
-            f"assets: pip {error.cmd[3]} failed\n  hint: read the output above, and check the network\n"
-        )
-        return 2
+        return _report_failure(error)
     stamp.write_text(wanted, encoding="utf-8")
     for name in ("servers", "lambda"):
         size = sum(file.stat().st_size for file in (into / name).rglob("*") if file.is_file())
@@ -110,9 +107,8 @@ def _sources() -> list[Path]:
 
 def _state_of_the_sources() -> str:
     state = hashlib.sha256(os.environ.get("SOURCE_DATE_EPOCH", EPOCH).encode())
-    has_compiler = any(map(shutil.which, (os.environ.get("CXX", "c++"), "g++", "clang++")))
     pythons = [_python_of(version) is not None for version in (DEBIAN_12[0], AMAZON_2023[0])]
-    state.update(f"compiler: {has_compiler}\0bytecode: {pythons}\0".encode())
+    state.update(f"bytecode: {pythons}\0".encode())
     native = sorted(file for pattern in NATIVE_SOURCES for file in (ROOT / "native").glob(pattern))
     locks = [ROOT / "locks/boot.txt", ROOT / "locks/lambda.txt"]
     for file in [*_sources(), *native, Path(__file__), *locks]:
@@ -135,35 +131,42 @@ def _our_wheel(work: Path) -> Path:
     return wheel
 
 
-def _native_wheels(folder: Path, machine: str) -> list[Path]:
-    """Return the wheel of the native core for *machine*; none, and say why, where it cannot be built."""
+def _native_wheel(folder: Path, machine: str) -> Path:
+    """Build and return the wheel of the native core for *machine*."""
     folder.mkdir(parents=True, exist_ok=True)
     pattern = f"rse_pf_native-*_{machine}.whl"
     for old in folder.glob(pattern):
         old.unlink()
-    built = subprocess.run(
+    subprocess.run(
         ["/bin/sh", str(ROOT / "scripts/native_wheel.sh"), str(folder.resolve()), machine],
-        env={"SOURCE_DATE_EPOCH": EPOCH, **os.environ},
-        capture_output=True, text=True, check=False,
+        check=True, env={"SOURCE_DATE_EPOCH": EPOCH, **os.environ},
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
     )  # fmt: skip
-    if built.returncode:
-        sys.stderr.write(
-            f"{(built.stdout + built.stderr)[-3000:]}assets: there is no native core for {machine}\n"
-            "  hint: read the output above; sudo apt-get install g++\n"
-        )
-    return list(folder.glob(pattern))
+    (wheel,) = folder.glob(pattern)
+    return wheel
 
 
 def _native_for_arm(into: Path) -> int:
     """Build the wheel for ARM robots and Graviton servers."""
     folder = into / "native"
-    if not _native_wheels(folder, "aarch64"):
-        return 2
+    try:
+        _native_wheel(folder, "aarch64")
+    except subprocess.CalledProcessError as error:
+        return _report_failure(error)
     _write_hashes(folder)
     sys.stderr.write(
         f"assets: {folder} holds {', '.join(file.name for file in sorted(folder.glob('*.whl')))}\n"
     )
     return 0
+
+
+def _report_failure(error: subprocess.CalledProcessError) -> int:
+    """Write the end of the output of a command that failed, and how to go on; return the exit status."""
+    sys.stderr.write(
+        f"{(error.output or '')[-3000:]}assets: {' '.join(error.cmd[:4])} failed\n"
+        "  hint: read the output above, and check the network\n"
+    )
+    return 2
 
 
 def _wheelhouse(folder: Path, ours: list[Path], wheels: Path) -> None:
@@ -290,11 +293,11 @@ def _pack(tree: Path, archive: Path, paths: list[Path] | None = None) -> None:
             made.add(path, path.relative_to(tree).as_posix(), recursive=False, filter=same)
 
 
-def _function(folder: Path, ours: Path, core: list[Path], wheels: Path) -> None:
+def _function(folder: Path, ours: Path, core: Path, wheels: Path) -> None:
     """Unpack the function's wheels into *folder*, without files that are never used."""
     _empty(folder)
     _download(ROOT / "locks/lambda.txt", wheels, *AMAZON_2023)
-    for wheel in (*sorted(wheels.glob("*.whl")), *core):
+    for wheel in (*sorted(wheels.glob("*.whl")), core):
         _unpack(wheel, folder, None)
     _unpack(ours, folder, LAMBDA_PACKAGES)
     _compile(folder, AMAZON_2023[0], FUNCTION_FOLDER)

@@ -1,27 +1,30 @@
 #!/bin/sh
-# Compile the native core into native/build where a C++ compiler is found: sh scripts/native.sh
-# Compiles what has changed only, and never fails: without the core, PoseLib solves the poses.
-set -u
+# Compile the native core into native/build, once per change: sh scripts/native.sh
+# Where no C++ compiler works, that of the ziglang wheel of locks/tools.txt is used (100 MB, once).
+set -eu
 cd "$(dirname "$0")/.."
-log=native/build/build.log
-library=native/build/librse_pf_native.so
+log=build/native.log
 
-slower() {
-  echo "setup: $1; PoseLib solves the poses instead, for several times the CPU" >&2
+fail() {
+  echo "setup: $1" >&2
   echo "  hint: $2" >&2
-  exit 0
+  exit 2
+}
+
+compile() {
+  echo "setup: compiling the native core with $1 (once per change)"
+  make -C native CXX="$1" ARCH="$(uname -m)" > "$log" 2>&1
 }
 
 make -q -C native > /dev/null 2>&1 && exit 0
-compiler=${CXX:-}
-for each in c++ g++ clang++; do
-  [ -z "$compiler" ] && command -v "$each" > /dev/null 2>&1 && compiler=$each
-done
-[ -n "$compiler" ] || slower "no C++ compiler was found" "sudo apt-get install g++, or CXX=/path/to/one make setup"
+mkdir -p build
+compiler=${CXX:-$(command -v c++ || command -v g++ || command -v clang++ || true)}
+if [ -n "$compiler" ] && compile "$compiler"; then exit 0; fi
+rm -rf native/build
+[ -z "${CXX:-}" ] || fail "the native core does not compile with $CXX" "read $log; g++ 11 and clang 14 are new enough"
 
-mkdir -p native/build
-echo "setup: compiling the native core with $compiler (once per change, some seconds)"
-make -C native CXX="$compiler" > "$log" 2>&1 && exit 0
-# An old library would not be what the sources say.
-rm -f "$library"
-slower "the native core does not compile with $compiler" "read $log; g++ 11 and clang 14 are new enough"
+sh scripts/tool.sh ziglang build/ziglang \
+  || fail "no C++ compiler works here, and ziglang cannot be installed" "sudo apt-get install g++, or see pip's lines above"
+export ZIG_GLOBAL_CACHE_DIR="$PWD/build/zig-cache" ZIG_LOCAL_CACHE_DIR="$PWD/build/zig-cache"
+compile "../build/ziglang/ziglang/zig c++ -target $(uname -m)-linux-gnu.2.28" \
+  || fail "the native core does not compile with ziglang" "read $log; sudo apt-get install g++"

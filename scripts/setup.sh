@@ -13,7 +13,7 @@ fail() {
 
 case "$(uname -s)-$(uname -m)" in
   Linux-x86_64) ;;
-  Linux-*) fail "no poselib and Envoy wheels for $(uname -m)" \
+  Linux-*) fail "no wheel of Envoy for $(uname -m)" \
     "run the platform on x86-64; on this robot: pip install 'rse-pf[vision]' and connect to it" ;;
   *) fail "$(uname -s) is not supported" "use Linux on x86-64, or a virtual machine with it" ;;
 esac

@@ -26,8 +26,6 @@ def build(repository: Path) -> Path:
     folder = repository / "build"
     if not (folder / "assets.sha256").is_file():
         pytest.skip("no packages: run make assets")
-    if not list((folder / "native").glob("*x86_64.whl")):
-        pytest.skip("the packages were built without a C++ compiler")
     return folder
 
 

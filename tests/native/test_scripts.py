@@ -1,4 +1,4 @@
-"""The setup compiles the native core where it can, once, and goes on where it cannot."""
+"""The setup compiles the native core, once, with a compiler of the machine or of the ziglang wheel."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ echo "$@" >> {log}
 while [ $# -gt 0 ]; do [ "$1" = -o ] && : > "$2"; shift; done
 exit {status}
 """
-TOOLS = ("sh", "make", "dirname", "mkdir", "rm", "mv")
+TOOLS = ("sh", "make", "dirname", "mkdir", "rm", "mv", "uname")
 
 
 class Checkout:
@@ -46,6 +46,13 @@ class Checkout:
         program.chmod(0o755)
         return program
 
+    def add_ziglang(self, status: int = 0) -> None:
+        """Let the installation of ziglang end with *status*, and its compiler succeed."""
+        (self.folder / "scripts/tool.sh").write_text(f"exit {status}\n", encoding="utf-8")
+        zig = self.folder / "build/ziglang/ziglang/zig"
+        zig.parent.mkdir(parents=True)
+        self.add_compiler("zig").rename(zig)
+
     def set_up(self, **variables: str) -> subprocess.CompletedProcess[str]:
         """Run the script."""
         return subprocess.run(
@@ -74,7 +81,7 @@ def test_any_compiler_is_found_and_its_library_is_put_where_it_is_looked_for(
     told = checkout.set_up()
 
     assert (told.returncode, told.stderr) == (0, "")
-    assert f"with {name}" in told.stdout
+    assert f"/{name} " in told.stdout
     assert checkout.built.is_file()
 
 
@@ -96,29 +103,39 @@ def test_nothing_is_compiled_again_until_a_source_changes(checkout: Checkout) ->
     assert checkout.compilations() == 2 * first
 
 
-def test_without_a_compiler_one_line_says_what_is_slower_and_the_setup_goes_on(checkout: Checkout) -> None:
-    told = checkout.set_up()
-
-    assert told.returncode == 0
-    assert told.stdout == ""
-    assert "no C++ compiler was found; PoseLib solves the poses instead" in told.stderr
-    assert "\n  hint: sudo apt-get install g++" in told.stderr
-
-
-@pytest.mark.parametrize("variables", [{}, {"CXX": "no-such-compiler"}])
-def test_a_compiler_that_fails_does_not_stop_the_setup_and_leaves_no_old_library(
-    checkout: Checkout, variables: dict[str, str]
+@pytest.mark.parametrize("status", [None, 1])
+def test_where_no_compiler_works_that_of_the_ziglang_wheel_compiles(
+    checkout: Checkout, status: int | None
 ) -> None:
-    checkout.add_compiler("c++", status=1)
+    if status is not None:
+        checkout.add_compiler("c++", status)
+    checkout.add_ziglang()
+
+    done = checkout.set_up()
+
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "zig c++ -target" in done.stdout
+    assert checkout.built.is_file()
+
+
+def test_without_a_compiler_and_without_ziglang_the_setup_fails_with_a_hint(checkout: Checkout) -> None:
+    checkout.add_ziglang(status=1)
+
+    done = checkout.set_up()
+
+    assert done.returncode == 2
+    assert "no C++ compiler works here, and ziglang cannot be installed\n  hint: sudo" in done.stderr
+
+
+def test_a_chosen_compiler_that_fails_stops_the_setup_and_leaves_no_old_library(checkout: Checkout) -> None:
     checkout.built.parent.mkdir()
     checkout.built.write_bytes(b"of older sources")
     os.utime(checkout.built, (0, 0))
 
-    told = checkout.set_up(**variables)
+    done = checkout.set_up(CXX="no-such-compiler")
 
-    assert told.returncode == 0
-    assert "does not compile" in told.stderr
-    assert "build.log" in told.stderr
+    assert done.returncode == 2
+    assert "does not compile with no-such-compiler\n  hint: read build/native.log" in done.stderr
     assert not checkout.built.exists()
 
 
