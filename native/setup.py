@@ -23,8 +23,10 @@ class BuildLibrary(build_py):
     """Put the compiled library beside the module by which it is found."""
 
     def run(self) -> None:
-        """Compile what has changed, and copy the library."""
+        """Compile what has changed, and copy the library; a checkout is only made known to pip."""
         super().run()
+        if self.editable_mode:
+            return
         compilers = [os.environ.get("CXX", ""), *map(shutil.which, ("c++", "g++", "clang++"))]
         compiler = next(filter(None, compilers), None)
         if compiler is None:

@@ -65,7 +65,7 @@ def bounded_protocol(
         MissingExtra: uvicorn or httptools is not installed.
     """
     if _missing is not None:
-        raise MissingExtra(_missing.name or "uvicorn", "data") from _missing
+        raise MissingExtra(_missing.name or "uvicorn", "backend") from _missing
     silent: SilentConnections[object] = SilentConnections(call_later=_call_later, seconds=seconds, most=most)
     idle: SilentConnections[object] = SilentConnections(
         call_later=_call_later, seconds=idle_s, most=most_idle

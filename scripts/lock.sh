@@ -14,11 +14,10 @@ lock() { # lock FILE ARGUMENT...
 every="--universal --python-version 3.10"
 # shellcheck disable=SC2086
 {
-  lock demo pyproject.toml $every --extra demo --extra build
-  lock dev pyproject.toml $every --extra dev --extra infra --extra release
+  lock demo pyproject.toml $every --extra demo --group build
+  lock dev pyproject.toml $every --extra local --extra aws --extra batch --extra bags --extra experiments --group dev
   # What one .venv holds beside the packages of developers has the same versions as they.
-  lock ci pyproject.toml $every --extra docs --extra browser --extra build --group clients --constraint locks/dev.txt
-  # Each of them lies in a folder of its own: scripts/tool.sh.
+  lock ci pyproject.toml $every --group ci --constraint locks/dev.txt
   lock tools $every --group tools
   # In an environment of its own: later releases of what LocalStack needs break it.
   lock localstack --universal --python-version 3.11 --group localstack --exclude-newer 2025-10-25
@@ -28,7 +27,7 @@ every="--universal --python-version 3.10"
 one="--python-platform x86_64-manylinux_2_28"
 # shellcheck disable=SC2086
 {
-  lock boot pyproject.toml $one --python-version 3.11 --extra boot             # Debian 12
-  lock lambda lambda_pnp/requirements.txt $one --python-version 3.13           # the runtime of stacks/serverless_stack.py
+  lock boot pyproject.toml $one --python-version 3.11 --extra backend --extra aws --extra batch --group boot # Debian 12
+  lock lambda lambda_pnp/requirements.txt $one --python-version 3.13 # the runtime of stacks/serverless_stack.py
   lock ros2 pyproject.toml $one --python-version 3.11 --extra ros2 tests/ros_bridge/tf2_msgs/generators.in
 }

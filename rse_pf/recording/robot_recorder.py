@@ -126,7 +126,7 @@ class RobotRecorder:
             UsageError: Recordings cannot be written there.
         """
         if importlib.util.find_spec("mcap") is None:
-            raise MissingExtra("mcap", "record")
+            raise MissingExtra("mcap", "vision")
         if self.thumbnails and importlib.util.find_spec("PIL") is None:
             raise MissingExtra("pillow", "local")
         folder = make_folder(self._folder)

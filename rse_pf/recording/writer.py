@@ -51,7 +51,7 @@ def with_recordings(settings: PlatformSettings, folder: Path | None) -> Platform
     if not chosen:
         return settings
     if importlib.util.find_spec("mcap") is None:
-        raise MissingExtra("mcap", "record")
+        raise MissingExtra("mcap", "local")
     return settings.replace(recording={"folder": str(make_folder(Path(chosen)))})
 
 

@@ -24,7 +24,7 @@ def signed_out(monkeypatch: pytest.MonkeyPatch, tmp_path: Any) -> None:
 def test_missing_credentials_are_reported_although_the_metadata_service_is_silent(
     signed_out: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    pytest.importorskip("boto3", reason="the dev extra is not installed")
+    pytest.importorskip("boto3", reason="run make setup")
     with socket.create_server(("127.0.0.1", 0)) as silent:
         address = f"http://127.0.0.1:{silent.getsockname()[1]}"
         monkeypatch.setenv("AWS_EC2_METADATA_SERVICE_ENDPOINT", address)
@@ -50,7 +50,7 @@ def connections_to(listener: socket.socket) -> int:
 
 
 def test_a_missing_profile_is_reported(signed_out: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("boto3", reason="the dev extra is not installed")
+    pytest.importorskip("boto3", reason="run make setup")
     monkeypatch.setenv("AWS_PROFILE", "forgotten")
 
     with pytest.raises(ConfigurationError, match="forgotten"):
@@ -79,7 +79,7 @@ def test_all_pages_are_read(region: str) -> None:
 
 
 def test_a_refusal_names_the_call_and_the_code() -> None:
-    errors = pytest.importorskip("botocore.exceptions", reason="the dev extra is not installed")
+    errors = pytest.importorskip("botocore.exceptions", reason="run make setup")
 
     class Refusing:
         def get_parameter(self, **arguments: Any) -> None:
@@ -93,7 +93,7 @@ def test_a_refusal_names_the_call_and_the_code() -> None:
 
 
 def test_an_invalid_region_is_a_configuration_error() -> None:
-    pytest.importorskip("boto3", reason="the dev extra is not installed")
+    pytest.importorskip("boto3", reason="run make setup")
 
     with pytest.raises(ConfigurationError, match=r"cloud\.region"):
         Account("Seoul!").client("s3")

@@ -21,7 +21,7 @@ REGION = PlatformSettings().cloud.region
 
 @pytest.fixture
 def account(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Any]:
-    moto = pytest.importorskip("moto", reason="the dev extra is not installed")
+    moto = pytest.importorskip("moto", reason="run make setup")
     monkeypatch.chdir(tmp_path)
     for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
         monkeypatch.setenv(name, "testing")

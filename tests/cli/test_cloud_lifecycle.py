@@ -35,7 +35,7 @@ class Person(io.StringIO):
 @pytest.fixture
 def cloud(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Formation]:
     """An empty account on moto, and tools that deploy to it."""
-    moto = pytest.importorskip("moto", reason="the dev extra is not installed")
+    moto = pytest.importorskip("moto", reason="run make setup")
     monkeypatch.chdir(tmp_path)
     for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
         monkeypatch.setenv(name, "testing")

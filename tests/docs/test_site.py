@@ -50,7 +50,7 @@ def test_the_page_of_metrics_has_what_a_server_gives(repository: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(find_spec("mkdocs") is None, reason="the extra docs is not installed: make site")
+@pytest.mark.skipif(find_spec("mkdocs") is None, reason="run make site")
 def test_the_site_is_built_in_a_minute_of_cpu_time_without_dead_links(repository: Path) -> None:
     before = os.times()
     path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"

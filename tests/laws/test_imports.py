@@ -32,7 +32,7 @@ for name in ("rse_pf", "client_sdk", "lambda_pnp", "ros_bridge"):
 
 def lint_imports(folder: Path) -> subprocess.CompletedProcess[str]:
     """Check the packages of *folder* by the contracts in it."""
-    pytest.importorskip("importlinter", reason="the dev extra is not installed")
+    pytest.importorskip("importlinter", reason="run make setup")
     return subprocess.run(
         [Path(sys.executable).with_name("lint-imports"), "--no-cache", "--no-logo"],
         cwd=folder, env={**os.environ, "COLUMNS": "200"}, capture_output=True, text=True, check=False,

@@ -86,7 +86,7 @@ def deployment(in_localstack: None, tmp_path_factory: pytest.TempPathFactory, re
 
 
 def _synthesise(folder: Path, repository: Path) -> Path:
-    cdk = pytest.importorskip("aws_cdk", reason="the infra extra is not installed")
+    cdk = pytest.importorskip("aws_cdk", reason="run make setup")
     from app import build
     from stacks.assets import SERVERS
 

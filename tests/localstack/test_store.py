@@ -20,7 +20,7 @@ READY_S, LOOKS = 2, 30
 @pytest.fixture
 def session() -> Any:
     """A session of boto3 whose clients talk to LocalStack."""
-    client = pytest.importorskip("localstack_client.session", reason="the infra extra is not installed")
+    client = pytest.importorskip("localstack_client.session", reason="run make setup")
     return client.Session()
 
 

@@ -230,12 +230,12 @@ def test_the_base_install_names_the_missing_extra_of_every_verb_in_two_lines(rob
         "experiment": "  hint: pip install 'rse-pf[experiments]'",
         "local": "  hint: pip install 'rse-pf[local]'",
         "swarm": "  hint: pip install 'rse-pf[local]'",
-        "data": "  hint: pip install 'rse-pf[data]'",
+        "data": "  hint: pip install 'rse-pf[backend]'",
         "check": "  hint: pip install 'rse-pf[demo]'",
         "cloud": "  hint: pip install 'rse-pf[aws]'",
         "compare": "  hint: pip install 'rse-pf[demo]'",
         "fleet": "  hint: pip install 'rse-pf[local]'",
-        "replay": "  hint: pip install 'rse-pf[record]'",
+        "replay": "  hint: pip install 'rse-pf[local]'",
     }, "the others fail for another reason first, or work"
 
 

@@ -84,8 +84,8 @@ def assembly(
     """The platform as it would be deployed, with and without TLS."""
     if shutil.which("node") is None:
         pytest.skip("the CDK needs Node.js")
-    pytest.importorskip("aws_cdk", reason="the infra extra is not installed")
-    pytest.importorskip("cdk_nag", reason="the infra extra is not installed")
+    pytest.importorskip("aws_cdk", reason="run make setup")
+    pytest.importorskip("cdk_nag", reason="run make setup")
     settings = INSECURE if request.param == "insecure" else PUBLIC
     base = tmp_path_factory.getbasetemp()
     if "PYTEST_XDIST_WORKER" in os.environ:
@@ -117,8 +117,8 @@ def synthesise(tmp_path: Path, repository: Path) -> Callable[[PlatformSettings],
     """Return what synthesises other settings and returns the templates by stack: 10 s, for slow tests."""
     if shutil.which("node") is None:
         pytest.skip("the CDK needs Node.js")
-    pytest.importorskip("aws_cdk", reason="the infra extra is not installed")
-    pytest.importorskip("cdk_nag", reason="the infra extra is not installed")
+    pytest.importorskip("aws_cdk", reason="run make setup")
+    pytest.importorskip("cdk_nag", reason="run make setup")
 
     def made(settings: PlatformSettings) -> dict[str, Any]:
         synthesise_into(settings, tmp_path, repository)

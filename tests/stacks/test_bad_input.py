@@ -18,7 +18,7 @@ from rse_pf.errors import SettingsError
 
 if shutil.which("node") is None:
     pytest.skip("the CDK needs Node.js", allow_module_level=True)
-pytest.importorskip("aws_cdk", reason="the infra extra is not installed")
+pytest.importorskip("aws_cdk", reason="run make setup")
 
 NOT_PUBLIC = {"cloud": {"allow_insecure": False, "domain_name": "robots.example.org"}}
 ENOUGH_S = 240

@@ -16,7 +16,7 @@ def resources(**groups: dict[str, Any]) -> dict[str, list[dict[str, Any]]]:
     """Return the properties of every resource of a small stack with one group, by type."""
     if shutil.which("node") is None:
         pytest.skip("the CDK needs Node.js")
-    cdk = pytest.importorskip("aws_cdk", reason="the infra extra is not installed")
+    cdk = pytest.importorskip("aws_cdk", reason="run make setup")
     from aws_cdk import assertions, aws_autoscaling, aws_ec2
 
     from stacks.capacity import Capacity

@@ -45,8 +45,8 @@ def synthesise(settings: PlatformSettings, folder: Path, repository: Path) -> As
     """Return the assembly of *settings*; it takes about ten seconds."""
     if shutil.which("node") is None:
         pytest.skip("the CDK needs Node.js")
-    pytest.importorskip("aws_cdk", reason="the infra extra is not installed")
-    pytest.importorskip("cdk_nag", reason="the infra extra is not installed")
+    pytest.importorskip("aws_cdk", reason="run make setup")
+    pytest.importorskip("cdk_nag", reason="run make setup")
     synthesise_into(settings, folder, repository)
     return read_assembly(settings, folder)
 

@@ -161,14 +161,14 @@ def test_the_units_let_owners_of_live_maps_listen_where_the_firewall_lets_server
     [({}, True), ({"data": {"enabled": False}}, False), ({"live": {"max_owners": 0}}, False)],
 )
 def test_without_live_maps_no_port_is_open_between_servers(groups: Any, has_ports: bool) -> None:
-    pytest.importorskip("aws_cdk", reason="the infra extra is not installed")
+    pytest.importorskip("aws_cdk", reason="run make setup")
     from stacks.firewall import live_range
 
     assert (live_range(PlatformSettings.from_dict(groups)) is not None) == has_ports
 
 
 def test_ports_of_live_maps_that_no_firewall_can_name_are_refused() -> None:
-    pytest.importorskip("aws_cdk", reason="the infra extra is not installed")
+    pytest.importorskip("aws_cdk", reason="run make setup")
     from stacks.firewall import live_range
 
     with pytest.raises(ConfigurationError, match=r"live\.first_port = 0") as told:

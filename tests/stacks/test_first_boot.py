@@ -216,7 +216,7 @@ def test_the_environment_file_holds_plain_words_only() -> None:
 def test_an_unknown_region_says_how_to_look_its_prefix_list_up() -> None:
     if shutil.which("node") is None:
         pytest.skip("the CDK needs Node.js")
-    pytest.importorskip("aws_cdk", reason="the infra extra is not installed")
+    pytest.importorskip("aws_cdk", reason="run make setup")
     from rse_pf.errors import ConfigurationError
     from stacks.firewall import s3_prefix_list
 

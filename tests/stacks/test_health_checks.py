@@ -176,7 +176,7 @@ async def source_of_a_pose(ports: dict[str, int]) -> str:
 def test_a_server_outlives_a_bucket_that_fails_and_then_is_silent(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    pytest.importorskip("moto.server", reason="the infra extra is not installed")
+    pytest.importorskip("moto.server", reason="run make setup")
     for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
         monkeypatch.setenv(name, "testing")
     monkeypatch.setenv("AWS_EC2_METADATA_DISABLED", "true")

@@ -20,8 +20,8 @@ import pytest
 from rse_pf.config.resource_names import READY_PATH, ResourceNames
 from rse_pf.scaling.health import CLOUD_INTERVAL_S
 
-boto3 = pytest.importorskip("boto3", reason="the infra extra is not installed")
-moto = pytest.importorskip("moto", reason="the infra extra is not installed")
+boto3 = pytest.importorskip("boto3", reason="run make setup")
+moto = pytest.importorskip("moto", reason="run make setup")
 
 Assembly = Any
 

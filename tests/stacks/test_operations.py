@@ -115,7 +115,7 @@ class Formation:
 @pytest.fixture
 def account(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[None]:
     """An account in this process, with what the Data stack leaves."""
-    moto = pytest.importorskip("moto", reason="the dev extra is not installed")
+    moto = pytest.importorskip("moto", reason="run make setup")
     monkeypatch.chdir(tmp_path)
     for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
         monkeypatch.setenv(name, "testing")

@@ -17,7 +17,7 @@ from pathlib import Path
 from rse_pf.aws.lifecycle.cdk_tools import PACKAGES, are_packages_built
 from rse_pf.cli.doctor import Finding, report
 from rse_pf.config import PlatformSettings
-from rse_pf.errors import MissingExtra, RsePfError
+from rse_pf.errors import RsePfError
 
 __all__ = ["NO_PACKAGES", "add_arguments", "check_tools", "run"]
 
@@ -86,7 +86,7 @@ def _cli(checkout: Path) -> Finding:
     try:
         writes = metadata.version("aws-cdk.cloud-assembly-schema")
     except metadata.PackageNotFoundError:
-        return Finding(grade="fail", what="aws-cdk-lib is not installed", fix=MissingExtra.command("infra"))
+        return Finding(grade="fail", what="aws-cdk-lib is not installed", fix="make setup")
     try:
         cli = json.loads((checkout / _CLI).read_text(encoding="utf-8"))
         pinned = json.loads((checkout / _PINNED).read_text(encoding="utf-8"))["devDependencies"]["aws-cdk"]

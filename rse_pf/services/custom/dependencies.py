@@ -302,7 +302,7 @@ def _wish(line: str, where: str) -> str:
     try:
         from packaging.requirements import InvalidRequirement, Requirement
     except ImportError as error:
-        raise MissingExtra("packaging", "services") from error
+        raise MissingExtra("packaging", "backend") from error
     locked = _LINE.fullmatch(line)
     hashes = "" if locked is None else locked["hashes"]
     try:

@@ -47,7 +47,7 @@ def warm_up() -> Any:
     try:
         import lupa.luajit21 as lupa
     except ImportError as error:
-        raise MissingExtra("lupa", "services") from error
+        raise MissingExtra("lupa", "backend") from error
     return lupa
 
 

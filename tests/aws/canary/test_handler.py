@@ -118,7 +118,7 @@ def test_nobody_at_the_address_is_one_line() -> None:
 
 @pytest.fixture
 def secret(monkeypatch: pytest.MonkeyPatch) -> Any:
-    moto = pytest.importorskip("moto", reason="the dev extra is not installed")
+    moto = pytest.importorskip("moto", reason="run make setup")
     for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
         monkeypatch.setenv(name, "testing")
     with moto.mock_aws():

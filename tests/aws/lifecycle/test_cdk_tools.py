@@ -42,7 +42,7 @@ def test_the_qualifier_of_the_cdk_has_the_stack_of_the_cdk_and_any_other_one_of_
 def test_the_file_of_settings_reaches_the_synthesis(
     checkout: Path, tmp_path: Path, repository: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    pytest.importorskip("aws_cdk", reason="the infra extra is not installed")
+    pytest.importorskip("aws_cdk", reason="run make setup")
     from app import settings_file
 
     monkeypatch.chdir(tmp_path)

@@ -119,7 +119,7 @@ def test_parking_that_is_ended_between_note_and_group_is_finished_by_the_same_co
 def test_wherever_a_command_is_ended_the_same_command_finishes(
     monkeypatch: pytest.MonkeyPatch, command: str
 ) -> None:
-    moto = pytest.importorskip("moto", reason="the dev extra is not installed")
+    moto = pytest.importorskip("moto", reason="run make setup")
     for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
         monkeypatch.setenv(name, "testing")
     ends = 0

@@ -27,7 +27,7 @@ LARGE = random.Random(5).randbytes(700_000)
 @pytest.fixture
 def s3_server(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     """An emulated S3 on a port of this machine, which boto3 calls instead of AWS."""
-    server_of = pytest.importorskip("moto.server", reason="the infra extra is not installed")
+    server_of = pytest.importorskip("moto.server", reason="run make setup")
     server = server_of.ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
     server.start()
     host, port = server.get_host_and_port()

@@ -37,7 +37,7 @@ def kept(repository: Path) -> Path:
     """A bare Debian, and the packages; skips where one of them cannot be had."""
     if missing():
         pytest.skip(missing())
-    pytest.importorskip("flask", reason="the infra extra is not installed: moto's server")
+    pytest.importorskip("flask", reason="run make setup: moto's server")
     from stacks.assets import ENVIRONMENT_FILE, SERVERS
 
     if not (repository / "build" / SERVERS / ENVIRONMENT_FILE).is_file():

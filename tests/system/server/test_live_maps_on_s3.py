@@ -27,7 +27,7 @@ REGION = PlatformSettings().cloud.region
 @pytest.fixture
 def bucket(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     """An emulated bucket on a port of this machine."""
-    server_of = pytest.importorskip("moto.server", reason="the infra extra is not installed")
+    server_of = pytest.importorskip("moto.server", reason="run make setup")
     server = server_of.ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
     server.start()
     host, port = server.get_host_and_port()
