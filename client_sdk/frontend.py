@@ -1,12 +1,14 @@
-"""The robot's visual front end: frames, features, matches of two frames, and the queries for poses.
+"""The robot's visual front end: frames, features with their points, and the queries for poses.
 
 What a frame is matched with is decided in `client_sdk.tracking`.
 """
 
 from __future__ import annotations
 
+import ctypes
 from dataclasses import dataclass, replace
-from typing import Literal
+from functools import cache
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -19,7 +21,7 @@ from rse_pf.errors import UsageError
 from rse_pf.geometry import Array, Camera, body_poses
 from rse_pf.images import load_opencv
 from rse_pf.maps.descriptors import ORB, DescriptorKind, Descriptors
-from rse_pf.native_front_end import front_end_core
+from rse_pf.native import address_of, aligned, core_function
 from rse_pf.pnp import DepthNoise
 from rse_pf.slam.orb import DescribedPixels, describe_orb, spread_rows
 
@@ -34,7 +36,6 @@ __all__ = [
     "describe",
     "extract",
     "load_opencv",
-    "match",
     "points_at",
     "round_for_wire",
 ]
@@ -280,43 +281,6 @@ def _described_by(
     )  # fmt: skip
 
 
-def match(reference: Features, frame: Features, options: FrontEndOptions) -> Correspondences:
-    """Match the reference's points to the frame's pixels; deterministic.
-
-    Brute-force Hamming distance, ratio test, at most one match for each pixel of the frame.  Rows
-    go from left to right: neighbours share digits, which makes the message 8 % smaller.
-
-    The native core gives the same rows in a tenth of the time where its library is built.
-
-    Raises:
-        MissingExtra: Neither the native core nor OpenCV is installed.
-    """
-    core = front_end_core()
-    if core is not None and len(frame.pixels) >= 2:
-        found = core.matches(
-            reference.descriptors, reference.points_camera, frame.descriptors, frame.pixels,
-            frame.points_camera, ratio=options.ratio, max_matches=options.max_matches,
-        )  # fmt: skip
-        if found is not None:
-            return Correspondences(points_world=found[0], pixels=found[1], depths_m=found[2])
-    known = np.flatnonzero(np.isfinite(reference.points_camera[:, 2]))
-    if not len(known) or len(frame.pixels) < 2:
-        return Correspondences(points_world=np.empty((0, 3)), pixels=np.empty((0, 2)), depths_m=np.empty(0))
-    cv2 = load_opencv()
-    distances, neighbours = cv2.batchDistance(
-        reference.descriptors[known], frame.descriptors, cv2.CV_32S, normType=cv2.NORM_HAMMING, K=2
-    )
-    clear = np.flatnonzero(distances[:, 0] < options.ratio * distances[:, 1])
-    best_first = clear[np.argsort(distances[clear, 0], kind="stable")]
-    _, firsts = np.unique(neighbours[best_first, 0], return_index=True)
-    chosen = best_first[np.sort(firsts)][: options.max_matches]
-    chosen = chosen[np.argsort(frame.pixels[neighbours[chosen, 0], 0], kind="stable")]
-    seen = neighbours[chosen, 0]
-    points_world, pixels = round_for_wire(reference.points_camera[known[chosen]], frame.pixels[seen])
-    depths_m: Array = np.nan_to_num(frame.points_camera[seen, 2], posinf=0.0, neginf=0.0)
-    return Correspondences(points_world=points_world, pixels=pixels, depths_m=np.round(depths_m, 3))
-
-
 def round_for_wire(points_world: Array, pixels: Array) -> tuple[Array, Array]:
     """Round points to 0.1 mm and pixels to 0.01 px, so that cloud and robot solve the same numbers.
 
@@ -394,43 +358,25 @@ def points_at(frame: Frame, pixels: Array, options: FrontEndOptions) -> Array:
 
     The depth of a pixel is the median of its 3x3 patch, NaN where that is sparse, spread, near or far.  A
     stereo pair is matched, see `client_sdk.stereo.depth`.
+
+    Raises:
+        MissingExtra: The native core is not installed.
     """
     if frame.stereo is not None:
         return stereo_points(frame.rgb, frame.stereo, frame.camera, pixels)
-    core = front_end_core()
-    if core is not None:
-        found = core.points_at(
-            frame.depth_m, pixels, frame.camera,
-            min_depth_m=options.min_depth_m, max_depth_m=options.max_depth_m,
-            spread=options.depth_spread_percent / 100.0,
-        )  # fmt: skip
-        if found is not None:
-            return found
-    return frame.camera.back_project(pixels, _depth_at(frame.depth_m, pixels, options))
+    depth_m, pixels = aligned(frame.depth_m, np.float32), aligned(pixels, np.float64)
+    height, width = depth_m.shape
+    camera, points_camera = frame.camera, np.full((len(pixels), 3), np.nan)
+    _core_points_at()(
+        address_of(depth_m), width, height, address_of(pixels), len(pixels),
+        camera.fx, camera.fy, camera.cx, camera.cy, options.min_depth_m, options.max_depth_m,
+        options.depth_spread_percent / 100.0, address_of(points_camera),
+    )  # fmt: skip
+    return points_camera
 
 
-def _depth_at(depth_m: npt.NDArray[np.float32], pixels: Array, options: FrontEndOptions) -> Array:
-    """Return the median of each pixel's 3x3 patch, NaN where it is sparse, spread, near or far."""
-    columns, rows = np.rint(pixels).astype(np.int64).T
-    inside = (columns >= 1) & (rows >= 1) & (columns < depth_m.shape[1] - 1) & (rows < depth_m.shape[0] - 1)
-    found = np.full(len(pixels), np.nan)
-    step = np.array([-1, 0, 1])
-    patches = depth_m[
-        rows[inside][:, None, None] + step[:, None], columns[inside][:, None, None] + step
-    ].reshape(-1, 9)
-    valid = (patches > 0) & np.isfinite(patches)
-    count = valid.sum(axis=1)
-    ascending = np.sort(np.where(valid, patches, np.inf), axis=1)
-    each = np.arange(len(patches))
-    median = ascending[each, np.maximum(count - 1, 0) // 2].astype(np.float64)
-    largest = ascending[each, np.maximum(count - 1, 0)].astype(np.float64)
-    with np.errstate(invalid="ignore"):  # inf - inf where a patch holds no reading
-        spread = largest - ascending[:, 0]
-        trusted = (
-            (count >= 5)
-            & (spread < median * (options.depth_spread_percent / 100.0))
-            & (median >= options.min_depth_m)
-            & (median <= options.max_depth_m)
-        )
-    found[inside] = np.where(trusted, median, np.nan)
-    return found
+@cache
+def _core_points_at() -> Any:
+    pointer, size, number = ctypes.c_void_p, ctypes.c_int64, ctypes.c_double
+    arguments = (pointer, size, size, pointer, size, *[number] * 7, pointer)
+    return core_function("match", "rse_pf_points_at", arguments, ctypes.c_int32)

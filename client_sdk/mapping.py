@@ -5,7 +5,10 @@ The time to add a frame does not depend on the size of the map, and the memory o
 
 from __future__ import annotations
 
+import ctypes
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,7 +27,7 @@ from rse_pf.geometry import (
     to_quaternion,
     transform,
 )
-from rse_pf.native_cloud import CloudCore, VoxelArrays, cloud_core
+from rse_pf.native import PART_ABIS, address_of, aligned, core_function
 from rse_pf.slam.ply import decode_ply, encode_ply
 
 if TYPE_CHECKING:
@@ -46,6 +49,7 @@ _MAX_TRAJECTORY_BYTES = 256 << 20
 _EMPTY = -1
 # Voxels on either side of the origin: three signed indices of 21 bits fill one int64 key.
 _REACH = 1 << 20
+_NO_READINGS = np.empty((0, 3)), np.empty((0, 3), dtype=np.float32), np.empty(0, dtype=np.int32)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -79,12 +83,42 @@ class MapOptions:
             )
 
 
+_P, _I, _D, _F = ctypes.c_void_p, ctypes.c_int64, ctypes.c_double, ctypes.c_float
+
+
+class _Request(ctypes.Structure):
+    """``rse_pf_cloud_request`` of ``rse_pf_cloud.h``."""
+
+    _fields_ = (
+        ("abi", ctypes.c_uint32), ("flags", ctypes.c_uint32), ("rows", _I), ("points", _P), ("colours", _P),
+        ("readings", _P), ("voxel_m", _D), ("reach", _I), ("slots", _I), ("slot_keys", _P),
+        ("slot_rows", _P), ("size", _I), ("room", _I), ("keys", _P), ("means", _P), ("counts", _P),
+        ("used", _I), ("probes", _I),
+    )  # fmt: skip
+
+
+class _Frame(ctypes.Structure):
+    """``rse_pf_cloud_frame`` of ``rse_pf_cloud.h``."""
+
+    _fields_ = (
+        ("width", _I), ("height", _I), ("every_px", _I), ("depth_m", _P), ("rgb", _P), ("fx", _D), ("fy", _D),
+        ("cx", _D), ("cy", _D), ("min_depth_m", _F), ("max_depth_m", _F), ("edge_share", _F), ("zero", _F),
+        ("T_world_camera", _D * 16),
+    )  # fmt: skip
+
+
+@cache
+def _function(name: str) -> Any:
+    arguments = (_P, _P) if name == "add_frame" else (_P,)
+    return core_function("cloud", f"rse_pf_cloud_{name}", arguments, ctypes.c_int32)
+
+
 class PointMap:
     """A voxel grid that holds the mean position and colour of what was seen in each voxel.
 
     Voxels live in an open-addressing hash table over flat arrays, both of which grow by
-    doubling: a frame costs time in its own points alone, amortised.  ``refused_points`` counts the
-    voxels that were not added because the map was full, ``probes`` the slots read so far.
+    doubling: a frame costs time in its own points alone, amortised.  ``probes`` counts the slots read so far.
+    The native core adds the readings.
 
     Source:
         RSE-PF paper, Sect. 6.1: "it will join current frame into the point cloud".
@@ -92,7 +126,6 @@ class PointMap:
 
     def __init__(self, options: MapOptions | None = None) -> None:
         self.options = options or MapOptions()
-        self.refused_points = 0
         self.probes = 0
         self._size = 0
         self._slot_keys: npt.NDArray[np.int64] = np.full(4096, _EMPTY, dtype=np.int64)
@@ -107,17 +140,16 @@ class PointMap:
     def add(self, frame: Frame, T_world_camera: Array) -> int:
         """Add *frame*, seen from *T_world_camera*, to the map; return the number of points used."""
         options = self.options
-        core = self._core_for(frame.depth_m[:: options.every_px, :: options.every_px].size)
-        if core is None:
-            points, colours = frame_points(frame, options)
-            return self.add_points(transform(T_world_camera, points), colours)
-        chosen = (options.min_depth_m, options.max_depth_m, options.edge_percent / 100.0, options.every_px)
-        return self._added(
-            core.add_frame(
-                frame.depth_m, frame.rgb, frame.camera, T_world_camera, chosen, self._voxels(), self._size,
-                options.voxel_m, _REACH,
-            )
+        depth_m, rgb = aligned(frame.depth_m, np.float32), aligned(frame.rgb, np.uint8)
+        height, width = depth_m.shape
+        camera, step = frame.camera, options.every_px
+        seen = _Frame(
+            width, height, step, address_of(depth_m), address_of(rgb), camera.fx, camera.fy, camera.cx,
+            camera.cy, options.min_depth_m, options.max_depth_m, options.edge_percent / 100.0, 0.0,
+            (_D * 16)(*T_world_camera.ravel().tolist()),
         )  # fmt: skip
+        self._grow(depth_m[::step, ::step].size)
+        return self._call("add_frame", _NO_READINGS, ctypes.byref(seen))
 
     def take(self, other: PointMap, T_world_other: Array) -> None:
         """Add all voxels of another map, seen in its frame, each with its readings."""
@@ -131,44 +163,22 @@ class PointMap:
 
     def _add(self, points_world: Array, colours: npt.NDArray[Any], readings: npt.NDArray[np.int32]) -> int:
         """Add points that stand for so many readings each; return how many readings were used."""
-        core = self._core_for(len(points_world))
-        if core is not None:
-            return self._added(
-                core.add(
-                    points_world, colours.astype(np.float32), readings, self._voxels(), self._size,
-                    self.options.voxel_m, _REACH,
-                )
-            )  # fmt: skip
-        index = np.floor(points_world / self.options.voxel_m)
-        inside = (np.abs(index) < _REACH).all(axis=1)
-        index = index[inside].astype(np.int64) + _REACH
-        if not len(index):
-            return 0
-        keys = (index[:, 0] << 42) | (index[:, 1] << 21) | index[:, 2]
-        order = np.argsort(keys)
-        keys = keys[order]
-        first = np.flatnonzero(np.concatenate(([True], keys[1:] != keys[:-1])))
-        readings = readings[inside][order]
-        values = np.concatenate((points_world[inside], colours[inside]), axis=1)[order]
-        sums = np.add.reduceat(values * readings[:, None], first, axis=0)
-        counts = np.add.reduceat(readings, first)
-        rows = self._rows_of(keys[first])
-        has_row = rows >= 0
-        self._average(rows[has_row], sums[has_row], counts[has_row])
-        return int(counts[has_row].sum())
+        arrays = aligned(points_world, np.float64), aligned(colours, np.float32), aligned(readings, np.int32)
+        self._grow(len(points_world))
+        return self._call("add", arrays)
 
-    def _core_for(self, rows: int) -> CloudCore | None:
-        """Return the native core with room for *rows* new voxels; None without it, or if they may not fit."""
-        core = cloud_core()
-        if core is None or self._size + rows > self.options.max_points:
-            return None
-        self._grow(rows)
-        return core
-
-    def _added(self, added: tuple[int, int, int]) -> int:
-        """Take the number of voxels and of slots that were read; return how many readings were used."""
-        self._size, used, probes = added
-        self.probes += probes
+    def _call(self, name: str, readings: Sequence[npt.NDArray[Any]], *more: Any) -> int:
+        """Call a function of the native core with *readings*; return how many of them were used."""
+        request = _Request(
+            PART_ABIS["cloud"], 0, len(readings[0]), *map(address_of, readings), self.options.voxel_m, _REACH,
+            len(self._slot_keys), address_of(self._slot_keys), address_of(self._slot_rows), self._size,
+            min(len(self._counts), self.options.max_points), address_of(self._keys), address_of(self._means),
+            address_of(self._counts), 0, 0,
+        )  # fmt: skip
+        _function(name)(ctypes.byref(request), *more)
+        self._size = request.size
+        self.probes += request.probes
+        used: int = request.used
         return used
 
     def points(self, min_readings: int = 1) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.uint8]]:
@@ -179,53 +189,6 @@ class PointMap:
         seen = self._counts[: self._size] >= min_readings
         means = self._means[: self._size][seen]
         return means[:, :3].copy(), np.clip(np.round(means[:, 3:]), 0, 255).astype(np.uint8)
-
-    def _average(self, rows: npt.NDArray[np.int64], sums: Array, counts: npt.NDArray[np.int64]) -> None:
-        total = self._counts[rows] + counts
-        step = (sums - counts[:, None] * self._means[rows]) / total[:, None]
-        self._means[rows] += step.astype(np.float32)
-        self._counts[rows] = total
-
-    def _rows_of(self, keys: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-        """Return the row of each distinct key, making new ones; -1 where the map is full."""
-        self._grow(len(keys))
-        slots = self._find_slots(keys)
-        is_new = self._slot_keys[slots] == _EMPTY
-        fits = np.cumsum(is_new) <= self.options.max_points - self._size
-        self.refused_points += int((is_new & ~fits).sum())
-        made = np.flatnonzero(is_new & fits)
-        new_rows = self._size + np.arange(len(made))
-        self._keys[new_rows] = keys[made]
-        self._means[new_rows] = 0.0
-        self._counts[new_rows] = 0
-        self._size += len(made)
-        self._insert(keys[made], new_rows)
-        rows = np.full(len(keys), -1, dtype=np.int64)
-        rows[~is_new] = self._slot_rows[slots[~is_new]]
-        rows[made] = new_rows
-        return rows
-
-    def _find_slots(self, keys: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-        """Return, for each key, the slot that holds it or the empty slot that ends its search."""
-        mask = len(self._slot_keys) - 1
-        slots = _hash(keys) & mask
-        searching = np.arange(len(keys))
-        while len(searching):
-            self.probes += len(searching)
-            held = self._slot_keys[slots[searching]]
-            searching = searching[(held != keys[searching]) & (held != _EMPTY)]
-            slots[searching] = (slots[searching] + 1) & mask
-        return slots
-
-    def _insert(self, keys: npt.NDArray[np.int64], rows: npt.NDArray[np.int64]) -> None:
-        waiting = np.arange(len(keys))
-        while len(waiting):
-            slots = self._find_slots(keys[waiting])
-            # Two new keys may ask for one slot; the last one written wins, the others continue the search.
-            self._slot_keys[slots] = keys[waiting]
-            won = self._slot_keys[slots] == keys[waiting]
-            self._slot_rows[slots[won]] = rows[waiting[won]]
-            waiting = waiting[~won]
 
     def _grow(self, more: int) -> None:
         wanted = min(self._size + more, self.options.max_points)
@@ -238,17 +201,7 @@ class PointMap:
             slots = 1 << (2 * wanted - 1).bit_length()
             self._slot_keys = np.full(slots, _EMPTY, dtype=np.int64)
             self._slot_rows = np.zeros(slots, dtype=np.int32)
-            core = cloud_core()
-            if core is not None:
-                self.probes += core.index(self._voxels(), self._size)
-            else:
-                self._insert(self._keys[: self._size].copy(), np.arange(self._size))
-
-    def _voxels(self) -> VoxelArrays:
-        return VoxelArrays(
-            slot_keys=self._slot_keys, slot_rows=self._slot_rows, keys=self._keys, means=self._means,
-            counts=self._counts,
-        )  # fmt: skip
+            self._call("index", _NO_READINGS)
 
 
 def _grown(array: npt.NDArray[Any], capacity: int) -> npt.NDArray[Any]:
@@ -256,35 +209,6 @@ def _grown(array: npt.NDArray[Any], capacity: int) -> npt.NDArray[Any]:
     larger = np.empty((capacity, *array.shape[1:]), dtype=array.dtype)
     larger[: len(array)] = array
     return larger
-
-
-def frame_points(frame: Frame, options: MapOptions) -> tuple[Array, npt.NDArray[np.uint8]]:
-    """Return the camera-frame points ``(n, 3)`` and colours ``(n, 3)`` that a map takes of a frame."""
-    step = options.every_px
-    depth = frame.depth_m
-    in_range = (depth >= options.min_depth_m) & (depth <= options.max_depth_m)
-    limit = depth * (options.edge_percent / 100.0)
-    across = np.abs(np.diff(depth, axis=1)) <= limit[:, 1:]
-    down = np.abs(np.diff(depth, axis=0)) <= limit[1:]
-    in_range[:, 1:] &= across
-    in_range[:, :-1] &= across
-    in_range[1:] &= down
-    in_range[:-1] &= down
-    rows, columns = np.nonzero(in_range[::step, ::step])
-    rows, columns = rows * step, columns * step
-    pixels = np.column_stack((columns, rows)).astype(np.float64)
-    points = frame.camera.back_project(pixels, depth[rows, columns].astype(np.float64))
-    return points, frame.rgb[rows, columns]
-
-
-def _hash(keys: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    """Return well-mixed non-negative hashes (the finaliser of MurmurHash3, Appleby 2011)."""
-    mixed = keys.astype(np.uint64)
-    mixed ^= mixed >> np.uint64(33)
-    mixed *= np.uint64(0xFF51AFD7ED558CCD)
-    mixed ^= mixed >> np.uint64(33)
-    hashes: npt.NDArray[np.int64] = (mixed >> np.uint64(1)).astype(np.int64)
-    return hashes
 
 
 def write_ply(

@@ -10,7 +10,7 @@ from __future__ import annotations
 import ctypes
 import struct
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache, lru_cache
 from importlib.util import find_spec
 from pathlib import Path
@@ -33,6 +33,7 @@ from rse_pf.errors import (
 from rse_pf.geometry import Array, Camera
 
 __all__ = [
+    "PART_ABIS",
     "POSE_AT",
     "REASONS",
     "RESULT",
@@ -40,8 +41,10 @@ __all__ = [
     "Evidence",
     "NativeOptions",
     "NativeSolver",
+    "Workspace",
     "address_of",
     "aligned",
+    "core_function",
     "find_library",
     "load_core",
     "load_part",
@@ -55,6 +58,8 @@ __all__ = [
 Part = TypeVar("Part")
 
 _ABI = 2
+PART_ABIS = {"check": 1, "cloud": 1, "depth": 1, "match": 4, "stereo": 1, "track": 2}
+"""The version of each header ``rse_pf_PART.h`` that this package calls."""
 _FILE = "librse_pf_native.so"
 _PROPOSE = 2
 _LANES = {"avx512": 0, "avx2": 4, "portable": 1}
@@ -372,6 +377,18 @@ def aligned(array: npt.NDArray[Any], dtype: type | None = None) -> npt.NDArray[A
     return whole if whole.flags.aligned else whole.copy()
 
 
+class Workspace(threading.local):
+    """Memory that a thread lends to the library, so that a call allocates no more than its results."""
+
+    _words = np.empty(0, dtype=np.uint64)
+
+    def words(self, count: int) -> npt.NDArray[np.uint64]:
+        """Return *count* numbers of 8 bytes or more, whose values are arbitrary."""
+        if len(self._words) < count:
+            self._words = np.empty(count, dtype=np.uint64)
+        return self._words
+
+
 def load_part(path: Path, part: str, abi: int, *functions: str) -> list[Any]:
     """Return *functions* of the library at *path*, once the version of their part was checked.
 
@@ -411,6 +428,18 @@ def load_core(open_part: Callable[[Path], Part]) -> Part:
         error.hint = f"make native in a checkout; {error.hint} on a robot"
         raise error
     return open_part(path)
+
+
+def core_function(part: str, name: str, arguments: Sequence[Any], result: Any) -> Any:
+    """Return the function *name* of a part of the native core, with the types of its arguments and result.
+
+    Raises:
+        MissingExtra: The native core is not installed.
+        ConfigurationError: The native core cannot be loaded, or has another version.
+    """
+    (function,) = load_core(lambda path: load_part(path, part, PART_ABIS[part], name))
+    function.argtypes, function.restype = arguments, result
+    return function
 
 
 def open_found(open_part: Callable[[Path], Part]) -> Part | None:

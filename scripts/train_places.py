@@ -1,7 +1,7 @@
 """Train the vocabulary of `rse_pf.slam.places` from rendered worlds, and write it to its file.
 
 No recording takes part, so the package carries nobody's images.  The worlds' seeds are used by no test and no
-benchmark.  It takes about two minutes on one core:
+benchmark.  It needs the package faiss-cpu, and takes about two minutes on one core:
 
     python scripts/train_places.py
 """
@@ -12,6 +12,7 @@ import argparse
 import hashlib
 from pathlib import Path
 
+import faiss
 import numpy as np
 import numpy.typing as npt
 
@@ -19,7 +20,7 @@ from client_sdk.frontend import Frame, FrontEndOptions, extract
 from client_sdk.simulator import SIMULATED_CAMERA, true_trajectory
 from client_sdk.simulator.camera import Painter, add_depth_noise, add_image_noise
 from client_sdk.simulator.world import make_world
-from rse_pf.slam.descriptors import BYTES, Descriptors, load_faiss
+from rse_pf.maps.descriptors import ORB, Descriptors
 from rse_pf.slam.places import PARTS, PLACE_WORDS_FILE, WORDS
 
 WORLDS = range(101, 107)
@@ -64,8 +65,8 @@ def train_words(views: list[Descriptors]) -> npt.NDArray[np.float32]:
     if len(stacked) > MAX_TRAINING:
         rows = np.random.default_rng(SEED).choice(len(stacked), MAX_TRAINING, replace=False)
         stacked = stacked[np.sort(rows)]
-    kmeans = load_faiss().Kmeans(
-        8 * BYTES, WORDS, niter=KMEANS_ITERATIONS, seed=SEED, verbose=False, min_points_per_centroid=1
+    kmeans = faiss.Kmeans(
+        8 * ORB.size, WORDS, niter=KMEANS_ITERATIONS, seed=SEED, verbose=False, min_points_per_centroid=1
     )
     kmeans.train(np.unpackbits(stacked, axis=1) * np.float32(2.0) - np.float32(1.0))
     centres: npt.NDArray[np.float32] = np.asarray(kmeans.centroids, dtype=np.float32)

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import ctypes
 import itertools
 import math
+from functools import cache
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -11,7 +14,7 @@ import numpy.typing as npt
 from client_sdk.check.findings import CannotTell, FaultKind, Finding
 from client_sdk.source_facts import Doubt, DoubtName
 from rse_pf.geometry import Array
-from rse_pf.native_check import check_core
+from rse_pf.native import address_of, core_function
 
 __all__ = ["FrameStatistics", "sharpness"]
 
@@ -234,6 +237,8 @@ def _percentile(values: npt.NDArray[np.int16], percent: int) -> float:
 def sharpness(gray: _Image) -> tuple[float, float]:
     """Return how sharp the strongest edges of ``(h, w)`` uint8 are, along x and along y; NaN without edges.
 
+    Sides longer than 16,384 px count as without edges.
+
     It is the steepest difference over two pixels beside the whole step over 16: 1 for a step within two
     pixels, and about ``2 / n`` for one that is blurred over *n*.  Texture changes it little.
     """
@@ -248,23 +253,21 @@ def _edges(lines: _Image) -> float:
     if lines.shape[1] < 6 * _HALF_PX:
         return math.nan
     strong = max(1, int(_STRONGEST * len(lines) * (lines.shape[1] - 2 * _HALF_PX)))
-    core = check_core()
-    found = None if core is None else core.edges(lines, strong, _LEAST_STEP, _MOST_EDGES)
-    if found is not None:
-        return float(np.median(found[1])) if found[0] >= _FEWEST_EDGES else math.nan
-    values = lines.astype(np.int16)
-    whole = np.abs(values[:, 2 * _HALF_PX :] - values[:, : -2 * _HALF_PX])
-    limit = max(_LEAST_STEP, int(np.partition(whole.ravel(), -strong)[-strong]))
-    row, column = np.nonzero(whole >= limit)
-    if len(row) < _FEWEST_EDGES:
+    sharpest = np.empty(_MOST_EDGES)
+    count = _core_edges()(
+        address_of(lines), *lines.shape, *lines.strides, strong, _LEAST_STEP, _MOST_EDGES,
+        address_of(sharpest),
+    )  # fmt: skip
+    if count < _FEWEST_EDGES:
         return math.nan
-    every = -(-len(row) // _MOST_EDGES)
-    row, column = row[::every], column[::every]
-    # Column c of *whole* is about pixel c + 8, and column c of *fine* about pixel c + 1.
-    fine = np.abs(values[:, 2:] - values[:, :-2])
-    around = column[:, None] + np.arange(2 * _HALF_PX - 1)
-    steepest = fine[row[:, None], around].max(axis=1)
-    return float(np.median(steepest / whole[row, column]))
+    every = -(-count // _MOST_EDGES)
+    return float(np.median(sharpest[: -(-count // every)]))
+
+
+@cache
+def _core_edges() -> Any:
+    arguments = (ctypes.c_void_p, *[ctypes.c_int64] * 7, ctypes.c_void_p)
+    return core_function("check", "rse_pf_edges", arguments, ctypes.c_int64)
 
 
 def _interval_s(steps_s: Array) -> float:

@@ -6,19 +6,22 @@ matches by an epipolar line, for which no calibration is needed.
 
 from __future__ import annotations
 
+import ctypes
 from collections import deque
 from dataclasses import dataclass, field, replace
+from functools import cache
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from client_sdk.frontend import DescribedPixels, Features, Frame, describe, load_opencv
-from client_sdk.monocular.descriptors import match_all
 from client_sdk.stereo.depth import stereo_points
 from rse_pf.geometry import Array, Camera, inverse, log_se3
 from rse_pf.maps.descriptors import ORB
-from rse_pf.native_check import check_core
+from rse_pf.native import address_of, aligned, core_function
 from rse_pf.pnp import DepthNoise
+from rse_pf.slam.descriptors import match_all
 
 __all__ = ["FLIPS", "Keyframe", "KeyframeStore", "Tracks", "tracks_of"]
 
@@ -239,19 +242,18 @@ def _has_depth(frame: Frame) -> bool:
 
 def depths_at(depth_m: npt.NDArray[np.float32], pixels: Array) -> Array:
     """Return ``(n,)`` medians of five depths around each pixel; NaN where one is missing, or on an edge."""
-    core = check_core()
-    if core is not None and depth_m.dtype == np.float32:
-        found = core.depths_at(depth_m, pixels, _SPREAD)
-        if found is not None:
-            return found
-    height, width = depth_m.shape
-    u = np.clip(np.rint(pixels[:, 0]).astype(np.int64), 2, width - 3)
-    v = np.clip(np.rint(pixels[:, 1]).astype(np.int64), 2, height - 3)
-    five = np.stack(
-        [depth_m[v, u], depth_m[v - 2, u], depth_m[v + 2, u], depth_m[v, u - 2], depth_m[v, u + 2]]
-    )
-    five.sort(axis=0)
-    middle = five[2].astype(np.float64)
-    with np.errstate(invalid="ignore"):
-        is_smooth = (five[0] > 0.0) & (five[4] - five[0] <= _SPREAD * middle)
-    return np.where(is_smooth & np.isfinite(middle), middle, np.nan)
+    pixels, depths_m = aligned(pixels, np.float64), np.full(len(pixels), np.nan)
+    depth_m = np.asarray(depth_m, dtype=np.float32)
+    strides = (stride // depth_m.itemsize for stride in depth_m.strides)
+    _core_depths_at()(
+        address_of(depth_m), *depth_m.shape, *strides, address_of(pixels), len(pixels), _SPREAD,
+        address_of(depths_m),
+    )  # fmt: skip
+    return depths_m
+
+
+@cache
+def _core_depths_at() -> Any:
+    pointer, size = ctypes.c_void_p, ctypes.c_int64
+    arguments = (pointer, *[size] * 4, pointer, size, ctypes.c_double, pointer)
+    return core_function("check", "rse_pf_depths_at", arguments, ctypes.c_int32)

@@ -25,7 +25,6 @@ from client_sdk.frontend import (
 )
 from client_sdk.mapping import Trajectory
 from client_sdk.monocular.bundle import adjust
-from client_sdk.monocular.descriptors import match_all
 from client_sdk.monocular.two_view import TwoViewStart, start_from_two_views
 from client_sdk.slots import Slots
 from client_sdk.tracking.keyframe_map import NO_LANDMARK
@@ -36,6 +35,7 @@ from client_sdk.tracking.tracker import Join
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Array, inverse, pose_difference, rigid, scaled, transform
 from rse_pf.maps.descriptors import ORB, DescriptorKind
+from rse_pf.slam.descriptors import match_all
 from rse_pf.slam.tracking import (
     ImageFeatures,
     NearLimits,

@@ -22,7 +22,6 @@ from client_sdk.frontend import (
     extract,
     round_for_wire,
 )
-from client_sdk.monocular.descriptors import match_all
 from client_sdk.slots import Slots
 from client_sdk.stereo.depth import with_offset
 from client_sdk.tracking.keyframe_map import NO_LANDMARK, KeyframeMap, Landmarks, View, between
@@ -35,6 +34,7 @@ from client_sdk.tracking.stereo_adjustment import StereoAdjustment, adjust_stere
 from rse_pf.geometry import Array, inverse, pose_difference, rigid, transform
 from rse_pf.maps.descriptors import Descriptors
 from rse_pf.pnp import DepthNoise
+from rse_pf.slam.descriptors import match_all
 from rse_pf.slam.tracking import (
     FittedPose,
     ImageFeatures,

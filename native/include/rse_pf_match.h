@@ -1,4 +1,4 @@
-/* The C ABI of a robot's front end: points at keypoints, and matches of binary descriptors.
+/* The C ABI of features: keypoints, descriptors, points at keypoints, and matches of descriptors of 256 bits.
  *
  * Every function may be called from any thread, on arrays of its own.  Nothing is allocated, and equal
  * arguments give equal bytes on every processor. */
@@ -11,14 +11,14 @@
 extern "C" {
 #endif
 
-#define RSE_PF_MATCH_ABI 3
+#define RSE_PF_MATCH_ABI 4
 
 /* Use no AVX2 and AVX-512, or no AVX-512, for tests: the bytes of the result are the same. */
 #define RSE_PF_MATCH_PORTABLE 1u
 #define RSE_PF_MATCH_AVX2 2u
 
 /* Numbers of 8 bytes that rse_pf_match works in. */
-#define RSE_PF_MATCH_WORKSPACE(reference_rows, frame_rows) (3 * (reference_rows) + 5 * (frame_rows) + 64)
+#define RSE_PF_MATCH_WORKSPACE(reference_rows, frame_rows) ((reference_rows) + 5 * (frame_rows) + 64)
 
 /* Return RSE_PF_MATCH_ABI of the library, to compare with the header's. */
 uint32_t rse_pf_match_abi(void);
@@ -33,19 +33,15 @@ int32_t rse_pf_points_at(const float *depth_m, int64_t width, int64_t height, co
                          double fx, double fy, double cx, double cy, double min_depth_m, double max_depth_m,
                          double spread, double *points_camera);
 
-/* Match points of a reference view to pixels of a frame; return the number of matches, -1 if a size does not fit.
+/* Match the descriptors of a reference view to those of a frame; return the number of matches, -1 if a size does not
+ * fit.
  *
- * Descriptors have 256 bits.  A reference row whose third coordinate is finite takes the pixel at the least
- * Hamming distance, the first one of equals, if that is less than ratio times the second least.  Of the rows
- * that take one pixel the nearest stays, the first one of equals; of all the max_matches nearest stay.  Rows
- * are written from left to right in the frame, points rounded to 0.1 mm, pixels to 0.01 px, and the depths of
- * the frame's points there to 1 mm, 0 where they are not finite.
- * points_camera and frame_points are rows x 3.  points_world, matched and depths_m have room for
- * min(reference_rows, frame_rows, max_matches) rows. */
-int64_t rse_pf_match(const uint8_t *reference, const double *points_camera, int64_t reference_rows,
-                     const uint8_t *frame, const double *pixels, const double *frame_points, int64_t frame_rows,
-                     double ratio, int64_t max_matches, uint32_t flags, uint64_t *workspace, double *points_world,
-                     double *matched, double *depths_m);
+ * Descriptors have 256 bits.  A reference row takes the frame row at the least Hamming distance, the first one of
+ * equals, if that distance is less than ratio times the second least.  Of the reference rows that take one frame row
+ * the nearest stays, the first one of equals.  Matches are written by ascending distance, equals by reference row.
+ * rows and columns have room for min(reference_rows, frame_rows) numbers. */
+int64_t rse_pf_match(const uint8_t *reference, int64_t reference_rows, const uint8_t *frame, int64_t frame_rows,
+                     double ratio, uint32_t flags, uint64_t *workspace, int64_t *rows, int64_t *columns);
 
 /* Numbers of 8 bytes that rse_pf_detect works in. */
 #define RSE_PF_DETECT_WORKSPACE(width, height) (((width) * (height)) / 2 + 8 * (width) + (height) + 64)

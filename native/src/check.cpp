@@ -1,4 +1,4 @@
-// What the check of a drive measures of each frame.  client_sdk/check has the same in numpy.
+// What the check of a drive measures of each frame.
 #include "rse_pf_check.h"
 
 namespace {

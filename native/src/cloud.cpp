@@ -1,4 +1,4 @@
-// Readings of a depth camera in voxels, by an open-addressing hash table.  client_sdk/mapping.py has the same in numpy.
+// Readings of a depth camera in voxels, by an open-addressing hash table.
 #include "rse_pf_cloud.h"
 
 namespace {

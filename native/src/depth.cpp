@@ -1,5 +1,5 @@
 // Refine a pose with the depths that both cameras measured: iterated least squares with a Cauchy weight, on
-// residuals weighed by the noise of both images.  rse_pf/pnp/depth_refinement.py is its reference and says why.
+// residuals weighed by the noise of both images.  rse_pf/pnp/depth_refinement.py says why.
 #include "rse_pf_depth.h"
 
 #include <cstring>

@@ -1,4 +1,4 @@
-// A robot's front end: points at keypoints, and matches of 256-bit descriptors by Hamming distance.
+// Points at keypoints, and matches of 256-bit descriptors by Hamming distance.
 //
 // The caller lends all memory.  The results are integers, or single IEEE operations in one order, so the
 // instructions chosen below change no byte.
@@ -16,8 +16,6 @@ constexpr int64_t kMaxRows = int64_t{1} << 24;
 constexpr int64_t kMaxSide = int64_t{1} << 16;
 constexpr int kPatch = 9, kLeastReadings = 5;
 constexpr int64_t kAhead = 16;
-
-bool is_finite(double value) { return value - value == 0.0; }
 
 double not_a_number() { return __builtin_nan(""); }
 
@@ -68,32 +66,6 @@ double median_of_patch(const DepthImage& image, int64_t first, double least, dou
     return is_trusted ? median : not_a_number();
 }
 
-// NaN stands behind all numbers.
-bool is_left_of(double a, double b) { return a < b || (b != b && a == a); }
-
-// Sort reference rows by the column of their pixel, equals as they stand; return where the result is.
-uint64_t* left_to_right(uint64_t* rows, uint64_t* spare, int64_t count, const uint64_t* nearest, const double* pixels) {
-    for (int64_t run = 1; run < count; run *= 2) {
-        for (int64_t begin = 0; begin < count; begin += 2 * run) {
-            const int64_t middle = begin + run < count ? begin + run : count;
-            const int64_t end = begin + 2 * run < count ? begin + 2 * run : count;
-            int64_t left = begin, right = middle;
-            for (int64_t to = begin; to < end; ++to) {
-                const bool takes_right =
-                    left == middle ||
-                    (right < end && is_left_of(pixels[2 * nearest[rows[right]]], pixels[2 * nearest[rows[left]]]));
-                spare[to] = takes_right ? rows[right++] : rows[left++];
-            }
-        }
-        uint64_t* const sorted = spare;
-        spare = rows;
-        rows = sorted;
-    }
-    return rows;
-}
-
-double rounded(double value, double steps) { return __builtin_rint(value * steps) / steps; }
-
 }  // namespace
 
 extern "C" {
@@ -120,21 +92,16 @@ __attribute__((visibility("default"))) int32_t rse_pf_points_at(const float* dep
     return 0;
 }
 
-__attribute__((visibility("default"))) int64_t rse_pf_match(const uint8_t* reference, const double* points_camera,
-                                                            int64_t reference_rows, const uint8_t* frame,
-                                                            const double* pixels, const double* frame_points,
-                                                            int64_t frame_rows, double ratio, int64_t max_matches,
-                                                            uint32_t flags, uint64_t* workspace, double* points_world,
-                                                            double* matched, double* depths_m) {
-    if (reference == nullptr || points_camera == nullptr || frame == nullptr || pixels == nullptr ||
-        frame_points == nullptr || workspace == nullptr || points_world == nullptr || matched == nullptr ||
-        depths_m == nullptr || reference_rows < 0 || reference_rows > kMaxRows || frame_rows < 0 || frame_rows > kMaxRows)
+__attribute__((visibility("default"))) int64_t rse_pf_match(const uint8_t* reference, int64_t reference_rows,
+                                                            const uint8_t* frame, int64_t frame_rows, double ratio,
+                                                            uint32_t flags, uint64_t* workspace, int64_t* rows,
+                                                            int64_t* columns) {
+    if (reference == nullptr || frame == nullptr || workspace == nullptr || rows == nullptr || columns == nullptr ||
+        reference_rows < 0 || reference_rows > kMaxRows || frame_rows < 0 || frame_rows > kMaxRows)
         return -1;
     if (frame_rows < 2) return 0;
-    uint64_t* const nearest = workspace;                // of each reference row
-    uint64_t* const sorted = nearest + reference_rows;  // reference rows
-    uint64_t* const spare = sorted + reference_rows;
-    uint64_t* const takers = spare + reference_rows;  // of each pixel: distance and reference row
+    uint64_t* const nearest = workspace;               // of each reference row
+    uint64_t* const takers = nearest + reference_rows;  // of each frame row: distance and reference row
     const Lanes most = (flags & RSE_PF_MATCH_PORTABLE) != 0 ? Lanes::words
                        : (flags & RSE_PF_MATCH_AVX2) != 0   ? Lanes::avx2
                                                             : Lanes::avx512;
@@ -143,7 +110,6 @@ __attribute__((visibility("default"))) int64_t rse_pf_match(const uint8_t* refer
     std::memset(takers, 0xff, static_cast<size_t>(frame_rows) * sizeof *takers);
     for (int64_t row = 0; row < reference_rows; ++row) {
         nearest[row] = kNone;
-        if (!is_finite(points_camera[3 * row + 2])) continue;
         const Nearest found = two_nearest(search, reference + kBytes * row);
         const double first = static_cast<double>(distance_of(found.first));
         if (!(first < ratio * static_cast<double>(distance_of(found.second)))) continue;
@@ -152,7 +118,7 @@ __attribute__((visibility("default"))) int64_t rse_pf_match(const uint8_t* refer
         if (taker < takers[nearest[row]]) takers[nearest[row]] = taker;
     }
 
-    // The rows that kept their pixel, the nearest first: one place for each distance.
+    // The rows that kept their frame row, the nearest first: one place for each distance.
     int64_t places[kBits + 2] = {};
     const auto has_kept = [&](int64_t row) {
         return nearest[row] != kNone && row_of(takers[nearest[row]]) == static_cast<uint64_t>(row);
@@ -160,19 +126,12 @@ __attribute__((visibility("default"))) int64_t rse_pf_match(const uint8_t* refer
     for (int64_t row = 0; row < reference_rows; ++row)
         if (has_kept(row)) ++places[distance_of(takers[nearest[row]]) + 1];
     for (int64_t distance = 0; distance <= kBits; ++distance) places[distance + 1] += places[distance];
-    int64_t count = places[kBits + 1];
-    for (int64_t row = 0; row < reference_rows; ++row)
-        if (has_kept(row)) sorted[places[distance_of(takers[nearest[row]])]++] = static_cast<uint64_t>(row);
-
-    count = count < max_matches ? count : (max_matches > 0 ? max_matches : 0);
-    const uint64_t* const rows = left_to_right(sorted, spare, count, nearest, pixels);
-    for (int64_t i = 0; i < count; ++i) {
-        const double* const point = points_camera + 3 * rows[i];
-        const double* const pixel = pixels + 2 * nearest[rows[i]];
-        const double depth_m = frame_points[3 * nearest[rows[i]] + 2];
-        for (int k = 0; k < 3; ++k) points_world[3 * i + k] = rounded(point[k], 1e4);
-        for (int k = 0; k < 2; ++k) matched[2 * i + k] = rounded(pixel[k], 1e2);
-        depths_m[i] = is_finite(depth_m) ? rounded(depth_m, 1e3) : 0.0;
+    const int64_t count = places[kBits + 1];
+    for (int64_t row = 0; row < reference_rows; ++row) {
+        if (!has_kept(row)) continue;
+        const int64_t place = places[distance_of(takers[nearest[row]])]++;
+        rows[place] = row;
+        columns[place] = static_cast<int64_t>(nearest[row]);
     }
     return count;
 }

@@ -1,5 +1,4 @@
-// Disparities of features between the two images of a rectified stereo pair.  rse_pf/slam/stereo.py has the same in
-// numpy and says why.
+// Disparities of features between the two images of a rectified stereo pair; rse_pf/slam/stereo.py says why.
 //
 // Sums of products of pixels are integers, and everything else is single IEEE operations in one order, so the
 // instructions chosen below change no byte.

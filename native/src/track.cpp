@@ -1,5 +1,5 @@
 // A tracker's inner loops: features that resemble no other, matches near predicted pixels, and the pose that fits
-// landmarks.  rse_pf/slam/tracking.py has the same in numpy and says why.
+// landmarks.  rse_pf/slam/tracking.py calls it and says why.
 #include "rse_pf_track.h"
 
 #include <cstring>

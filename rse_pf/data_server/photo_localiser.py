@@ -94,12 +94,10 @@ def make_handler(configuration: str) -> Handler:
     """Import what localises and return what answers in the process; *configuration* has the settings."""
     from rse_pf.images import load_opencv
     from rse_pf.services.mapping.photo import localise_photo, location_of, outline_of
-    from rse_pf.slam.descriptors import load_faiss
 
     settings = PlatformSettings.from_dict(json.loads(configuration))
-    for load in (load_faiss, load_opencv):
-        with contextlib.suppress(MissingExtra):  # the answer to each request says so
-            load()
+    with contextlib.suppress(MissingExtra):  # the answer to each request says so
+        load_opencv()
     maps = _Maps(settings)
 
     def answer(data: bytes) -> bytes:

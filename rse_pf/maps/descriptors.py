@@ -75,7 +75,7 @@ class DescriptorKind:
 
 
 ORB = DescriptorKind("orb", "uint8", 32)
-"""The default, and all that the native core matches."""
+"""The default, and all that the native core matches; numpy matches the others."""
 
 
 def one_kind(kinds: Iterable[DescriptorKind], what: str) -> DescriptorKind:

@@ -139,7 +139,7 @@ def merge_versions(
         steps: The steps that take long; None means the functions of this package, in this process.
 
     Raises:
-        MissingExtra: faiss, gtsam or a solver is not installed.
+        MissingExtra: gtsam or the native core is not installed.
         Cancelled: *report* raised it.
     """
     options = options or MergeOptions()

@@ -16,7 +16,6 @@ from rse_pf.errors import PnpError
 from rse_pf.geometry import Array, Camera, adjoint, inverse, transform
 from rse_pf.maps.descriptors import Descriptors
 from rse_pf.maps.format import Keyframe
-from rse_pf.native_matcher import match_core
 from rse_pf.pnp import DepthNoise, PnpOptions, PnpSolution, refine_with_depth, solve_pnp
 from rse_pf.slam.descriptors import best_matches
 
@@ -157,8 +156,6 @@ class RelativePose:
 
 
 _DEFAULT = RelativePoseOptions()
-_ANY_CAMERA = Camera(fx=1.0, fy=1.0, cx=0.5, cy=0.5, width=1, height=1)
-"""No matcher looks at the camera."""
 
 
 def reference_of(keyframe: Keyframe) -> Reference:
@@ -294,49 +291,31 @@ def match_points(
 ) -> tuple[Array, Array, Array]:
     """Return the points of *reference* that *view* shows, ``(k, 3)``, with its pixels and depths there.
 
-    They are sorted from left to right, and rounded to 0.1 mm, 0.01 px and 1 mm.  The native core matches ORB
-    where its library is built, else faiss, in ten times the time; vectors are matched by numpy.
+    They are sorted from left to right, and rounded to 0.1 mm, 0.01 px and 1 mm.
 
     Raises:
         BadRequest: The descriptors are of two kinds.
-        MissingExtra: They are binary, and there is neither the native core nor faiss.
+        MissingExtra: They are ORB descriptors, and the native core is not installed.
     """
-    core = match_core()
-    n = len(view.pixels)
-    view_depths_m = np.zeros(n) if view.depths_m is None else view.depths_m
-    if core is not None and n >= 2:
-        # The core reads nothing of a frame's points but their depth.
-        frame_points = np.zeros((n, 3))
-        frame_points[:, 2] = view_depths_m
-        matched = core.matches(
-            reference.descriptors, reference.points_camera, view.descriptors, view.pixels, frame_points,
-            ratio=options.ratio, max_matches=options.max_matches,
-        )  # fmt: skip
-        if matched is not None:
-            return matched
     rows, columns = best_matches(reference.descriptors, view.descriptors, options.ratio)
     rows, columns = rows[: options.max_matches], columns[: options.max_matches]
     leftmost = np.argsort(view.pixels[columns, 0], kind="stable")
     rows, columns = rows[leftmost], columns[leftmost]
-    points, depths_m = reference.points_camera[rows], view_depths_m[columns]
-    return points.round(4), view.pixels[columns].round(2), depths_m.round(3)
+    depths_m = np.zeros(len(columns)) if view.depths_m is None else view.depths_m[columns]
+    return reference.points_camera[rows].round(4), view.pixels[columns].round(2), depths_m.round(3)
 
 
 def match_rows(
     reference: Descriptors, view: Descriptors, options: RelativePoseOptions = _DEFAULT
 ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    """Return the rows of *reference* and of *view* that match, as `match_points` finds them.
+    """Return rows of *reference* and of *view* that match, the best ``max_matches``, by rows of *view*.
 
     Raises:
         As `match_points`.
     """
-    n, m = len(reference), len(view)
-    # The matcher only carries points and pixels along: here they are the numbers of their rows.
-    numbered = Reference(points_camera=np.column_stack([np.arange(n), np.zeros(n), np.ones(n)]),
-                         descriptors=reference)  # fmt: skip
-    seen = View(camera=_ANY_CAMERA, pixels=np.column_stack([np.arange(m), np.zeros(m)]), descriptors=view)
-    points, pixels, _ = match_points(numbered, seen, options)
-    return points[:, 0].astype(np.int64), pixels[:, 0].astype(np.int64)
+    rows, columns = best_matches(reference, view, options.ratio)
+    order = np.argsort(columns[: options.max_matches])
+    return rows[order], columns[order]
 
 
 @lru_cache(maxsize=16)

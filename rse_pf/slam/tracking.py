@@ -1,20 +1,24 @@
 """What a tracker computes for each frame: matches near predicted pixels, and the pose that fits landmarks.
 
-Each function runs in the native core where its library is built, and in numpy elsewhere: matches are equal,
-poses agree to rounding.  Which landmarks are sought, and what is done with a pose, is decided elsewhere.
+The native core does both.  Features of other kinds than ORB, which a user's function computes, are matched by
+numpy.  Which landmarks are sought, and what is done with a pose, is decided elsewhere.
 """
 
 from __future__ import annotations
 
+import ctypes
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from rse_pf.errors import BadRequest
-from rse_pf.geometry import Array, Camera, exp_se3, skew, transform
+from rse_pf.geometry import Array, Camera, transform
 from rse_pf.maps.descriptors import ORB, Descriptors
-from rse_pf.native_tracker import track_core
+from rse_pf.native import PART_ABIS, Workspace, address_of, aligned, core_function
 from rse_pf.slam.descriptors import distance_matrix, distances_of_pairs, no_distance
 
 __all__ = [
@@ -25,28 +29,22 @@ __all__ = [
     "NearLimits",
     "Observations",
     "SoughtFeatures",
-    "distinct_by_numpy",
     "distinct_distances",
     "expect",
     "fit_pose",
-    "fit_pose_by_numpy",
     "fit_sway",
-    "fit_sway_by_numpy",
     "match_near",
-    "match_near_by_numpy",
-    "pairs_within",
     "seek_near",
 ]
 
 Rows = npt.NDArray[np.int64]
 
+_ABI = PART_ABIS["track"]
+_CELL_WORDS = 16_400  # of the grid of cells in which `rse_pf_match_near` sorts features
+_NO_ORB_DISTANCE = 256  # above every distance of two descriptors that differ
 _DTYPES = (np.uint8, np.int8)
-_BAND = 1e6
-_ITERATIONS, _FIRST_GATED, _CONVERGED = 10, 3, 1e-6
-_NEAR_M = 0.05
-_MAX_ABS, _MAX_TWIST, _MAX_DISTANCE2 = 1e9, 1e6, 1e300
-_FREE = 1e-12
-_OWN = 1e-9
+_BAND = 1e6  # between the sort keys of two rows of bands; no image is wider
+_MAX_ABS = 1e9  # px: features farther out match nothing
 _NEAREST_M = 0.1  # nearer landmarks are not sought
 _MIN_COSINE = 0.6  # between the rays of two looks: from other directions a landmark looks different
 _MAX_NEARER, _MAX_FARTHER = 2.0, 2.0  # ratios of distances: from others a landmark looks different
@@ -171,6 +169,63 @@ class FittedPose:
     is_inlier: npt.NDArray[np.bool_]
 
 
+_P, _I, _D = ctypes.c_void_p, ctypes.c_int64, ctypes.c_double
+_WORKSPACE = Workspace()
+
+
+class _NearRequest(ctypes.Structure):
+    """``rse_pf_near_request`` of ``rse_pf_track.h``."""
+
+    _fields_ = (
+        ("abi", ctypes.c_uint32), ("flags", ctypes.c_uint32), ("sought_rows", _I), ("rows", _I),
+        ("predicted", _P), ("sought_turns", _P), ("sought_sizes", _P), ("sought", _P), ("pixels", _P),
+        ("turns", _P), ("sizes", _P), ("descriptors", _P), ("distinct", _P), ("radius_px", _D), ("ratio", _D),
+        ("distinct_ratio", _D), ("min_cosine", _D), ("max_size_ratio", _D), ("max_distance", _I),
+    )  # fmt: skip
+
+
+class _SeekRequest(ctypes.Structure):
+    """``rse_pf_seek_request`` of ``rse_pf_track.h``."""
+
+    _fields_ = (
+        ("abi", ctypes.c_uint32), ("flags", ctypes.c_uint32), ("rows", _I), ("landmarks", _I),
+        ("numbers", _P), ("points", _P), ("rays", _P), ("turns", _P), ("sizes", _P), ("descriptors", _P),
+        ("fx", _D), ("fy", _D), ("cx", _D), ("cy", _D), ("width", _D), ("height", _D), ("margin_px", _D),
+        ("nearest_m", _D), ("min_cosine", _D), ("max_nearer", _D), ("max_farther", _D),
+        ("T_camera_world", _D * 16),
+    )  # fmt: skip
+
+
+class _FitRequest(ctypes.Structure):
+    """``rse_pf_fit_request`` of ``rse_pf_track.h``."""
+
+    _fields_ = (
+        ("abi", ctypes.c_uint32), ("flags", ctypes.c_uint32), ("rows", _I), ("points", _P), ("spreads", _P),
+        ("pixels", _P), ("pixels_px", _P), ("depths_m", _P), ("depths_dev", _P), ("fx", _D), ("fy", _D),
+        ("cx", _D), ("cy", _D), ("cauchy2", _D), ("gate2", _D), ("T_camera_world", _D * 16),
+    )  # fmt: skip
+
+
+class _FitResult(ctypes.Structure):
+    """``rse_pf_fit_result`` of ``rse_pf_track.h``."""
+
+    _fields_ = (("inliers", _I), ("T_camera_world", _D * 16), ("information", _D * 36))
+
+
+_SIGNATURES = {
+    "distinct": ((_P, _P, _I, _D, _P), ctypes.c_int32),
+    "match_near": ((_P,) * 4, _I),
+    "seek": ((_P,) * 5, _I),
+    "fit_pose": ((_P,) * 3, ctypes.c_int32),
+    "fit_sway": ((_P,) * 4, ctypes.c_int32),
+}
+
+
+@cache
+def _function(name: str) -> Any:
+    return core_function("track", f"rse_pf_{name}", *_SIGNATURES[name])
+
+
 def distinct_distances(
     descriptors: Descriptors, pixels: Array, apart_px: float = 6.0
 ) -> npt.NDArray[np.int32]:
@@ -195,21 +250,20 @@ def distinct_distances(
             f"{len(pixels)} features with descriptors of shape {descriptors.shape}, {descriptors.dtype}",
             hint="give a descriptor and two pixel coordinates for each feature",
         )
-    core = track_core()
-    if core is not None and ORB.describes(descriptors):
-        return core.distinct(descriptors, pixels, apart_px)
-    return distinct_by_numpy(descriptors, pixels, apart_px)
-
-
-def distinct_by_numpy(descriptors: Descriptors, pixels: Array, apart_px: float) -> npt.NDArray[np.int32]:
-    """Return what `distinct_distances` does, without the native core, whose oracle this is."""
+    if ORB.describes(descriptors):
+        descriptors, pixels = aligned(descriptors), aligned(pixels, np.float64)
+        nearest = np.full(len(pixels), _NO_ORB_DISTANCE, dtype=np.int32)
+        _function("distinct")(
+            address_of(descriptors), address_of(pixels), len(pixels), float(apart_px), address_of(nearest)
+        )
+        return nearest
     pixels = np.asarray(pixels, dtype=np.float64)
     distances, none = distance_matrix(descriptors, descriptors), no_distance(descriptors)
     with np.errstate(invalid="ignore", over="ignore"):
         apart = (np.abs(pixels[:, None] - pixels[None]) >= apart_px).any(axis=2)
     distances[~apart | np.eye(len(pixels), dtype=bool)] = none
-    nearest: npt.NDArray[np.int32] = distances.min(axis=1, initial=none).astype(np.int32)
-    return nearest
+    similar: npt.NDArray[np.int32] = distances.min(axis=1, initial=none).astype(np.int32)
+    return similar
 
 
 def match_near(sought: SoughtFeatures, image: ImageFeatures, limits: NearLimits) -> tuple[Rows, Rows]:
@@ -238,14 +292,11 @@ def match_near(sought: SoughtFeatures, image: ImageFeatures, limits: NearLimits)
         )
     if not 0.0 <= limits.radius_px <= _MAX_ABS:
         raise BadRequest(f"a radius of {limits.radius_px:g} px", hint="give 0 to 1e9 px")
-    core = track_core()
-    if core is None or not ORB.describes(image.descriptors):
-        return match_near_by_numpy(sought, image, limits)
-    return core.match_near(
-        (sought.pixels, sought.turns, sought.sizes, sought.descriptors),
-        (image.pixels, image.turns, image.sizes, image.descriptors, image.distinct),
-        _numbers_of(limits, image),
-    )  # fmt: skip
+    if not ORB.describes(image.descriptors):
+        return _match_near_by_numpy(sought, image, limits)
+    arrays = _aligned(sought.pixels, sought.turns, sought.sizes, descriptors=sought.descriptors)
+    request, _held = _near_request(image, limits, arrays, m)
+    return _core_matches(_function("match_near"), (request,), m, n)
 
 
 def expect(
@@ -302,17 +353,50 @@ def seek_near(
         limits: When a feature is the expected one.
         margin_px: Landmarks are expected so far around the image, too.
     """
-    core = track_core()
-    if core is None or not ORB.describes(image.descriptors):
+    if not ORB.describes(image.descriptors):
         expected = expect(looks, numbers, T_camera_world, camera, margin_px)
         rows, features = match_near(expected.features, image, limits)
         return expected.rows[rows], features
-    return core.seek(
-        (looks.points, looks.rays, looks.turns, looks.sizes, looks.descriptors), numbers,
-        (T_camera_world, camera, margin_px), (_NEAREST_M, _MIN_COSINE, _MAX_NEARER, _MAX_FARTHER),
-        (image.pixels, image.turns, image.sizes, image.descriptors, image.distinct),
-        _numbers_of(limits, image),
+    chosen = aligned(numbers, np.int64)
+    arrays = _aligned(looks.points, looks.rays, looks.turns, looks.sizes, descriptors=looks.descriptors)
+    request = _SeekRequest(
+        _ABI, 0, len(chosen), len(looks.points), address_of(chosen), *map(address_of, arrays),
+        camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, margin_px,
+        _NEAREST_M, _MIN_COSINE, _MAX_NEARER, _MAX_FARTHER, (_D * 16)(*T_camera_world.ravel().tolist()),
     )  # fmt: skip
+    near, _held = _near_request(image, limits)
+    return _core_matches(_function("seek"), (request, near), len(chosen), len(image))
+
+
+def _aligned(*arrays: Array, descriptors: npt.NDArray[np.uint8]) -> list[npt.NDArray[Any]]:
+    """Return arrays of numbers and their descriptors as the native core reads them."""
+    return [*(aligned(array, np.float64) for array in arrays), aligned(descriptors)]
+
+
+def _near_request(
+    image: ImageFeatures, limits: NearLimits, sought: Sequence[npt.NDArray[Any]] = (), sought_rows: int = 0
+) -> tuple[_NearRequest, list[npt.NDArray[Any]]]:
+    """Return a request, and the arrays of *image* that it points to, which must live as long."""
+    arrays = _aligned(image.pixels, image.turns, image.sizes, descriptors=image.descriptors)
+    arrays.append(aligned(image.distinct, np.int32))
+    sought_at: list[int | None] = [None] * 4
+    sought_at[: len(sought)] = map(address_of, sought)
+    *numbers, max_distance = _numbers_of(limits, image)
+    request = _NearRequest(
+        _ABI, 0, sought_rows, len(image), *sought_at, *map(address_of, arrays), *map(float, numbers),
+        int(min(max(max_distance, -1), _NO_ORB_DISTANCE)),
+    )  # fmt: skip
+    return request, arrays
+
+
+def _core_matches(
+    function: Any, requests: Sequence[ctypes.Structure], sought_rows: int, image_rows: int
+) -> tuple[Rows, Rows]:
+    """Return the rows that a function of the native core matches."""
+    rows, columns = np.empty((2, min(sought_rows, image_rows)), dtype=np.int64)
+    workspace = _WORKSPACE.words(11 * sought_rows + 12 * image_rows + _CELL_WORDS)
+    count = function(*map(ctypes.byref, requests), *map(address_of, (workspace, rows, columns)))
+    return rows[: max(0, count)], columns[: max(0, count)]
 
 
 def _numbers_of(limits: NearLimits, image: ImageFeatures) -> tuple[float, float, float, float, float, int]:
@@ -324,16 +408,16 @@ def _numbers_of(limits: NearLimits, image: ImageFeatures) -> tuple[float, float,
     )  # fmt: skip
 
 
-def match_near_by_numpy(
+def _match_near_by_numpy(
     sought: SoughtFeatures, image: ImageFeatures, limits: NearLimits
 ) -> tuple[Rows, Rows]:
-    """Return what `match_near` does, without the native core, whose oracle this is."""
+    """Return what `match_near` does of descriptors of any kind."""
     radius_px, ratio, distinct_ratio, min_cosine, max_size_ratio, max_distance = _numbers_of(limits, image)
     empty = np.empty(0, dtype=np.int64)
     if not len(sought.pixels) or not len(image):
         return empty, empty
     with np.errstate(invalid="ignore", over="ignore"):
-        rows, columns = pairs_within(
+        rows, columns = _pairs_within(
             np.asarray(sought.pixels, np.float64), np.asarray(image.pixels, np.float64), radius_px
         )
         a, b = np.asarray(sought.turns, np.float64)[rows], np.asarray(image.turns, np.float64)[columns]
@@ -366,6 +450,39 @@ def match_near_by_numpy(
     _, firsts = np.unique(columns[nearest_first], return_index=True)
     chosen = np.sort(nearest_first[firsts])
     return rows[chosen].astype(np.int64), columns[chosen]
+
+
+def _pairs_within(predicted: Array, pixels: Array, radius_px: float) -> tuple[Rows, Rows]:
+    """Return all pairs (row of predicted, row of pixels) within the radius.
+
+    The pixels are sorted by bands of rows, and by column within a band, so that each prediction looks at a
+    stretch of three bands only.
+    """
+    reach = radius_px + 1.0  # the sum of a pixel and a radius is rounded
+    known = np.flatnonzero((np.abs(predicted) <= _MAX_ABS).all(axis=1))
+    predicted = predicted[known]
+    key = _key(np.floor(pixels[:, 1] / reach), pixels[:, 0])
+    order = np.argsort(key, kind="stable")
+    key = key[order]
+    band = np.floor(predicted[:, 1] / reach)
+    pairs: list[tuple[Rows, Rows]] = []
+    for offset in (-1, 0, 1):
+        first = np.searchsorted(key, _key(band + offset, predicted[:, 0] - reach))
+        last = np.searchsorted(key, _key(band + offset, predicted[:, 0] + reach), side="right")
+        counts = last - first
+        rows = np.repeat(np.arange(len(predicted)), counts)
+        offsets = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)
+        columns = order[np.repeat(first, counts) + offsets]
+        apart = pixels[columns] - predicted[rows]
+        near = apart[:, 0] * apart[:, 0] + apart[:, 1] * apart[:, 1] <= radius_px * radius_px
+        pairs.append((known[rows[near]], columns[near].astype(np.int64)))
+    return np.concatenate([rows for rows, _ in pairs]), np.concatenate([columns for _, columns in pairs])
+
+
+def _key(band: Array, x: Array) -> Array:
+    """Return numbers that sort by band, then by column; columns far outside stay in their band."""
+    key: Array = band * _BAND + np.clip(x, -0.4 * _BAND, 0.4 * _BAND)
+    return key
 
 
 def fit_pose(
@@ -403,51 +520,29 @@ def fit_pose(
         raise BadRequest(
             "observations of different numbers of rows", hint="give one row for each landmark, and a 4x4 pose"
         )
-    core = track_core()
-    if core is None:
-        return fit_pose_by_numpy(observed, camera, T_camera_world, cauchy=cauchy, gate2=gate2)
-    fitted = core.fit_pose(*_packed(observed), camera, (cauchy * cauchy, gate2), T_camera_world)
-    if fitted is None:
+    is_inlier = np.zeros(n, dtype=np.uint8)
+    result = _FitResult()
+    request, _held = _fit_request(observed, camera, T_camera_world, cauchy, gate2)
+    if _function("fit_pose")(ctypes.byref(request), address_of(is_inlier), ctypes.byref(result)):
         return None
-    return FittedPose(T_camera_world=fitted[0], information=fitted[1], is_inlier=fitted[2])
+    return FittedPose(
+        T_camera_world=np.array(result.T_camera_world).reshape(4, 4),
+        information=np.array(result.information).reshape(6, 6), is_inlier=is_inlier.view(bool),
+    )  # fmt: skip
 
 
-def _packed(observed: Observations) -> tuple[tuple[Array, Array], tuple[Array, Array, Array, Array]]:
-    """Return points with the upper triangles of their covariances, and what was measured of them."""
+def _fit_request(
+    observed: Observations, camera: Camera, T_camera_world: Array, cauchy: float, gate2: float
+) -> tuple[_FitRequest, list[Array]]:
+    """Return a request, and the arrays that it points to, which must live as long."""
     upper = observed.spreads.reshape(-1, 9)[:, (0, 1, 2, 4, 5, 8)]
     measured = observed.pixels, observed.pixels_px, observed.depths_m, observed.depths_dev_m
-    return (observed.points, upper), measured
-
-
-def fit_pose_by_numpy(
-    observed: Observations, camera: Camera, T_camera_world: Array, *, cauchy: float, gate2: float
-) -> FittedPose | None:
-    """Return what `fit_pose` does, without the native core, whose oracle this is."""
-    if not _is_whole(observed, camera, T_camera_world, (cauchy**2, gate2)):
-        return None
-    T = T_camera_world
-    try:
-        for iteration in range(_ITERATIONS):
-            J, W, residual, distance2, is_inlier = _linearised(observed, camera, T, gate2)
-            weight = 1.0 / (1.0 + distance2 / cauchy**2)
-            if iteration >= _FIRST_GATED:
-                weight = weight * is_inlier
-            information = np.einsum("nia,nij,njb,n->ab", J, W, J, weight, optimize=True)
-            gradient = np.einsum("nia,nij,nj,n->a", J, W, residual, weight, optimize=True)
-            np.linalg.cholesky(information)
-            twist = np.linalg.solve(information, gradient)
-            if not np.abs(twist).max() <= _MAX_TWIST:
-                return None
-            T = exp_se3(twist) @ T
-            if np.abs(twist).max() < _CONVERGED and iteration > _FIRST_GATED:
-                break
-        J, W, _, _, is_inlier = _linearised(observed, camera, T, gate2)
-        information = np.einsum("nia,nij,njb,n->ab", J, W, J, is_inlier.astype(float), optimize=True)
-        if not np.isfinite(T).all() or _has_free_motion(information):
-            return None
-    except np.linalg.LinAlgError:
-        return None
-    return FittedPose(T_camera_world=T, information=information, is_inlier=is_inlier)
+    arrays = [aligned(array, np.float64) for array in (observed.points, upper, *measured)]
+    request = _FitRequest(
+        _ABI, 0, len(arrays[0]), *map(address_of, arrays), camera.fx, camera.fy, camera.cx, camera.cy,
+        float(cauchy * cauchy), float(gate2), (_D * 16)(*T_camera_world.ravel().tolist()),
+    )  # fmt: skip
+    return request, arrays
 
 
 def fit_sway(
@@ -464,123 +559,9 @@ def fit_sway(
         T_camera_world: ``(4, 4)``, the pose that fits.
         cauchy: As in `fit_pose`.
     """
-    core = track_core()
-    if core is None:
-        return fit_sway_by_numpy(observed, sways, camera, T_camera_world, cauchy=cauchy)
-    return core.fit_sway(*_packed(observed), sways, camera, cauchy * cauchy, T_camera_world)
-
-
-def fit_sway_by_numpy(
-    observed: Observations, sways: Array, camera: Camera, T_camera_world: Array, *, cauchy: float
-) -> tuple[float, float]:
-    """Return what `fit_sway` does, without the native core, whose oracle this is."""
-    J, W, residual, distance2, _ = _linearised(observed, camera, T_camera_world, np.inf)
-    slopes = np.concatenate([J, J[:, :, :3] @ sways[:, :, None]], axis=2)
-    weighted = (W @ slopes) / (1.0 + distance2 / cauchy**2)[:, None, None]
-    information = np.tensordot(slopes, weighted, axes=((0, 1), (0, 1)))
-    gradient = np.tensordot(weighted, residual, axes=((0, 1), (0, 1)))
-    try:
-        by_pose = np.linalg.solve(information[:6, :6], information[:6, 6])
-    except np.linalg.LinAlgError:
-        return 0.0, 0.0
-    own = float(information[6, 6] - information[6, :6] @ by_pose)
-    if not own > _OWN * float(information[6, 6]):
-        return 0.0, 0.0
-    return float(gradient[6] - by_pose @ gradient[:6]) / own, own
-
-
-def _is_whole(observed: Observations, camera: Camera, T: Array, limits: tuple[float, float]) -> bool:
-    """Return whether all numbers are finite and such as a camera measures."""
-    has_depth = observed.depths_m > 0.0
-    diagonals = observed.spreads[:, (0, 1, 2), (0, 1, 2)]
-    anything = (observed.points, observed.pixels, observed.spreads, np.array([camera.cx, camera.cy]), T)
-    within = (
-        (np.array([camera.fx, camera.fy, limits[0]]), 1e-9, _MAX_ABS), (np.array(limits[1]), 0.0, _MAX_ABS),
-        (diagonals, 0.0, _MAX_ABS), (observed.pixels_px, 1e-3, 1e6), (observed.depths_m, 0.0, 1e3),
-        (observed.depths_dev_m[has_depth], 1e-6, 1e3),
-    )  # fmt: skip
-    return all((np.abs(numbers) <= _MAX_ABS).all() for numbers in anything) and all(
-        ((numbers >= low) & (numbers <= high)).all() for numbers, low, high in within
-    )
-
-
-def _has_free_motion(information: Array) -> bool:
-    """Return whether the information, scaled to a diagonal of 1, has no least eigenvalue to speak of.
-
-    Points on a line have 1e-14 and less, a mark of 20 px, without depth, 1e-9.
-    """
-    diagonal = np.diag(information)
-    if not ((diagonal >= 1e-300) & (diagonal <= 1e300)).all():
-        return True
-    scales = 1.0 / np.sqrt(diagonal)
-    least = np.linalg.eigvalsh(information * scales[:, None] * scales)[0]
-    return not least > _FREE
-
-
-def _linearised(
-    observed: Observations, camera: Camera, T: Array, gate2: float
-) -> tuple[Array, Array, Array, Array, npt.NDArray[np.bool_]]:
-    """Return slopes by the twist, weights, residuals, their squared distances, and who is within the gate."""
-    has_depth = observed.depths_m > 0.0
-    p = observed.points @ T[:3, :3].T + T[:3, 3]
-    is_ahead = p[:, 2] > _NEAR_M
-    p[:, 2] = np.maximum(p[:, 2], _NEAR_M)
-    x, y, z = p.T
-    n = len(p)
-    residual = np.stack(
-        [
-            observed.pixels[:, 0] - (camera.fx * x / z + camera.cx),
-            observed.pixels[:, 1] - (camera.fy * y / z + camera.cy),
-            np.where(has_depth, observed.depths_m - z, 0.0),
-        ],
-        axis=1,
-    )
-    by_point = np.zeros((n, 3, 3))
-    by_point[:, 0, 0], by_point[:, 0, 2] = camera.fx / z, -camera.fx * x / z**2
-    by_point[:, 1, 1], by_point[:, 1, 2] = camera.fy / z, -camera.fy * y / z**2
-    by_point[:, 2, 2] = has_depth
-    by_twist = np.concatenate([np.broadcast_to(np.eye(3), (n, 3, 3)), -skew(p)], axis=2)
-    by_world = by_point @ T[:3, :3]
-    variance = by_world @ observed.spreads @ by_world.transpose(0, 2, 1)
-    variance[:, (0, 1), (0, 1)] += (observed.pixels_px**2)[:, None]
-    variance[:, 2, 2] = np.where(has_depth, variance[:, 2, 2] + observed.depths_dev_m**2, 1.0)
-    W = np.linalg.inv(variance)
-    distance2 = np.einsum("ni,nij,nj->n", residual, W, residual)
-    # A covariance that is none gives no distance, or a negative one.
-    is_distance = (distance2 >= 0.0) & (distance2 <= _MAX_DISTANCE2)
-    W = np.where(is_distance[:, None, None], W, 0.0)
-    distance2 = np.where(is_distance, distance2, _MAX_DISTANCE2)
-    return by_point @ by_twist, W, residual, distance2, (distance2 < gate2) & is_ahead
-
-
-def pairs_within(predicted: Array, pixels: Array, radius_px: float) -> tuple[Rows, Rows]:
-    """Return all pairs (row of predicted, row of pixels) within the radius.
-
-    The pixels are sorted by bands of rows, and by column within a band, so that each prediction looks at a
-    stretch of three bands only.
-    """
-    reach = radius_px + 1.0  # the sum of a pixel and a radius is rounded
-    known = np.flatnonzero((np.abs(predicted) <= _MAX_ABS).all(axis=1))
-    predicted = predicted[known]
-    key = _key(np.floor(pixels[:, 1] / reach), pixels[:, 0])
-    order = np.argsort(key, kind="stable")
-    key = key[order]
-    band = np.floor(predicted[:, 1] / reach)
-    pairs: list[tuple[Rows, Rows]] = []
-    for offset in (-1, 0, 1):
-        first = np.searchsorted(key, _key(band + offset, predicted[:, 0] - reach))
-        last = np.searchsorted(key, _key(band + offset, predicted[:, 0] + reach), side="right")
-        counts = last - first
-        rows = np.repeat(np.arange(len(predicted)), counts)
-        offsets = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)
-        columns = order[np.repeat(first, counts) + offsets]
-        apart = pixels[columns] - predicted[rows]
-        near = apart[:, 0] * apart[:, 0] + apart[:, 1] * apart[:, 1] <= radius_px * radius_px
-        pairs.append((known[rows[near]], columns[near].astype(np.int64)))
-    return np.concatenate([rows for rows, _ in pairs]), np.concatenate([columns for _, columns in pairs])
-
-
-def _key(band: Array, x: Array) -> Array:
-    """Return numbers that sort by band, then by column; columns far outside stay in their band."""
-    key: Array = band * _BAND + np.clip(x, -0.4 * _BAND, 0.4 * _BAND)
-    return key
+    sways = aligned(sways, np.float64)
+    request, _held = _fit_request(observed, camera, T_camera_world, cauchy, 0.0)
+    fitted = np.zeros(2)
+    at = address_of(fitted)
+    _function("fit_sway")(ctypes.byref(request), address_of(sways), at, at + fitted.itemsize)
+    return float(fitted[0]), float(fitted[1])

@@ -22,7 +22,7 @@ from tests.synthetic_maps import make_world
 
 pytestmark = pytest.mark.slow
 
-for package in ("distributed", "faiss", "gtsam"):
+for package in ("distributed", "gtsam"):
     pytest.importorskip(package, reason="the extra batch is not installed")
 
 MERGE = ("run", "merge", "a", "b", "--out", "hall", "--json")

@@ -20,8 +20,7 @@ from rse_pf.object_store import MemoryStore
 from rse_pf.slam.map_merge import Atlas, MergedMap, MergeOptions, merge_versions, propose_links
 from tests.synthetic_maps import make_world
 
-for package in ("faiss", "gtsam"):
-    pytest.importorskip(package, reason="the extra maps is not installed")
+pytest.importorskip("gtsam", reason="the extra maps is not installed")
 
 SETTINGS = PlatformSettings().replace(batch={"pairs_per_part": 40})
 NAMES = ("maps/a", "maps/b")

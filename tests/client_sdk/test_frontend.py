@@ -1,29 +1,21 @@
-"""Features, matches and the tracker's decisions, on pictures whose motion is known exactly."""
+"""Features and their points, on pictures whose depth is known exactly."""
 
 from __future__ import annotations
 
-from collections import Counter
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from client_sdk.frontend import (
-    Features,
-    Frame,
-    FrontEndOptions,
-    describe,
-    extract,
-    match,
-    round_for_wire,
-)
+from client_sdk.frontend import Frame, FrontEndOptions, describe, extract, points_at, round_for_wire
 from rse_pf.errors import UsageError
-from rse_pf.geometry import Array, Camera, transform
+from rse_pf.geometry import Camera
 from rse_pf.pnp import PnpOptions
 from rse_pf.services.pnp import make_request
-from rse_pf.slam.descriptors import distances_of_pairs
+from rse_pf.slam.descriptors import distances_of_pairs, match_all
 from rse_pf.slam.orb import describe_at
 from rse_pf.wire import Command, make_codec
+from tests.oracles import depths
 
 cv2 = pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
 
@@ -45,48 +37,18 @@ def wall_frame(shift_px: int, timestamp_s: float = 0.0) -> Frame:
     return Frame(timestamp_s=timestamp_s, rgb=rgb, depth_m=depth_m, camera=CAMERA)
 
 
-def blank_frame() -> Frame:
-    rgb = np.full((240, 320, 3), 128, np.uint8)
-    return Frame(timestamp_s=0.0, rgb=rgb, depth_m=np.full((240, 320), 2.0, np.float32), camera=CAMERA)
-
-
-def pushed(metres: float) -> Array:
-    """Return ``T_camera_reference`` of a camera that moved along x."""
-    pose = np.eye(4)
-    pose[0, 3] = -metres
-    return pose
-
-
 def test_matches_of_a_known_motion_agree_with_it():
     before, after = extract(wall_frame(0), OPTIONS), extract(wall_frame(16), OPTIONS)
 
-    found = match(before, after, OPTIONS)
+    rows, columns = match_all(before.descriptors, after.descriptors)
 
-    expected = CAMERA.project(transform(pushed(16 * PX_M), found.points_world))
-    errors = np.linalg.norm(expected - found.pixels, axis=1)
-    assert len(found) > 150
+    known = np.isfinite(before.points_camera[rows, 2])
+    rows, columns = rows[known], columns[known]
+    expected = CAMERA.project(before.points_camera[rows] - (16 * PX_M, 0.0, 0.0))
+    errors = np.linalg.norm(expected - after.pixels[columns], axis=1)
+    assert len(rows) > 150
     assert np.mean(errors < 3.0) > 0.85
     assert np.median(errors) < 1.0
-
-
-def test_matches_carry_the_depth_of_the_frame_in_millimetres():
-    frame = wall_frame(16)
-    frame.depth_m[:, :] += np.float32(0.12345)
-    frame.depth_m[:, 200:] = 0.0
-
-    found = match(extract(wall_frame(0), OPTIONS), extract(frame, OPTIONS), OPTIONS)
-
-    x, y = found.pixels.T
-    clear = (np.abs(y - 119.5) > 2.0) & (np.abs(x - 199.5) > 2.0)  # away from the edges of depth
-    expected = np.where(x > 199.5, 0.0, np.where(y < 119.5, 2.123, 1.123))
-    np.testing.assert_array_equal(found.depths_m[clear], expected[clear])
-    assert 0 < np.count_nonzero(found.depths_m[clear]) < np.count_nonzero(clear)
-
-
-def test_frames_without_matches_have_no_depths():
-    found = match(extract(blank_frame(), OPTIONS), extract(blank_frame(), OPTIONS), OPTIONS)
-
-    assert found.depths_m.shape == (0,)
 
 
 def test_points_are_where_the_depth_says():
@@ -121,41 +83,35 @@ def test_a_depth_is_used_only_on_a_surface(patch: list[list[float]], expected: f
     np.testing.assert_allclose(found, np.full(len(found), expected), rtol=0.03)
 
 
-def test_no_pixel_is_matched_twice_and_the_best_are_kept():
-    features = extract(wall_frame(0), OPTIONS)
-    doubled = Features(
-        pixels=np.vstack((features.pixels, features.pixels)),
-        descriptors=np.vstack((features.descriptors, features.descriptors)),
-        points_camera=np.vstack((features.points_camera, features.points_camera)),
-        turns=np.vstack((features.turns, features.turns)),
-        sizes=np.hstack((features.sizes, features.sizes)),
-    )
+@pytest.mark.parametrize("kind", ["plane", "holes", "edges", "nothing", "strange"])
+def test_points_are_those_of_the_definition_to_the_last_bit(kind: str):
+    rng = np.random.default_rng(7)
+    camera = Camera(fx=500.0, fy=510.0, cx=31.5, cy=23.25, width=64, height=48)
+    depth_m = rng.uniform(1.9, 2.1, (48, 64)).astype(np.float32)
+    if kind == "holes":
+        depth_m[rng.random(depth_m.shape) < 0.4] = 0.0
+    elif kind == "edges":
+        depth_m *= rng.choice([1.0, 1.02, 4.0], (48, 1)).astype(np.float32)
+    elif kind == "nothing":
+        depth_m[:] = 0.0
+    elif kind == "strange":
+        strange = np.float32([np.nan, np.inf, -np.inf, -2.0, -0.0, 1e-45, 3e38, 2.0])
+        depth_m = strange[rng.choice(8, (48, 64), p=[0.06] * 7 + [0.58])]
+    beyond = [[-5.0, 3.0], [0.5, 0.5], [1.5, 1.5], [62.5, 46.5], [62.4, 46.4], [1e9, 2.0], [64.0, 48.0]]
+    pixels = np.vstack((rng.uniform(-1, 65, (500, 2)), np.round(rng.uniform(0, 64, (99, 2))) - 0.5, beyond))
+    frame = Frame(timestamp_s=0.0, rgb=np.zeros((48, 64, 3), np.uint8), depth_m=depth_m, camera=camera)
 
-    every = match(doubled, features, OPTIONS)
-    some = match(doubled, features, FrontEndOptions(max_matches=50))
+    found = points_at(frame, pixels, OPTIONS)
 
-    there = Counter(map(tuple, np.round(features.pixels, 2)))  # some features share a pixel
-    assert all(count <= there[pixel] for pixel, count in Counter(map(tuple, every.pixels)).items())
-    assert len(every) > 100
-    assert len(some) == 50
+    assert found.tobytes() == depths.points_at(depth_m, pixels, camera, 0.3, 6.0, 0.05).tobytes()
+    assert np.isfinite(found).any() == (kind != "nothing")
+    assert np.isnan(found).any()
 
 
 def test_numbers_are_rounded_for_the_wire():
     points, pixels = round_for_wire(np.array([[1.23456, -0.00004, 2.0]]), np.array([[10.126, 5.0]]))
     assert points.tolist() == [[1.2346, -0.0, 2.0]]
     assert pixels.tolist() == [[10.13, 5.0]]
-    found = match(extract(wall_frame(0), OPTIONS), extract(wall_frame(7), OPTIONS), OPTIONS)
-    again = round_for_wire(found.points_world, found.pixels)
-    np.testing.assert_array_equal(found.points_world, again[0])
-    np.testing.assert_array_equal(found.pixels, again[1])
-
-
-def test_the_same_frame_gives_the_same_matches():
-    first, second = (
-        match(extract(wall_frame(0), OPTIONS), extract(wall_frame(9), OPTIONS), OPTIONS) for _ in "ab"
-    )
-    np.testing.assert_array_equal(first.points_world, second.points_world)
-    np.testing.assert_array_equal(first.pixels, second.pixels)
 
 
 def test_options_that_cannot_work_and_frames_that_do_not_fit_are_refused():

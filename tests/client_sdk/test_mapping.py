@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from client_sdk import mapping
 from client_sdk.frontend import Frame
 from client_sdk.mapping import (
     MapOptions,
@@ -19,18 +18,10 @@ from client_sdk.mapping import (
     write_trajectory,
 )
 from rse_pf.errors import UsageError
-from rse_pf.geometry import Camera, exp_se3
+from rse_pf.geometry import Camera, exp_se3, transform
+from tests.oracles import depths
 
 CAMERA = Camera(fx=20.0, fy=20.0, cx=9.5, cy=7.5, width=20, height=16)
-
-
-@pytest.fixture(autouse=True, params=["native", "numpy"])
-def either(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Run each test with the native core, and without."""
-    if request.param == "numpy":
-        monkeypatch.setattr(mapping, "cloud_core", lambda: None)
-    elif mapping.cloud_core() is None:
-        pytest.skip("the native core is not built: make -C native")
 
 
 def flat_frame(depth_m: float = 2.0) -> Frame:
@@ -95,7 +86,7 @@ def test_a_full_map_refuses_new_voxels_and_still_refines_old_ones():
     assert cloud.add_points(points, colours) == 100
     again = cloud.add_points(points, colours)
 
-    assert (len(cloud), again, cloud.refused_points) == (100, 100, 800)
+    assert (len(cloud), again) == (100, 100)
     assert len(cloud.points(min_readings=2)[0]) == 100
 
 
@@ -124,6 +115,34 @@ def test_readings_beside_a_depth_step_or_out_of_range_are_left_out():
     used = cloud.add(frame, np.eye(4))
 
     assert used == 16 * (20 - 2 - 2 - 1)  # two columns at the step, two beyond 3.5 m, one beside them
+
+
+@pytest.mark.parametrize("every_px", [1, 2, 3])
+def test_a_map_of_frames_is_that_of_the_definition(every_px: int):
+    rng = np.random.default_rng(2)
+    options, pose = MapOptions(voxel_m=0.2, every_px=every_px), exp_se3(rng.normal(size=6) * 0.3)
+    cloud, points, colours = PointMap(options), [], []
+    for _ in range(3):
+        depth_m = rng.choice(
+            [0.0, 0.2, 2.0, 2.05, 2.3, 3.4, 3.6, np.nan], (16, 20), p=[0.05] * 4 + [0.65] + [0.05] * 3
+        )
+        frame = Frame(
+            timestamp_s=0.0, rgb=rng.integers(0, 256, (16, 20, 3)).astype(np.uint8),
+            depth_m=depth_m.astype(np.float32), camera=CAMERA,
+        )  # fmt: skip
+        seen, seen_colours = depths.frame_readings(frame, options)
+        points.append(transform(pose, seen))
+        colours.append(seen_colours)
+
+        assert cloud.add(frame, pose) == len(seen) > 2
+
+    expected = depths.voxel_means(np.concatenate(points), np.concatenate(colours), options.voxel_m)
+    found, found_colours = cloud.points()
+    assert len(found) == len(expected)
+    for point, colour in zip(found, found_colours, strict=True):
+        nearest = min(expected.values(), key=lambda mean: np.abs(mean[:3] - point).max())
+        np.testing.assert_allclose(point, nearest[:3], atol=1e-5)
+        np.testing.assert_allclose(colour, nearest[3:], atol=0.51)
 
 
 @pytest.mark.parametrize("bad", [{"voxel_m": 0.0}, {"every_px": 0}, {"max_points": 0}])

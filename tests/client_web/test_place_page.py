@@ -22,7 +22,6 @@ from tests.examples.conftest import ExamplePlatform, Program
 from tests.examples.conftest import platform as platform
 
 cv2 = pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
-pytest.importorskip("faiss", reason="pip install 'rse-pf[maps]'")
 from client_sdk.frontend import FrontEndOptions, extract  # noqa: E402
 from client_sdk.simulator import make_world, render_along, true_trajectory  # noqa: E402
 from client_sdk.transfer.data_client import DataClient  # noqa: E402

@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 
 cv2 = pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
-pytest.importorskip("faiss", reason="pip install 'rse-pf[maps]'")
 from fake_data_service import Answer, Service, small_settings  # noqa: E402
 from hostile.hostile_images import HARMLESS, hostile_images, photo  # noqa: E402
 

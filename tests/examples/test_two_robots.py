@@ -9,7 +9,7 @@ import pytest
 from client_sdk.mapping import read_ply
 from tests.examples.conftest import ExamplePlatform
 
-for _package in ("cv2", "gtsam", "faiss"):
+for _package in ("cv2", "gtsam"):
     pytest.importorskip(_package, reason="pip install 'rse-pf[vision,maps]'")
 from tests.examples.rendered_inputs import write_drives  # noqa: E402  after importorskip
 

@@ -12,8 +12,8 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from client_sdk.monocular.descriptors import match_all
 from client_sdk.slots import FeaturesFunction, FeaturesSlot, FoundFeatures
+from rse_pf.slam.descriptors import match_all
 
 FOLDER = Path(__file__).parents[2] / "examples" / "features"
 

@@ -54,7 +54,6 @@ def test_random_frames_keep_the_rules(data: bytes) -> None:
     [("maps", 200), ("snapshots", 200), ("keyframes", 10), ("graph", 15), ("cloud", 15), ("live", 60)],
 )
 def test_damaged_bytes_give_an_answer_or_a_typed_error(target: str, inputs: int) -> None:
-    pytest.importorskip("faiss", reason="needs the extra 'maps'")
     meter = fuzzed(target, seed=11, inputs=inputs)
 
     assert meter.calls >= inputs
@@ -76,7 +75,6 @@ def test_a_minute_of_fuzzing_finds_nothing(target: str, repository: Path, tmp_pa
         pytest.importorskip("atheris", reason="atheris has no wheel for this Python")
         command += ["--engine", "atheris"]
     else:
-        pytest.importorskip("faiss", reason="needs the extra 'maps'")
         command += ["--seconds", "60"]
 
     done = subprocess.run(command, cwd=repository, capture_output=True, text=True, check=False)

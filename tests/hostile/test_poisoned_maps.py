@@ -87,7 +87,6 @@ def first_point(value: float) -> Callable[[Keyframe], Keyframe]:
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 3e38, -3e38, 1e30, 1e7])
 def test_one_point_of_a_keyframe_does_not_spoil_the_map_for_others(value: float) -> None:
-    pytest.importorskip("faiss", reason="pip install 'rse-pf[maps]'")
     poisoned = with_keyframes(first_point(value))
 
     assert localised(poisoned).verdict == "ok"
@@ -97,7 +96,6 @@ def test_one_point_of_a_keyframe_does_not_spoil_the_map_for_others(value: float)
 
 
 def test_a_keyframe_at_the_end_of_the_world_does_not_spoil_the_map_for_others() -> None:
-    pytest.importorskip("faiss", reason="pip install 'rse-pf[maps]'")
     copy = HONEST.keyframes[3]
     far = np.eye(4)
     far[0, 3] = 9e8
@@ -125,8 +123,6 @@ def test_an_information_beyond_every_sensor_is_refused_at_the_door(value: float)
     [-INFORMATION, np.zeros((6, 6)), np.triu(np.ones((6, 6))), np.diag([1.0, 1, 1, 1, 1, -1e-3])],
 )
 def test_a_merge_names_the_map_whose_information_is_none(information: np.ndarray) -> None:
-    pytest.importorskip("faiss", reason="pip install 'rse-pf[maps]'")
-
     merged = asked("merge", maps=[encode_map(OTHER), encode_map(with_edges(information))])
 
     assert isinstance(merged, Failure)

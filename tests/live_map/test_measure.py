@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 
-import rse_pf.slam.relative_pose as relative_pose
 from rse_pf.geometry import Array, exp_se3, inverse, pose_difference, transform
 from rse_pf.live_map.events import LinksMeasured, matrix_of
 from rse_pf.live_map.measure import joined_links, measure_links, measure_stored
@@ -92,14 +90,6 @@ def test_a_pose_that_the_evidence_calls_weak_is_no_link():
 
     assert found.links == ()
     assert found.failed == {"nearly-collinear": 1}
-
-
-@pytest.mark.skipif(relative_pose.match_core() is None, reason="the native core is not built: make -C native")
-def test_without_the_native_core_the_links_are_the_same(monkeypatch):
-    native = measure_links(numbered(0), [numbered(1), numbered(3)])
-    monkeypatch.setattr(relative_pose, "match_core", lambda: None)
-
-    assert measure_links(numbered(0), [numbered(1), numbered(3)]) == native
 
 
 def test_a_view_of_fewer_than_two_features_gives_no_link():

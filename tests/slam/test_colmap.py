@@ -13,12 +13,8 @@ from slam.exact_maps import OTHER_CAMERA, points_map, world_map
 from rse_pf.errors import UsageError
 from rse_pf.geometry import from_quaternion, inverse
 from rse_pf.maps.format import Edge, MapVersion
-from rse_pf.native_matcher import match_core
 from rse_pf.slam.colmap import colmap_files
 from rse_pf.slam.tracks import find_tracks
-
-if match_core() is None:
-    pytest.importorskip("faiss", reason="pip install 'rse-pf[maps]'")
 
 NO_PYCOLMAP = "pycolmap is not installed, and in no lock: its wheel has 38 MB (pip install pycolmap==4.2.1)"
 

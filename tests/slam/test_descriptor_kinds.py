@@ -97,7 +97,6 @@ def test_distances_are_exact_whole_numbers(kind: DescriptorKind) -> None:
 
 @pytest.mark.parametrize("kind", KINDS, ids=str)
 def test_matches_are_the_nearest_by_the_ratio_and_one_to_one(kind: DescriptorKind) -> None:
-    pytest.importorskip("faiss", reason="the extra maps is not installed")
     view = random_descriptors(kind, 60, 3)
     reference = view[[7, 20, 20, 41]].copy()
     reference[2, 0] ^= 1  # not as near to row 20 as row 1 is
@@ -342,8 +341,6 @@ def asked(service: str, kind: DescriptorKind, **other: Any) -> Result | Failure:
 
 
 def test_a_view_of_the_same_kind_is_found() -> None:
-    pytest.importorskip("faiss", reason="the extra maps is not installed")
-
     answer = asked("place", SIFT, check=False)
 
     assert isinstance(answer, Result), answer

@@ -18,8 +18,6 @@ from rse_pf.slam.relative_pose import View
 from rse_pf.wire import Command, Failure, Result
 from tests.synthetic_maps import make_world
 
-pytest.importorskip("faiss", reason="the extra maps is not installed")
-
 WORLD = make_world(1)
 TURNS = np.linspace(0.0, 1.0, 24, endpoint=False)
 

@@ -19,8 +19,6 @@ from rse_pf.slam.relative_pose import (
     view_of_keyframe,
 )
 
-pytest.importorskip("faiss", reason="the extra maps is not installed")
-
 _NOISE = DepthNoise()
 
 

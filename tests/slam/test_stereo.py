@@ -1,4 +1,4 @@
-"""Disparities of a stereo pair: the native core agrees with numpy, and both with the truth."""
+"""Disparities of a stereo pair agree with their definition, and with the truth."""
 
 from __future__ import annotations
 
@@ -10,27 +10,13 @@ from client_sdk.simulator import SIMULATED_CAMERA, make_world, true_trajectory
 from client_sdk.simulator.camera import Painter, add_image_noise
 from rse_pf.errors import BadRequest
 from rse_pf.geometry import Array
-from rse_pf.native import find_library
-from rse_pf.native_stereo import open_stereo, stereo_core
 from rse_pf.pnp import DepthNoise
-from rse_pf.slam import stereo as stereo_module
-from rse_pf.slam.stereo import StereoOptions, disparities, disparities_by_numpy, stereo_noise
+from rse_pf.slam.stereo import StereoOptions, disparities, stereo_noise
+from tests.oracles import disparities as oracle
 
 Gray = npt.NDArray[np.uint8]
 BASELINE_M = 0.12
 F_BASELINE = SIMULATED_CAMERA.fx * BASELINE_M
-
-needs_library = pytest.mark.skipif(
-    stereo_core() is None, reason="the native core is not built: make -C native"
-)
-
-
-@pytest.fixture(params=[pytest.param("native", marks=needs_library), "numpy"])
-def engine(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
-    """Run a test with the native core, and without."""
-    if request.param == "numpy":
-        monkeypatch.setattr(stereo_module, "stereo_core", lambda: None)
-    return str(request.param)
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +48,7 @@ def errors(found: Array, true: Array, pixels: Array) -> Array:
     return np.asarray(found[rows] - true[lines, columns])
 
 
-def test_disparities_are_right_to_a_tenth_of_a_pixel(engine: str, pair: tuple[Gray, Gray, Array]) -> None:
+def test_disparities_are_right_to_a_tenth_of_a_pixel(pair: tuple[Gray, Gray, Array]) -> None:
     left, right, true = pair
     pixels = textured(left, 1000)
 
@@ -74,23 +60,20 @@ def test_disparities_are_right_to_a_tenth_of_a_pixel(engine: str, pair: tuple[Gr
     assert float((np.abs(wrong) > 1.0).mean()) < 0.03
 
 
-@needs_library
 @pytest.mark.parametrize("most", [16, 64, 200])
-def test_the_native_core_agrees_with_numpy(pair: tuple[Gray, Gray, Array], most: int) -> None:
+def test_disparities_are_those_of_the_definition(pair: tuple[Gray, Gray, Array], most: int) -> None:
     left, right, _ = pair
     pixels = np.concatenate([textured(left, 400), np.random.default_rng(2).uniform(-20, 660, (400, 2))])
     options = StereoOptions(max_disparity_px=most)
 
-    found, expected = (
-        disparities(left, right, pixels, options),
-        disparities_by_numpy(left, right, pixels, options),
-    )
+    found = disparities(left, right, pixels, options)
 
     assert np.isfinite(found).any()
-    np.testing.assert_allclose(found, expected, atol=1e-9, equal_nan=True)
+    np.testing.assert_allclose(
+        found, oracle.disparities(left, right, pixels, options), atol=1e-9, equal_nan=True
+    )
 
 
-@needs_library
 @pytest.mark.parametrize("most", [16, 64, 1024])
 def test_the_processor_changes_no_byte_of_a_disparity(pair: tuple[Gray, Gray, Array], most: int) -> None:
     """The darkest and brightest patches have the largest sums."""
@@ -98,20 +81,17 @@ def test_the_processor_changes_no_byte_of_a_disparity(pair: tuple[Gray, Gray, Ar
     rng = np.random.default_rng(3)
     harsh = (255 * (rng.uniform(size=left.shape) < 0.995)).astype(np.uint8)
     pixels = np.concatenate([textured(left, 400), rng.uniform(-20, 660, (400, 2))])
-    path = find_library()
-    assert path is not None
-    wide, portable = open_stereo(path), open_stereo(path, portable=True)
-    limits = (1.0, 0.64, 0.8)
+    options = StereoOptions(max_disparity_px=most)
 
     for one, other in ((left, right), (harsh, np.roll(harsh, -7, axis=1))):
-        found = wide.disparities(one, other, pixels, limits, most, 1)
+        found = disparities(one, other, pixels, options)
 
         assert np.isfinite(found).any()
-        assert found.tobytes() == portable.disparities(one, other, pixels, limits, most, 1).tobytes()
+        assert found.tobytes() == disparities(one, other, pixels, options, portable=True).tobytes()
 
 
 @pytest.mark.parametrize("fraction", np.linspace(0.0, 0.875, 8).tolist())
-def test_no_fraction_of_a_pixel_is_preferred(engine: str, fraction: float) -> None:
+def test_no_fraction_of_a_pixel_is_preferred(fraction: float) -> None:
     rng = np.random.default_rng(5)
     spectrum = np.fft.rfft(rng.normal(size=(60, 512)), axis=1)
     spectrum[:, 100:] = 0.0
@@ -126,7 +106,7 @@ def test_no_fraction_of_a_pixel_is_preferred(engine: str, fraction: float) -> No
     assert abs(float(np.nanmedian(found)) - 10.0 - fraction) < 0.03
 
 
-def test_what_the_right_camera_does_not_see_has_no_disparity(engine: str) -> None:
+def test_what_the_right_camera_does_not_see_has_no_disparity() -> None:
     """A place hidden from the right camera looks like another one that it sees, whose disparity is 5."""
     rng = np.random.default_rng(6)
     left = np.kron(rng.integers(0, 256, (30, 240)), np.ones((2, 2))).astype(np.uint8)
@@ -144,7 +124,7 @@ def test_what_the_right_camera_does_not_see_has_no_disparity(engine: str) -> Non
     np.testing.assert_allclose(seen, 5.0, atol=0.05)
 
 
-def test_a_repeated_pattern_and_a_plain_wall_have_no_disparity(engine: str) -> None:
+def test_a_repeated_pattern_and_a_plain_wall_have_no_disparity() -> None:
     stripes = np.tile(np.repeat(np.array([40, 200], dtype=np.uint8), 6), (60, 40))
     plain = np.full((60, 480), 90, dtype=np.uint8)
     pixels = np.random.default_rng(7).uniform((100, 8), (400, 52), (200, 2))
@@ -154,7 +134,7 @@ def test_a_repeated_pattern_and_a_plain_wall_have_no_disparity(engine: str) -> N
 
 
 def test_a_pair_whose_images_are_swapped_has_no_disparities_to_speak_of(
-    engine: str, pair: tuple[Gray, Gray, Array]
+    pair: tuple[Gray, Gray, Array],
 ) -> None:
     left, right, _ = pair
     pixels = textured(left, 500)

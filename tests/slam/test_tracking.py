@@ -1,21 +1,17 @@
-"""A tracker's functions: the native core agrees with numpy, poses with the truth; wrong input is refused."""
+"""A tracker's functions agree with their definition, poses with the truth; wrong input is refused."""
 
 from __future__ import annotations
 
 import threading
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import pytest
 
-from rse_pf import native
-from rse_pf.errors import BadRequest, ConfigurationError
+from rse_pf.errors import BadRequest
 from rse_pf.geometry import Array, Camera, exp_se3, inverse, log_se3, transform
-from rse_pf.native_tracker import open_tracker, track_core
-from rse_pf.slam import tracking
 from rse_pf.slam.tracking import (
     FittedPose,
     ImageFeatures,
@@ -23,30 +19,16 @@ from rse_pf.slam.tracking import (
     NearLimits,
     Observations,
     SoughtFeatures,
-    distinct_by_numpy,
     distinct_distances,
     expect,
     fit_pose,
-    fit_pose_by_numpy,
     fit_sway,
-    fit_sway_by_numpy,
     match_near,
-    match_near_by_numpy,
     seek_near,
 )
+from tests.oracles import matching, pose_fit
 
 CAMERA = Camera(fx=525.0, fy=520.0, cx=319.5, cy=239.5, width=640, height=480)
-GATE = {"cauchy": 2.5, "gate2": 11.3}
-needs_library = pytest.mark.skipif(
-    track_core() is None, reason="the native core is not built: make -C native"
-)
-
-
-@pytest.fixture(params=[pytest.param("native", marks=needs_library), "numpy"])
-def either(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Run a test with the native core, and without."""
-    if request.param == "numpy":
-        monkeypatch.setattr(tracking, "track_core", lambda: None)
 
 
 # --- landmarks where a pose expects them ---------------------------------------------------------
@@ -64,9 +46,8 @@ def looks_of(rng: np.random.Generator, n: int) -> LandmarkLooks:
     )  # fmt: skip
 
 
-@needs_library
 @pytest.mark.parametrize("seed", range(20))
-def test_landmarks_that_a_pose_expects_are_those_of_numpy(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_landmarks_are_matched_where_a_pose_expects_them(seed: int) -> None:
     rng = np.random.default_rng(seed)
     looks = looks_of(rng, 400)
     T = exp_se3(rng.normal(0.0, 0.1, 6))
@@ -83,11 +64,11 @@ def test_landmarks_that_a_pose_expects_are_those_of_numpy(seed: int, monkeypatch
 
     rows, features = seek_near(looks, numbers, T, CAMERA, image, limits, 10.0)
 
-    monkeypatch.setattr(tracking, "track_core", lambda: None)
-    expected = seek_near(looks, numbers, T, CAMERA, image, limits, 10.0)
+    expected = expect(looks, numbers, T, CAMERA, 10.0)
+    sought, columns = matching.match_near(expected.features, image, limits)
     assert len(rows) > 5
-    np.testing.assert_array_equal(rows, expected[0])
-    np.testing.assert_array_equal(features, expected[1])
+    np.testing.assert_array_equal(rows, expected.rows[sought])
+    np.testing.assert_array_equal(features, columns)
 
 
 # --- matches -----------------------------------------------------------------------------------
@@ -142,7 +123,7 @@ def request_of(seed: int) -> tuple[SoughtFeatures, ImageFeatures, NearLimits]:
     )  # fmt: skip
     image = ImageFeatures(
         pixels=pixels, descriptors=bits, turns=angles(rng, n), sizes=1.2 ** rng.integers(0, 4, n),
-        distinct=distinct_by_numpy(bits, pixels, 6.0),
+        distinct=matching.distinct_distances(bits, pixels, 6.0).astype(np.int32),
     )  # fmt: skip
     limits = NearLimits(
         radius_px=float(rng.choice([0.0, 3.0, 8.0, 40.0, 5000.0, 1e9])),
@@ -153,8 +134,7 @@ def request_of(seed: int) -> tuple[SoughtFeatures, ImageFeatures, NearLimits]:
     return sought, image, limits
 
 
-@needs_library
-def test_matches_and_distances_are_those_of_numpy() -> None:
+def test_matches_and_distances_are_those_of_the_definition() -> None:
     counts, similar = [], 0
     for seed in range(600):
         sought, image, limits = request_of(seed)
@@ -163,11 +143,12 @@ def test_matches_and_distances_are_those_of_numpy() -> None:
         apart_px = (0.0, 6.0, 40.0, np.nan)[seed % 4]
         distances = distinct_distances(image.descriptors, image.pixels, apart_px)
 
-        expected = match_near_by_numpy(sought, image, limits)
+        expected = matching.match_near(sought, image, limits)
         assert (rows.tolist(), columns.tolist()) == tuple(each.tolist() for each in expected), seed
-        assert rows.dtype == columns.dtype == expected[0].dtype == expected[1].dtype == np.int64
+        assert rows.dtype == columns.dtype == np.int64
         assert distances.dtype == np.int32
-        assert distances.tolist() == distinct_by_numpy(image.descriptors, image.pixels, apart_px).tolist()
+        of_all = matching.distinct_distances(image.descriptors, image.pixels, apart_px)
+        assert distances.tolist() == of_all.tolist()
         counts.append(len(rows))
         similar += int((distances < 256).sum())
     assert counts.count(0) > 50
@@ -200,7 +181,6 @@ def matched(sought: dict[str, Any], image: ImageFeatures, **limits: float) -> li
     return list(zip(rows.tolist(), columns.tolist(), strict=True))
 
 
-@pytest.mark.usefixtures("either")
 def test_the_nearest_within_the_radius_and_every_limit_is_taken() -> None:
     sought = flat([(100, 100)], [0])
 
@@ -218,7 +198,6 @@ def test_the_nearest_within_the_radius_and_every_limit_is_taken() -> None:
         assert bool(matched(sought, replace(image_of([(100, 100)], [0]), sizes=np.array([size])))) == is_like
 
 
-@pytest.mark.usefixtures("either")
 def test_one_feature_goes_to_the_nearest_and_to_the_first_of_equals() -> None:
     image = image_of([(50, 50)], [0])
 
@@ -226,7 +205,6 @@ def test_one_feature_goes_to_the_nearest_and_to_the_first_of_equals() -> None:
     assert matched(flat([(50, 50)], [5]), image_of([(50, 51), (50, 50)], [0, 0]), ratio=1.5) == [(0, 0)]
 
 
-@pytest.mark.usefixtures("either")
 def test_places_that_are_none_match_nothing_and_disturb_nothing() -> None:
     nan, inf = float("nan"), float("inf")
     wrong = [(nan, 5.0), (5.0, nan), (inf, 5.0), (5.0, -inf), (inf, inf), (2e9, 5.0)]
@@ -239,7 +217,6 @@ def test_places_that_are_none_match_nothing_and_disturb_nothing() -> None:
     assert matched(flat([(7.5, 2.0)], [0]), image_of([(7.5, 2.0)], [0]), radius_px=0.0) == [(0, 0)]
 
 
-@pytest.mark.usefixtures("either")
 def test_other_numbers_and_gaps_in_memory_give_the_same() -> None:
     sought, image, limits = next(
         request
@@ -276,7 +253,6 @@ def test_other_numbers_and_gaps_in_memory_give_the_same() -> None:
     )
 
 
-@pytest.mark.usefixtures("either")
 @pytest.mark.parametrize(
     "change",
     [
@@ -297,14 +273,12 @@ def test_features_that_do_not_fit_are_refused(change: dict[str, Array]) -> None:
             match_near(replace(sought, **change), image, NearLimits(radius_px=3.0))
 
 
-@pytest.mark.usefixtures("either")
 @pytest.mark.parametrize("radius_px", [-1.0, np.nan, np.inf, 1e10])
 def test_a_radius_that_is_none_is_refused(radius_px: float) -> None:
     with pytest.raises(BadRequest, match="radius"):
         matched(flat([(0, 0)], [0]), image_of([(0, 0)], [0]), radius_px=radius_px)
 
 
-@pytest.mark.usefixtures("either")
 def test_the_most_similar_feature_that_is_another_point_counts() -> None:
     features = flat([(10, 10), (13, 10), (10, 16), (300, 10)], [0, 1, 20, 50])
 
@@ -354,16 +328,15 @@ def observations(
     return observed, truth, exp_se3(rng.normal(size=6) * 0.01) @ truth
 
 
-@needs_library
 @pytest.mark.parametrize("has_depth", [True, False])
 @pytest.mark.parametrize("outliers", [0.0, 0.3])
-def test_poses_are_those_of_numpy(has_depth: bool, outliers: float) -> None:
+def test_poses_are_those_of_the_definition(has_depth: bool, outliers: float) -> None:
     for seed in range(40):
         n = (4, 7, 30, 300)[seed % 4]
         observed, _, start = observations(seed, n=n, has_depth=has_depth, outliers=outliers)
 
         found = fit_pose(observed, CAMERA, start)
-        expected = fit_pose_by_numpy(observed, CAMERA, start, **GATE)
+        expected = pose_fit.fit_pose(observed, CAMERA, start)
 
         assert (found is None) == (expected is None)
         if found is None or expected is None:
@@ -375,20 +348,18 @@ def test_poses_are_those_of_numpy(has_depth: bool, outliers: float) -> None:
         np.testing.assert_allclose(found.information, expected.information, rtol=0, atol=1e-9 * scale)
 
 
-@needs_library
 @pytest.mark.parametrize("has_depth", [True, False])
-def test_motions_of_points_are_fitted_as_by_numpy(has_depth: bool) -> None:
+def test_motions_of_points_are_fitted_beside_the_pose(has_depth: bool) -> None:
     observed, T, _ = observations(5, n=80, has_depth=has_depth)
     sways = np.random.default_rng(5).normal(0.0, 1.0, (80, 3))
 
     more, information = fit_sway(observed, sways, CAMERA, T)
 
-    expected = fit_sway_by_numpy(observed, sways, CAMERA, T, cauchy=2.5)
+    expected = pose_fit.fit_sway(observed, sways, CAMERA, T)
     assert information > 0.0
     assert (more, information) == pytest.approx(expected, rel=1e-8)
 
 
-@pytest.mark.usefixtures("either")
 @pytest.mark.parametrize("has_depth", [True, False])
 @pytest.mark.parametrize("outliers", [0.0, 0.3])
 def test_poses_are_right_within_the_noise_that_was_put_in(has_depth: bool, outliers: float) -> None:
@@ -408,7 +379,6 @@ def test_poses_are_right_within_the_noise_that_was_put_in(has_depth: bool, outli
     assert inliers / (problems * 120) == pytest.approx(0.99 * (1.0 - outliers), abs=0.03)
 
 
-@pytest.mark.usefixtures("either")
 @pytest.mark.parametrize("has_depth", [True, False])
 def test_a_motion_that_nothing_holds_is_told(has_depth: bool) -> None:
     for seed in range(20):
@@ -421,7 +391,6 @@ def test_a_motion_that_nothing_holds_is_told(has_depth: bool) -> None:
             assert fit_pose(observed, CAMERA, truth) is None
 
 
-@pytest.mark.usefixtures("either")
 def test_points_that_no_row_agrees_with_give_no_pose() -> None:
     observed, _, start = observations(1)
     behind = replace(observed, points=transform(inverse(start), np.tile([0.0, 0.0, -2.0], (120, 1))))
@@ -432,7 +401,6 @@ def test_points_that_no_row_agrees_with_give_no_pose() -> None:
 NAN, INF = float("nan"), float("inf")
 
 
-@pytest.mark.usefixtures("either")
 @pytest.mark.parametrize(
     ("name", "number"),
     [
@@ -453,7 +421,6 @@ def test_numbers_that_no_camera_measures_give_no_pose(name: str, number: float) 
     assert fit_pose(replace(observed, **{name: array}), CAMERA, start) is None
 
 
-@pytest.mark.usefixtures("either")
 @pytest.mark.parametrize("number", [NAN, INF, 2e9])
 def test_a_start_or_a_limit_that_is_none_gives_no_pose(number: float) -> None:
     observed, _, start = observations(2)
@@ -465,7 +432,6 @@ def test_a_start_or_a_limit_that_is_none_gives_no_pose(number: float) -> None:
     assert fit_pose(observed, CAMERA, start, cauchy=number) is None
 
 
-@pytest.mark.usefixtures("either")
 @pytest.mark.parametrize(
     "change",
     [
@@ -484,7 +450,6 @@ def test_observations_that_do_not_fit_are_refused(change: dict[str, Array]) -> N
             fit_pose(observed, CAMERA, T)
 
 
-@pytest.mark.usefixtures("either")
 def test_covariances_that_are_none_never_make_an_inlier_or_an_infinite_pose() -> None:
     for seed in range(60):
         rng = np.random.default_rng(seed)
@@ -500,7 +465,6 @@ def test_covariances_that_are_none_never_make_an_inlier_or_an_infinite_pose() ->
             assert np.isfinite(fitted.information).all()
 
 
-@pytest.mark.usefixtures("either")
 def test_a_squared_distance_below_zero_is_no_small_one() -> None:
     observed, truth, _ = observations(5, has_depth=False)
     spreads, pixels = observed.spreads.copy(), CAMERA.project(transform(truth, observed.points))
@@ -515,7 +479,6 @@ def test_a_squared_distance_below_zero_is_no_small_one() -> None:
     assert np.flatnonzero(~fitted.is_inlier).tolist() == [7]
 
 
-@needs_library
 def test_float32_and_gaps_in_memory_give_the_same_pose() -> None:
     observed, _, start = observations(4)
     rounded = replace(
@@ -537,10 +500,9 @@ def test_float32_and_gaps_in_memory_give_the_same_pose() -> None:
     assert found.T_camera_world.tobytes() == expected.T_camera_world.tobytes()
 
 
-@needs_library
 def test_threads_do_not_share_memory() -> None:
     requests = [request_of(seed) for seed in range(100, 108)]
-    expected = [match_near_by_numpy(*request) for request in requests]
+    expected = [matching.match_near(*request) for request in requests]
     wrong: list[int] = []
 
     def check(which: int) -> None:
@@ -556,17 +518,3 @@ def test_threads_do_not_share_memory() -> None:
         thread.join()
 
     assert not wrong
-
-
-def test_a_file_that_is_no_library_is_refused_and_done_without(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = tmp_path / "librse_pf_native.so"
-    path.write_bytes(b"no library")
-
-    with pytest.raises(ConfigurationError, match="cannot be loaded"):
-        open_tracker(path)
-    monkeypatch.setattr(native, "find_library", lambda: path)
-    track_core.cache_clear()
-    assert track_core() is None
-    track_core.cache_clear()

@@ -18,7 +18,6 @@ from rse_pf.services.mapping.place import (
     open_map,
     view_of,
 )
-from rse_pf.slam.descriptors import load_faiss
 from rse_pf.slam.localise import LocalisationOptions, PlacedKeyframe, localise, spread_candidates
 from rse_pf.slam.relative_pose import RelativePoseOptions, View, reference_of
 from rse_pf.wire.arrays import Array
@@ -104,7 +103,7 @@ def locate(
         The reply of the service, with ``T_map_camera`` as ``(4, 4)`` and ``covariance`` as ``(6, 6)``.
 
     Raises:
-        MissingExtra: faiss or the solver is not installed.
+        MissingExtra: The native core is not installed.
     """
     options = options or LocaliseOptions()
     similar = index.nearest(view.descriptors, _SEARCHED * options.candidates, within)
@@ -139,7 +138,7 @@ def locate(
 def register(registry: Registry) -> None:
     """Add ``localise`` to *registry*."""
 
-    @registry.service("localise", limited=True, warm_up=load_faiss)
+    @registry.service("localise", limited=True)
     def answer(request: LocaliseRequest) -> LocaliseReply:
         """Find the camera's pose in a map."""
         _, index = open_map(request.map)

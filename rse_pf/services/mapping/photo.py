@@ -51,7 +51,7 @@ def localise_photo(data: bytes, lens: Lens, index: MapIndex) -> LocaliseReply:
     Raises:
         BadRequest, LimitExceeded: The photo or its intrinsics cannot be used, or the map has other features.
         InvalidCamera: An intrinsic is impossible.
-        MissingExtra: OpenCV, faiss or the solver is not installed.
+        MissingExtra: OpenCV or the native core is not installed.
     """
     check_alike(index.kind, ORB, "the map")
     whole = _camera_of(lens, *photo_size(data))

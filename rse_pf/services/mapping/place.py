@@ -17,7 +17,6 @@ from rse_pf.geometry import Camera
 from rse_pf.maps.descriptors import ORB, DescriptorKind, Descriptors, check_alike, descriptors_of, one_kind
 from rse_pf.maps.format import Keyframe, MapLimits, MapVersion, decode_map
 from rse_pf.service import Registry
-from rse_pf.slam.descriptors import load_faiss
 from rse_pf.slam.places import PlaceIndex, place_vector
 from rse_pf.slam.relative_pose import View, measure_pose, reference_of
 from rse_pf.wire.arrays import Array, reshaped
@@ -186,7 +185,7 @@ def check_comparisons(index: MapIndex, view: View, candidates: int) -> None:
 def register(registry: Registry) -> None:
     """Add ``place`` to *registry*."""
 
-    @registry.service("place", limited=True, warm_up=load_faiss)
+    @registry.service("place", limited=True)
     def place(request: PlaceRequest) -> PlaceReply:
         """Find the keyframes of a map that show what a view shows."""
         if not 1 <= request.candidates <= 100:

@@ -39,7 +39,7 @@ def make(settings: PlatformSettings) -> Registry:
 
     def warm_up() -> None:
         warmed.append("work")
-        raise MissingExtra("faiss", "maps")
+        raise MissingExtra("small_gicp", "maps")
 
     @registry.service("work", limited=True, warm_up=warm_up)
     def work(request: Work) -> Done:

@@ -15,7 +15,7 @@ from rse_pf.maps.registry import MapRegistry
 from rse_pf.object_store import DirectoryStore
 from tests.synthetic_maps import make_world
 
-for package in ("faiss", "gtsam", "PIL", "cv2"):
+for package in ("gtsam", "PIL", "cv2"):
     pytest.importorskip(package, reason="the extras maps, local and vision are needed")
 
 WORLD = make_world(1)

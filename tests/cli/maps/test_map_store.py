@@ -44,7 +44,6 @@ def take_photo(row: int) -> str:
 def test_the_map_of_a_bag_is_found_localised_in_merged_and_extended(
     folder: Path, state_home: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    pytest.importorskip("faiss", reason="pip install 'rse-pf[maps]'")
     pytest.importorskip("gtsam", reason="pip install 'rse-pf[maps]'")
     for name in ("one", "two"):
         assert main(["map", "from-bag", "drive.bag", "--out", name, *PLATFORM]) == 0
@@ -69,7 +68,6 @@ def test_the_map_of_a_bag_is_found_localised_in_merged_and_extended(
 def test_the_map_of_a_video_in_metres_can_be_localised_in(
     video_folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    pytest.importorskip("faiss", reason="pip install 'rse-pf[maps]'")
     poses = np.tile(np.eye(4), (60, 1, 1))
     poses[:, 0, 3] = 5 * STEP_M * np.arange(60)
     write_trajectory(Path("odometry.txt"), Trajectory(np.arange(60) / 10, poses))

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from client_sdk.monocular.bundle import Bundle, adjust
-from client_sdk.monocular.descriptors import match_all
 from client_sdk.monocular.scale import MarkerScale, OdometryScale
 from client_sdk.monocular.two_view import start_from_two_views
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Array, Camera, exp_se3, inverse, pose_difference, transform
+from rse_pf.slam.descriptors import match_all
 from rse_pf.slam.triangulation import reprojection_errors, triangulate
 
 cv2 = pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")

@@ -11,7 +11,6 @@ import pytest
 from client_sdk.datasets import open_dataset
 from client_sdk.frontend import Frame, FrontEndOptions, PoseQuery, TrackedFrame
 from client_sdk.mapping import Trajectory
-from client_sdk.monocular import descriptors
 from client_sdk.tracking.tracker import Tracker
 from rse_pf.errors import UsageError
 from rse_pf.experiments.results.trajectory_error import absolute_error
@@ -218,21 +217,6 @@ def test_rotations_stay_rotations_over_a_long_drive() -> None:
     for pose in poses:
         assert pose is not None
         np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-9)
-
-
-def test_matches_of_the_native_core_are_those_of_opencv(monkeypatch: pytest.MonkeyPatch) -> None:
-    rng = np.random.default_rng(4)
-    first = rng.integers(0, 256, (300, 32), dtype=np.uint8)
-    second = first[rng.permutation(300)] ^ (rng.random((300, 32)) < 0.2).astype(np.uint8)
-    second[:40] = second[40:80]  # equal ones are no clear match
-
-    by_core = descriptors.match_all(first, second, max_distance=40)
-    monkeypatch.setattr(descriptors, "match_core", lambda: None)
-    by_opencv = descriptors.match_all(first, second, max_distance=40)
-
-    np.testing.assert_array_equal(by_core[0], by_opencv[0])
-    np.testing.assert_array_equal(by_core[1], by_opencv[1])
-    assert 100 < len(by_core[0]) < 300
 
 
 @pytest.mark.data

@@ -16,7 +16,7 @@ from rse_pf.maps.format import MapVersion, decode_map, encode_map
 from rse_pf.services.mapping.merge import MergeReply, MergeRequest, merge_maps
 from tests.synthetic_maps import make_world
 
-for package in ("faiss", "gtsam", "PIL", "cv2"):
+for package in ("gtsam", "PIL", "cv2"):
     pytest.importorskip(package, reason="the extras maps, local and vision are needed")
 
 WORLD = make_world(1)

@@ -24,8 +24,6 @@ from rse_pf.slam.map_merge import merge_versions
 from rse_pf.wire import Command, Failure, Result, make_codec
 from tests.synthetic_maps import make_room, make_world
 
-pytest.importorskip("faiss", reason="needs the extra 'maps'")
-
 REGISTRY = builtin_services(PlatformSettings())
 EYE = np.eye(4).ravel().tolist()
 CAMERA = {"fx": 525.0, "fy": 525.0, "cx": 319.5, "cy": 239.5, "width": 640, "height": 480}

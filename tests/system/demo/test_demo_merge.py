@@ -16,7 +16,7 @@ from rse_pf.object_store import DirectoryStore
 
 pytestmark = pytest.mark.system
 
-for package in ("faiss", "gtsam", "PIL", "cv2", "uvicorn"):
+for package in ("gtsam", "PIL", "cv2", "uvicorn"):
     pytest.importorskip(package, reason="the extras maps, demo and data are needed")
 
 
