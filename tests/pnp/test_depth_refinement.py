@@ -24,7 +24,7 @@ _options = PnpOptions(inlier_px=5.0)
 
 @pytest.fixture(autouse=True, params=["native", "opencv"])
 def options(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let both paths be tested: the core refines what it solved, numpy what OpenCV solved."""
+    """Refine the solutions of both engines."""
     monkeypatch.setitem(globals(), "_options", PnpOptions(inlier_px=5.0, engine=request.param))
 
 
