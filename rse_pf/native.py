@@ -22,10 +22,8 @@ import numpy.typing as npt
 
 from rse_pf.errors import (
     BadRequest,
-    Cancelled,
     ConfigurationError,
     DegenerateGeometry,
-    Expired,
     MissingExtra,
     NoConsensus,
     RsePfError,
@@ -57,22 +55,21 @@ __all__ = [
 
 Part = TypeVar("Part")
 
-_ABI = 2
-PART_ABIS = {"check": 1, "cloud": 1, "depth": 1, "match": 4, "stereo": 1, "track": 2}
+_ABI = 3
+PART_ABIS = {"check": 2, "cloud": 1, "depth": 1, "match": 4, "stereo": 1, "track": 2}
 """The version of each header ``rse_pf_PART.h`` that this package calls."""
 _FILE = "librse_pf_native.so"
 _PROPOSE = 2
 _LANES = {"avx512": 0, "avx2": 4, "portable": 1}
-# rse_pf_pnp_request: abi, flags, rows, points, pixels | camera | options | deadline, cancelled.
+# rse_pf_pnp_request: abi, flags, rows, points, pixels | camera, options.
 _HEAD = struct.Struct("=IIqQQ")
-_BODY = struct.Struct("=ddddiiddiiQdddd")
-_TAIL = struct.Struct("=qQ")
-# rse_pf_pnp_result: status, reason, five counts, four measures | pose | covariance.
-RESULT = struct.Struct("=iiqqqqqdddd")
+_BODY = struct.Struct("=ddddiiddiidddd")
+# rse_pf_pnp_result: status, reason, three counts, four measures | pose | covariance.
+RESULT = struct.Struct("=iiqqqdddd")
 POSE_AT, _COVARIANCE_AT = RESULT.size, RESULT.size + 16 * 8
 RESULT_BYTES = _COVARIANCE_AT + 36 * 8
-# One call packs what the three above describe; the camera and the options are packed already.
-_REQUEST = struct.Struct(f"=IIqQQ{_BODY.size}sqQ")
+# One call packs what the two above describe; the camera and the options are packed already.
+_REQUEST = struct.Struct(f"=IIqQQ{_BODY.size}s")
 _FIRST_ROWS = 1024
 _COLLINEAR = 0.02
 # Of the 36 numbers of a covariance, those of the upper triangle.
@@ -102,24 +99,20 @@ class NativeOptions(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Evidence(msgspec.Struct, frozen=True, kw_only=True, eq=False):
-    """A pose and what speaks for it; the fields are those of `rse_pf.pnp.PnpSolution`.
-
-    ``trials`` is the number of samples drawn, which no reply carries.
-    """
+    """A pose and what speaks for it; the fields are those of `rse_pf.pnp.PnpSolution`."""
 
     T_camera_world: Array
     inliers: npt.NDArray[np.intp]
     rmse_px: float
     covariance: Array
     reason: str
-    trials: int
 
 
 class _Buffers(threading.local):
     """The request and the result of one thread, with views of their parts."""
 
     def __init__(self) -> None:
-        request = np.zeros(_HEAD.size + _BODY.size + _TAIL.size, dtype=np.uint8)
+        request = np.zeros(_HEAD.size + _BODY.size, dtype=np.uint8)
         result = np.zeros(RESULT_BYTES, dtype=np.uint8)
         self.request = memoryview(request)  # type: ignore[arg-type]
         self.result = memoryview(result)  # type: ignore[arg-type]
@@ -141,7 +134,7 @@ def _pack(camera: Camera, options: NativeOptions) -> bytes:
     return _BODY.pack(
         camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height,
         options.inlier_px, options.confidence, options.max_iterations,
-        min(options.min_iterations, options.max_iterations), 0,
+        min(options.min_iterations, options.max_iterations),
         options.weak_inliers, options.weak_inlier_ratio, options.weak_translation_m,
         options.weak_rotation_rad,
     )  # fmt: skip
@@ -150,7 +143,7 @@ def _pack(camera: Camera, options: NativeOptions) -> bytes:
 def packed_request(camera: Camera, options: NativeOptions) -> bytes:
     """Return an rse_pf_pnp_request that says how to solve, without rows."""
     flags = _LANES[options.lanes]
-    return _REQUEST.pack(_ABI, flags, 0, 0, 0, _pack(camera, options), 0, 0)
+    return _REQUEST.pack(_ABI, flags, 0, 0, 0, _pack(camera, options))
 
 
 class NativeSolver:
@@ -162,16 +155,7 @@ class NativeSolver:
         self.lanes = lanes
         """``avx512``, ``avx2`` or ``portable``: the instructions that this processor gets."""
 
-    def solve(
-        self,
-        points_world: Array,
-        pixels: Array,
-        camera: Camera,
-        options: NativeOptions,
-        *,
-        deadline_ns: int = 0,
-        cancelled: ctypes.c_int32 | None = None,
-    ) -> Evidence:
+    def solve(self, points_world: Array, pixels: Array, camera: Camera, options: NativeOptions) -> Evidence:
         """Estimate the camera pose with its evidence.
 
         Args:
@@ -179,33 +163,28 @@ class NativeSolver:
             pixels: ``(n, 2)``, undistorted pixels.
             camera: Intrinsics of the image the pixels come from.
             options: How to solve.
-            deadline_ns: Of `time.monotonic_ns`, after which the search is given up; 0 for none.
-            cancelled: Another thread sets it to 1 to end the call soon.
 
         Raises:
             BadRequest: Shapes do not fit, or a number is not finite or absurd.
             DegenerateGeometry: The points lie on one line or coincide, or two poses fit alike.
             NoConsensus: No pose agrees with more rows than chance would give.
-            Expired: The deadline has passed.
-            Cancelled: The flag was set.
         """
         n = len(pixels)
         inliers = np.empty(n, dtype=np.int64)
         # The arrays stay referenced during the call: the request holds their addresses only.
         arrays = self._write_request(points_world, pixels, camera, options)
-        values = self._run(address_of(inliers), deadline_ns, cancelled)
+        values = self._run(address_of(inliers))
         del arrays
-        status, reason, count, _, _, trials = values[:6]
+        status, reason, count = values[:3]
         if status:
             raise solver_error(values, n, options)
         buffers = self._buffers
         return Evidence(
             T_camera_world=buffers.pose.copy(),
             inliers=inliers[:count],
-            rmse_px=values[7],
+            rmse_px=values[5],
             covariance=buffers.covariance.copy(),
             reason=REASONS[reason],
-            trials=trials,
         )
 
     def solve_flat(
@@ -243,7 +222,7 @@ class NativeSolver:
             buffers.lend(n)
         _REQUEST.pack_into(
             buffers.request, 0, _ABI, _LANES[options.lanes], n, address_of(points_world),
-            address_of(pixels), _pack(camera, options), 0, 0,
+            address_of(pixels), _pack(camera, options),
         )  # fmt: skip
         self._call(buffers.request_at, buffers.inliers_at, buffers.result_at)
         values = RESULT.unpack_from(buffers.result)
@@ -252,7 +231,7 @@ class NativeSolver:
         return (
             buffers.flat_pose.copy(),
             buffers.inliers[: values[2]].astype(np.uint32),
-            values[7],
+            values[5],
             buffers.flat_covariance.take(_UPPER).astype(np.float32),
             REASONS[values[1]],
         )
@@ -283,20 +262,16 @@ class NativeSolver:
         request[_HEAD.size : _HEAD.size + _BODY.size] = _pack(camera, options)
         return points_world, pixels
 
-    def _run(
-        self, inliers_at: int, deadline_ns: int = 0, cancelled: ctypes.c_int32 | None = None
-    ) -> tuple[Any, ...]:
+    def _run(self, inliers_at: int) -> tuple[Any, ...]:
         """Solve the request that was written last."""
         buffers = self._buffers
-        flag_at = 0 if cancelled is None else ctypes.addressof(cancelled)
-        _TAIL.pack_into(buffers.request, _HEAD.size + _BODY.size, deadline_ns, flag_at)
         self._call(buffers.request_at, inliers_at, buffers.result_at)
         return RESULT.unpack_from(buffers.result)
 
 
 def solver_error(values: tuple[Any, ...], n: int, options: NativeOptions) -> RsePfError:
     """Return the error of what `RESULT` unpacks; the sentences are those of `rse_pf.pnp.solver`."""
-    status, _, count, independent, other, _, _, rmse_px, other_rmse_px, thinness, radius_px = values
+    status, _, count, independent, other, rmse_px, other_rmse_px, thinness, radius_px = values
     everywhere = "match points all over the image, or skip this frame"
     match status:
         case 2 | 3:
@@ -345,10 +320,6 @@ def solver_error(values: tuple[Any, ...], n: int, options: NativeOptions) -> Rse
                 hint="check the handedness of the world frame and the sign of the depth",
             )
         case 11:
-            return Expired("the deadline passed while the pose was sought", hint="send fewer matches")
-        case 12:
-            return Cancelled("the pose was no longer wanted", hint="ask again if it is")
-        case 13:
             return BadRequest(f"no memory for {n} correspondences", hint="send the best matches only")
     return BadRequest("the options or sizes of the request do not fit", hint="leave the options out")
 

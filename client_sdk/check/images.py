@@ -237,8 +237,6 @@ def _percentile(values: npt.NDArray[np.int16], percent: int) -> float:
 def sharpness(gray: _Image) -> tuple[float, float]:
     """Return how sharp the strongest edges of ``(h, w)`` uint8 are, along x and along y; NaN without edges.
 
-    Sides longer than 16,384 px count as without edges.
-
     It is the steepest difference over two pixels beside the whole step over 16: 1 for a step within two
     pixels, and about ``2 / n`` for one that is blurred over *n*.  Texture changes it little.
     """
@@ -255,7 +253,7 @@ def _edges(lines: _Image) -> float:
     strong = max(1, int(_STRONGEST * len(lines) * (lines.shape[1] - 2 * _HALF_PX)))
     sharpest = np.empty(_MOST_EDGES)
     count = _core_edges()(
-        address_of(lines), *lines.shape, *lines.strides, strong, _LEAST_STEP, _MOST_EDGES,
+        address_of(lines), *lines.shape, strong, _LEAST_STEP, _MOST_EDGES,
         address_of(sharpest),
     )  # fmt: skip
     if count < _FEWEST_EDGES:
@@ -266,7 +264,7 @@ def _edges(lines: _Image) -> float:
 
 @cache
 def _core_edges() -> Any:
-    arguments = (ctypes.c_void_p, *[ctypes.c_int64] * 7, ctypes.c_void_p)
+    arguments = (ctypes.c_void_p, *[ctypes.c_int64] * 5, ctypes.c_void_p)
     return core_function("check", "rse_pf_edges", arguments, ctypes.c_int64)
 
 

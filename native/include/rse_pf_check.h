@@ -11,10 +11,7 @@
 extern "C" {
 #endif
 
-#define RSE_PF_CHECK_ABI 1
-
-/* The longest line that rse_pf_edges reads. */
-#define RSE_PF_CHECK_LONGEST 16384
+#define RSE_PF_CHECK_ABI 2
 
 /* Return RSE_PF_CHECK_ABI of the library, to compare with the header's. */
 uint32_t rse_pf_check_abi(void);
@@ -23,10 +20,10 @@ uint32_t rse_pf_check_abi(void);
  * of the step over 16.  Return how many there are, all of them in the order of lines, at most `most` of them, evenly
  * chosen; -1 if a size does not fit.
  *
- * gray: the first pixel, from which lines are line_stride bytes apart and their pixels pixel_stride bytes; strong: how
- * many steps over 16 pixels are strong, by which the least one is found that counts, which is least_step at least. */
-int64_t rse_pf_edges(const uint8_t *gray, int64_t lines, int64_t length, int64_t line_stride, int64_t pixel_stride,
-                     int64_t strong, int64_t least_step, int64_t most, double *sharpness);
+ * gray: lines x length; strong: how many steps over 16 pixels are strong, by which the least one is found that counts,
+ * which is least_step at least. */
+int64_t rse_pf_edges(const uint8_t *gray, int64_t lines, int64_t length, int64_t strong, int64_t least_step,
+                     int64_t most, double *sharpness);
 
 /* Write the median of the depths at each pixel and two pixels above, below, left and right of it, NaN where one is
  * missing or they differ by more than a share of it; return 0, -1 if a size does not fit.

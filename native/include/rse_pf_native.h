@@ -11,7 +11,7 @@
 extern "C" {
 #endif
 
-#define RSE_PF_NATIVE_ABI 2
+#define RSE_PF_NATIVE_ABI 3
 
 /* Flags of a request. */
 #define RSE_PF_PNP_PORTABLE 1u /* Use no AVX, for tests: the bytes of the result are the same. */
@@ -31,9 +31,7 @@ enum rse_pf_pnp_status {
     RSE_PF_PNP_UNCONSTRAINED = 8,
     RSE_PF_PNP_TWO_POSES = 9,     /* rmse_px, other_rmse_px */
     RSE_PF_PNP_MIRRORED = 10,     /* count, other_count */
-    RSE_PF_PNP_EXPIRED = 11,
-    RSE_PF_PNP_CANCELLED = 12,
-    RSE_PF_PNP_OUT_OF_MEMORY = 13
+    RSE_PF_PNP_OUT_OF_MEMORY = 11
 };
 
 /* Why a pose is weak; 0 for a pose that is ok. */
@@ -58,17 +56,13 @@ typedef struct rse_pf_pnp_request {
     double inlier_px;
     double confidence;
     int32_t max_iterations, min_iterations;
-    uint64_t seed;
     double weak_inliers, weak_inlier_ratio, weak_translation_m, weak_rotation_rad;
-    int64_t deadline_ns;               /* CLOCK_MONOTONIC; 0 for none */
-    const volatile int32_t *cancelled; /* Not zero ends the call soon; may be null. */
 } rse_pf_pnp_request;
 
 typedef struct rse_pf_pnp_result {
     int32_t status;
     int32_t reason;
     int64_t count, independent, other_count;
-    int64_t trials, refinements;
     double rmse_px, other_rmse_px, thinness, radius_px;
     double T_camera_world[16]; /* row-major */
     double covariance[36];     /* of the twist (rho metres, phi radians) left of the pose */

@@ -2,7 +2,6 @@
 #if defined(__x86_64__)
 #define RSE_PF_ISA rse_pf_avx2
 #include "solve.hpp"
-#include "clock.hpp"
 
 void rse_pf::avx2::solve(const rse_pf::Task& task) { rse_pf_avx2::solve_task(task); }
 #endif

@@ -3,7 +3,6 @@
 #if defined(__x86_64__)
 #define RSE_PF_ISA rse_pf_avx512
 #include "solve.hpp"
-#include "clock.hpp"
 
 void rse_pf::avx512::solve(const rse_pf::Task& task) { rse_pf_avx512::solve_task(task); }
 #endif

@@ -39,27 +39,22 @@ extern "C" {
 __attribute__((visibility("default"))) uint32_t rse_pf_check_abi(void) { return RSE_PF_CHECK_ABI; }
 
 __attribute__((visibility("default"))) int64_t rse_pf_edges(const uint8_t* gray, int64_t lines, int64_t length,
-                                                            int64_t line_stride, int64_t pixel_stride, int64_t strong,
-                                                            int64_t least_step, int64_t most, double* sharpness) {
+                                                            int64_t strong, int64_t least_step, int64_t most,
+                                                            double* sharpness) {
     if (gray == nullptr || sharpness == nullptr || lines < 1 || lines > kMaxSide || length < kShortest ||
-        length > RSE_PF_CHECK_LONGEST || strong < 1 || least_step < 1 || most < 1)
+        length > kMaxSide || strong < 1 || least_step < 1 || most < 1)
         return -1;
     int64_t counts[kLevels] = {};
-    uint8_t line[RSE_PF_CHECK_LONGEST];
-    const auto read = [&](int64_t number) {
-        for (int64_t i = 0; i < length; ++i) line[i] = gray[number * line_stride + i * pixel_stride];
-    };
-    for (int64_t number = 0; number < lines; ++number) {
-        read(number);
+    const uint8_t* line = gray;
+    for (int64_t number = 0; number < lines; ++number, line += length)
         for (int64_t i = 0; i + kWhole < length; ++i) ++counts[step(line[i], line[i + kWhole])];
-    }
     int64_t limit = kLevels - 1, edges = counts[limit];
     while (limit > 0 && edges < strong) edges += counts[--limit];
     for (; limit < least_step && limit < kLevels - 1; ++limit) edges -= counts[limit];
     const int64_t every = (edges + most - 1) / most;
     int64_t seen = 0, written = 0;
-    for (int64_t number = 0; number < lines && edges > 0; ++number) {
-        read(number);
+    line = gray;
+    for (int64_t number = 0; number < lines && edges > 0; ++number, line += length) {
         for (int64_t i = 0; i + kWhole < length; ++i) {
             const int whole = step(line[i], line[i + kWhole]);
             if (whole < limit || seen++ % every != 0) continue;

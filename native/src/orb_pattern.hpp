@@ -1,4 +1,4 @@
-// Where ORB compares intensities; written by tools/orb_pattern.py.  The first places of the 256
+// Where ORB compares intensities (Rublee et al., ICCV 2011, sect. 4.3), as OpenCV does.  The first places of the 256
 // pairs stand before the second ones; pixels from the keypoint.
 #pragma once
 

@@ -1,6 +1,5 @@
 // The solver for every processor of the architecture.
 #define RSE_PF_ISA rse_pf_portable
 #include "solve.hpp"
-#include "clock.hpp"
 
 void rse_pf::portable::solve(const rse_pf::Task& task) { rse_pf_portable::solve_task(task); }

@@ -73,35 +73,17 @@ static void refine_locally(const rse_pf::Columns<float>& rows, int64_t n, const 
     }
 }
 
-enum class Search { kFound, kNothing, kExpired, kCancelled };
-
 struct SearchOptions {
     double limit2;  // px^2
     double confidence;
     int64_t max_iterations, min_iterations;
-    uint64_t seed;
 };
 
-static int64_t now_ns();
-
-static bool must_stop(const rse_pf_pnp_request& request, Search& why) {
-    if (request.cancelled != nullptr && *request.cancelled != 0) {
-        why = Search::kCancelled;
-        return true;
-    }
-    if (request.deadline_ns != 0 && now_ns() > request.deadline_ns) {
-        why = Search::kExpired;
-        return true;
-    }
-    return false;
-}
-
-// Find the pose that most rows agree with.
-static Search search(const rse_pf::Task& task, const Optics& optics, const SearchOptions& options, Model& best) {
+// Find the pose that most rows agree with; say whether there is any.
+static bool search(const rse_pf::Task& task, const Optics& optics, const SearchOptions& options, Model& best) {
     const rse_pf::Workspace& data = *task.workspace;
     const int64_t n = task.request->rows;
-    Sampler sampler = {options.seed};
-    Search why = Search::kNothing;
+    Sampler sampler = {0};
     best.cost = kInfinity;
     best.agree = 0;
     double needed = static_cast<double>(options.max_iterations);
@@ -109,8 +91,6 @@ static Search search(const rse_pf::Task& task, const Optics& optics, const Searc
     if (n <= kFewRows && least < kTrialsOfFewRows) least = kTrialsOfFewRows;
     for (int64_t trial = 0; trial < options.max_iterations; ++trial) {
         if (trial >= least && static_cast<double>(trial) >= needed) break;
-        if (trial % 16 == 0 && must_stop(*task.request, why)) return why;
-        ++task.result->trials;
         int64_t rows[3];
         sampler.three(n, rows);
         Vector3 bearings[3], points[3];
@@ -125,13 +105,12 @@ static Search search(const rse_pf::Task& task, const Optics& optics, const Searc
             if (!(score(data.single, n, optics, poses[i], options.limit2, best.cost) < best.cost)) continue;
             Model model = {poses[i], 0.0, 0};
             refine_locally(data.single, n, optics, options.limit2, model);
-            ++task.result->refinements;
             if (!(model.cost < best.cost)) continue;
             best = model;
             needed = trials_for(best.agree, n, options.confidence);
         }
     }
-    return best.cost < kInfinity ? Search::kFound : Search::kNothing;
+    return best.cost < kInfinity;
 }
 
 // Refine over the rows by Levenberg and Marquardt's method; false where it cannot start.
@@ -198,12 +177,11 @@ static int64_t refine_inliers(const rse_pf::Workspace& data, int64_t n, const Op
     return count;
 }
 
-// Return the robust pose of the rows as they stand in the workspace.
-static Search propose(const rse_pf::Task& task, const Optics& optics, const SearchOptions& options,
+// Find the robust pose of the rows as they stand in the workspace; say whether there is any.
+static bool propose(const rse_pf::Task& task, const Optics& optics, const SearchOptions& options,
                       const Vector3& origin, Pose& pose) {
     Model best;
-    const Search found = search(task, optics, options, best);
-    if (found != Search::kFound) return found;
+    if (!search(task, optics, options, best)) return false;
     const rse_pf::Workspace& data = *task.workspace;
     const int64_t n = task.request->rows;
     pose = best.pose;
@@ -217,7 +195,7 @@ static Search propose(const rse_pf::Task& task, const Optics& optics, const Sear
             if (score(data.single, n, optics, twin, options.limit2, cost) < cost) pose = twin;
         }
     }
-    return is_finite(pose) ? Search::kFound : Search::kNothing;
+    return is_finite(pose);
 }
 
 }  // namespace RSE_PF_ISA

@@ -61,12 +61,6 @@ static void reflect(const rse_pf::Workspace& data, int64_t n) {
     }
 }
 
-static int32_t status_of(Search search, const rse_pf::Task& task) {
-    if (search == Search::kExpired) return RSE_PF_PNP_EXPIRED;
-    if (search == Search::kCancelled) return RSE_PF_PNP_CANCELLED;
-    return without_pose(task, 0);
-}
-
 static int32_t judged(const rse_pf::Task& task, const Vector3& centre) {
     const rse_pf_pnp_request& request = *task.request;
     const rse_pf::Workspace& data = *task.workspace;
@@ -74,11 +68,9 @@ static int32_t judged(const rse_pf::Task& task, const Vector3& centre) {
     const Optics optics = {request.fx, request.fy};
     const double limit2 = request.inlier_px * request.inlier_px, area = static_cast<double>(request.width) * request.height;
     const int64_t n = request.rows;
-    const SearchOptions options = {limit2, request.confidence, request.max_iterations,
-                                   request.min_iterations, request.seed};
+    const SearchOptions options = {limit2, request.confidence, request.max_iterations, request.min_iterations};
     Pose pose;
-    const Search found = propose(task, optics, options, centre, pose);
-    if (found != Search::kFound) return status_of(found, task);
+    if (!propose(task, optics, options, centre, pose)) return without_pose(task, 0);
     give(result.T_camera_world, pose, centre);
     if ((request.flags & RSE_PF_PNP_PROPOSE) != 0) return RSE_PF_PNP_SOLVED;
 
@@ -132,9 +124,7 @@ static int32_t judged(const rse_pf::Task& task, const Vector3& centre) {
     few.max_iterations = few.max_iterations < kMirrorIterations ? few.max_iterations : kMirrorIterations;
     reflect(data, n);
     Pose reflected;
-    const Search other = propose(task, optics, few, centre * -1.0, reflected);
-    if (other == Search::kExpired || other == Search::kCancelled) return status_of(other, task);
-    if (other == Search::kFound) {
+    if (propose(task, optics, few, centre * -1.0, reflected)) {
         project(data.all, n, optics, reflected, data);
         for (int64_t i = 0; i < n; ++i) result.other_count += data.error2[i] <= limit2 ? 1 : 0;
         if (result.other_count >= 2 * count) return RSE_PF_PNP_MIRRORED;

@@ -5,14 +5,12 @@ The library is compiled from the sources of this checkout; without a C++ compile
 
 from __future__ import annotations
 
-import ctypes
 import math
 import os
 import re
 import shutil
 import subprocess
 import threading
-import time
 from pathlib import Path
 
 import msgspec
@@ -25,9 +23,7 @@ from hypothesis.extra import numpy as hnp
 from rse_pf import native
 from rse_pf.errors import (
     BadRequest,
-    Cancelled,
     ConfigurationError,
-    Expired,
     MissingExtra,
 )
 from rse_pf.pnp import PnpOptions, WeakLimits, engines
@@ -170,45 +166,6 @@ def test_the_same_request_gives_the_same_bytes_whatever_was_solved_before_and_in
 
     assert len(found) == 12
     assert all(same_bytes(each, found[0]) for each in found)
-
-
-def hard_problem():
-    """Noise without a pose: the search goes on for minutes."""
-    rng = np.random.default_rng(0)
-    return rng.uniform(-3, 3, (50_000, 3)), rng.uniform(0, [640, 480], (50_000, 2))
-
-
-def test_a_call_ends_soon_after_its_deadline(solver):
-    options = msgspec.structs.replace(OPTIONS, max_iterations=100_000)
-    begin = time.monotonic_ns()
-
-    with pytest.raises(Expired):
-        solver.solve(*hard_problem(), KINECT, options, deadline_ns=begin + 20_000_000)
-
-    assert time.monotonic_ns() - begin < 5_000_000_000
-
-
-def test_another_thread_ends_a_call_while_it_runs(solver):
-    """The flag can only be set while the call runs if the call holds no interpreter lock."""
-    options = msgspec.structs.replace(OPTIONS, max_iterations=100_000)
-    flag, begun, ended = ctypes.c_int32(0), threading.Event(), []
-    points, pixels = hard_problem()
-
-    def work():
-        begun.set()
-        try:
-            solver.solve(points, pixels, KINECT, options, cancelled=flag)
-        except Cancelled as error:
-            ended.append(error)
-
-    thread = threading.Thread(target=work)
-    thread.start()
-    begun.wait(10)
-    flag.value = 1
-    thread.join(timeout=10)
-
-    assert not thread.is_alive()
-    assert len(ended) == 1
 
 
 @pytest.mark.parametrize(
