@@ -2,8 +2,7 @@
  *
  * Every function may be called from any thread, on memory of its own.  Nothing is allocated, and equal arguments give
  * equal bytes on every processor. */
-#ifndef RSE_PF_CHECK_H
-#define RSE_PF_CHECK_H
+#pragma once
 
 #include <stdint.h>
 
@@ -34,5 +33,4 @@ int32_t rse_pf_depths_at(const float *depth_m, int64_t height, int64_t width, in
 
 #ifdef __cplusplus
 }
-#endif
 #endif

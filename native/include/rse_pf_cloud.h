@@ -2,8 +2,7 @@
  *
  * It may be called from any thread, on memory of its own.  Nothing is allocated, and equal arguments give equal bytes
  * on every processor. */
-#ifndef RSE_PF_CLOUD_H
-#define RSE_PF_CLOUD_H
+#pragma once
 
 #include <stdint.h>
 
@@ -59,5 +58,4 @@ int32_t rse_pf_cloud_index(rse_pf_cloud_request *request);
 
 #ifdef __cplusplus
 }
-#endif
 #endif

@@ -2,8 +2,7 @@
  *
  * It does what rse_pf/pnp/depth_refinement.py does.  It may be called from any thread, on memory of its own.
  * Nothing is allocated, and equal requests give equal bytes on every processor. */
-#ifndef RSE_PF_DEPTH_H
-#define RSE_PF_DEPTH_H
+#pragma once
 
 #include <stdint.h>
 
@@ -15,9 +14,6 @@ extern "C" {
 
 /* Use no AVX2, for tests: the bytes of the result are the same. */
 #define RSE_PF_DEPTH_PORTABLE 1u
-
-/* Numbers of 8 bytes that rse_pf_depth_refine works in. */
-#define RSE_PF_DEPTH_WORKSPACE(inlier_rows) (11 * ((inlier_rows) + 4))
 
 enum {
     RSE_PF_DEPTH_REFINED = 0,
@@ -53,10 +49,10 @@ typedef struct rse_pf_depth_result {
 /* Return RSE_PF_DEPTH_ABI of the library, to compare with the header's. */
 uint32_t rse_pf_depth_abi(void);
 
-/* Refine the pose; the result holds numbers only where its status is RSE_PF_DEPTH_REFINED. */
+/* Refine the pose; the result holds numbers only where its status is RSE_PF_DEPTH_REFINED.  workspace has room for
+ * 11 * (inlier_rows + 4) numbers. */
 void rse_pf_depth_refine(const rse_pf_depth_request *request, double *workspace, rse_pf_depth_result *result);
 
 #ifdef __cplusplus
 }
-#endif
 #endif

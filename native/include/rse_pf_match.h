@@ -2,8 +2,7 @@
  *
  * Every function may be called from any thread, on arrays of its own.  Nothing is allocated, and equal
  * arguments give equal bytes on every processor. */
-#ifndef RSE_PF_MATCH_H
-#define RSE_PF_MATCH_H
+#pragma once
 
 #include <stdint.h>
 
@@ -16,9 +15,6 @@ extern "C" {
 /* Use no AVX2 and AVX-512, or no AVX-512, for tests: the bytes of the result are the same. */
 #define RSE_PF_MATCH_PORTABLE 1u
 #define RSE_PF_MATCH_AVX2 2u
-
-/* Numbers of 8 bytes that rse_pf_match works in. */
-#define RSE_PF_MATCH_WORKSPACE(reference_rows, frame_rows) ((reference_rows) + 5 * (frame_rows) + 64)
 
 /* Return RSE_PF_MATCH_ABI of the library, to compare with the header's. */
 uint32_t rse_pf_match_abi(void);
@@ -39,15 +35,13 @@ int32_t rse_pf_points_at(const float *depth_m, int64_t width, int64_t height, co
  * Descriptors have 256 bits.  A reference row takes the frame row at the least Hamming distance, the first one of
  * equals, if that distance is less than ratio times the second least.  Of the reference rows that take one frame row
  * the nearest stays, the first one of equals.  Matches are written by ascending distance, equals by reference row.
- * rows and columns have room for min(reference_rows, frame_rows) numbers. */
+ * rows and columns have room for min(reference_rows, frame_rows) numbers; workspace has room for reference_rows +
+ * 5 * frame_rows + 64. */
 int64_t rse_pf_match(const uint8_t *reference, int64_t reference_rows, const uint8_t *frame, int64_t frame_rows,
                      double ratio, uint32_t flags, uint64_t *workspace, int64_t *rows, int64_t *columns);
 
-/* Numbers of 8 bytes that rse_pf_detect works in. */
-#define RSE_PF_DETECT_WORKSPACE(width, height) (((width) * (height)) / 2 + 8 * (width) + (height) + 64)
-
 /* An image of height x width, row-major; the scale of each level, 1 and more, and how many keypoints it gives;
- * FAST's threshold; for how many keypoints there is room. */
+ * FAST's threshold; for how many keypoints there is room; width * height / 2 + 8 * width + height + 64 numbers. */
 typedef struct rse_pf_detect_request {
     const uint8_t *gray;
     int64_t width, height;
@@ -65,19 +59,15 @@ typedef struct rse_pf_detect_request {
 int64_t rse_pf_detect(const rse_pf_detect_request *request, float *pixels, float *responses, float *angles_deg,
                       int32_t *octaves);
 
-/* Numbers of 8 bytes that rse_pf_describe works in. */
-#define RSE_PF_DESCRIBE_WORKSPACE(width, height) ((3 * (width) * (height)) / 8 + 7 * (width) + 64)
-
 /* Write ORB's descriptors (rows x 32) of keypoints, bit by bit those of OpenCV, and return 0; -1 if a size does not
  * fit, if a keypoint is nearer than 22 px to the edge of its level, or if the processor lacks AVX2 or FMA.
  *
  * gray: height x width, row-major.  scales: of each level, 1 and more.  pixels: rows x 2, of the whole image; the
- * cosine, sine and octave (level) of each keypoint. */
+ * cosine, sine and octave (level) of each keypoint.  workspace: 3 * width * height / 8 + 7 * width + 64 numbers. */
 int32_t rse_pf_describe(const uint8_t *gray, int64_t width, int64_t height, const float *scales, int32_t levels,
                         const float *pixels, const float *cosines, const float *sines, const int32_t *octaves,
                         int64_t rows, uint64_t *workspace, uint8_t *descriptors);
 
 #ifdef __cplusplus
 }
-#endif
 #endif

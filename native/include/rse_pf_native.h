@@ -2,8 +2,7 @@
  *
  * Every function may be called from any thread at any time.  Equal requests give equal bytes on every
  * processor, whatever was solved before.  A request is never written to. */
-#ifndef RSE_PF_NATIVE_H
-#define RSE_PF_NATIVE_H
+#pragma once
 
 #include <stdint.h>
 
@@ -80,5 +79,4 @@ void rse_pf_pnp_solve(const rse_pf_pnp_request *request, int64_t *inliers, rse_p
 
 #ifdef __cplusplus
 }
-#endif
 #endif

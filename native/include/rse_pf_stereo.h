@@ -2,8 +2,7 @@
  *
  * It does what rse_pf/slam/stereo.py does.  It may be called from any thread, on memory of its own.  Nothing is
  * allocated, and equal arguments give equal bytes on every processor. */
-#ifndef RSE_PF_STEREO_H
-#define RSE_PF_STEREO_H
+#pragma once
 
 #include <stdint.h>
 
@@ -42,5 +41,4 @@ int32_t rse_pf_disparities(const rse_pf_stereo_request *request, double *dispari
 
 #ifdef __cplusplus
 }
-#endif
 #endif

@@ -2,8 +2,7 @@
  *
  * Every function may be called from any thread, on arrays of its own.  Nothing is allocated, and equal
  * arguments give equal bytes on every processor. */
-#ifndef RSE_PF_TRACK_H
-#define RSE_PF_TRACK_H
+#pragma once
 
 #include <stdint.h>
 
@@ -72,11 +71,9 @@ typedef struct rse_pf_seek_request {
     double T_camera_world[16];  /* row-major */
 } rse_pf_seek_request;
 
-/* Numbers of 8 bytes that rse_pf_seek works in. */
-#define RSE_PF_SEEK_WORKSPACE(rows, image_rows) (10 * (rows) + RSE_PF_NEAR_WORKSPACE(rows, image_rows))
-
 /* Find landmarks in an image as a pose expects them there, and match them as rse_pf_match_near does; what image says
- * of sought features is not read.  Writes the row of the numbers and that of the image for each match. */
+ * of sought features is not read.  Writes the row of the numbers and that of the image for each match.  workspace has
+ * room for 10 * rows + RSE_PF_NEAR_WORKSPACE(rows, image->rows) numbers. */
 int64_t rse_pf_seek(const rse_pf_seek_request *request, const rse_pf_near_request *image, uint64_t *workspace,
                     int64_t *sought_matched, int64_t *matched);
 
@@ -113,5 +110,4 @@ int32_t rse_pf_fit_sway(const rse_pf_fit_request *request, const double *sways, 
 
 #ifdef __cplusplus
 }
-#endif
 #endif

@@ -151,6 +151,8 @@ RSE_PF_FUSED int32_t describe_all(Image image, const float* scales, int32_t leve
 }
 
 }  // namespace
+#else
+#pragma GCC diagnostic ignored "-Wunused-parameter"  // not written for other processors: the caller uses OpenCV
 #endif
 
 extern "C" __attribute__((visibility("default"))) int32_t rse_pf_describe(
@@ -170,10 +172,6 @@ extern "C" __attribute__((visibility("default"))) int32_t rse_pf_describe(
     return describe_all({gray, width, height}, scales, levels, {pixels, cosines, sines, octaves, rows}, work,
                         descriptors);
 #else
-    // Not written for other processors yet: the caller describes with OpenCV.
-    const void* const unused[] = {gray, scales, pixels, cosines, sines, octaves, workspace, descriptors};
-    static_cast<void>(unused);
-    static_cast<void>(width + height + levels + rows);
     return -1;
 #endif
 }

@@ -238,6 +238,8 @@ bool fits(const rse_pf_detect_request& request) {
 }
 
 }  // namespace
+#else
+#pragma GCC diagnostic ignored "-Wunused-parameter"  // not written for other processors: the caller uses OpenCV
 #endif
 
 extern "C" __attribute__((visibility("default"))) int64_t rse_pf_detect(const rse_pf_detect_request* request,
@@ -249,9 +251,6 @@ extern "C" __attribute__((visibility("default"))) int64_t rse_pf_detect(const rs
         return -1;
     return find_all(*request, {pixels, responses, angles_deg, octaves, request->room, 0});
 #else
-    // Not written for other processors yet: the caller finds keypoints with OpenCV.
-    const void* const unused[] = {request, pixels, responses, angles_deg, octaves};
-    static_cast<void>(unused);
     return -1;
 #endif
 }
