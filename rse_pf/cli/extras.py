@@ -81,10 +81,7 @@ EXTRAS: dict[str, Extra] = {
     "realsense": Extra(
         modules=_same("pyrealsense2"), enables="Intel RealSense cameras", includes=("vision",)
     ),
-    "maps": Extra(
-        modules={"gtsam": "gtsam", "small_gicp": "small_gicp", "faiss": "faiss-cpu"},
-        enables="merging maps, localising in maps, clouds",
-    ),
+    "maps": Extra(modules=_same("gtsam", "small_gicp"), enables="merging maps, localising in maps, clouds"),
     "batch": Extra(
         modules=_same("distributed"), enables="merges in parts, by several processes or machines",
         includes=("maps", "keys"),
