@@ -1,7 +1,4 @@
-"""The native solver: the verdicts of the Python evidence, the poses of PoseLib, and the same bytes anywhere.
-
-The library is compiled from the sources of this checkout; without a C++ compiler the tests are skipped.
-"""
+"""The native solver: verdicts of the Python evidence, poses of PoseLib, and the same bytes anywhere."""
 
 from __future__ import annotations
 
@@ -11,7 +8,6 @@ import re
 import shutil
 import subprocess
 import threading
-from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -43,28 +39,10 @@ COMPILER = os.environ.get("CXX", "g++")
 OPTIONS = engines.native_options(PnpOptions(), WeakLimits())
 
 
-@pytest.fixture(scope="module")
-def library(repository: Path) -> Path:
-    """The library of the checkout; what has changed in its sources is compiled first."""
-    if shutil.which(COMPILER) is None or shutil.which("make") is None:
-        pytest.skip(f"no C++ compiler ({COMPILER}) or no make")
-    built = subprocess.run(
-        ["make", "-C", str(repository / "native"), f"CXX={COMPILER}"],
-        capture_output=True, text=True, check=False,
-    )  # fmt: skip
-    assert built.returncode == 0, built.stderr
-    return repository / "native" / "build" / "librse_pf_native.so"
-
-
 @pytest.fixture
-def solver(library: Path, monkeypatch: pytest.MonkeyPatch):
-    """The solver, which the engine ``native`` uses as well while the test runs."""
-    monkeypatch.setattr(native, "find_library", lambda: library)
-    native.native_solver.cache_clear()
-    engines.ENGINES["native"].cache_clear()
-    yield native.native_solver()
-    native.native_solver.cache_clear()
-    engines.ENGINES["native"].cache_clear()
+def solver() -> native.NativeSolver:
+    """The solver, which the engine ``native`` uses as well."""
+    return native.native_solver()
 
 
 def solve(solver, problem, **changes):
@@ -192,8 +170,8 @@ mild = st.floats(-10, 700, allow_nan=False)
 
 @settings(max_examples=120, deadline=None)
 @given(data=st.data(), n=st.integers(4, 40))
-def test_any_numbers_give_finite_evidence_or_a_typed_error(library, data, n):
-    opened = native.open_solver(library)
+def test_any_numbers_give_finite_evidence_or_a_typed_error(data, n):
+    opened = native.native_solver()
     elements = data.draw(st.sampled_from([numbers, mild, st.integers(-3, 3).map(float)]))
     points = data.draw(hnp.arrays(np.float64, (n, 3), elements=elements))
     pixels = data.draw(hnp.arrays(np.float64, (n, 2), elements=elements))
@@ -218,12 +196,12 @@ def test_the_rotation_is_orthonormal_to_the_last_bits(solver):
         np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-13)
 
 
-def test_the_file_needs_the_c_library_of_2018_and_nothing_else(library):
+def test_the_file_needs_the_c_library_of_2018_and_nothing_else():
     """Debian 10, Amazon Linux 2023 and every later system have it."""
     if shutil.which("readelf") is None:
         pytest.skip("no readelf")
     listed = subprocess.run(
-        ["readelf", "--wide", "--dynamic", "--version-info", str(library)],
+        ["readelf", "--wide", "--dynamic", "--version-info", str(native.find_library())],
         capture_output=True, text=True, check=True,
     ).stdout  # fmt: skip
     versions = [tuple(map(int, each.split("."))) for each in re.findall(r"GLIBC_(\d+\.\d+)", listed)]
@@ -233,7 +211,9 @@ def test_the_file_needs_the_c_library_of_2018_and_nothing_else(library):
     assert max(versions) <= (2, 28)
 
 
-def test_the_checks_in_cpp_pass(repository, library):
+def test_the_checks_in_cpp_pass(repository):
+    if shutil.which(COMPILER) is None:
+        pytest.skip(f"no C++ compiler ({COMPILER})")
     done = subprocess.run(
         ["make", "-C", str(repository / "native"), f"CXX={COMPILER}", "check"],
         capture_output=True, text=True, check=False,
