@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import os
-import platform
-import subprocess
 import zipfile
 from pathlib import Path
 
@@ -62,24 +59,3 @@ def test_the_wheel_for_arm_holds_a_library_for_arm(build: Path) -> None:
     assert "-manylinux_2_" in wheels[0].name, "auditwheel did not look at its symbols"
     assert int.from_bytes(data[_MACHINE_AT : _MACHINE_AT + 2], "little") == _AARCH64
     assert digest in (build / "native" / "requirements.txt").read_text(encoding="utf-8")
-
-
-@pytest.mark.timeout(900)  # with an empty cache the compiler builds its own C++ library first
-def test_the_compiler_for_arm_builds_a_core_with_the_instructions_of_the_processor(
-    build: Path, repository: Path, tmp_path: Path
-) -> None:
-    zig = build / "ziglang" / "ziglang" / "zig"
-    if not zig.is_file() or platform.machine() != "x86_64":
-        pytest.skip("no compiler of the wheel ziglang: run make assets on x86-64")
-    command = ["make", "-j2", "-C", str(repository / "native"), f"OUT={tmp_path}", "ARCH=x86_64"]
-    cache = str((build / "zig-cache").resolve())  # that of `make assets`
-    caches = {"ZIG_GLOBAL_CACHE_DIR": cache, "ZIG_LOCAL_CACHE_DIR": cache}
-    subprocess.run(
-        [*command, f"CXX={zig} c++ -target x86_64-linux-gnu.2.28"], check=True, env=os.environ | caches
-    )
-
-    has = set(Path("/proc/cpuinfo").read_text(encoding="ascii").split())
-    widest = (
-        "avx512" if {"avx512f", "avx512dq", "avx512vl"} <= has else "avx2" if "avx2" in has else "portable"
-    )
-    assert open_solver(tmp_path / LIBRARY).lanes == widest

@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from rse_pf.native import native_solver, open_solver
+
 COMPILER = """#!/bin/sh
 # Stands in for a compiler: writes what -o names.
 echo "$@" >> {log}
@@ -16,7 +18,7 @@ echo "$@" >> {log}
 while [ $# -gt 0 ]; do [ "$1" = -o ] && : > "$2"; shift; done
 exit {status}
 """
-TOOLS = ("sh", "make", "dirname", "mkdir", "rm", "mv", "uname")
+TOOLS = ("sh", "make", "dirname", "mkdir", "rm", "mv", "uname", "sed", "cat")
 
 
 class Checkout:
@@ -53,10 +55,10 @@ class Checkout:
         zig.parent.mkdir(parents=True)
         self.add_compiler("zig").rename(zig)
 
-    def set_up(self, **variables: str) -> subprocess.CompletedProcess[str]:
+    def set_up(self, *, timeout_s: float = 60, **variables: str) -> subprocess.CompletedProcess[str]:
         """Run the script."""
         return subprocess.run(
-            ["sh", "scripts/native.sh"], cwd=self.folder, capture_output=True, text=True, timeout=60,
+            ["sh", "scripts/native.sh"], cwd=self.folder, capture_output=True, text=True, timeout=timeout_s,
             check=False, env={"PATH": str(self.programs), **variables},
         )  # fmt: skip
 
@@ -137,6 +139,23 @@ def test_a_chosen_compiler_that_fails_stops_the_setup_and_leaves_no_old_library(
     assert done.returncode == 2
     assert "does not compile with no-such-compiler\n  hint: read build/native.log" in done.stderr
     assert not checkout.built.exists()
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)  # with an empty cache zig builds its own C++ library first
+def test_ziglang_builds_a_core_with_the_instructions_of_the_processor(
+    checkout: Checkout, repository: Path
+) -> None:
+    if not (repository / "build/ziglang/locked.txt").is_file():
+        pytest.skip("no ziglang: run make assets")
+    for name in ("locks", "scripts/tool.sh", "build/ziglang", "build/zig-cache"):
+        (checkout.folder / name).parent.mkdir(exist_ok=True)
+        (checkout.folder / name).symlink_to((repository / name).resolve())
+
+    done = checkout.set_up(timeout_s=800)
+
+    assert (done.returncode, done.stderr) == (0, "")
+    assert open_solver(checkout.built).lanes == native_solver().lanes
 
 
 @pytest.mark.slow

@@ -147,8 +147,8 @@ def release(repository: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """
     if "RSE_PF_RELEASE" in os.environ:
         return Path(os.environ["RSE_PF_RELEASE"]).absolute()
-    if not any(map(shutil.which, ("c++", "g++", "clang++"))) or not (repository / ".git").exists():
-        pytest.skip("no C++ compiler, or no checkout of git")
+    if not (repository / ".git").exists():
+        pytest.skip("no checkout of git")
     folder = tmp_path_factory.mktemp("release")
     made = subprocess.run(
         ["sh", "scripts/release.sh", str(folder), platform.machine()],
