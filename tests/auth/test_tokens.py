@@ -6,10 +6,11 @@ import base64
 import hashlib
 import hmac
 import json
+import subprocess
+import sys
 from collections.abc import Callable
 from typing import Any
 
-import jwt
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
@@ -83,6 +84,7 @@ FORGED: dict[str, Callable[[], str]] = {
     "not ascii": lambda: issue() + "é",
     "trailing dot": lambda: issue() + ".",
     "padding": lambda: issue() + "=",
+    "whole padding": lambda: issue() + "==",
     "white space": lambda: " " + issue(),
     "deeply nested header": lambda: base64.urlsafe_b64encode(b"[" * 2900).decode().rstrip("=") + ".e30.AA",
     "header is a list": lambda: f"{encoded([1])}.e30.AA",
@@ -98,6 +100,8 @@ FORGED: dict[str, Callable[[], str]] = {
     "HS256 that calls itself EdDSA": lambda: hmac_with(PUBLIC, "EdDSA"),
     "another type": lambda: sign(GOOD, {**HEADER, "typ": "JWT"}),
     "critical header": lambda: sign(GOOD, {**HEADER, "crit": ["exp"]}),
+    "critical header of a known extension": lambda: sign(GOOD, {**HEADER, "crit": ["b64"], "b64": True}),
+    "payload without an encoding": lambda: sign(GOOD, {**HEADER, "crit": ["b64"], "b64": False}),
     "own key in the header": lambda: sign(
         GOOD, {**HEADER, "kid": "mine", "jwk": json.loads(OTHER.key_set().to_json())["keys"][0]}, OTHER
     ),
@@ -109,6 +113,12 @@ FORGED: dict[str, Callable[[], str]] = {
     "subject is a number": lambda: sign({**GOOD, "sub": 7}),
     "subject is empty": lambda: sign({**GOOD, "sub": ""}),
     "subject is long": lambda: sign({**GOOD, "sub": "r" * 65}),
+    "subject is half a character": lambda: sign({**GOOD, "sub": "\ud800"}),
+    "id is half a character": lambda: sign({**GOOD, "jti": "\ud800"}),
+    "tenant is half a character": lambda: sign({**GOOD, "tenant": "\ud800"}),
+    "scope is half a character": lambda: sign({**GOOD, "scope": "\ud800"}),
+    "audience is a number and ours": lambda: sign({**GOOD, "aud": ["rse-pf", 1]}),
+    "audience is an object": lambda: sign({**GOOD, "aud": {"rse-pf": 1}}),
     "id is empty": lambda: sign({**GOOD, "jti": ""}),
     "expires as a string": lambda: sign({**GOOD, "exp": str(GOOD["exp"])}),
     "expires as a truth": lambda: sign({**GOOD, "exp": True}),
@@ -254,19 +264,19 @@ def test_what_is_no_key_set_is_a_usage_error(text: str) -> None:
         KeySet.from_json(text)
 
 
-def test_a_plain_jwt_library_accepts_our_tokens() -> None:
-    public = KEYS.get("key-1")
-    assert public is not None
+def test_who_reads_a_key_set_can_verify_a_token_without_another_import() -> None:
+    code = """if True:
+        import sys
+        from rse_pf.auth.tokens import KeySet
+        KeySet.from_json(sys.argv[1])
+        sys.exit(0 if "jwt" in sys.modules else "PyJWT is not imported")
+    """
 
-    claims = jwt.decode(
-        KEY.issue("robot-7", now=NOW, token_id="t1", settings=SETTINGS),
-        public,
-        algorithms=["EdDSA"],
-        audience="rse-pf",
-        options={"verify_exp": False, "verify_iat": False},
+    done = subprocess.run(
+        [sys.executable, "-c", code, KEYS.to_json()], capture_output=True, text=True, check=False
     )
 
-    assert claims["sub"] == "robot-7"
+    assert (done.returncode, done.stderr) == (0, "")
 
 
 # --- tokens that were verified before ---------------------------------------------------------------
@@ -351,44 +361,3 @@ def test_a_robot_has_one_place_among_the_remembered_tokens_and_their_number_is_b
         token = KEY.issue(f"r{n}", now=NOW, token_id="t", settings=SETTINGS)
         verify_token(token, keys=keys, now=NOW, settings=SETTINGS)
     assert len(keys._signed) == len(keys._digests) == 3
-
-
-CLAIMS = st.fixed_dictionaries(
-    {},
-    optional={
-        "iss": st.sampled_from(["rse-pf", "rse", 1, None]),
-        "aud": st.sampled_from(["rse-pf", ["rse-pf", "x"], ["x"], [1, "rse-pf"], "x", None, {}]),
-        "sub": st.sampled_from(["robot-7", 7, "", None]),
-        "jti": st.sampled_from(["t1", 1, None, [""]]),
-        "iat": st.sampled_from([int(NOW), None, "1", True, NOW + 0.5]),
-        "exp": st.sampled_from([int(NOW) + 600, None, "1", NOW - 900]),
-    },
-)
-HEADERS = st.fixed_dictionaries(
-    {},
-    optional={
-        "kid": st.sampled_from(["key-1", "key-2", 1, None]),
-        "alg": st.sampled_from(["EdDSA", "none", "HS256"]),
-        "crit": st.just(["exp"]),
-        "b64": st.booleans(),
-    },
-)
-
-
-@given(CLAIMS, HEADERS)
-@example({"aud": ["rse-pf", "x"]}, {})
-def test_a_token_that_is_accepted_is_valid_for_the_library_as_well(claims, header):
-    token = sign({**GOOD, **claims}, {**HEADER, **header})
-
-    try:
-        found = verify_token(token, keys=KEYS, now=NOW, settings=SETTINGS)
-    except Unauthorized:
-        return
-    public = KEYS.get("key-1")
-    assert public is not None
-    told = jwt.decode(
-        token, public, algorithms=["EdDSA"], audience="rse-pf", issuer="rse-pf",
-        options={"require": ["iss", "aud", "sub", "exp", "iat", "jti"], "verify_exp": False,
-                 "verify_iat": False, "verify_nbf": False},
-    )  # fmt: skip
-    assert (told["sub"], told["jti"]) == (found.robot.name, found.token_id)
