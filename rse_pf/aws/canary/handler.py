@@ -10,18 +10,22 @@ from __future__ import annotations
 import json
 import os
 import secrets
+import socket
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 import numpy as np
+from websockets.exceptions import ConnectionClosed, InvalidStatus, WebSocketException
+from websockets.sync.client import ClientConnection, connect
+from websockets.typing import Subprotocol
 
 from rse_pf.auth.tokens import SigningKey
-from rse_pf.aws.canary.websocket import WebSocket
 from rse_pf.aws.clients import call_api, make_client
 from rse_pf.config import PlatformSettings, load_settings
-from rse_pf.errors import Expired, InternalError, RsePfError
+from rse_pf.errors import ConnectError, Expired, InternalError, RsePfError
 from rse_pf.pnp.problems import make_problem
 from rse_pf.service import Registry
 from rse_pf.services import pnp
@@ -36,6 +40,8 @@ __all__ = ["ask_known_pose", "handler", "read_key"]
 _ROOT = Path(__file__).resolve().parents[3]
 _CODEC = "zlib"
 _TIMEOUT_S = 10.0
+_CLOSE_S = 1.0  # limit of the closing handshake; the answer is known before it
+_HINT = "look at the load balancer's target groups and the servers' journals"
 _SEED, _MAX_ERROR = 20260101, 0.02
 _KEYS: dict[str, SigningKey] = {}
 """Read once in the life of an execution environment."""
@@ -82,20 +88,47 @@ def ask_known_pose(
     session = ClientSession(codec=codec, settings=settings.session, sdk="rse-pf-canary")
     began = clock()
     request = pnp.make_request(problem.points_world, problem.pixels, problem.camera)
-    with WebSocket.dial(url, subprotocol=SUBPROTOCOLS[_CODEC], token=token, timeout_s=_TIMEOUT_S) as socket:
-        connection = session.open_connection(clock())
-        session.submit("pnp", request, now=clock(), deadline_s=_TIMEOUT_S, trace=trace)
-        while clock() - began < _TIMEOUT_S:
-            while connection.outgoing:
-                socket.send(connection.outgoing.pop(0))
-            for event in session.receive(connection, socket.receive(), clock()):
-                if isinstance(event, Welcomed):
-                    session.adopt(connection, clock())
-                elif isinstance(event, Answered):
-                    return _check_answer(event, problem.T_camera_world, (clock() - began) * 1e3)
-                elif isinstance(event, ConnectionLost | Notice):
-                    raise InternalError(f"the session failed: {event}", hint="read the server's journal")
-    raise Expired(f"no answer within {_TIMEOUT_S:g} s", hint="read the servers' journals")
+    session.submit("pnp", request, now=began, deadline_s=_TIMEOUT_S, trace=trace)
+    address = urlsplit(url)
+    host, port = address.hostname or "", address.port or (443 if address.scheme == "wss" else 80)
+    try:
+        # With a socket of ours the library follows no redirect, as robots do not.
+        stream = socket.create_connection((host, port), timeout=_TIMEOUT_S)
+        with connect(
+            url, sock=stream, subprotocols=[Subprotocol(SUBPROTOCOLS[_CODEC])], compression=None,
+            additional_headers={"Authorization": f"Bearer {token}"}, open_timeout=_TIMEOUT_S,
+            ping_interval=None, close_timeout=_CLOSE_S, max_size=settings.session.max_message_bytes,
+        ) as websocket:  # fmt: skip
+            answered = _exchange(session, websocket, clock, until_s=began + _TIMEOUT_S)
+    except InvalidStatus as error:
+        body = error.response.body[:200].decode("utf-8", "replace")
+        raise ConnectError(f"the handshake: {error}: {body}", hint=_HINT) from error
+    except ConnectionClosed as error:
+        raise ConnectError(f"the server left: {error}", hint=_HINT) from error
+    except (OSError, ValueError, WebSocketException) as error:
+        raise ConnectError(f"no server answers at {host}:{port}: {error}", hint=_HINT) from error
+    return _check_answer(answered, problem.T_camera_world, (clock() - began) * 1e3)
+
+
+def _exchange(
+    session: ClientSession, websocket: ClientConnection, clock: Callable[[], float], until_s: float
+) -> Answered:
+    """Send what the session wants to send until its command is answered."""
+    connection = session.open_connection(clock())
+    while True:
+        while connection.outgoing:
+            websocket.send(connection.outgoing.pop(0))
+        try:
+            message = websocket.recv(until_s - clock(), decode=False)
+        except TimeoutError as error:
+            raise Expired(f"no answer within {_TIMEOUT_S:g} s", hint="read the servers' journals") from error
+        for event in session.receive(connection, message, clock()):
+            if isinstance(event, Welcomed):
+                session.adopt(connection, clock())
+            elif isinstance(event, Answered):
+                return event
+            elif isinstance(event, ConnectionLost | Notice):
+                raise InternalError(f"the session failed: {event}", hint="read the server's journal")
 
 
 def _check_answer(event: Answered, expected: Any, took_ms: float) -> dict[str, Any]:

@@ -20,7 +20,7 @@ from rse_pf.aws.canary import handler as canary
 from rse_pf.aws.canary.handler import ask_known_pose, read_key
 from rse_pf.aws.clients import make_client
 from rse_pf.config import PlatformSettings
-from rse_pf.errors import ConfigurationError, ConnectError, InternalError, UsageError
+from rse_pf.errors import ConfigurationError, ConnectError, Expired, InternalError, UsageError
 from rse_pf.service import Registry
 from rse_pf.services import pnp
 
@@ -103,6 +103,41 @@ async def test_a_server_that_leaves_is_a_failure_and_not_a_wait() -> None:
         platform.on_command = leave
 
         with pytest.raises(ConnectError, match="left"):
+            await ask(platform)
+
+
+@in_a_loop
+async def test_a_redirect_is_a_failure_because_robots_do_not_follow_it() -> None:
+    async with FakePlatform(registry=registry()) as platform:
+
+        async def redirect(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+            await reader.readuntil(b"\r\n\r\n")
+            head = f"HTTP/1.1 302 Found\r\nLocation: {platform.url}\r\nContent-Length: 0\r\n\r\n"
+            writer.write(head.encode())
+            writer.close()
+
+        server = await asyncio.start_server(redirect, "127.0.0.1", 0)
+        port = server.sockets[0].getsockname()[1]
+        with pytest.raises(ConnectError, match="redirect"):
+            await asyncio.to_thread(
+                ask_known_pose, f"ws://127.0.0.1:{port}/ws", "t", SETTINGS, trace=TRACE, clock=time.monotonic
+            )
+        server.close()
+
+        assert platform.tokens_seen == []
+
+
+@in_a_loop
+async def test_a_server_that_does_not_answer_the_command_is_late(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(canary, "_TIMEOUT_S", 0.5)
+    async with FakePlatform(registry=registry()) as platform:
+
+        async def drop(robot: Any, command: Any) -> None:
+            pass
+
+        platform.on_command = drop
+
+        with pytest.raises(Expired, match="no answer within"):
             await ask(platform)
 
 

@@ -113,10 +113,11 @@ def test_a_deployment_whose_agents_are_silent_is_not_parked(region: str, topic: 
     assert "nobody told" in told
 
 
-def test_the_function_needs_no_package_that_the_lock_of_the_function_lacks(repository: Path) -> None:
+@pytest.mark.parametrize("module", ["rse_pf.aws.lifecycle.idle", "rse_pf.aws.canary.handler"])
+def test_a_function_needs_no_package_that_the_lock_of_functions_lacks(module: str, repository: Path) -> None:
     locked = set(re.findall(r"^([a-z0-9-]+)==", (repository / "locks/lambda.txt").read_text(), re.M))
     code = (
-        "import sys, rse_pf.aws.lifecycle.idle\n"
+        f"import sys, {module}\n"
         "files = {name.partition('.')[0]: getattr(of, '__file__', '') for name, of in sys.modules.items()}\n"
         "found = [name for name, file in files.items() if 'site-packages' in (file or '')]\n"
         "print(*sorted(found))"
@@ -125,6 +126,11 @@ def test_the_function_needs_no_package_that_the_lock_of_the_function_lacks(repos
         [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60
     )
 
-    optional = ("_", "rse_pf", "typing_extensions")  # msgspec works without the last one
+    optional = (
+        "_",
+        "rse_pf",
+        "typing_extensions",
+        "python_socks",
+    )  # msgspec and websockets work without them
     loaded = {name for name in told.stdout.split() if not name.startswith(optional)}
     assert loaded <= {name.replace("-", "_") for name in locked}, "the runtime itself has botocore only"
