@@ -12,12 +12,12 @@ from __future__ import annotations
 import argparse
 import asyncio
 import base64
-import contextlib
 import re
 import signal
+import socket
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -27,115 +27,70 @@ from lambda_pnp.keys import KeyCache
 from rse_pf.config import PlatformSettings, load_settings
 from rse_pf.config.front_door import BEARER_PATTERN, BURST_PATH
 from rse_pf.errors import NotFound, RsePfError
+from rse_pf.http_connections import bounded_protocol
 from rse_pf.linux import die_with_parent, set_process_name
-from rse_pf.silent_connections import BACKLOG, FIRST_REQUEST_S, KEEP_ALIVE_S, SilentConnections
+from rse_pf.silent_connections import BACKLOG, MAX_SILENT
 from rse_pf.terminal import show, show_error, show_json
 
 __all__ = ["LocalFront", "answering_of", "read_beside"]
 
 _HOST = "127.0.0.1"
-_TIMEOUT_S = 10.0
-_MAX_HEAD_BYTES = 16384
-_MAX_BODY_BYTES = 1_048_576
-"""Of a request that an ALB passes on to a function."""
+_TIMEOUT_S = 10.0  # limit of a body, and of an execution, as stacks/serverless_stack.py sets it
+_STOP_TIMEOUT_S = 1  # uvicorn's limit of the requests that are being answered when the front stops
+_MAX_BODY_BYTES = 1_048_576  # of a request that an ALB passes on to a function
 _TOKEN = re.compile(BEARER_PATTERN)
-_REASONS = {
-    200: "OK", 400: "Bad Request", 401: "Unauthorized", 404: "Not Found", 413: "Payload Too Large",
-    502: "Bad Gateway",
-}  # fmt: skip
+_Receive = Callable[[], Awaitable[Mapping[str, Any]]]
 
 
 class LocalFront:
-    """The firewall, the load balancer and the executions of one function.
+    """The firewall, the load balancer and the executions of one function, as an ASGI application.
 
     Attributes:
-        url: Where commands are posted, once it listens.
         answered: Requests that an execution answered; ``refused`` those that met none.
         executions: How many were started.
     """
 
-    def __init__(
-        self, make: Callable[[], Answering], *, most: int, first_request_s: float = FIRST_REQUEST_S
-    ) -> None:
-        """Describe the front; nothing listens yet.
+    def __init__(self, make: Callable[[], Answering], *, most: int) -> None:
+        """Describe the front; nothing is started yet.
 
         Args:
             make: Starts an execution.
             most: How many there may be at a time.
-            first_request_s: A connection whose first request is not complete by then is cut.
         """
-        self.url = ""
         self.answered = self.refused = self.executions = 0
         self._make = make
         self._most = most
-        self._first_request_s = first_request_s
         self._idle: list[Answering] = []
         self._threads = ThreadPoolExecutor(most, "execution")
-        self._writers: set[asyncio.StreamWriter] = set()
-        self._server: asyncio.Server | None = None
-        self._silent: SilentConnections[asyncio.StreamWriter] | None = None
 
-    async def start(self, port: int = 0) -> None:
-        """Listen on loopback; port 0 takes a free one."""
-        self._silent = SilentConnections(
-            call_later=asyncio.get_running_loop().call_later, seconds=self._first_request_s
-        )
-        self._server = await asyncio.start_server(
-            self._serve, _HOST, port, limit=_MAX_HEAD_BYTES, backlog=BACKLOG
-        )
-        self.url = f"http://{_HOST}:{self._server.sockets[0].getsockname()[1]}{BURST_PATH}"
+    async def __call__(
+        self,
+        scope: Mapping[str, Any],
+        receive: _Receive,
+        send: Callable[[Mapping[str, Any]], Awaitable[None]],
+    ) -> None:
+        """Answer one request."""
+        status, headers, body = await self._answer(scope, receive)
+        fields = [(name.encode(), value.encode()) for name, value in headers.items()]
+        fields.append((b"content-length", b"%d" % len(body)))
+        await send({"type": "http.response.start", "status": status, "headers": fields})
+        await send({"type": "http.response.body", "body": body})
 
-    async def stop(self) -> None:
-        """Stop listening and end every connection."""
-        assert self._server is not None
-        self._server.close()
-        for writer in self._writers:
-            writer.transport.abort()
-        await self._server.wait_closed()
+    def close(self) -> None:
+        """Start no execution any more."""
         self._threads.shutdown(wait=False, cancel_futures=True)
 
-    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        assert self._silent is not None
-        self._writers.add(writer)
-        self._silent.enter(writer, writer.transport.abort)
-        try:
-            while True:
-                head = await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), KEEP_ALIVE_S)
-                if not await self._exchange(head, reader, writer):
-                    return
-        except (OSError, EOFError, asyncio.LimitOverrunError, asyncio.TimeoutError):
-            return
-        finally:
-            self._silent.leave(writer)
-            self._writers.discard(writer)
-            writer.transport.abort()
-
-    async def _exchange(
-        self, head: bytes, reader: asyncio.StreamReader, writer: asyncio.StreamWriter
-    ) -> bool:
-        """Answer one request; return whether another may follow on the connection."""
-        first, *lines = head.decode("latin-1").split("\r\n")
+    async def _answer(self, scope: Mapping[str, Any], receive: _Receive) -> tuple[int, dict[str, str], bytes]:
+        method, path = scope["method"], scope["path"]
         headers: dict[str, list[str]] = {}
-        for line in lines:
-            name, colon, value = line.partition(":")
-            if colon:
-                headers.setdefault(name.strip().lower(), []).append(value.strip())
-        size = headers.get("content-length", ["0"])[0]
-        if not size.isdecimal() or int(size) > _MAX_BODY_BYTES or "transfer-encoding" in headers:
-            await _write(writer, 413, {"connection": "close"}, b"")
-            return False
-        body = await asyncio.wait_for(reader.readexactly(int(size)), _TIMEOUT_S)
-        assert self._silent is not None
-        self._silent.leave(writer)
-        status, response_headers, answer = await self._answer_request(first, headers, body)
-        await _write(writer, status, response_headers, answer)
-        return True
-
-    async def _answer_request(
-        self, first: str, headers: dict[str, list[str]], body: bytes
-    ) -> tuple[int, dict[str, str], bytes]:
-        method, _, rest = first.partition(" ")
-        path = rest.partition(" ")[0].partition("?")[0]
+        for name, value in scope["headers"]:
+            headers.setdefault(name.decode("latin-1"), []).append(value.decode("latin-1"))
+        try:
+            body = await asyncio.wait_for(_read_body(headers, receive), _TIMEOUT_S)
+        except asyncio.TimeoutError:
+            return 408, {}, b""
+        if body is None:
+            return 413, {}, b""
         if not path.startswith(BURST_PATH):
             return 404, {}, b""
         if not all(_TOKEN.fullmatch(value) for value in headers.get("authorization", [""])):
@@ -173,11 +128,18 @@ class LocalFront:
         return execution, answer
 
 
-async def _write(writer: asyncio.StreamWriter, status: int, headers: dict[str, str], body: bytes) -> None:
-    lines = "".join(f"{name}: {value}\r\n" for name, value in headers.items())
-    head = f"HTTP/1.1 {status} {_REASONS.get(status, 'Status')}\r\n{lines}content-length: {len(body)}\r\n\r\n"
-    writer.write(head.encode() + body)
-    await writer.drain()
+async def _read_body(headers: Mapping[str, list[str]], receive: _Receive) -> bytes | None:
+    """Return the whole body; None if it is too long, or if the client left before its end."""
+    if int(headers.get("content-length", ["0"])[0]) > _MAX_BODY_BYTES:
+        return None
+    body, is_complete = b"", False
+    while not is_complete:
+        part = await receive()
+        body += part.get("body", b"")
+        if part["type"] != "http.request" or len(body) > _MAX_BODY_BYTES:
+            return None
+        is_complete = not part.get("more_body", False)
+    return body
 
 
 def answering_of(settings: PlatformSettings, folder: Path) -> Callable[[], Answering]:
@@ -201,17 +163,31 @@ def read_beside(folder: Path, name: str = "keys.json") -> str:
         raise NotFound(f"there is no {name} in {folder}") from error
 
 
-async def _run(folder: Path, port: int) -> None:
+def _serve(folder: Path, port: int) -> None:
+    """Serve the platform in *folder* on loopback until a signal; print the address as JSON."""
+    protocol = bounded_protocol(most_idle=MAX_SILENT)
+    import uvicorn
+
     settings = load_settings(folder / "settings.json")
     front = LocalFront(answering_of(settings, folder), most=settings.cloud.lambda_concurrency)
-    await front.start(port)
-    stopped = asyncio.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        asyncio.get_running_loop().add_signal_handler(number, stopped.set)
-    show_json({"url": front.url})
-    sys.stdout = sys.stderr  # what the function logs; nobody reads more than the first line of the output
-    await stopped.wait()
-    await front.stop()
+    config = uvicorn.Config(
+        front, http=protocol, ws="none", lifespan="off", access_log=False, log_level="warning",
+        backlog=BACKLOG, server_header=False, date_header=False, proxy_headers=False,
+        timeout_graceful_shutdown=_STOP_TIMEOUT_S,
+    )  # fmt: skip
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda number, frame: None)  # uvicorn repeats it to itself when it has ended
+    with socket.create_server((_HOST, port), backlog=BACKLOG) as listening:
+        # asyncio does this only for sockets that name their protocol.
+        listening.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        show_json({"url": f"http://{_HOST}:{listening.getsockname()[1]}{BURST_PATH}"})
+        sys.stdout = (
+            sys.stderr
+        )  # the log of the function; nobody reads more than the first line of the output
+        try:
+            uvicorn.Server(config).run(sockets=[listening])
+        finally:
+            front.close()
 
 
 def main() -> int:
@@ -225,8 +201,7 @@ def main() -> int:
         die_with_parent(args.parent)
     set_process_name("rse-pf-burst")
     try:
-        with contextlib.suppress(KeyboardInterrupt):
-            asyncio.run(_run(args.folder, args.port))
+        _serve(args.folder, args.port)
     except RsePfError as error:
         show_error(error)
         return 2

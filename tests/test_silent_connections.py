@@ -14,7 +14,6 @@ import pytest
 from fakes import FakeLoop
 from http_service import http_service
 
-from lambda_pnp.local_front import LocalFront
 from rse_pf.backend.live_map.owner.link_security import client_context, server_context
 from rse_pf.backend.live_map.owner.server import listen
 from rse_pf.config.front_door import BALANCER_IDLE_TIMEOUT_S
@@ -103,16 +102,6 @@ async def control_of_a_platform(folder: Path, seconds: float) -> Started:
         yield server.sockets[0].getsockname()[1]
 
 
-@contextlib.asynccontextmanager
-async def burst_front(folder: Path, seconds: float) -> Started:
-    front = LocalFront(lambda: None, most=1, first_request_s=seconds)  # type: ignore[arg-type, return-value]
-    await front.start()
-    try:
-        yield int(front.url.rpartition(":")[2].partition("/")[0])
-    finally:
-        await front.stop()
-
-
 async def answer(scope: Any, receive: Any, send: Any) -> None:
     headers = [(b"content-length", b"2")]
     await send({"type": "http.response.start", "status": 200, "headers": headers})
@@ -143,7 +132,7 @@ async def owner_of_a_map(folder: Path, seconds: float) -> Started:
         listener.close()
 
 
-KINDS = [control_of_a_server, control_of_a_platform, burst_front, data_or_fleet_page, owner_of_a_map]
+KINDS = [control_of_a_server, control_of_a_platform, data_or_fleet_page, owner_of_a_map]
 BEGUN = (b"", b"G", b"GET /healthz HTTP/1.1\r\nHost: a\r\nContent-")
 """What silent connections send before they fall silent."""
 
@@ -221,7 +210,7 @@ async def test_above_the_bound_silent_connections_are_cut_at_once(kind: Any, tmp
         await asyncio.gather(*map(ended, silent[:20]))
         newest = asyncio.ensure_future(ended(silent[-1]))
         first = await Honest.open(port, is_owner=kind is owner_of_a_map)
-        assert b" 200 " in await first.ask() or kind is burst_front
+        assert b" 200 " in await first.ask()
         assert not newest.done()
         newest.cancel()
         for each in (first, *silent):
