@@ -19,6 +19,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from documentation_pages import PAGES
 
 from rse_pf.auth.tokens import SigningKey
 from rse_pf.cli.main import VERBS, main, parser_of, verb_module
@@ -27,9 +28,7 @@ from rse_pf.geometry import Camera
 from rse_pf.maps.format import Keyframe, MapVersion, encode_map
 from rse_pf.maps.registry import MapRegistry
 from rse_pf.object_store import DirectoryStore
-from scripts.site.blocks import pages
 
-PAGES = tuple(name for name in pages(Path(__file__).parents[2]) if name != "docs/settings.md")
 OTHER_PROGRAMS = (
     "npx", "aws", "dask", "python", ".", "grep", "sudo", "g++", "cmake", "mkdir", "build/first_pose",
     "client_cpp/build/rse_pf_tum_robot", "roscore", "roslaunch", "rosbag",

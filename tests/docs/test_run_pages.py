@@ -1,4 +1,8 @@
-"""The pages as a reader follows them: each block that is not marked runs, in the order of its page.
+"""The pages as a reader follows them: sybil finds their blocks, which run in the order of the page.
+
+Commands (a block without a language, or ``sh``) and programs (``python``) run, unless sybil's comment
+``skip: next "REASON"`` stands before them.  The comment ``file: NAME`` names the file in which a program is
+saved for the commands after it.
 
 Every page has an empty folder, a home and a platform of its own, and a network namespace of its own where the
 user may make one, so that the ports of the pages are free.
@@ -13,22 +17,26 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from queue import Empty, Queue
+from unittest import SkipTest
 
 import pytest
-
-from scripts.site.blocks import RUN_BY_OTHERS, Block, all_blocks, is_executed
+from documentation_pages import PAGES, ROOT
+from sybil import Document, Example, Region, Sybil
+from sybil.parsers.markdown import SkipParser
+from sybil.parsers.markdown.lexers import DirectiveInHTMLCommentLexer, FencedCodeBlockLexer
 
 pytestmark = [pytest.mark.system, pytest.mark.slow, pytest.mark.timeout(400)]
 
-ROOT = Path(__file__).parents[2]
 SOON_S = 120.0
 WHILE_A_PLATFORM_RUNS = (
     "docs/local.md", "docs/fleet_page.md", "docs/howto/robot_keys.md", "docs/howto/load_and_faults.md",
 )  # fmt: skip
-IN_THE_CHECKOUT = ("docs/architecture.md",)
+RUN_BY_OTHERS = ("docs/operations.md",)
+"""Pages whose blocks another test runs: `tests/stacks/test_operations.py`."""
 RUN_BY_CI = ("make demo", "make test", ". .venv/bin/activate", "cd ")
 """`.ci/run` executes them; here the environment is active already."""
 EXECUTED_IN = {
@@ -47,12 +55,44 @@ _READY, _PAGE = re.compile(r"wss?://\S+"), re.compile(r"fleet page +http\S+")
 """What a platform prints when robots can connect, and when its page serves, a little later."""
 
 
-def todo() -> dict[str, list[Block]]:
-    """Return the blocks that this module executes, by page."""
-    found: dict[str, list[Block]] = {}
-    for block in all_blocks(ROOT):
-        if is_executed(block) and block.page not in RUN_BY_OTHERS:
-            found.setdefault(block.page, []).append(block)
+def parse_blocks(document: Document) -> Iterator[Region]:
+    """Yield the blocks that run, and the names of the files in which programs are saved."""
+    for region in DirectiveInHTMLCommentLexer(directive="file")(document):
+        region.evaluator = name_file
+        yield region
+    for region in FencedCodeBlockLexer(language=r"\w*")(document):
+        if region.lexemes["language"] in ("", "sh", "python"):
+            region.evaluator = follow_block
+            yield region
+
+
+def name_file(example: Example) -> None:
+    example.namespace["file"] = example.region.lexemes["arguments"]
+
+
+def follow_block(example: Example) -> None:
+    lexemes = example.region.lexemes
+    example.namespace["follow"](
+        str(lexemes["language"]), str(lexemes["source"]), example.namespace.pop("file", "")
+    )
+
+
+SYBIL = Sybil(parsers=[parse_blocks, SkipParser()])
+
+
+def follow_page(page: str, follow: Callable[[str, str, str], None]) -> None:
+    """Call *follow* with language, text and file of each block of *page* that is not skipped."""
+    document = SYBIL.parse(ROOT / page)
+    document.namespace["follow"] = follow
+    for example in document.examples():
+        with suppress(SkipTest):  # the page has the reason
+            example.evaluate()
+
+
+def blocks(page: str) -> list[tuple[str, str, str]]:
+    """Return what `follow_page` would run."""
+    found: list[tuple[str, str, str]] = []
+    follow_page(page, lambda *block: found.append(block))
     return found
 
 
@@ -73,11 +113,11 @@ class Reader:
         }
         self._started: list[subprocess.Popen[str]] = []
 
-    def start_platform(self, command: str, within: Path) -> None:
+    def start_platform(self, command: str) -> None:
         """Start a platform instead of the one that runs, and wait until it prints its addresses."""
         self.leave()
         process = subprocess.Popen(
-            ["bash", "-c", f"exec {command}"], cwd=within, env=self.environment, text=True,
+            ["bash", "-c", f"exec {command}"], cwd=self.folder, env=self.environment, text=True,
             stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
         )  # fmt: skip
         self._started.append(process)
@@ -102,36 +142,35 @@ class Reader:
                 pytest.fail(f"{command} ended: {told}")
             told += line
 
-    def run(self, script: str, within: Path) -> str:
+    def run(self, script: str) -> str:
         """Run lines of a shell; return what they print."""
         done = subprocess.run(
-            ["bash", "-euo", "pipefail", "-c", script], cwd=within, env=self.environment, check=False,
+            ["bash", "-euo", "pipefail", "-c", script], cwd=self.folder, env=self.environment, check=False,
             text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, timeout=SOON_S * 2,
         )  # fmt: skip
         assert done.returncode == 0, f"{script}\n{done.stdout}"
         return done.stdout
 
-    def follow(self, block: Block) -> None:
+    def follow(self, language: str, text: str, file: str) -> None:
         """Do what a block says."""
-        within = ROOT if block.page in IN_THE_CHECKOUT else self.folder
-        if block.language == "python":
-            (self.folder / (block.file or "block.py")).write_text(block.text, encoding="utf-8")
-            if not block.file:
-                self.run("python block.py", within)
+        if language == "python":
+            (self.folder / (file or "block.py")).write_text(text, encoding="utf-8")
+            if not file:
+                self.run("python block.py")
             return
         script = []
-        for line in block.text.splitlines():
+        for line in text.splitlines():
             if line.startswith((*RUN_BY_CI, *EXECUTED_IN)):
                 continue
             if _START.match(line):
-                self.run("\n".join(script), within)
+                self.run("\n".join(script))
                 script = []
-                self.start_platform(line.partition(" #")[0], within)
+                self.start_platform(line.partition(" #")[0])
             elif line.endswith("--follow"):
                 script.append(f"timeout --signal=INT 3 {line} || [ $? -eq 124 ]")
             else:
                 script.append(line)
-        self.run("\n".join(script), within)
+        self.run("\n".join(script))
 
     def leave(self) -> None:
         """End the platforms."""
@@ -164,7 +203,7 @@ def may_have_a_network() -> bool:
     return subprocess.run(tried, capture_output=True, check=False).returncode == 0
 
 
-@pytest.mark.parametrize("page", todo())
+@pytest.mark.parametrize("page", [page for page in PAGES if page not in RUN_BY_OTHERS and blocks(page)])
 def test_what_a_page_says_works(page: str, reader: Reader) -> None:
     if os.environ.get("RSE_PF_OWN_NETWORK") != "1" and may_have_a_network():
         one = f"{__file__}::test_what_a_page_says_works[{page}]"
@@ -176,6 +215,5 @@ def test_what_a_page_says_works(page: str, reader: Reader) -> None:
         assert done.returncode == 0, done.stdout
         return
     if page in WHILE_A_PLATFORM_RUNS:
-        reader.start_platform("rse-pf local", reader.folder)
-    for block in todo()[page]:
-        reader.follow(block)
+        reader.start_platform("rse-pf local")
+    follow_page(page, reader.follow)
