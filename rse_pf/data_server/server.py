@@ -86,6 +86,7 @@ def serve_data(
     sys.setswitchinterval(_SWITCH_S)
     log = None if audit is None else _audit_log(audit, settings)
     app = DataServer(settings, store, keys=keys, log=_write_line, audit=log)
+    keys()  # reads the keys, and imports what verifies tokens, before the first request
     listening = _listen(settings)
     config = uvicorn.Config(
         app, http=bounded_protocol(most_idle=_MAX_IDLE, ends_with_client=True), ws="none", lifespan="off",
