@@ -32,13 +32,11 @@ from rse_pf.identity import RobotId
 from rse_pf.maps.charges import charged_to
 from rse_pf.object_store import (
     MIN_CHARGE_BYTES,
-    MeasuringStore,
+    DirectoryStore,
     ObjectStore,
-    SizedStore,
     Usage,
     charge_of,
     name_segment,
-    usage_of,
 )
 
 __all__ = ["Accounts", "TenantAccount"]
@@ -223,14 +221,14 @@ class TenantAccount:
 
     def _free_bytes(self) -> int:
         """Return how many bytes are free above the reserve of the disk."""
-        if not isinstance(self._store, SizedStore):
+        if not isinstance(self._store, DirectoryStore):
             return self._settings.tenant_quota_bytes
         free, total = self._store.space()
         return free - int(total * _RESERVE_SHARE)
 
     def _share(self) -> float:
         """Return how many bytes a tenant may hold while the disk is nearly full."""
-        if not isinstance(self._store, SizedStore):
+        if not isinstance(self._store, DirectoryStore):
             return float("inf")
         now = self._wall_clock()
         if 0.0 <= now - self._share_s < _SHARE_S:
@@ -264,7 +262,7 @@ def stored_by_tenant(store: ObjectStore, folder: str, check: Callable[[], None] 
     total = Usage()
     for area in _OF_TENANT:
         check()
-        total += usage_of(store, f"{area}/{folder}/")
+        total += store.usage(f"{area}/{folder}/")
     for robot in store.folders(f"uploads/{folder}/"):
         total += _uploads(store, f"{folder}/{robot}/", check)
     return total
@@ -406,7 +404,7 @@ class Accounts:
     def _count_if_old(self, account: _RobotAccount, robot: RobotId) -> None:
         now = self._clock()
         if now - account.counted_s >= self._recount_s:
-            total = usage_of(self._store, f"objects/{robot.folder}/")
+            total = self._store.usage(f"objects/{robot.folder}/")
             total += _uploads(self._store, f"{robot.folder}/", self._check)
             account.stored = total + charged_to(self._store, robot, self._check)
             account.counted_s = now
@@ -427,7 +425,7 @@ class Accounts:
 
 
 def _recount_s(store: ObjectStore) -> float:
-    return _RECOUNT_S if isinstance(store, MeasuringStore) else _SLOW_RECOUNT_S
+    return _RECOUNT_S if isinstance(store, DirectoryStore) else _SLOW_RECOUNT_S
 
 
 def _subtract(usage: Usage, charge: Usage) -> Usage:

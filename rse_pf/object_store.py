@@ -10,7 +10,6 @@ import contextlib
 import errno
 import fcntl
 import hashlib
-import io
 import os
 import re
 import secrets
@@ -28,18 +27,11 @@ from rse_pf.files import OWNER_ONLY, TEMPORARY_PREFIX, replace_file, sync_folder
 
 __all__ = [
     "MIN_CHARGE_BYTES",
-    "CachedStore",
     "DirectoryStore",
-    "GrowingStore",
-    "MeasuringStore",
     "MemoryStore",
     "ObjectInfo",
     "ObjectStore",
-    "PieceStore",
     "PresigningStore",
-    "RangedStore",
-    "ScratchStore",
-    "SizedStore",
     "Usage",
     "charge_of",
     "check_name",
@@ -47,10 +39,6 @@ __all__ = [
     "is_name",
     "name_segment",
     "open_store",
-    "put_pieces",
-    "put_scratch",
-    "read_range",
-    "usage_of",
 ]
 
 _T = TypeVar("_T")
@@ -95,8 +83,14 @@ class ObjectStore(Protocol):
     def get(self, name: str) -> bytes:
         """Return the object; raises NotFound."""
 
+    def get_range(self, name: str, start: int, length: int) -> bytes:
+        """Return at most *length* bytes from *start* on; raises NotFound."""
+
     def put(self, name: str, data: bytes) -> None:
         """Store the object durably and atomically; raises StoreFull."""
+
+    def put_pieces(self, name: str, pieces: Iterator[bytes]) -> None:
+        """Store the object durably and atomically; if *pieces* raises an error, nothing is stored."""
 
     def head(self, name: str) -> ObjectInfo:
         """Return size and name; raises NotFound."""
@@ -107,75 +101,14 @@ class ObjectStore(Protocol):
     def folders(self, prefix: str) -> Iterator[str]:
         """Yield, sorted, what stands between *prefix*, which ends with /, and the next slash in names."""
 
+    def usage(self, prefix: str) -> Usage:
+        """Return the usage of the objects below the folder *prefix*, which ends with a slash."""
+
     def delete(self, name: str) -> None:
         """Remove the object; a missing one is no error."""
 
     def compare_and_swap(self, name: str, expected: bytes | None, data: bytes) -> None:
         """Replace the object if it still holds *expected* (None: is missing); raises Conflict."""
-
-
-@runtime_checkable
-class RangedStore(Protocol):
-    """A store that can read a part of an object."""
-
-    def get_range(self, name: str, start: int, length: int) -> bytes:
-        """Return at most *length* bytes from *start* on; raises NotFound."""
-
-
-@runtime_checkable
-class ScratchStore(Protocol):
-    """A store that can write without waiting for the disk."""
-
-    def put_scratch(self, name: str, data: bytes) -> None:
-        """Store an object that survives this process, but may be lost or truncated if the machine crashes."""
-
-
-@runtime_checkable
-class GrowingStore(Protocol):
-    """A store whose objects can grow, and get another name."""
-
-    def append(self, name: str, offset: int, data: bytes) -> None:
-        """Add *data* to an object of *offset* bytes, which is missing if that is 0.
-
-        It survives this process, but a crash of the machine may damage it.
-
-        Raises:
-            Conflict: The object has another size.
-            Busy: Another process writes it.
-        """
-
-    def adopt(self, name: str, source: str, size: int) -> None:
-        """Make the object *source* the object *name*, durably.
-
-        Raises:
-            NotFound: It is missing.
-            Conflict: It does not have *size* bytes.
-            Busy: Another process writes it.
-        """
-
-
-@runtime_checkable
-class MeasuringStore(Protocol):
-    """A store that knows how much it holds without listing all of it each time."""
-
-    def usage(self, prefix: str) -> Usage:
-        """Return the usage of the objects below the folder *prefix*, which ends with a slash."""
-
-
-@runtime_checkable
-class SizedStore(Protocol):
-    """A store that can become full."""
-
-    def space(self) -> tuple[int, int]:
-        """Return how many bytes can still be stored, and how many all of it holds, by whomever."""
-
-
-@runtime_checkable
-class PieceStore(Protocol):
-    """A store that can write an object without holding it in memory."""
-
-    def put_pieces(self, name: str, pieces: Iterator[bytes]) -> None:
-        """Store the object durably and atomically; if *pieces* raises an error, nothing is stored."""
 
 
 @runtime_checkable
@@ -189,53 +122,14 @@ class PresigningStore(Protocol):
         """Return a URL from which the object can be read."""
 
 
-@runtime_checkable
-class CachedStore(Protocol):
-    """A store that knows which objects it can read at once."""
-
-    def get_cached(self, name: str, start: int, length: int) -> tuple[int, bytes] | None:
-        """Return the object's size, and at most *length* bytes from *start* on; None if that has to wait."""
-
-
-def read_range(store: ObjectStore, name: str, start: int, length: int) -> bytes:
-    """Return at most *length* bytes of an object from *start* on, in the cheapest way."""
-    if isinstance(store, RangedStore):
-        return store.get_range(name, start, length)
-    return store.get(name)[start : start + length]
-
-
-def put_scratch(store: ObjectStore, name: str, data: bytes) -> None:
-    """Store an object that a crash of the machine may lose or truncate, in the cheapest way."""
-    if isinstance(store, ScratchStore):
-        store.put_scratch(name, data)
-    else:
-        store.put(name, data)
-
-
-def put_pieces(store: ObjectStore, name: str, pieces: Iterator[bytes]) -> None:
-    """Store an object that comes in pieces; if *pieces* raises an error, nothing is stored."""
-    if isinstance(store, PieceStore):
-        store.put_pieces(name, pieces)
-        return
-    buffer = io.BytesIO()  # holds the object once; joining a list would hold it twice
-    for piece in pieces:
-        buffer.write(piece)
-    store.put(name, buffer.getvalue())
-
-
 def charge_of(size: int) -> int:
     """Return for how many bytes of a quota an object of *size* bytes counts."""
     return max(size, MIN_CHARGE_BYTES)
 
 
-def usage_of(store: ObjectStore, prefix: str) -> Usage:
-    """Return the usage of the objects below the folder *prefix*, in the cheapest way."""
-    if isinstance(store, MeasuringStore):
-        return store.usage(prefix)
-    objects = charged = 0
-    for info in store.list(prefix):
-        objects, charged = objects + 1, charged + charge_of(info.size)
-    return Usage(objects, charged)
+def usage_of(listed: Iterable[ObjectInfo]) -> Usage:
+    """Return the usage of the objects in a list."""
+    return sum((Usage(1, charge_of(info.size)) for info in listed), Usage())
 
 
 def name_segment(text: str) -> str:
@@ -306,6 +200,10 @@ class MemoryStore:
         with self._lock:
             self._objects[check_name(name)] = bytes(data)
 
+    def put_pieces(self, name: str, pieces: Iterator[bytes]) -> None:
+        """Store the object; if *pieces* raises an error, nothing is stored."""
+        self.put(name, b"".join(pieces))
+
     def head(self, name: str) -> ObjectInfo:
         """Return size and name."""
         return ObjectInfo(name=name, size=len(self.get(name)))
@@ -325,6 +223,10 @@ class MemoryStore:
         """Yield what stands between *prefix* and the next slash in names."""
         rests = (info.name.removeprefix(prefix).partition("/") for info in self.list(prefix))
         yield from sorted({folder for folder, slash, _ in rests if slash})
+
+    def usage(self, prefix: str) -> Usage:
+        """Return the usage of the objects below *prefix*."""
+        return usage_of(self.list(prefix))
 
     def delete(self, name: str) -> None:
         """Remove the object."""
@@ -371,16 +273,20 @@ class DirectoryStore:
         """Store the object durably."""
         self._write(name, lambda path: replace_file(path, data, mode=OWNER_ONLY, is_durable=True))
 
-    def put_scratch(self, name: str, data: bytes) -> None:
-        """Store the object atomically, without waiting for the disk."""
-        self._write(name, lambda path: replace_file(path, data, mode=OWNER_ONLY))
-
     def put_pieces(self, name: str, pieces: Iterator[bytes]) -> None:
         """Store the object durably; if *pieces* raises an error, nothing is stored."""
         self._write(name, lambda path: _replace_by_pieces(path, pieces))
 
     def append(self, name: str, offset: int, data: bytes) -> None:
-        """Add *data* to the object; a lock on its file excludes other writers."""
+        """Add *data* to the object of *offset* bytes, which is missing if that is 0.
+
+        The object survives this process, but a crash of the machine may damage it.  A lock on its file
+        excludes other writers.
+
+        Raises:
+            Conflict: The object has another size.
+            Busy: Another process writes it.
+        """
 
         def add(path: str) -> None:
             with _locked(path, 0 if offset else os.O_CREAT, offset) as handle:
@@ -396,7 +302,13 @@ class DirectoryStore:
         self._write(name, add)
 
     def adopt(self, name: str, source: str, size: int) -> None:
-        """Give the object *source* the name *name*, durably."""
+        """Give the object *source* the name *name*, durably.
+
+        Raises:
+            NotFound: It is missing.
+            Conflict: It does not have *size* bytes.
+            Busy: Another process writes it.
+        """
         grown = self._paths(source)[0]
 
         def rename(path: str) -> None:

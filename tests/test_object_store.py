@@ -30,15 +30,11 @@ from rse_pf.object_store import (
     MemoryStore,
     ObjectInfo,
     ObjectStore,
-    RangedStore,
     Usage,
     _is_no_folder,
     check_name,
     digest_of,
     open_store,
-    put_pieces,
-    read_range,
-    usage_of,
 )
 
 STORES: dict[str, Callable[[Path], ObjectStore]] = {
@@ -80,12 +76,11 @@ def test_a_stored_object_is_complete(store: ObjectStore) -> None:
 def test_a_piece_is_read_where_it_lies_and_ends_where_the_object_does(store: ObjectStore) -> None:
     store.put("a", b"0123456789")
 
-    pieces = [read_range(store, "a", start, length) for start, length in [(0, 4), (8, 4), (10, 4), (3, 0)]]
+    pieces = [store.get_range("a", start, length) for start, length in [(0, 4), (8, 4), (10, 4), (3, 0)]]
 
     assert pieces == [b"0123", b"89", b"", b""]
-    assert isinstance(store, RangedStore), "pieces of a large object must not cost the whole"
     with pytest.raises(NotFound):
-        read_range(store, "b", 0, 1)
+        store.get_range("b", 0, 1)
 
 
 def test_an_empty_object_is_an_object(store: ObjectStore) -> None:
@@ -161,8 +156,8 @@ def test_folders_are_what_stands_before_the_next_slash(store: ObjectStore) -> No
 def test_an_object_of_many_pieces_is_complete(store: ObjectStore) -> None:
     pieces = [bytes([n]) * (6 << 20) for n in range(3)]
 
-    put_pieces(store, "large", iter(pieces))
-    put_pieces(store, "empty", iter(()))
+    store.put_pieces("large", iter(pieces))
+    store.put_pieces("empty", iter(()))
 
     assert store.get("large") == b"".join(pieces)
     assert store.get("empty") == b""
@@ -175,23 +170,23 @@ def test_an_object_whose_pieces_fail_is_not_stored(store: ObjectStore, count: in
         raise StoreError("the last part is missing")
 
     with pytest.raises(StoreError, match="last part"):
-        put_pieces(store, "large", pieces())
+        store.put_pieces("large", pieces())
 
     assert names(store) == []
 
 
 def test_an_object_counts_for_four_kib_at_least(store: ObjectStore) -> None:
-    assert usage_of(store, "objects/lab/robot-1/") == Usage()
+    assert store.usage("objects/lab/robot-1/") == Usage()
     for size in (0, 8, 4096, 10_000):
         name = f"objects/lab/robot-1/{digest_of(bytes(size))}"
         store.put(name, bytes(size))
         store.put(name, bytes(size))
     store.put(f"objects/lab/robot-2/{digest_of(b'x')}", b"x")
 
-    assert usage_of(store, "objects/lab/robot-1/") == Usage(4, 3 * 4096 + 10_000)
-    assert usage_of(store, "objects/lab/") == Usage(5, 4 * 4096 + 10_000)
+    assert store.usage("objects/lab/robot-1/") == Usage(4, 3 * 4096 + 10_000)
+    assert store.usage("objects/lab/") == Usage(5, 4 * 4096 + 10_000)
     store.delete(name)
-    assert usage_of(store, "objects/lab/robot-1/") == Usage(3, 3 * 4096)
+    assert store.usage("objects/lab/robot-1/") == Usage(3, 3 * 4096)
 
 
 def test_a_swap_requires_the_expected_content(store: ObjectStore) -> None:
@@ -344,7 +339,7 @@ def test_usage_reads_only_folders_that_changed(tmp_path: Path, monkeypatch: pyte
 def test_nothing_is_left_of_what_was_deleted(tmp_path: Path) -> None:
     store = DirectoryStore(tmp_path / "store")
     store.put("uploads/lab/robot-1/abc/size", b"8")
-    store.put_scratch("uploads/lab/robot-1/abc/part-0", b"x")
+    store.put("uploads/lab/robot-1/abc/part-0", b"x")
     store.compare_and_swap("jobs/lab/robot-1/key", None, b"1")
 
     for name in names(store):
@@ -395,7 +390,7 @@ def test_writers_and_removers_of_one_folder_never_disturb_each_other(tmp_path: P
 
     def work(number: int) -> None:
         for turn in range(100):
-            store.put_scratch(f"uploads/a/{number}", b"x")
+            store.put(f"uploads/a/{number}", b"x")
             with contextlib.suppress(Conflict):
                 store.compare_and_swap("uploads/a/head", None, b"%d" % turn)
             store.delete(f"uploads/a/{number}")
@@ -420,7 +415,7 @@ def test_a_folder_that_a_remover_takes_while_it_is_made_is_made_again(
         mkdir(path)
 
     monkeypatch.setattr(os, "mkdir", first_taken)
-    store.put_scratch("uploads/a/1", b"x")
+    store.put("uploads/a/1", b"x")
 
     assert len(made) > 1
     assert names(store) == ["uploads/a/1"]

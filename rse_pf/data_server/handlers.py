@@ -47,7 +47,7 @@ from rse_pf.maps.describe import MapSummary
 from rse_pf.maps.photos import Lens
 from rse_pf.maps.registry import MapContent, MapOrigin, MapRecord, MapRegistry
 from rse_pf.maps.removal import freed_bytes, superseded
-from rse_pf.object_store import CachedStore, ObjectStore, PresigningStore, read_range
+from rse_pf.object_store import DirectoryStore, ObjectStore, PresigningStore
 
 __all__ = ["Handler", "Handlers", "MapWork"]
 
@@ -98,7 +98,7 @@ class Handlers:
     ) -> None:
         """Make the handlers; *map_work* is done in threads of its own, and closed elsewhere."""
         self._store = store
-        self._cached = store if isinstance(store, CachedStore) else None
+        self._cached = store if isinstance(store, DirectoryStore) else None
         self._audit = audit
         self._settings = settings
         self._wall_clock = wall_clock
@@ -403,7 +403,7 @@ class Handlers:
         if cached is not None:
             piece = cached[1]
         else:
-            piece = await self.threads.run(robot, read_range, self._store, name, start, length)
+            piece = await self.threads.run(robot, self._store.get_range, name, start, length)
         if not piece:
             raise NotFound("the object was removed while it was read")
         return piece

@@ -23,16 +23,7 @@ from rse_pf.data_server.routes import Upload
 from rse_pf.data_server.running_hashes import RunningHashes
 from rse_pf.errors import BadRequest, Conflict, LimitExceeded, NotFound, QuotaExceeded
 from rse_pf.identity import object_name
-from rse_pf.object_store import (
-    GrowingStore,
-    ObjectInfo,
-    ObjectStore,
-    PresigningStore,
-    digest_of,
-    put_pieces,
-    put_scratch,
-    read_range,
-)
+from rse_pf.object_store import DirectoryStore, ObjectInfo, ObjectStore, PresigningStore, digest_of
 
 __all__ = ["Objects"]
 
@@ -57,7 +48,7 @@ class Objects:
         wall_clock: Callable[[], float],
     ) -> None:
         self._store = store
-        self._growing = store if isinstance(store, GrowingStore) else None
+        self._growing = store if isinstance(store, DirectoryStore) else None
         self._settings = settings
         self._wall_clock = wall_clock
         self.accounts = Accounts(store, settings, clock=clock, wall_clock=wall_clock, check=check_wanted)
@@ -237,7 +228,7 @@ class Objects:
             self._growing.append(f"{prefix}{0:015d}", offset, data)
             self._hashes.add(name, offset, data)
         else:
-            put_scratch(self._store, f"{prefix}{offset:015d}", data)
+            self._store.put(f"{prefix}{offset:015d}", data)
 
     def _assemble(self, claims: Claims, digest: str, name: str, size: int) -> None:
         parts = list(self._stored_parts(claims, digest))
@@ -248,7 +239,7 @@ class Objects:
                     raise _wrong_digest()
                 self._growing.adopt(name, parts[0].name, size)
             else:
-                put_pieces(self._store, name, self._whole(parts, digest, size))
+                self._store.put_pieces(name, self._whole(parts, digest, size))
         except BadRequest:
             self._discard(claims, digest)
             raise
@@ -269,7 +260,7 @@ class Objects:
         hashed = hashlib.sha256()
         for start in range(0, part.size, _PIECE_BYTES):
             check_wanted()
-            hashed.update(read_range(self._store, part.name, start, _PIECE_BYTES))
+            hashed.update(self._store.get_range(part.name, start, _PIECE_BYTES))
         return hashed.hexdigest()
 
     def _discard(self, claims: Claims, digest: str) -> None:

@@ -26,14 +26,7 @@ from rse_pf.maps.charges import remove_charges
 from rse_pf.maps.describe import MapSummary, describe_map
 from rse_pf.maps.record import MapRecord
 from rse_pf.maps.removal import HELD, MOST_S, REMOVING, Marks
-from rse_pf.object_store import (
-    ObjectStore,
-    digest_of,
-    name_segment,
-    put_pieces,
-    read_range,
-    usage_of,
-)
+from rse_pf.object_store import ObjectStore, digest_of, name_segment
 
 if TYPE_CHECKING:  # importing numpy takes a third of a data server's start, and only maps need it
     from rse_pf.maps.format import Keyframe, MapVersion
@@ -195,7 +188,7 @@ class MapRegistry:
             hashed = hashlib.sha256()
             for start in range(0, content.size, _PIECE_BYTES):
                 self._check()
-                piece = read_range(self._store, source, start, _PIECE_BYTES)
+                piece = self._store.get_range(source, start, _PIECE_BYTES)
                 hashed.update(piece)
                 yield piece
             if hashed.hexdigest() != content.digest:
@@ -203,7 +196,7 @@ class MapRegistry:
 
         return self._commit(
             name, summary, content, origin,
-            write=lambda blob: put_pieces(self._store, blob, pieces()), charged=charged,
+            write=lambda blob: self._store.put_pieces(blob, pieces()), charged=charged,
         )  # fmt: skip
 
     def _commit(
@@ -248,7 +241,7 @@ class MapRegistry:
 
     def _check_counts(self, base: str, *, is_new: bool) -> None:
         """Raise LimitExceeded if the tenant has no place for another map, or the map for another version."""
-        versions = usage_of(self._store, f"{base}versions/").objects
+        versions = self._store.usage(f"{base}versions/").objects
         if versions >= _MAX_VERSIONS:
             raise LimitExceeded(
                 f"the map has {versions} versions, the limit is {_MAX_VERSIONS}",

@@ -15,7 +15,7 @@ from rse_pf.config import DataSettings
 from rse_pf.errors import QuotaExceeded, StoreFull
 from rse_pf.identity import RobotId, object_name
 from rse_pf.maps.format import MapVersion, encode_map
-from rse_pf.object_store import DirectoryStore, MemoryStore, ObjectStore, digest_of, usage_of
+from rse_pf.object_store import DirectoryStore, MemoryStore, ObjectStore, digest_of
 
 ROBOT = RobotId("default", "robot-1")
 
@@ -104,13 +104,13 @@ def test_a_tenant_over_its_quota_removes_old_versions_and_commits_again() -> Non
         head = answer.json["id"]
         answer = commit(service, 1, head)
     assert (answer.status, answer.json["code"]) == (413, "quota")
-    before = usage_of(service.store, "").charged_bytes
+    before = service.store.usage("").charged_bytes
 
     pruned = service.ask("DELETE", VERSIONS, query="keep=2", robot="robot-2")
 
     assert pruned.status == 200
     assert pruned.json["removed"] >= 2
-    assert before - usage_of(service.store, "maps/").charged_bytes >= pruned.json["freed_bytes"] > 0
+    assert before - service.store.usage("maps/").charged_bytes >= pruned.json["freed_bytes"] > 0
     listed = service.ask("GET", VERSIONS).json
     assert [version["id"] for version in listed][-1] == head
     assert len(listed) == 2
@@ -230,7 +230,7 @@ def test_counting_again_reads_only_folders_that_changed(
     now, store = [0.0], DirectoryStore(tmp_path)
     made = ledger(store, now, quota_bytes=10_000_000)
     for number in range(300):
-        store.put_scratch(object_name(ROBOT, digest_of(b"%d" % number)), b"x")
+        store.put(object_name(ROBOT, digest_of(b"%d" % number)), b"x")
     for folder in (tmp_path / object_name(ROBOT, "")).glob("**/"):
         os.utime(folder, (1, 1))
     write(made, store, b"first")

@@ -19,7 +19,7 @@ from rse_pf.maps.charges import charge_name, charged_to
 from rse_pf.maps.format import encode_map
 from rse_pf.maps.registry import MapRecord, MapRegistry
 from rse_pf.maps.removal import ABANDONED_S, MOST_S, Marks, freed_bytes, superseded
-from rse_pf.object_store import DirectoryStore, MemoryStore, ObjectInfo, ObjectStore, Usage, usage_of
+from rse_pf.object_store import DirectoryStore, MemoryStore, ObjectInfo, ObjectStore, Usage
 
 NAME, FOLDER = "kitchen", "maps/default/kitchen/"
 ROBOT = RobotId("default", "robot-1")
@@ -97,7 +97,7 @@ def test_the_newest_versions_stay_and_of_the_others_neither_bytes_nor_record_nor
     for record in records:
         store.put(charge_name(ROBOT, NAME, record.id, record.size), b"")
     store.put(charge_name(ROBOT, "hall", records[0].id, 9), b"")
-    before, told[:] = usage_of(store, "maps/"), []
+    before, told[:] = store.usage("maps/"), []
 
     removed = prune(maps, keep=2)
 
@@ -105,7 +105,7 @@ def test_the_newest_versions_stay_and_of_the_others_neither_bytes_nor_record_nor
     assert told == [("map.remove", number) for number in (1, 2, 3)]
     assert [record.number for record in maps.versions(NAME)] == [4, 5]
     assert_whole(maps)
-    after = usage_of(store, "maps/")
+    after = store.usage("maps/")
     assert before.charged_bytes - after.charged_bytes == freed_bytes(removed)
     assert after.objects == 5, "two maps, two records and the head; no mark"
     assert charged_to(store, ROBOT).objects == 3, "two versions, and one of another map"

@@ -16,7 +16,7 @@ from typing import Any
 from rse_pf.aws.clients import error_code, make_client, status_of, with_retries
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import Archived, Conflict, NotFound, StoreError, StoreFull
-from rse_pf.object_store import ObjectInfo, ObjectStore, check_name, open_store
+from rse_pf.object_store import ObjectInfo, ObjectStore, Usage, check_name, open_store, usage_of
 
 __all__ = ["S3Store", "open_bucket", "open_data_store"]
 
@@ -107,6 +107,10 @@ class S3Store:
         for page in self._pages(prefix, Delimiter="/"):
             for row in page.get("CommonPrefixes", ()):
                 yield str(row["Prefix"])[len(prefix) : -1]
+
+    def usage(self, prefix: str) -> Usage:
+        """Return the usage of the objects below *prefix*, of which all are listed."""
+        return usage_of(self.list(prefix))
 
     def delete(self, name: str) -> None:
         """Remove the object; a missing one is no error."""

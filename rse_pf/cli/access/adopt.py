@@ -20,7 +20,7 @@ from rse_pf.config import PlatformSettings
 from rse_pf.errors import Conflict, NotFound, UsageError
 from rse_pf.identity import RobotId
 from rse_pf.local.state import state_folder
-from rse_pf.object_store import ObjectStore, is_name, put_pieces, read_range
+from rse_pf.object_store import ObjectStore, is_name
 from rse_pf.terminal import counted, show
 
 __all__ = ["Adopted", "adopt", "run_adopt"]
@@ -112,7 +112,7 @@ def adopt(store: ObjectStore, robot: RobotId, *, source: RobotId) -> Adopted:
     for kind in ("objects", "charges") if source != robot else ():
         old, new = f"{kind}/{source.folder}/", f"{kind}/{robot.folder}/"
         for info in store.list(old):
-            put_pieces(store, new + info.name.removeprefix(old), _pieces(store, info.name, info.size))
+            store.put_pieces(new + info.name.removeprefix(old), _pieces(store, info.name, info.size))
             store.delete(info.name)
             objects += kind == "objects"
             object_bytes += info.size
@@ -143,7 +143,7 @@ def _places_of_snapshots(source: RobotId, robot: RobotId) -> Iterator[str]:
 
 def _pieces(store: ObjectStore, name: str, size: int) -> Iterator[bytes]:
     for start in range(0, size, _PIECE_BYTES):
-        yield read_range(store, name, start, _PIECE_BYTES)
+        yield store.get_range(name, start, _PIECE_BYTES)
 
 
 def _is_equal(store: ObjectStore, name: str, other: str) -> bool:

@@ -27,7 +27,7 @@ __all__ = ["failing_environment", "install", "set_failing_percent"]
 _VARIABLE = "RSE_PF_FAILING_STORE"
 _SHARE = "percent"
 _READS = ("get", "head")
-_WRITES = ("put", "put_scratch", "put_pieces", "compare_and_swap", "delete")
+_WRITES = ("put", "put_pieces", "compare_and_swap", "delete")
 _SITE = "from rse_pf.local.faults.failing_store import install\n\ninstall()\n"
 
 

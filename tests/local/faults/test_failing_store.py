@@ -18,7 +18,7 @@ from rse_pf.object_store import DirectoryStore
 store, failed = DirectoryStore(Path(sys.argv[1])), 0
 for number in range(200):
     try:
-        store.put_scratch(f"o/{number}", b"x")
+        store.put(f"o/{number}", b"x")
     except StoreError:
         failed += 1
 print(failed)

@@ -28,7 +28,7 @@ from rse_pf.backend.log import JsonLog
 from rse_pf.errors import Busy, Conflict, NotFound, RsePfError, StoreError, StoreFull
 from rse_pf.live_map.events import Event, KeyframeAdded, encode_events
 from rse_pf.live_map.outcomes import Outcome
-from rse_pf.object_store import ObjectStore, digest_of, usage_of
+from rse_pf.object_store import ObjectStore, digest_of
 
 __all__ = [
     "BUSY_RETRY_MS",
@@ -230,7 +230,7 @@ class LiveLog:
     def charged_bytes(self) -> int:
         """Return for how much of the tenant's quota log, snapshots and parts count; raises StoreError."""
         areas = (self._entries, self._snapshots, self._parts)
-        return sum(usage_of(self._store, area).charged_bytes for area in areas)
+        return sum(self._store.usage(area).charged_bytes for area in areas)
 
     def delete_until(self, number: int) -> None:
         """Delete entries and snapshots up to *number*: the map was stopped there; raises StoreError."""
