@@ -19,7 +19,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO, Protocol, TypeVar, runtime_checkable
+from typing import BinaryIO, Protocol, runtime_checkable
 
 from rse_pf.disk_reserve import DiskReserve, is_full
 from rse_pf.errors import Busy, Conflict, NotFound, StoreError, StoreFull, UsageError
@@ -41,7 +41,6 @@ __all__ = [
     "open_store",
 ]
 
-_T = TypeVar("_T")
 _Names = list[str]  # within a class that has a method "list"
 _SHARD, _LOCK = "+", ".lock-"
 _DIGEST = re.compile(r"[0-9a-f]{64}")
@@ -245,8 +244,7 @@ class DirectoryStore:
     """Objects as files below one folder, written by temporary file, fsync and rename.
 
     A robot's objects lie in up to 256 folders by the first two digits of their digests, as
-    ``objects/TENANT/ROBOT/+ab/DIGEST``, so that a page of a list reads a few small folders.  Earlier versions
-    wrote them to ``objects/TENANT/ROBOT``, where they are found, too.
+    ``objects/TENANT/ROBOT/+ab/DIGEST``, so that a page of a list reads a few small folders.
     """
 
     def __init__(self, folder: Path, reserve: DiskReserve | None = None) -> None:
@@ -257,16 +255,16 @@ class DirectoryStore:
 
     def get(self, name: str) -> bytes:
         """Return the object."""
-        with _as_store_errors(name), self._find(name, _open) as file:
+        with _as_store_errors(name), _open(self._path(name)) as file:
             return file.read()
 
     def get_cached(self, name: str, start: int, length: int) -> tuple[int, bytes] | None:
         """Return size and a part of the object if these bytes are in memory."""
-        return _read_cached(self._paths(name)[0], start, length)
+        return _read_cached(self._path(name), start, length)
 
     def get_range(self, name: str, start: int, length: int) -> bytes:
         """Return a part of the object."""
-        with _as_store_errors(name), self._find(name, _open) as file:
+        with _as_store_errors(name), _open(self._path(name)) as file:
             return os.pread(file.fileno(), length, start)
 
     def put(self, name: str, data: bytes) -> None:
@@ -309,7 +307,7 @@ class DirectoryStore:
             Conflict: It does not have *size* bytes.
             Busy: Another process writes it.
         """
-        grown = self._paths(source)[0]
+        grown = self._path(source)
 
         def rename(path: str) -> None:
             with _locked(grown, 0, size) as handle:
@@ -322,7 +320,7 @@ class DirectoryStore:
     def head(self, name: str) -> ObjectInfo:
         """Return size and name."""
         with _as_store_errors(name):
-            status = self._find(name, os.lstat)
+            status = os.lstat(self._path(name))
         if not stat.S_ISREG(status.st_mode):
             raise NotFound(f"no object named {name!r}")
         return ObjectInfo(name=name, size=status.st_size)
@@ -334,7 +332,7 @@ class DirectoryStore:
         """
         above, slash, _ = prefix.rpartition("/")
         if not slash or is_name(above):
-            yield from self._walk(above + slash, prefix, after)
+            yield from self._walk(above + slash, above + slash, prefix, after)
 
     def folders(self, prefix: str) -> Iterator[str]:
         """Yield what stands between *prefix* and the next slash in names."""
@@ -371,15 +369,15 @@ class DirectoryStore:
 
     def delete(self, name: str) -> None:
         """Remove the object, and its folder if nothing else lies there; a missing one is no error."""
-        paths = self._paths(name)
-        folder, lock = os.path.dirname(paths[0]), _lock_of(paths[0])
+        path = self._path(name)
+        folder, lock = os.path.dirname(path), _lock_of(path)
         with contextlib.suppress(NotFound), _as_store_errors(name):
             self.head(name)
             with _hold_lock(lock) if os.path.exists(lock) else contextlib.nullcontext():
-                for path in (*paths, lock):
+                for each in (path, lock):
                     with contextlib.suppress(FileNotFoundError):
-                        os.unlink(path)
-            if len(paths) == 1 and folder != self._root:
+                        os.unlink(each)
+            if folder != self._root and not os.path.basename(folder).startswith(_SHARD):
                 with contextlib.suppress(OSError):  # it is not empty
                     os.rmdir(folder)
 
@@ -422,46 +420,15 @@ class DirectoryStore:
                         removed += 1
         return removed
 
-    def move_old_objects(self) -> int:
-        """Move robots' objects from where earlier versions wrote them to the folders by digest; return how
-        many.
-        """
-        moved = 0
-        for tenant in self.folders("objects/"):
-            for robot in self.folders(f"objects/{tenant}/"):
-                at = f"objects/{tenant}/{robot}/"
-                for name in filter(_DIGEST.fullmatch, self._scan(at)[0]):
-                    path, old = self._paths(at + name)
-                    with _as_store_errors(at + name):
-                        changed = _make_folder(os.path.dirname(path))
-                        with contextlib.suppress(FileNotFoundError):  # the robot removed it
-                            os.rename(old, path)
-                            moved += 1
-                        for folder in changed:
-                            sync_folder(folder)
-        return moved
-
-    def _paths(self, name: str) -> tuple[str, ...]:
-        """Return where the object is written, and then where an earlier version may have written it."""
+    def _path(self, name: str) -> str:
         path = f"{self._root}/{check_name(name)}"
-        if not name.startswith("objects/"):
-            return (path,)
         folder, _, last = path.rpartition("/")
-        if not _DIGEST.fullmatch(last):
-            return (path,)
-        return f"{folder}/{_SHARD}{last[:2]}/{last}", path
-
-    def _find(self, name: str, read: Callable[[str], _T]) -> _T:
-        """Call *read* with the path of the object and return its result; raises OSError."""
-        *first, last = self._paths(name)
-        for path in [*first, *([last] if first else [])]:
-            with contextlib.suppress(FileNotFoundError):
-                return read(path)
-        return read(first[0] if first else last)  # it may have been moved there meanwhile
+        is_of_robot = name.startswith("objects/") and _DIGEST.fullmatch(last) is not None
+        return f"{folder}/{_SHARD}{last[:2]}/{last}" if is_of_robot else path
 
     def _write(self, name: str, write: Callable[[str], None]) -> None:
         """Call *write* for the path of the object; again if there was no folder, which is made first."""
-        path = self._paths(name)[0]
+        path = self._path(name)
         changed: list[str] = []
         with _as_store_errors(name):
             for tries_left in reversed(range(_WRITE_TRIES)):
@@ -502,38 +469,23 @@ class DirectoryStore:
                     folders.append(entry.name)
         return files, folders
 
-    def _walk(self, at: str, prefix: str, after: str) -> Iterator[ObjectInfo]:
-        """Yield the objects below the folder *at* in the order of their names."""
-        files, folders = self._scan(at)
-        # What lies in +ab sorts where "ab" does; files of an earlier version are merged with it.
-        shards: dict[str, _Names] = {name[1:]: [] for name in folders if name.startswith(_SHARD)}
-        below = [f"{name}/" for name in folders if not name.startswith(_SHARD)]
-        for name in files:
-            shards.get(name[:2], below).append(name)
-        for name in sorted([*below, *shards]):
-            begin = at + name
-            if not (begin.startswith(prefix) or prefix.startswith(begin)):
-                continue
-            if name not in shards and not name.endswith("/"):
-                yield from self._info(begin, begin, after)
-            elif begin < after and not after.startswith(begin):
-                continue
-            elif name in shards:
-                yield from self._walk_shard(at, name, shards[name], prefix, after)
-            else:
-                yield from self._walk(begin, prefix, after)
-
-    def _walk_shard(self, at: str, shard: str, old: _Names, prefix: str, after: str) -> Iterator[ObjectInfo]:
-        within = set(self._scan(f"{at}{_SHARD}{shard}/")[0])
-        for name in sorted(within.union(old)):
-            if (at + name).startswith(prefix):
-                place = f"{at}{_SHARD}{shard}/{name}" if name in within else at + name
-                yield from self._info(at + name, place, after)
-
-    def _info(self, name: str, place: str, after: str) -> Iterator[ObjectInfo]:
-        if name > after and is_name(name):
-            with contextlib.suppress(FileNotFoundError):
-                yield ObjectInfo(name=name, size=os.lstat(f"{self._folder}/{place}").st_size)
+    def _walk(self, place: str, at: str, prefix: str, after: str) -> Iterator[ObjectInfo]:
+        """Yield the objects in the folder *place*, whose names begin with *at*, in the order of names."""
+        files, folders = self._scan(place)
+        rows = [(name, name) for name in files]
+        # The names in the folder +ab begin with ab, so it sorts where ab does.
+        rows += [(name[1:] if name.startswith(_SHARD) else f"{name}/", f"{name}/") for name in folders]
+        for begin, entry in sorted(rows):
+            name = at + begin
+            if not entry.endswith("/"):
+                if name.startswith(prefix) and name > after and is_name(name):
+                    with contextlib.suppress(FileNotFoundError):
+                        size = os.lstat(f"{self._folder}/{place}{entry}").st_size
+                        yield ObjectInfo(name=name, size=size)
+            elif (name.startswith(prefix) or prefix.startswith(name)) and (
+                name >= after or after.startswith(name)
+            ):
+                yield from self._walk(place + entry, at if entry.startswith(_SHARD) else name, prefix, after)
 
 
 def _open(path: str) -> BinaryIO:

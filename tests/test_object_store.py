@@ -127,6 +127,7 @@ def test_names_are_listed_in_order_and_by_prefix(store: ObjectStore) -> None:
     assert names(store, "a/") == ["a/10", "a/2"]
     assert names(store, "a") == ["a-1", "a/10", "a/2", "ab/c"]
     assert names(store, "c") == []
+    assert names(store, "a/22") == []
     assert [info.size for info in store.list("a/")] == [4, 3]
 
 
@@ -255,50 +256,6 @@ def test_an_object_cannot_be_a_folder_too(tmp_path: Path) -> None:
 
     assert not isinstance(caught.value, NotFound)
     assert store.get("a") == b"x"
-
-
-def old_path(folder: Path, robot: str, digest: str) -> Path:
-    """Return where versions before the folders by digest wrote a robot's object."""
-    path = folder / "objects" / "default" / robot / digest
-    path.parent.mkdir(parents=True, exist_ok=True)
-    return path
-
-
-def test_objects_of_an_earlier_version_are_read_listed_and_removed(tmp_path: Path) -> None:
-    store, digests = DirectoryStore(tmp_path), sorted(digest_of(b"%d" % n) for n in range(100))
-    for row, digest in enumerate(digests):
-        if row % 2:
-            old_path(tmp_path, "robot-1", digest).write_bytes(b"old")
-        else:
-            store.put(f"objects/default/robot-1/{digest}", b"new")
-    prefix = "objects/default/robot-1/"
-
-    assert names(store, prefix) == [prefix + digest for digest in digests]
-    assert [info.name for info in store.list(prefix, after=prefix + digests[50])] == [
-        prefix + digest for digest in digests[51:]
-    ]
-    assert store.get(prefix + digests[1]) == b"old"
-    assert store.head(prefix + digests[1]).size == 3
-    assert store.usage(prefix).objects == 100
-    store.put(prefix + digests[1], b"newer")
-    assert len(names(store, prefix)) == 100
-    store.delete(prefix + digests[1])
-    store.delete(prefix + digests[3])
-    assert names(store, prefix) == [prefix + each for row, each in enumerate(digests) if row not in (1, 3)]
-
-
-def test_objects_of_an_earlier_version_are_moved_and_keep_their_names(tmp_path: Path) -> None:
-    store, digests = DirectoryStore(tmp_path), sorted(digest_of(bytes([n])) for n in range(20))
-    for digest in digests:
-        old_path(tmp_path, "robot-1", digest).write_bytes(digest.encode())
-    before = names(store)
-
-    assert store.move_old_objects() == 20
-    assert store.move_old_objects() == 0
-
-    assert names(store) == before
-    assert [store.get(name) for name in before] == [digest.encode() for digest in digests]
-    assert not [path for path in old_path(tmp_path, "robot-1", "x").parent.iterdir() if path.is_file()]
 
 
 def test_a_page_reads_only_the_folders_that_it_needs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -135,8 +135,6 @@ async def _run(
 
 
 async def _sweep_periodically(app: DataServer, store: ObjectStore) -> None:
-    if isinstance(store, DirectoryStore):
-        await asyncio.to_thread(_move_old_objects, store)
     while True:
         await asyncio.sleep(_SWEEP_S)
         await asyncio.to_thread(_sweep, app, store)
@@ -153,17 +151,6 @@ def _sweep(app: DataServer, store: ObjectStore) -> None:
         return
     if uploads or files:
         _write_line({"event": "swept", "uploads": uploads, "files": files})
-
-
-def _move_old_objects(store: DirectoryStore) -> None:
-    """Move objects of earlier versions to where they are listed quickly; they can be read meanwhile."""
-    try:
-        moved = store.move_old_objects()
-    except StoreError as error:
-        _write_line({"event": "sweep-failed", "error": error.message})
-        return
-    if moved:
-        _write_line({"event": "moved", "objects": moved})
 
 
 def _listen(settings: PlatformSettings) -> socket.socket:

@@ -40,13 +40,13 @@ def test_parts_extend_one_file_that_becomes_the_object(service: Service, store: 
     part(service, 0, 4096)
     part(service, 4096, 8192)
     names = [info.name for info in store.list("uploads/")]
-    before = os.stat(store._paths(PART)[0]).st_ino
+    before = os.stat(store._path(PART)).st_ino
 
     assert names == [PART, PART.replace(f"part-{0:015d}", "size")]
     assert part(service, 8192, 10_000).status == 201
 
     (info,) = store.list("objects/")
-    assert os.stat(store._paths(info.name)[0]).st_ino == before
+    assert os.stat(store._path(info.name)).st_ino == before
     assert service.ask("GET", OBJECT).body == DATA
     assert list(store.list("uploads/")) == []
 
@@ -118,7 +118,7 @@ def test_parts_of_an_earlier_version_are_assembled(service: Service, store: Dire
 
 def test_only_one_writer_extends_a_file_and_nobody_after_it_became_an_object(store: DirectoryStore) -> None:
     store.append("uploads/a", 0, b"ab")
-    with open(store._paths("uploads/a")[0], "rb") as other:
+    with open(store._path("uploads/a"), "rb") as other:
         fcntl.flock(other, fcntl.LOCK_EX)
         with pytest.raises(Busy):
             store.append("uploads/a", 2, b"c")
