@@ -14,6 +14,10 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
+# Its function connect_accepted_socket costs a task and two futures for each socket.
+from aiofastnet.selector_transport import SelectorSocketTransport
+from picows import picows as _picows
+
 from rse_pf.auth.claimed import claimed_by
 from rse_pf.auth.origins import carried_token
 from rse_pf.backend.gateway.audit_recorder import AuditRecorder
@@ -32,12 +36,12 @@ from rse_pf.backend.gateway.handshake import (
 from rse_pf.backend.gateway.rate_limits import SourceRates
 from rse_pf.backend.gateway.socket_poller import SocketPoller
 from rse_pf.backend.scheduling.deferred_work import DeferredWork
-from rse_pf.config import ServingSettings
 from rse_pf.config.front_door import MAX_HANDSHAKE_BYTES, WRITE_BUFFER_BYTES
-from rse_pf.errors import MissingExtra
 from rse_pf.silent_connections import PendingHandshakes
 
-__all__ = ["PendingSocket", "RobotSockets", "listener_type", "protocol_type"]
+picows: Any = _picows  # its stubs lack what is used here
+
+__all__ = ["Listener", "PendingSocket", "RobotProtocol", "RobotSockets"]
 
 _MAX_CLOSE_REASON_BYTES = 123
 _UPGRADE = (
@@ -57,6 +61,8 @@ _LINGER_S = 2.0
 """Time that a robot has to read the CLOSE frame and to end its side; then the socket is cut."""
 _READ_BUFFER_BYTES = 2048
 """The first read buffer of a socket; it grows with the messages."""
+_TEXT = int(picows.WSMsgType.TEXT)
+_BINARY = int(picows.WSMsgType.BINARY)
 
 
 class _NoLogger:
@@ -68,6 +74,9 @@ class _NoLogger:
     def log(self, *args: Any) -> None: ...
 
     debug = info = warning = error = exception = log
+
+
+_NO_LOGGER = _NoLogger()
 
 
 class _RobotSocket(socket.socket):
@@ -164,14 +173,10 @@ class RobotSockets:
         )
         self._new_name = new_name
         self._recorder = recorder
-        picows, self._transport = _libraries()
         clock = self._context.clocks.monotonic
         self._poller = SocketPoller(self._context.loop, clock=clock)
         dispatcher.stateless.leaves_unread = self._poller.leaves_unread
         self._steps = DeferredWork(self._context.loop, clock=clock, bound_s=_HANDSHAKES_S)
-        max_bytes = self._context.settings.session.max_message_bytes
-        self._protocol = protocol_type(picows, max_bytes, self._poller)
-        self._listener = listener_type(picows, self._context.loop, serving)
 
     @property
     def is_behind(self) -> bool:
@@ -282,13 +287,17 @@ class RobotSockets:
         pending.close(verdict.answer)
 
     def _serve(self, pending: PendingSocket, verdict: Accepted, upgrade: bytes, rest: bytes) -> None:
-        listener = self._listener(self._dispatcher, verdict, pending.number)
+        listener = Listener(self._dispatcher, verdict, pending.number)
         accepted = pending.accepted
         try:
             # Otherwise the kernel buffers megabytes for a slow reader, unnoticed.
             accepted.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, WRITE_BUFFER_BYTES)
-            protocol = self._protocol(listener, verdict.subprotocol, upgrade, rest, pending.on_end)
-            self._transport(self._poller, accepted, protocol)
+            protocol = RobotProtocol(
+                listener, verdict.subprotocol, upgrade, rest,
+                max_frame_bytes=self._context.settings.session.max_message_bytes, poller=self._poller,
+                on_end=pending.on_end,
+            )  # fmt: skip
+            SelectorSocketTransport(self._poller, accepted, protocol)
         except OSError:
             pending.close()
 
@@ -321,201 +330,196 @@ class RobotSockets:
         return verdict
 
 
-def _libraries() -> tuple[Any, Any]:
-    try:
-        # Its function connect_accepted_socket costs a task and two futures for each socket.
-        from aiofastnet.selector_transport import SelectorSocketTransport
-        from picows import picows
-    except ImportError as error:
-        raise MissingExtra("picows", "backend") from error
-    return picows, SelectorSocketTransport
+class RobotProtocol(picows.WSProtocol):  # type: ignore[misc]
+    """The socket of one robot: passes nothing behind the first CLOSE to picows.
 
-
-def protocol_type(picows: Any, max_frame_bytes: int, poller: SocketPoller) -> Any:
-    """Return the subclass of picows' protocol that one robot's socket uses.
-
-    picows itself sends no pings and answers none: `RobotConnection` does.  *poller* reads on where a
-    message is longer than one read.
+    picows itself sends no pings and answers none: `RobotConnection` does.
     """
-    base = picows.WSProtocol
-    get_buffer, buffer_updated, connection_lost = base.get_buffer, base.buffer_updated, base.connection_lost
-    connection_made, begin, answer_with = (
-        base.connection_made, base.__init__, picows.WSUpgradeResponseWithListener,
-    )  # fmt: skip
-    auto_ping = (False, 20.0, 20.0, picows.WSAutoPingStrategy.PING_WHEN_IDLE)
-    disconnect_on_exception, auto_pong, handshake_timeout, extra_headers = True, False, None, None
-    options = (
-        _NoLogger(), disconnect_on_exception, handshake_timeout, *auto_ping, auto_pong, max_frame_bytes,
-        extra_headers, _READ_BUFFER_BYTES,
-    )  # fmt: skip
 
-    class Protocol(base):  # type: ignore[misc, valid-type]
-        """Passes nothing behind the first CLOSE to picows, and calls *on_end* when the socket is gone."""
+    def __init__(
+        self,
+        listener: Any,
+        subprotocol: str,
+        upgrade: bytes,
+        rest: bytes,
+        *,
+        max_frame_bytes: int,
+        poller: SocketPoller,
+        on_end: Callable[[], None],
+    ) -> None:
+        """Wait for the transport.
 
-        def __init__(
-            self, listener: Any, subprotocol: str, upgrade: bytes, rest: bytes, on_end: Callable[[], None]
-        ) -> None:
-            answer = answer_with(_Upgrade(subprotocol), listener)
-            begin(self, None, None, False, lambda _: answer, *options)
-            self._request = (upgrade, rest)
-            self._listener = listener
-            self._is_made = False
-            self._read_bytes = 0
-            self._on_end = on_end
-            self._border = CloseBorder(upgraded=True)
-            self._buffer = memoryview(b"")
+        Args:
+            listener: Gets the frames.
+            subprotocol: What was agreed in the handshake.
+            upgrade: The request that picows gets in place of the robot's.
+            rest: Bytes that were read behind the robot's request.
+            max_frame_bytes: A longer frame ends the connection.
+            poller: Reads on where a message is longer than one read.
+            on_end: Called when the socket is gone.
+        """
+        answer = picows.WSUpgradeResponseWithListener(_Upgrade(subprotocol), listener)
+        auto_ping = (False, 20.0, 20.0, picows.WSAutoPingStrategy.PING_WHEN_IDLE)
+        disconnect_on_exception, auto_pong, handshake_timeout, extra_headers = True, False, None, None
+        super().__init__(
+            None, None, False, lambda _: answer, _NO_LOGGER, disconnect_on_exception, handshake_timeout,
+            *auto_ping, auto_pong, max_frame_bytes, extra_headers, _READ_BUFFER_BYTES,
+        )  # fmt: skip
+        self._request = (upgrade, rest)
+        self._listener = listener
+        self._poller = poller
+        self._is_made = False
+        self._read_bytes = 0
+        self._on_end = on_end
+        self._border = CloseBorder(upgraded=True)
+        self._buffer = memoryview(b"")
 
-        def connection_made(self, transport: Any) -> None:
-            connection_made(self, transport)
-            request, rest = self._request
-            self._request = (b"", b"")
-            get_buffer(self, -1)[: len(request)] = request
-            buffer_updated(self, len(request))
-            self.transport.request.headers = None  # picows keeps them as long as the connection
-            while rest:
-                size = min(len(self.get_buffer(-1)), len(rest))
-                self._buffer[:size] = rest[:size]
-                self.buffer_updated(size)
-                rest = rest[size:]
-            self._is_made = True
+    def connection_made(self, transport: Any) -> None:
+        super().connection_made(transport)
+        request, rest = self._request
+        self._request = (b"", b"")
+        super().get_buffer(-1)[: len(request)] = request
+        super().buffer_updated(len(request))
+        self.transport.request.headers = None  # picows keeps them as long as the connection
+        while rest:
+            size = min(len(self.get_buffer(-1)), len(rest))
+            self._buffer[:size] = rest[:size]
+            self.buffer_updated(size)
+            rest = rest[size:]
+        self._is_made = True
 
-        def get_buffer(self, hint: int) -> memoryview:
-            buffer: memoryview = get_buffer(self, hint)
-            self._buffer = buffer if len(buffer) <= _MAX_READ_BYTES else buffer[:_MAX_READ_BYTES]
-            return self._buffer
+    def get_buffer(self, hint: int) -> memoryview:
+        buffer: memoryview = super().get_buffer(hint)
+        self._buffer = buffer if len(buffer) <= _MAX_READ_BYTES else buffer[:_MAX_READ_BYTES]
+        return self._buffer
 
-        def buffer_updated(self, n: int) -> None:
-            if self.transport is not None and self.transport.is_close_frame_sent:
-                return
-            read_bytes = self._read_bytes + n if n == len(self._buffer) else 0
-            size = self._border.bytes_to_close(self._buffer, n)
-            if size:
-                buffer_updated(self, size)
-            if read_bytes >= _MAX_READ_BYTES and self._is_made:
-                # The transport would read on up to 256 KiB before the next socket.
-                read_bytes = 0
-                self._listener.hold()
-                poller.end_turn(self._listener.read_on)
-            self._read_bytes = read_bytes
+    def buffer_updated(self, n: int) -> None:
+        if self.transport is not None and self.transport.is_close_frame_sent:
+            return
+        read_bytes = self._read_bytes + n if n == len(self._buffer) else 0
+        size = self._border.bytes_to_close(self._buffer, n)
+        if size:
+            super().buffer_updated(size)
+        if read_bytes >= _MAX_READ_BYTES and self._is_made:
+            # The transport would read on up to 256 KiB before the next socket.
+            read_bytes = 0
+            self._listener.hold()
+            self._poller.end_turn(self._listener.read_on)
+        self._read_bytes = read_bytes
 
-        def connection_lost(self, error: Exception | None) -> None:
-            try:
-                connection_lost(self, error)
-            finally:
-                self._on_end()
-
-    return Protocol
+    def connection_lost(self, error: Exception | None) -> None:
+        try:
+            super().connection_lost(error)
+        finally:
+            self._on_end()
 
 
-def listener_type(picows: Any, loop: asyncio.AbstractEventLoop, serving: ServingSettings) -> Any:
-    """Return the subclass of picows' listener that passes frames between a socket and the dispatcher."""
-    text, binary = int(picows.WSMsgType.TEXT), int(picows.WSMsgType.BINARY)
+class Listener(picows.WSListener):  # type: ignore[misc]
+    """Passes frames of one robot's socket to its connection, and is the connection's `Wire`."""
 
-    class Listener(picows.WSListener):  # type: ignore[misc]
-        """One robot's socket: passes frames to its connection, and is the connection's `Wire`."""
+    def __init__(self, dispatcher: Dispatcher, accepted: Accepted, number: int) -> None:
+        self._dispatcher = dispatcher
+        self._loop = dispatcher.context.loop
+        self._accepted = accepted
+        self._number = number
+        self._transport: Any = None
+        self._connection: RobotConnection | None = None
+        self._cut: asyncio.TimerHandle | None = None
+        self._pause: asyncio.TimerHandle | None = None
+        self._paused_until_s = 0.0
+        self._linger: asyncio.TimerHandle | None = None
+        self._holds = 0
 
-        def __init__(self, dispatcher: Dispatcher, accepted: Accepted, number: int) -> None:
-            self._dispatcher = dispatcher
-            self._accepted = accepted
-            self._number = number
-            self._transport: Any = None
-            self._connection: RobotConnection | None = None
-            self._cut: asyncio.TimerHandle | None = None
-            self._pause: asyncio.TimerHandle | None = None
-            self._paused_until_s = 0.0
-            self._linger: asyncio.TimerHandle | None = None
-            self._holds = 0
+    def on_ws_connected(self, transport: Any) -> None:
+        self._transport = transport
+        transport.underlying_transport.set_write_buffer_limits(
+            high=WRITE_BUFFER_BYTES, low=WRITE_BUFFER_BYTES // 4
+        )
+        if self._accepted.claims is not None:
+            self._dispatcher.context.crash.enter(self._number, self._accepted.robot)
+        self._connection = self._dispatcher.connect(self, self._accepted, self._number)
 
-        def on_ws_connected(self, transport: Any) -> None:
-            self._transport = transport
-            transport.underlying_transport.set_write_buffer_limits(
-                high=WRITE_BUFFER_BYTES, low=WRITE_BUFFER_BYTES // 4
+    def on_ws_frame(self, transport: Any, frame: Any) -> None:
+        if self._connection is not None:
+            rsv = bool(frame.rsv1 or frame.rsv2 or frame.rsv3)
+            payload = frame.get_payload_as_bytes()
+            self._connection.receive_frame(frame.msg_type, bool(frame.fin), rsv, payload)
+
+    def on_ws_disconnected(self, transport: Any) -> None:
+        for timer in (self._cut, self._pause, self._linger):
+            if timer is not None:
+                timer.cancel()
+        if self._connection is not None:
+            self._connection.on_socket_end()
+            self._connection = None
+
+    def pause_writing(self) -> None:
+        if self._cut is None:
+            self._cut = self._loop.call_later(
+                self._dispatcher.context.settings.serving.slow_reader_timeout_s, self._cut_off
             )
-            if self._accepted.claims is not None:
-                self._dispatcher.context.crash.enter(self._number, self._accepted.robot)
-            self._connection = self._dispatcher.connect(self, self._accepted, self._number)
+            # The commands of a robot that does not read its answers are not read either.
+            self.hold()
 
-        def on_ws_frame(self, transport: Any, frame: Any) -> None:
-            if self._connection is not None:
-                rsv = bool(frame.rsv1 or frame.rsv2 or frame.rsv3)
-                payload = frame.get_payload_as_bytes()
-                self._connection.receive_frame(frame.msg_type, bool(frame.fin), rsv, payload)
-
-        def on_ws_disconnected(self, transport: Any) -> None:
-            for timer in (self._cut, self._pause, self._linger):
-                if timer is not None:
-                    timer.cancel()
-            if self._connection is not None:
-                self._connection.on_socket_end()
-                self._connection = None
-
-        def pause_writing(self) -> None:
-            if self._cut is None:
-                self._cut = loop.call_later(serving.slow_reader_timeout_s, self._cut_off)
-                # The commands of a robot that does not read its answers are not read either.
-                self.hold()
-
-        def resume_writing(self) -> None:
-            if self._cut is not None:
-                self._cut.cancel()
-                self._cut = None
-                self.read_on()
-
-        def send(self, data: bytes, is_text: bool) -> None:
-            if self._connection is not None:
-                self._transport.send(text if is_text else binary, data)
-
-        def unsent_bytes(self) -> int:
-            if self._connection is None:
-                return 0
-            size: int = self._transport.underlying_transport.get_write_buffer_size()
-            return size
-
-        def bound_unsent(self, max_bytes: int) -> None:
-            accepted = self._transport.underlying_transport.get_extra_info("socket")
-            if accepted is not None:
-                accepted.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, max_bytes)
-
-        def send_pong(self, data: bytes) -> None:
-            self._transport.send_pong(data)
-
-        def send_ping(self) -> None:
-            self._transport.send_ping()
-
-        def pause(self, seconds: float) -> None:
-            until_s = loop.time() + seconds
-            if self._pause is None:
-                self.hold()
-            elif self._paused_until_s >= until_s:
-                return
-            else:
-                self._pause.cancel()
-            self._paused_until_s = until_s
-            self._pause = loop.call_later(seconds, self._end_pause)
-
-        def _end_pause(self) -> None:
-            self._pause = None
+    def resume_writing(self) -> None:
+        if self._cut is not None:
+            self._cut.cancel()
+            self._cut = None
             self.read_on()
 
-        def hold(self) -> None:
-            self._holds += 1
-            self._transport.underlying_transport.pause_reading()
+    def send(self, data: bytes, is_text: bool) -> None:
+        if self._connection is not None:
+            self._transport.send(_TEXT if is_text else _BINARY, data)
 
-        def read_on(self) -> None:
-            self._holds -= 1
-            if self._connection is not None and not self._holds:
-                self._transport.underlying_transport.resume_reading()
+    def unsent_bytes(self) -> int:
+        if self._connection is None:
+            return 0
+        size: int = self._transport.underlying_transport.get_write_buffer_size()
+        return size
 
-        def close(self, code: int, reason: str) -> None:
-            self._transport.send_close(code, reason.encode()[:_MAX_CLOSE_REASON_BYTES])
-            # Closing with unread bytes would reset the connection, and the robot would not see the code.
-            with contextlib.suppress(OSError):  # the robot reset it, and the loop has not heard of that yet
-                self._transport.underlying_transport.write_eof()
-            if self._linger is None:
-                self._linger = loop.call_later(_LINGER_S, self._transport.disconnect, False)
+    def bound_unsent(self, max_bytes: int) -> None:
+        accepted = self._transport.underlying_transport.get_extra_info("socket")
+        if accepted is not None:
+            accepted.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, max_bytes)
 
-        def _cut_off(self) -> None:
-            self._dispatcher.context.metrics.closed["slow-reader"] += 1
-            self._transport.disconnect(False)
+    def send_pong(self, data: bytes) -> None:
+        self._transport.send_pong(data)
 
-    return Listener
+    def send_ping(self) -> None:
+        self._transport.send_ping()
+
+    def pause(self, seconds: float) -> None:
+        until_s = self._loop.time() + seconds
+        if self._pause is None:
+            self.hold()
+        elif self._paused_until_s >= until_s:
+            return
+        else:
+            self._pause.cancel()
+        self._paused_until_s = until_s
+        self._pause = self._loop.call_later(seconds, self._end_pause)
+
+    def _end_pause(self) -> None:
+        self._pause = None
+        self.read_on()
+
+    def hold(self) -> None:
+        self._holds += 1
+        self._transport.underlying_transport.pause_reading()
+
+    def read_on(self) -> None:
+        self._holds -= 1
+        if self._connection is not None and not self._holds:
+            self._transport.underlying_transport.resume_reading()
+
+    def close(self, code: int, reason: str) -> None:
+        self._transport.send_close(code, reason.encode()[:_MAX_CLOSE_REASON_BYTES])
+        # Closing with unread bytes would reset the connection, and the robot would not see the code.
+        with contextlib.suppress(OSError):  # the robot reset it, and the loop has not heard of that yet
+            self._transport.underlying_transport.write_eof()
+        if self._linger is None:
+            self._linger = self._loop.call_later(_LINGER_S, self._transport.disconnect, False)
+
+    def _cut_off(self) -> None:
+        self._dispatcher.context.metrics.closed["slow-reader"] += 1
+        self._transport.disconnect(False)

@@ -9,13 +9,14 @@ from fakes import FakeLoop
 from picows import picows
 
 from rse_pf.backend.gateway.socket_poller import SocketPoller
-from rse_pf.backend.gateway.websocket import listener_type, protocol_type
-from rse_pf.config import ServingSettings
+from rse_pf.backend.gateway.websocket import Listener, RobotProtocol
 
 
 async def test_the_protocol_takes_the_options_that_we_give_it():
     poller = SocketPoller(FakeLoop(), clock=lambda: 0.0)
-    protocol = protocol_type(picows, 1000, poller)(picows.WSListener(), "", b"", b"", lambda: None)
+    protocol = RobotProtocol(
+        picows.WSListener(), "", b"", b"", max_frame_bytes=1000, poller=poller, on_end=lambda: None
+    )
 
     assert isinstance(protocol, picows.WSProtocol)
     assert protocol.transport is None
@@ -51,8 +52,8 @@ def test_a_socket_that_the_robot_has_reset_can_be_closed():
             done.append("disconnected")
 
     loop = FakeLoop(0.0)
-    dispatcher = SimpleNamespace(connect=lambda *arguments: None)
-    listener = listener_type(picows, loop, ServingSettings())(dispatcher, SimpleNamespace(claims=None), 1)
+    dispatcher = SimpleNamespace(connect=lambda *arguments: None, context=SimpleNamespace(loop=loop))
+    listener = Listener(dispatcher, SimpleNamespace(claims=None), 1)
     listener.on_ws_connected(Transport())
 
     listener.close(4403, "revoked")
