@@ -259,9 +259,8 @@ def accuracy_lines(report: Mapping[str, Any]) -> list[str]:
     """Return the line that tells the error of a path; none without a truth, or without a scale."""
     if report.get("ate_cm") is None:
         return []
-    return [
-        f"error beside the {report['truth']}: ATE {report['ate_cm']:.2f} cm, RPE {report['rpe_cm']:.2f} cm"
-    ]
+    rpe = "" if report["rpe_cm"] is None else f", RPE {report['rpe_cm']:.2f} cm"
+    return [f"error beside the {report['truth']}: ATE {report['ate_cm']:.2f} cm{rpe}"]
 
 
 def _keep(

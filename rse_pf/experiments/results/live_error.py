@@ -19,7 +19,7 @@ from client_sdk.mapping import Trajectory, read_trajectory
 from rse_pf.errors import RsePfError, UsageError
 from rse_pf.experiments.results.map_error import move_frames
 from rse_pf.experiments.results.markdown import number, table
-from rse_pf.experiments.results.trajectory_error import align, associate
+from rse_pf.experiments.results.trajectory_error import align, match_truth
 from rse_pf.geometry import Array
 from rse_pf.maps.format import MapVersion, decode_map
 
@@ -190,12 +190,12 @@ def alignment_errors(drives: Sequence[LiveDrive], version: MapVersion | None) ->
         placed = [frame for frame in drive.frames if frame["T_map"] is not None]
         path = _trajectory(placed, "T_map")
         try:
-            rows, truth_rows = associate(path, _truth(drive))
+            rows, true_poses = match_truth(path, _truth(drive))
         except UsageError:
             errors.append((np.empty(0), np.empty(0)))
             continue
         moved = path.positions[rows] @ T[:3, :3].T + T[:3, 3]
-        distances = np.linalg.norm(moved - _truth(drive).positions[truth_rows], axis=1)
+        distances = np.linalg.norm(moved - true_poses[:, :3, 3], axis=1)
         errors.append((np.array([placed[row]["t"] for row in rows]), 100.0 * distances))
     return errors
 
@@ -273,10 +273,10 @@ def _match_positions(path: Trajectory, truth: Trajectory | None) -> tuple[Array,
     if truth is None:
         return None
     try:
-        rows, truth_rows = associate(path, truth)
+        rows, true_poses = match_truth(path, truth)
     except UsageError:
         return None
-    return path.positions[rows], truth.positions[truth_rows]
+    return path.positions[rows], true_poses[:, :3, 3]
 
 
 def _together_cm(paths: Iterable[Trajectory], drives: Sequence[LiveDrive]) -> float | None:

@@ -15,7 +15,7 @@ import numpy as np
 from client_sdk.mapping import Trajectory
 from rse_pf.errors import UsageError
 from rse_pf.experiments.results.markdown import table
-from rse_pf.experiments.results.trajectory_error import align, associate
+from rse_pf.experiments.results.trajectory_error import align, match_truth
 from rse_pf.geometry import Array, inverse, pose_difference
 from rse_pf.maps.format import MapVersion
 from rse_pf.services.mapping.merge import MergeReply
@@ -218,14 +218,10 @@ def _match_poses(robot: JoinedRobot) -> tuple[Array, Array, Array] | None:
     if robot.truth is None:
         return None
     try:
-        rows, truth_rows = associate(robot.merged, robot.truth, 0.02)
+        rows, true_poses = match_truth(robot.merged, robot.truth)
     except UsageError:
         return None
-    return (
-        robot.own.T_world_camera[rows],
-        robot.merged.T_world_camera[rows],
-        robot.truth.T_world_camera[truth_rows],
-    )
+    return robot.own.T_world_camera[rows], robot.merged.T_world_camera[rows], true_poses
 
 
 def _rigid_motion(own: Array, merged: Array) -> Array:

@@ -1,67 +1,38 @@
 """Errors of an estimated trajectory against the true one: ATE and RPE as the TUM benchmark defines them.
 
-`accuracy` is what ``rse-pf compare`` and the benchmarks report: the truth is interpolated to the frames.
+The truth is interpolated to the time stamps of the estimate.
 Pure functions: they change neither trajectory and read no files.
 """
 
 from __future__ import annotations
 
 import contextlib
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from client_sdk.mapping import Trajectory
 from rse_pf.errors import UsageError
-from rse_pf.geometry import Array, body_poses, inverse, pose_difference, rotation_angle_deg
+from rse_pf.geometry import Array, body_poses, inverse, pose_difference
 
 __all__ = [
-    "AbsoluteError",
     "Accuracy",
-    "RelativeError",
-    "absolute_error",
     "accuracy",
     "align",
-    "associate",
     "ate_m",
+    "match_truth",
     "motion_errors",
-    "relative_error",
     "trajectory_figures",
     "with_truth",
 ]
 
-MAX_STAMP_DIFFERENCE_S = 0.02
-"""Poses further apart in time are not compared: the TUM benchmark's default (evo's is 0.01)."""
 MAX_TRUTH_GAP_S = 0.25
 """A pose between two true ones that are further apart has no truth."""
 SAME_STAMP_S = 0.002
 """A pose this close to a true one in time has it as its truth, also before the first and after the last."""
 STEP_S = 1.0
 """The motion of the relative error."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AbsoluteError:
-    """Distances between aligned positions; the alignment maps the estimate onto the truth."""
-
-    rmse_m: float
-    median_m: float
-    max_m: float
-    matched: int
-    scale: float
-    T_truth_estimate: Array
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RelativeError:
-    """Errors of the motion between consecutive matched poses."""
-
-    rmse_m: float
-    rmse_deg: float
-    max_m: float
-    max_deg: float
-    steps: int
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -109,14 +80,8 @@ def accuracy(
     Source:
         Sturm et al., IROS 2012, eqs. 1 to 3; alignment after Umeyama, PAMI 1991.
     """
-    rows = np.flatnonzero(with_truth(truth, estimate.timestamps_s))
-    if len(rows) < 3:
-        raise UsageError(
-            f"{len(rows)} poses have a true one at their time, an evaluation needs 3",
-            hint="check that recording and truth use the same clock",
-        )
+    rows, true_poses = match_truth(estimate, truth)
     stamps_s, poses = estimate.timestamps_s[rows], estimate.T_world_camera[rows].copy()
-    true_poses = truth.at(stamps_s)
     compared, scale = poses.copy(), 1.0
     if with_scale:
         scale, _ = align(poses[:, :3, 3], true_poses[:, :3, 3], with_scale=True)
@@ -141,6 +106,21 @@ def accuracy(
         aligned=Trajectory(stamps_s, poses),
         truth=Trajectory(stamps_s, true_poses),
     )
+
+
+def match_truth(estimate: Trajectory, truth: Trajectory) -> tuple[npt.NDArray[np.int64], Array]:
+    """Return the rows ``(n,)`` of the estimate that have a truth, and the true poses ``(n, 4, 4)`` of these.
+
+    Raises:
+        UsageError: Fewer than three poses have a truth.
+    """
+    rows = np.flatnonzero(with_truth(truth, estimate.timestamps_s))
+    if len(rows) < 3:
+        raise UsageError(
+            f"{len(rows)} poses have a true one at their time, an evaluation needs 3",
+            hint="check that recording and truth use the same clock",
+        )
+    return rows, truth.at(estimate.timestamps_s[rows])
 
 
 def with_truth(truth: Trajectory, stamps_s: npt.ArrayLike) -> npt.NDArray[np.bool_]:
@@ -175,78 +155,13 @@ def ate_m(T_estimate: Array, T_truth: Array) -> float:
     return _rms(np.linalg.norm(moved - wanted, axis=1))
 
 
-def absolute_error(
-    estimate: Trajectory,
-    truth: Trajectory,
-    *,
-    with_scale: bool = False,
-    max_difference_s: float = MAX_STAMP_DIFFERENCE_S,
-) -> AbsoluteError:
-    """Return the absolute trajectory error after a rigid alignment of the estimate.
-
-    Args:
-        estimate: Poses to evaluate.
-        truth: True poses, in any frame.
-        with_scale: Also estimate a scale (Sim(3)), as for one camera without depth.
-        max_difference_s: Largest difference of the time stamps of a pair.
-
-    Raises:
-        UsageError: Fewer than three poses match in time.
-
-    Source:
-        Sturm et al., IROS 2012, eq. 3; alignment after Umeyama, PAMI 1991.
-    """
-    rows, truth_rows = associate(estimate, truth, max_difference_s)
-    positions, wanted = estimate.positions[rows], truth.positions[truth_rows]
-    scale, T_truth_estimate = align(positions, wanted, with_scale=with_scale)
-    moved = scale * positions @ T_truth_estimate[:3, :3].T + T_truth_estimate[:3, 3]
-    distances = np.linalg.norm(moved - wanted, axis=1)
-    return AbsoluteError(
-        rmse_m=_rms(distances),
-        median_m=float(np.median(distances)),
-        max_m=float(distances.max()),
-        matched=len(rows),
-        scale=scale,
-        T_truth_estimate=T_truth_estimate,
-    )
-
-
-def relative_error(
-    estimate: Trajectory, truth: Trajectory, *, max_difference_s: float = MAX_STAMP_DIFFERENCE_S
-) -> RelativeError:
-    """Return the relative pose error over consecutive matched poses; it needs no alignment.
-
-    Raises:
-        UsageError: Fewer than three poses match in time.
-
-    Source:
-        Sturm et al., IROS 2012, eqs. 1 and 2, with a step of one frame.
-    """
-    rows, truth_rows = associate(estimate, truth, max_difference_s)
-    poses, true_poses = estimate.T_world_camera[rows], truth.T_world_camera[truth_rows]
-    distances, angles = [], []
-    for row in range(len(rows) - 1):
-        moved = inverse(poses[row]) @ poses[row + 1]
-        truly = inverse(true_poses[row]) @ true_poses[row + 1]
-        error = inverse(truly) @ moved
-        distances.append(np.linalg.norm(error[:3, 3]))
-        angles.append(rotation_angle_deg(error[:3, :3]))
-    return RelativeError(
-        rmse_m=_rms(np.array(distances)),
-        rmse_deg=_rms(np.array(angles)),
-        max_m=float(np.max(distances)),
-        max_deg=float(np.max(angles)),
-        steps=len(distances),
-    )
-
-
 def trajectory_figures(
     estimate: Trajectory, truth: Trajectory | None, T_body_camera: Array | None = None
 ) -> dict[str, float | None]:
-    """Return ``path_m``, ``ate_cm``, ``rpe_cm`` and ``rpe_deg``, rounded for a report.
+    """Return ``path_m``, and ``ate_cm``, ``rpe_cm`` and ``rpe_deg`` of `accuracy`, rounded for a report.
 
-    The errors are None without a truth, or where fewer than three poses match it in time.  With
-    *T_body_camera* ``(4, 4)`` they are those of the body.
+    The errors are None without a truth, or where fewer than three poses have one.  With *T_body_camera*
+    ``(4, 4)`` they are those of the body.
     """
     figures: dict[str, float | None] = {
         "path_m": round(estimate.length_m, 3),
@@ -255,51 +170,13 @@ def trajectory_figures(
         "rpe_deg": None,
     }
     if truth is not None:
-        if T_body_camera is not None:
-            estimate, truth = (
-                replace(each, T_world_camera=body_poses(each.T_world_camera, T_body_camera))
-                for each in (estimate, truth)
-            )
         with contextlib.suppress(UsageError):
-            relative = relative_error(estimate, truth)
-            figures["ate_cm"] = round(100 * absolute_error(estimate, truth).rmse_m, 4)
-            figures["rpe_cm"] = round(100 * relative.rmse_m, 4)
-            figures["rpe_deg"] = round(relative.rmse_deg, 4)
+            errors = accuracy(estimate, truth, T_body_camera=T_body_camera)
+            figures["ate_cm"] = round(100 * errors.ate_m, 4)
+            if errors.rpe_m is not None and errors.rpe_deg is not None:
+                figures["rpe_cm"] = round(100 * errors.rpe_m, 4)
+                figures["rpe_deg"] = round(errors.rpe_deg, 4)
     return figures
-
-
-def associate(
-    estimate: Trajectory, truth: Trajectory, max_difference_s: float = MAX_STAMP_DIFFERENCE_S
-) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    """Return the rows of both trajectories that belong together, nearest in time.
-
-    Every pose of the shorter trajectory takes the nearest of the longer one.
-
-    Raises:
-        UsageError: Fewer than three poses match.
-    """
-    swapped = len(truth) < len(estimate)
-    few, many = (truth, estimate) if swapped else (estimate, truth)
-    rows = _nearest_rows(few.timestamps_s, many.timestamps_s)
-    near = np.abs(few.timestamps_s - many.timestamps_s[rows]) <= max_difference_s if len(many) else rows > 0
-    if near.sum() < 3:
-        raise UsageError(
-            f"{int(near.sum())} poses match within {max_difference_s:g} s, an evaluation needs 3",
-            hint="check that both trajectories use the same clock",
-        )
-    of_few, of_many = np.flatnonzero(near), rows[near]
-    return (of_many, of_few) if swapped else (of_few, of_many)
-
-
-def _nearest_rows(wanted: Array, values: Array) -> npt.NDArray[np.int64]:
-    """Return, for each wanted value, the row of the nearest of *values*, in any order."""
-    if len(values) < 2:
-        return np.zeros(len(wanted), dtype=np.int64)
-    order = np.argsort(values, kind="stable")
-    ascending = values[order]
-    right = np.clip(np.searchsorted(ascending, wanted), 1, len(values) - 1)
-    is_left = wanted - ascending[right - 1] <= ascending[right] - wanted
-    return order[right - is_left]
 
 
 def align(points: Array, wanted: Array, *, with_scale: bool = False) -> tuple[float, Array]:

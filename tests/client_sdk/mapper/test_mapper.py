@@ -23,7 +23,7 @@ from client_sdk.monocular.scale import OdometryScale
 from client_sdk.robot import Robot, connect
 from client_sdk.tracking.monocular_tracker import MonocularOptions, MonocularTracker
 from rse_pf.errors import Busy, MissingExtra, UsageError
-from rse_pf.experiments.results.trajectory_error import absolute_error
+from rse_pf.experiments.results.trajectory_error import accuracy
 from rse_pf.geometry import exp_se3
 from rse_pf.pnp import solve_pnp
 from tests.client_sdk.live.fake_live_map import solve
@@ -249,7 +249,7 @@ def test_the_kitchen_without_its_depth_is_mapped_within_8_cm(recordings: Path) -
     assert mapper.scale.startswith("metric")
     assert mapper.lost_frames <= 0.05 * len(dataset)
     assert len(path) >= 0.95 * len(dataset)
-    assert absolute_error(path, truth).rmse_m <= 0.08
+    assert accuracy(path, truth).ate_m <= 0.08
 
 
 def test_the_mapper_of_a_robot_asks_it_and_keeps_commands_of_its_codec_small(

@@ -17,7 +17,7 @@ from client_sdk.simulator.camera import Painter, add_depth_noise
 from client_sdk.simulator.world import DEPTH_M, DOOR_Y_M, HEIGHT_M, ROOM_M, make_world
 from client_sdk.tracking.tracker import Tracker
 from rse_pf.errors import UsageError
-from rse_pf.experiments.results.trajectory_error import absolute_error
+from rse_pf.experiments.results.trajectory_error import accuracy
 from rse_pf.geometry import pose_difference, transform
 from rse_pf.pnp import PnpOptions, solve_pnp
 
@@ -160,6 +160,5 @@ def test_the_world_can_be_tracked(robot: int, robots: int, seed: int):
 
     assert tracker.lost_frames == 0
     assert (
-        100 * absolute_error(Trajectory(truth.timestamps_s, np.array(poses)), truth).rmse_m
-        <= 2.0 * truth.length_m
+        100 * accuracy(Trajectory(truth.timestamps_s, np.array(poses)), truth).ate_m <= 2.0 * truth.length_m
     )

@@ -17,7 +17,7 @@ from client_sdk.tracking.landmark_map import LandmarkMap, ViewFeatures
 from client_sdk.tracking.monocular_tracker import MonocularOptions, MonocularTracker
 from client_sdk.tracking.place import place_of
 from rse_pf.errors import UsageError
-from rse_pf.experiments.results.trajectory_error import absolute_error
+from rse_pf.experiments.results.trajectory_error import accuracy
 from rse_pf.geometry import Array, Camera, exp_se3, inverse, pose_difference, transform
 from rse_pf.slam.tracking import ImageFeatures, distinct_distances
 from tests.client_sdk.mapper.flat_world import CAMERA, covered, foreign, frame_at
@@ -189,7 +189,7 @@ def test_a_car_that_drives_forward_is_posed_from_its_first_frame(recordings: Pat
     path = tracker.trajectory()
     assert len(path) >= 38
     assert tracker.segments == (0,)
-    error_m = absolute_error(path, drive.truth, with_scale=True).rmse_m
+    error_m = accuracy(path, drive.truth, with_scale=True).ate_m
     assert error_m <= 0.015 * np.linalg.norm(drive.truth.positions[39])
 
 

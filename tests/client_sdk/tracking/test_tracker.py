@@ -13,7 +13,7 @@ from client_sdk.frontend import Frame, FrontEndOptions, PoseQuery, TrackedFrame
 from client_sdk.mapping import Trajectory
 from client_sdk.tracking.tracker import Tracker
 from rse_pf.errors import UsageError
-from rse_pf.experiments.results.trajectory_error import absolute_error
+from rse_pf.experiments.results.trajectory_error import accuracy
 from rse_pf.geometry import Array, inverse, pose_difference
 from tests.client_sdk.mapper.flat_world import STEP_M, covered, foreign, frame_at
 from tests.client_sdk.tracking.driving import NO_ANSWER, Answer, run, run_all, solve
@@ -238,7 +238,7 @@ def test_recordings_that_turn_quickly_are_not_lost(
     estimate = Trajectory(np.array([stamp for stamp, _ in posed]), np.array([pose for _, pose in posed]))
     assert dataset.truth is not None
     assert tracker.lost_frames <= most_lost
-    assert 100 * absolute_error(estimate, dataset.truth).rmse_m <= ate_cm
+    assert 100 * accuracy(estimate, dataset.truth).ate_m <= ate_cm
 
 
 @pytest.mark.data
