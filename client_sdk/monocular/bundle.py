@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rse_pf.geometry import Array, Camera, exp_se3
+from rse_pf.slam.schur import NormalEquations
 
 __all__ = ["Adjuster", "Bundle", "adjust"]
 
@@ -24,6 +25,7 @@ _MIN_DEPTH = 1e-3
 _FIRST_DAMPING, _MAX_DAMPING = 1e-4, 1e6
 _CONVERGED = 1e-4
 """The adjustment ends when a step lowers the cost by less than this share."""
+_LITTLE_INFORMATION = 1e-9  # far below that of any pixel: a point behind all cameras has an inverse
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -97,9 +99,13 @@ class _System:
         self._seen, self._starts = np.unique(self._points, return_index=True)
         self._slot = np.searchsorted(self._seen, self._points)
         self._free = np.flatnonzero(~bundle.is_fixed)
-        column = np.full(len(bundle.is_fixed), -1)
-        column[self._free] = np.arange(len(self._free))
-        self._column = column[self._cameras]
+        self._of_camera = [np.flatnonzero(self._cameras == row) for row in self._free]
+        size = 6 * len(self._free)
+        # What no camera sees of a point stays 0 in E from one step to the next.
+        self._equations = NormalEquations(
+            np.zeros((size, size)), np.zeros(size), np.zeros((len(self._seen), 3, size)),
+            np.zeros((len(self._seen), 3, 3)), np.zeros((len(self._seen), 3)),
+        )  # fmt: skip
 
     def cost(self, poses: Array, points: Array) -> float:
         """Return the sum of Huber's function over the observations."""
@@ -119,37 +125,24 @@ class _System:
         weights = np.sqrt(_huber_weights(residuals) * (camera_points[:, 2] > _MIN_DEPTH))
         scale = (weights / self._sigma_px)[:, None, None]
         Jc, Jp, residuals = Jc * scale, Jp * scale, residuals * weights[:, None]
-        n = len(self._free)
-        self._Hpp = np.add.reduceat(Jp.transpose(0, 2, 1) @ Jp, self._starts, axis=0)
-        self._bp = np.add.reduceat(np.einsum("nij,ni->nj", Jp, residuals), self._starts, axis=0)
-        self._Hcc = np.zeros((n, 6, 6))
-        self._bc = np.zeros((n, 6))
-        self._E = np.zeros((n, 6, len(self._seen), 3))
-        for column in range(n):
-            own = self._column == column
+        equations, J_pt = self._equations, Jp.transpose(0, 2, 1)
+        equations.H_landmarks = np.add.reduceat(J_pt @ Jp, self._starts, axis=0)
+        equations.g_landmarks = np.add.reduceat(np.einsum("nij,ni->nj", Jp, residuals), self._starts, axis=0)
+        for row, own in enumerate(self._of_camera):
+            at = slice(6 * row, 6 * row + 6)
             J = Jc[own].reshape(-1, 6)
-            self._Hcc[column] = J.T @ J
-            self._bc[column] = J.T @ residuals[own].ravel()
-            self._E[column][:, self._slot[own]] = (Jc[own].transpose(0, 2, 1) @ Jp[own]).transpose(1, 0, 2)
+            equations.H[at, at] = J.T @ J
+            equations.g[at] = J.T @ residuals[own].ravel()
+            equations.E[self._slot[own], :, at] = J_pt[own] @ Jc[own]
 
     def step(self, poses: Array, points: Array, damping: float) -> tuple[Array, Array]:
         """Return the poses and points after one damped step."""
-        n, p = len(self._free), len(self._seen)
-        damped = self._Hpp * (1.0 + damping * np.eye(3)) + 1e-9 * np.eye(3)
-        Hpp_inverse = np.linalg.inv(damped)
-        E = self._E.reshape(6 * n, 3 * p)
-        Y = (self._E.transpose(0, 2, 1, 3) @ Hpp_inverse).transpose(0, 2, 1, 3).reshape(6 * n, 3 * p)
-        S = -Y @ E.T
-        for column in range(n):
-            rows = slice(6 * column, 6 * column + 6)
-            S[rows, rows] += self._Hcc[column] * (1.0 + damping * np.eye(6)) + 1e-9 * np.eye(6)
-        dc = np.linalg.solve(S, Y @ self._bp.ravel() - self._bc.ravel())
-        back = -self._bp - (E.T @ dc).reshape(p, 3)
-        dp = np.einsum("pij,pj->pi", Hpp_inverse, back)
+        reduced = self._equations.reduce(damping, _LITTLE_INFORMATION, _LITTLE_INFORMATION)
+        dc: Array = np.linalg.solve(reduced.S, reduced.right).astype(np.float64, copy=False)
         moved_poses, moved_points = poses.copy(), points.copy()
         for column, row in enumerate(self._free):
             moved_poses[row] = exp_se3(dc[6 * column : 6 * column + 6]) @ poses[row]
-        moved_points[self._seen] += dp
+        moved_points[self._seen] += self._equations.landmark_steps(reduced, dc)
         return moved_poses, moved_points
 
 

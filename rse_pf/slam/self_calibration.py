@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from rse_pf.errors import BadRequest, DegenerateGeometry
 from rse_pf.geometry import Array, Camera, exp_se3, inverse, skew
+from rse_pf.slam.schur import NormalEquations, Reduced
 
 __all__ = [
     "UNKNOWNS",
@@ -313,8 +314,12 @@ class _System:
         self.moments = self.pixels[:, 1:] / self.camera.height - 0.5
         self.pixel_factor = self.depth_factor = 1.0
         self._of_keyframe = [np.flatnonzero(self.keyframes == row) for row in range(keyframes)]
-        # What no keyframe sees of a landmark stays 0 from one step to the next.
-        self._E = np.zeros((landmarks, 3, self._c * keyframes + self._m))
+        size = self._c * keyframes + self._m
+        # What no keyframe sees of a landmark stays 0 in E from one step to the next.
+        self._equations = NormalEquations(
+            np.zeros((size, size)), np.zeros(size), np.zeros((landmarks, 3, size)),
+            np.zeros((landmarks, 3, 3)), np.zeros((landmarks, 3)),
+        )  # fmt: skip
         columns = self._c * self.keyframes[:, None, None] + np.arange(self._c)
         self._seen_at = self.landmarks[:, None, None], np.arange(3)[:, None], columns
 
@@ -417,40 +422,33 @@ class _System:
     def _normal(self) -> None:
         J_c, J_v, J_p = self._J
         c, m, split = self._c, self._m, self._c * self.k
-        size = split + m
-        self._H, self._g = np.zeros((size, size)), np.zeros(size)
+        equations = self._equations
+        H, g, E = equations.H, equations.g, equations.E
+        H[:], g[:] = 0.0, 0.0
         for row, own in enumerate(self._of_keyframe):
             at = slice(c * row, c * row + c)
             stacked, others = J_c[own].reshape(-1, c), J_v[own].reshape(-1, m)
             r = self._r[own].ravel()
-            self._H[at, at] = stacked.T @ stacked
-            self._H[at, split:] = stacked.T @ others
-            self._H[split:, at] = self._H[at, split:].T
-            self._H[split:, split:] += others.T @ others
-            self._g[at] = stacked.T @ r
-            self._g[split:] += others.T @ r
-        # (l, 3, size): a landmark's rows lie together, so that the product below is of one array with itself.
+            H[at, at] = stacked.T @ stacked
+            H[at, split:] = stacked.T @ others
+            H[split:, at] = H[at, split:].T
+            H[split:, split:] += others.T @ others
+            g[at] = stacked.T @ r
+            g[split:] += others.T @ r
         J_pt = J_p.transpose(0, 2, 1)
-        self._E[self._seen_at] = J_pt @ J_c
-        self._E[:, :, split:] = _summed(J_pt @ J_v, self.landmarks, self.l)
-        self._Hpp = _summed(J_pt @ J_p, self.landmarks, self.l)
-        self._gp = _summed((J_pt @ self._r[:, :, None])[:, :, 0], self.landmarks, self.l)
+        E[self._seen_at] = J_pt @ J_c
+        E[:, :, split:] = _summed(J_pt @ J_v, self.landmarks, self.l)
+        equations.H_landmarks = _summed(J_pt @ J_p, self.landmarks, self.l)
+        equations.g_landmarks = _summed((J_pt @ self._r[:, :, None])[:, :, 0], self.landmarks, self.l)
 
-    def _reduced(self, damping: float) -> tuple[Array, Array, Array]:
-        """Return the reduced matrix with priors, its right side, and ``Hpp^-1``."""
-        size = len(self._g)
-        damped = self._Hpp * (1.0 + damping * np.eye(3)) + _POINT_INFORMATION * np.eye(3)
-        root: Array = np.linalg.inv(np.linalg.cholesky(damped)).astype(np.float64, copy=False)
-        Z = (root @ self._E).reshape(-1, size)
-        S = self._H - Z.T @ Z
-        right = (root @ self._gp[:, :, None]).ravel() @ Z - self._g
-        diagonal = np.arange(size)
-        S[diagonal, diagonal] += damping * self._H[diagonal, diagonal] + self._prior()
+    def _reduced(self, damping: float) -> Reduced:
+        """Return the equations of poses and calibration, with priors."""
+        reduced = self._equations.reduce(damping, self._prior(), _POINT_INFORMATION)
         if self._c == 7:
             # The mean of the zooms is the common focal length's.
             zoom = 7 * np.arange(self.k) + 6
-            S[np.ix_(zoom, zoom)] += _MEAN_INFORMATION / self.k
-        return S, right, root.transpose(0, 2, 1) @ root
+            reduced.S[np.ix_(zoom, zoom)] += _MEAN_INFORMATION / self.k
+        return reduced
 
     def _prior(self) -> Array:
         own = np.full((self.k, self._c), _POSE_INFORMATION)
@@ -459,27 +457,27 @@ class _System:
 
     def step(self, state: _State, damping: float) -> _State:
         """Return the state after one damped step."""
-        S, right, P = self._reduced(damping)
+        reduced = self._reduced(damping)
         k, c = self.k, self._c
         now = np.zeros((k, c))
         now[:, 6:] = state.zooms[:, None]
         pull = self._prior() * np.concatenate([now.ravel(), state.values[self._free]])
-        d = np.linalg.solve(S, right - pull)
-        back = -(self._gp + self._E @ d)
+        d = np.linalg.solve(reduced.S, reduced.right - pull)
         own = d[: c * k].reshape(k, c)
         limit = min(1.0, _MOST_TURN_RAD / max(float(np.abs(own[:, 3:6]).max()), 1e-12))
         values = state.values.copy()
         values[self._free] += limit * d[c * k :]
         return _State(
             exp_se3(limit * own[:, :6]) @ state.T,
-            state.points + limit * (P @ back[:, :, None])[:, :, 0],
+            state.points + limit * self._equations.landmark_steps(reduced, d),
             values,
             state.zooms + limit * own[:, 6] if c == 7 else state.zooms,
         )
 
     def result(self, state: _State) -> Calibrated:
         """Return the state with its deviations."""
-        S, _, P = self._reduced(0.0)
+        reduced = self._reduced(0.0)
+        S, P = reduced.S, reduced.landmark_covariance
         k, c, m, split = self.k, self._c, self._m, self._c * self.k
         whole: Array = np.linalg.inv(S).astype(np.float64, copy=False)
         rows = np.arange(split, split + m)
@@ -509,7 +507,7 @@ class _System:
     def _inflation(self, rows: Array, P: Array, variances: Array) -> Array:
         """Return by how much variances grow where errors of one stretch of the drive go together."""
         k, split = self.k, self._c * self.k
-        of_points = np.einsum("lar,lab->rlb", self._E @ rows.T, P)
+        of_points = np.einsum("lar,lab->rlb", self._equations.E @ rows.T, P)
         of_cameras = rows[:, :split].reshape(len(rows), k, self._c)
         pull_c, pull_v, pull_p = ((J.transpose(0, 2, 1) @ self._r[:, :, None])[:, :, 0] for J in self._J)
         moved = pull_v @ rows[:, split:].T
