@@ -43,14 +43,15 @@ __all__ = ["Accounts", "TenantAccount"]
 
 _K = TypeVar("_K")
 _T = TypeVar("_T")
-_RECOUNT_S, _SLOW_RECOUNT_S = 10.0, 600.0
+_RECOUNT_S = 10.0  # between two counts of a folder, which reads only what changed
+_SLOW_RECOUNT_S = 600.0  # between two counts of another store, which lists all objects
 _REFUSED_RECOUNT_SHARE = 0.1
 """Before a refusal a tenant is counted again after this share of the usual time: it may have deleted."""
 _MAX_ACCOUNTS = 10_000
-_MAX_DRAWN_BYTES, _DRAWN_SHARE = 16 << 20, 64
-"""A process draws this share of what is left, and no more than so many bytes, at once."""
-_DRAWN_S, _WRITTEN_S = 5.0, 15.0
-"""What was drawn is spent within the first time, and written within the second one."""
+_MAX_DRAWN_BYTES = 16 << 20  # bytes that a process draws from an account at once, at most
+_DRAWN_SHARE = 64  # it draws this fraction of what is left, so that a full account is shared finely
+_DRAWN_S = 5.0  # drawn bytes expire after this time, so that a process that ended holds none for long
+_WRITTEN_S = 15.0  # an object is written this long after its bytes were drawn, at the latest
 _SWAPS = 50
 _SHARE_S = 1.0
 _RESERVE_SHARE = 0.1

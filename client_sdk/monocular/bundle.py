@@ -22,7 +22,8 @@ Rows = npt.NDArray[np.int64]
 # Huber's threshold in standard deviations: 95 % of the residuals of a 2-D Gaussian are below.
 _HUBER = 2.45
 _MIN_DEPTH = 1e-3
-_FIRST_DAMPING, _MAX_DAMPING = 1e-4, 1e6
+_FIRST_DAMPING = 1e-4  # Levenberg-Marquardt's share of the diagonal: nearly Gauss-Newton at first
+_MAX_DAMPING = 1e6  # with more, a step is shorter than the rounding of a pose
 _CONVERGED = 1e-4
 """The adjustment ends when a step lowers the cost by less than this share."""
 _LITTLE_INFORMATION = 1e-9  # far below that of any pixel: a point behind all cameras has an inverse

@@ -51,28 +51,32 @@ Rows = npt.NDArray[np.int64]
 
 _PIXEL_PX = 1.0
 """Deviation of a feature's pixel on the finest level; it grows with the size of the feature."""
-_LOCAL, _LATEST, _ALIKE = 6, 3, 5
+_LOCAL = 6  # keyframes next to a predicted pose whose landmarks are matched
+_LATEST = 3  # newest keyframes that a camera which was lost just now is compared with first
+_ALIKE = 5  # keyframes that place recognition proposes
 _MANY = 3
 """A guided match with so many times the fewest inliers is worth a query."""
-_GUIDED_RATIO, _FOLLOWED_RATIO, _NEAR_RATIO, _CONFIRMED_RATIO, _CLEAR_RATIO = 0.35, 0.4, 0.25, 0.3, 0.5
-"""Shares of the matches that must agree: with a guided query, with the last frame, with a keyframe of the
-place where the camera was just now, with the map around a pose, and with a keyframe of any other place."""
+_GUIDED_RATIO = 0.35  # share of the matches that must be inliers of a query guided by a predicted pose
+_FOLLOWED_RATIO = 0.4  # of a query against the last frame
+_NEAR_RATIO = 0.25  # of a query against a keyframe of the place where the camera was just now
+_CONFIRMED_RATIO = 0.3  # of the landmarks around a recognised pose
+_CLEAR_RATIO = 0.5  # of a query against a keyframe of any other place, which may be an alias
 _CLEAR_INLIERS = 40
 _ALIKE_SHARE = 0.25
 """Of the landmarks that the pose of a recognised place expects, so many look as expected at their pixels."""
 _CONFIRM_PX = 8.0
-_NEAR_LOWE_RATIO, _CONFIRM_LOWE_RATIO = 0.8, 0.9
-"""The best match must be this much nearer than the second within the radius: around a prediction, and around
-a pose, where the radius is small."""
+_NEAR_LOWE_RATIO = 0.8  # largest ratio of the best and the second distance around a predicted pixel
+_CONFIRM_LOWE_RATIO = 0.9  # the same around a pose to confirm, where the radius is small
 _FAR_PX = 160.0
 """Radius of the last search around the last pose: a camera that turned otherwise is 10 degrees off."""
-_ALL_RATIO, _ALL_DISTANCE = 0.8, 64
+_ALL_RATIO = 0.8  # largest ratio of the best and the second distance where all features are compared
+_ALL_DISTANCE = 64  # largest distance of a match there, in bits of 256
 _ENOUGH = 120
 """With so many landmarks of the map a pose needs no points of the last frame: a chain of frames drifts."""
 _MOST_JUMPS = 4
 """A camera that was lost for long may have moved by so many limits, or its place must be clear."""
-_LEAST_ROWS, _LEAST_INTERVAL_S = 30, 1e-3
-"""An image with fewer landmarks with depth says nothing of the shutter."""
+_LEAST_ROWS = 30  # an image with fewer landmarks with depth does not determine the rate of its shutter
+_LEAST_INTERVAL_S = 1e-3  # between two frames, so that stamps which repeat give no infinite rate
 _MOST_RATE = 3.0
 """Radians a second.  A rate that a cut only seems to have would turn an image of 20 ms by 3.4 degrees."""
 _QUERIES = 3
@@ -82,8 +86,8 @@ _STEREO_MATCHES = 250
 _JUMP_SHARE = 0.15
 """Of the median depth."""
 _JOIN_EVERY = 3
-_JOIN_M, _JOIN_DEG = 0.15, 4.0
-"""Two measurements of where a segment lies agree within this."""
+_JOIN_M = 0.15  # two measurements of the pose of a segment agree within this translation
+_JOIN_DEG = 4.0  # and within this rotation
 
 
 @dataclass(frozen=True, slots=True)

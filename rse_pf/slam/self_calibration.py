@@ -35,17 +35,23 @@ PRIOR = np.array([0.15, 0.15, 40.0, 40.0, 0.15, 0.15, 0.3, 0.02, 0.01])
 """Standard deviations of the unknowns before the drive is seen."""
 _ZOOM_PRIOR = 0.15
 _CAUCHY = 2.0
-_ITERATIONS, _ZOOM_ITERATIONS, _CONVERGED = 12, 6, 1e-4
-_FIRST_DAMPING, _MOST_DAMPING = 1e-4, 1e4
+_ITERATIONS = 12  # steps of an adjustment
+_ZOOM_ITERATIONS = 6  # steps with a focal length for each keyframe, which begin near the solution
+_CONVERGED = 1e-4  # the adjustment ends when a step lowers the cost by less than this share
+_FIRST_DAMPING = 1e-4  # Levenberg-Marquardt's share of the diagonal: nearly Gauss-Newton at first
+_MOST_DAMPING = 1e4  # the adjustment ends when a step with more damping does not lower the cost
 _NEAR_M = 0.02
 _BEHIND = 1e3
-_BLOCKS, _CELLS = 6, 6
+_BLOCKS = 6  # stretches of a drive whose errors are taken as correlated
+_CELLS = 6  # columns and rows of the image whose errors are taken as correlated
 _MAD = 1.4826
-_MOST_PARTS, _LEAST_OF_PART = 4, 6
-_MOST_TURN_RAD, _MEAN_INFORMATION = 0.5, 1e8
+_MOST_PARTS = 4  # parts of a drive that are adjusted by themselves
+_LEAST_OF_PART = 6  # keyframes of a part
+_MOST_TURN_RAD = 0.5  # largest rotation of a keyframe in one step; exp_se3 is far from linear beyond it
+_MEAN_INFORMATION = 1e8  # of the mean of all zooms, which holds it at 0
 _SAMPLES = 8
-_POSE_INFORMATION, _POINT_INFORMATION = 1.0, 1e-3
-"""Far below what any drive tells: they fix position, and scale where nothing is metric."""
+_POSE_INFORMATION = 1.0  # of each pose, far below that of a drive: fixes position, and scale without metres
+_POINT_INFORMATION = 1e-3  # of each landmark, far below that of one pixel
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
