@@ -13,10 +13,9 @@ from collections import Counter
 from collections.abc import Awaitable, Callable, Coroutine, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-import numpy.typing as npt
 
 from client_sdk.answers import PoseAnswer
 from client_sdk.frontend import Features, Frame, FrontEndOptions, PoseQuery, TrackedFrame
@@ -42,7 +41,10 @@ from rse_pf.maps.format import UP, UP_FIELD, Keyframe, MapVersion, encode_map
 from rse_pf.pnp import DepthNoise, PnpOptions
 from rse_pf.slam.inertial import KeyframeImu, upright_turn
 
-__all__ = ["AskPose", "BlockingMapper", "FrameRecorder", "Mapper", "PoseSolver", "ask_robot"]
+if TYPE_CHECKING:  # only robots that record need what it imports
+    from rse_pf.recording.robot_recorder import RobotRecorder
+
+__all__ = ["AskPose", "BlockingMapper", "Mapper", "ask_robot"]
 
 
 AskPose = Callable[[PoseQuery], Awaitable[PoseAnswer]]
@@ -54,33 +56,12 @@ _LEVEL_GRAVITY: Array = np.array([0.0, 9.81, 0.0])
 _USUAL_DEPTH_M = 2.0
 
 
-class PoseSolver(Protocol):
-    """What `ask_robot` needs of a robot."""
-
-    async def solve_pnp(
-        self, points_world: Array, pixels: Array, camera: Camera, options: PnpOptions | None = None, *,
-        depths_m: Array | None = None, depth_noise: DepthNoise | None = None,
-        deadline_s: float | None = None, keep: bool = False,
-    ) -> PoseAnswer:  # fmt: skip
-        """Estimate the camera pose of one frame."""
-
-
-class FrameRecorder(Protocol):
-    """What a mapper needs of the recorder of a robot."""
-
-    def frame(self, timestamp_s: float, rgb: npt.NDArray[np.uint8] | None = None) -> None:
-        """Record a thumbnail of an image, if the robot allows it."""
-
-    def map(self, points: npt.NDArray[np.float32]) -> None:
-        """Record the ``(n, 3)`` points of a map."""
-
-
-def ask_robot(robot: PoseSolver, deadline_s: float | None = None) -> AskPose:
-    """Return a function that answers pose queries by a connected robot, within *deadline_s* each."""
+def ask_robot(solve_pnp: Callable[..., Awaitable[PoseAnswer]], deadline_s: float | None = None) -> AskPose:
+    """Return a function that answers pose queries by `Robot.solve_pnp`, within *deadline_s* each."""
 
     async def ask(query: PoseQuery) -> PoseAnswer:
         found = query.correspondences
-        return await robot.solve_pnp(
+        return await solve_pnp(
             found.points_world,
             found.pixels,
             query.camera,
@@ -122,7 +103,7 @@ class Mapper:
         T_world_start: Array | None = None,
         keyframes_of: str = "",
         adds_frames: bool = True,
-        recorder: FrameRecorder | None = None,
+        recorder: RobotRecorder | None = None,
         holds_world: bool = False,
         features: FeaturesFunction | None = None,
         motion: MotionFunction | None = None,

@@ -329,7 +329,7 @@ class Robot:
 
         bounded = (options or FrontEndOptions()).sent_with(self._session.codec.name)
         return Mapper(
-            ask=ask_robot(self, deadline_s), camera=camera, options=bounded, monocular=monocular,
+            ask=ask_robot(self.solve_pnp, deadline_s), camera=camera, options=bounded, monocular=monocular,
             depth=depth, scale=scale, map_options=map_options, T_world_start=T_world_start,
             keyframes_of=keyframes_of, recorder=self._recorder, features=features,
             motion=motion, loops=loops, optimiser=optimiser,
@@ -364,7 +364,8 @@ class Robot:
         codec = self._session.codec.name
         bounded = (options or FrontEndOptions.live()).sent_with(codec)
         return LiveMapper(
-            self, name, ask=ask_robot(self, deadline_s), camera=camera, depth=depth, options=bounded,
+            self, name, ask=ask_robot(self.solve_pnp, deadline_s), camera=camera, depth=depth,
+            options=bounded,
             live=(live or LiveOptions()).sent_with(codec),
             spool=None if spool is None else Path(spool), map_options=map_options,
             T_world_start=T_world_start, features=features, motion=motion, loops=loops,

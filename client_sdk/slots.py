@@ -22,11 +22,12 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from client_sdk.imu.inertial import Inertial
 from client_sdk.monocular.bundle import Bundle
 from rse_pf.errors import BadRequest, UsageError
 from rse_pf.geometry import Array, Camera, rigid
@@ -45,7 +46,6 @@ __all__ = [
     "OptimiserFunction",
     "OptimiserSlot",
     "Slots",
-    "Turning",
     "load_features",
     "load_function",
 ]
@@ -230,13 +230,6 @@ class FeaturesSlot:
         )
 
 
-class Turning(Protocol):
-    """What knows how a camera turns between two times, such as an IMU."""
-
-    def turn(self, begin_s: float, end_s: float) -> Array | None:
-        """Return ``R_begin_end`` ``(3, 3)`` of the camera; None if it is not known."""
-
-
 class MotionSlot:
     """A motion function with its checks, and the newest poses that it is given."""
 
@@ -368,7 +361,7 @@ class Slots:
     motion: MotionSlot | None = None
     loops: LoopsSlot | None = None
     optimiser: OptimiserSlot | None = None
-    inertial: Turning | None = None
+    inertial: Inertial | None = None
 
     @classmethod
     def of(

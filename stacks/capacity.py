@@ -40,7 +40,7 @@ class Capacity(Construct):
                 capacity_distribution_strategy="balanced-best-effort"
             )
         )
-        types = instance_types(settings.cloud)
+        types = instance_types(settings.cloud.instance_type, settings.cloud.other_instance_types)
         if settings.cloud.spot or len(types) > 1:
             self._mix(raw, types, settings)
         if settings.cloud.warm_servers:

@@ -24,7 +24,7 @@ from collections.abc import AsyncIterator, Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -35,7 +35,7 @@ from client_sdk.live.attachments import Attached, Attachments
 from client_sdk.live.keyframe_chain import KeyframeChain
 from client_sdk.live.object_sender import StoreObject
 from client_sdk.live.options import LiveOptions
-from client_sdk.live.sender import REFUSALS, KeyframeSender, LiveCaller, Myself
+from client_sdk.live.sender import REFUSALS, KeyframeSender, LiveRobot, Myself
 from client_sdk.live.waiting_keyframes import Base, WaitingKeyframe, WaitingKeyframes
 from client_sdk.mapper import AskPose, Mapper
 from client_sdk.mapping import MapOptions, PointMap, Trajectory
@@ -55,7 +55,7 @@ from rse_pf.slam.keyframe import (
 )
 from rse_pf.wire.live_map import LiveRelocalise, RelocaliseReply, live_topic
 
-__all__ = ["KeyframeSent", "LiveMapper", "LiveRobot"]
+__all__ = ["KeyframeSent", "LiveMapper"]
 
 _FINAL = (*REFUSALS, BadRequest, UnsupportedProtocol)
 """A live map that answers so will not be joined by trying again."""
@@ -66,17 +66,6 @@ _NEVER = 1_000_000_000
 _MAX_SENT = 100_000
 _OFTEN_IN_VAIN, _RARELY = 6, 4.0
 """After so many answers without a place a robot asks so many times as rarely."""
-
-
-class LiveRobot(LiveCaller, Protocol):
-    """What a live mapper needs of a robot."""
-
-    @property
-    def connected(self) -> bool:
-        """Whether there is a connection to a server now."""
-
-    def subscribe(self, topic: str) -> Any:
-        """Return an async iterator of keys and payloads."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -30,7 +30,7 @@ from rse_pf.errors import (
 from rse_pf.token_bucket import TokenBucket
 from rse_pf.wire.live_map import KeyframeKept, KeyframeRequest
 
-__all__ = ["REFUSALS", "KeyframeSender", "LiveCaller", "Myself", "ask_map", "keyframe_request"]
+__all__ = ["REFUSALS", "KeyframeSender", "LiveRobot", "Myself", "ask_map", "keyframe_request"]
 
 _MAX_QUIET_WAIT_S = 1.0
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.1, 1.0
@@ -41,14 +41,21 @@ _WORTHLESS = (BadRequest, LimitExceeded, InvalidCamera)
 """The keyframe itself is refused: no later attempt can succeed."""
 
 
-class LiveCaller(Protocol):
-    """What this module needs of a robot."""
+class LiveRobot(Protocol):
+    """What a live map needs of a `client_sdk.robot.Robot`, which imports this package."""
 
     async def call(
         self, service: str, request: Any, reply_type: type[Any] | None = None, *,
         deadline_s: float | None = None, keep: bool = False,
     ) -> Answer:  # fmt: skip
         """Call a service of the platform."""
+
+    @property
+    def connected(self) -> bool:
+        """Whether there is a connection to a server now."""
+
+    def subscribe(self, topic: str) -> Any:
+        """Return an async iterator of keys and payloads."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -64,7 +71,7 @@ class Myself:
     """Whether the platform allows images of keyframes."""
 
 
-async def ask_map(robot: LiveCaller, name: str, deadline_s: float) -> Myself:
+async def ask_map(robot: LiveRobot, name: str, deadline_s: float) -> Myself:
     """Return how the map *name* knows this robot; raises RsePfError."""
     try:
         answer = await robot.call("live-show", {"map": name}, deadline_s=deadline_s, keep=True)
@@ -91,7 +98,7 @@ class KeyframeSender:
 
     def __init__(
         self,
-        robot: LiveCaller,
+        robot: LiveRobot,
         name: str,
         waiting: WaitingKeyframes,
         *,

@@ -11,7 +11,7 @@ import functools
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any
 
 import msgspec
 
@@ -92,13 +92,6 @@ def resolve(
     return _replace(_shape(request_type), payload, held.__getitem__)
 
 
-class Owner(Protocol):
-    """The robot whose objects may be used."""
-
-    robot: RobotId
-    claims: Claims | None
-
-
 @dataclass(frozen=True, slots=True)
 class ObjectRefs:
     """The store and limits of one worker; without a store, references are not resolved."""
@@ -115,13 +108,13 @@ class ObjectRefs:
         shape = None if self.store is None else _shape(service.request_type)
         return shape is not None and any(True for _ in _references(shape, command.payload))
 
-    def resolve_references(self, command: Command, registry: Registry, who: Owner) -> Command:
+    def resolve_references(self, command: Command, registry: Registry, robot: RobotId) -> Command:
         """Return *command* with the bytes that its payload refers to; blocks for the store.
 
         Args:
             command: As decoded from the wire; not changed.
             registry: Knows the request type of the service.
-            who: The robot, whose own objects alone are read.
+            robot: Whose own objects alone are read.
 
         Raises:
             UnknownService: The registry does not know the service.
@@ -133,16 +126,19 @@ class ObjectRefs:
         service = registry.get(command.service)
         if self.store is None or not self.has_references(command, service):
             return command
-        payload = resolve(service.request_type, command.payload, who.robot, self.store)
+        payload = resolve(service.request_type, command.payload, robot, self.store)
         return msgspec.structs.replace(command, payload=payload)
 
-    def store_large_reply(self, result: Result, too_large: Failure, who: Owner) -> Result | Failure:
+    def store_large_reply(
+        self, result: Result, too_large: Failure, robot: RobotId, claims: Claims | None
+    ) -> Result | Failure:
         """Store the reply of *result*, which is too large for a message; blocks for the store.
 
         Args:
             result: Of the service.
             too_large: The failure that the robot gets if the reply cannot be stored.
-            who: The robot, whose quota the stored reply counts for.
+            robot: Whose quota the stored reply counts for.
+            claims: Of its token, which may name the quota.
 
         Returns:
             *result* with the digest of the stored reply instead of the reply; *too_large* if there is no
@@ -154,10 +150,10 @@ class ObjectRefs:
         reply = msgspec.msgpack.encode(result.reply, enc_hook=binary_encode_hook)
         if len(reply) > MAX_OBJECT_BYTES_PER_COMMAND:
             return too_large
-        max_bytes = quota_bytes(who.claims, self.data.quota_bytes)
+        max_bytes = quota_bytes(claims, self.data.quota_bytes)
         accounts = Accounts(self.store, self.data)
         try:
-            digest = store_within_quota(self.store, accounts, who.robot, reply, max_bytes)
+            digest = store_within_quota(self.store, accounts, robot, reply, max_bytes)
         except QuotaExceeded as error:
             return msgspec.structs.replace(too_large, code=error.code, message=error.message, hint=error.hint)
         except StoreError:

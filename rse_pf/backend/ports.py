@@ -8,13 +8,16 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
+from rse_pf.auth.tokens import Claims
 from rse_pf.backend.log import JsonLog
 from rse_pf.backend.metrics import Metrics
 from rse_pf.config import PlatformSettings
+from rse_pf.errors import RsePfError
 from rse_pf.identity import RobotId
 from rse_pf.recording.tap import RecordingTap
+from rse_pf.wire.server_session import ServerSession
 
-__all__ = ["Clocks", "CrashMarks", "Log", "NoCrashMarks", "SlowReader", "Wire", "WorkerContext"]
+__all__ = ["Clocks", "CrashMarks", "Log", "NoCrashMarks", "Subscriber", "Wire", "WorkerContext"]
 
 
 class Wire(Protocol):
@@ -78,10 +81,16 @@ class NoCrashMarks:
         return 0
 
 
-class SlowReader(Protocol):
-    """A connection to which messages are written only as fast as its other end reads them."""
+class Subscriber(Protocol):
+    """A robot's connection, as topics and live maps use it, which the gateway stands above.
+
+    Messages are written only as fast as its other end reads them.
+    """
 
     is_connected: bool
+    robot: RobotId
+    claims: Claims | None
+    session: ServerSession | None
 
     @property
     def unsent_bytes(self) -> int:
@@ -92,6 +101,9 @@ class SlowReader(Protocol):
 
     def write(self, data: bytes) -> None:
         """Write one message."""
+
+    def refuse_updates(self, identity: int, error: RsePfError) -> None:
+        """Write that the subscription *identity* ends because of *error*."""
 
 
 class Log(Protocol):

@@ -17,12 +17,12 @@ import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 from rse_pf.child.start import Child, ChildPlan, how_ended, start_child
 from rse_pf.linux import PR_SET_CHILD_SUBREAPER, prctl
 
-__all__ = ["ForkPlan", "Watcher", "read_packet", "send_order", "serve_forks", "start_fork_server"]
+__all__ = ["ForkPlan", "read_packet", "send_order", "serve_forks", "start_fork_server"]
 
 _MOST_BYTES, _MOST_FDS = 1 << 20, 2
 
@@ -63,17 +63,6 @@ def read_packet(connection: socket.socket) -> tuple[Any, list[int]]:
 # --- the fork server ----------------------------------------------------------------------------------------
 
 
-class Watcher(Protocol):
-    """Looks at all forks again and again."""
-
-    @property
-    def interval_s(self) -> float:
-        """Time until the next look."""
-
-    def find_excess(self, pids: list[int]) -> dict[int, str]:
-        """Return why processes are to be killed, by pid."""
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ForkPlan:
     """What a fork server does for each fork."""
@@ -84,7 +73,8 @@ class ForkPlan:
     """Lets process *number* run, whose *pid* the parent knows; returns why it is to be killed, or ""."""
     free: Callable[[int], str] = lambda number: ""
     """Frees what process *number* had; returns why it ended, or "" if its exit code says that."""
-    watcher: Watcher | None = None
+    watch: Callable[[list[int]], tuple[dict[int, str], float]] | None = None
+    """Looks at all forks, by pid; returns why some are to be killed, and the seconds until the next look."""
     keeps_ended: bool = False
     """Whether a process that ended keeps its pid, and is reported, only when its end is ordered."""
 
@@ -110,7 +100,7 @@ class _Forks:
         self._reasons: dict[int, str] = {}
         """Why forks were killed that are still ending, by pid."""
         self._look_s = 0.0
-        """When the watcher looks next."""
+        """When `ForkPlan.watch` looks next."""
         self._poll = select.poll()
 
     def run(self, ready: dict[str, Any]) -> None:
@@ -135,17 +125,18 @@ class _Forks:
 
     def _wait_ms(self) -> float | None:
         """Return how long there is nothing to do without an event; None is forever."""
-        if self._plan.watcher is None or not self._forks:
+        if self._plan.watch is None or not self._forks:
             return None
         return max(0.0, self._look_s - time.monotonic()) * 1e3
 
     def _watch(self) -> None:
-        watcher = self._plan.watcher
-        if watcher is None or not self._forks or time.monotonic() < self._look_s:
+        watch = self._plan.watch
+        if watch is None or not self._forks or time.monotonic() < self._look_s:
             return
-        for pid, reason in watcher.find_excess(list(self._forks)).items():
+        reasons, pause_s = watch(list(self._forks))
+        for pid, reason in reasons.items():
             self._kill(pid, reason)
-        self._look_s = time.monotonic() + watcher.interval_s
+        self._look_s = time.monotonic() + pause_s
 
     def _kill(self, pid: int, reason: str) -> None:
         self._reasons[pid] = reason

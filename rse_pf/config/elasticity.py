@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from typing import Any, Protocol
+from typing import Any
 
 from rse_pf.config.schedule import parse_schedule, zone_named
 from rse_pf.config.validation import WHERE
@@ -36,24 +36,17 @@ _ARM = re.compile(r"a1|[a-z]+[0-9]+[a-z]*g[a-z]*")
 """Families of ARM processors: the letter g after the generation, such as m7g, c6gn and t4g."""
 
 
-class _Cloud(Protocol):
-    """The part of the settings' group ``cloud`` that names instance types."""
+def instance_types(preferred: str, others: str) -> tuple[str, ...]:
+    """Return the EC2 types of a backend server, the *preferred* one first, each once.
 
-    @property
-    def instance_type(self) -> str: ...
-
-    @property
-    def other_instance_types(self) -> str: ...
-
-
-def instance_types(cloud: _Cloud) -> tuple[str, ...]:
-    """Return the EC2 types of a backend server, the preferred one first, each once."""
-    return _types(cloud.instance_type, cloud.other_instance_types)
+    The *others* are separated by spaces.
+    """
+    return tuple(dict.fromkeys((preferred, *others.split())))
 
 
 def check_elasticity(scaling: Mapping[str, Any], cloud: Mapping[str, Any]) -> None:
     """Raise SettingsError if two settings of *scaling* and *cloud*, by name, cannot both hold."""
-    types = _types(cloud["instance_type"], cloud["other_instance_types"])
+    types = instance_types(cloud["instance_type"], cloud["other_instance_types"])
     _check_periods(scaling)
     if scaling["underused_s"] and scaling["busy_cpu_percent"] < 2 * UNDERUSED_CPU_PERCENT:
         raise SettingsError(
@@ -85,10 +78,6 @@ def check_elasticity(scaling: Mapping[str, Any], cloud: Mapping[str, Any]) -> No
             "warm pool in a group with a mixed instances policy",
             hint=f"choose one of the two {WHERE}",
         )
-
-
-def _types(preferred: str, others: str) -> tuple[str, ...]:
-    return tuple(dict.fromkeys((preferred, *others.split())))
 
 
 def _check_periods(scaling: Mapping[str, Any]) -> None:

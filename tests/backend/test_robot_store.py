@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import msgspec
 import pytest
 
@@ -83,11 +81,9 @@ def test_a_large_reply_beyond_the_quota_is_refused_with_the_reason():
     store = MemoryStore()
     gate = ObjectRefs(store, DataSettings(quota_bytes=4000))
     answer, sent = Result(id=1, reply=bytes(500)), Failure(id=1, code="too-large", message="too large")
-    owner = SimpleNamespace(robot=ROBOT, claims=None)
 
-    refused = gate.store_large_reply(answer, sent, owner)
-    owner.claims = claims(data_bytes=5000.0)
-    stored = gate.store_large_reply(answer, sent, owner)
+    refused = gate.store_large_reply(answer, sent, ROBOT, None)
+    stored = gate.store_large_reply(answer, sent, ROBOT, claims(data_bytes=5000.0))
 
     assert isinstance(refused, Failure)
     assert (refused.id, refused.code) == (1, "quota")

@@ -107,7 +107,7 @@ def _covers(name: str, domain: str) -> bool:
 
 
 def _check_instance_type(account: Account, settings: PlatformSettings) -> Check:
-    kinds = instance_types(settings.cloud)
+    kinds = instance_types(settings.cloud.instance_type, settings.cloud.other_instance_types)
     rows = account.pages(
         "ec2", "describe_instance_type_offerings", "InstanceTypeOfferings",
         LocationType="availability-zone", Filters=[{"Name": "instance-type", "Values": list(kinds)}],

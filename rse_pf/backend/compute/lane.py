@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from asyncio import AbstractEventLoop
 from collections.abc import Callable, Iterable
-from typing import Generic, Protocol, TypeVar
+from typing import Generic, TypeVar
 
 from rse_pf.backend.compute.limited_services import LimitedServices
 from rse_pf.backend.scheduling.command_queue import CommandQueue, QueueReport
@@ -23,28 +23,7 @@ from rse_pf.wire import Failure, Result
 __all__ = ["ComputeLane"]
 
 
-class _Answered(Protocol):
-    """An answer that knows its command."""
-
-    @property
-    def queued(self) -> QueuedCommand:
-        """The command."""
-
-
-Answer = TypeVar("Answer", bound=_Answered)
-
-
-class _Answers(Protocol[Answer]):
-    """Makes and sends the answers of the worker."""
-
-    def encode(self, queued: QueuedCommand, message: Result | Failure, started_s: float) -> Answer:
-        """Return the answer of *message*, whose computation began at *started_s* of the worker's clock."""
-
-    def send(self, answer: Answer, now: float) -> None:
-        """Send *answer* at *now*."""
-
-    def send_refusal(self, refusal: RefusedCommand, now: float) -> None:
-        """Answer a command that is given up at *now*."""
+Answer = TypeVar("Answer")
 
 
 class ComputeLane(CommandQueue, Generic[Answer]):
@@ -58,7 +37,9 @@ class ComputeLane(CommandQueue, Generic[Answer]):
         threads: int,
         loop: AbstractEventLoop,
         monotonic: Callable[[], float],
-        answers: _Answers[Answer],
+        encode: Callable[[QueuedCommand, Result | Failure, float], Answer],
+        send: Callable[[Answer, float], None],
+        send_refusal: Callable[[RefusedCommand, float], None],
     ) -> None:
         """Start the threads; they do nothing before the first command.
 
@@ -68,18 +49,20 @@ class ComputeLane(CommandQueue, Generic[Answer]):
             threads: Commands that run at the same time.
             loop: Event loop of the worker.
             monotonic: Its clock, s.
-            answers: Encodes answers in the threads, and sends answers and refusals in the loop.
+            encode: Makes an answer in a thread; gets the time at which the computation began.
+            send: Sends an answer in the loop, at a time.
+            send_refusal: Answers a command that is given up, at a time.
         """
         self._names = frozenset(names)
         self._limited = limited
         self._scheduler = Scheduler()
         self._count = threads
         self._monotonic = monotonic
-        self._answers = answers
+        self._encode, self._send, self._send_refusal = encode, send, send_refusal
         self._threads = SolverThreads(
             threads,
             self._compute,
-            lambda answer: loop.call_soon_threadsafe(self._on_computed, answer),
+            lambda computed: loop.call_soon_threadsafe(self._on_computed, *computed),
             name="compute",
         )
 
@@ -100,7 +83,7 @@ class ComputeLane(CommandQueue, Generic[Answer]):
         """Queue *queued*, which was admitted, or refuse it while its robot is blocked after crashes."""
         refusal = self._limited.refusal(queued, now)
         if refusal is not None:
-            self._answers.send_refusal(RefusedCommand(queued, refusal, "blocked"), now)
+            self._send_refusal(RefusedCommand(queued, refusal, "blocked"), now)
             return
         self._refuse_all(self._scheduler.submit(queued), now)
         self._start()
@@ -137,16 +120,16 @@ class ComputeLane(CommandQueue, Generic[Answer]):
             if queued is not None:
                 self._threads.run(queued)
 
-    def _compute(self, queued: QueuedCommand) -> Answer:
-        started = self._monotonic()
-        return self._answers.encode(queued, self._limited.compute(queued), started)
+    def _compute(self, queued: QueuedCommand) -> tuple[QueuedCommand, Answer]:
+        started_s = self._monotonic()
+        return queued, self._encode(queued, self._limited.compute(queued), started_s)
 
-    def _on_computed(self, answer: Answer) -> None:
+    def _on_computed(self, queued: QueuedCommand, answer: Answer) -> None:
         now = self._monotonic()
-        self._scheduler.done(answer.queued, now)
-        self._answers.send(answer, now)
+        self._scheduler.done(queued, now)
+        self._send(answer, now)
         self._start()
 
     def _refuse_all(self, refusals: list[RefusedCommand], now: float) -> None:
         for refusal in refusals:
-            self._answers.send_refusal(refusal, now)
+            self._send_refusal(refusal, now)

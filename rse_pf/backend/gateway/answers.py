@@ -104,7 +104,7 @@ class Answers:
         """Compute the answer of a service whose payload may refer to stored objects; it may block."""
         started = self._monotonic()
         try:
-            command = self.objects.resolve_references(queued.command, self.registry, queued.owner)
+            command = self.objects.resolve_references(queued.command, self.registry, queued.owner.robot)
         except RsePfError as error:
             return self._encode_failure(queued, error)
         message = dispatch(
@@ -245,7 +245,7 @@ class Answers:
             return answer
         if failure.code != LimitExceeded.code:
             return answer
-        stored = self.objects.store_large_reply(message, failure, queued.owner)
+        stored = self.objects.store_large_reply(message, failure, queued.owner.robot, queued.owner.claims)
         return answer if stored is failure else self._encode(queued, stored)
 
     def _encode(self, queued: QueuedCommand, message: Result | Failure) -> EncodedAnswer:

@@ -17,8 +17,8 @@ from rse_pf.auth.roster import scopes_allow
 from rse_pf.auth.tokens import Claims
 from rse_pf.backend.live_map.garbage import GarbageCounts
 from rse_pf.backend.live_map.map_link import OwnerLinks
-from rse_pf.backend.live_map.subscriptions import Reader, Subscriptions
-from rse_pf.backend.ports import WorkerContext
+from rse_pf.backend.live_map.subscriptions import Subscriptions
+from rse_pf.backend.ports import Subscriber, WorkerContext
 from rse_pf.backend.scheduling.command_queue import CommandQueue, QueueReport
 from rse_pf.backend.scheduling.scheduler import QueueBacklog, QueuedCommand
 from rse_pf.errors import (
@@ -236,14 +236,14 @@ class LiveMapRouter(CommandQueue):
             may_start=_forbidden(judged, "maps:live", map_name) is None,
         )  # fmt: skip
 
-    def unsubscribe(self, connection: Reader, identity: int) -> None:
+    def unsubscribe(self, connection: Subscriber, identity: int) -> None:
         """End a subscription."""
         self._subscriptions.end(connection, identity)
 
     def withdraw(self, owner: Any, command_id: int) -> None:
         """Do nothing: the owner of the map answers before the deadline."""
 
-    def leave(self, owner: Reader) -> list[QueuedCommand]:
+    def leave(self, owner: Subscriber) -> list[QueuedCommand]:
         """Forget the subscriptions of a connection that ended; its keyframes go on to their map."""
         self._subscriptions.left(owner)
         return []

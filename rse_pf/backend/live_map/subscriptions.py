@@ -9,18 +9,18 @@ from __future__ import annotations
 from asyncio import AbstractEventLoop
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any
 
 import msgspec
 
-from rse_pf.backend.ports import Log, SlowReader
+from rse_pf.backend.ports import Log, Subscriber
 from rse_pf.errors import BadMessage, RsePfError
 from rse_pf.wire import Update
 from rse_pf.wire.live_map import live_topic
 from rse_pf.wire.preencoded import encode_payload
 from rse_pf.wire.server_session import ServerSession
 
-__all__ = ["Reader", "Subscriptions"]
+__all__ = ["Subscriptions"]
 
 _GATHER_S = 0.01
 """Values leave this long after the last ones, or at once; until then they replace each other."""
@@ -35,15 +35,6 @@ _MAX_KEYS = 1024
 _MAX_VALUE_BYTES = 65_536
 _NO_OWNER = {"kind": "map", "keyframes": 0, "version": 0, "owner": "", "state": "moving"}
 """The value of the key ``map`` as long as the map's owner has sent none."""
-
-
-class Reader(SlowReader, Protocol):
-    """What is needed of a robot's connection."""
-
-    session: ServerSession | None
-
-    def refuse_updates(self, identity: int, error: RsePfError) -> None:
-        """Write that a subscription ends because of *error*."""
 
 
 @dataclass(eq=False, slots=True)
@@ -68,7 +59,7 @@ class _Topic:
 
 @dataclass(eq=False, slots=True)
 class _Subscription:
-    reader: Reader
+    reader: Subscriber
     id: int
     topic: _Topic
     may_go_on: Callable[[], RsePfError | None]
@@ -104,7 +95,7 @@ class Subscriptions:
         self._watch = watch
         self._unwatch = unwatch
         self._topics: dict[tuple[str, str], _Topic] = {}
-        self._of_reader: dict[Reader, dict[int, _Subscription]] = {}
+        self._of_reader: dict[Subscriber, dict[int, _Subscription]] = {}
         self._due: dict[_Subscription, None] = {}
         self._slow: dict[_Subscription, None] = {}
         self._is_sending = self._is_retrying = False
@@ -116,7 +107,7 @@ class Subscriptions:
 
     def begin(
         self,
-        reader: Reader,
+        reader: Subscriber,
         identity: int,
         tenant: str,
         map_name: str,
@@ -151,7 +142,7 @@ class Subscriptions:
         if may_start:
             self._set_starter(subscription, is_starter=True, is_told=is_new)
 
-    def stop_starting(self, reader: Reader, identity: int) -> None:
+    def stop_starting(self, reader: Subscriber, identity: int) -> None:
         """Start no owner for this subscription any more: the reader may only watch from now on."""
         subscription = self._of_reader.get(reader, {}).get(identity)
         if subscription is not None:
@@ -164,7 +155,7 @@ class Subscriptions:
         if topic.readers and bool(topic.starters) != before and not is_told:
             self._watch(topic.tenant, topic.map_name, is_starter)
 
-    def end(self, reader: Reader, identity: int) -> None:
+    def end(self, reader: Subscriber, identity: int) -> None:
         """Send no more to a subscription; does nothing if it has ended."""
         own = self._of_reader.get(reader, {})
         subscription = own.pop(identity, None)
@@ -181,7 +172,7 @@ class Subscriptions:
             del self._topics[topic.tenant, topic.map_name]
             self._unwatch(topic.tenant, topic.map_name)
 
-    def left(self, reader: Reader) -> None:
+    def left(self, reader: Subscriber) -> None:
         """End all subscriptions of a connection that ended."""
         for identity in list(self._of_reader.get(reader, ())):
             self.end(reader, identity)

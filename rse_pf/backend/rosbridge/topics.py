@@ -15,8 +15,7 @@ from typing import Any, Protocol
 import msgspec
 
 from rse_pf.auth.roster import scopes_allow
-from rse_pf.auth.tokens import Claims
-from rse_pf.backend.ports import SlowReader
+from rse_pf.backend.ports import Subscriber
 from rse_pf.backend.rosbridge.codec import RosbridgeOp
 from rse_pf.backend.rosbridge.session import RosbridgeSession
 from rse_pf.backend.rosbridge.subscription import MAX_QUEUE_LENGTH, HeldBytes, Subscription, TopicMessage
@@ -29,9 +28,8 @@ from rse_pf.errors import (
     UnknownService,
     UnsupportedProtocol,
 )
-from rse_pf.identity import RobotId
 
-__all__ = ["Client", "RosbridgeTopics", "TopicPeers"]
+__all__ = ["RosbridgeTopics", "TopicPeers"]
 
 MAX_TOPICS = 64
 """Topics that one client advertises."""
@@ -53,13 +51,6 @@ Key = tuple[str, str]
 """Tenant and topic, without the slash before its name."""
 
 
-class Client(SlowReader, Protocol):
-    """What is needed of a client's connection."""
-
-    robot: RobotId
-    claims: Claims | None
-
-
 class TopicPeers(Protocol):
     """What is needed of the way to other workers; `rse_pf.backend.rosbridge.peers.WorkerPeers` is one."""
 
@@ -77,10 +68,10 @@ class TopicPeers(Protocol):
 class _Topic:
     key: Key
     kind: str
-    publishers: dict[Client, bool] = field(default_factory=dict)
+    publishers: dict[Subscriber, bool] = field(default_factory=dict)
     """Whether a publisher latches."""
-    subscriptions: dict[Client, Subscription] = field(default_factory=dict)
-    latched: dict[Client, TopicMessage] = field(default_factory=dict)
+    subscriptions: dict[Subscriber, Subscription] = field(default_factory=dict)
+    latched: dict[Subscriber, TopicMessage] = field(default_factory=dict)
 
 
 class RosbridgeTopics:
@@ -112,7 +103,7 @@ class RosbridgeTopics:
         self._per_tenant: dict[str, int] = {}
         self._latched_bytes: dict[str, int] = {}
         self._held: dict[str, HeldBytes] = {}
-        self._of_client: dict[Client, dict[Key, None]] = {}
+        self._of_client: dict[Subscriber, dict[Key, None]] = {}
         self._due: dict[Subscription, None] = {}
         self._slow: dict[Subscription, None] = {}
         self._resting: dict[Subscription, TimerHandle] = {}
@@ -132,7 +123,7 @@ class RosbridgeTopics:
             "rosbridge_replaced": float(self.replaced),
         }
 
-    def execute(self, client: Client, session: RosbridgeSession, op: RosbridgeOp) -> None:
+    def execute(self, client: Subscriber, session: RosbridgeSession, op: RosbridgeOp) -> None:
         """Execute one operation of a client, or tell it why not."""
         try:
             if op.op == "call_service":
@@ -143,7 +134,7 @@ class RosbridgeTopics:
             for send in session.refuse(op, error):
                 client.write(send.data)
 
-    def leave(self, client: Client) -> None:
+    def leave(self, client: Subscriber) -> None:
         """Forget a client whose connection ended."""
         for key in list(self._of_client.get(client, ())):
             topic = self._topics[key]
@@ -166,7 +157,7 @@ class RosbridgeTopics:
 
     # --- operations ----------------------------------------------------------------------------
 
-    def _execute(self, client: Client, op: RosbridgeOp) -> None:
+    def _execute(self, client: Subscriber, op: RosbridgeOp) -> None:
         key = self._key(client, op.topic)
         reads = op.op in ("subscribe", "unsubscribe")
         right = "topics:read" if reads else "topics:write"
@@ -183,12 +174,12 @@ class RosbridgeTopics:
         else:
             self._publish(client, key, op)
 
-    def _key(self, client: Client, topic: str) -> Key:
+    def _key(self, client: Subscriber, topic: str) -> Key:
         if not _NAME.fullmatch(topic) or not {".", ".."}.isdisjoint(topic.split("/")):
             raise BadRequest(f"{topic[:80]!r} is no name of a topic", hint="use a ROS name such as /scan")
         return client.robot.tenant, topic.removeprefix("/")
 
-    def _advertise(self, client: Client, key: Key, op: RosbridgeOp) -> _Topic:
+    def _advertise(self, client: Subscriber, key: Key, op: RosbridgeOp) -> _Topic:
         own = self._of_client.get(client, ())
         topic = self._topics.get(key)
         if topic is None or client not in topic.publishers:
@@ -199,13 +190,13 @@ class RosbridgeTopics:
         topic.publishers[client] = bool(op.latch) or topic.publishers.get(client, False)
         return topic
 
-    def _unadvertise(self, client: Client, key: Key) -> None:
+    def _unadvertise(self, client: Subscriber, key: Key) -> None:
         topic = self._topics.get(key)
         if topic is not None and topic.publishers.pop(client, None) is not None:
             self._unlatch(topic, client)
             self._settle(topic, client)
 
-    def _publish(self, client: Client, key: Key, op: RosbridgeOp) -> None:
+    def _publish(self, client: Subscriber, key: Key, op: RosbridgeOp) -> None:
         topic = self._topics.get(key)
         if topic is None or client not in topic.publishers:
             topic = self._advertise(client, key, op)
@@ -216,7 +207,7 @@ class RosbridgeTopics:
         self._queue_message(topic, message)
         self._peers.publish(key, data)
 
-    def _subscribe(self, client: Client, key: Key, op: RosbridgeOp) -> None:
+    def _subscribe(self, client: Subscriber, key: Key, op: RosbridgeOp) -> None:
         if op.compression not in (None, "", "none"):
             raise UnsupportedProtocol(
                 f"compression {op.compression[:20]!r} is not supported here", hint="subscribe with none"
@@ -246,7 +237,7 @@ class RosbridgeTopics:
             if subscription:
                 self._send_soon(subscription)
 
-    def _unsubscribe(self, client: Client, key: Key, op: RosbridgeOp) -> None:
+    def _unsubscribe(self, client: Subscriber, key: Key, op: RosbridgeOp) -> None:
         topic = self._topics.get(key)
         subscription = None if topic is None else topic.subscriptions.get(client)
         if topic is None or subscription is None:
@@ -258,7 +249,7 @@ class RosbridgeTopics:
 
     # --- topics --------------------------------------------------------------------------------
 
-    def _use_topic(self, client: Client, key: Key, kind: str) -> _Topic:
+    def _use_topic(self, client: Subscriber, key: Key, kind: str) -> _Topic:
         """Return the topic *key*, which *client* uses from now on as one of messages of type *kind*."""
         topic = self._topics.get(key)
         present = self._peers.topics(key[0]).get(key[1], "") if topic is None else topic.kind
@@ -277,7 +268,7 @@ class RosbridgeTopics:
         self._of_client.setdefault(client, {})[key] = None
         return topic
 
-    def _settle(self, topic: _Topic, client: Client) -> None:
+    def _settle(self, topic: _Topic, client: Subscriber) -> None:
         """Drop *topic* from those of *client* if it uses it no longer, and altogether if nobody does."""
         if client in topic.publishers or client in topic.subscriptions:
             return
@@ -297,7 +288,7 @@ class RosbridgeTopics:
     def _tell(self, topic: _Topic) -> None:
         self._peers.tell(topic.key, topic.kind, exists=True, is_wanted=bool(topic.subscriptions))
 
-    def _end(self, topic: _Topic, client: Client) -> None:
+    def _end(self, topic: _Topic, client: Subscriber) -> None:
         """End a subscription."""
         subscription = topic.subscriptions.pop(client, None)
         if subscription is None:
@@ -312,7 +303,7 @@ class RosbridgeTopics:
         if not topic.subscriptions:
             self._tell(topic)
 
-    def _latch(self, topic: _Topic, client: Client, message: TopicMessage) -> None:
+    def _latch(self, topic: _Topic, client: Subscriber, message: TopicMessage) -> None:
         tenant = topic.key[0]
         self._unlatch(topic, client)
         held = self._latched_bytes.get(tenant, 0) + len(message.data)
@@ -323,7 +314,7 @@ class RosbridgeTopics:
         self._latched_bytes[tenant] = held
         topic.latched[client] = message
 
-    def _unlatch(self, topic: _Topic, client: Client) -> None:
+    def _unlatch(self, topic: _Topic, client: Subscriber) -> None:
         message = topic.latched.pop(client, None)
         if message is not None:
             tenant = topic.key[0]
@@ -405,7 +396,7 @@ class RosbridgeTopics:
 
     # --- rosapi --------------------------------------------------------------------------------
 
-    def _answer(self, client: Client, session: RosbridgeSession, op: RosbridgeOp) -> None:
+    def _answer(self, client: Subscriber, session: RosbridgeSession, op: RosbridgeOp) -> None:
         """Answer one of the calls of ``rosapi`` that clients need to find services and topics."""
         call = op.service.removeprefix("/").removeprefix("rosapi/")
         if call == "services":
@@ -425,11 +416,11 @@ class RosbridgeTopics:
             )
         client.write(session.respond(op, values))
 
-    def _allowed_services(self, client: Client) -> list[str]:
+    def _allowed_services(self, client: Subscriber) -> list[str]:
         scopes = () if client.claims is None else client.claims.scopes
         return sorted(name for name in self._services if scopes_allow(scopes, f"services:{name}"))
 
-    def _readable_topics(self, client: Client) -> dict[str, str]:
+    def _readable_topics(self, client: Subscriber) -> dict[str, str]:
         """Return the types of the tenant's topics, by their names, if the client may read topics."""
         if client.claims is not None and not scopes_allow(client.claims.scopes, "topics:read"):
             return {}

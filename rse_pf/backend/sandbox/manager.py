@@ -112,7 +112,8 @@ class SandboxManager:
         self._timer: TimerHandle | None = None
         self._timer_s = math.inf
         self._zygote = ZygoteClient(
-            services, settings, loop=host.loop, log=host.log, listener=self, on_ready=on_ready,
+            services, settings, loop=host.loop, log=host.log, on_gone=self.on_gone, on_lost=self.on_lost,
+            on_ready=on_ready,
         )  # fmt: skip
 
     @property

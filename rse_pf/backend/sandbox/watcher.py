@@ -37,6 +37,10 @@ class MemoryWatcher:
         """Time until the next look: short when a sandbox of the last look was close to its limit."""
         return self._next_s
 
+    def look(self, pids: list[int]) -> tuple[dict[int, str], float]:
+        """Return what `find_excess` returns, and the time until the next look."""
+        return self.find_excess(pids), self.interval_s
+
     def find_excess(self, pids: list[int]) -> dict[int, str]:
         """Return the reason for each of *pids*, first processes of sandboxes, that uses too much memory."""
         reasons = {}

@@ -79,14 +79,14 @@ class _Zygote:
         )
         self._cgroups.prepare()
         has_cgroup = "memory" in self._cgroups.controllers
-        self._watcher = None if has_cgroup else MemoryWatcher(total_bytes)
+        self._watch = None if has_cgroup else MemoryWatcher(total_bytes).look
         self._slots: dict[int, int] = {}
         """Which user id each sandbox has, by number."""
         self._starts: dict[int, int] = {}
         """Pipes by which sandboxes are told that their pid is known, by number."""
 
     def run(self, worker: socket.socket) -> None:
-        plan = ForkPlan(fork=self._fork, begin=self._begin, free=self._free, watcher=self._watcher)
+        plan = ForkPlan(fork=self._fork, begin=self._begin, free=self._free, watch=self._watch)
         serve_forks(worker, plan, missing=list(self._plan.missing), cgroup=list(self._cgroups.controllers))
         self._cgroups.close()
         self._private.remove()

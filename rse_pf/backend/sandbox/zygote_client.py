@@ -12,7 +12,6 @@ import socket
 import tempfile
 from asyncio import AbstractEventLoop
 from collections.abc import Callable, Sequence
-from typing import Protocol
 
 from rse_pf.backend.ports import Log
 from rse_pf.child.fork_server import read_packet, send_order, start_fork_server
@@ -21,22 +20,12 @@ from rse_pf.config import PlatformSettings
 from rse_pf.errors import ConfigurationError
 from rse_pf.services.custom.installed import InstalledService
 
-__all__ = ["ZygoteClient", "ZygoteListener"]
+__all__ = ["ZygoteClient"]
 
 SCRATCH_BYTES = 1 << 24
 """Scratch folder of one sandbox, in its memory; it holds at most one file per 4,096 bytes of this."""
 _END_S = 0.5
 """Time that a zygote has to end its sandboxes before it is killed."""
-
-
-class ZygoteListener(Protocol):
-    """Learns of the ends of sandboxes."""
-
-    def on_gone(self, number: int, how: str) -> None:
-        """Sandbox *number* ended; *how* says by what."""
-
-    def on_lost(self) -> None:
-        """The zygote ended, and every sandbox with it; a new one is starting."""
 
 
 class ZygoteClient:
@@ -49,7 +38,8 @@ class ZygoteClient:
         *,
         loop: AbstractEventLoop,
         log: Log,
-        listener: ZygoteListener,
+        on_gone: Callable[[int, str], None],
+        on_lost: Callable[[], None],
         on_ready: Callable[[tuple[str, ...] | None], None] | None = None,
     ) -> None:
         """Start it and wait until it is ready.
@@ -59,7 +49,8 @@ class ZygoteClient:
             settings: Limits of sandboxes.
             loop: Event loop of the worker.
             log: Log of the worker.
-            listener: Learns of the ends of sandboxes.
+            on_gone: Called with the number of a sandbox that ended, and how it ended.
+            on_lost: Called when the zygote ended, and every sandbox with it; a new one is starting.
             on_ready: If given, nothing blocks: it is called once, with the means of isolation that are
                 missing, or with None if the zygote ended before.  The caller judges them.
 
@@ -71,7 +62,7 @@ class ZygoteClient:
         self._settings = settings
         self._loop = loop
         self._log = log
-        self._listener = listener
+        self._on_gone, self._on_lost = on_gone, on_lost
         self._handles: dict[int, int] = {}
         """Descriptors of the processes of sandboxes, by number."""
         self._paused: set[int] = set()
@@ -190,7 +181,7 @@ class ZygoteClient:
                     return
                 self._launch()
                 self._listen()
-                self._listener.on_lost()
+                self._on_lost()
                 return
             if report["event"] == "ready":
                 self._log.info("sandbox-limits", cgroup=", ".join(report["cgroup"]))
@@ -200,7 +191,7 @@ class ZygoteClient:
                 self._on_created(report["id"], *handles)
             elif report["event"] == "gone":
                 self._forget(report["id"])
-                self._listener.on_gone(report["id"], report["how"])
+                self._on_gone(report["id"], report["how"])
 
     def _tell_ready(self, missing: tuple[str, ...] | None) -> bool:
         """Call `on_ready` once, outside of this call; return whether there was one."""

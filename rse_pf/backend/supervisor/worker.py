@@ -288,7 +288,9 @@ class _Worker:
             threads=serving.compute_processes,
             loop=self._loop,
             monotonic=time.monotonic,
-            answers=answers,
+            encode=answers.encode,
+            send=answers.send,
+            send_refusal=answers.send_refusal,
         )
 
     def _installed_services(self, chosen: ServiceSettings) -> list[InstalledService]:

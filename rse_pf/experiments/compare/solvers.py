@@ -90,7 +90,7 @@ class PlatformSolver:
         self.sent_bytes = 0
         self.server_s = 0.0
         self.inside_s = 0.0
-        self._ask = ask_robot(robot)
+        self._ask = ask_robot(robot.solve_pnp)
 
     async def ask(self, query: PoseQuery) -> PoseAnswer:
         """Answer one query."""

@@ -314,7 +314,7 @@ async def _solve(
     )
     drive.asking = True
     try:
-        answer = await ask_robot(robot, spec.session.answer_timeout_s)(query)
+        answer = await ask_robot(robot.solve_pnp, spec.session.answer_timeout_s)(query)
     except RsePfError as error:
         drive.commands.append(replace(record, answered=_since(began), code=error.code))
         raise

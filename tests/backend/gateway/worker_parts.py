@@ -117,7 +117,9 @@ class WorkerParts:
             threads=self.settings.serving.compute_processes,
             loop=self.loop,
             monotonic=self.clocks.monotonic,
-            answers=self.answers,
+            encode=self.answers.encode,
+            send=self.answers.send,
+            send_refusal=self.answers.send_refusal,
         )
 
     def join(

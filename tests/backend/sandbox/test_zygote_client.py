@@ -43,7 +43,7 @@ async def running_zygote() -> AsyncIterator[tuple[ZygoteClient, Reports, FakeLog
     reports, log, loop = Reports(), FakeLog(), asyncio.get_running_loop()
     failures: list[dict[str, Any]] = []
     loop.set_exception_handler(lambda _, context: failures.append(context))
-    zygote = ZygoteClient([], SETTINGS, loop=loop, log=log, listener=reports)
+    zygote = ZygoteClient([], SETTINGS, loop=loop, log=log, on_gone=reports.on_gone, on_lost=reports.on_lost)
     try:
         yield zygote, reports, log
     finally:

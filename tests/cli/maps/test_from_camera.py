@@ -44,7 +44,7 @@ class SolvingRobot:
         )
 
     def mapper(self, **options: Any) -> Mapper:
-        return Mapper(ask=ask_robot(self), **options)
+        return Mapper(ask=ask_robot(self.solve_pnp), **options)
 
 
 @pytest.fixture
@@ -272,7 +272,7 @@ def test_a_pipe_gets_a_line_of_progress_every_five_seconds(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     status = from_camera._Status(now=iter([0.0, 4.9, 5.0, 5.0, 9.9, 10.0, 10.0]).__next__)
-    mapper = Mapper(ask=ask_robot(SolvingRobot()))
+    mapper = Mapper(ask=ask_robot(SolvingRobot().solve_pnp))
     done = asyncio.run(mapper.track(frame_at(0, depth=True)))
 
     for _ in range(4):

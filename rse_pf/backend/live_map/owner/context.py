@@ -9,7 +9,7 @@ from typing import Any
 from rse_pf.accounts import TenantAccount
 from rse_pf.backend.live_map.owner.keyframe_objects import KeyframeObjects
 from rse_pf.backend.live_map.owner.state import MapKind
-from rse_pf.backend.live_map.owner.threads import Sleep, Threads
+from rse_pf.backend.live_map.owner.threads import OwnerThreads, Sleep
 from rse_pf.backend.live_map.owner.whole_fit import WholeFit, fit_here
 from rse_pf.backend.log import JsonLog
 from rse_pf.config import LiveSettings
@@ -37,7 +37,7 @@ class OwnerContext:
     map_name: str
     settings: LiveSettings
     kind: MapKind
-    threads: Threads
+    threads: OwnerThreads
     maps: MapRegistry
     clock: Callable[[], float]
     wall_clock: Callable[[], float]

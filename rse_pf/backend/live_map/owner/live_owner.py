@@ -114,8 +114,9 @@ class LiveOwner:
         self._names: dict[str, str] = {}
         self._book = UpdateBook(self._name_of)
         self._writer = EntryWriter(
-            log, self, threads=context.threads, sleep=context.sleep, json_log=context.log,
-            name=context.map_name,
+            log, take_entry=self.take_entry, on_lost=self.lose,
+            on_waiting=lambda is_waiting: self.note_store(is_waiting=is_waiting),
+            threads=context.threads, sleep=context.sleep, json_log=context.log, name=context.map_name,
         )  # fmt: skip
         self._measuring = Measuring(
             state, context.threads, self._writer.submit, fit=context.fit, json_log=context.log,

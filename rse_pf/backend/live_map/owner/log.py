@@ -17,13 +17,12 @@ from __future__ import annotations
 import asyncio
 import contextlib
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Awaitable, Callable, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Protocol
 
 import msgspec
 
-from rse_pf.backend.live_map.owner.threads import FIRST_RETRY_S, Sleep, Threads, next_retry_s
+from rse_pf.backend.live_map.owner.threads import FIRST_RETRY_S, OwnerThreads, Sleep, next_retry_s
 from rse_pf.backend.log import JsonLog
 from rse_pf.errors import Busy, Conflict, NotFound, RsePfError, StoreError, StoreFull
 from rse_pf.live_map.events import Event, KeyframeAdded, encode_events
@@ -33,7 +32,6 @@ from rse_pf.object_store import ObjectStore, digest_of
 __all__ = [
     "BUSY_RETRY_MS",
     "SLOW_STORE_S",
-    "EntryTaker",
     "EntryWriter",
     "LiveLog",
     "LogEntry",
@@ -286,36 +284,35 @@ class Submitted:
     done: asyncio.Future[list[Outcome]]
 
 
-class EntryTaker(Protocol):
-    """Who holds the map."""
-
-    async def take_entry(self, position: int, batch: list[Submitted]) -> None:
-        """Apply the events of an entry that is durable, and set what is done."""
-
-    def note_store(self, *, is_waiting: bool) -> None:
-        """Take whether the store is slow or fails."""
-
-    def lose(self, reason: str) -> None:
-        """Take that another process owns the map."""
-
-
 class EntryWriter:
     """Writes the entries of one map; its methods are called in the event loop."""
 
     def __init__(
-        self, log: LiveLog, taker: EntryTaker, *, threads: Threads, sleep: Sleep, json_log: JsonLog, name: str
+        self,
+        log: LiveLog,
+        *,
+        take_entry: Callable[[int, list[Submitted]], Awaitable[None]],
+        on_waiting: Callable[[bool], None],
+        on_lost: Callable[[str], None],
+        threads: OwnerThreads,
+        sleep: Sleep,
+        json_log: JsonLog,
+        name: str,
     ) -> None:
         """Write nothing until `run`.
 
         Args:
             log: Of the map.
-            taker: Gets each entry.
+            take_entry: Applies the events of a durable entry, and sets what is done.
+            on_waiting: Called with whether the store is slow or fails.
+            on_lost: Called with the reason when another process owns the map.
             threads: One of them writes.
             sleep: Waits for seconds.
             json_log: Of the server.
             name: Of the map, for `json_log`.
         """
-        self._log, self._taker, self._threads = log, taker, threads
+        self._log, self._threads = log, threads
+        self._take_entry, self._on_waiting, self._on_lost = take_entry, on_waiting, on_lost
         self._sleep, self._json_log, self._name = sleep, json_log, name
         self._queue: deque[Submitted] = deque()
         self._queued = asyncio.Event()
@@ -362,7 +359,7 @@ class EntryWriter:
                 if not batch:
                     continue
                 position = await self._make_durable(batch)
-            await self._taker.take_entry(position, batch)
+            await self._take_entry(position, batch)
 
     def _next_batch(self) -> list[Submitted]:
         batch = [self._queue.popleft()]
@@ -387,20 +384,20 @@ class EntryWriter:
             write = asyncio.ensure_future(self._threads.store(lambda: self._log.write(data)))
             try:
                 await asyncio.wait({write}, timeout=SLOW_STORE_S)
-                self._taker.note_store(is_waiting=not write.done())
+                self._on_waiting(not write.done())
                 position = await write
             except OwnershipLost as error:
-                self._taker.lose(error.message)
+                self._on_lost(error.message)
                 await asyncio.Event().wait()
             except StoreError as error:
                 if isinstance(error, StoreFull) and has_keyframes and await self._is_missing():
                     raise
                 self._json_log.warning("live-log-retry", map=self._name, error=error.message)
-                self._taker.note_store(is_waiting=wait_s > FIRST_RETRY_S)
+                self._on_waiting(wait_s > FIRST_RETRY_S)
                 await self._sleep(wait_s)
                 wait_s = next_retry_s(wait_s)
             else:
-                self._taker.note_store(is_waiting=False)
+                self._on_waiting(False)
                 return position
 
     async def _is_missing(self) -> bool:

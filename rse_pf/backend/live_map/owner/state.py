@@ -19,7 +19,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from rse_pf.backend.live_map.owner.log import LiveLog, MapSnapshot, OwnershipLost, snapshot_entries
-from rse_pf.backend.live_map.owner.threads import Threads, Urgency
+from rse_pf.backend.live_map.owner.threads import OwnerThreads, Urgency
 from rse_pf.backend.live_map.owner.whole_fit import WholeFit
 from rse_pf.backend.log import JsonLog
 from rse_pf.errors import BadRequest, NotFound
@@ -62,7 +62,7 @@ _NEVER = ("cause", "version")
 """A payload that differs in these only is not told again."""
 _UNCHANGING = (OwnerChanged, RobotLeft)
 _AT_ONCE = 2
-"""Threads that measure: both share one keyframe, or take one each where more wait."""
+"""OwnerThreads that measure: both share one keyframe, or take one each where more wait."""
 _FEW_WAIT, _FEWER, _FEWEST = 4, 6, 4
 """Where more keyframes wait than the first number, a keyframe is compared with so many others; where twice as
 many wait, with the last number."""
@@ -241,7 +241,7 @@ class Measuring:
     def __init__(
         self,
         state: MapState,
-        threads: Threads,
+        threads: OwnerThreads,
         submit: Callable[[Event], Any],
         *,
         fit: WholeFit,

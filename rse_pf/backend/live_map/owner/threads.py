@@ -13,9 +13,9 @@ import threading
 from collections.abc import Awaitable, Callable, Coroutine
 from concurrent.futures import Future, ThreadPoolExecutor
 from queue import PriorityQueue
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
-__all__ = ["FIRST_RETRY_S", "OwnerThreads", "Sleep", "Threads", "Urgency", "next_retry_s"]
+__all__ = ["FIRST_RETRY_S", "OwnerThreads", "Sleep", "Urgency", "next_retry_s"]
 
 _LOOKING = 3
 """Two measure keyframes, one may look for a robot that is lost; matching and solving free the GIL."""
@@ -37,27 +37,11 @@ class Urgency(enum.IntEnum):
     BACKGROUND = 4
 
 
-class Threads(Protocol):
-    """Where an owner computes and waits; each but `look` does one thing at a time."""
-
-    def compute(self, urgency: Urgency, act: Callable[[], _T]) -> Awaitable[_T]:
-        """Call *act* in the thread of the map."""
-
-    def look(self, act: Callable[[], _T]) -> Awaitable[_T]:
-        """Call *act*, which works on what the map's thread has handed out, while the map changes."""
-
-    def store(self, act: Callable[[], _T]) -> Awaitable[_T]:
-        """Call *act* in the thread that writes the log."""
-
-    def lease(self, act: Callable[[], _T]) -> Awaitable[_T]:
-        """Call *act* in the thread that renews the lease."""
-
-    def background(self, act: Callable[[], _T]) -> Awaitable[_T]:
-        """Call *act* in the thread for snapshots and versions."""
-
-
 class OwnerThreads:
-    """Real threads; they end with the process."""
+    """Where an owner computes and waits; each thread but those of `look` does one thing at a time.
+
+    They end with the process.
+    """
 
     def __init__(self) -> None:
         self._store, self._lease = (

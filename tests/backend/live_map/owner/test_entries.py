@@ -24,9 +24,6 @@ class Taker:
         for each in batch:
             each.done.set_result([])
 
-    def note_store(self, *, is_waiting: bool) -> None:
-        pass
-
 
 class Store:
     """Writes at once, as a thread and a log do."""
@@ -48,8 +45,9 @@ def keyframe(number: int) -> Event:
 def writer(taker: Taker) -> EntryWriter:
     store = cast(Any, Store())
     return EntryWriter(
-        store, cast(Any, taker), threads=store, sleep=asyncio.sleep, json_log=cast(Any, None), name="m"
-    )
+        store, take_entry=taker.take_entry, on_waiting=lambda is_waiting: None, on_lost=lambda reason: None,
+        threads=store, sleep=asyncio.sleep, json_log=cast(Any, None), name="m",
+    )  # fmt: skip
 
 
 async def test_an_entry_holds_no_more_than_four_mebibytes() -> None:
