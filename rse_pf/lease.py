@@ -1,6 +1,6 @@
 """A lease: one record in a shared store, of which one process at a time is the owner.
 
-The record changes by "put if the version is equal" only, so of two processes that claim it one succeeds.  The
+The record changes by compare-and-swap only, so of two processes that claim it one succeeds.  The
 owner renews it; others watch it with their own clocks, so that the clocks of two machines are never compared.
 What the record says, and when it may be claimed, is decided by those who use it.
 """
@@ -15,34 +15,15 @@ import msgspec
 from rse_pf.errors import Conflict, NotFound
 from rse_pf.object_store import ObjectStore
 
-__all__ = ["Lease", "ObjectRecords", "OwnedRecord", "Versioned"]
+__all__ = ["Lease", "OwnedRecord", "read_record"]
 
 
-class Versioned(msgspec.Struct, frozen=True):
-    """What a store holds under one name, and the version to which a change of it refers."""
-
-    data: bytes
-    version: bytes
-
-
-class ObjectRecords:
-    """The records of leases in an object store, where the bytes of an object are its version."""
-
-    def __init__(self, store: ObjectStore) -> None:
-        self._store = store
-
-    def get(self, name: str) -> Versioned | None:
-        """Return what is stored, None if there is nothing; raises StoreError."""
-        try:
-            data = self._store.get(name)
-        except NotFound:
-            return None
-        return Versioned(data, data)
-
-    def put(self, name: str, data: bytes, version: bytes | None) -> Versioned:
-        """Replace what has *version*; raises Conflict and StoreError."""
-        self._store.compare_and_swap(name, version, data)
-        return Versioned(data, data)
+def read_record(store: ObjectStore, name: str) -> bytes | None:
+    """Return the record that is stored, None if there is none; raises StoreError."""
+    try:
+        return store.get(name)
+    except NotFound:
+        return None
 
 
 class OwnedRecord(Protocol):
@@ -69,7 +50,7 @@ class Lease(Generic[R]):
 
     def __init__(
         self,
-        store: ObjectRecords,
+        store: ObjectStore,
         name: str,
         decode: Callable[[str, bytes], R],
         clock: Callable[[], float],
@@ -83,7 +64,7 @@ class Lease(Generic[R]):
             clock: Seconds, monotonic.
         """
         self.name = name
-        self.known: Versioned | None = None
+        self.known: bytes | None = None
         """As the record was read or written last; None if there was none."""
         self.record: R | None = None
         self._store = store
@@ -105,14 +86,14 @@ class Lease(Generic[R]):
 
     def read(self) -> R | None:
         """Read the record; raises StoreError."""
-        return self.note(self._store.get(self.name))
+        return self.note(read_record(self._store, self.name))
 
-    def note(self, found: Versioned | None) -> R | None:
+    def note(self, found: bytes | None) -> R | None:
         """Take what was read from the store; a renewal that the owner has told is no change."""
         if found == self.known:
             return self.record
         before = self.record
-        now = None if found is None else self._decode(self.name, found.data)
+        now = None if found is None else self._decode(self.name, found)
         self.known, self.record = found, now
         if before is None or now is None or (now.owner, now.state) != (before.owner, before.state):
             self._heard = -1
@@ -135,13 +116,13 @@ class Lease(Generic[R]):
         """
         began_s = self._clock()
         data = msgspec.json.encode(record)
-        version = None if self.known is None else self.known.version
+        found: bytes | None = data
         try:
-            found: Versioned | None = self._store.put(self.name, data, version)
+            self._store.compare_and_swap(self.name, self.known, data)
         except Conflict:
-            found = self._store.get(self.name)
+            found = read_record(self._store, self.name)
         self.note(found)
-        if found is None or found.data != data:
+        if found != data:
             return False
         self._written_s = began_s
         return True

@@ -6,15 +6,14 @@ import itertools
 import random
 from collections.abc import Callable
 
-import msgspec
 import pytest
 
 from rse_pf.backend.jobs.lease import JobLease, JobRecord
 from rse_pf.backend.jobs.lease import verdict_on as verdict_on_job
 from rse_pf.backend.live_map.owner.lease import OwnerLease, decode_lease
 from rse_pf.backend.live_map.owner.lease import verdict_on as verdict_on_map
-from rse_pf.errors import Conflict, StoreError
-from rse_pf.lease import Lease, Versioned
+from rse_pf.errors import Conflict, NotFound, StoreError
+from rse_pf.lease import Lease
 
 LEASE_S = 1.5
 NAME = "lease"
@@ -27,7 +26,7 @@ LOST = 0.04
 
 
 class World:
-    """A store with numbered versions, as a table has them, and the processes that use it."""
+    """A store of one record, and the processes that use it."""
 
     def __init__(self, seed: int) -> None:
         self.random = random.Random(seed)
@@ -35,8 +34,7 @@ class World:
         self.processes: list[Process] = []
         self.holder: Process | None = None
         self.accepted: list[tuple[str, str]] = []
-        self._stored: Versioned | None = None
-        self._count = 0
+        self._stored: bytes | None = None
         self._depth = 0
 
     def clock(self) -> float:
@@ -55,27 +53,26 @@ class World:
         if free:
             self.random.choice(free).step()
 
-    def get(self, name: str) -> Versioned | None:
+    def get(self, name: str) -> bytes:
         self.stall()
         found = self._stored
         self.stall()
+        if found is None:
+            raise NotFound("no record")
         return found
 
-    def put(self, process: Process, data: bytes, version: bytes | None) -> Versioned:
+    def swap(self, process: Process, expected: bytes | None, data: bytes) -> None:
         self.stall()
         is_lost = self.random.random() < LOST
         if is_lost and self.random.random() < 0.5:
             raise StoreError("the store did not answer")
-        present = None if self._stored is None else self._stored.version
-        if version != present:
-            raise Conflict("another version")
-        self._count += 1
-        self._stored = stored = Versioned(data, b"%d" % self._count)
+        if self._stored != expected:
+            raise Conflict("another record")
+        self._stored = data
         self._accept(process)
         self.stall()
         if is_lost:
             raise StoreError("the answer was lost")
-        return stored
 
     def _accept(self, process: Process) -> None:
         """Note a write that was done: only who claimed last may write, until another claims."""
@@ -98,11 +95,11 @@ class Process:
         self.world = world
         self.holds = self.is_ending = False
 
-    def get(self, name: str) -> Versioned | None:
+    def get(self, name: str) -> bytes:
         return self.world.get(name)
 
-    def put(self, name: str, data: bytes, version: bytes | None) -> Versioned:
-        return self.world.put(self, data, version)
+    def compare_and_swap(self, name: str, expected: bytes | None, data: bytes) -> None:
+        self.world.swap(self, expected, data)
 
     def step(self) -> None:
         self.is_busy = True
@@ -198,18 +195,3 @@ def test_in_10_000_schedules_with_stalls_no_two_holders_have_accepted_writes(kin
 
     assert claims > 2 * SCHEDULES, "leases are claimed again and again"
     assert lost > SCHEDULES, "and by different processes"
-
-
-def test_the_version_decides_and_not_the_content() -> None:
-    """As in a table: content that is written again is another version."""
-    world = World(0)
-    world.stall = lambda: None  # type: ignore[method-assign]
-    process = JobProcess(world, "a")
-    process.action = "claim"
-    data = msgspec.json.encode(JobRecord(state="running", owner="a"))
-
-    first = world.put(process, data, None)
-    world.put(process, data, first.version)
-
-    with pytest.raises(Conflict):
-        world.put(process, data, first.version)

@@ -13,7 +13,8 @@ import msgspec
 
 from rse_pf.errors import BadMessage, BadRequest, StoreError
 from rse_pf.identity import RobotId
-from rse_pf.lease import Lease, ObjectRecords
+from rse_pf.lease import Lease
+from rse_pf.object_store import ObjectStore
 from rse_pf.wire.arrays import binary_encode_hook
 
 __all__ = [
@@ -126,7 +127,7 @@ def verdict_on(
 class JobLease:
     """One process's view of the record of one job, and its lease on it."""
 
-    def __init__(self, store: ObjectRecords, name: str, owner: str, clock: Callable[[], float]) -> None:
+    def __init__(self, store: ObjectStore, name: str, owner: str, clock: Callable[[], float]) -> None:
         """Read nothing yet.
 
         Args:

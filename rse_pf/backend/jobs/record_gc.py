@@ -15,7 +15,7 @@ import msgspec
 
 from rse_pf.backend.jobs.lease import JobRecord, decode_record
 from rse_pf.errors import StoreError
-from rse_pf.lease import Lease, ObjectRecords
+from rse_pf.lease import Lease
 from rse_pf.object_store import ObjectStore
 
 __all__ = ["RECORD_TTL_S", "RecordCollector"]
@@ -74,7 +74,7 @@ class RecordCollector:
             self._lock.release()
 
     def _collect(self, name: str) -> bool:
-        lease = Lease(ObjectRecords(self._store), name, decode_record, self._clock)
+        lease = Lease(self._store, name, decode_record, self._clock)
         try:
             record, now = lease.read(), self._wall_clock()
             if record is None:

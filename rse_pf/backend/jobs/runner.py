@@ -36,7 +36,6 @@ from rse_pf.errors import (
 )
 from rse_pf.identity import object_name
 from rse_pf.ipc import FrameReader
-from rse_pf.lease import ObjectRecords
 from rse_pf.linux import cpu_seconds
 from rse_pf.object_store import ObjectStore, digest_of
 
@@ -139,7 +138,7 @@ def run_job(
         owner: Name that is unique to this process, which runs a job once at a time.
     """
     name = record_name(request.robot, request.key)
-    lease = JobLease(ObjectRecords(context.store), name, owner, context.clock)
+    lease = JobLease(context.store, name, owner, context.clock)
     try:
         return _follow_or_run(request, context, signals, tell, lease)
     except RsePfError as error:

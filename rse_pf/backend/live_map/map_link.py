@@ -52,7 +52,7 @@ from rse_pf.errors import (
 )
 from rse_pf.identity import RobotId
 from rse_pf.ipc import FrameReader, encode_message
-from rse_pf.lease import Lease, ObjectRecords, Versioned
+from rse_pf.lease import Lease, read_record
 from rse_pf.object_store import ObjectStore
 from rse_pf.wire.live_map import SHOW, KeyframeRequest, LiveRequest, LiveStart
 
@@ -143,8 +143,7 @@ class MapLink:
         self._context = context
         self._on_update = on_update
         self._on_end = on_end
-        self._records = ObjectRecords(context.store)
-        self._lease = Lease(self._records, lease_name(tenant, map_name), decode_lease, context.clock)
+        self._lease = Lease(context.store, lease_name(tenant, map_name), decode_lease, context.clock)
         self._numbers = itertools.count(1)
         self._pending: dict[int, _Pending] = {}
         self._writer: asyncio.StreamWriter | None = None
@@ -475,8 +474,8 @@ class MapLink:
             return True
         return self._context.clock() - self._used_s < _LINGER_S
 
-    def _read_lease(self) -> Versioned | None:
-        return self._records.get(self._lease.name)
+    def _read_lease(self) -> bytes | None:
+        return read_record(self._context.store, self._lease.name)
 
     async def _pause(self, seconds: float) -> None:
         """Wait, but not longer than until something is asked for."""
@@ -654,9 +653,9 @@ class OwnerLinks:
         return self._key
 
     def _list(self, tenant: str) -> list[dict[str, Any]]:
-        found, records = [], ObjectRecords(self._store)
+        found = []
         for name in self._store.folders(tenant_folder(tenant)):
-            lease = Lease(records, lease_name(tenant, name), decode_lease, self._context.clock)
+            lease = Lease(self._store, lease_name(tenant, name), decode_lease, self._context.clock)
             record = lease.read()
             if record is None:
                 continue

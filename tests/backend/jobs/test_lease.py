@@ -8,7 +8,6 @@ import pytest
 from rse_pf.backend.jobs.lease import MAX_TRIES, JobLease, JobRecord, job_key, record_name, verdict_on
 from rse_pf.errors import BadRequest, StoreError
 from rse_pf.identity import RobotId
-from rse_pf.lease import ObjectRecords
 from rse_pf.object_store import MemoryStore
 
 NAME = record_name(RobotId("default", "robot-1"), "ab" * 32)
@@ -33,7 +32,7 @@ def store() -> MemoryStore:
 
 
 def looked(store: MemoryStore, owner: str, clock: Clock) -> JobLease:
-    lease = JobLease(ObjectRecords(store), NAME, owner, clock)
+    lease = JobLease(store, NAME, owner, clock)
     lease.read()
     return lease
 

@@ -8,7 +8,6 @@ import pytest
 from rse_pf.backend.jobs.lease import JobLease, JobRecord, decode_record, verdict_on
 from rse_pf.backend.jobs.record_gc import RecordCollector
 from rse_pf.errors import StoreError
-from rse_pf.lease import ObjectRecords
 from rse_pf.object_store import MemoryStore
 
 LIFE_S, LEASE_S = 1000.0, 5.0
@@ -29,7 +28,7 @@ class Bench:
         )  # fmt: skip
 
     def lease(self) -> JobLease:
-        lease = JobLease(ObjectRecords(self.store), NAME, "us", lambda: self.now)
+        lease = JobLease(self.store, NAME, "us", lambda: self.now)
         lease.read()
         return lease
 
@@ -78,7 +77,7 @@ def test_a_request_between_tombstone_and_deletion_waits_and_then_gets_a_new_run(
 
     class Watched(MemoryStore):
         def delete(self, name: str) -> None:
-            reader = JobLease(ObjectRecords(self), NAME, "reader", lambda: bench.now)
+            reader = JobLease(self, NAME, "reader", lambda: bench.now)
             record = reader.read()
             asked.append(verdict_on(record, unchanged_s=0.0, lease_s=LEASE_S, is_watched=reader.is_watched))
             super().delete(name)

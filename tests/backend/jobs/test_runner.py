@@ -21,7 +21,6 @@ from rse_pf.config import PlatformSettings
 from rse_pf.errors import Conflict, StoreError
 from rse_pf.identity import RobotId, object_name
 from rse_pf.ipc import encode_message
-from rse_pf.lease import ObjectRecords
 from rse_pf.linux import raise_descriptor_limit
 from rse_pf.object_store import MemoryStore, digest_of
 
@@ -122,7 +121,7 @@ def code(outcome: JobOutcome) -> str:
 
 
 def another(bench: Bench) -> JobLease:
-    lease = JobLease(ObjectRecords(bench.store), NAME, "another", Clock())
+    lease = JobLease(bench.store, NAME, "another", Clock())
     lease.read()
     return lease
 

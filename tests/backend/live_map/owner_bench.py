@@ -21,7 +21,7 @@ from rse_pf.backend.live_map.owner.threads import Urgency
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import NotFound, StoreError
 from rse_pf.identity import RobotId
-from rse_pf.lease import ObjectRecords
+from rse_pf.lease import read_record
 from rse_pf.maps.registry import MapRegistry
 from rse_pf.object_store import MemoryStore, ObjectStore
 from tests.backend.live_map.fake_map import FAKE_MAP
@@ -111,8 +111,8 @@ class OwnerBench:
         self.told: list[dict[str, Any]] = []
         self.beats: list[int] = []
         self.used: list[bool] = []
-        self.lease = OwnerLease(ObjectRecords(bench.store), LEASE, owner=name, server=name, clock=bench.clock)
-        self.claimed = self.lease.claim(ObjectRecords(bench.store).get(LEASE))
+        self.lease = OwnerLease(bench.store, LEASE, owner=name, server=name, clock=bench.clock)
+        self.claimed = self.lease.claim(read_record(bench.store, LEASE))
         record = self.lease.record
         self.log = LiveLog(
             bench.store, FOLDER, owner=name, epoch=record.epoch, base=record.base, keeps_all=bench.keeps_all

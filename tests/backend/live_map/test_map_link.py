@@ -20,7 +20,6 @@ from rse_pf.config import PlatformSettings
 from rse_pf.errors import Busy, NotFound
 from rse_pf.identity import RobotId
 from rse_pf.ipc import encode_message
-from rse_pf.lease import ObjectRecords
 from rse_pf.object_store import MemoryStore
 from rse_pf.wire.live_map import KeyframeRequest, LiveMapRequest, LiveStart
 from tests.backend.live_map.fake_map import keyframe_request
@@ -48,7 +47,7 @@ class PlayedProcess:
         self.claims += 1
         order = OwnerOrder(**message)
         lease = OwnerLease(
-            ObjectRecords(self._store),
+            self._store,
             LEASE,
             owner=f"owner-{id(self)}",
             server=order.server,
@@ -133,9 +132,7 @@ async def test_an_owner_elsewhere_is_used_before_the_own_process_is_ready() -> N
         await until(lambda: worker.started)  # it never gets ready
         with socket.create_server(("127.0.0.1", 0)) as listener:
             listener.setblocking(False)
-            elsewhere = OwnerLease(
-                ObjectRecords(worker.store), LEASE, owner="b", server="there", clock=time.monotonic
-            )
+            elsewhere = OwnerLease(worker.store, LEASE, owner="b", server="there", clock=time.monotonic)
             assert elsewhere.claim(None)
             assert elsewhere.serve("127.0.0.1", listener.getsockname()[1], "c")
             connection, _ = await asyncio.get_running_loop().sock_accept(listener)
@@ -146,9 +143,7 @@ async def test_an_owner_elsewhere_is_used_before_the_own_process_is_ready() -> N
 
 def owner_on_a_closed_port(worker: Worker) -> None:
     """Let another server have the lease, with a port where nobody listens."""
-    elsewhere = OwnerLease(
-        ObjectRecords(worker.store), LEASE, owner="b", server="there", clock=time.monotonic
-    )
+    elsewhere = OwnerLease(worker.store, LEASE, owner="b", server="there", clock=time.monotonic)
     assert elsewhere.claim(None)
     with socket.create_server(("127.0.0.1", 0)) as listener:
         port = listener.getsockname()[1]
@@ -182,9 +177,7 @@ async def test_a_link_that_ends_while_the_owner_has_not_welcomed_it_closes_its_c
 
         context, certificate = server_context("127.0.0.1", now_s=time.time())
         server = await asyncio.start_server(owner, "127.0.0.1", 0, ssl=context)
-        elsewhere = OwnerLease(
-            ObjectRecords(worker.store), LEASE, owner="b", server="there", clock=time.monotonic
-        )
+        elsewhere = OwnerLease(worker.store, LEASE, owner="b", server="there", clock=time.monotonic)
         assert elsewhere.claim(None)
         assert elsewhere.serve("127.0.0.1", server.sockets[0].getsockname()[1], certificate)
         worker.link.set_watched(True)
@@ -209,9 +202,7 @@ async def test_an_owner_whose_port_was_never_reached_keeps_its_lease() -> None:
 
 async def test_who_may_only_watch_starts_no_process_and_is_told_that_the_map_is_idle() -> None:
     async with Worker() as worker:
-        lease = OwnerLease(
-            ObjectRecords(worker.store), LEASE, owner="b", server="there", clock=time.monotonic
-        )
+        lease = OwnerLease(worker.store, LEASE, owner="b", server="there", clock=time.monotonic)
         assert lease.claim(None)
         assert lease.release()
         worker.link.set_watched(True, may_start=False)

@@ -10,7 +10,6 @@ import pytest
 from rse_pf.backend.live_map.owner.lease import OwnerLease, lease_name, map_folder
 from rse_pf.backend.live_map.owner.log import LiveLog
 from rse_pf.cli.main import main
-from rse_pf.lease import ObjectRecords
 from rse_pf.live_map.events import OwnerChanged, encode_events
 from rse_pf.object_store import DirectoryStore
 
@@ -21,7 +20,7 @@ def store(tmp_path: Path) -> Path:
     objects = DirectoryStore(tmp_path / "store")
     for name in ("hall", "attic"):
         lease = OwnerLease(
-            ObjectRecords(objects),
+            objects,
             lease_name("default", name),
             owner="a-1",
             server="server-1",

@@ -9,8 +9,8 @@ from typing import Literal
 import msgspec
 
 from rse_pf.errors import BadRequest, StoreError
-from rse_pf.lease import Lease, ObjectRecords, Versioned
-from rse_pf.object_store import name_segment
+from rse_pf.lease import Lease
+from rse_pf.object_store import ObjectStore, name_segment
 
 __all__ = [
     "INTERNAL_KEY",
@@ -117,7 +117,7 @@ class OwnerLease:
     """The lease in the hands of the process that claims it.  Blocking; for one thread at a time."""
 
     def __init__(
-        self, store: ObjectRecords, name: str, *, owner: str, server: str, clock: Callable[[], float]
+        self, store: ObjectStore, name: str, *, owner: str, server: str, clock: Callable[[], float]
     ) -> None:
         """Read nothing yet.
 
@@ -137,7 +137,7 @@ class OwnerLease:
         """Seconds since the begin of the last write that succeeded: nobody took the map before that."""
         return self._lease.age_s
 
-    def claim(self, known: Versioned | None) -> bool:
+    def claim(self, known: bytes | None) -> bool:
         """Become the owner if the record is still *known*; False if another process was first."""
         before = self._lease.note(known)
         if before is None:

@@ -45,7 +45,6 @@ from rse_pf.config import PlatformSettings
 from rse_pf.config.placement import live_ports
 from rse_pf.errors import StoreError
 from rse_pf.ipc import FrameReader, encode_message, receive
-from rse_pf.lease import ObjectRecords, Versioned
 from rse_pf.maps.registry import MapRegistry
 from rse_pf.object_store import ObjectStore
 
@@ -71,7 +70,7 @@ class OwnerOrder(msgspec.Struct, frozen=True, kw_only=True):
     tenant: str
     map_name: str
     server: str
-    known: Versioned | None
+    known: bytes | None
 
 
 def start_owner(settings: PlatformSettings, kind: str = MAP_KIND, *, calmly: bool = False) -> Child:
@@ -160,7 +159,7 @@ class _Process:
         self._threads = OwnerThreads()
         self._log = JsonLog(level=settings.serving.log_level, server=order.server, wall_clock=time.time)
         self._lease = OwnerLease(
-            ObjectRecords(store), lease_name(order.tenant, order.map_name), owner=self._name,
+            store, lease_name(order.tenant, order.map_name), owner=self._name,
             server=order.server, clock=time.monotonic,
         )  # fmt: skip
 

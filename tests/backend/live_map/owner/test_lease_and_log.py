@@ -19,7 +19,7 @@ from rse_pf.backend.live_map.owner.link_security import (
 from rse_pf.backend.live_map.owner.log import LiveLog, MapSnapshot, OwnershipLost, snapshot_entries
 from rse_pf.backend.live_map.owner.state import MapState, restore
 from rse_pf.errors import BadRequest, StoreError, Unauthorized
-from rse_pf.lease import Lease, ObjectRecords
+from rse_pf.lease import Lease, read_record
 from rse_pf.live_map.events import OwnerChanged, encode_events
 from rse_pf.object_store import MemoryStore
 from tests.backend.live_map.fake_map import FAKE_MAP, FakeMap
@@ -29,7 +29,7 @@ LEASE_S = 1.5
 
 
 def leased(store: MemoryStore, name: str, clock: HandClock) -> OwnerLease:
-    return OwnerLease(ObjectRecords(store), LEASE, owner=name, server=name, clock=clock)
+    return OwnerLease(store, LEASE, owner=name, server=name, clock=clock)
 
 
 def log_of(store: MemoryStore, epoch: int = 1, **options: int) -> LiveLog:
@@ -70,7 +70,7 @@ def test_of_two_processes_that_claim_a_map_one_gets_it():
 
     assert first.claim(None)
     assert not second.claim(None)
-    assert second.claim(ObjectRecords(store).get(LEASE))
+    assert second.claim(read_record(store, LEASE))
     assert second.record.epoch == 2
     assert not first.renew()
     assert not first.release()
@@ -91,7 +91,7 @@ def test_the_age_of_a_lease_counts_from_the_begin_of_its_last_write():
 def test_a_renewal_that_the_owner_told_is_no_change_when_it_is_read_later():
     """Else a silent owner would be found out only after twice the lease."""
     store, clock = MemoryStore(), HandClock()
-    lease, watch = leased(store, "a", clock), Lease(ObjectRecords(store), LEASE, decode_lease, clock)
+    lease, watch = leased(store, "a", clock), Lease(store, LEASE, decode_lease, clock)
     lease.claim(None)
     watch.read()
     lease.renew()
