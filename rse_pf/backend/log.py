@@ -44,7 +44,11 @@ class JsonLog:
         self._wake = threading.Event()
         self._over = False
         self._writer = threading.Thread(target=self._write_on, name="log", daemon=True)
+
+    def start(self) -> JsonLog:
+        """Begin to write lines, also those that were logged before; return this object."""
         self._writer.start()
+        return self
 
     def writes(self, level: str) -> bool:
         """Whether lines of *level* are written at all."""

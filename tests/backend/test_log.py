@@ -14,7 +14,7 @@ from rse_pf.backend.log import JsonLog
 
 def written(*events: tuple[str, str, dict], level: str = "info") -> list[str]:
     reading, writing = os.pipe()
-    log = JsonLog(level=level, server="s-1", wall_clock=lambda: 5.0, fd=writing)
+    log = JsonLog(level=level, server="s-1", wall_clock=lambda: 5.0, fd=writing).start()
     for method, event, fields in events:
         getattr(log, method)(event, **fields)
     log.close(5.0)

@@ -94,7 +94,11 @@ class Dispatcher:
         now = context.clocks.monotonic()
         self._idle_timeouts = IdleTimeouts(settings.session, now)
         self._lag_s = 0.0
-        context.loop.call_later(self._idle_timeouts.until_tick_s(now), self._tick)
+
+    def start(self) -> None:
+        """Begin to look for idle connections."""
+        now = self.context.clocks.monotonic()
+        self.context.loop.call_later(self._idle_timeouts.until_tick_s(now), self._tick)
 
     @property
     def held(self) -> int:

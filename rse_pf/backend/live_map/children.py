@@ -36,7 +36,7 @@ class OwnerChild:
     """One owner process, in the event loop of its worker."""
 
     def __init__(self, process: Child, clock: Callable[[], float] = time.monotonic) -> None:
-        """Read what the process says; *clock* returns seconds."""
+        """Describe the child of a started *process*; *clock* returns seconds."""
         self.tenant = ""
         """Whose map it claims or serves."""
         self.unused_s: float | None = None
@@ -56,7 +56,12 @@ class OwnerChild:
         self._outcome: asyncio.Future[Literal["serving", "lost"]] = loop.create_future()
         self.ended: asyncio.Future[int] = loop.create_future()
         self._cpu_before_s = 0.0
-        self._reader = loop.create_task(self._read())
+        self._reader: asyncio.Task[None]
+
+    def start(self) -> OwnerChild:
+        """Begin to read what the process sends; return this object."""
+        self._reader = asyncio.get_running_loop().create_task(self._read())
+        return self
 
     @property
     def pid(self) -> int:
@@ -212,7 +217,7 @@ class OwnerChildren:
     def prepare(self, *, calmly: bool = False) -> OwnerChild | None:
         """Return the process that waits for a map, which is started if one more may be used."""
         if self._spare is None and len(self._used) < self._max_owners and not self.is_giving_up:
-            self._spare = OwnerChild(self._spawn(calmly), self._clock)
+            self._spare = OwnerChild(self._spawn(calmly), self._clock).start()
             self._spare.on_end = self._lose_spare
         return self._spare
 

@@ -125,7 +125,7 @@ class MapLink:
         on_update: Callable[[dict[str, Any]], None],
         on_end: Callable[[MapLink], None],
     ) -> None:
-        """Begin to look for the owner.
+        """Describe the link; `start` begins to look for the owner.
 
         Args:
             context: Of the worker.
@@ -153,7 +153,12 @@ class MapLink:
         self._used_s = context.clock()
         self._is_closed = self._was_asked = False
         self._wake = asyncio.Event()
+        self._task: asyncio.Task[None]
+
+    def start(self) -> MapLink:
+        """Begin to look for the owner; return this object."""
         self._task = asyncio.get_running_loop().create_task(self._run())
+        return self
 
     async def request(
         self, robot: RobotId, operation: str, request: LiveRequest, deadline_s: float
@@ -636,7 +641,7 @@ class OwnerLinks:
             link = self._links[tenant, map_name] = MapLink(
                 self._context, tenant, map_name,
                 on_update=lambda payload: self._on_update(tenant, map_name, payload), on_end=self._forget,
-            )  # fmt: skip
+            ).start()  # fmt: skip
         return link
 
     def _keep_spare(self) -> None:

@@ -94,7 +94,7 @@ async def _dry_run(
         max_sandboxes=1,
         store=MemoryStore(),
         host=host,
-    )
+    ).start()
     sandboxes.add_connection(_ROBOT)
     runs = []
     try:

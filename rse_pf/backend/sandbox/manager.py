@@ -116,6 +116,11 @@ class SandboxManager:
             on_ready=on_ready,
         )  # fmt: skip
 
+    def start(self) -> SandboxManager:
+        """Start the zygote; return this object.  Raises ConfigurationError, see `ZygoteClient.start`."""
+        self._zygote.start()
+        return self
+
     @property
     def missing(self) -> tuple[str, ...]:
         """The means of isolation that this machine lacks."""

@@ -49,25 +49,20 @@ class ReloadingSandboxes(CommandQueue):
     def __init__(
         self,
         make: MakeSandboxes,
-        services: Sequence[InstalledService],
         *,
         accepts_weak_isolation: bool,
         start_timeout_s: float,
         host: SandboxHost,
         on_change: Callable[[tuple[str, ...]], None],
     ) -> None:
-        """Run *services*, and wait until they are ready; without any, start no process.
+        """Run nothing yet.
 
         Args:
-            make: Makes the sandboxes.
-            services: As installed and checked.
+            make: Makes and starts the sandboxes.
             accepts_weak_isolation: ``services.accept_weak_isolation``.
             start_timeout_s: A replacement that is not ready after this is given up.
             host: The worker.
             on_change: Called with the names of the services that run from now on.
-
-        Raises:
-            ConfigurationError: A means of isolation is missing and weak isolation was not accepted.
         """
         self._make = make
         self._accepts_weak_isolation = accepts_weak_isolation
@@ -85,9 +80,18 @@ class ReloadingSandboxes(CommandQueue):
         self._past_s: defaultdict[str, float] = defaultdict(float)
         self._past: Counter[str] = Counter()
         """What the sandboxes that are gone have counted."""
-        self._current = _Generation(tuple(service.name for service in services))
+        self._current = _Generation(())
+
+    def start(self, services: Sequence[InstalledService]) -> None:
+        """Run *services*, and wait until they are ready; without any, start no process.
+
+        Raises:
+            ConfigurationError: A means of isolation is missing and weak isolation was not accepted.
+        """
+        first = _Generation(tuple(service.name for service in services))
         if services:
-            self._current.sandboxes = self._make_manager(services, self._current, None)
+            first.sandboxes = self._make_manager(services, first, None)
+        self._current = first
 
     @property
     def names(self) -> tuple[str, ...]:

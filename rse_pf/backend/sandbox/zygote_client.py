@@ -42,7 +42,7 @@ class ZygoteClient:
         on_lost: Callable[[], None],
         on_ready: Callable[[tuple[str, ...] | None], None] | None = None,
     ) -> None:
-        """Start it and wait until it is ready.
+        """Describe the zygote; `start` starts it.
 
         Args:
             services: Services that sandboxes may load.
@@ -51,12 +51,8 @@ class ZygoteClient:
             log: Log of the worker.
             on_gone: Called with the number of a sandbox that ended, and how it ended.
             on_lost: Called when the zygote ended, and every sandbox with it; a new one is starting.
-            on_ready: If given, nothing blocks: it is called once, with the means of isolation that are
-                missing, or with None if the zygote ended before.  The caller judges them.
-
-        Raises:
-            ConfigurationError: It did not start, or a means of isolation is missing and weak isolation
-                was not accepted.
+            on_ready: If given, `start` does not block: it is called once, with the means of isolation that
+                are missing, or with None if the zygote ended before.  The caller judges them.
         """
         self._services = services
         self._settings = settings
@@ -68,8 +64,16 @@ class ZygoteClient:
         self._paused: set[int] = set()
         self._on_ready = on_ready
         self.missing: tuple[str, ...] = ()
+
+    def start(self) -> None:
+        """Start the zygote, and wait until it is ready unless *on_ready* was given.
+
+        Raises:
+            ConfigurationError: It did not start, or a means of isolation is missing and weak isolation
+                was not accepted.
+        """
         self._launch()
-        if on_ready is None:
+        if self._on_ready is None:
             self.missing = self._wait_until_ready()
         self._listen()
 

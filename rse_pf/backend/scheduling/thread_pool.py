@@ -20,7 +20,7 @@ core."""
 
 
 class SolverThreads(Generic[Outcome]):
-    """Threads of one worker; *compute* runs in them, *deliver* is told of each outcome there."""
+    """Threads of one worker; *compute* and *deliver* run in them.  They start with the first command."""
 
     def __init__(
         self,
@@ -33,17 +33,23 @@ class SolverThreads(Generic[Outcome]):
         self._commands: SimpleQueue[QueuedCommand | None] = SimpleQueue()
         self._compute = compute
         self._deliver = deliver
-        self._count = count
-        for number in range(count):
-            threading.Thread(target=self._work, name=f"{name}-{number}", daemon=True).start()
+        self._threads = [
+            threading.Thread(target=self._work, name=f"{name}-{number}", daemon=True)
+            for number in range(count)
+        ]
+        self._is_started = False
 
     def run(self, queued: QueuedCommand) -> None:
-        """Give *queued* to the next free thread."""
+        """Give *queued* to the next free thread; call it from one thread."""
+        if not self._is_started:
+            self._is_started = True
+            for thread in self._threads:
+                thread.start()
         self._commands.put(queued)
 
     def close(self) -> None:
         """End the threads when they have nothing left."""
-        for _ in range(self._count):
+        for _ in self._threads:
             self._commands.put(None)
 
     def _work(self) -> None:

@@ -136,7 +136,9 @@ def serve(
             workers, spares = processes[:count], processes[count:]
             recording.hand_over()
             try:
-                log = JsonLog(level=settings.serving.log_level, server=server_id, wall_clock=time.time)
+                log = JsonLog(
+                    level=settings.serving.log_level, server=server_id, wall_clock=time.time
+                ).start()
                 with (
                     closing(log),
                     ServerAudit(

@@ -155,7 +155,9 @@ def run_worker(plan: WorkerPlan, data: socket.socket, control: socket.socket) ->
         plan = _plan_of(plan, begin)
     loop = event_loop_maker()()
     asyncio.set_event_loop(loop)
-    worker = _Worker(plan, data, control, loop)
+    log = JsonLog(level=plan.settings.serving.log_level, server=plan.server_id, wall_clock=time.time)
+    log.start()
+    worker = _Worker(plan, data, control, loop, log)
     if begin is not None:
         for robot, seconds in begin.banned:
             worker.ban(robot, seconds)
@@ -184,6 +186,7 @@ class _Worker:
         data: socket.socket,
         control: socket.socket,
         loop: asyncio.AbstractEventLoop,
+        log: JsonLog,
     ) -> None:
         settings = plan.settings
         self._data = data
@@ -193,7 +196,7 @@ class _Worker:
         self._flushing = False
         self._robot_events = RobotEvents(loop, self._say)
         self._tasks: set[asyncio.Task[None]] = set()
-        self._log = JsonLog(level=settings.serving.log_level, server=plan.server_id, wall_clock=time.time)
+        self._log = log
         registry = load_services(plan.services, settings)
         chosen = settings.services
         installed = self._installed_services(chosen)
@@ -320,7 +323,7 @@ class _Worker:
         def make(
             services: Sequence[InstalledService], *, answer: Answer, on_ready: OnReady | None
         ) -> SandboxManager:
-            return SandboxManager(
+            sandboxes = SandboxManager(
                 services,
                 settings=settings,
                 max_sandboxes=-(-settings.services.max_sandboxes // plan.workers),
@@ -328,23 +331,20 @@ class _Worker:
                 host=replace(host, answer=answer),
                 on_ready=on_ready,
             )
+            return sandboxes.start()
 
-        def run(services: Sequence[InstalledService]) -> ReloadingSandboxes:
-            return ReloadingSandboxes(
-                make, services,
-                accepts_weak_isolation=chosen.accept_weak_isolation,
-                start_timeout_s=settings.local.start_timeout_s,
-                host=host, on_change=self._offer,
-            )  # fmt: skip
-
+        reloading = ReloadingSandboxes(
+            make, accepts_weak_isolation=chosen.accept_weak_isolation,
+            start_timeout_s=settings.local.start_timeout_s, host=host, on_change=self._offer,
+        )  # fmt: skip
         try:
-            return run(services)
+            reloading.start(services)
         except ConfigurationError as error:
             if not chosen.follow:
                 raise
             self._log.error("services-refused", reason=error.message)
             self._offer(())
-            return run(())
+        return reloading
 
     def _offer(self, names: tuple[str, ...]) -> None:
         """Offer the installed services *names* from now on."""
@@ -404,6 +404,7 @@ class _Worker:
         reader, self._writer = await asyncio.open_unix_connection(sock=self._control, limit=_MAX_LINE_BYTES)
         self._data.setblocking(False)
         self._loop.add_reader(self._data.fileno(), self._take_sockets)
+        self._dispatcher.start()
         gc.collect()
         gc.freeze()
         self._say(event="ready")

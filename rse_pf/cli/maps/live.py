@@ -163,7 +163,7 @@ async def _with_links(settings: PlatformSettings, act: Callable[[OwnerLinks], An
     from rse_pf.backend.log import JsonLog
 
     settings = settings.replace(serving={"log_level": "error"})  # the owner's lines are for a server's log
-    log = JsonLog(level="error", server="operator", wall_clock=time.time)
+    log = JsonLog(level="error", server="operator", wall_clock=time.time).start()
     links = OwnerLinks(
         store=open_data_store(settings), settings=settings, server_id=f"operator-{os.getpid()}",
         log=log, on_update=lambda tenant, name, payload: None,

@@ -34,10 +34,14 @@ class KeyframeUploads:
         spool: Path,
         is_busy: Callable[[], bool],
     ) -> None:
-        """Begin to upload; while *is_busy* (a live pose is on its way) keyframes wait."""
+        """Describe the uploads; while *is_busy* (a live pose is on its way) keyframes wait."""
         self._client = DataClient(url, token)
         self._background = BackgroundUploader(DataClient(url, token), spool, is_busy=is_busy)
+
+    def start(self) -> KeyframeUploads:
+        """Begin to upload; return this object."""
         self._background.start()
+        return self
 
     def keyframe(self, data: bytes) -> None:
         """Spool a keyframe."""

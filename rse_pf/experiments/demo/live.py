@@ -33,7 +33,12 @@ class LiveRecorder:
         """Record nothing yet; *now* is the clock of *mapper*, and *began* its reading at the start."""
         self._mapper, self._now, self._began = mapper, now, began
         self._lines: list[dict[str, Any]] = []
+        self._listening: asyncio.Task[None]
+
+    def start(self) -> LiveRecorder:
+        """Begin to record corrections; return this object."""
         self._listening = asyncio.create_task(self._listen())
+        return self
 
     def frame(self, done: TrackedFrame) -> None:
         """Record a frame with its poses as they were given out."""

@@ -88,6 +88,7 @@ class LiveFault:
                     LinkProcess(PROFILES["none"], parts.hostname or "", parts.port or 0)
                 )
             disturbance = Disturbance(self, platform, store, link, log)
+            disturbance.watch()
             try:
                 yield disturbance
             finally:
@@ -104,8 +105,12 @@ class Disturbance:
         self._link, self._log = link, log
         self._store = DirectoryStore(folder / "platform" / "objects")
         self._lease: LeaseRecord | None = None
-        self._watching = asyncio.create_task(self._watch())
+        self._watching: asyncio.Task[None] | None = None
         self._acting: asyncio.Task[None] | None = None
+
+    def watch(self) -> None:
+        """Begin to watch the lease of the map."""
+        self._watching = asyncio.create_task(self._watch())
 
     def url_of(self, robot: int) -> str:
         """Return where *robot* 0, 1, ... connects."""

@@ -230,7 +230,7 @@ async def _run(spec: RobotSpec, pipe: ParentPipe) -> None:
             pipe.send(ChildReady(len(frames)))
             began = planned = await asyncio.to_thread(pipe.wait_start)
             collector = _collector(spec, pipe.token, lambda: drive.asking)
-            recorder = LiveRecorder(shared, time.monotonic, began) if options.live else None
+            recorder = LiveRecorder(shared, time.monotonic, began).start() if options.live else None
             check = DriveCheck(
                 is_wanted=options.check and options.data is not None, is_thinned=loaded.is_thinned
             )
@@ -367,7 +367,7 @@ def _collector(
 ) -> KeyframeCollector | None:
     if not spec.options.merge:
         return None
-    uploads = KeyframeUploads(spec.url, token, spec.folder / "spool", is_busy)
+    uploads = KeyframeUploads(spec.url, token, spec.folder / "spool", is_busy).start()
     features = load_features(spec.options.features)
     return KeyframeCollector(spec.name, spec.options.frontend_options, uploads, features)
 

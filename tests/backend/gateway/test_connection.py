@@ -163,7 +163,7 @@ def test_a_long_command_that_cannot_be_decoded_is_answered_with_its_id(worker: W
 
 def test_the_log_names_why_a_message_was_refused_and_a_robot_cut_off(tmp_path: Path):
     with (tmp_path / "log").open("wb") as file:
-        log = JsonLog(level="info", server="s-1", wall_clock=lambda: 0.0, fd=file.fileno())
+        log = JsonLog(level="info", server="s-1", wall_clock=lambda: 0.0, fd=file.fileno()).start()
         worker = WorkerParts(log, codec="zlib")
         connection, _ = worker.join()
         worker.say(connection, UNDECODABLE)

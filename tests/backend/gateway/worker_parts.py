@@ -106,6 +106,7 @@ class WorkerParts:
             updates=updates,
             topics=None if topics is None else topics(self.context),
         )
+        self.dispatcher.start()
         self.scheduler = self.dispatcher.stateless.scheduler
         self.admission = self.dispatcher.admission
         self.decoder = self.dispatcher.decoder
@@ -158,7 +159,7 @@ class WorkerParts:
 def quiet_log() -> Iterator[JsonLog]:
     """Yield a log whose lines go nowhere."""
     fd = os.open(os.devnull, os.O_WRONLY)
-    log = JsonLog(level="error", server="s-1", wall_clock=lambda: 0.0, fd=fd)
+    log = JsonLog(level="error", server="s-1", wall_clock=lambda: 0.0, fd=fd).start()
     try:
         yield log
     finally:

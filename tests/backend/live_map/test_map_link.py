@@ -79,7 +79,7 @@ class Worker:
         )  # fmt: skip
         self.link = MapLink(
             context, "default", "warehouse", on_update=self.told.append, on_end=lambda link: None
-        )
+        ).start()
 
     def lease(self) -> LeaseRecord | None:
         with contextlib.suppress(NotFound):

@@ -118,7 +118,7 @@ async def served(services: list[InstalledService]) -> AsyncIterator[tuple[Ask, l
             log=Lines(),
             answer=lambda queued, answer: answers[queued.command.id].set_result(answer),
         ),
-    )
+    ).start()
 
     async def ask(robot: str) -> Result | Failure:
         name, number = RobotId("fleet", robot), len(answers)

@@ -84,9 +84,10 @@ class Parts:
             answer=self._answer,  # type: ignore[arg-type]
         )
         self.sandboxes = ReloadingSandboxes(
-            self._make, services(*names), accepts_weak_isolation=accepts_weak_isolation,
+            self._make, accepts_weak_isolation=accepts_weak_isolation,
             start_timeout_s=20.0, host=self.host, on_change=self.offered.append,
         )  # fmt: skip
+        self.sandboxes.start(services(*names))
 
     def _make(self, found: Sequence[InstalledService], *, answer: Any, on_ready: Any) -> Any:
         self.made.append(Sandboxes([each.name for each in found], answer, on_ready))
@@ -233,6 +234,6 @@ def test_the_first_services_are_started_when_they_come_and_a_failure_of_the_star
     make: Callable[..., Any] = refuse
     with pytest.raises(ConfigurationError):
         ReloadingSandboxes(
-            make, services("a"), accepts_weak_isolation=False, start_timeout_s=1.0, host=parts.host,
+            make, accepts_weak_isolation=False, start_timeout_s=1.0, host=parts.host,
             on_change=parts.offered.append,
-        )  # fmt: skip
+        ).start(services("a"))  # fmt: skip

@@ -44,6 +44,7 @@ async def running_zygote() -> AsyncIterator[tuple[ZygoteClient, Reports, FakeLog
     failures: list[dict[str, Any]] = []
     loop.set_exception_handler(lambda _, context: failures.append(context))
     zygote = ZygoteClient([], SETTINGS, loop=loop, log=log, on_gone=reports.on_gone, on_lost=reports.on_lost)
+    zygote.start()
     try:
         yield zygote, reports, log
     finally:

@@ -48,7 +48,7 @@ def test_ten_thousand_hostile_names_are_ten_thousand_lines(tmp_path: Path) -> No
     words = hostile_words(10_000, seed=1)
     file = tmp_path / "log"
     with file.open("wb") as opened:
-        log = JsonLog(level="debug", server="s-1", wall_clock=lambda: 5.0, fd=opened.fileno())
+        log = JsonLog(level="debug", server="s-1", wall_clock=lambda: 5.0, fd=opened.fileno()).start()
         for word in words:
             log.info("command", robot=word, service=word, trace=word)
         log.close(SOON_S)
@@ -64,7 +64,7 @@ def test_ten_thousand_hostile_names_are_ten_thousand_lines(tmp_path: Path) -> No
 @settings(max_examples=200)
 def test_any_text_is_one_short_line(word: str) -> None:
     reading, writing = os.pipe()
-    log = JsonLog(level="info", server="s-1", wall_clock=lambda: 5.0, fd=writing)
+    log = JsonLog(level="info", server="s-1", wall_clock=lambda: 5.0, fd=writing).start()
     log.info("command", robot=word, reason=word)
     log.close(SOON_S)
     os.close(writing)

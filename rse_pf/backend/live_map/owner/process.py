@@ -164,6 +164,8 @@ class _Process:
         )  # fmt: skip
 
     async def run(self) -> None:
+        self._threads.start()
+        self._log.start()
         if not await self._retry(self._threads.lease, lambda: self._lease.claim(self._order.known)):
             self._worker.sendall(encode_message(["lost"]))
             return

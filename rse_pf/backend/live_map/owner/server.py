@@ -92,6 +92,7 @@ class OwnerServer:
         self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, named: Callable[[], object]
     ) -> None:
         link = _Link(self._owner, writer, self._on_defect)
+        link.start()
         try:
             frames = FrameReader(MAX_LINK_BYTES)
             hello, rest = await _first_message(reader, frames)
@@ -131,7 +132,11 @@ class _Link:
         self._has_more = asyncio.Event()
         self._is_flushed = asyncio.Event()
         self._in_work = asyncio.Semaphore(_MAX_IN_WORK)
-        self._tasks = {asyncio.ensure_future(self._send_on())}
+        self._tasks: set[asyncio.Future[None]] = set()
+
+    def start(self) -> None:
+        """Begin to send."""
+        self._tasks.add(asyncio.ensure_future(self._send_on()))
 
     def say(self, message: list[Any]) -> None:
         """Send *message* when the socket takes it."""

@@ -51,6 +51,9 @@ class OwnerThreads:
         self._look = ThreadPoolExecutor(_LOOKING, thread_name_prefix="look")
         self._waiting: PriorityQueue[tuple[int, int, Callable[[], None]]] = PriorityQueue()
         self._count = itertools.count()
+
+    def start(self) -> None:
+        """Start the thread of the map; the others start with their first work."""
         threading.Thread(target=self._compute_on, name="map", daemon=True).start()
 
     def compute(self, urgency: Urgency, act: Callable[[], _T]) -> Awaitable[_T]:

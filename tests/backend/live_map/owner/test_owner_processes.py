@@ -85,7 +85,7 @@ async def servers(folder: Path, **live: Any) -> AsyncIterator[Servers]:
          "serving": {"log_level": "error"}}
     )  # fmt: skip
     store, updates = DirectoryStore(folder), []  # type: tuple[DirectoryStore, list[dict[str, Any]]]
-    log = JsonLog(level="error", server="test", wall_clock=time.time)
+    log = JsonLog(level="error", server="test", wall_clock=time.time).start()
     made = [
         OwnerLinks(
             store=store, settings=settings, server_id=name, log=log,
@@ -238,7 +238,7 @@ async def test_a_process_listens_only_once_it_has_a_map(tmp_path: Path) -> None:
     """Strangers would fill the backlog of one that does not accept, and nobody would close them."""
 
     settings = PlatformSettings.from_dict({"data": {"store": f"dir:{tmp_path}"}})
-    child = OwnerChild(start_owner(settings, KIND))
+    child = OwnerChild(start_owner(settings, KIND)).start()
     try:
         await child.wait_ready(PATIENT_S)
         assert child.is_ready
