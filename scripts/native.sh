@@ -13,7 +13,7 @@ fail() {
 
 compile() {
   echo "setup: compiling the native core with $1 (once per change)"
-  make -C native CXX="$1" ARCH="$(uname -m)" > "$log" 2>&1
+  make -j2 -C native CXX="$1" ARCH="$(uname -m)" > "$log" 2>&1
 }
 
 make -q -C native > /dev/null 2>&1 && exit 0
