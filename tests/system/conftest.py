@@ -40,7 +40,6 @@ _SERVICES = """
 import ctypes, time
 from typing import Any
 import msgspec
-from rse_pf import native
 from rse_pf.service import Registry
 from rse_pf.services import echo
 
@@ -71,10 +70,6 @@ def make(settings):
     def crash(request: Work) -> Done:
         ctypes.string_at(0)
         return Done()
-
-    @registry.service("core")
-    def core(request: Work) -> Done:
-        return Done(filling=str(native.find_library()))
 
     return registry
 """
