@@ -326,10 +326,11 @@ def solver_error(values: tuple[Any, ...], n: int, options: NativeOptions) -> Rse
 
 def find_library() -> Path | None:
     """Return the library's file: that of the package ``rse_pf_native``, else that built in this checkout."""
-    folders = [Path(__file__).parent.parent / "native" / "build"]
+    folders = [Path(__file__).parents[1] / "native" / "build"]
     installed = find_spec("rse_pf_native")
     if installed is not None and installed.origin:
-        folders.insert(0, Path(installed.origin).parent)
+        package = Path(installed.origin).parent
+        folders = [package, package.parent / "build", *folders]  # the second: an editable installation
     return next((folder / _FILE for folder in folders if (folder / _FILE).is_file()), None)
 
 

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 from rse_pf.native import native_solver
@@ -26,3 +29,17 @@ def test_the_library_uses_what_the_processor_has() -> None:
     )
 
     assert native_solver().lanes == widest
+
+
+def test_an_editable_installation_brings_the_library_that_its_checkout_built(tmp_path: Path) -> None:
+    library = tmp_path / "build" / "librse_pf_native.so"
+    for file in (library, tmp_path / "rse_pf_native" / "__init__.py"):
+        file.parent.mkdir()
+        file.touch()
+
+    found = subprocess.run(
+        [sys.executable, "-c", "from rse_pf.native import find_library; print(find_library())"],
+        env={**os.environ, "PYTHONPATH": str(tmp_path)}, capture_output=True, text=True, check=True,
+    ).stdout  # fmt: skip
+
+    assert found.strip() == str(library)
