@@ -37,10 +37,10 @@ from rse_pf.backend.sandbox.replies import is_ready, outcome_of
 from rse_pf.backend.sandbox.zygote_client import ZygoteClient
 from rse_pf.backend.scheduling.scheduler import QueuedCommand
 from rse_pf.config import PlatformSettings
-from rse_pf.errors import BadMessage, NotFound, RsePfError, StoreError
+from rse_pf.errors import BadMessage, NotFound, RsePfError
 from rse_pf.identity import RobotId, state_name
 from rse_pf.ipc import encode_message
-from rse_pf.object_store import ObjectStore, is_name
+from rse_pf.object_store import ObjectStore
 from rse_pf.service import failure_of
 from rse_pf.services.custom.installed import InstalledService
 from rse_pf.wire import Failure, Result
@@ -308,29 +308,11 @@ class SandboxManager:
 
 
 def _load(store: ObjectStore, robot: RobotId, service: str) -> bytes | None:
-    """Return the snapshot, None if there is none; raises StoreError if only one without an owner is there."""
+    """Return the snapshot, None if there is none; raises StoreError."""
     try:
         return store.get(state_name(robot, service))
     except NotFound:
-        pass
-    if _has_unowned_snapshot(store, robot, service):
-        raise StoreError(
-            "the only snapshot is stored under the robot's name alone, as versions before 0.3 did, and might "
-            "belong to a robot of another tenant",
-            hint=f"let this robot have it with rse-pf robot adopt {robot.name}, or delete it",
-        )
-    return None
-
-
-def _has_unowned_snapshot(store: ObjectStore, robot: RobotId, service: str) -> bool:
-    name = f"snapshots/{robot.name}/{service}"
-    if not is_name(name):
-        return False
-    try:
-        store.head(name)
-    except NotFound:
-        return False
-    return True
+        return None
 
 
 def _save(store: ObjectStore, robot: RobotId, service: str, expected: bytes | None, data: bytes) -> None:

@@ -1,8 +1,7 @@
 """Give a robot what is stored under an older identity of it, because an operator says that it is the same.
 
-Versions before 0.3 kept an enrolled robot's objects without its key, and the snapshots of services under its
-bare name; a robot that was enrolled with a new key has what it stored under the old one.  A server never
-decides by itself that two identities are one robot.
+A robot that had no key stored under its name alone, and one that was enrolled with a new key under the old
+key.  A server never decides by itself that two identities are one robot.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ from rse_pf.config import PlatformSettings
 from rse_pf.errors import Conflict, NotFound, UsageError
 from rse_pf.identity import RobotId
 from rse_pf.local.state import state_folder
-from rse_pf.object_store import ObjectStore, is_name
+from rse_pf.object_store import ObjectStore
 from rse_pf.terminal import counted, show
 
 __all__ = ["Adopted", "adopt", "run_adopt"]
@@ -96,8 +95,7 @@ def _open_store(args: argparse.Namespace, settings: PlatformSettings) -> ObjectS
 def adopt(store: ObjectStore, robot: RobotId, *, source: RobotId) -> Adopted:
     """Move what is stored for *source* to *robot*; after an interruption, the next call continues.
 
-    Snapshots that were stored under the bare name of the robot are moved, too.  A snapshot that *robot* has
-    already stays, and the older one is left where it is.
+    A snapshot that *robot* has already stays, and the older one is left where it is.
 
     Args:
         store: Of the platform.
@@ -108,37 +106,30 @@ def adopt(store: ObjectStore, robot: RobotId, *, source: RobotId) -> Adopted:
         StoreError: The store failed in between.
     """
     objects = object_bytes = snapshots = 0
-    kept = []
-    for kind in ("objects", "charges") if source != robot else ():
+    kept: list[str] = []
+    if source == robot:
+        return Adopted(objects=0, object_bytes=0, snapshots=0, kept=())
+    for kind in ("objects", "charges"):
         old, new = f"{kind}/{source.folder}/", f"{kind}/{robot.folder}/"
         for info in store.list(old):
             store.put_pieces(new + info.name.removeprefix(old), _pieces(store, info.name, info.size))
             store.delete(info.name)
             objects += kind == "objects"
             object_bytes += info.size
-    new = f"states/{robot.folder}/"
-    for old in _places_of_snapshots(source, robot):
-        for info in list(store.list(old)):
-            service = info.name.removeprefix(old)
-            try:
-                store.compare_and_swap(new + service, None, store.get(info.name))
-            except Conflict:
-                if _is_equal(store, info.name, new + service):
-                    store.delete(info.name)
-                else:
-                    kept.append(service)
-                continue
-            store.delete(info.name)
-            snapshots += 1
+    old, new = f"states/{source.folder}/", f"states/{robot.folder}/"
+    for info in list(store.list(old)):
+        service = info.name.removeprefix(old)
+        try:
+            store.compare_and_swap(new + service, None, store.get(info.name))
+        except Conflict:
+            if _is_equal(store, info.name, new + service):
+                store.delete(info.name)
+            else:
+                kept.append(service)
+            continue
+        store.delete(info.name)
+        snapshots += 1
     return Adopted(objects=objects, object_bytes=object_bytes, snapshots=snapshots, kept=tuple(kept))
-
-
-def _places_of_snapshots(source: RobotId, robot: RobotId) -> Iterator[str]:
-    if source != robot:
-        yield f"states/{source.folder}/"
-    unowned = f"snapshots/{robot.name}"  # by the bare name: versions before 0.3
-    if is_name(unowned):
-        yield f"{unowned}/"
 
 
 def _pieces(store: ObjectStore, name: str, size: int) -> Iterator[bytes]:

@@ -8,8 +8,7 @@ deletes the public key, so tokens signed by the robot are refused; disable refus
 also those of rse-pf token issue.
 
 A name with another key is another robot, which sees nothing of the one before.  adopt gives the robot that
-has the name now what was stored under the name before robots' keys counted (versions before 0.3), or, with
---from-key, under its earlier key.
+has the name now what was stored under the name without a key, or, with --from-key, under its earlier key.
 
 examples:
   rse-pf robot enrol robot-2 --out robot-2.enrolment

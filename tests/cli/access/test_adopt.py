@@ -82,12 +82,10 @@ def test_a_platform_that_stored_nothing_says_so(capsys: Capture, platform: Path)
     assert "the platform 'default' of this machine has stored nothing yet" in capsys.readouterr().err
 
 
-def test_what_versions_without_keys_stored_is_adopted(capsys: Capture, platform: Path) -> None:
+def test_what_was_stored_without_a_key_is_adopted(capsys: Capture, platform: Path) -> None:
     store, robot = DirectoryStore(platform / "objects"), enrol(capsys)
-    old = platform / "objects" / "objects" / "default" / "robot-1" / digest_of(DATA)
-    old.parent.mkdir(parents=True)
-    old.write_bytes(DATA)
-    store.put("snapshots/robot-1/counter", b"7")
+    store.put(object_name(OLD, digest_of(DATA)), DATA)
+    store.put(state_name(OLD, "counter"), b"7")
 
     run(capsys, "robot", "adopt", "robot-1")
     again = run(capsys, "robot", "adopt", "robot-1")
@@ -100,26 +98,25 @@ def test_what_versions_without_keys_stored_is_adopted(capsys: Capture, platform:
 
 def test_a_newer_snapshot_stays_and_the_older_one_is_not_removed(capsys: Capture, platform: Path) -> None:
     store, robot = DirectoryStore(platform / "objects"), enrol(capsys)
-    store.put("snapshots/robot-1/counter", b"7")
+    store.put(state_name(OLD, "counter"), b"7")
     store.put(state_name(robot, "counter"), b"8")
 
     said = run(capsys, "robot", "adopt", "robot-1")
 
     assert "'counter' is newer" in said
     assert store.get(state_name(robot, "counter")) == b"8"
-    assert store.get("snapshots/robot-1/counter") == b"7"
+    assert store.get(state_name(OLD, "counter")) == b"7"
 
 
-def test_a_robot_without_a_key_adopts_only_snapshots() -> None:
+def test_a_robot_without_another_identity_adopts_nothing() -> None:
     store = MemoryStore()
     name = stored_for(store, OLD)
-    store.put("snapshots/robot-1/keeper", b"9")
 
     adopted = adopt(store, OLD, source=OLD)
 
-    assert (adopted.objects, adopted.snapshots) == (0, 1)
+    assert (adopted.objects, adopted.snapshots) == (0, 0)
     assert store.get(name) == DATA
-    assert store.get(state_name(OLD, "keeper")) == b"9"
+    assert store.get(state_name(OLD, "counter")) == b"7"
 
 
 def test_an_interrupted_adoption_is_continued() -> None:

@@ -13,7 +13,7 @@ from guarded_server import GuardedServer
 
 from rse_pf.auth.roster import EnrolledRobot, public_key_of
 from rse_pf.auth.tokens import SigningKey
-from rse_pf.identity import RobotId, object_name
+from rse_pf.identity import object_name
 from rse_pf.object_store import DirectoryStore, digest_of
 from rse_pf.wire import Command, Failure, Result
 from tests.hostile.attacks import AttackTarget
@@ -151,24 +151,3 @@ def test_a_name_that_is_enrolled_again_sees_nothing_of_the_robot_before(server: 
 
     assert asyncio.run(see(before, "a secret")) == ("a secret", "bad-request")
     assert asyncio.run(see(after, "")) == ("", "not-found")
-
-
-def test_state_that_is_stored_under_a_name_alone_is_refused_with_the_reason(
-    server: GuardedServer, folder: Path
-):
-    DirectoryStore(folder / "store").put("snapshots/robot-8/keeper", b"whose?")
-
-    async def ask() -> Any:
-        socket = await AttackTarget(server.url).enter(server.token("robot-8"), "bin")
-        try:
-            socket.say(Command(id=1, service="keeper", payload={}, keep=True, deadline_ms=30e3))
-            return await asyncio.wait_for(socket.hear(), tenants.ANSWER_S)
-        finally:
-            socket.end()
-
-    answer = asyncio.run(ask())
-
-    assert isinstance(answer, Failure)
-    assert "name alone" in answer.message
-    assert "rse-pf robot adopt robot-8" in answer.hint
-    assert RobotId("default", "robot-8").folder == "default/robot-8"
