@@ -20,7 +20,6 @@ from rse_pf.auth.tokens import Claims
 from rse_pf.config import DataSettings
 from rse_pf.data_server.fair_threads import check_wanted, while_wanted
 from rse_pf.data_server.routes import Upload
-from rse_pf.data_server.running_hashes import RunningHashes
 from rse_pf.errors import BadRequest, Conflict, LimitExceeded, NotFound, QuotaExceeded
 from rse_pf.identity import object_name
 from rse_pf.object_store import DirectoryStore, ObjectInfo, ObjectStore, PresigningStore, digest_of
@@ -54,7 +53,6 @@ class Objects:
         self.accounts = Accounts(store, settings, clock=clock, wall_clock=wall_clock, check=check_wanted)
         self._lock = threading.Lock()  # of the dictionary, never held during work
         self._writing: dict[str, tuple[threading.Lock, int]] = {}
-        self._hashes = RunningHashes()
 
     def reservation(self, claims: Claims, size: int) -> AbstractContextManager[None]:
         """Return the context in which a robot writes *size* bytes; it raises QuotaExceeded or StoreFull."""
@@ -187,7 +185,7 @@ class Objects:
                     hint=f"DELETE it, begin again and send parts of {self._settings.part_bytes} bytes",
                 )
             if data:
-                self._store_part(name, f"{self._parts(claims, digest)}part-", parts, offset, data)
+                self._store_part(f"{self._parts(claims, digest)}part-", parts, offset, data)
             if offset + len(data) == size:
                 self._assemble(claims, digest, name, size)
             return self._state(digest, size, offset + len(data))
@@ -220,13 +218,10 @@ class Objects:
             self._assemble(claims, digest, name, size)
         return self._state(digest, size, offset)
 
-    def _store_part(
-        self, name: str, prefix: str, parts: Sequence[ObjectInfo], offset: int, data: bytes
-    ) -> None:
+    def _store_part(self, prefix: str, parts: Sequence[ObjectInfo], offset: int, data: bytes) -> None:
         """Store a part: at the end of the only one before it if the store can do that."""
         if self._growing is not None and len(parts) < 2:
             self._growing.append(f"{prefix}{0:015d}", offset, data)
-            self._hashes.add(name, offset, data)
         else:
             self._store.put(f"{prefix}{offset:015d}", data)
 
@@ -234,8 +229,7 @@ class Objects:
         parts = list(self._stored_parts(claims, digest))
         try:
             if self._growing is not None and len(parts) == 1:
-                known = self._hashes.take(name, size)
-                if (known or self._hash_of(parts[0])) != digest:
+                if self._hash_of(parts[0]) != digest:
                     raise _wrong_digest()
                 self._growing.adopt(name, parts[0].name, size)
             else:
@@ -267,7 +261,6 @@ class Objects:
         """Remove an upload that became no object."""
         size = self._find_size(claims, digest)
         self._drop(self._parts(claims, digest))
-        self._hashes.forget(self.name(claims, digest))
         if size is not None and not isinstance(self._store, PresigningStore):
             # else the robot may have a URL with which it can still store the object
             self.accounts.release(claims.robot, size)

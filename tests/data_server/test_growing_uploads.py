@@ -10,7 +10,6 @@ from pathlib import Path
 import pytest
 from fake_data_service import Answer, Service, small_settings
 
-from rse_pf.data_server.running_hashes import RunningHashes
 from rse_pf.errors import Busy, Conflict, NotFound
 from rse_pf.object_store import DirectoryStore, digest_of
 
@@ -155,28 +154,6 @@ def test_a_full_disk_leaves_the_file_as_it_was(
         store.append("uploads/a", 2, b"cd")
 
     assert store.get("uploads/a") == b"ab"
-
-
-def test_a_hash_is_known_only_of_what_was_added_from_the_first_byte_on() -> None:
-    hashes = RunningHashes()
-    for start in range(0, 10_000, 2500):
-        hashes.add("whole", start, DATA[start : start + 2500])
-        hashes.add("late", start + 1, DATA[start : start + 2500])
-    hashes.add("gap", 0, DATA[:10])
-    hashes.add("gap", 20, DATA[20:])
-
-    assert [hashes.take(name, 10_000) for name in ("whole", "late", "gap", "whole")] == [
-        DIGEST,
-        None,
-        None,
-        None,
-    ]
-    hashes.add("again", 0, b"wrong")
-    hashes.add("again", 0, DATA)
-    assert hashes.take("again", 10_000) == DIGEST
-    hashes.add("forgotten", 0, DATA)
-    hashes.forget("forgotten")
-    assert hashes.take("forgotten", 10_000) is None
 
 
 def test_a_file_is_read_from_memory_as_it_is_or_not_at_all(tmp_path: Path) -> None:
