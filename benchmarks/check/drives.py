@@ -15,8 +15,8 @@ from client_sdk.frontend import Frame
 from client_sdk.imu.samples import ImuModel
 from client_sdk.mapping import Trajectory
 from client_sdk.simulator import loop_trajectory, make_world, render_along, render_pairs
-from client_sdk.simulator.inertial import InertialDrive, Motion
 from rse_pf.geometry import Array, exp_se3, inverse
+from tests.client_sdk.imu.inertial_drive import InertialDrive, Motion
 
 __all__ = ["CheckedDrive", "recorded_drive", "rendered_drive"]
 

@@ -14,7 +14,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from rse_pf.batch.parts import Engine, Part, PartResult, delete_parts, is_done, put_input, read_result
+from rse_pf.batch.cluster import DaskEngine
+from rse_pf.batch.parts import Part, PartResult, delete_parts, is_done, put_input, read_result
 from rse_pf.batch.tasks import graph_arrays, links_of, strongest_rows
 from rse_pf.batch.two_levels import graph_between, graphs_within, poses_of_levels, stacked
 from rse_pf.config import PlatformSettings
@@ -81,7 +82,7 @@ class BatchMerge:
     def __init__(
         self,
         store: ObjectStore,
-        engine: Engine,
+        engine: DaskEngine,
         settings: PlatformSettings,
         *,
         options: MergeOptions | None = None,

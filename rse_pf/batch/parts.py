@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -19,7 +19,6 @@ from rse_pf.object_store import ObjectStore, digest_of
 
 __all__ = [
     "PREFIX",
-    "Engine",
     "Part",
     "PartResult",
     "decode_part",
@@ -63,17 +62,6 @@ class PartResult:
 
     arrays: Mapping[str, Array] = field(default_factory=dict)
     counts: Mapping[str, int] = field(default_factory=dict)
-
-
-class Engine(Protocol):
-    """What computes parts: this process, or others."""
-
-    def run(self, parts: Sequence[Part], on_done: Callable[[int], None]) -> None:
-        """Compute *parts* and store their results; call *on_done* with how many are done.
-
-        Raises:
-            RsePfError: A part failed, or those who compute are gone; what was done is stored.
-        """
 
 
 class _Array(msgspec.Struct, frozen=True, array_like=True):

@@ -35,7 +35,6 @@ from rse_pf.slam.places import PLACE_NUMBERS, PlaceIndex, place_vector
 from rse_pf.slam.pose_graph import PoseGraph
 
 __all__ = [
-    "InProcessEngine",
     "compute_part",
     "graph_arrays",
     "graph_of",
@@ -58,19 +57,6 @@ def compute_part(store: ObjectStore, part: Part) -> None:
         raise BadRequest(f"there is no kind of part {part.kind!r}", hint="run the same version everywhere")
     if not is_done(store, part):
         store.put(part.name, encode_result(_KINDS[part.kind](store, part)))
-
-
-class InProcessEngine:
-    """Computes parts one after the other, in this process."""
-
-    def __init__(self, store: ObjectStore) -> None:
-        self._store = store
-
-    def run(self, parts: Sequence[Part], on_done: Callable[[int], None]) -> None:
-        """Compute *parts*."""
-        for number, part in enumerate(parts, start=1):
-            compute_part(self._store, part)
-            on_done(number)
 
 
 def link_arrays(links: Sequence[LoopClosure]) -> dict[str, npt.NDArray[Any]]:

@@ -11,13 +11,14 @@ import pytest
 
 from rse_pf.batch.merge import BatchMerge, BatchMergeResult, strongest
 from rse_pf.batch.parts import PREFIX, Part
-from rse_pf.batch.tasks import InProcessEngine, strongest_rows
+from rse_pf.batch.tasks import strongest_rows
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import BadRequest, Disconnected, LimitExceeded
 from rse_pf.geometry import Array
 from rse_pf.maps.format import MapVersion, encode_map
 from rse_pf.object_store import MemoryStore
 from rse_pf.slam.map_merge import Atlas, MergedMap, MergeOptions, merge_versions, propose_links
+from tests.batch.in_process import InProcessEngine
 from tests.synthetic_maps import make_world
 
 pytest.importorskip("gtsam", reason="the extra maps is not installed")
