@@ -112,7 +112,7 @@ class ObjectStore(Protocol):
 
 @runtime_checkable
 class PresigningStore(Protocol):
-    """A store that can sign URLs for one object and a limited time, without any request."""
+    """A store that can sign URLs for one object and a limited time, without any request: a bucket of S3."""
 
     def presigned_put(self, name: str, *, size: int, sha256: str, ttl_s: int) -> tuple[str, dict[str, str]]:
         """Return a URL and the headers with which exactly these bytes can be PUT."""

@@ -21,7 +21,7 @@ __all__ = ["Clocks", "CrashMarks", "Log", "NoCrashMarks", "Subscriber", "Wire", 
 
 
 class Wire(Protocol):
-    """The socket of one robot."""
+    """The socket of one robot; only `rse_pf.backend.gateway.websocket`, which makes it, imports picows."""
 
     def send(self, data: bytes, is_text: bool) -> None:
         """Write one message; does nothing on a socket that ended."""

@@ -49,7 +49,7 @@ connection."""
 
 
 class CommandHandler(Protocol):
-    """The part of the dispatcher that a connection uses."""
+    """The part of the dispatcher, which imports this module, that a connection uses."""
 
     context: WorkerContext
     decoder: DecoderThread

@@ -24,7 +24,7 @@ _ASK_S = 2.0
 
 
 class OperatedPlatform(Protocol):
-    """What the port needs of a platform."""
+    """What the port needs of a `LocalPlatform`, which imports this module."""
 
     @property
     def servers(self) -> Sequence[BackendServer]:
