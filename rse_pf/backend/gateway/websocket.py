@@ -41,7 +41,7 @@ from rse_pf.silent_connections import PendingHandshakes
 
 picows: Any = _picows  # its stubs lack what is used here
 
-__all__ = ["Listener", "PendingSocket", "RobotProtocol", "RobotSockets"]
+__all__ = ["PendingSocket", "RobotSockets"]
 
 _MAX_CLOSE_REASON_BYTES = 123
 _UPGRADE = (

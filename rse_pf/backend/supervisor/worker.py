@@ -35,7 +35,6 @@ from rse_pf.backend.gateway.dispatcher import Dispatcher
 from rse_pf.backend.gateway.handshake import HandshakePolicy
 from rse_pf.backend.gateway.migration import Migration
 from rse_pf.backend.gateway.token_watch import TokenWatch
-from rse_pf.backend.gateway.websocket import RobotSockets
 from rse_pf.backend.jobs.manager import JobManager
 from rse_pf.backend.jobs.process import spawner
 from rse_pf.backend.jobs.runner import JobContext
@@ -188,6 +187,8 @@ class _Worker:
         loop: asyncio.AbstractEventLoop,
         log: JsonLog,
     ) -> None:
+        from rse_pf.backend.gateway.websocket import RobotSockets  # `warm_up` has imported it
+
         settings = plan.settings
         self._data = data
         self._control = control

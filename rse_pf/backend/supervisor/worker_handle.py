@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import gc
+import importlib
 import os
 import signal
 import socket
@@ -31,6 +32,7 @@ from rse_pf.backend.supervisor.orders import (
 )
 from rse_pf.backend.supervisor.worker import BEGIN_LENGTH, HANDOVER, WorkerPlan, run_worker
 from rse_pf.config import PlatformSettings
+from rse_pf.errors import MissingExtra
 from rse_pf.event_loop import event_loop_maker
 from rse_pf.services.loading import load_services
 
@@ -53,6 +55,10 @@ def warm_up(services: str = BUILTIN, settings: PlatformSettings | None = None) -
         MissingExtra: The extra ``backend`` is not installed.
     """
     event_loop_maker()
+    try:
+        importlib.import_module("rse_pf.backend.gateway.websocket")
+    except ModuleNotFoundError as error:
+        raise MissingExtra(error.name or "picows", "backend") from error
     load_services(services, settings or PlatformSettings())
 
 
