@@ -21,10 +21,10 @@ from fuzz.meter import BARS, Meter
 _INPUTS_PER_SEED = 500
 _TARGETS = (
     "codec", "frames", "stream", "geometry", "maps", "keyframes", "snapshots", "graph", "cloud",
-    "native", "answer", "match", "depth", "describe", "track", "stereo", "live",
+    "match", "depth", "describe", "track", "stereo", "live",
 )  # fmt: skip
 """Not read from `fuzz.targets`, which atheris has to import by itself."""
-_OF_THE_CORE = frozenset({"native", "answer", "match", "depth", "describe", "track", "stereo"})
+_OF_THE_CORE = frozenset({"match", "depth", "describe", "track", "stereo"})
 """Targets that compare the native core with Python: without it they compare nothing."""
 
 
@@ -83,9 +83,9 @@ def _with_hypothesis(options: argparse.Namespace) -> int:
 
 def _lacks_core(target: str) -> bool:
     """Return, having said so, whether *target* compares the native core and none can be loaded."""
-    from rse_pf.wire.native_codec import native_codec
+    from rse_pf.native import find_library
 
-    lacks = target in _OF_THE_CORE and native_codec() is None
+    lacks = target in _OF_THE_CORE and find_library() is None
     if lacks:
         print(f"{target}: skipped: the native core is not built, or cannot be loaded")
     return lacks

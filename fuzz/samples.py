@@ -19,7 +19,6 @@ import numpy as np
 from rse_pf.ipc import encode_message
 from rse_pf.live_map.versions import encode_stored
 from rse_pf.maps.format import Edge, MapVersion, decode_map, encode_map
-from rse_pf.pnp import PnpOptions
 from rse_pf.pnp.problems import DEGENERATE, KINECT, make_degenerate, make_problem, make_two_views
 from rse_pf.services.pnp import make_request
 from rse_pf.slam.pose_graph import write_g2o
@@ -57,21 +56,6 @@ def _messages() -> list[bytes]:
         bytes([kind]) + make_codec(name).encode(message)
         for kind, name in ((0, "bin"), (1, "json"), (2, "zlib"), (3, "json"))
         for message in said
-    ]
-
-
-def _answerable() -> list[bytes]:
-    """Return `pnp` commands of all encodings: plain ones with a good, a weak or no pose, and others."""
-    problems = [
-        make_problem(seed=n, n=n, outlier_ratio=share) for n, share in ((40, 0.3), (24, 0.0), (70, 0.75))
-    ]
-    problems += [make_degenerate(kind, seed=2, n=24) for kind in ("mirrored", "noise", "same-pixel")]
-    asked = [make_request(each.points_world, each.pixels, KINECT) for each in problems]
-    asked.append(msgspec.structs.replace(asked[0], options=PnpOptions(inlier_px=2.0)))
-    return [
-        bytes([kind]) + make_codec(name).encode(Command(id=number, service="pnp", payload=each, trace="t"))
-        for kind, name in ((0, "bin"), (1, "json"), (2, "zlib"), (3, "json"))
-        for number, each in enumerate(asked)
     ]
 
 
@@ -138,6 +122,8 @@ _COUNT, _ALL, _VALUES = 24_900, 1_048_000, 29_900
 _PACKED_KEYS = b"".join(b"\xa5k%04x\1" % k for k in range(14_900))
 _KEYS = b",".join(b'"k%d":%d' % (i, i + 1000) for i in range(_COUNT))
 _NUMBERED = b"".join(b"\xcd%c%c\x90" % divmod(i, 256) for i in range(_COUNT))
+_EMPTY_BLOCK_BITS = 0b10  # not the last block, fixed codes, and the code that ends it: ten bits
+_EMPTY_BLOCKS = sum(_EMPTY_BLOCK_BITS << 10 * k for k in range(4)).to_bytes(5, "little")
 _DIGITS = b"".join(b"0.%016d," % (k * k * 2654435761 % 10**16) for k in range(29_000))
 
 EXPENSIVE: dict[str, tuple[str, bytes]] = {
@@ -182,6 +168,10 @@ EXPENSIVE: dict[str, tuple[str, bytes]] = {
     "a text with escaped quotes": _deflated(b'"\\"' + _text(_ALL) + b'\\ud83d\\ude00"'),
     "a short text with one escape": _deflated(b'"' + _text(240_000) + b'\\ud83d\\ude00"'),
     "json text with one escape": ("json", _json(b'"' + _text(260_000) + b'\\ud83d\\ude00"')),
+    "json long numbers": ("json", _json(b"[" + b"17976931348623157081e289," * 10_000 + b"1]")),
+    "json long numbers that may be": ("json", _json(b"[" + b"17976931348623157081e289," * 390 + b"1]")),
+    "empty blocks": ("zlib", b"\x78\x9c" + _EMPTY_BLOCKS * 52_000),
+    "few empty blocks": ("zlib", b"\x78\x9c" + _EMPTY_BLOCKS * 1_600),
     "bomb": ("zlib", zlib.compress(b"[" * 50_000_000, 9)),
 }  # fmt: skip
 """Name to codec and message."""
@@ -293,7 +283,6 @@ def _live_keyframes() -> list[bytes]:
 _MADE = {
     "codec": _messages, "frames": _frames, "stream": _streams, "geometry": _problems, "maps": _maps,
     "keyframes": _keyframes, "snapshots": _sandbox_messages, "graph": _graphs, "cloud": _clouds,
-    "native": _messages, "answer": _answerable,
     "match": _views, "depth": _depths, "describe": _pictures, "track": _tracks,
     "stereo": _pairs,
     "live": _live_keyframes,

@@ -33,8 +33,9 @@ from rse_pf.errors import (
 )
 from rse_pf.service import Registry, dispatch, failure_of
 from rse_pf.services import pnp
-from rse_pf.wire import SUBPROTOCOLS, Codec, Command, Failure, codec_for, make_codec
+from rse_pf.wire import SUBPROTOCOLS, Codec, Command, Failure, codec_for
 from rse_pf.wire.envelope import undecodable_id
+from rse_pf.wire.server_codec import make_server_codec
 
 __all__ = ["Answering", "LambdaAnswer", "load_answering"]
 
@@ -95,9 +96,9 @@ class Answering:
         self._keys = keys
         self._registry = Registry()
         pnp.register(self._registry, settings.pnp)
+        types = pnp.wire_types(self._registry)
         self._codecs: dict[str, Codec] = {
-            name: make_codec(name, settings.session, pnp=pnp.wire_types(self._registry))
-            for name in SUBPROTOCOLS
+            name: make_server_codec(name, settings.session, pnp=types) for name in SUBPROTOCOLS
         }
 
     def answer(

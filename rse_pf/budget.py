@@ -10,18 +10,18 @@ Source:
 
 from __future__ import annotations
 
-import itertools
 import re
 import zlib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from typing import Any, Literal
+from types import ModuleType
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from rse_pf.config import SessionSettings
-from rse_pf.errors import BadMessage, LimitExceeded, RsePfError
+from rse_pf.errors import BadMessage, LimitExceeded
 
 __all__ = [
     "LIST_VALUES",
@@ -29,16 +29,16 @@ __all__ = [
     "PROVENANCE",
     "SERVICE_REPLY",
     "Budget",
-    "Refusal",
     "announced_values",
     "check_json",
     "check_json_containers",
+    "check_json_counts",
     "check_msgpack",
     "check_size",
-    "inflate_short",
+    "inflate_message",
+    "inflate_up_to",
     "inflate_within",
     "measure_msgpack",
-    "refusal",
     "small_text",
 ]
 
@@ -59,41 +59,23 @@ LIST_VALUES, MAP_VALUES = 3, 6
 """How many values a list and a map count as, according to the memory that they take."""
 
 _PIECE_BYTES = 32768
-# Bytes in memory per string, per number, per character of a text beyond ASCII, and per byte at worst.
-_STRING_BYTES, _NUMBER_BYTES, _WIDE, _MAX_BYTES_PER_BYTE = 60, 32, 7, 8
-_FEW_STRINGS = 2000
 _FLAT_FROM = 32
 """Shorter lists are read value by value."""
 _NOT_BRACKETS = bytes(set(range(256)) - set(b"[]{}"))
 _NOT_BRACKETS_OR_QUOTES = bytes(set(range(256)) - set(b'[]{}"'))
-_NOT_MARKS_OR_QUOTES = bytes(set(range(256)) - set(b',:[]{}"'))
-# A number counts as more than one value if decoders need longer for it: because it has many digits, lies in
-# the middle between two doubles, or is about as small or large as a double can be.
-_LONG_DIGITS = 19
-"""Significant digits from which a number counts as one more value for every two of its digits."""
-_WIDE_DIGITS = 32
-"""Digits, leading zeros included, from which a number counts as long, too."""
-_MIDDLE_DIGITS = 16
-"""Significant digits from which a number can lie in the middle between two doubles."""
-_MIDDLE_WHOLE_DIGITS = 12
-"""A number below `_LONG_DIGITS` with fewer digits before its point is never such a middle."""
-_MIDDLE_POWER = -4
-"""Power of ten of the last digit from which a number can be such a middle."""
-_MIDDLE_VALUES = 10
-"""Values that a possible middle counts as, beyond its own."""
-_FAR_VALUES = 160
-"""Values that a number counts as, beyond its own, if it is about as small or large as a double can be."""
-_MOST_VALUES_PER_BYTE = 40
-"""Upper bound of the values that the numbers of a text count as, for each byte of the text."""
-_EXPONENT_DIGITS = 9
-"""Longest exponent that is read as a number; a longer one counts as `_MOST_EXPONENT`."""
-_MOST_EXPONENT = 10**9
-_COSTLY_EXPONENT = re.compile(rb"e(?<=[0-9.]e)(?:[+-]?0*([1-9][0-9]{2})|\+?0*[2-9][0-9](?![0-9]))")
-_MANY_DIGITS = re.compile(rb"([0-9.]{16,})(?=(?:e([+-]?)([0-9]+))?)")
-_DIGITS = bytes(ord("0") if k in b"0123456789." else ord(" ") for k in range(256))
-_MARKS_OF_NUMBERS = bytes(
-    k if k in b"0123456789.e+-" else ord("e" if k == ord("E") else " ") for k in range(256)
-)
+
+_NOT_BACKSLASH = re.compile(rb"[^\\]")
+
+_SHORT_BYTES = 8192  # no JSON text up to this size exceeds a limit of a message but the depth
+_STRING_BYTES = 60  # memory of a string besides its characters
+_NUMBER_BYTES = 32  # memory of a number in a list
+_WIDE = 7  # memory of a character, at most, in a text beyond ASCII
+# simdjson takes 10 us for a number of more than 19 significant digits, and less than 0.1 us for any other.
+_MAX_LONG_NUMBERS = 400  # of a JSON text, which are read in 4 ms
+_LONG_RUN = b"0" * 20  # what a long number contains after `_ZEROS`
+_LONG_NUMBER = re.compile(b" 0*1[01]{19}")  # after `_ONES`, without its point
+_ZEROS = bytes(ord("0") if k in b"0123456789." else ord(" ") for k in range(256))
+_ONES = bytes(ord("0") if k == ord("0") else ord("1") if k in b"123456789" else ord(" ") for k in range(256))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -108,7 +90,7 @@ class Budget:
         depth: Levels of nesting; a list of numbers has one.
         containers: Lists and maps, at any depth.
         values: Values outside of raw arrays; a list counts as `LIST_VALUES`, a map as `MAP_VALUES`, and a
-            long text or a raw array as two.  In JSON, a number that takes long to read counts as several.
+            long text or a raw array as two.
         mixed_values: MessagePack only: those of the values that are not in a flat list of numbers of one
             kind, and therefore have to be read one by one.
         memory_bytes: JSON only: estimated memory of the decoded objects.
@@ -141,39 +123,6 @@ def _plain_budget(*, size: int, depth: int, containers: int, values: int, mixed_
         wire_bytes=size, inflated_bytes=size, inflate_ratio=1.0, free_bytes=size, depth=depth,
         containers=containers, values=values, mixed_values=mixed_values, memory_bytes=size,
     )  # fmt: skip
-
-
-Refusal = Literal[
-    "json-containers", "json-depth", "containers", "depth", "values", "memory", "cut-off", "followed",
-    "not-zlib", "not-one-stream", "bomb", "blocks",
-]  # fmt: skip
-"""Why bytes are refused."""
-
-
-def refusal(reason: Refusal, budget: Budget, *, size: int, max_bytes: int) -> RsePfError:
-    """Return the error of *reason*, for another implementation of these guards.
-
-    Args:
-        reason: What was found.
-        budget: The limits.
-        size: Bytes on the wire.
-        max_bytes: What a bomb inflates to more than.
-    """
-    errors: dict[Refusal, Callable[[], RsePfError]] = {
-        "json-containers": lambda: _too_many_json_containers_error(budget.containers),
-        "json-depth": lambda: _too_deep_json_error(budget.depth),
-        "containers": lambda: _too_many_containers_error(budget.containers),
-        "depth": lambda: _too_deep_error(budget.depth),
-        "values": lambda: _too_many_values_error(budget.values),
-        "memory": lambda: _too_much_memory_error(budget.memory_bytes),
-        "cut-off": _cut_off_error,
-        "followed": _trailing_bytes_error,
-        "not-zlib": _not_zlib_error,
-        "not-one-stream": _not_one_stream_error,
-        "bomb": lambda: _bomb_error(size, max_bytes),
-        "blocks": _too_many_blocks_error,
-    }
-    return errors[reason]()
 
 
 PROVENANCE = _plain_budget(size=1 << 20, depth=64, containers=40_000, values=150_000, mixed_values=150_000)
@@ -224,22 +173,50 @@ def inflate_within(data: bytes, budget: Budget) -> Text:
     return text
 
 
-def inflate_short(data: bytes, max_bytes: int) -> bytes | None:
+def inflate_message(data: bytes, budget: Budget, library: ModuleType = zlib) -> bytes:
+    """Return the inflated bytes of the message *data*, whose size is checked already.
+
+    Args:
+        data: One zlib stream.
+        budget: The limits.
+        library: ``zlib``, or ``isal.isal_zlib``.
+
+    Raises:
+        LimitExceeded: It is longer than *budget* allows; no more than that was inflated.
+        BadMessage: It is not one complete zlib stream.
+    """
+    plain = min(budget.free_bytes, budget.inflated_bytes)
+    max_bytes = min(budget.inflated_bytes, max(plain, int(len(data) * budget.inflate_ratio)))
+    # The ratio limits large results only: a bomb reaches the plain size in its first bytes.
+    first = data[: int(plain / budget.inflate_ratio)]
+    is_bomb = max_bytes > plain and len(_inflated(first, plain + 1, library)[0]) > plain
+    text = None if is_bomb else inflate_up_to(data, max_bytes, library)
+    if text is None:
+        raise _bomb_error(len(data), max_bytes)
+    return text
+
+
+def inflate_up_to(data: bytes, max_bytes: int, library: ModuleType = zlib) -> bytes | None:
     """Return the inflated bytes of the zlib stream *data*, None if they are more than *max_bytes*.
 
     Raises:
         BadMessage: It is not one complete zlib stream.
     """
-    stream = zlib.decompressobj()
-    try:
-        text = stream.decompress(data, max_bytes + 1)
-    except zlib.error as error:
-        raise _not_zlib_error() from error
+    text, stream = _inflated(data, max_bytes + 1, library)
     if len(text) > max_bytes:
         return None
     if not stream.eof or stream.unused_data:
         raise _not_one_stream_error()
     return text
+
+
+def _inflated(data: bytes, max_bytes: int, library: ModuleType) -> tuple[bytes, Any]:
+    """Return the first *max_bytes* that *data* inflates to, and the stream that inflated them."""
+    stream = library.decompressobj()
+    try:
+        return stream.decompress(data, max_bytes), stream
+    except library.error as error:
+        raise _not_zlib_error() from error
 
 
 def _inflate_rest(stream: Any, head: bytes, data: bytes, first: int, max_bytes: int) -> bytearray:
@@ -268,10 +245,6 @@ def _not_one_stream_error() -> BadMessage:
 
 def _bomb_error(size: int, max_bytes: int) -> LimitExceeded:
     return LimitExceeded(f"{size} bytes inflate to more than {max_bytes}", hint="send smaller messages")
-
-
-def _too_many_blocks_error() -> LimitExceeded:
-    return LimitExceeded("a zlib stream of many tiny blocks", hint="deflate a message as a whole")
 
 
 # --- MessagePack ----------------------------------------------------------------------------------
@@ -428,7 +401,7 @@ def _cut_off_error() -> BadMessage:
 def _too_many_values_error(max_values: int) -> LimitExceeded:
     return LimitExceeded(
         f"more than {max_values} values in one message",
-        hint="send large data to the data server, and numbers of at most 18 digits",
+        hint="send large data to the data server, and numbers of at most 19 digits",
     )
 
 
@@ -450,8 +423,7 @@ def _trailing_bytes_error() -> BadMessage:
 def check_json(text: Text, budget: Budget) -> None:
     """Raise LimitExceeded if *text* holds more lists, levels, values or memory than *budget* allows."""
     check_json_containers(text, budget)
-    _check_values(text, budget.values)
-    _check_memory(text, budget.memory_bytes)
+    check_json_counts(text, budget)
 
 
 def check_json_containers(text: Text, budget: Budget) -> None:
@@ -473,103 +445,40 @@ def check_json_containers(text: Text, budget: Budget) -> None:
         raise _too_deep_json_error(max_depth)
 
 
-def _check_values(text: Text, max_values: int) -> None:
-    """Check the number of values before any is created; strings are told apart only above the limit."""
-    values_left = max_values - _values(text)
-    # Many words may hold many digits: they are told apart at once.
-    if values_left > 0 and (
-        len(text) * _MOST_VALUES_PER_BYTE < values_left
-        or (text.count(b'"') < _FEW_STRINGS and _more_values(_pieces(text), values_left) < values_left)
-    ):
-        return
-    outside = b"".join(_without_strings(text, _NOT_MARKS_OR_QUOTES))
-    values_left = max_values - _values(outside)
-    numbers = _without_strings(text, b"", is_separated=True)
-    if values_left <= 0 or _more_values(numbers, values_left) >= values_left:
-        raise _too_many_values_error(max_values)
+def check_json_counts(text: Text, budget: Budget) -> None:
+    """Raise LimitExceeded if *text* holds more values, long numbers or memory than *budget* allows.
 
-
-def _pieces(text: Text) -> Iterator[Text]:
-    for begin in range(0, len(text), _PIECE_BYTES):
-        yield text[begin : begin + _PIECE_BYTES]
-
-
-def _more_values(pieces: Iterable[Text], enough: int) -> int:
-    """Return for how many more values the numbers in *pieces* of a text count, or at least *enough*.
-
-    Decoders take 0.1 us for most numbers, 0.2 to 1 us for many digits and for the middle between two doubles,
-    and up to 14 us near the smallest and the largest double.
+    Marks inside strings are told apart only if all marks together exceed a limit.
     """
-    values = 0
-    rest = b""
-    for piece in itertools.chain(pieces, (b" ",)):
-        marks = rest + piece.translate(_MARKS_OF_NUMBERS)
-        # What may continue in the next piece is read there.
-        cut = marks.rfind(b" ") + 1
-        whole, rest = marks[:cut], marks[cut:]
-        for exponent in _COSTLY_EXPONENT.finditer(whole):
-            values += _FAR_VALUES if exponent[1] else _MIDDLE_VALUES
-            if values >= enough:
-                return values
-        if b"0" * _MIDDLE_DIGITS not in whole.translate(_DIGITS):
-            continue
-        for token in whole.split():
-            if len(token) < _MIDDLE_DIGITS:
-                continue
-            # Most numbers have fewer digits, or are real ones with many decimals.
-            is_short = len(token) < _LONG_DIGITS and b"e" not in token
-            if not (is_short and token.find(b".") < _MIDDLE_WHOLE_DIGITS):
-                values += sum(map(_values_of_digits, _MANY_DIGITS.finditer(token)))
-        if values >= enough:
-            break
-    return values
-
-
-def _values_of_digits(digits_and_exponent: re.Match[bytes]) -> int:
-    run, sign, exponent = digits_and_exponent.groups()
-    number = run.replace(b".", b"")
-    digits = len(number)
-    significant = len(number.lstrip(b"0"))
-    more = digits // 2 if significant >= _LONG_DIGITS or digits >= _WIDE_DIGITS else 0
-    decimals = len(run) - 1 - run.find(b".") if digits < len(run) else 0
-    if significant < _MIDDLE_DIGITS or (exponent is None and digits == len(run)):
-        return more
-    exponent = (exponent or b"").lstrip(b"0")
-    power = _MOST_EXPONENT if len(exponent) > _EXPONENT_DIGITS else int(exponent or b"0")
-    power = (-power if sign == b"-" else power) - decimals
-    return more + _MIDDLE_VALUES if power >= _MIDDLE_POWER else more
-
-
-def _check_memory(text: Text, max_bytes: int) -> None:
-    """Check the memory that a message will take; estimate more exactly only above the limit."""
-    if _MAX_BYTES_PER_BYTE * len(text) <= max_bytes:
+    if len(text) <= _SHORT_BYTES:
         return
+    pieces = (text[at : at + _PIECE_BYTES] for at in range(0, len(text), _PIECE_BYTES))
+    try:
+        _check_pieces(text, pieces, budget, has_strings=True)
+    except LimitExceeded:
+        _check_pieces(text, _without_strings(text, b""), budget, has_strings=False)
+
+
+def _check_pieces(text: Text, pieces: Iterable[Text], budget: Budget, *, has_strings: bool) -> None:
+    """Raise LimitExceeded if *text* exceeds a limit by what its *pieces* hold.
+
+    With *has_strings* the pieces hold the strings, and all of the text may be characters of strings.
+    """
+    marks = containers = long_numbers = outside = 0
+    for piece in pieces:
+        outside += len(piece)
+        marks += piece.count(b",") + piece.count(b":")
+        containers += LIST_VALUES * piece.count(b"[") + MAP_VALUES * piece.count(b"{")
+        if _LONG_RUN in piece.translate(_ZEROS):
+            long_numbers += sum(1 for _ in _LONG_NUMBER.finditer(piece.translate(_ONES, b".")))
+    if marks + containers >= budget.values or long_numbers > _MAX_LONG_NUMBERS:
+        raise _too_many_values_error(budget.values)
     strings = text.count(b'"') // 2
-    width = 1 if text.isascii() and b"\\u" not in text else _WIDE
-    numbers = text.count(b",") + text.count(b":")
-    other = len(text) + _STRING_BYTES * strings + _NUMBER_BYTES * max(0, numbers - strings)
-    if other + width * len(text) <= max_bytes:
-        return
-    characters = len(text) if strings > _FEW_STRINGS or b'\\"' in text else _characters(text)
-    if other + width * characters > max_bytes:
-        raise _too_much_memory_error(max_bytes)
-
-
-def _characters(text: Text) -> int:
-    """Return the number of characters between quotes, none of which is escaped."""
-    count = 0
-    end = -1
-    while (begin := text.find(b'"', end + 1)) >= 0:
-        end = text.find(b'"', begin + 1)
-        if end < 0:
-            return len(text)
-        count += end - begin
-    return count
-
-
-def _values(text: Text) -> int:
-    containers = LIST_VALUES * text.count(b"[") + MAP_VALUES * text.count(b"{")
-    return text.count(b",") + text.count(b":") + containers
+    characters = len(text) if has_strings else len(text) - outside
+    memory = _STRING_BYTES * strings + _NUMBER_BYTES * max(0, marks - strings) + len(text)
+    memory += characters if text.isascii() and b"\\u" not in text else _WIDE * characters
+    if memory > budget.memory_bytes:
+        raise _too_much_memory_error(budget.memory_bytes)
 
 
 def _depth(brackets: Text) -> int:
@@ -577,21 +486,20 @@ def _depth(brackets: Text) -> int:
     return int(np.cumsum(np.where(opening, np.int8(1), np.int8(-1)), dtype=np.int32).max(initial=0))
 
 
-def _without_strings(text: Text, dropped: bytes, *, is_separated: bool = False) -> Iterator[bytes]:
-    """Yield *text* without its strings and the bytes *dropped*, on request with a space for each string."""
-    marks = text.translate(None, dropped) if dropped else text
-    if b"\\" in text:
-        marks = text.replace(b"\\\\", b"  ").replace(b'\\"', b"  ").translate(None, dropped)
+def _without_strings(text: Text, dropped: bytes) -> Iterator[bytes]:
+    """Yield *text* in pieces, without its strings and the bytes *dropped*."""
     is_inside = False
-    for piece in _pieces(marks):
-        signs: npt.NDArray[np.uint8] = np.frombuffer(piece, np.uint8)
+    end = 0
+    while end < len(text):
+        begin, end = end, end + _PIECE_BYTES
+        if text[end - 1 : end] == b"\\":  # a backslash and what it escapes are in one piece
+            end = len(text) if (after := _NOT_BACKSLASH.search(text, end)) is None else after.end()
+        marks = text[begin:end].replace(b"\\\\", b"  ").replace(b'\\"', b"  ").translate(None, dropped)
+        signs: npt.NDArray[np.uint8] = np.frombuffer(marks, np.uint8)
         quotes = signs == ord('"')
         inside = np.logical_xor.accumulate(quotes) ^ is_inside
-        if is_separated:
-            yield np.where(quotes, np.uint8(ord(" ")), signs)[~inside].tobytes()
-        else:
-            yield signs[~(inside | quotes)].tobytes()
-        is_inside = bool(inside[-1])
+        yield signs[~(inside | quotes)].tobytes()
+        is_inside = bool(inside[-1]) if len(inside) else is_inside
 
 
 def _too_many_json_containers_error(most: int) -> LimitExceeded:

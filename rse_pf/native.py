@@ -32,10 +32,6 @@ from rse_pf.geometry import Array, Camera
 
 __all__ = [
     "PART_ABIS",
-    "POSE_AT",
-    "REASONS",
-    "RESULT",
-    "RESULT_BYTES",
     "Evidence",
     "NativeOptions",
     "NativeSolver",
@@ -47,10 +43,7 @@ __all__ = [
     "load_core",
     "load_part",
     "native_solver",
-    "open_found",
     "open_solver",
-    "packed_request",
-    "solver_error",
 ]
 
 Part = TypeVar("Part")
@@ -65,17 +58,12 @@ _LANES = {"avx512": 0, "avx2": 4, "portable": 1}
 _HEAD = struct.Struct("=IIqQQ")
 _BODY = struct.Struct("=ddddiiddiidddd")
 # rse_pf_pnp_result: status, reason, three counts, four measures | pose | covariance.
-RESULT = struct.Struct("=iiqqqdddd")
-POSE_AT, _COVARIANCE_AT = RESULT.size, RESULT.size + 16 * 8
-RESULT_BYTES = _COVARIANCE_AT + 36 * 8
-# One call packs what the two above describe; the camera and the options are packed already.
-_REQUEST = struct.Struct(f"=IIqQQ{_BODY.size}s")
-_FIRST_ROWS = 1024
+_RESULT = struct.Struct("=iiqqqdddd")
+_POSE_AT, _COVARIANCE_AT = _RESULT.size, _RESULT.size + 16 * 8
+_RESULT_BYTES = _COVARIANCE_AT + 36 * 8
 _COLLINEAR = 0.02
-# Of the 36 numbers of a covariance, those of the upper triangle.
-_UPPER = np.flatnonzero(np.triu(np.ones((6, 6))))
 
-REASONS = (
+_REASONS = (
     "", "few-inliers", "low-inlier-ratio", "nearly-collinear", "clustered", "poorly-constrained", "ambiguous",
 )  # fmt: skip
 
@@ -113,20 +101,12 @@ class _Buffers(threading.local):
 
     def __init__(self) -> None:
         request = np.zeros(_HEAD.size + _BODY.size, dtype=np.uint8)
-        result = np.zeros(RESULT_BYTES, dtype=np.uint8)
+        result = np.zeros(_RESULT_BYTES, dtype=np.uint8)
         self.request = memoryview(request)  # type: ignore[arg-type]
         self.result = memoryview(result)  # type: ignore[arg-type]
         self.request_at, self.result_at = address_of(request), address_of(result)
-        self.pose = result[POSE_AT:_COVARIANCE_AT].view(np.float64).reshape(4, 4)
+        self.pose = result[_POSE_AT:_COVARIANCE_AT].view(np.float64).reshape(4, 4)
         self.covariance = result[_COVARIANCE_AT:].view(np.float64).reshape(6, 6)
-        self.flat_pose, self.flat_covariance = self.pose.reshape(16), self.covariance.reshape(36)
-        self.inliers = np.empty(_FIRST_ROWS, dtype=np.int64)
-        self.inliers_at = address_of(self.inliers)
-
-    def lend(self, rows: int) -> None:
-        """Make room for the inliers of *rows*."""
-        self.inliers = np.empty(rows, dtype=np.int64)
-        self.inliers_at = address_of(self.inliers)
 
 
 @lru_cache(maxsize=256)
@@ -138,12 +118,6 @@ def _pack(camera: Camera, options: NativeOptions) -> bytes:
         options.weak_inliers, options.weak_inlier_ratio, options.weak_translation_m,
         options.weak_rotation_rad,
     )  # fmt: skip
-
-
-def packed_request(camera: Camera, options: NativeOptions) -> bytes:
-    """Return an rse_pf_pnp_request that says how to solve, without rows."""
-    flags = _LANES[options.lanes]
-    return _REQUEST.pack(_ABI, flags, 0, 0, 0, _pack(camera, options))
 
 
 class NativeSolver:
@@ -177,63 +151,14 @@ class NativeSolver:
         del arrays
         status, reason, count = values[:3]
         if status:
-            raise solver_error(values, n, options)
+            raise _solver_error(values, n, options)
         buffers = self._buffers
         return Evidence(
             T_camera_world=buffers.pose.copy(),
             inliers=inliers[:count],
             rmse_px=values[5],
             covariance=buffers.covariance.copy(),
-            reason=REASONS[reason],
-        )
-
-    def solve_flat(
-        self,
-        points_world: Array,
-        pixels: Array,
-        camera: Camera,
-        options: NativeOptions,
-    ) -> tuple[Array, npt.NDArray[np.uint32], float, npt.NDArray[np.float32], str] | None:
-        """Estimate the camera pose as a reply carries it, in a third of the calls of `solve`.
-
-        Args:
-            points_world: ``(3n,)``, metres, world frame, row after row; ``n >= 4``.
-            pixels: ``(2n,)``, undistorted pixels in the same order.
-            camera: Intrinsics of the image the pixels come from.
-            options: How to solve.
-
-        Returns:
-            The ``(16,)`` pose, row-major; the sorted row numbers of the inliers; ``rmse_px``; the ``(21,)``
-            upper triangle of the covariance; and the reason why the pose is weak, ``""`` if it is ok.  None
-            for arrays that are not plain float64, or whose lengths do not fit.
-
-        Raises:
-            RsePfError: As `solve` does.
-        """
-        n = pixels.size // 2
-        if (
-            points_world.size != 3 * n or pixels.size != 2 * n
-            or points_world.dtype != np.float64 or pixels.dtype != np.float64
-            or not points_world.flags.carray or not pixels.flags.carray
-        ):  # fmt: skip
-            return None
-        buffers = self._buffers
-        if n > len(buffers.inliers):
-            buffers.lend(n)
-        _REQUEST.pack_into(
-            buffers.request, 0, _ABI, _LANES[options.lanes], n, address_of(points_world),
-            address_of(pixels), _pack(camera, options),
-        )  # fmt: skip
-        self._call(buffers.request_at, buffers.inliers_at, buffers.result_at)
-        values = RESULT.unpack_from(buffers.result)
-        if values[0]:
-            raise solver_error(values, n, options)
-        return (
-            buffers.flat_pose.copy(),
-            buffers.inliers[: values[2]].astype(np.uint32),
-            values[5],
-            buffers.flat_covariance.take(_UPPER).astype(np.float32),
-            REASONS[values[1]],
+            reason=_REASONS[reason],
         )
 
     def propose(
@@ -266,11 +191,11 @@ class NativeSolver:
         """Solve the request that was written last."""
         buffers = self._buffers
         self._call(buffers.request_at, inliers_at, buffers.result_at)
-        return RESULT.unpack_from(buffers.result)
+        return _RESULT.unpack_from(buffers.result)
 
 
-def solver_error(values: tuple[Any, ...], n: int, options: NativeOptions) -> RsePfError:
-    """Return the error of what `RESULT` unpacks; the sentences are those of `rse_pf.pnp.solver`."""
+def _solver_error(values: tuple[Any, ...], n: int, options: NativeOptions) -> RsePfError:
+    """Return the error of what `_RESULT` unpacks; the sentences are those of `rse_pf.pnp.solver`."""
     status, _, count, independent, other, rmse_px, other_rmse_px, thinness, radius_px = values
     everywhere = "match points all over the image, or skip this frame"
     match status:
@@ -366,7 +291,7 @@ def load_part(path: Path, part: str, abi: int, *functions: str) -> list[Any]:
 
     Args:
         path: Of the library.
-        part: ``native`` (the solver), ``codec``, ``depth``, ``match``, ``track`` or ``stereo``;
+        part: ``native`` (the solver), ``depth``, ``match``, ``track`` or ``stereo``;
             ``rse_pf_PART_abi`` is its version.
         abi: The version that the caller needs.
         functions: Their names.
@@ -412,15 +337,6 @@ def core_function(part: str, name: str, arguments: Sequence[Any], result: Any) -
     (function,) = load_core(lambda path: load_part(path, part, PART_ABIS[part], name))
     function.argtypes, function.restype = arguments, result
     return function
-
-
-def open_found(open_part: Callable[[Path], Part]) -> Part | None:
-    """Return the part that *open_part* opens in the library of `find_library`; None if no library fits."""
-    path = find_library()
-    try:
-        return None if path is None else open_part(path)
-    except ConfigurationError:
-        return None
 
 
 def open_solver(path: Path) -> NativeSolver:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import inspect
 import typing
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Literal, TypeVar
 
 import msgspec
@@ -24,7 +24,6 @@ from rse_pf.errors import (
     UnknownService,
 )
 from rse_pf.wire import Command, Failure, Result, as_type
-from rse_pf.wire.plain_pnp import PlainPnp
 
 __all__ = ["Kind", "Registry", "Report", "Service", "dispatch", "failure_of", "request_of", "unknown_service"]
 
@@ -46,7 +45,6 @@ class Service:
     keyword ``report``: a long service that reports progress and can be cancelled then.  A ``limited`` one
     decodes data that may expand to anything: a backend server computes it in a process that has a memory
     limit and is killed at the deadline.  Such a process calls ``warm_up`` once, to import what is slow.
-    ``plain`` answers as ``function`` does what the native core has read (`rse_pf.wire.PlainPnp`).
     """
 
     name: str
@@ -58,7 +56,6 @@ class Service:
     reports: bool = False
     limited: bool = False
     warm_up: Callable[[], object] | None = None
-    plain: Callable[[PlainPnp], Any] | None = None
 
     @property
     def summary(self) -> str:
@@ -113,10 +110,6 @@ class Registry:
             raise ConfigurationError(f"two services are named {service.name!r}", hint="rename one")
         self._services[service.name] = service
 
-    def answer_plain(self, name: str, function: Callable[[PlainPnp], Any]) -> None:
-        """Let *function* answer what the native core has read of the commands of the service *name*."""
-        self._services[name] = replace(self.get(name), plain=function)
-
     def get(self, name: str) -> Service:
         """Return the service called *name*, or raise UnknownService with what is offered."""
         service = self._services.get(name)
@@ -158,13 +151,11 @@ def dispatch(
     started = clock()
     try:
         service = registry.get(command.service)
-        payload = command.payload
-        if service.plain is not None and type(payload) is PlainPnp:
-            reply = service.plain(payload)
-        elif service.reports and report is not None:
-            reply = service.function(request_of(payload, service), **{_REPORT: report})
+        request = request_of(command.payload, service)
+        if service.reports and report is not None:
+            reply = service.function(request, **{_REPORT: report})
         else:
-            reply = service.function(request_of(payload, service))
+            reply = service.function(request)
     except RsePfError as error:
         return failure_of(error, command, server=server)
     except (Exception, SystemExit) as error:  # noqa: BLE001  a service is untrusted code

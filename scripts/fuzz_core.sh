@@ -3,7 +3,7 @@
 # sh scripts/fuzz_core.sh [TARGET] [SECONDS].  Needs clang++ and atheris, which brings libFuzzer; without, ends with 0.
 set -eu
 cd "$(dirname "$0")/.."
-target=${1:-answer}
+target=${1:-match}
 seconds=${2:-60}
 python=.venv/bin/python
 

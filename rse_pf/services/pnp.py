@@ -12,15 +12,10 @@ import numpy.typing as npt
 from rse_pf.config import PnpSettings
 from rse_pf.errors import LimitExceeded, TooFewCorrespondences
 from rse_pf.geometry import Camera
-from rse_pf.native import native_solver, open_found
 from rse_pf.pnp import DepthNoise, PnpOptions, PnpSolution, refine_with_depth, solve_pnp
-from rse_pf.pnp.engines import native_options
-from rse_pf.pnp.native_reply import open_reply_solver
-from rse_pf.pnp.options import WeakLimits
 from rse_pf.service import Registry
 from rse_pf.wire.arrays import Array, reshaped
-from rse_pf.wire.native_codec import PnpTypes
-from rse_pf.wire.plain_pnp import EncodedReply, PlainPnp
+from rse_pf.wire.server_codec import PnpTypes
 
 __all__ = ["PnpReply", "PnpRequest", "make_request", "register", "wire_types"]
 
@@ -127,11 +122,10 @@ def make_request(
     )
 
 
-def wire_types(registry: Registry, *, stays_plain: bool = False) -> PnpTypes | None:
+def wire_types(registry: Registry) -> PnpTypes | None:
     """Return what the codecs of a server decode a `pnp` command to, None if *registry* offers another one.
 
-    What runs in another process is sent there as the robot sent it.  With *stays_plain* it is decoded to what
-    `Service.plain` answers.
+    What runs in another process is sent there as the robot sent it.
     """
     own = any(
         each.name == "pnp"
@@ -140,34 +134,17 @@ def wire_types(registry: Registry, *, stays_plain: bool = False) -> PnpTypes | N
         and not each.limited
         for each in registry
     )
-    return PnpTypes(PnpRequest, Camera, PnpOptions, PnpReply, stays_plain) if own else None
+    return PnpTypes(PnpRequest, camera=Camera, options=PnpOptions, depth_noise=DepthNoise) if own else None
 
 
 def register(registry: Registry, settings: PnpSettings) -> None:
     """Add ``pnp`` to *registry*, with the limits and the engine of *settings*."""
     defaults = PnpOptions(max_iterations=settings.max_iterations)
     engine = settings.engine
-    solver = native_solver() if engine == "native" else None
-    plain = native_options(defaults, WeakLimits())
 
     @registry.service("pnp", cheap=True)
     def pnp(request: PnpRequest) -> PnpReply:
         """Estimate the camera pose of one frame."""
-        # What nearly all robots send goes from arrays to arrays; what the rest of this function refuses,
-        # or another engine solves, is left to it.
-        if (
-            solver is not None
-            and request.options is None
-            and (request.depths_m is msgspec.UNSET or request.depths_m is None)
-            and 8 <= request.pixels.size <= 2 * MAX_CORRESPONDENCES
-        ):
-            found = solver.solve_flat(request.points_world, request.pixels, request.camera, plain)
-            if found is not None:
-                pose, inliers, rmse_px, covariance, reason = found
-                return PnpReply(
-                    T_camera_world=pose, inliers=inliers, rmse_px=rmse_px, covariance=covariance,
-                    verdict="weak" if reason else "ok", reason=reason, engine="native",
-                )  # fmt: skip
         points_world = reshaped("points_world", request.points_world, 3)
         pixels = reshaped("pixels", request.pixels, 2)
         n = len(points_world)
@@ -194,16 +171,3 @@ def register(registry: Registry, settings: PnpSettings) -> None:
                 request.depth_noise or DepthNoise(),
             )  # fmt: skip
         return PnpReply.of(solution)
-
-    if solver is not None:
-        replies = open_found(open_reply_solver)
-
-        def answer_plain(read: PlainPnp) -> EncodedReply | PnpReply:
-            """Answer as `pnp`, without a Python object for each part of the request and the reply."""
-            is_common = (
-                read.options is None and not read.depths and 8 <= read.pixels <= 2 * MAX_CORRESPONDENCES
-            )
-            reply = replies.answer(read, plain) if replies is not None and is_common else None
-            return reply or pnp(read.request())
-
-        registry.answer_plain("pnp", answer_plain)

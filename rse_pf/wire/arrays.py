@@ -16,7 +16,6 @@ import numpy as np
 import numpy.typing as npt
 
 from rse_pf.errors import BadMessage, BadRequest
-from rse_pf.wire.plain_pnp import EncodedReply
 
 __all__ = ["Array", "binary_encode_hook", "decode_hook", "extension_hook", "json_encode_hook", "reshaped"]
 
@@ -31,8 +30,6 @@ _KINDS = {np.dtype(np.float32): _F4, np.dtype(np.uint32): _U4, np.dtype(np.float
 
 def json_encode_hook(value: Any) -> Any:
     """Return *value* as JSON can represent it: arrays become flat lists."""
-    if type(value) is EncodedReply:
-        return value.raw
     if isinstance(value, np.ndarray) and value.dtype.kind in "fiu":
         return value.tolist() if value.ndim == 1 else value.ravel().tolist()
     raise _unknown_type_error(value)
@@ -40,8 +37,6 @@ def json_encode_hook(value: Any) -> Any:
 
 def binary_encode_hook(value: Any) -> Any:
     """Return the MessagePack extension of an array: float32, uint32 if it fits, else float64."""
-    if type(value) is EncodedReply:
-        return value.raw
     if isinstance(value, np.ndarray):
         kind = _KINDS.get(value.dtype)
         if kind is not None and _IS_LITTLE_ENDIAN:
@@ -73,7 +68,8 @@ def decode_hook(kind: type[Any], value: Any) -> Any:
     if kind is not np.ndarray:
         raise BadMessage(f"{kind.__name__} cannot be encoded in a message")
     if type(value) is np.ndarray and value.dtype.kind in "fiu":
-        array = value.astype(np.float64).ravel() if value.ndim != 1 else value.astype(np.float64)
+        is_flat = value.dtype == np.float64 and value.ndim == 1 and value.flags.carray
+        array = value if is_flat else value.astype(np.float64).ravel()
     elif isinstance(value, list):
         array = _from_list(value)
     else:

@@ -1,8 +1,8 @@
 """Bytes to messages and back: JSON, JSON+zlib (the paper's) and MessagePack with raw arrays.
 
 Input is untrusted: limits hold *while* decoding, and only errors of `rse_pf.errors` are raised.  A codec
-keeps no state between messages.  Where the native core is built, it does what takes most of the time; the
-messages, the verdicts and the bytes stay the same, but for how a `pnp` reply is deflated.
+keeps no state between messages.  These codecs need what a robot installs; servers read JSON with faster
+libraries (`rse_pf.wire.server_codec`).
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import itertools
 import zlib
 from collections.abc import Callable
+from types import ModuleType
 from typing import Any, Protocol, TypeVar, get_args
 
 import msgspec
@@ -20,17 +21,28 @@ from rse_pf.budget import (
     check_json_containers,
     check_msgpack,
     check_size,
-    inflate_short,
+    inflate_message,
+    inflate_up_to,
     inflate_within,
 )
 from rse_pf.config import SessionSettings
 from rse_pf.errors import BadMessage, LimitExceeded, RsePfError, UnsupportedProtocol
 from rse_pf.wire import arrays
-from rse_pf.wire.messages import Command, FromRobot, FromServer, Message, Result
-from rse_pf.wire.native_codec import NativeCodec, NativeReader, PnpTypes, native_codec
-from rse_pf.wire.plain_pnp import EncodedReply, PlainPnp
+from rse_pf.wire.messages import Command, FromRobot, FromServer, Message
 
-__all__ = ["CODECS", "SUBPROTOCOLS", "Codec", "as_type", "codec_for", "deflated", "make_codec", "stored"]
+__all__ = [
+    "CODECS",
+    "SUBPROTOCOLS",
+    "Codec",
+    "as_type",
+    "check_codec",
+    "codec_for",
+    "decode_guarded",
+    "deflated",
+    "json_codec",
+    "make_codec",
+    "stored",
+]
 
 T = TypeVar("T")
 
@@ -51,13 +63,13 @@ _LEVEL = 6
 _LEVEL_OF_NUMBERS, _BYTES_PER_NUMBER = 4, 16
 
 # A server's messages are short: level 6 saves 5 of 794 bytes and costs a third more time.
-_REPLY_LEVEL, _REPLY_WINDOW_BITS, _REPLY_MEMORY = 1, 12, 5
+_REPLY_LEVEL = 1
 
 # A shorter reply is stored: one packet holds it in either case, and deflating 180 bytes to 121 takes 29 us.
 _STORED_BYTES = 512
 _STORED_HEAD = b"\x78\x01\x01"
-# A `pnp` command of four matches has more; what is shorter is decoded sooner than the native core is called.
-_SHORTEST_POSE_BYTES = 192
+# Longer messages are inflated by zlib: isal takes 0.4 us for an empty block, which is 5 ms of this size.
+_MAX_FAST_BYTES = 16_384
 
 _CONTAINERS = frozenset((dict, list, tuple))
 _is_flat = _CONTAINERS.isdisjoint
@@ -86,28 +98,44 @@ class Codec(Protocol):
         """Return the message of a server in *data*; raises BadMessage or LimitExceeded."""
 
 
-def make_codec(
-    name: str, limits: SessionSettings | None = None, *, pnp: PnpTypes | None = None, use_native: bool = True
-) -> Codec:
+def make_codec(name: str, limits: SessionSettings | None = None) -> Codec:
     """Return the codec called *name*: ``zlib``, ``json`` or ``bin``.
 
     Args:
         name: Which one.
         limits: What is accepted from the other side.
-        pnp: The types of the service `pnp`, where a server offers the platform's own: the payload of a plain
-            command is decoded to its request at once.
-        use_native: Whether the native core may be used, if it is there.
 
     Raises:
         UnsupportedProtocol: There is no such codec.
     """
+    check_codec(name)
     session = limits or SessionSettings()
-    native = native_codec() if use_native else None
-    if name == "bin":
-        return _BinaryCodec(session, native, pnp)
-    if name in ("zlib", "json"):
-        return _JsonCodec(session, native, pnp, compressed=name == "zlib")
-    raise UnsupportedProtocol(f"no codec named {name!r}", hint=f"choose one of {', '.join(CODECS)}")
+    return _BinaryCodec(session) if name == "bin" else json_codec(session, is_compressed=name == "zlib")
+
+
+def json_codec(
+    limits: SessionSettings,
+    *,
+    is_compressed: bool,
+    zlib_library: ModuleType = zlib,
+    read: Callable[[bytes | bytearray], FromRobot] | None = None,
+) -> Codec:
+    """Return the codec ``zlib`` or ``json``.
+
+    Args:
+        limits: What is accepted from the other side.
+        is_compressed: Whether messages are deflated.
+        zlib_library: ``zlib``, or ``isal.isal_zlib``.
+        read: Returns the message of a robot in a JSON text and raises ProtocolError; None for the reader of
+            `msgspec`.
+    """
+    return _JsonCodec(limits, is_compressed, zlib_library, read)
+
+
+def check_codec(name: str) -> None:
+    """Raise UnsupportedProtocol if there is no codec called *name*."""
+    if name not in CODECS:
+        raise UnsupportedProtocol(f"no codec named {name!r}", hint=f"choose one of {', '.join(CODECS)}")
 
 
 def as_type(value: Any, kind: type[T]) -> T:
@@ -116,8 +144,6 @@ def as_type(value: Any, kind: type[T]) -> T:
     Raises:
         BadMessage: It does not fit.
     """
-    if type(value) is PlainPnp:
-        value = value.request()
     try:
         return msgspec.convert(value, kind, dec_hook=arrays.decode_hook)
     except RsePfError:
@@ -168,18 +194,16 @@ class _JsonCodec:
     def __init__(
         self,
         limits: SessionSettings,
-        native: NativeCodec | None,
-        pnp: PnpTypes | None,
-        *,
-        compressed: bool,
+        is_compressed: bool,
+        zlib_library: ModuleType,
+        read: Callable[[bytes | bytearray], FromRobot] | None,
     ) -> None:
-        self.name = "zlib" if compressed else "json"
-        self.is_text = not compressed
+        self.name = "zlib" if is_compressed else "json"
+        self.is_text = not is_compressed
         self._budget = Budget.of_messages(limits)
-        self._compressed = compressed
-        self._native, self._pnp = native, pnp
-        self._reader = None if native is None else NativeReader(native, self.name, self._budget, pnp)
-        self._short_readers: dict[int, NativeReader] = {}
+        self._is_compressed = is_compressed
+        self._zlib = zlib_library
+        self._read = read or self._read_with_msgspec
         self._encode = msgspec.json.Encoder(enc_hook=arrays.json_encode_hook).encode
         self._from_robot = msgspec.json.Decoder(FromRobot).decode
         self._from_server = msgspec.json.Decoder(FromServer).decode
@@ -189,76 +213,51 @@ class _JsonCodec:
             data = self._encode(message)
         except _UNENCODABLE as error:
             raise _unencodable_error(message, error) from error
-        if not self._compressed:
+        if not self._is_compressed:
             return data
-        if self._native is not None and self._is_pose(message):
-            return self._native.deflate(data)
         if type(message) in _FROM_ROBOT:
             return deflated(data)
         if len(data) < _STORED_BYTES:
             return stored(data)
-        stream = zlib.compressobj(_REPLY_LEVEL, zlib.DEFLATED, _REPLY_WINDOW_BITS, _REPLY_MEMORY)
-        return stream.compress(data) + stream.flush()
+        compressed: bytes = self._zlib.compress(data, _REPLY_LEVEL)
+        return compressed
 
     def decode_from_robot(self, data: bytes) -> FromRobot:
-        check_size(data, self._budget)
-        if self._reader is not None:
-            message_or_text = self._reader.read(data)
-            if isinstance(message_or_text, Command):
-                return message_or_text
-            if message_or_text is not None and not isinstance(message_or_text, str):
-                message: FromRobot = _decode_guarded(self._from_robot, message_or_text)
-                return message
         return self._read(self._open(data))
 
     def decode_short_from_robot(self, data: bytes, max_bytes: int) -> FromRobot | None:
-        if not self._compressed:
+        if not self._is_compressed:
             return None if len(data) > max_bytes else self.decode_from_robot(data)
-        if self._native is not None:
-            reader = self._short_readers.get(max_bytes)
-            if reader is None:
-                reader = NativeReader(self._native, self.name, self._budget, self._pnp, short_bytes=max_bytes)
-                self._short_readers[max_bytes] = reader
-            message_or_text = reader.read(data)
-            if isinstance(message_or_text, Command):
-                return message_or_text
-            if isinstance(message_or_text, str):
-                return None
-            if message_or_text is not None:
-                message: FromRobot = _decode_guarded(self._from_robot, message_or_text)
-                return message
-        text = inflate_short(data, max_bytes)
-        return None if text is None or len(text) > max_bytes else self._read(text)
+        check_size(data, self._budget)
+        text = inflate_up_to(data, max_bytes, self._zlib)
+        return None if text is None else self._read(text)
 
     def decode_from_server(self, data: bytes) -> FromServer:
         text = self._open(data)
         check_json_containers(text, self._budget)
-        message: FromServer = _decode_guarded(self._from_server, text)
-        return message
-
-    def _is_pose(self, message: Message) -> bool:
-        if self._pnp is None or not isinstance(message, Result):
-            return False
-        return type(message.reply) is EncodedReply or type(message.reply) is self._pnp.reply
-
-    def _read(self, text: bytes | bytearray) -> FromRobot:
-        if self._reader is None or not self._reader.check(text):
-            check_json(text, self._budget)
-        message: FromRobot = _decode_guarded(self._from_robot, text)
+        message: FromServer = decode_guarded(self._from_server, text)
         return message
 
     def _open(self, data: bytes) -> bytes | bytearray:
         check_size(data, self._budget)
-        return inflate_within(data, self._budget) if self._compressed else data
+        if not self._is_compressed:
+            return data
+        if len(data) > _MAX_FAST_BYTES:
+            return inflate_within(data, self._budget)
+        return inflate_message(data, self._budget, self._zlib)
+
+    def _read_with_msgspec(self, text: bytes | bytearray) -> FromRobot:
+        check_json(text, self._budget)
+        message: FromRobot = decode_guarded(self._from_robot, text)
+        return message
 
 
 class _BinaryCodec:
     name = "bin"
     is_text = False
 
-    def __init__(self, limits: SessionSettings, native: NativeCodec | None, pnp: PnpTypes | None) -> None:
+    def __init__(self, limits: SessionSettings) -> None:
         self._budget = Budget.of_messages(limits)
-        self._reader = None if native is None else NativeReader(native, self.name, self._budget, pnp)
         self._encode = msgspec.msgpack.Encoder(enc_hook=arrays.binary_encode_hook).encode
         self._from_robot = msgspec.msgpack.Decoder(FromRobot, ext_hook=arrays.extension_hook).decode
         self._from_server = msgspec.msgpack.Decoder(FromServer, ext_hook=arrays.extension_hook).decode
@@ -270,21 +269,9 @@ class _BinaryCodec:
             raise _unencodable_error(message, error) from error
 
     def decode_from_robot(self, data: bytes) -> FromRobot:
-        if len(data) > self._budget.wire_bytes:
-            check_size(data, self._budget)
-        is_checked = False
-        if self._reader is not None and len(data) >= _SHORTEST_POSE_BYTES:
-            command_or_data = self._reader.read(data)
-            if isinstance(command_or_data, Command):
-                return command_or_data
-            is_checked = command_or_data is not None
-        is_checked = is_checked or check_msgpack(data, self._budget)
-        try:
-            message: FromRobot = self._from_robot(data)
-        except RsePfError:
-            raise
-        except _UNDECODABLE as error:
-            raise _undecodable_error(error) from error
+        check_size(data, self._budget)
+        is_checked = check_msgpack(data, self._budget)
+        message: FromRobot = decode_guarded(self._from_robot, data)
         if not is_checked and type(message) is Command and type(message.payload) in _CONTAINERS:
             _check_nesting(message.payload, self._budget.depth)
         return message
@@ -294,12 +281,12 @@ class _BinaryCodec:
 
     def decode_from_server(self, data: bytes) -> FromServer:
         check_size(data, self._budget)
-        message: FromServer = _decode_guarded(self._from_server, data)
+        message: FromServer = decode_guarded(self._from_server, data)
         _check_nesting(getattr(message, "reply", None), self._budget.depth)
         return message
 
 
-def _decode_guarded(decode: Callable[[Any], Any], data: Any) -> Any:
+def decode_guarded(decode: Callable[[Any], Any], data: Any) -> Any:
     """Decode *data*, turning every exception of the decoder into `BadMessage`."""
     try:
         return decode(data)

@@ -7,12 +7,14 @@ from __future__ import annotations
 
 import asyncio
 import base64
+import itertools
 import os
+import random
 import struct
 import time
 import zlib
 from collections import Counter
-from collections.abc import Awaitable
+from collections.abc import Awaitable, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from urllib.parse import urlsplit
@@ -178,6 +180,28 @@ async def zip_bombs(target: AttackTarget, count: int = 1000, pause_s: float = 1.
             socket.end()
 
     await _all([robot(token) for token in target.tokens[: count // each]])
+    return outcome
+
+
+async def large_documents(target: AttackTarget, documents: Sequence[bytes]) -> Outcome:
+    """Send one of the *documents*, each a JSON payload, from every robot at once, deflated.
+
+    A text before it that hardly deflates keeps a message from being a bomb.  The codes of the answers are the
+    ends.
+    """
+    outcome = Outcome(tried=len(target.tokens))
+    noise = base64.b64encode(random.Random(1).randbytes(12_000))
+    head = b'{"type":"command","id":7,"service":"echo","noise":"' + noise + b'","payload":'
+    endless = itertools.cycle([frame(zlib.compress(head + document + b"}", 6)) for document in documents])
+
+    async def send(socket: Socket, message: bytes) -> None:
+        socket.send(message)
+        answer = await socket.hear()
+        outcome.ends[answer.code if isinstance(answer, Failure) else type(answer).__name__] += 1
+        socket.end()
+
+    sockets = [await target.enter(token) for token in target.tokens]
+    await _all([send(socket, next(endless)) for socket in sockets])
     return outcome
 
 

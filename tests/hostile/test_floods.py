@@ -128,6 +128,56 @@ def test_every_bomb_is_refused_and_memory_stays(server):
     assert resident_mib(server) - before < 64
 
 
+_SIZE = (1 << 20) - 20_000  # bytes of a document, which leave room for the rest of a message of 1 MiB
+
+
+def repeated(begin: bytes, item: bytes, end: bytes) -> bytes:
+    """Return a document of *item*, separated by commas."""
+    return begin + b",".join([item] * (_SIZE // (len(item) + 1))) + end
+
+
+LARGE_DOCUMENTS = (
+    b"[" * (_SIZE // 2) + b"]" * (_SIZE // 2),
+    b'{"a":' * (_SIZE // 6) + b"1" + b"}" * (_SIZE // 6),
+    repeated(b"{", b'"a":1', b"}"),
+    repeated(b"[", b"1", b"]"),
+    repeated(b"[", b"[]", b"]"),
+    repeated(b"[", b"{}", b"]"),
+    repeated(b"[", b'"ab"', b"]"),
+    repeated(b"[", b"17976931348623157081e289", b"]"),
+    b'["' + b'\\"' * (_SIZE // 2) + b'"]',
+    b'["' + "\u00e9".encode() * (_SIZE // 2) + b'"]',
+    b"[" + b",".join([b"0.12345678901234567"] * 28_000) + b"]",  # is read, and then refused by the service
+)
+
+
+def peak_mib(server: GuardedServer) -> float:
+    """Return the largest resident memory of a worker since `forget_peaks`."""
+    statuses = [Path(f"/proc/{pid}/status").read_text() for pid in announced(server)["workers"]]
+    return max(int(re.findall(r"VmHWM:\s+(\d+) kB", status)[0]) for status in statuses) / 1024
+
+
+def forget_peaks(server: GuardedServer) -> None:
+    for pid in announced(server)["workers"]:
+        Path(f"/proc/{pid}/clear_refs").write_text("5")
+
+
+def test_a_hundred_robots_with_documents_of_one_mib_take_little_memory_of_a_worker(server):
+    async def attack(target: AttackTarget) -> Outcome:
+        return await attacks.large_documents(target, LARGE_DOCUMENTS)
+
+    forget_peaks(server)
+    before = peak_mib(server)
+    outcome, answered = attacked(server, attack, robots=100)
+
+    assert outcome.ends.keys() <= {"too-large", "bad-request"}
+    assert outcome.ends.total() == 100
+    assert answered == 5
+    growth_mib = peak_mib(server) - before
+    print(f"the worker grew by {growth_mib:.1f} MiB: {outcome.ends}")
+    assert growth_mib < 64
+
+
 def test_silent_connections_are_cut_for_newer_ones_and_after_their_time(server):
     async def attack(target: AttackTarget) -> Outcome:
         return await attacks.silent_connects(target, 100)

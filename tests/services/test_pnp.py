@@ -10,12 +10,13 @@ import pytest
 
 from rse_pf.config import PlatformSettings
 from rse_pf.geometry import Array, exp_se3, transform
-from rse_pf.pnp import DepthNoise, PnpOptions, refine_with_depth, solve_pnp
-from rse_pf.pnp.problems import KINECT, make_problem
+from rse_pf.pnp import DepthNoise, refine_with_depth, solve_pnp
+from rse_pf.pnp.problems import KINECT
 from rse_pf.service import dispatch
 from rse_pf.services.builtin import builtin_services
 from rse_pf.services.pnp import PnpReply, PnpRequest, make_request, wire_types
 from rse_pf.wire import CODECS, Command, Failure, Result, as_type, make_codec
+from rse_pf.wire.server_codec import make_server_codec
 
 _T = exp_se3([0.1, -0.05, 0.02, 0.03, -0.02, 0.05])
 _REGISTRY = builtin_services(PlatformSettings())
@@ -34,7 +35,7 @@ def _views(n: int = 60) -> tuple[Array, Array, Array]:
 
 
 def _answer(payload: Any, codec_name: str = "json") -> PnpReply | Failure:
-    codec = make_codec(codec_name, pnp=wire_types(_REGISTRY))
+    codec = make_server_codec(codec_name, pnp=wire_types(_REGISTRY))
     arrived = codec.decode_from_robot(codec.encode(Command(id=1, service="pnp", payload=payload)))
     assert isinstance(arrived, Command)
     answer = dispatch(_REGISTRY, arrived, lambda: 0.0)
@@ -154,53 +155,3 @@ def test_no_finite_numbers_make_the_service_fail() -> None:
         assert isinstance(found, PnpReply) or found.code in {
             "bad-request", "no-consensus", "degenerate", "ambiguous",
         }, found  # fmt: skip
-
-
-def _wrong_views() -> dict[str, tuple[Array, Array]]:
-    """Return points and pixels of requests that are weak, refused, or shaped as no robot sends them."""
-    points, pixels, _ = _views()
-    rng = np.random.default_rng(2)
-    line = points[:1] + np.linspace(0.0, 1.0, len(points))[:, None] * [1.0, 0.5, 0.2]
-    return {
-        "few": (points[:8], pixels[:8]),
-        "three": (points[:3], pixels[:3]),
-        "none": (points[:0], pixels[:0]),
-        "too many": (np.tile(points, (400, 1)), np.tile(pixels, (400, 1))),
-        "random": (rng.uniform(-1.0, 1.0, (40, 3)), rng.uniform(0.0, 480.0, (40, 2))),
-        "line": (line, KINECT.project(line)),
-        "not finite": (np.where(points == points[3, 1], np.nan, points), pixels),
-        "far": (points * 1e7, pixels),
-        "a point less": (points[1:], pixels),
-        "a pixel less": (points, pixels[1:]),
-        "a number less": (points.ravel()[1:], pixels),
-        "columns": (np.asfortranarray(points), np.asfortranarray(pixels)),
-        "single": (points.astype(np.float32), pixels.astype(np.float32)),
-        "single points": (points.astype(np.float32), pixels),
-        "single pixels": (points, pixels.astype(np.float32)),
-        "whole": (points.round().astype(np.int64), pixels.round().astype(np.int64)),
-        "not aligned": (_moved_by_a_byte(points), _moved_by_a_byte(pixels)),
-    }
-
-
-def _moved_by_a_byte(array: Array) -> Array:
-    raw = np.empty(array.nbytes + 1, dtype=np.uint8)
-    raw[1:] = np.frombuffer(array.tobytes(), dtype=np.uint8)
-    return np.ndarray(array.shape, array.dtype, raw.data, offset=1)
-
-
-def test_the_short_way_of_a_request_without_options_answers_byte_for_byte_as_the_long_one() -> None:
-    def answered(points: Array, pixels: Array, options: PnpOptions | None) -> list[bytes]:
-        request = PnpRequest(camera=KINECT, points_world=points, pixels=pixels, options=options)
-        message = dispatch(_REGISTRY, Command(id=1, service="pnp", payload=request), lambda: 0.0)
-        return [make_codec(name, pnp=wire_types(_REGISTRY)).encode(message) for name in CODECS]
-
-    problems = [
-        make_problem(seed=seed, n=n, outlier_ratio=ratio)
-        for seed, (n, ratio) in enumerate([(200, 0.3), (200, 0.8), (4, 0.0), (15, 0.2), (1500, 0.5)])
-    ]
-    views = {str(i): (each.points_world, each.pixels) for i, each in enumerate(problems)} | _wrong_views()
-    options = PnpOptions(max_iterations=PlatformSettings().pnp.max_iterations)
-
-    different = [name for name, view in views.items() if answered(*view, None) != answered(*view, options)]
-
-    assert different == []

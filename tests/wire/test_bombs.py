@@ -9,7 +9,8 @@ import pytest
 
 from rse_pf.config import SessionSettings
 from rse_pf.errors import BadMessage, LimitExceeded
-from rse_pf.wire import Command, make_codec
+from rse_pf.wire import Command
+from rse_pf.wire.server_codec import make_server_codec
 
 LIMITS = SessionSettings()
 
@@ -25,7 +26,7 @@ def command(words: list[str]) -> Command:
 
 
 def test_a_bomb_costs_no_more_memory_than_a_message_may_have():
-    codec, data = make_codec("zlib"), bomb(256 << 20)[: LIMITS.max_message_bytes]
+    codec, data = make_server_codec("zlib"), bomb(256 << 20)[: LIMITS.max_message_bytes]
     assert len(data) > 250_000
     tracemalloc.start()
     try:
@@ -40,7 +41,7 @@ def test_a_bomb_costs_no_more_memory_than_a_message_may_have():
 
 @pytest.mark.parametrize("size", [1000, 2600, 2622, 20_000, 200_000, 262_000])
 def test_a_text_of_an_allowed_size_is_accepted_at_any_ratio(size):
-    codec = make_codec("zlib")
+    codec = make_server_codec("zlib")
     message = command(["x" * (size - 80)])
 
     assert codec.decode_from_robot(codec.encode(message)) == message
@@ -48,14 +49,14 @@ def test_a_text_of_an_allowed_size_is_accepted_at_any_ratio(size):
 
 @pytest.mark.parametrize("words", [3000, 10_000, 20_000])
 def test_a_message_that_shrinks_little_is_whole_after_inflating(words):
-    codec = make_codec("zlib")
+    codec = make_server_codec("zlib")
     message = command([str(k * 2654435761 % 2**32) for k in range(words)])
 
     assert codec.decode_from_robot(codec.encode(message)) == message
 
 
 def test_more_than_all_that_is_allowed_is_refused_where_it_grows_slowly():
-    codec = make_codec("zlib")
+    codec = make_server_codec("zlib")
     text = b",".join(b"%d" % (k * 2654435761 % 2**32) for k in range(130_000))
     data = zlib.compress(text, 9)[: LIMITS.max_message_bytes]
 

@@ -1,4 +1,4 @@
-"""The codecs against ourselves and against strangers."""
+"""The codecs of a server against ourselves and against strangers."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ from rse_pf.wire import (
     Result,
     Welcome,
     codec_for,
-    make_codec,
 )
 from rse_pf.wire.codec import stored
+from rse_pf.wire.server_codec import make_server_codec
 
 LIMITS = SessionSettings()
 
@@ -80,7 +80,7 @@ FROM_SERVER: dict[type[Any], st.SearchStrategy[Any]] = {
 @settings(max_examples=50)
 def test_robot_messages_survive_encoding(name: str, kind: type[Any], data: st.DataObject) -> None:
     message = data.draw(FROM_ROBOT[kind])
-    codec = make_codec(name)
+    codec = make_server_codec(name)
 
     assert codec.decode_from_robot(codec.encode(message)) == message
 
@@ -91,7 +91,7 @@ def test_robot_messages_survive_encoding(name: str, kind: type[Any], data: st.Da
 @settings(max_examples=50)
 def test_server_messages_survive_encoding(name: str, kind: type[Any], data: st.DataObject) -> None:
     message = data.draw(FROM_SERVER[kind])
-    codec = make_codec(name)
+    codec = make_server_codec(name)
 
     assert codec.decode_from_server(codec.encode(message)) == message
 
@@ -105,7 +105,7 @@ def test_server_messages_survive_encoding(name: str, kind: type[Any], data: st.D
 @example(b"\xdf\xff\xff\xff\xff")
 @example(b"\xc9\xff\xff\xff\xff\x01")
 def test_random_bytes_give_a_message_or_a_protocol_error(name: str, inflatable: bool, data: bytes) -> None:
-    codec = make_codec(name)
+    codec = make_server_codec(name)
     sent = zlib.compress(data) if inflatable else data
     for decode in (codec.decode_from_robot, codec.decode_from_server):
         try:
@@ -122,7 +122,7 @@ def test_random_bytes_give_a_message_or_a_protocol_error(name: str, inflatable: 
 def test_damaged_messages_give_a_message_or_a_protocol_error(
     name: str, message: Command, cut: int, flip: int
 ) -> None:
-    codec = make_codec(name)
+    codec = make_server_codec(name)
     data = bytearray(codec.encode(message))
     data[flip // 8 % len(data)] ^= 1 << flip % 8
     for damaged in (bytes(data), bytes(data[:cut])):
@@ -135,7 +135,7 @@ def test_damaged_messages_give_a_message_or_a_protocol_error(
 
 def refused(name: str, data: bytes, limits: SessionSettings = LIMITS) -> ProtocolError:
     with pytest.raises(ProtocolError) as caught:
-        make_codec(name, limits).decode_from_robot(data)
+        make_server_codec(name, limits).decode_from_robot(data)
     return caught.value
 
 
@@ -149,7 +149,7 @@ def deflated(data: bytes, wbits: int) -> bytes:
 
 
 def payload_of(name: str, data: bytes) -> Any:
-    message = make_codec(name).decode_from_robot(data)
+    message = make_server_codec(name).decode_from_robot(data)
     assert isinstance(message, Command)
     return message.payload
 
@@ -252,7 +252,7 @@ def nested(depth: int) -> Any:
 
 @pytest.mark.parametrize("name", CODECS)
 def test_the_depth_limit_is_kept_to_the_level_in_every_codec(name: str) -> None:
-    codec = make_codec(name)
+    codec = make_server_codec(name)
     deepest = MESSAGE_DEPTH - 1  # the message itself is the first level
 
     message = Command(id=1, service="echo", payload=nested(deepest))
@@ -267,7 +267,7 @@ def test_the_depth_limit_is_kept_to_the_level_in_every_codec(name: str) -> None:
 )
 @pytest.mark.parametrize("name", CODECS)
 def test_brackets_inside_strings_are_not_depth(name: str, text: str) -> None:
-    codec = make_codec(name)
+    codec = make_server_codec(name)
     message = Command(id=1, service="echo", payload={text: [text, "x", {"y": text}]})
 
     assert codec.decode_from_robot(codec.encode(message)) == message
@@ -304,7 +304,7 @@ HEAVY = {
 def test_no_message_within_the_size_limit_takes_long(name: str) -> None:
     data = HEAVY[name]
     assert len(data) <= LIMITS.max_message_bytes
-    codec = make_codec("json")
+    codec = make_server_codec("json")
     took_s = []
     for _ in range(3):
         started = time.thread_time()
@@ -324,27 +324,27 @@ def test_deep_messagepack_is_refused_or_skipped_and_never_a_crash(depth: int, op
 
     assert isinstance(refused("bin", before + b"\xa7payload" + deep + b"\x01"), ProtocolError)
     with contextlib.suppress(ProtocolError):  # an unknown field is skipped, so it may be deep
-        make_codec("bin").decode_from_robot(before + b"\xa7unknown" + deep + b"\x01")
+        make_server_codec("bin").decode_from_robot(before + b"\xa7unknown" + deep + b"\x01")
 
 
 @pytest.mark.parametrize("value", [object(), {1, object()}, nested(3000)], ids=["object", "set", "deep"])
 @pytest.mark.parametrize("name", CODECS)
 def test_a_message_that_cannot_be_encoded_is_a_bad_message_of_its_sender(name: str, value: Any) -> None:
     with pytest.raises(BadMessage):
-        make_codec(name).encode(Result(id=1, reply=value))
+        make_server_codec(name).encode(Result(id=1, reply=value))
 
 
 def test_integers_beyond_64_bits_travel_in_json_only() -> None:
     message = Result(id=1, reply=2**70)
 
-    assert make_codec("json").decode_from_server(make_codec("json").encode(message)) == message
+    assert make_server_codec("json").decode_from_server(make_server_codec("json").encode(message)) == message
     with pytest.raises(BadMessage, match="a Result cannot be encoded"):
-        make_codec("bin").encode(message)
+        make_server_codec("bin").encode(message)
 
 
 def test_an_unknown_codec_is_refused_with_the_known_ones() -> None:
     with pytest.raises(UnsupportedProtocol) as caught:
-        make_codec("xml")
+        make_server_codec("xml")
 
     assert caught.value.hint == "choose one of zlib, json, bin"
 
@@ -363,7 +363,11 @@ def test_the_first_sub_protocol_that_both_speak_is_chosen(offered: list[str], na
 
 
 def test_only_plain_json_is_text() -> None:
-    assert {name: make_codec(name).is_text for name in CODECS} == {"zlib": False, "json": True, "bin": False}
+    assert {name: make_server_codec(name).is_text for name in CODECS} == {
+        "zlib": False,
+        "json": True,
+        "bin": False,
+    }
 
 
 def test_messages_are_values() -> None:

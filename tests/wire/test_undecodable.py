@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from rse_pf.config import SessionSettings
 from rse_pf.wire import CODECS, Codec, Command, Failure, Hello, Subscribe, make_codec
 from rse_pf.wire.envelope import undecodable_id
+from rse_pf.wire.server_codec import make_server_codec
 from rse_pf.wire.server_session import MAX_BAD_MESSAGES, Close, SendRefusal, ServerSession, Submit
 
 LIMITS = SessionSettings()
@@ -32,10 +33,8 @@ def bytes_of(codec: Codec, kind: Kind, identity: int) -> bytes:
     )  # fmt: skip
 
 
-def opened(codec: str, *, use_native: bool = True) -> ServerSession:
-    made = ServerSession(
-        codec=make_codec(codec, use_native=use_native), robot="r", server="s", session="x", limits=LIMITS
-    )
+def opened(codec: str) -> ServerSession:
+    made = ServerSession(codec=make_server_codec(codec), robot="r", server="s", session="x", limits=LIMITS)
     server_sessions.receive(made, made.codec.encode(Hello()), 0.0)
     return made
 
@@ -47,12 +46,9 @@ def refusal(decisions: list[Any]) -> Failure:
     return sent.failure
 
 
-@pytest.mark.parametrize("use_native", [True, False], ids=["native", "python"])
 @pytest.mark.parametrize(("codec", "kind"), KINDS, ids=[f"{codec}-{kind.name}" for codec, kind in KINDS])
-def test_a_command_that_cannot_be_decoded_is_answered_with_its_id(
-    codec: str, kind: Kind, use_native: bool
-) -> None:
-    server = opened(codec, use_native=use_native)
+def test_a_command_that_cannot_be_decoded_is_answered_with_its_id(codec: str, kind: Kind) -> None:
+    server = opened(codec)
 
     failure = refusal(server_sessions.receive(server, bytes_of(server.codec, kind, 7), 1.0))
 

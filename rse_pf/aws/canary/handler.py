@@ -27,7 +27,6 @@ from rse_pf.aws.clients import call_api, make_client
 from rse_pf.config import PlatformSettings, load_settings
 from rse_pf.errors import ConnectError, Expired, InternalError, RsePfError
 from rse_pf.pnp.problems import make_problem
-from rse_pf.service import Registry
 from rse_pf.services import pnp
 from rse_pf.terminal import show
 from rse_pf.wire import SUBPROTOCOLS, make_codec
@@ -82,9 +81,7 @@ def ask_known_pose(
         RsePfError: No server answers, it refuses, the answer is late, or the pose is wrong.
     """
     problem = make_problem(seed=_SEED, noise_px=0.5, outlier_ratio=0.3)
-    registry = Registry()
-    pnp.register(registry, settings.pnp)
-    codec = make_codec(_CODEC, settings.session, pnp=pnp.wire_types(registry))
+    codec = make_codec(_CODEC, settings.session)
     session = ClientSession(codec=codec, settings=settings.session, sdk="rse-pf-canary")
     began = clock()
     request = pnp.make_request(problem.points_world, problem.pixels, problem.camera)

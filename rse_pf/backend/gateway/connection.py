@@ -328,7 +328,7 @@ class RobotConnection:
         if decisions is not None and len(decisions) == 1 and type(decisions[0]) is Submit:
             command = decisions[0].command
             if self.tap is not None and isinstance(command.payload, Struct):
-                # Read by the native core, which takes known fields only.
+                # A request: the codec knows all fields of the message.
                 self.tap.is_plain(data, command.id, f"{command.stream} {command.trace}")
             handler.submit(self, command, len(data), now)
         elif decisions is not None:

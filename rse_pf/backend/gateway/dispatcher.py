@@ -30,8 +30,9 @@ from rse_pf.backend.scheduling.scheduler import QueueBacklog, QueuedCommand, Ref
 from rse_pf.errors import Busy, NotFound, UnknownService
 from rse_pf.services.pnp import wire_types
 from rse_pf.silent_connections import SilentConnections
-from rse_pf.wire import CODECS, Codec, Command, Failure, make_codec
+from rse_pf.wire import CODECS, Codec, Command, Failure
 from rse_pf.wire.envelope import peek
+from rse_pf.wire.server_codec import make_server_codec
 from rse_pf.wire.server_session import CLOSE_GOING_AWAY, CLOSE_RATE, CLOSE_TOKEN_OVER, ServerSession
 
 __all__ = ["Dispatcher"]
@@ -80,9 +81,9 @@ class Dispatcher:
         self._topics = topics
         self._token_watch = token_watch
         self._names = frozenset(service.name for service in answers.registry)
+        types = wire_types(answers.registry)
         self._codecs: dict[str, Codec] = {
-            name: make_codec(name, settings.session, pnp=wire_types(answers.registry, stays_plain=True))
-            for name in CODECS
+            name: make_server_codec(name, settings.session, pnp=types) for name in CODECS
         }
         serving = settings.serving
         self._awaited: SilentConnections[RobotConnection] = SilentConnections(

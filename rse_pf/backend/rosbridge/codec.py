@@ -20,7 +20,6 @@ from rse_pf.config import SessionSettings
 from rse_pf.errors import BadMessage, LimitExceeded, ProtocolError, UnsupportedProtocol
 from rse_pf.wire import Codec, Command, Failure, Result, arrays
 from rse_pf.wire.envelope import Envelope
-from rse_pf.wire.native_codec import NativeReader, native_codec
 
 __all__ = [
     "CODEC",
@@ -165,8 +164,6 @@ class RosbridgeCodec:
         self.calls: dict[int, ServiceCall] = {}
         self._inner = inner
         self._budget = Budget.of_messages(limits)
-        native = native_codec()
-        self._reader = None if native is None else NativeReader(native, "json", self._budget, None)
         self._number = 0
 
     # --- from the robot ------------------------------------------------------------------------
@@ -233,8 +230,7 @@ class RosbridgeCodec:
         text = bytes(op.msg)
         if not text:
             raise BadMessage("a publish has no msg", hint="send op, topic and msg")
-        if self._reader is None or not self._reader.check(text):
-            check_json(text, self._budget)
+        check_json(text, self._budget)
 
     # --- to the robot --------------------------------------------------------------------------
 

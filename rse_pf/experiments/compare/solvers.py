@@ -20,8 +20,9 @@ from rse_pf.errors import error_from_code
 from rse_pf.pnp import PnpOptions
 from rse_pf.service import dispatch
 from rse_pf.services.builtin import builtin_services
-from rse_pf.services.pnp import PnpReply, make_request
-from rse_pf.wire import Command, Failure, Result, as_type, make_codec
+from rse_pf.services.pnp import PnpReply, make_request, wire_types
+from rse_pf.wire import Command, Failure, Result, as_type
+from rse_pf.wire.server_codec import make_server_codec
 
 __all__ = ["InProcessSolver", "MeteredSolver", "PlatformSolver", "platform_solver"]
 
@@ -51,7 +52,7 @@ class InProcessSolver:
         self.server_s = 0.0
         self.inside_s = 0.0
         self._registry = builtin_services(settings)
-        self._codec = make_codec(_CODEC)
+        self._codec = make_server_codec(_CODEC, pnp=wire_types(self._registry))
         self._commands = 0
 
     async def ask(self, query: PoseQuery) -> PoseAnswer:

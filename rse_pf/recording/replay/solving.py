@@ -28,7 +28,7 @@ from rse_pf.pnp.engines import engine_for
 from rse_pf.recording.reader import RecordedCommand
 from rse_pf.service import Registry, dispatch, request_of
 from rse_pf.services.builtin import builtin_services
-from rse_pf.services.pnp import PnpReply, PnpRequest, wire_types
+from rse_pf.services.pnp import PnpReply, PnpRequest
 from rse_pf.wire import Codec, Command, Failure, Result, as_type, make_codec
 
 __all__ = ["TIMES_AND_PLACES", "Again", "Overrides", "Resolver", "pnp_reply", "solver_codes"]
@@ -202,8 +202,7 @@ class Resolver:
 
     def _codec(self, name: str) -> Codec:
         if name not in self._codecs:
-            types = wire_types(self._registry(self._engines[0], free=False))
-            self._codecs[name] = make_codec(name, self._settings.session, pnp=types)
+            self._codecs[name] = make_codec(name, self._settings.session)
         return self._codecs[name]
 
     def _bytes_of(self, codec: str, answer: Result | Failure, recorded: Result | Failure) -> bytes | None:

@@ -20,7 +20,7 @@ from rse_pf.recording import file_format
 from rse_pf.recording.writer import RecordingWriter
 from rse_pf.service import dispatch
 from rse_pf.services.builtin import builtin_services
-from rse_pf.services.pnp import make_request, wire_types
+from rse_pf.services.pnp import make_request
 from rse_pf.wire import Command, make_codec
 
 __all__ = ["START_NS", "Made", "jpeg"]
@@ -77,7 +77,6 @@ class Made:
         )  # fmt: skip
         self._edit = edit
         self._registry = builtin_services(settings)
-        self._types = wire_types(self._registry)
         self._channels: dict[tuple[int, str, str], int] = {}
         self._ids = itertools.count()
 
@@ -115,7 +114,7 @@ class Made:
             })  # fmt: skip
         self.writer.add(self._channel(robot, "up", codec), self.now_ns, self._edit("up", command))
         if is_answered:
-            codecs = make_codec(codec, pnp=self._types)
+            codecs = make_codec(codec)
             message = codecs.decode_from_robot(command)
             assert isinstance(message, Command)
             clock = itertools.count(100.0).__next__
