@@ -50,9 +50,9 @@ MESSAGE_DEPTH = 16
 """Levels of nesting of a robot's message."""
 MESSAGE_CONTAINERS = 7000
 """Lists and maps of a robot's message, at any depth."""
-MESSAGE_VALUES = 30_000
+MESSAGE_VALUES = 31_000
 """Values of a robot's message outside of raw arrays.  The largest request of ``pnp``, 5,000 correspondences
-in JSON, has less than all of them; 2,000 correspondences need less than half."""
+with their depths in JSON, has 30,000 numbers and less than 100 other values."""
 MESSAGE_MEMORY_BYTES = 2_000_000
 """Estimated memory of a decoded JSON message."""
 LIST_VALUES, MAP_VALUES = 3, 6
@@ -166,11 +166,7 @@ def inflate_within(data: bytes, budget: Budget) -> Text:
             text = _inflate_rest(stream, head, data, first, max_bytes)
     except zlib.error as error:
         raise _not_zlib_error() from error
-    if len(text) > max_bytes:
-        raise _bomb_error(len(data), max_bytes)
-    if not stream.eof or stream.unused_data:
-        raise _not_one_stream_error()
-    return text
+    return _whole(text, stream, len(data), max_bytes)
 
 
 def inflate_message(data: bytes, budget: Budget, library: ModuleType = zlib) -> bytes:
@@ -185,15 +181,17 @@ def inflate_message(data: bytes, budget: Budget, library: ModuleType = zlib) -> 
         LimitExceeded: It is longer than *budget* allows; no more than that was inflated.
         BadMessage: It is not one complete zlib stream.
     """
-    plain = min(budget.free_bytes, budget.inflated_bytes)
-    max_bytes = min(budget.inflated_bytes, max(plain, int(len(data) * budget.inflate_ratio)))
-    # The ratio limits large results only: a bomb reaches the plain size in its first bytes.
-    first = data[: int(plain / budget.inflate_ratio)]
-    is_bomb = max_bytes > plain and len(_inflated(first, plain + 1, library)[0]) > plain
-    text = None if is_bomb else inflate_up_to(data, max_bytes, library)
-    if text is None:
-        raise _bomb_error(len(data), max_bytes)
-    return text
+    plain_bytes = min(budget.free_bytes, budget.inflated_bytes)
+    max_bytes = min(budget.inflated_bytes, max(plain_bytes, int(len(data) * budget.inflate_ratio)))
+    text, stream = _inflated(data, plain_bytes + 1, library)
+    if len(text) > plain_bytes:
+        # The ratio limits large results only: a bomb reaches the plain size with its first bytes.
+        used_bytes = len(data) - len(stream.unconsumed_tail)
+        if used_bytes * budget.inflate_ratio > plain_bytes:
+            text += stream.decompress(stream.unconsumed_tail, max_bytes + 1 - plain_bytes)
+        else:
+            max_bytes = plain_bytes  # the limit that the message broke
+    return _whole(text, stream, len(data), max_bytes)
 
 
 def inflate_up_to(data: bytes, max_bytes: int, library: ModuleType = zlib) -> bytes | None:
@@ -203,11 +201,7 @@ def inflate_up_to(data: bytes, max_bytes: int, library: ModuleType = zlib) -> by
         BadMessage: It is not one complete zlib stream.
     """
     text, stream = _inflated(data, max_bytes + 1, library)
-    if len(text) > max_bytes:
-        return None
-    if not stream.eof or stream.unused_data:
-        raise _not_one_stream_error()
-    return text
+    return None if len(text) > max_bytes else _whole(text, stream, len(data), max_bytes)
 
 
 def _inflated(data: bytes, max_bytes: int, library: ModuleType) -> tuple[bytes, Any]:
@@ -217,6 +211,15 @@ def _inflated(data: bytes, max_bytes: int, library: ModuleType) -> tuple[bytes, 
         return stream.decompress(data, max_bytes), stream
     except library.error as error:
         raise _not_zlib_error() from error
+
+
+def _whole(text: Text, stream: Any, size: int, max_bytes: int) -> Any:
+    """Return *text*, which *stream* inflated from *size* bytes, if it is complete and not too long."""
+    if len(text) > max_bytes:
+        raise _bomb_error(size, max_bytes)
+    if not stream.eof or stream.unused_data:
+        raise _not_one_stream_error()
+    return text
 
 
 def _inflate_rest(stream: Any, head: bytes, data: bytes, first: int, max_bytes: int) -> bytearray:
@@ -462,7 +465,7 @@ def check_json_counts(text: Text, budget: Budget) -> None:
 def _check_pieces(text: Text, pieces: Iterable[Text], budget: Budget, *, has_strings: bool) -> None:
     """Raise LimitExceeded if *text* exceeds a limit by what its *pieces* hold.
 
-    With *has_strings* the pieces hold the strings, and all of the text may be characters of strings.
+    With *has_strings* the pieces still hold the strings, whose length is not known: all characters count.
     """
     marks = containers = long_numbers = outside = 0
     for piece in pieces:
@@ -471,8 +474,13 @@ def _check_pieces(text: Text, pieces: Iterable[Text], budget: Budget, *, has_str
         containers += LIST_VALUES * piece.count(b"[") + MAP_VALUES * piece.count(b"{")
         if _LONG_RUN in piece.translate(_ZEROS):
             long_numbers += sum(1 for _ in _LONG_NUMBER.finditer(piece.translate(_ONES, b".")))
-    if marks + containers >= budget.values or long_numbers > _MAX_LONG_NUMBERS:
+    if marks + containers >= budget.values:
         raise _too_many_values_error(budget.values)
+    if long_numbers > _MAX_LONG_NUMBERS:
+        raise LimitExceeded(
+            f"more than {_MAX_LONG_NUMBERS} numbers have more than 19 significant digits",
+            hint="round the numbers before sending",
+        )
     strings = text.count(b'"') // 2
     characters = len(text) if has_strings else len(text) - outside
     memory = _STRING_BYTES * strings + _NUMBER_BYTES * max(0, marks - strings) + len(text)

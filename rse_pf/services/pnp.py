@@ -159,6 +159,8 @@ def register(registry: Registry, settings: PnpSettings) -> None:
                 hint="loosen the matcher, or skip this frame",
             )
         options = request.options or defaults
+        if options.max_iterations == PnpOptions().max_iterations:  # left out, so the server's limit holds
+            options = msgspec.structs.replace(options, max_iterations=defaults.max_iterations)
         if options.max_iterations > settings.max_iterations:
             raise LimitExceeded(
                 f"{options.max_iterations} iterations are above {settings.max_iterations}",

@@ -46,7 +46,7 @@ _OWN_SHARE = 0.9
 _UNLIMITED = 1 << 30
 # The burst is what a robot sends in this time at its rate: the frames of one reconnect.
 _BURST_S = 2.0
-# A server is loaded if a command queued for longer; equals its ``QUEUE_TARGET_S``.
+# A server is loaded if a command waited in its queue for longer than this, in ms.
 _SHORT_QUEUE_MS = 50.0
 # An outage is long if it took more than this share of a frame's time.
 _LONG_OUTAGE_SHARE = 0.5

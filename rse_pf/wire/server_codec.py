@@ -1,6 +1,7 @@
-"""The codecs of servers and of the Lambda: isal inflates and deflates, simdjson parses JSON.
+"""The codecs of servers and of the Lambda: isal inflates and deflates short messages, simdjson parses JSON.
 
-They read the same messages as those of `rse_pf.wire.codec`, in a third of the time.
+They read the messages of `rse_pf.wire.codec` in half of the time, but refuse a field of the message that is
+there twice, and integers of more than 64 bits.
 """
 
 from __future__ import annotations
@@ -88,27 +89,31 @@ class _JsonReader:
         check_json_counts(text, self._budget)
         try:
             document = self._new_parser().parse(text)
+            fields = self._pnp_fields(document, text) or self._fields(document, text)
         except (RuntimeError, ValueError) as error:  # RuntimeError: an integer of more than 64 bits
             check_json_containers(text, self._budget)
             raise BadMessage(f"not a message: {error}", hint=_HINT) from error
-        fields = self._pnp_fields(document, text)
-        if fields is None:
-            check_json_containers(text, self._budget)
-            if not isinstance(document, self._object):
-                raise BadMessage("a message is not a JSON object", hint=_HINT)
-            fields = document.as_dict()
-            if len(fields) < len(document):
-                raise BadMessage("a message has a field twice", hint="compare it with docs/protocol.md")
         name = fields.get("type")
         # Of a union, which an unknown type means, msgspec makes a new converter each time.
         kind = _KINDS.get(name, FromRobot) if isinstance(name, str) else FromRobot
         message: FromRobot = decode_guarded(partial(msgspec.convert, type=kind), fields)
         return message
 
-    def _pnp_fields(self, document: Any, text: bytes | bytearray) -> dict[str, Any] | None:
-        """Return the fields of a `pnp` command, its payload as a request; None if it has any other field.
+    def _fields(self, document: Any, text: bytes | bytearray) -> dict[str, Any]:
+        """Return the fields of any message."""
+        check_json_containers(text, self._budget)
+        if not isinstance(document, self._object):
+            raise BadMessage("a message is not a JSON object", hint=_HINT)
+        fields: dict[str, Any] = document.as_dict()
+        if len(fields) < len(document):
+            raise BadMessage("a message has a field twice", hint="compare it with docs/protocol.md")
+        return fields
 
-        No field is repeated, and no list is in a list, which simdjson would flatten.
+    def _pnp_fields(self, document: Any, text: bytes | bytearray) -> dict[str, Any] | None:
+        """Return the fields of a `pnp` command, its payload as a request; None if it is not a plain one.
+
+        In a plain one no field is unknown or repeated, no list is in a list, which simdjson would flatten,
+        and the request is valid.
         """
         types = self._pnp
         if types is None or not isinstance(document, self._object) or document.get("service") != "pnp":
@@ -124,7 +129,7 @@ class _JsonReader:
             request = {name: self._plain(payload[name], name, types) for name in parts}
             fields = {name: document[name] for name in names if name != "payload"}
             return {**fields, "payload": as_type(request, types.request)}
-        except (RsePfError, TypeError, ValueError):  # which the service says in words of its own
+        except (RsePfError, TypeError, ValueError):  # the service refuses the payload, and says why
             return None
 
     def _plain(self, value: Any, name: str, types: PnpTypes) -> Any:
@@ -134,8 +139,8 @@ class _JsonReader:
         if not isinstance(value, self._object):
             return value
         plain = value.as_dict()
-        if len(plain) < len(value) or not types.objects[name].issuperset(plain):
-            raise ValueError(f"{name} has unknown or repeated fields")
+        if len(plain) < len(value) or not types.objects.get(name, frozenset()).issuperset(plain):
+            raise ValueError(f"{name} is no object, or has unknown or repeated fields")
         return plain
 
 

@@ -87,7 +87,7 @@ CLOSE_UNSUPPORTED = 4406
 CLOSE_REPLACED = 4409
 CLOSE_RATE = 4429
 MAX_BAD_MESSAGES = 10
-"""Undecodable messages of one socket, without a readable id, before it is closed by either side."""
+"""Undecodable messages without a readable id after which robot and server close the socket."""
 # An undecodable message counts once more for so many bytes.
 _BAD_MESSAGE_BYTES = 65_536
 
@@ -167,7 +167,8 @@ class ServerSession:
         topics: The topic of each live subscription, by its id.
         bad_messages: How many invalid messages arrived whose id could not be read; a long one counts several
             times.
-        refused_commands: The same of those whose id could be read; each valid command takes one away.
+        refused_commands: How many invalid messages arrived whose id could be read, less one for each valid
+            command since.
         suspicion: The sum of both; a robot with less is read first.
         is_pinged: Whether the server asks a silent client by WebSocket pings, because it sends none itself.
         ends_when_idle: Whether the connection ends with the answer to its last command.

@@ -8,9 +8,9 @@ import msgspec
 import numpy as np
 import pytest
 
-from rse_pf.config import PlatformSettings
+from rse_pf.config import PlatformSettings, PnpSettings
 from rse_pf.geometry import Array, exp_se3, transform
-from rse_pf.pnp import DepthNoise, refine_with_depth, solve_pnp
+from rse_pf.pnp import DepthNoise, PnpOptions, refine_with_depth, solve_pnp
 from rse_pf.pnp.problems import KINECT
 from rse_pf.service import dispatch
 from rse_pf.services.builtin import builtin_services
@@ -155,3 +155,17 @@ def test_no_finite_numbers_make_the_service_fail() -> None:
         assert isinstance(found, PnpReply) or found.code in {
             "bad-request", "no-consensus", "degenerate", "ambiguous",
         }, found  # fmt: skip
+
+
+def test_a_servers_lower_limit_of_iterations_holds_where_a_robot_names_none() -> None:
+    registry = builtin_services(PlatformSettings(pnp=PnpSettings(max_iterations=100)))
+    points, pixels, _ = _views()
+
+    def answer(options: PnpOptions) -> Result | Failure:
+        request = make_request(points, pixels, KINECT, options)
+        return dispatch(registry, Command(id=1, service="pnp", payload=request), lambda: 0.0)
+
+    assert isinstance(answer(PnpOptions(inlier_px=4.0)), Result)
+    refused = answer(PnpOptions(max_iterations=101))
+    assert isinstance(refused, Failure)
+    assert "101 iterations are above 100" in refused.message

@@ -32,7 +32,7 @@ def over_the_wire(values: Any, codec: str) -> npt.NDArray[np.float64]:
 
 FLOATS = st.floats(-1e150, 1e150, allow_subnormal=True)
 SIDE = 13
-"""Each number may be one that takes long to read, which counts as 161 of the 30,000 values of a message."""
+"""Each number may be one that takes long to read, of which a message may have 400."""
 
 
 @pytest.mark.parametrize("codec", CODECS)

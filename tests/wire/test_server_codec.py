@@ -103,7 +103,7 @@ def sample(codec: str, n: int = 20, options: PnpOptions | None = None, *, deep: 
 
 
 @pytest.mark.parametrize("codec", ["json", "zlib"])
-@pytest.mark.parametrize("options", [None, PnpOptions(inlier_px=4.0, engine="poselib"), PnpOptions()])
+@pytest.mark.parametrize("options", [None, PnpOptions(inlier_px=4.0, engine="opencv"), PnpOptions()])
 def test_a_plain_command_is_read_as_its_request_and_means_the_same(
     codec: str, options: PnpOptions | None
 ) -> None:
@@ -348,3 +348,30 @@ def test_json_dumps_of_a_robot_without_the_sdk_is_read_at_once() -> None:
 
     assert payload_type("json", plain) is PnpRequest
     assert_alike("json", plain)
+
+
+@pytest.mark.parametrize("part", ["camera", "points_world", "pixels", "depths_m", "options", "depth_noise"])
+@pytest.mark.parametrize("value", ["{}", '{"a":1}', "[{}]", '"x"', "true", "[[1],[2]]", "null"])
+@pytest.mark.parametrize("brackets", ["", "[", "[["])
+def test_a_part_of_another_kind_is_a_message_that_the_service_refuses_or_reads(
+    part: str, value: str, brackets: str
+):
+    trace = f'"trace":"{brackets}",'
+    data = (
+        '{"type":"command","id":1,"service":"pnp",' + trace + '"payload":{"' + part + '":' + value + "}}"
+    ).encode()
+
+    assert outcome(SERVER["json"], data) == outcome(ROBOT["json"], data)
+
+
+def test_the_largest_request_of_pnp_is_read():
+    problem = make_problem(seed=1, n=5000)
+    request = make_request(
+        problem.points_world, problem.pixels, problem.camera, PnpOptions(), depths_m=np.full(5000, 12.345)
+    )
+    data = ROBOT["json"].encode(Command(id=1, service="pnp", payload=request))
+
+    message = SERVER["json"].decode_from_robot(data)
+
+    assert isinstance(message, Command)
+    assert as_type(message.payload, PnpRequest).depths_m.size == 5000

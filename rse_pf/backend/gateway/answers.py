@@ -276,7 +276,7 @@ class Answers:
 
 
 def _tell_pose(tap: RecordingTap, message: Result | Failure, data: bytes) -> None:
-    """Pass to a recording the pose in *data*, the answer to a command that the native core read."""
+    """Pass to a recording the pose in *data*, the answer to a plain `pnp` command."""
     pose = getattr(message.reply, "T_camera_world", None) if isinstance(message, Result) else None
     if isinstance(message, Result) and isinstance(pose, np.ndarray) and pose.dtype == np.float64:
         tap.has_pose(data, message.id, pose.tobytes())

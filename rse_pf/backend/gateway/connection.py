@@ -271,13 +271,16 @@ class RobotConnection:
     def hold_until_answered(self, command_id: int) -> None:
         """Read nothing more from the robot until a command is answered."""
         self._awaited_id = command_id
-        self._deferred = deque()
-        self._wire.hold()
+        if self._deferred is None:
+            self._deferred = deque()
+            self._wire.hold()
 
     def _read_deferred(self) -> None:
+        if self._deferred is None:
+            return
         deferred, self._deferred = self._deferred, None
         now = self._context.clocks.monotonic()
-        for waiting, was_text in deferred or ():
+        for waiting, was_text in deferred:
             if not self._assembler.closed:
                 self._take(waiting, was_text, now)
         self._wire.read_on()
@@ -328,7 +331,7 @@ class RobotConnection:
         if decisions is not None and len(decisions) == 1 and type(decisions[0]) is Submit:
             command = decisions[0].command
             if self.tap is not None and isinstance(command.payload, Struct):
-                # A request: the codec knows all fields of the message.
+                # The codec decodes a payload to a request only if it knows all fields of the message.
                 self.tap.is_plain(data, command.id, f"{command.stream} {command.trace}")
             handler.submit(self, command, len(data), now)
         elif decisions is not None:
@@ -348,7 +351,8 @@ class RobotConnection:
                     self._follow(session, decisions, len(data), now, state, suspicion)
                 finally:
                     works_for[0] = 0
-            self._read_deferred()
+            if self._awaited_id is None:
+                self._read_deferred()
 
         self._deferred = deque()
         self._wire.hold()

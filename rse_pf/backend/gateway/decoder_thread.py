@@ -14,14 +14,14 @@ from collections.abc import Callable
 
 from rse_pf.backend.ports import CrashMarks
 from rse_pf.backend.scheduling.scheduler import INLINE_BYTES
-from rse_pf.errors import ProtocolError
+from rse_pf.errors import BadMessage, ProtocolError
 from rse_pf.wire import Codec
 from rse_pf.wire.messages import FromRobot
 
 __all__ = ["DecoderThread"]
 
 _MAX_INLINE_RATIO = 4
-"""A message that is decoded in the event loop may inflate to so many times ``inline_bytes``; JSON of numbers
+"""A message that is decoded in the event loop may inflate to this many times `INLINE_BYTES`; JSON of numbers
 inflates to two or three times its size."""
 
 Done = Callable[[FromRobot | ProtocolError], None]
@@ -30,7 +30,19 @@ Done = Callable[[FromRobot | ProtocolError], None]
 class DecoderThread:
     """The decoder thread of one worker; it starts with the first long message."""
 
-    def __init__(self, call_soon_threadsafe: Callable[..., object], crash: CrashMarks) -> None:
+    def __init__(
+        self,
+        call_soon_threadsafe: Callable[..., object],
+        crash: CrashMarks,
+        on_defect: Callable[[Exception], None],
+    ) -> None:
+        """Decode nothing yet.
+
+        Args:
+            call_soon_threadsafe: Calls a function in the event loop.
+            crash: Notes whose message is decoded.
+            on_defect: Takes, in the event loop, an exception that a codec should not raise.
+        """
         self.short_bytes = INLINE_BYTES
         """A message up to this size, on the wire, is tried in the event loop."""
         self.short_inflated_bytes = _MAX_INLINE_RATIO * INLINE_BYTES
@@ -38,6 +50,7 @@ class DecoderThread:
         """Length of the messages that wait or are being decoded."""
         self._call = call_soon_threadsafe
         self._crash = crash
+        self._on_defect = on_defect
         self._count = 0
         self._waiting: list[tuple[int, int, int, Codec, bytes, Done]] = []
         self._changed = threading.Condition()
@@ -51,7 +64,7 @@ class DecoderThread:
             codec: The codec of the robot.
             data: One whole message, which `Admission.may_wait` let pass.
             number: Of the connection of the robot.
-            suspicion: How many messages of the robot could not be decoded; robots with fewer come first.
+            suspicion: `ServerSession.suspicion` of the robot; robots with less come first.
             done: Takes the message, or why it is none.
         """
         with self._changed:
@@ -82,6 +95,9 @@ class DecoderThread:
                 message = codec.decode_from_robot(data)
             except ProtocolError as error:
                 message = error
+            except Exception as error:  # noqa: BLE001  the messages of other robots are decoded after it
+                message = BadMessage("the message cannot be decoded", hint="compare it with docs/protocol.md")
+                self._call(self._on_defect, error)
             finally:
                 self._crash.compute_for(0)
             with self._changed:

@@ -6,6 +6,7 @@ is known here.  Each queue (`CommandQueue`) answers what it took.
 
 from __future__ import annotations
 
+import traceback
 from collections.abc import Sequence
 from functools import partial
 from typing import Any
@@ -57,7 +58,7 @@ class Dispatcher:
         updates: LiveMapRouter | None = None,
         topics: RosbridgeTopics | None = None,
     ) -> None:
-        """Take no connection yet; start the solver threads and the timer of idle connections.
+        """Take no connection yet; `start` begins to look for idle ones.
 
         Args:
             context: The settings, clocks, event loop and log of the worker.
@@ -73,7 +74,7 @@ class Dispatcher:
         self.connections = token_watch.connections
         self.admission = Admission(settings.session)
         self.rates = self.admission.rates
-        self.decoder = DecoderThread(context.loop.call_soon_threadsafe, context.crash)
+        self.decoder = DecoderThread(context.loop.call_soon_threadsafe, context.crash, self._log_defect)
         self.stateless = StatelessQueue(context, answers)
         self._queues: tuple[CommandQueue, ...] = (*queues, self.stateless)
         self._answers = answers
@@ -131,6 +132,10 @@ class Dispatcher:
         else:
             self._add_connection(connection, expires_s, now)
         return connection
+
+    def _log_defect(self, error: Exception) -> None:
+        text = "".join(traceback.format_exception(error))
+        self.context.log.error("defect", traceback=text)
 
     def _rosbridge_session(self, accepted: Accepted) -> RosbridgeSession:
         limits = self.context.settings.session

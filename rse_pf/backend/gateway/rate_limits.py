@@ -29,8 +29,7 @@ HANDSHAKE_BURST = 1000.0
 """Sockets or handshakes above their rate that are accepted at once: a fleet that comes back."""
 _MAX_NAMES = 20000
 """Robots or addresses remembered at a time; those that did nothing wrong are forgotten first."""
-_MIN_RETRY_MS = 1.0
-"""An IPv4 or IPv6 address, perhaps with a port, as load balancers append it."""
+_MIN_RETRY_MS = 1.0  # a refused robot waits at least this long, in ms
 
 Key = TypeVar("Key", bound=Hashable)
 Value = TypeVar("Value")

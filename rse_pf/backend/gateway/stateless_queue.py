@@ -38,7 +38,7 @@ class StatelessQueue(CommandQueue):
     """Commands of stateless services that wait or run."""
 
     def __init__(self, context: WorkerContext, answers: Answers) -> None:
-        """Start the solver threads; they do nothing before the first command.
+        """Compute nothing yet; the solver threads start with the first command that needs them.
 
         Args:
             context: The settings, clocks and event loop of the worker.

@@ -258,6 +258,25 @@ def test_a_robot_that_ignores_its_pause_is_read_one_command_at_a_time(worker: Wo
         assert results(wire)[-1].id == number
 
 
+def test_nothing_is_lost_while_a_long_command_of_a_robot_that_ignores_pauses_is_decoded(worker: WorkerParts):
+    connection, wire = worker.join()
+    worker.say(connection, echo(7, deadline_ms=250.0))
+    running = overload(worker)
+    send_until_refused(worker, connection, wire)
+    for number in range(30, 39):
+        worker.say(connection, echo(number, deadline_ms=250.0))
+    assert refused(wire)[-9:] == list(range(30, 39))
+
+    worker.say(connection, Command(id=40, service="echo", payload={"text": "x" * 20_000}, deadline_ms=60e3))
+    worker.say(connection, echo(41, deadline_ms=60e3))
+    worker.loop.run_until(lambda: worker.dispatcher.held > 2)
+    end_overload(worker, running)
+    worker.say(worker.join("next")[0], echo(1))
+    worker.loop.run_until(lambda: [result.id for result in results(wire)[-2:]] == [40, 41])
+
+    assert wire.holds == 0
+
+
 def test_hellos_pings_and_unknown_services_are_decoded_even_behind(worker: WorkerParts):
     overload(worker)
     connection, wire = worker.join()
