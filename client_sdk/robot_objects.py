@@ -7,7 +7,7 @@ import hashlib
 import ssl
 from collections.abc import Awaitable, Callable
 
-from client_sdk.network.data_requests import MAX_SINGLE_PUT_BYTES, NO_UPSTREAM, DataRequests, error_of
+from client_sdk.network.data_requests import MAX_SINGLE_PUT_BYTES, DataRequests
 from rse_pf.errors import LimitExceeded, Unauthorized
 
 __all__ = ["RobotObjects"]
@@ -66,9 +66,7 @@ class RobotObjects:
 
 def _put(requests: DataRequests, data: bytes, token: str) -> str:
     digest = hashlib.sha256(data).hexdigest()
-    status, _, content = requests.request("PUT", f"/data/v1/objects/{digest}", data, {}, token)
-    if content == NO_UPSTREAM:
-        raise requests.no_service()
-    if status >= 400:
-        raise error_of(status, content)
+    error = requests.failure(*requests.request("PUT", f"/data/v1/objects/{digest}", data, {}, token))
+    if error is not None:
+        raise error
     return digest

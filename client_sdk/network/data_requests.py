@@ -4,27 +4,44 @@ from __future__ import annotations
 
 import http.client
 import json
+import socket
 import ssl
-from urllib.parse import urlsplit
+from urllib.parse import SplitResult
 
+from client_sdk.network.dialling import explain_unconnected, split_address
+from client_sdk.network.foreign_answers import (
+    HttpAnswer,
+    explain_answer,
+    explain_certificate,
+    explain_silence,
+)
+from client_sdk.network.probe import dial, port_of, probe
+from client_sdk.network.proxies import TunnelRefused
 from client_sdk.token_text import strip_token
 from rse_pf.errors import (
-    BadRequest,
-    CommandFailed,
     ConnectError,
-    NotFound,
     RsePfError,
     UsageError,
     error_from_code,
 )
 
-__all__ = ["CONNECTIONS", "MAX_SINGLE_PUT_BYTES", "NO_UPSTREAM", "DataRequests", "Response", "error_of"]
+__all__ = [
+    "MAX_SINGLE_PUT_BYTES",
+    "NO_UPSTREAM",
+    "DataRequests",
+    "Response",
+    "open_connection",
+]
 
 MAX_SINGLE_PUT_BYTES = 262_144
 """Larger objects are sent in parts."""
 NO_UPSTREAM = b"no healthy upstream"
 """The body of the load balancer's 503 while it knows no data server at all."""
-CONNECTIONS = {True: http.client.HTTPSConnection, False: http.client.HTTPConnection}
+_PROBE_S = 1.0
+"""How long a peer that gave no usable answer may take when it is asked again; a live one needs less."""
+_HTTP_SCHEMES = {"ws": "http", "wss": "https"}
+_FOREIGN_STATUSES = (301, 302, 303, 308, 407, 511)
+"""Of login pages and proxies; the data service redirects by 307 only, to presigned addresses."""
 
 Response = tuple[int, http.client.HTTPMessage, bytes]
 
@@ -43,11 +60,16 @@ class DataRequests:
         Raises:
             UsageError: *url* is not such an address.
         """
-        parts = urlsplit(url)
-        if parts.scheme not in ("http", "https", "ws", "wss") or not parts.hostname:
-            raise UsageError(f"{url!r} is not an address of a data service", hint="write https://HOST")
-        self.secure = parts.scheme in ("https", "wss")
-        self.host, self._port = parts.hostname, parts.port
+        error = UsageError(f"{url!r} is not an address of a data service", hint="write https://HOST")
+        parts = split_address(url, ("http", "https", "ws", "wss"), error)
+        scheme = _HTTP_SCHEMES.get(parts.scheme, parts.scheme)
+        netloc = parts.netloc.rpartition("@")[2]
+        self._parts = SplitResult(scheme, netloc, "", "", "")
+        self.secure = scheme == "https"
+        self.host = self._parts.hostname or ""
+        self.is_wrong_address = False
+        """Whether the last request failed in a way that only another address or setting changes."""
+        self._has_answered = False
         self._timeout_s, self._ssl_context = timeout_s, ssl_context
         self._connection: http.client.HTTPConnection | None = None
 
@@ -67,21 +89,38 @@ class DataRequests:
             Unauthorized: *token* is no text of a token.
         """
         authorization = {"Authorization": f"Bearer {strip_token(token)}"}
+        self.is_wrong_address = False
         try:
             if self._connection is None:
-                self._connection = self._new_connection()
+                self._connection = open_connection(self._parts, self._timeout_s, self._ssl_context)
             self._connection.request(method, path, body, {**authorization, **headers})
             answer = self._connection.getresponse()
             content = answer.read()
+        except TunnelRefused as refused:
+            self.is_wrong_address = refused.is_lasting
+            raise refused.error from None
         except (OSError, http.client.HTTPException) as broken:
             self.close()
-            raise ConnectError(
-                f"no answer from {self.host}: {broken or type(broken).__name__}",
-                hint="call again to resume the transfer",
-            ) from broken
+            raise self._explain(broken) from broken
         if answer.will_close:
             self.close()
+        self._has_answered = True
         return answer.status, answer.headers, content
+
+    def failure(self, status: int, headers: http.client.HTTPMessage, content: bytes) -> RsePfError | None:
+        """Return the typed error of an answer, None if it is a success of the data service.
+
+        Login pages and proxies answer with 200 and redirects, too; none of their answers is a success.
+        """
+        lower = {name.lower(): value for name, value in headers.items()}
+        is_foreign = status in _FOREIGN_STATUSES or "html" in lower.get("content-type", "").lower()
+        if not is_foreign and status < 400:
+            return None
+        if content == NO_UPSTREAM:
+            return self.no_service()
+        error = None if is_foreign else _error_of(content)
+        answer = HttpAnswer(status=status, headers=lower, body=content)
+        return error or explain_answer(self._parts.geturl(), answer)
 
     def no_service(self) -> ConnectError:
         """Return what `NO_UPSTREAM` means."""
@@ -90,22 +129,63 @@ class DataRequests:
             hint="start rse-pf local without --no-data; in a cloud, set data.enabled",
         )
 
-    def _new_connection(self) -> http.client.HTTPConnection:
-        if self.secure and self._ssl_context is not None:
-            return http.client.HTTPSConnection(
-                self.host, self._port, timeout=self._timeout_s, context=self._ssl_context
-            )
-        made: http.client.HTTPConnection = CONNECTIONS[self.secure](
-            self.host, self._port, timeout=self._timeout_s
+    def _explain(self, broken: OSError | http.client.HTTPException) -> ConnectError:
+        """Return what it means that a request has no answer; a peer that never gave one is asked again."""
+        address = self._parts.geturl()
+        if isinstance(broken, ssl.SSLCertVerificationError):
+            self.is_wrong_address = True
+            return explain_certificate(
+                address, broken, issuer=probe(self._parts, _PROBE_S).issuer,
+                is_enrolled=self._ssl_context is not None,
+            )  # fmt: skip
+        if not self._has_answered:
+            known = probe(self._parts, _PROBE_S)
+            data, speaks_tls = known.data, known.certificate is not None
+            if isinstance(broken, http.client.BadStatusLine) and not isinstance(broken, ConnectionResetError):
+                data = data or str(broken).encode("latin-1", "replace")
+            self.is_wrong_address = self.secure != speaks_tls and (speaks_tls or bool(data))
+            return explain_silence(address, broken, certificate=known.certificate, data=data)
+        return ConnectError(
+            f"no answer from {self.host}: {broken or type(broken).__name__}",
+            hint="call again to resume the transfer",
         )
-        return made
 
 
-def error_of(status: int, content: bytes) -> RsePfError:
-    """Return the typed error of an answer of *status* 400 or above."""
+def open_connection(
+    parts: SplitResult, timeout_s: float, ssl_context: ssl.SSLContext | None = None
+) -> http.client.HTTPConnection:
+    """Return a connection to the host of *parts*, through the proxy of the environment if it has one.
+
+    Raises:
+        ConnectError: There is no connection.
+        OSError: TLS fails.
+        TunnelRefused: The proxy opens none.
+        UsageError: The variable of the proxy names none.
+    """
+    host, port = parts.hostname or "", port_of(parts)
+    made = http.client.HTTPConnection(host, port, timeout=timeout_s)
+    made.auto_open = 0  # it would not know the proxy
+    try:
+        connected = dial(parts, timeout_s)
+    except OSError as error:
+        raise explain_unconnected(parts._replace(path="", query="").geturl(), error) from error
+    connected.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    if parts.scheme == "https":
+        try:
+            context = ssl_context or ssl.create_default_context()
+            connected = context.wrap_socket(connected, server_hostname=host)
+        except BaseException:
+            connected.close()
+            raise
+        made.default_port = http.client.HTTPS_PORT  # of the header Host
+    made.sock = connected
+    return made
+
+
+def _error_of(content: bytes) -> RsePfError | None:
+    """Return the typed error in the body of a refusal, None if the data service did not write it."""
     try:
         error = json.loads(content)
         return error_from_code(str(error["code"]), str(error["message"]), hint=str(error.get("hint", "")))
-    except (ValueError, KeyError, TypeError):
-        kind = NotFound if status == 404 else BadRequest if status < 500 else CommandFailed
-        return kind(f"the data service answered {status}", hint="see the log of the data server")
+    except (ValueError, KeyError, TypeError, AttributeError):
+        return None

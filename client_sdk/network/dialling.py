@@ -1,16 +1,26 @@
 """What a failed attempt to connect means for the next one, and how an address is shown.
 
-Nothing here opens a socket.  Between a robot and its servers stand firewalls, load balancers and login pages
-that answer with HTTP statuses of their own.  Only a refusal with the mark of our servers concerns the robot
-itself: it may last, so the robot is told, and tries again much later.  Nothing ends a robot for good.
+Nothing here opens a socket.  `foreign_answers` names the cause if somebody else than our servers answered.
+Only a refusal with the mark of our servers concerns the robot itself: it may last, so the robot is told, and
+tries again much later.  Nothing ends a robot for good.
 """
 
 from __future__ import annotations
 
 import errno
+import socket
 import ssl
-from urllib.parse import urlsplit
+from collections.abc import Mapping
+from urllib.parse import SplitResult, urlsplit
 
+from client_sdk.network.foreign_answers import (
+    HttpAnswer,
+    explain_answer,
+    explain_bytes,
+    explain_certificate,
+    explain_silence,
+)
+from client_sdk.network.probe import Probed
 from rse_pf.errors import ConnectError, Forbidden, RsePfError, Unauthorized, UsageError
 from rse_pf.wire.refusal import CUT_OFF, RefusedHandshake, refusal_in
 
@@ -20,7 +30,9 @@ __all__ = [
     "ISSUE",
     "DialError",
     "dial_error_of",
+    "explain_unconnected",
     "hide_password",
+    "split_address",
     "unconnected_error",
     "unreachable",
     "untrusted_error",
@@ -33,8 +45,8 @@ ISSUE = (
     "rse-pf robot enrol; if it has one, rse-pf robot list shows whether it was disabled or has a newer key"
 )
 _MAX_RETRY_AFTER_S = 300.0
-_TIMES = (9, 10)
-"""Of X509_verify_cert_error_string(3): not yet valid, expired."""
+_WRONG_ADDRESS = (400, 404, 405, 407, 410, 426)
+"""Statuses that come again until somebody changes the URL, the proxy, or a program at the address."""
 _ANSWERED = (errno.ECONNREFUSED, errno.ECONNRESET, errno.ECONNABORTED)
 _FOR_ANY_TOKEN = ("disabled", CUT_OFF, "not-yet-valid")
 
@@ -74,62 +86,73 @@ class DialError(Exception):
 def unconnected_error(address: str, error: OSError) -> DialError:
     """Return the error of an attempt without a TCP connection to *address*."""
     is_answered = error.errno in _ANSWERED
-    return DialError(_unreachable(address, error), is_unanswered=not is_answered)
+    return DialError(explain_unconnected(address, error), is_unanswered=not is_answered)
 
 
-def unreachable(address: str, error: Exception) -> DialError:
-    """Return the error of an attempt that was connected and got no HTTP answer from *address*."""
-    return DialError(_unreachable(address, error), is_late=True)
+def explain_unconnected(address: str, error: OSError) -> ConnectError:
+    """Return what it means that there is no TCP connection to *address*."""
+    cause, parts = error.strerror or str(error) or type(error).__name__, urlsplit(address)
+    hint = CHECK_RUNNING
+    if isinstance(error, socket.gaierror):
+        cause = f"the name {parts.hostname} does not resolve: {cause}"
+        hint = "check the host in the URL, and the name server (DNS) of this network"
+    elif error.errno not in _ANSWERED:
+        hint = f"check the network of this robot, and that firewalls let it reach {parts.netloc}"
+    return ConnectError(f"cannot connect to {address}: {cause}", hint=hint)
 
 
-def _unreachable(address: str, error: Exception) -> ConnectError:
-    cause = getattr(error, "strerror", None) or str(error) or type(error).__name__
-    return ConnectError(f"cannot connect to {address}: {cause}", hint=CHECK_RUNNING)
+def unreachable(
+    address: str, error: Exception, *, first_bytes: bytes = b"", probed: Probed | None = None
+) -> DialError:
+    """Return the error of an attempt that was connected and got no HTTP/1.1 answer from *address*.
+
+    Args:
+        address: The URL as shown to users.
+        error: Of the attempt.
+        first_bytes: That the peer sent, and that are no HTTP/1.1.
+        probed: What the peer shows when it is asked again; None if it was not.
+    """
+    if first_bytes:
+        return DialError(explain_bytes(address, first_bytes), is_late=True)
+    known = probed or Probed()
+    explained = explain_silence(address, error, certificate=known.certificate, data=known.data)
+    is_wrong = known.certificate is not None if address.startswith("ws:") else bool(known.data)
+    return DialError(explained, is_late=True, is_wrong_address=is_wrong)
 
 
-def untrusted_error(address: str, error: ssl.SSLCertVerificationError) -> DialError:
+def untrusted_error(
+    address: str, error: ssl.SSLCertVerificationError, *, issuer: str = "", is_enrolled: bool = False
+) -> DialError:
     """Return the error of a server whose certificate this robot does not trust, or not now.
 
     A later attempt may succeed: in some networks another machine answers first, and clocks are set.
     """
-    hint = "connect by the file of rse-pf robot enrol ROBOT --out FILE, made by this platform"
-    if error.verify_code in _TIMES:
-        hint = "check the clock of this robot; a platform renews its certificate by itself"
-    why = error.verify_message.rstrip(".")
-    message = f"{address} shows a certificate that this robot does not trust: {why}"
-    return DialError(ConnectError(message, hint=hint), is_wrong_address=True)
+    explained = explain_certificate(address, error, issuer=issuer, is_enrolled=is_enrolled)
+    return DialError(explained, is_wrong_address=True)
 
 
-def dial_error_of(address: str, status: int, retry_after: str, body: bytes = b"") -> DialError:
+def dial_error_of(address: str, status: int, headers: Mapping[str, str], body: bytes = b"") -> DialError:
     """Return the error of an HTTP *status* that came instead of a WebSocket.
 
     Args:
         address: The URL as shown to users.
         status: HTTP status of the handshake.
-        retry_after: The header ``Retry-After``, empty if there was none.
+        headers: Of the answer, with any letters of their names.
         body: Of the answer; 401 and 403 concern this robot only with the mark of our servers in it.
     """
+    lower = {name.lower(): value for name, value in headers.items()}
+    retry_after = lower.get("retry-after", "")
     after_s = float(retry_after) if retry_after.isdecimal() else 0.0
     after_s = min(after_s, _MAX_RETRY_AFTER_S)
     if status in (401, 403):
         refusal = refusal_in(body, Unauthorized.code if status == 401 else Forbidden.code)
-        if refusal is None:
-            return DialError(_not_ours(address, status), after_s=after_s)
-        return DialError(
-            _refusal_error(address, status, refusal),
-            is_refusal=True, after_s=after_s, cause=refusal.cause, valid_from_s=refusal.valid_from_s,
-        )  # fmt: skip
-    is_client_error = 300 <= status < 500 and status != 429
-    hint = "check the URL: it ends with the path of the servers, /ws"
-    error = ConnectError(
-        f"{address} answers {status}", hint=hint if is_client_error else "it is full or not ready; try later"
-    )
-    return DialError(error, after_s=after_s, is_wrong_address=status in (400, 404))
-
-
-def _not_ours(address: str, status: int) -> RsePfError:
-    hint = "a firewall or a login page between robot and platform answered: ask who runs the network"
-    return ConnectError(f"{address} answers {status}, and it is not an RSE-PF server that says so", hint=hint)
+        if refusal is not None:
+            return DialError(
+                _refusal_error(address, status, refusal),
+                is_refusal=True, after_s=after_s, cause=refusal.cause, valid_from_s=refusal.valid_from_s,
+            )  # fmt: skip
+    error = explain_answer(address, HttpAnswer(status=status, headers=lower, body=body))
+    return DialError(error, after_s=after_s, is_wrong_address=status in _WRONG_ADDRESS)
 
 
 def _refusal_error(address: str, status: int, handshake: RefusedHandshake) -> RsePfError:
@@ -140,15 +163,21 @@ def _refusal_error(address: str, status: int, handshake: RefusedHandshake) -> Rs
     return Unauthorized("the token is missing, wrong or expired", hint=ISSUE)
 
 
+def split_address(url: str, schemes: tuple[str, ...], error: UsageError) -> SplitResult:
+    """Return the parts of *url*; raises *error* unless scheme, host and port can be used."""
+    try:
+        parts = urlsplit(url)
+        parts.port  # noqa: B018 - it is read when it is asked for
+        (parts.hostname or "").encode("idna")  # refuses empty labels, and those of more than 63 letters
+    except ValueError:  # UnicodeError is a ValueError, too
+        raise error from None
+    if parts.scheme not in schemes or not parts.hostname:
+        raise error
+    return parts
+
+
 def hide_password(url: str) -> str:
     """Return *url* without user name and password; raises UsageError if it is no WebSocket address."""
-    parts = urlsplit(url)
-    try:
-        port = parts.port
-    except ValueError:
-        port = -1
-    if parts.scheme not in ("ws", "wss") or not parts.hostname or port == -1:
-        raise UsageError(
-            f"{url!r} is not a WebSocket address", hint="write ws://HOST:PORT/ws or wss://HOST/ws"
-        )
+    error = UsageError(f"{url!r} is not a WebSocket address", hint="write ws://HOST:PORT/ws or wss://HOST/ws")
+    parts = split_address(url, ("ws", "wss"), error)
     return f"{parts.scheme}://{parts.netloc.rpartition('@')[2]}{parts.path}"

@@ -9,8 +9,9 @@ import asyncio
 import socket
 import ssl
 from collections.abc import Awaitable, Callable
+from functools import partial
 from typing import Any
-from urllib.parse import urlsplit
+from urllib.parse import SplitResult, urlsplit
 
 from websockets.asyncio.client import ClientConnection
 from websockets.asyncio.client import connect as websocket_connect
@@ -26,11 +27,14 @@ from client_sdk.network.dialling import (
     unreachable,
     untrusted_error,
 )
+from client_sdk.network.foreign_answers import explain_proxy
+from client_sdk.network.probe import Probed, port_of, probe
+from client_sdk.network.proxies import Proxy, TunnelRefused, check_tunnel, is_complete_head, proxy_of
 from client_sdk.network.tcp import TcpDialler
 from client_sdk.network.timings import ConnectTimings
 from client_sdk.token_text import strip_token
 from rse_pf.config import SessionSettings
-from rse_pf.errors import ConnectError, RsePfError, Unauthorized, UnsupportedProtocol
+from rse_pf.errors import ConnectError, RsePfError, Unauthorized, UnsupportedProtocol, UsageError
 from rse_pf.wire import SUBPROTOCOLS
 
 __all__ = ["Dialler", "Token", "websocket_options"]
@@ -41,6 +45,8 @@ Token = str | Callable[[], Awaitable[str]] | None
 
 _ANSWER_S = 1.0
 """How long a TCP connection may take before another attempt begins."""
+_FIRST_BYTES = 4096
+"""Of an answer that is no HTTP/1.1: its head, and the begin of a page."""
 
 
 def websocket_options(settings: SessionSettings, timings: ConnectTimings) -> dict[str, Any]:
@@ -63,6 +69,20 @@ class _StraightConnect(websocket_connect):
         return exc
 
 
+class _ObservedConnection(ClientConnection):
+    """Keep the peer's first bytes in *seen*: they name a peer that is no WebSocket server."""
+
+    def __init__(self, seen: bytearray, *args: Any, **options: Any) -> None:
+        super().__init__(*args, **options)
+        self._seen = seen
+
+    def data_received(self, data: bytes) -> None:
+        """Note the begin of the handshake's answer."""
+        if len(self._seen) < _FIRST_BYTES:
+            self._seen += data[:_FIRST_BYTES]
+        super().data_received(data)
+
+
 class Dialler:
     """Opens WebSockets as one robot; *codec* names the sub-protocol."""
 
@@ -75,6 +95,7 @@ class Dialler:
         self._settings = settings
         self._timings = timings
         self._tcp = TcpDialler()
+        self._opened: set[str] = set()
 
     async def open(self, url: str, on_answered: Callable[[], None]) -> tuple[ClientConnection, str | None]:
         """Return a WebSocket to *url* and the token that it was opened with; raises DialError.
@@ -117,18 +138,51 @@ class Dialler:
             raise DialError(error, is_refusal=True) from None
 
     async def _connect(self, url: str, on_answered: Callable[[], None]) -> socket.socket:
-        """Return a TCP connection to the host of *url*: what is tried is what dials."""
+        """Return a TCP connection to the host of *url*, through the proxy of the environment, if any."""
         parts, within_s = urlsplit(url), min(_ANSWER_S, self._timings.connect_timeout_s)
-        port = parts.port or (443 if parts.scheme == "wss" else 80)
+        host, port = parts.hostname or "", port_of(parts)
         try:
-            made = await self._tcp.connect(parts.hostname or "", port, within_s)
+            proxy = proxy_of(parts.scheme, host, port)
+        except UsageError as error:
+            raise DialError(error, is_wrong_address=True) from None
+        try:
+            if proxy is None:
+                made = await self._tcp.connect(host, port, within_s)
+            else:
+                made = await self._tcp.connect(proxy.host, proxy.port, within_s)
         except OSError as error:
             failed = unconnected_error(hide_password(url), error)
+            if proxy is not None:
+                failed.error = _proxy_error(url, proxy)
             if not failed.is_unanswered:
                 on_answered()
             raise failed from error
         on_answered()
+        if proxy is not None:
+            try:
+                await self._open_tunnel(made, proxy, parts, url)
+            except BaseException:
+                made.close()
+                raise
         return made
+
+    async def _open_tunnel(self, made: socket.socket, proxy: Proxy, parts: SplitResult, url: str) -> None:
+        loop = asyncio.get_running_loop()
+
+        async def ask() -> bytes:
+            await loop.sock_sendall(made, proxy.connect_request(parts.hostname or "", port_of(parts)))
+            head = b""
+            while not is_complete_head(head) and (byte := await loop.sock_recv(made, 1)):
+                head += byte
+            return head
+
+        try:
+            head = await asyncio.wait_for(ask(), self._timings.connect_timeout_s)
+            check_tunnel(hide_password(url), proxy, head)
+        except (OSError, asyncio.TimeoutError) as error:
+            raise DialError(_proxy_error(url, proxy)) from error
+        except TunnelRefused as refused:
+            raise DialError(refused.error, is_wrong_address=refused.is_lasting) from None
 
     async def _handshake(
         self, url: str, token: str | None, on_answered: Callable[[], None]
@@ -137,21 +191,30 @@ class Dialler:
         options["sock"] = await self._connect(url, on_answered)
         if self.ssl_context is not None and url.startswith("wss:"):
             options["ssl"] = self.ssl_context
+        seen = bytearray()
         try:
             websocket = await _StraightConnect(
                 url,
                 subprotocols=[Subprotocol(self._subprotocol)],
                 additional_headers={} if token is None else {"Authorization": f"Bearer {token}"},
+                create_connection=partial(_ObservedConnection, seen),  # type: ignore[arg-type]
                 **options,
             )
         except InvalidStatus as error:
             response = error.response
-            after = response.headers.get("Retry-After", "")
-            raise dial_error_of(address, response.status_code, after, bytes(response.body or b"")) from error
+            headers = dict(response.headers.raw_items())
+            raise dial_error_of(
+                address, response.status_code, headers, bytes(response.body or b"")
+            ) from error
         except ssl.SSLCertVerificationError as error:
-            raise untrusted_error(address, error) from error
+            issuer, is_enrolled = (await self._probe(url)).issuer, self.ssl_context is not None
+            raise untrusted_error(address, error, issuer=issuer, is_enrolled=is_enrolled) from error
         except (OSError, asyncio.TimeoutError, WebSocketException, EOFError) as error:
-            raise unreachable(address, error) from error
+            # An address where a WebSocket was once open has the right scheme and program.
+            is_asked = not seen and url not in self._opened
+            probed = await self._probe(url) if is_asked else None
+            raise unreachable(address, error, first_bytes=bytes(seen), probed=probed) from error
+        self._opened.add(url)
         if websocket.subprotocol != self._subprotocol:
             websocket.transport.abort()
             unsupported = UnsupportedProtocol(
@@ -159,3 +222,11 @@ class Dialler:
             )
             raise DialError(unsupported, is_wrong_address=True)
         return websocket
+
+    async def _probe(self, url: str) -> Probed:
+        within_s = min(_ANSWER_S, self._timings.connect_timeout_s)
+        return await asyncio.to_thread(probe, urlsplit(url), within_s)
+
+
+def _proxy_error(url: str, proxy: Proxy) -> ConnectError:
+    return explain_proxy(hide_password(url), proxy.shown, proxy.variable, None, has_credentials=False)

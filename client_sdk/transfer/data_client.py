@@ -26,13 +26,13 @@ import msgspec
 
 from client_sdk.enrolment import read_enrolment
 from client_sdk.network.data_requests import (
-    CONNECTIONS,
     MAX_SINGLE_PUT_BYTES,
     NO_UPSTREAM,
     DataRequests,
     Response,
-    error_of,
+    open_connection,
 )
+from client_sdk.network.proxies import TunnelRefused
 from rse_pf.config.front_door import LOCALISE_PATH
 from rse_pf.errors import Conflict, ConnectError, NotFound, RsePfError, StoreError, UsageError
 from rse_pf.maps.photos import Lens, MapOutline, PhotoLocation
@@ -308,22 +308,23 @@ class DataClient:
         begin, pause = options.clock(), options.first_pause_s
         end = begin + options.deadline_s
         while True:
-            error: RsePfError
+            error: RsePfError | None
             after_s = 0.0
             try:
                 token = self._token() if callable(self._token) else self._token
                 status, answer, content = self._requests.request(method, path, body, headers or {}, token)
             except ConnectError as broken:
+                if self._requests.is_wrong_address:
+                    raise
                 error = broken
             else:
-                if status < 400 or status in also:
+                error = self._requests.failure(status, answer, content)
+                if error is None or status in also:
                     return status, answer, content
-                error = error_of(status, content)
                 if status not in _RETRIED:
                     raise error
                 if content == NO_UPSTREAM:
                     end = min(end, begin + _NO_SERVICE_S)
-                    error = self._requests.no_service()
                 retry_after = answer.get("Retry-After", "")
                 after_s = float(retry_after) if retry_after.isdecimal() else 0.0
             wait_s = max(after_s, pause * options.random.uniform(0.5, 1.0))
@@ -390,15 +391,17 @@ def _ask_bucket(
 ) -> Response | None:
     """Send exactly *headers*, never the token, to a presigned address; None unless the request succeeded."""
     parts = urlsplit(url)
-    connection = CONNECTIONS[parts.scheme == "https"](parts.hostname or "", parts.port, timeout=timeout_s)
+    connection = None
     try:
+        connection = open_connection(parts, timeout_s)
         connection.request(method, f"{parts.path}?{parts.query}", body, dict(headers))
         answer = connection.getresponse()
         response = answer.status, answer.headers, answer.read()
-    except (OSError, http.client.HTTPException):
+    except (OSError, ValueError, http.client.HTTPException, TunnelRefused, RsePfError):
         return None
     finally:
-        connection.close()
+        if connection is not None:
+            connection.close()
     return response if answer.status in ((200, 206, 416) if method == "GET" else (200, 201)) else None
 
 

@@ -19,7 +19,7 @@ REFUSALS = [(401, "unauthorized", Unauthorized), (403, "forbidden", Forbidden)]
 
 @pytest.mark.parametrize(("status", "code", "error"), REFUSALS)
 def test_a_refusal_by_one_of_our_servers_concerns_the_robot(status, code, error):
-    failed = dial_error_of("ws://host/ws", status, "", refusal_body(code, "no", "ask"))
+    failed = dial_error_of("ws://host/ws", status, {}, refusal_body(code, "no", "ask"))
 
     assert isinstance(failed.error, error)
     assert failed.is_refusal
@@ -41,7 +41,7 @@ def test_a_refusal_by_one_of_our_servers_concerns_the_robot(status, code, error)
     ],
 )
 def test_a_refusal_of_whoever_stands_between_is_temporary(status, body):
-    failed = dial_error_of("ws://host/ws", status, "60", body)
+    failed = dial_error_of("ws://host/ws", status, {"Retry-After": "60"}, body)
 
     assert isinstance(failed.error, ConnectError)
     assert not failed.is_refusal
@@ -68,8 +68,8 @@ def test_every_refusal_of_the_handshake_carries_the_mark():
 
     assert isinstance(refused, Rejected)
     assert isinstance(origin, Rejected)
-    assert dial_error_of("ws://host/ws", refused.status, "", refused.body).is_refusal
-    assert dial_error_of("ws://host/ws", origin.status, "", origin.body).is_refusal
+    assert dial_error_of("ws://host/ws", refused.status, {}, refused.body).is_refusal
+    assert dial_error_of("ws://host/ws", origin.status, {}, origin.body).is_refusal
 
 
 @pytest.mark.parametrize(
@@ -97,7 +97,7 @@ def test_the_cause_and_the_time_of_a_refusal_reach_the_robot():
         cause="cut-off", valid_from_s=1700000000.0,
     )  # fmt: skip
 
-    failed = dial_error_of("ws://host/ws", 401, "", body)
+    failed = dial_error_of("ws://host/ws", 401, {}, body)
 
     assert (failed.error.message, failed.error.hint) == (
         "tokens issued before noon are revoked", "sign another one"
@@ -110,13 +110,13 @@ def test_the_cause_and_the_time_of_a_refusal_reach_the_robot():
 def test_a_time_that_is_none_is_not_believed(time):
     body = refusal_body("unauthorized", "no", "", cause="cut-off", valid_from_s=time)
 
-    assert dial_error_of("ws://host/ws", 401, "", body).valid_from_s is None
+    assert dial_error_of("ws://host/ws", 401, {}, body).valid_from_s is None
 
 
 def test_a_cause_with_line_breaks_is_not_shown():
     body = refusal_body("unauthorized", "no\x1b[2J\nroot:", "", cause="disabled")
 
-    assert dial_error_of("ws://host/ws", 401, "", body).error.message == ""
+    assert dial_error_of("ws://host/ws", 401, {}, body).error.message == ""
 
 
 @pytest.mark.parametrize(
@@ -124,7 +124,7 @@ def test_a_cause_with_line_breaks_is_not_shown():
     [(400, True, "URL"), (404, True, "URL"), (429, False, "later"), (503, False, "later")],
 )
 def test_other_statuses_allow_another_attempt_and_hint_at_the_cause(status, is_wrong_address, hint):
-    failed = dial_error_of("ws://host/ws", status, "")
+    failed = dial_error_of("ws://host/ws", status, {})
 
     assert isinstance(failed.error, ConnectError)
     assert not failed.is_refusal
@@ -134,7 +134,7 @@ def test_other_statuses_allow_another_attempt_and_hint_at_the_cause(status, is_w
 
 @pytest.mark.parametrize(("header", "after_s"), [("", 0.0), ("5", 5.0), ("86400", 300.0), ("soon", 0.0)])
 def test_the_wait_that_a_server_asks_for_is_bounded(header, after_s):
-    assert dial_error_of("ws://host/ws", 503, header).after_s == after_s
+    assert dial_error_of("ws://host/ws", 503, {"retry-after": header}).after_s == after_s
 
 
 def test_a_shown_address_holds_no_credentials():

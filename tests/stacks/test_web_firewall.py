@@ -66,7 +66,7 @@ def test_what_is_blocked_is_told_when_to_come_back_and_never_ends_a_robot(templa
         reply = PlayedFirewall([rule]).judge(SITE, "/data/x" if rule.name == "data" else "/burst", 0.0)
         reply = reply or PlayedFirewall([rule]).judge(SITE, "/ws", 0.0)
         assert reply is not None
-        failed = dial_error_of("ws://host/ws", reply.status, reply.headers["Retry-After"], reply.body)
+        failed = dial_error_of("ws://host/ws", reply.status, reply.headers, reply.body)
 
         assert reply.status == 429
         assert not failed.is_refusal
