@@ -246,7 +246,7 @@ class UnsupportedProtocol(ProtocolError, code="unsupported"):
 class ConnectError(ProtocolError, code="connect"):
     """The robot could not open or keep a connection.
 
-    Cause: No platform answers at the address, it is full, or a firewall or proxy is in between.
+    Cause: No platform answers at the address, it is full, or a firewall, proxy or login page is in between.
     Check: Run rse-pf local status on the platform, and compare its address with that of the robot.
     Fix: Start the platform with rse-pf local, correct the address, or try later if it is full.
     """

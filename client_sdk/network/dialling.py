@@ -8,6 +8,7 @@ tries again much later.  Nothing ends a robot for good.
 from __future__ import annotations
 
 import errno
+import os
 import socket
 import ssl
 from collections.abc import Mapping
@@ -96,7 +97,9 @@ def explain_unconnected(address: str, error: OSError) -> ConnectError:
     if isinstance(error, socket.gaierror):
         cause = f"the name {parts.hostname} does not resolve: {cause}"
         hint = "check the host in the URL, and the name server (DNS) of this network"
-    elif error.errno not in _ANSWERED:
+    elif error.errno in _ANSWERED:
+        cause = os.strerror(error.errno)  # asyncio writes a tuple of the address instead
+    else:
         hint = f"check the network of this robot, and that firewalls let it reach {parts.netloc}"
     return ConnectError(f"cannot connect to {address}: {cause}", hint=hint)
 

@@ -130,7 +130,7 @@ def explain_answer(address: str, answer: HttpAnswer) -> ConnectError:
     if status in (502, 504):
         hint = f"check that the servers of the platform run; {later}"
         return ConnectError(f"{says}: a proxy before the platform reaches no server", hint=hint)
-    if status >= 500:
+    if status >= 500 and status not in (501, 505):
         return ConnectError(f"{says}: the server failed", hint=f"see the log of the server; {later}")
     server = _clean(answer.headers.get("server", ""))
     by = f" (a server that calls itself {server!r})" if server else ""
@@ -177,8 +177,10 @@ def explain_silence(
         return ConnectError(f"{address} ends the TLS handshake: {reason}", hint=_CHECK_PORT)
     is_late = isinstance(error, (TimeoutError, asyncio.TimeoutError))
     cause = "sends no answer" if is_late else "closed the connection without an answer"
-    hint = "check host and port of the URL, and the platform: rse-pf local status"
-    return ConnectError(f"{address} {cause}", hint=hint)
+    hint = (
+        "check host and port of the URL; on the platform, rse-pf local status shows whether its servers run"
+    )
+    return ConnectError(f"{address} {cause}, as a program of another protocol does", hint=hint)
 
 
 def explain_certificate(
@@ -190,8 +192,8 @@ def explain_certificate(
     """
     why = error.verify_message.rstrip(".")
     by = _clean(issuer)
-    of = f" by {by!r}" if by else ""
-    message = f"{address} shows a certificate{of} that this robot does not trust: {why}"
+    of = f" (issued by {by!r})" if by else ""
+    message = f"{address} shows a certificate that this robot does not trust: {why}{of}"
     if error.verify_code in _TIMES:
         hint = "check the clock of this robot; a platform renews its certificate by itself"
     elif error.verify_code in _NAMES:

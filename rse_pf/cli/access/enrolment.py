@@ -52,6 +52,11 @@ def enrolment_lines(made: Enrolment, file: Path) -> list[str]:
         lines.append("only this machine reaches that address; rse-pf local --lan opens one to others")
     elif made.url.startswith("ws:"):
         lines.append("tokens and data cross the network in clear text: the address is no wss://")
+    elif not made.authority:
+        lines.append(
+            "the robot trusts the authorities of its machine; for a certificate of a private one enrol "
+            "again with --authority and the file of that authority"
+        )
     return lines
 
 

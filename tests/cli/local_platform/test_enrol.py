@@ -64,6 +64,7 @@ def test_the_file_holds_address_authority_and_the_key_that_the_roster_knows(
     [
         ("", "only this machine reaches that address"),
         (" --url ws://platform.example:8700/ws", "clear text"),
+        (" --url wss://platform.example/ws", "again with --authority"),
     ],
 )
 def test_an_address_that_is_of_little_use_is_said(
