@@ -40,9 +40,6 @@ NO_UPSTREAM = b"no healthy upstream"
 _PROBE_S = 1.0
 """How long a peer that gave no usable answer may take when it is asked again; a live one needs less."""
 _HTTP_SCHEMES = {"ws": "http", "wss": "https"}
-_FOREIGN_STATUSES = (301, 302, 303, 308, 407, 511)
-"""Of login pages and proxies; the data service redirects by 307 only, to presigned addresses."""
-
 Response = tuple[int, http.client.HTTPMessage, bytes]
 
 
@@ -113,13 +110,12 @@ class DataRequests:
         Login pages and proxies answer with 200 and redirects, too; none of their answers is a success.
         """
         lower = {name.lower(): value for name, value in headers.items()}
-        is_foreign = status in _FOREIGN_STATUSES or "html" in lower.get("content-type", "").lower()
-        if not is_foreign and status < 400:
+        answer = HttpAnswer(status=status, headers=lower, body=content)
+        if not answer.is_foreign and status < 400:
             return None
         if content == NO_UPSTREAM:
             return self.no_service()
-        error = None if is_foreign else _error_of(content)
-        answer = HttpAnswer(status=status, headers=lower, body=content)
+        error = None if answer.is_foreign else _error_of(content)
         return error or explain_answer(self._parts.geturl(), answer)
 
     def no_service(self) -> ConnectError:

@@ -20,6 +20,7 @@ from client_sdk.network.foreign_answers import (
     explain_bytes,
     explain_certificate,
     explain_silence,
+    parse_answer,
 )
 from client_sdk.network.probe import Probed
 from rse_pf.errors import ConnectError, Forbidden, RsePfError, Unauthorized, UsageError
@@ -116,7 +117,8 @@ def unreachable(
         probed: What the peer shows when it is asked again; None if it was not.
     """
     if first_bytes:
-        return DialError(explain_bytes(address, first_bytes), is_late=True)
+        is_wrong = parse_answer(first_bytes) is None
+        return DialError(explain_bytes(address, first_bytes), is_late=True, is_wrong_address=is_wrong)
     known = probed or Probed()
     explained = explain_silence(address, error, certificate=known.certificate, data=known.data)
     is_wrong = known.certificate is not None if address.startswith("ws:") else bool(known.data)

@@ -34,6 +34,8 @@ _DEFAULT_PORTS = {"http": 80, "https": 443}
 _SECURE = ("wss", "https")
 _CHECK_PORT = "check host and port of the URL: no RSE-PF server answers there"
 _STATUS_LINE = re.compile(rb"HTTP/(\d(?:\.\d)?) +(\d{3})\b[^\r\n]*")
+_FOREIGN_STATUSES = (101, 301, 302, 303, 308, 407, 511)
+"""Of login pages and proxies; the data service redirects by 307 only, to presigned addresses."""
 _TLS_WANTED = re.compile(rb"https|\bssl\b|\btls\b", re.IGNORECASE)
 """In the 400 of nginx, Apache and Go for plain HTTP at a TLS port."""
 _LOGIN = re.compile(
@@ -85,6 +87,12 @@ class HttpAnswer:
         """Whether the body is a page for a web browser."""
         kind = self.headers.get("content-type", "").lower()
         return "html" in kind or (not kind and self.body.lstrip()[:1] == b"<")
+
+    @property
+    def is_foreign(self) -> bool:
+        """Whether no data service sends this, which writes JSON or binary data: a login page, or a proxy."""
+        is_text = self.headers.get("content-type", "").lower().startswith("text/")
+        return self.status in _FOREIGN_STATUSES or is_text or self.is_page
 
 
 def parse_answer(data: bytes) -> HttpAnswer | None:
@@ -162,7 +170,8 @@ def explain_silence(
         certificate: That a second attempt with TLS was shown, None if the peer does not speak TLS.
         data: The peer's answer to a second attempt without TLS.
     """
-    is_http = parse_answer(data) is not None
+    answer = parse_answer(data)
+    is_http = answer is not None
     if not _is_secure(address) and (certificate is not None or is_of_tls_server(data)):
         return _explain_tls(address)
     if _is_secure(address) and certificate is None and is_http and not is_of_tls_server(data):
@@ -170,6 +179,12 @@ def explain_silence(
             f"write {_OTHER_SCHEME[urlsplit(address).scheme]}:// in the URL, or the port where TLS is spoken"
         )
         return ConnectError(f"{address} speaks HTTP without TLS", hint=hint)
+    if (
+        answer is not None
+        and answer.is_foreign
+        and (answer.status < 400 or answer.status in _FOREIGN_STATUSES)
+    ):
+        return explain_answer(address, answer)  # it closed before it had read the first request
     if data and not is_http and not is_of_tls_server(data):
         return explain_bytes(address, data)
     if isinstance(error, ssl.SSLError) and not isinstance(error, ssl.SSLEOFError):
@@ -256,19 +271,21 @@ def _explain_tls(address: str) -> ConnectError:
 
 def _explain_redirect(address: str, answer: HttpAnswer) -> ConnectError:
     says, parts = f"{address} answers {answer.shown}", urlsplit(address)
-    web = parts._replace(scheme=_WEB_SCHEME[parts.scheme])
+    web, location = parts._replace(scheme=_WEB_SCHEME[parts.scheme]), answer.headers.get("location", "")
     try:
-        target = urlsplit(urljoin(web.geturl(), answer.headers.get("location", "")))
+        target = urlsplit(urljoin(web.geturl(), location))
     except ValueError:
+        location = ""
+    if not location:
         return ConnectError(says, hint=_CHECK_PORT)
     shown = _clean(f"{target.scheme}://{target.netloc.rpartition('@')[2]}{target.path}", _MAX_ADDRESS)
     says += f", a redirect to {shown}"
     if target.hostname == web.hostname and target.scheme in _DEFAULT_PORTS:
-        is_same_path = target.path.rstrip("/") == web.path.rstrip("/")
-        if is_same_path and target.scheme == "https" and web.scheme == "http":
-            secure = f"{_OTHER_SCHEME[parts.scheme]}://{target.netloc}{target.path}"
+        is_login = _LOGIN.search(f"{target.path}?{target.query}") is not None
+        if not is_login and target.scheme == "https" and web.scheme == "http":
+            secure = f"{_OTHER_SCHEME[parts.scheme]}://{target.netloc}{parts.path}"
             return ConnectError(says, hint=f"write {_clean(secure, _MAX_ADDRESS)}: TLS is required there")
-        if not _LOGIN.search(f"{target.path}?{target.query}"):
+        if not is_login:
             return ConnectError(says, hint=_CHECK_PORT)
     return ConnectError(f"{says}: a login page", hint=_log_in(shown))
 
@@ -276,8 +293,10 @@ def _explain_redirect(address: str, answer: HttpAnswer) -> ConnectError:
 def _explain_success(address: str, answer: HttpAnswer) -> ConnectError:
     says = f"{address} answers {answer.shown}"
     if not answer.is_page:
-        kind = _clean(answer.headers.get("content-type", "")) or "no content type"
-        return ConnectError(f"{says} ({kind}) as no RSE-PF server does", hint=_CHECK_PORT)
+        kind = _clean(answer.headers.get("content-type", ""))
+        return ConnectError(
+            f"{says}{f' ({kind})' if kind else ''} as no RSE-PF server does", hint=_CHECK_PORT
+        )
     text = answer.body.decode("utf-8", "replace")
     title = _TITLE.search(text)
     of = f" {_clean(title[1])!r}" if title and _clean(title[1]) else ""

@@ -45,6 +45,8 @@ HTTP_CASES = [
     Case("nginx", NGINX_404, "'nginx/1.24.0'", "no RSE-PF server"),
     Case("TLS of nginx", http("400 Bad Request", "plain HTTP request sent to HTTPS port"), "TLS", "s://"),
     Case("TLS of Go", http("400 Bad Request", "request to an HTTPS server", version="1.0"), "TLS", "s://"),
+    Case("TLS by redirect", http("301 x\r\nLocation: https://127.0.0.1/a"), "https://127.0.0.1/a", "s://127.0"),
+    Case("text", http("200 OK\r\nContent-Type: text/plain", "MongoDB"), "text/plain", "host and port"),
     Case("gateway", http("502 Bad Gateway"), "reaches no server", "servers of the platform run"),
     Case("firewall", http("403 Forbidden\r\nContent-Type: text/html"), "not an RSE-PF server", "firewall"),
 ]  # fmt: skip
