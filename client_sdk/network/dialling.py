@@ -41,7 +41,7 @@ __all__ = [
 ]
 
 CHECK_RUNNING = "is the platform running? start it with rse-pf local start"
-CHECK_ADDRESS = "is it an RSE-PF server?"
+CHECK_ADDRESS = "check host, port and path of the URL: another kind of WebSocket server answers there"
 ISSUE = (
     "a token of rse-pf token issue is valid for 15 minutes: issue another one, or give the robot a key by "
     "rse-pf robot enrol; if it has one, rse-pf robot list shows whether it was disabled or has a newer key"

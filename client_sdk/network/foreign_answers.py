@@ -94,6 +94,11 @@ class HttpAnswer:
         is_text = self.headers.get("content-type", "").lower().startswith("text/")
         return self.status in _FOREIGN_STATUSES or is_text or self.is_page
 
+    @property
+    def is_login(self) -> bool:
+        """Whether a login page or a proxy sends this whatever is asked for."""
+        return self.status in _FOREIGN_STATUSES or (self.status < 300 and self.is_foreign)
+
 
 def parse_answer(data: bytes) -> HttpAnswer | None:
     """Return the HTTP answer of any version that *data* begins with, None if it is not HTTP."""
@@ -175,21 +180,19 @@ def explain_silence(
     if not _is_secure(address) and (certificate is not None or is_of_tls_server(data)):
         return _explain_tls(address)
     if _is_secure(address) and certificate is None and is_http and not is_of_tls_server(data):
-        hint = (
-            f"write {_OTHER_SCHEME[urlsplit(address).scheme]}:// in the URL, or the port where TLS is spoken"
-        )
+        hint = f"write {_OTHER_SCHEME[urlsplit(address).scheme]}:// in the URL, or a port that speaks TLS"
         return ConnectError(f"{address} speaks HTTP without TLS", hint=hint)
-    if (
-        answer is not None
-        and answer.is_foreign
-        and (answer.status < 400 or answer.status in _FOREIGN_STATUSES)
-    ):
+    if answer is not None and answer.is_login:
         return explain_answer(address, answer)  # it closed before it had read the first request
     if data and not is_http and not is_of_tls_server(data):
         return explain_bytes(address, data)
     if isinstance(error, ssl.SSLError) and not isinstance(error, ssl.SSLEOFError):
         reason = (error.reason or str(error)).replace("_", " ").lower()
-        return ConnectError(f"{address} ends the TLS handshake: {reason}", hint=_CHECK_PORT)
+        refused = (
+            "ask who runs the server or the firewall there why it refuses TLS 1.2 and newer from this robot"
+        )
+        hint = refused if "alert" in reason else _CHECK_PORT
+        return ConnectError(f"{address} ends the TLS handshake: {reason}", hint=hint)
     is_late = isinstance(error, (TimeoutError, asyncio.TimeoutError))
     cause = "sends no answer" if is_late else "closed the connection without an answer"
     hint = (
