@@ -11,9 +11,11 @@ import ssl
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from random import Random
-from urllib.parse import urlsplit
+from urllib.parse import SplitResult, urlsplit
 
 from client_sdk.answers import Answer
+from client_sdk.network.probe import dial, port_of
+from client_sdk.network.proxies import TunnelRefused, proxy_of
 from client_sdk.network.region_sockets import cancel_all
 from client_sdk.offloading.burst_rules import BurstRules, burst_address
 from rse_pf.config import BurstSettings
@@ -234,14 +236,13 @@ class Burst:
                 except _Stale:
                     continue
             connection.writer.transport.abort()
-        is_secure = parts.scheme == "https"
+        context = self._context(host) if parts.scheme == "https" else None
         try:
-            reader, writer = await asyncio.open_connection(
-                parts.hostname, parts.port or (443 if is_secure else 80), limit=_MAX_HEAD_BYTES,
-                ssl=self._context(host) if is_secure else None,
-            )  # fmt: skip
+            reader, writer = await _open_connection(parts, context)
         except ValueError as error:  # such as a..b, which the encoding of names refuses
             raise _BrokenHttp(f"{parts.hostname} cannot be the name of a host") from error
+        except TunnelRefused as refused:
+            raise refused.error from None
         return await self._exchange(reader, writer, head + body, idle, is_reused=False)
 
     async def _exchange(
@@ -283,6 +284,20 @@ class Burst:
         if self._default_context is None:
             self._default_context = ssl.create_default_context()
         return self._default_context
+
+
+async def _open_connection(
+    parts: SplitResult, context: ssl.SSLContext | None
+) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
+    """Connect to the host of *parts*, through the proxy of the environment if it has one."""
+    host, port = parts.hostname or "", port_of(parts)
+    if proxy_of(parts.scheme, host, port) is None:
+        return await asyncio.open_connection(host, port, limit=_MAX_HEAD_BYTES, ssl=context)
+    tunnel = await asyncio.to_thread(dial, parts, _LONGEST_S)
+    name = host if context is not None else None
+    return await asyncio.open_connection(
+        sock=tunnel, limit=_MAX_HEAD_BYTES, ssl=context, server_hostname=name
+    )
 
 
 def _parse_head(head: bytes) -> tuple[int, dict[str, str]]:

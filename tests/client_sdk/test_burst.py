@@ -6,10 +6,12 @@ import asyncio
 import socket
 from random import Random
 from typing import Any
+from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
 from fake_burst import FakeBurst
+from fake_peers import peer, proxy_to
 from fake_platform import FakePlatform
 
 import client_sdk
@@ -70,6 +72,19 @@ async def test_for_a_busy_server_the_function_of_the_welcome_answers_with_the_sa
         assert 0 < burst.commands[0].deadline_ms <= 5000
         stats = client.stats
         assert (stats.answered_by_burst, stats.answered_by_robot, stats.failed) == (1, 0, 0)
+
+
+async def test_a_function_behind_the_proxy_of_the_environment_answers(monkeypatch):
+    asked: list[str] = []
+    async with FakeBurst() as burst, told_of(burst) as platform:
+        platform.on_command = busy
+        with peer(proxy_to(urlsplit(burst.url).port, asked)) as port:
+            monkeypatch.setenv("http_proxy", f"http://127.0.0.1:{port}")
+            async with robot(platform.url, burst_url="http://burst.invalid/burst") as client:
+                answer = await client.solve_pnp(*FRAME, deadline_s=5.0)
+
+    assert answer.source == "burst"
+    assert asked[0].startswith("CONNECT burst.invalid:80 ")
 
 
 async def test_a_server_that_answers_is_never_replaced():
