@@ -9,6 +9,8 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from rse_pf.errors import RsePfError
+
 if TYPE_CHECKING:
     from client_sdk.answers import Answer, PoseAnswer, decode_reply
     from client_sdk.blocking import BlockingRobot, connect_blocking
@@ -54,6 +56,7 @@ __all__ = [
     "PoseAnswer",
     "PoseQuery",
     "Robot",
+    "RsePfError",
     "Stats",
     "TrackedFrame",
     "Tracker",

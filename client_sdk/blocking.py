@@ -1,21 +1,21 @@
 """The SDK for programs without asyncio: a robot whose event loop runs in a thread of its own.
 
-Every method calls its namesake of `client_sdk.robot.Robot`; any number of threads may call at the same time.
+Every method calls its namesake of `client_sdk.robot.Robot`; any number of threads may call at the same time,
+also the callables of the program, which have a thread of their own.
 """
 
 from __future__ import annotations
 
-import asyncio
 import functools
-import threading
 from collections.abc import Callable, Coroutine
 from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, TypeVar
 
 from client_sdk.closing import Closing
-from client_sdk.robot import Robot, connect
+from client_sdk.loop_thread import LoopThread
+from client_sdk.robot import MAX_DEADLINE_S, Robot, connect
 from client_sdk.stats import Stats
 from client_sdk.updates import BlockingUpdates, Updates
-from rse_pf.errors import Disconnected, RsePfError
+from rse_pf.errors import Disconnected, RsePfError, UsageError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -28,6 +28,9 @@ if TYPE_CHECKING:
 
 __all__ = ["BlockingRobot", "connect_blocking"]
 
+GRACE_S = 0.5  # an answer at the deadline, or Expired, comes by itself within this time unless the loop hangs
+SNAPSHOT_S = 1.0  # what only reads or writes a value in the loop takes no longer
+
 P = ParamSpec("P")
 T = TypeVar("T")
 
@@ -39,7 +42,10 @@ def _blocking(
 
     @functools.wraps(method)
     def call(self: BlockingRobot, /, *args: P.args, **kwargs: P.kwargs) -> T:
-        return self._wait(method(self._robot, *args, **kwargs))
+        deadline_s, limit_s = kwargs.get("deadline_s"), None
+        if isinstance(deadline_s, int | float):
+            limit_s = min(max(0.0, deadline_s), MAX_DEADLINE_S) + GRACE_S
+        return self._wait(method(self._robot, *args, **kwargs), limit_s)
 
     return call
 
@@ -77,28 +83,27 @@ class BlockingRobot(Closing):
 
     def __init__(self, robot: Robot) -> None:
         self._robot = robot
-        self._loop: asyncio.AbstractEventLoop | None = None
-        self._thread: threading.Thread | None = None
+        self._thread = LoopThread(robot.close)
 
     def __enter__(self) -> BlockingRobot:
         """Connect; raises Unauthorized or ConnectError."""
-        self._loop = asyncio.new_event_loop()
-        self._thread = threading.Thread(target=self._loop.run_forever, name="rse-pf-robot", daemon=True)
+        self._thread = LoopThread(self._robot.close)
+        self._robot.callbacks.start_thread()
         self._thread.start()
         try:
             self._wait(self._robot.__aenter__())
         except BaseException:
-            self._end()
+            self.close()
             raise
         return self
 
     def close(self) -> None:
-        """Close the connection and end the thread."""
-        if self._loop is not None:
-            try:
-                self._wait(self._robot.close())
-            finally:
-                self._end()
+        """Close the connection and end the threads; calls that wait end with Disconnected.
+
+        Any thread may call it, also a callable of the program, and again.
+        """
+        self._thread.close()
+        self._robot.callbacks.end_thread()
 
     solve_pnp = _blocking(Robot.solve_pnp)
     call = _blocking(Robot.call)
@@ -112,7 +117,7 @@ class BlockingRobot(Closing):
         async def begin() -> Updates:
             return self._robot.subscribe(topic)
 
-        return BlockingUpdates(self._wait(begin()), self._wait)
+        return BlockingUpdates(self._wait(begin(), SNAPSHOT_S), self._wait)
 
     def record_frame(self, frame: Frame, T_odom_camera: npt.NDArray[np.float64] | None = None) -> None:
         """Record a thumbnail of *frame* and its pose by odometry, as `Robot.record_frame` does."""
@@ -120,7 +125,7 @@ class BlockingRobot(Closing):
         async def record() -> None:
             self._robot.record_frame(frame, T_odom_camera)
 
-        self._wait(record())
+        self._wait(record(), SNAPSHOT_S)
 
     @property
     def connected(self) -> bool:
@@ -135,34 +140,17 @@ class BlockingRobot(Closing):
     @property
     def stats(self) -> Stats:
         """A snapshot of the robot's traffic."""
-        if self._loop is None:
-            return self._robot.stats
 
         async def snapshot() -> Stats:
             return self._robot.stats
 
-        return self._wait(snapshot())
-
-    def _wait(self, work: Coroutine[Any, Any, T]) -> T:
-        if self._loop is None:
-            work.close()
-            raise Disconnected(
-                "the robot is not connected", hint="use with client_sdk.connect_blocking(...) as robot"
-            )
-        future = asyncio.run_coroutine_threadsafe(work, self._loop)
         try:
-            return future.result()
-        except BaseException:
-            future.cancel()
-            raise
+            return self._wait(snapshot(), SNAPSHOT_S)
+        except (Disconnected, UsageError):  # no other thread changes the robot now
+            return self._robot.stats
 
-    def _end(self) -> None:
-        loop, thread = self._loop, self._thread
-        self._loop = self._thread = None
-        if loop is not None and thread is not None:
-            loop.call_soon_threadsafe(loop.stop)
-            thread.join()
-            loop.close()
+    def _wait(self, work: Coroutine[Any, Any, T], limit_s: float | None = None) -> T:
+        return self._thread.wait(work, limit_s)
 
 
 def _blocking_connect(make: Callable[P, Robot]) -> Callable[P, BlockingRobot]:
@@ -175,4 +163,4 @@ def _blocking_connect(make: Callable[P, Robot]) -> Callable[P, BlockingRobot]:
 
 
 connect_blocking = _blocking_connect(connect)
-"""Takes the arguments of `connect`; *on_change* is called in the thread of the event loop."""
+"""Takes the arguments of `connect`; callables of the program run in threads of their own."""

@@ -6,6 +6,7 @@ Every command ends with exactly one answer or one typed error, within its deadli
 from __future__ import annotations
 
 import asyncio
+import os
 import random as random_module
 import time
 from collections.abc import Callable, Generator, Sequence
@@ -15,8 +16,10 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 from client_sdk.answers import Answer, PoseAnswer
+from client_sdk.callbacks import Callbacks
 from client_sdk.enrolment import read_enrolment
 from client_sdk.local_services import LocalServices
+from client_sdk.loop_thread import not_connected_here
 from client_sdk.network.connection import Connection, ForRobot, OnChange
 from client_sdk.network.dialling import DialError
 from client_sdk.network.handshake import Token
@@ -51,10 +54,10 @@ if TYPE_CHECKING:
     from rse_pf.geometry import Camera
     from rse_pf.pnp import DepthNoise, PnpOptions
 
-__all__ = ["OnProgress", "Robot", "connect"]
+__all__ = ["MAX_DEADLINE_S", "OnProgress", "Robot", "connect"]
 
 
-_MAX_DEADLINE_S = 3600.0
+MAX_DEADLINE_S = 3600.0
 
 
 class Robot:
@@ -97,7 +100,7 @@ class Robot:
             wall_clock: Unix seconds: the clock by which *token* signs.
             random: Source of the jitter of reconnects.
             on_change: Called with ``link-lost``, ``refused``, ``link-back``, ``moved`` or ``stands-by``,
-                and the reason or the server.
+                and the reason or the server.  `Stats.callback_errors` counts what it raises.
             record: Folder for a recording of what this robot says and hears, for rse-pf replay.
             thumbnails: Whether small pictures of the frames of its `mapper` are recorded, too.
             burst_url: ``https://HOST/burst``, a function that answers while no server can, also before the
@@ -120,6 +123,7 @@ class Robot:
             codec=make_codec(codec, settings), settings=settings, sdk=f"rse-pf-python/{sdk_version()}"
         )
         self._recorder = make_recorder(record, thumbnails, settings)
+        self.callbacks = Callbacks(settings.ping_timeout_s)
         self._connection = Connection(
             urls,
             token=token,
@@ -130,6 +134,7 @@ class Robot:
             random=random,
             wall_clock=wall_clock,
             on_change=on_change,
+            callbacks=self.callbacks,
             recorder=self._recorder,
         )
         self._urls, self._enrolment = urls, enrolment
@@ -145,12 +150,13 @@ class Robot:
         )  # fmt: skip
         self._asking = Asking(
             session=self._session, flush=self._connection.flush, keeper=self._keeper, clock=clock,
-            offload=offload, local=self._local, burst=self._burst,
+            offload=offload, local=self._local, burst=self._burst, callbacks=self.callbacks,
         )  # fmt: skip
         self._objects = RobotObjects(
             self._read_token, lambda: (self._connection.url, self._connection.dialler.ssl_context)
         )
         self._open = False
+        self._process = os.getpid()
 
     async def __aenter__(self) -> Robot:
         """Connect; with an offload or a *burst_url*, return also while no server answers.
@@ -177,7 +183,7 @@ class Robot:
         except BaseException:
             await self.close()
             raise
-        self._open = True
+        self._open, self._process = True, os.getpid()
         return self
 
     async def __aexit__(
@@ -275,12 +281,11 @@ class Robot:
         Raises:
             RsePfError: The typed failure of the command.
         """
-        if not self._open:
-            raise Disconnected("the robot is not connected", hint="use async with client_sdk.connect(...)")
+        self._check_open()
         wait_s = self._session.settings.answer_timeout_s if deadline_s is None else deadline_s
-        if not 0 < wait_s <= _MAX_DEADLINE_S:
+        if not 0 < wait_s <= MAX_DEADLINE_S:
             raise UsageError(
-                f"deadline_s = {wait_s} is not within 0..{_MAX_DEADLINE_S:g}",
+                f"deadline_s = {wait_s} is not within 0..{MAX_DEADLINE_S:g}",
                 hint="give the number of seconds that the call may take",
             )
         self._keeper.sent += 1
@@ -369,7 +374,7 @@ class Robot:
             live=(live or LiveOptions()).sent_with(codec),
             spool=None if spool is None else Path(spool), map_options=map_options,
             T_world_start=T_world_start, features=features, motion=motion, loops=loops,
-            clock=self._clock,
+            store=self.store_object, clock=self._clock,
         )  # fmt: skip
 
     async def store_object(self, data: bytes) -> str:
@@ -425,8 +430,7 @@ class Robot:
             Disconnected: The robot is not open, or its servers refuse it.
             LimitExceeded: The message would be larger than the limit.
         """
-        if not self._open or self._connection.refusal is not None:
-            raise Disconnected("the robot is not connected", hint="use async with client_sdk.connect(...)")
+        self._check_open(is_refused=self._connection.refusal is not None)
         identity = self._session.submit(
             service, request, now=self._clock(), deadline_s=deadline_s, stream=stream, keep=keep
         )
@@ -443,8 +447,7 @@ class Robot:
         Raises:
             Disconnected: The robot is not open.
         """
-        if not self._open:
-            raise Disconnected("the robot is not connected", hint="use async with client_sdk.connect(...)")
+        self._check_open()
         return self._subscriptions.begin(topic)
 
     @property
@@ -487,7 +490,14 @@ class Robot:
             server=current.server if current else "",
             region=connection.region if current else "",
             last_error=connection.last_error,
+            callback_errors=self.callbacks.errors,
         )
+
+    def _check_open(self, *, is_refused: bool = False) -> None:
+        if not self._open or is_refused:
+            raise Disconnected("the robot is not connected", hint="use async with client_sdk.connect(...)")
+        if os.getpid() != self._process:
+            raise not_connected_here(self._process)
 
     def _type_reply(self, answer: Answer | Failure, reply_type: type[Any] | None, started: float) -> Answer:
         """Return the answer with its reply typed and the caller's round trip; raise if it is a failure."""

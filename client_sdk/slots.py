@@ -13,6 +13,7 @@ A features function takes an image and returns `FoundFeatures`::
 
 from __future__ import annotations
 
+import asyncio
 import importlib
 import math
 import re
@@ -331,7 +332,7 @@ def _callable(slot: str, function: Any) -> Any:
 def _called(slot: str, function: Callable[..., Any], *arguments: Any) -> Any:
     try:
         return function(*arguments)
-    except Exception as error:
+    except (Exception, asyncio.CancelledError, SystemExit) as error:  # also what would end a thread or a task
         raise UsageError(
             f"the {slot} function failed: {type(error).__name__}: {_line(error)}",
             hint="call it with values of your own, or see docs/own_parts.md",
@@ -428,7 +429,7 @@ def load_function(name: str) -> Any:
     return getattr(module, parts[2])
 
 
-def _line(error: Exception) -> str:
+def _line(error: BaseException) -> str:
     """Return the message of an error in one line, and the last line of a user's file that led to it."""
     passed = (__file__, importlib.__file__)
     trace = traceback.extract_tb(error.__traceback__)

@@ -33,7 +33,9 @@ class Stats:
     ``sent_to_burst`` counts the commands of the present 24 hours, also those that a server answered first.
     ``region`` is the address of the platform that is used now.  ``held_back`` counts the commands that were
     not sent at once although there was a connection: by ``busy`` (the server's answer to this command, or to
-    another one of the stream) or ``own-limit`` (what the Welcome allows).
+    another one of the stream) or ``own-limit`` (what the Welcome allows).  ``callback_errors`` counts the
+    calls of the program's callables (*on_change*, *on_progress*, *token*) that raised or took longer than
+    ``session.ping_timeout_s``; the log names them.
     """
 
     sent: int
@@ -67,6 +69,7 @@ class Stats:
     server: str
     region: str
     last_error: str
+    callback_errors: int
 
 
 class StatsKeeper:

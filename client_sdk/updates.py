@@ -7,12 +7,13 @@ and moves; the server then sends the present state again.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
 from types import TracebackType
 from typing import Any
 
 from client_sdk.closing import Closing
-from rse_pf.errors import RsePfError, error_from_code
+from rse_pf.errors import Disconnected, RsePfError, error_from_code
 from rse_pf.wire.client_session import ClientSession
 from rse_pf.wire.client_subscriptions import SubscriptionEnded, Updated
 
@@ -169,8 +170,9 @@ class BlockingUpdates(Closing):
             yield update
 
     def close(self) -> None:
-        """End the subscription."""
-        self._wait(self._close())
+        """End the subscription; the end of the robot ends it, too."""
+        with contextlib.suppress(Disconnected):
+            self._wait(self._close())
 
     async def _next(self) -> tuple[str, Any] | None:
         try:

@@ -11,9 +11,11 @@ import contextlib
 from collections import deque
 from collections.abc import Awaitable, Callable
 
+from client_sdk.callbacks import Callbacks
 from rse_pf.errors import (
     BadRequest,
     Forbidden,
+    InternalError,
     LimitExceeded,
     QuotaExceeded,
     RsePfError,
@@ -65,6 +67,7 @@ class ObjectSender:
         """Why the last object is not stored; empty if all is well."""
         self._store, self._clock, self._wait_quiet = store, clock, wait_quiet
         self._bucket = TokenBucket(bytes_per_s, burst=0.0)
+        self._callbacks = Callbacks()
         self._waiting: deque[bytes] = deque()
         self._waiting_bytes = 0
         self._added, self._empty = asyncio.Event(), asyncio.Event()
@@ -108,7 +111,10 @@ class ObjectSender:
                 await asyncio.wait_for(self._wait_quiet(), _MAX_QUIET_WAIT_S)
             try:
                 await self._store(data)
-            except RsePfError as error:
+            except Exception as error:  # noqa: BLE001  code of the program
+                if not isinstance(error, RsePfError):
+                    self._callbacks.report("store", error)
+                    error = InternalError(f"store raised {type(error).__name__}", hint="see the log")
                 self.trouble = f"{error.code}: {error.message}"
                 if isinstance(error, _REFUSED):
                     self.dropped += self._remove(data)

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 from websockets.exceptions import ConnectionClosed
 
+from client_sdk.callbacks import Callbacks
 from client_sdk.network.backoff import Backoff
 from client_sdk.network.dialling import CHECK_ADDRESS, CHECK_RUNNING, ISSUE, DialError
 from client_sdk.network.handshake import Dialler, Token
@@ -90,6 +91,7 @@ class Connection:
         random: random_module.Random,
         wall_clock: Callable[[], float] = time.time,
         on_change: OnChange = None,
+        callbacks: Callbacks,
         recorder: RobotRecorder | None = None,
     ) -> None:
         self._recorder = recorder
@@ -103,9 +105,11 @@ class Connection:
         self._session = session
         self._settings = session.settings
         self._timings = timings
-        self.dialler = Dialler(token, codec=session.codec.name, settings=session.settings, timings=timings)
+        self.dialler = Dialler(
+            token, codec=session.codec.name, settings=session.settings, timings=timings, callbacks=callbacks
+        )
         self._on_answer = on_answer
-        self._on_change = on_change or (lambda what, why: None)
+        self._report_change, self._callbacks = on_change, callbacks
         self._clock = clock
         self._pauses = Pauses(clock, wall_clock)
         self._sockets: list[RegionSocket] = []
@@ -575,6 +579,10 @@ class Connection:
             self._note_refusal()
         for known in self._regions:
             known.changed.set()
+
+    def _on_change(self, change: str, why: str) -> None:
+        if self._report_change is not None:
+            self._callbacks.notify("on_change", self._report_change, change, why)
 
     def _spawn(self, work: Coroutine[Any, Any, Any]) -> asyncio.Task[Any]:
         task = asyncio.get_running_loop().create_task(work)

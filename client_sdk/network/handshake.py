@@ -18,6 +18,7 @@ from websockets.asyncio.client import connect as websocket_connect
 from websockets.exceptions import InvalidStatus, WebSocketException
 from websockets.typing import Subprotocol
 
+from client_sdk.callbacks import Callbacks
 from client_sdk.network.dialling import (
     CHECK_ADDRESS,
     DialError,
@@ -34,7 +35,7 @@ from client_sdk.network.tcp import TcpDialler
 from client_sdk.network.timings import ConnectTimings
 from client_sdk.token_text import strip_token
 from rse_pf.config import SessionSettings
-from rse_pf.errors import ConnectError, RsePfError, Unauthorized, UnsupportedProtocol, UsageError
+from rse_pf.errors import ConnectError, Unauthorized, UnsupportedProtocol, UsageError
 from rse_pf.wire import SUBPROTOCOLS
 
 __all__ = ["Dialler", "Token", "websocket_options"]
@@ -87,13 +88,20 @@ class Dialler:
     """Opens WebSockets as one robot; *codec* names the sub-protocol."""
 
     def __init__(
-        self, token: Token, *, codec: str, settings: SessionSettings, timings: ConnectTimings
+        self,
+        token: Token,
+        *,
+        codec: str,
+        settings: SessionSettings,
+        timings: ConnectTimings,
+        callbacks: Callbacks,
     ) -> None:
         self.token = token
         self.ssl_context: ssl.SSLContext | None = None
         self._subprotocol = SUBPROTOCOLS[codec]
         self._settings = settings
         self._timings = timings
+        self._callbacks = callbacks
         self._tcp = TcpDialler()
         self._opened: set[str] = set()
 
@@ -121,15 +129,9 @@ class Dialler:
             token = self.token
         else:
             try:
-                token = await self.token()
-            except RsePfError as error:  # its message is written for users, unlike that of any other error
-                raise DialError(ConnectError(f"no token: {error.message}", hint=error.hint)) from error
-            except Exception as error:
-                connect_error = ConnectError(
-                    f"no token: the token callable raised {type(error).__name__}",
-                    hint="fix the token callable",
-                )
-                raise DialError(connect_error) from error
+                token = await self._callbacks.fetch_token(self.token)
+            except ConnectError as error:
+                raise DialError(error) from error
         if token is None:
             return None
         try:

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from client_sdk.answers import Answer
+from client_sdk.callbacks import Callbacks
 from client_sdk.local_services import LocalServices
 from client_sdk.network.region_sockets import cancel_all
 from client_sdk.offloading.burst import Burst
@@ -63,6 +64,7 @@ class Asking:
         offload: CloudFirst | None,
         local: LocalServices | None,
         burst: Burst,
+        callbacks: Callbacks,
     ) -> None:
         self.waiting: dict[int, asyncio.Future[Answered] | Callable[[Answered], None]] = {}
         self._session = session
@@ -72,6 +74,7 @@ class Asking:
         self._offload = offload or CloudFirst()
         self._local = local
         self._burst = burst
+        self._callbacks = callbacks
         self._on_progress: dict[int, OnProgress] = {}
         self._tasks: set[asyncio.Task[Ended]] = set()
 
@@ -102,7 +105,7 @@ class Asking:
         """Hand an event of the session to whom it concerns."""
         if isinstance(event, Progressed):
             if event.id in self._on_progress:
-                self._on_progress[event.id](event.done, event.what)
+                self._callbacks.notify("on_progress", self._on_progress[event.id], event.done, event.what)
             return
         waiting = self.waiting.get(event.id)
         if isinstance(waiting, asyncio.Future):
@@ -112,7 +115,7 @@ class Asking:
                 waiting.set_result(event)
         elif waiting is not None:
             del self.waiting[event.id]
-            waiting(event)
+            self._callbacks.notify("on_end", waiting, event)
         else:
             self._keeper.duplicates += 1
 

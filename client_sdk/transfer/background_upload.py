@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+from client_sdk.callbacks import Callbacks
 from client_sdk.transfer.data_client import DataClient
 from rse_pf.errors import BadRequest, LimitExceeded, RsePfError, UsageError
 from rse_pf.files import replace_file
@@ -53,6 +54,7 @@ class BackgroundUploader:
             max_spool_bytes: Size of the spool; keyframes above it are dropped.
             clock: Monotonic seconds.
             is_busy: Whether live poses are waiting; no keyframe and no part is started meanwhile.
+                An exception counts as not busy, and is logged.
         """
         self.sent = 0
         self.dropped = 0
@@ -63,6 +65,7 @@ class BackgroundUploader:
         self._max_spool_bytes = max_spool_bytes
         self._clock = clock
         self._is_busy = is_busy
+        self._callbacks = Callbacks()
         self._condition = threading.Condition()
         self._held: dict[str, int] = {}
         self._next = 0
@@ -114,7 +117,7 @@ class BackgroundUploader:
             self._over = True
             self._condition.notify_all()
         self._uploads.close()
-        if self._thread.is_alive():
+        if self._thread.is_alive() and self._thread is not threading.current_thread():
             self._thread.join(_JOIN_TIMEOUT_S)
 
     def _work(self) -> None:
@@ -155,7 +158,7 @@ class BackgroundUploader:
             self._wait_for_quiet()
 
     def _wait_for_quiet(self) -> bool:
-        while self._is_busy():
+        while self._callbacks.call("is_busy", self._is_busy, default=False):
             if self._pause(_BUSY_POLL_S):
                 return False
         return True

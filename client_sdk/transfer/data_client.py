@@ -8,8 +8,10 @@ the service carries the bytes itself.
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import http.client
+import inspect
 import json
 import os
 import random
@@ -24,6 +26,7 @@ from urllib.parse import quote, urlencode, urlsplit
 
 import msgspec
 
+from client_sdk.callbacks import Callbacks
 from client_sdk.enrolment import read_enrolment
 from client_sdk.network.data_requests import (
     MAX_SINGLE_PUT_BYTES,
@@ -34,7 +37,7 @@ from client_sdk.network.data_requests import (
 )
 from client_sdk.network.proxies import TunnelRefused
 from rse_pf.config.front_door import LOCALISE_PATH
-from rse_pf.errors import Conflict, ConnectError, NotFound, RsePfError, StoreError, UsageError
+from rse_pf.errors import Conflict, ConnectError, NotFound, RsePfError, StoreError, Unauthorized, UsageError
 from rse_pf.maps.photos import Lens, MapOutline, PhotoLocation
 
 __all__ = ["DataClient", "DataOptions", "OnBytes", "is_allowed"]
@@ -82,6 +85,7 @@ class DataClient:
             UsageError: *url* is not such an address.
         """
         self._token = token
+        self._callbacks = Callbacks()
         self._options = options or DataOptions()
         self._requests = DataRequests(
             url, timeout_s=self._options.timeout_s, ssl_context=self._options.ssl_context
@@ -116,7 +120,7 @@ class DataClient:
             size, digest = opened.size, opened.digest()
             if size <= MAX_SINGLE_PUT_BYTES:
                 self._request("PUT", f"/data/v1/objects/{digest}", opened.read(0, size))
-                _report(progress, size, size)
+                self._report(progress, size, size)
             else:
                 self._upload_parts(opened, digest, progress)
             return digest
@@ -221,7 +225,7 @@ class DataClient:
         state = self._begin(path, begin, opened, progress)
         part_bytes = min(int(state["part_bytes"]), self._options.part_bytes)
         offset = int(state["offset"])
-        _report(progress, offset, size)
+        self._report(progress, offset, size)
         while offset < size:
             part = opened.read(offset, min(part_bytes, size - offset))
             try:
@@ -232,7 +236,7 @@ class DataClient:
             ):  # the answer to this part was lost, or another process uploads the same object
                 state = self._json("PUT", path, begin)
             offset = int(state["offset"])
-            _report(progress, offset, size)
+            self._report(progress, offset, size)
 
     def _begin(self, path: str, begin: bytes, opened: _Source, progress: OnBytes | None) -> Any:
         """Open an upload, and send the object to a presigned address if the service offers one."""
@@ -243,7 +247,7 @@ class DataClient:
             if direct is None or not tries or not is_allowed(direct["url"], secure=self._requests.secure):
                 return state
             tries -= 1
-            body = opened.pieces(progress)
+            body = opened.pieces(functools.partial(self._report, progress))
             if not _ask_bucket("PUT", direct["url"], direct["headers"], body, self._options.timeout_s):
                 self._options.sleep(pause)
                 pause *= 2
@@ -284,7 +288,7 @@ class DataClient:
             elif size != len(held):  # the partial file is longer than the object
                 held.clear()
                 _remove(partial)
-            _report(progress, len(held), size)
+            self._report(progress, len(held), size)
         if hashlib.sha256(held).hexdigest() != digest:
             _remove(partial)
             raise StoreError("the bytes do not match the digest", hint="fetch it again")
@@ -293,6 +297,25 @@ class DataClient:
         partial.write_bytes(held)
         os.replace(partial, to)
         return b""
+
+    def _read_token(self) -> object:
+        if not callable(self._token):
+            return self._token
+        try:
+            token: object = self._token()
+        except Exception as error:
+            raise self._callbacks.token_error(error) from error
+        if inspect.iscoroutine(token):
+            token.close()
+            raise Unauthorized(
+                "the token callable of DataClient is an async function",
+                hint="pass read_enrolment(FILE).fresh_token, or use DataClient.enrolled(FILE)",
+            )
+        return token
+
+    def _report(self, progress: OnBytes | None, done: int, size: int) -> None:
+        if progress is not None:
+            self._callbacks.call("progress", progress, done, size)
 
     def _json(
         self, method: str, path: str, body: bytes | None = None, headers: dict[str, str] | None = None
@@ -311,7 +334,7 @@ class DataClient:
             error: RsePfError | None
             after_s = 0.0
             try:
-                token = self._token() if callable(self._token) else self._token
+                token = self._read_token()
                 status, answer, content = self._requests.request(method, path, body, headers or {}, token)
             except ConnectError as broken:
                 if self._requests.is_wrong_address:
@@ -364,7 +387,8 @@ class _Source:
     def pieces(self, progress: OnBytes | None) -> Iterator[bytes]:
         for offset in range(0, self.size, _PIECE_BYTES):
             yield self.read(offset, _PIECE_BYTES)
-            _report(progress, min(offset + _PIECE_BYTES, self.size), self.size)
+            if progress is not None:
+                progress(min(offset + _PIECE_BYTES, self.size), self.size)
 
     def read(self, offset: int, length: int) -> bytes:
         if self._file is None:
@@ -403,11 +427,6 @@ def _ask_bucket(
         if connection is not None:
             connection.close()
     return response if answer.status in ((200, 206, 416) if method == "GET" else (200, 201)) else None
-
-
-def _report(progress: OnBytes | None, done: int, size: int) -> None:
-    if progress is not None:
-        progress(done, size)
 
 
 def _append(path: Path | None, piece: bytes) -> None:
