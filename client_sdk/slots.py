@@ -142,14 +142,7 @@ class FeaturesSlot:
         Raises:
             UsageError: The function failed, or what it returned cannot be features.
         """
-        try:
-            found = self._function(rgb)
-        except Exception as error:
-            raise UsageError(
-                f"the features function {self.name} failed: {type(error).__name__}: {_line(error)}",
-                hint="call it with one of your images",
-            ) from error
-        return self._checked(found, rgb.shape)
+        return self._checked(_called(f"features function {self.name}", self._function, rgb), rgb.shape)
 
     def _checked(self, found: Any, shape: tuple[int, ...]) -> CheckedFeatures:
         if not isinstance(found, FoundFeatures):
@@ -257,7 +250,7 @@ class MotionSlot:
             return None
         stamps_s = np.array([stamp_s for stamp_s, _ in self._recent])
         poses = np.array([pose for _, pose in self._recent])
-        returned = _called("motion", self._function, stamps_s, poses, timestamp_s)
+        returned = _called("motion function", self._function, stamps_s, poses, timestamp_s)
         T = rigid(_numbers_of("motion", returned, (4, 4)))
         if T is None:
             raise UsageError(
@@ -281,7 +274,7 @@ class LoopsSlot:
         Raises:
             UsageError: The function failed, or returned no such vector.
         """
-        vector = _numbers_of("loops", _called("loops", self._function, rgb), (-1,))
+        vector = _numbers_of("loops", _called("loops function", self._function, rgb), (-1,))
         length = float(np.linalg.norm(vector))
         self._size = self._size or len(vector)
         if len(vector) != self._size or not _MIN_PLACE <= len(vector) <= _MAX_PLACE or not length > 0.0:
@@ -305,7 +298,7 @@ class OptimiserSlot:
         Raises:
             UsageError: The function failed, or returned no poses and points of these numbers.
         """
-        returned = _called("optimiser", self._function, bundle, camera, iterations)
+        returned = _called("optimiser function", self._function, bundle, camera, iterations)
         if not isinstance(returned, tuple) or len(returned) != 2:
             raise UsageError(
                 f"the optimiser function returned {type(returned).__name__}, not poses and points",
@@ -329,12 +322,12 @@ def _callable(slot: str, function: Any) -> Any:
     return function
 
 
-def _called(slot: str, function: Callable[..., Any], *arguments: Any) -> Any:
+def _called(name: str, function: Callable[..., Any], *arguments: Any) -> Any:
     try:
         return function(*arguments)
     except (Exception, asyncio.CancelledError, SystemExit) as error:  # also what would end a thread or a task
         raise UsageError(
-            f"the {slot} function failed: {type(error).__name__}: {_line(error)}",
+            f"the {name} failed: {type(error).__name__}: {_line(error)}",
             hint="call it with values of your own, or see docs/own_parts.md",
         ) from error
 

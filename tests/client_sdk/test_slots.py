@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import sys
 from collections import Counter
 from pathlib import Path
@@ -433,3 +434,12 @@ def test_what_names_no_function_is_refused_in_one_line(
     assert "\n" not in refused.value.message
     assert "importlib" not in refused.value.message
     assert callable(load_function("json:dumps"))
+
+
+@pytest.mark.parametrize("error", [asyncio.CancelledError(), SystemExit(3), StopIteration()])
+def test_a_function_that_raises_what_would_end_a_task_or_a_thread_is_named(error):
+    def features(rgb):
+        raise error
+
+    with pytest.raises(UsageError, match="the features function features failed"):
+        FeaturesSlot(features)(np.zeros((48, 64, 3), np.uint8))

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import re
 import time
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import pytest
 
-from client_sdk import connect
+from client_sdk import DataClient, LiveOptions, connect, open_dataset
+from rse_pf.errors import NotFound
+from rse_pf.maps.format import decode_map
 from tests.examples.conftest import ExamplePlatform
 
 pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
@@ -33,6 +37,34 @@ def test_two_robots_share_a_live_map(platform: ExamplePlatform) -> None:
     assert re.search(r"^16 frames, [1-9]\d* keyframes, 0 waiting$", first.stdout, re.MULTILINE), first.stdout
     assert (second.returncode, second.stderr) == (0, "")
     assert second.stdout.count("\n") >= 16
+
+
+async def drive(file: Path, recording: Path, name: str) -> int:
+    """Drive through a recording by `Robot.live_map`, and return how many objects of points were stored."""
+    live = LiveOptions(points_bytes_per_s=1e7, leave_s=40.0)
+    async with connect(enrolment=file) as robot, robot.live_map(name, live=live) as mapper:
+        for frame in open_dataset(recording):
+            await mapper.track(frame)
+    return int(mapper.report()["live"]["points"]["sent"])
+
+
+def test_the_map_of_a_robot_of_the_sdk_has_a_cloud(platform: ExamplePlatform) -> None:
+    recording, file = platform.folder / "coloured", platform.folder / "robot-1.enrolment"
+    write_drives([recording], frames=8)
+    for kind in ("rgb", "depth"):
+        lines = [f"{row / 10:.1f} {kind}/{row}.png\n" for row in range(8)]
+        (recording / f"{kind}.txt").write_text("".join(lines))
+
+    stored = asyncio.run(drive(file, recording, "coloured"))
+
+    assert stored > 0
+    data, points, end = DataClient.enrolled(file), 0, time.monotonic() + 60.0
+    while not points:
+        assert time.monotonic() < end, "no version of the map has points"
+        with contextlib.suppress(NotFound):
+            points = len(decode_map(data.download_map("coloured")).points)
+        time.sleep(0.1)  # polls: the map is published some seconds after its last robot left
+    data.close()
 
 
 async def keyframes_of(platform: ExamplePlatform, robot: str, name: str) -> int:

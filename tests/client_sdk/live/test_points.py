@@ -200,3 +200,17 @@ async def test_keyframes_whose_images_do_not_fit_the_share_of_the_link_have_none
         await robot.until(lambda: mapper.keyframes_waiting == 0)
         images = [decode_keyframe(request.keyframe).image for request in robot.kept]
         assert [each is not None for each in images] == [True, False, False]
+
+
+async def test_a_store_function_that_raises_is_reported_and_asked_again(
+    robot: FakeLiveRobot, caplog: pytest.LogCaptureFixture
+) -> None:
+    objects = Objects()
+    objects.error = KeyError("a bug of the program")
+    async with mapper_of(robot, objects, replace(QUICK, points_bytes_per_s=1e9, leave_s=5.0)) as mapper:
+        await drive(mapper, range(1))
+        await robot.until(lambda: objects.tries == 1)
+        objects.error = None
+        await robot.until(lambda: len(objects.held) == 1)
+
+    assert len([record for record in caplog.records if record.exc_info]) == 1

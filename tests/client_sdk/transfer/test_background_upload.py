@@ -8,6 +8,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import pytest
+
 from client_sdk.transfer import BackgroundUploader
 from rse_pf.errors import BadRequest
 from rse_pf.token_bucket import TokenBucket
@@ -138,3 +140,21 @@ def test_a_keyframe_that_is_refused_for_good_is_dropped_and_the_next_is_uploaded
 
     assert uploads.taken == [b"good"]
     assert (uploader.dropped, uploader.last_error) == (1, "no")
+
+
+def test_keyframes_are_uploaded_although_is_busy_raises(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    uploads = FakeUploads()
+
+    def is_busy() -> bool:
+        raise KeyError("a bug of the program")
+
+    with started(uploads, tmp_path / "spool", is_busy=is_busy) as uploader:
+        for n in range(4):
+            uploader.add(bytes([n]))
+
+        assert uploader.wait_sent(20)
+
+    assert len(uploads.taken) == 4
+    assert len([record for record in caplog.records if record.exc_info]) == 1

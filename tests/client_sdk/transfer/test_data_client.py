@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from client_sdk.transfer.data_client import DataClient, DataOptions
-from rse_pf.errors import ConnectError, NotFound, QuotaExceeded, StoreError, UsageError
+from rse_pf.errors import ConnectError, NotFound, QuotaExceeded, StoreError, Unauthorized, UsageError
 
 DATA = random.Random(1).randbytes(700_000)
 DIGEST = hashlib.sha256(DATA).hexdigest()
@@ -271,3 +271,49 @@ def test_bytes_that_do_not_match_the_digest_are_refused(
 def test_an_address_is_checked_before_anything_is_sent(url: str) -> None:
     with pytest.raises(UsageError):
         DataClient(url, "token")
+
+
+def test_a_token_callable_that_fails_is_asked_again_after_a_pause(robot: Robot, service: FakeService) -> None:
+    asked: list[int] = []
+
+    def token() -> str:
+        asked.append(1)
+        if len(asked) < 3:
+            raise KeyError("the service of tokens is down")
+        return "token"
+
+    client = DataClient(service.url, token, DataOptions(clock=lambda: robot.now, sleep=robot.sleep))
+
+    digest = client.upload(b"data")
+
+    assert service.objects[digest] == b"data"
+    assert len(asked) == 3
+    assert len(robot.pauses) == 2
+    client.close()
+
+
+def test_an_async_token_callable_is_refused_with_the_callable_that_fits(service: FakeService) -> None:
+    async def token() -> str:
+        return "token"
+
+    client = DataClient(service.url, token)  # type: ignore[arg-type]
+
+    with pytest.raises(Unauthorized) as refused:
+        client.upload(b"data")
+
+    assert "fresh_token" in refused.value.hint
+    client.close()
+
+
+def test_a_transfer_goes_on_although_its_progress_function_raises(
+    robot: Robot, service: FakeService, caplog: pytest.LogCaptureFixture
+) -> None:
+    def progress(done: int, size: int) -> None:
+        raise KeyError("a bug of the program")
+
+    data = bytes(range(256)) * 2000
+
+    digest = robot.client.upload(data, progress)
+
+    assert robot.client.download(digest, progress=progress) == data
+    assert len([record for record in caplog.records if record.exc_info]) == 1
