@@ -255,7 +255,7 @@ async def _send(reply: HttpReply, request: HttpRequest, send: Send) -> int:
     """Send *reply*; return how many bytes of body were sent."""
     body = reply.body
     headers = {"Content-Type": reply.media_type, "Cache-Control": "no-store", **reply.headers}
-    if isinstance(body, bytes) and reply.status != 204:
+    if isinstance(body, bytes) and reply.status not in (204, 304):
         headers.setdefault("Content-Length", str(len(body)))
     raw = [(name.lower().encode("latin-1"), value.encode("latin-1")) for name, value in headers.items()]
     await send({"type": "http.response.start", "status": reply.status, "headers": raw})

@@ -12,7 +12,9 @@ from rse_pf.data_server.http import HttpReply, HttpRequest
 
 __all__ = ["is_preflight", "preflight_reply", "shared_reply"]
 
-_SENT = "authorization, content-type, range, upload-offset, x-accept-direct"
+_SENT = (
+    "authorization, content-type, if-match, if-none-match, if-range, range, upload-offset, x-accept-direct"
+)
 _EXPOSED = "content-range, etag, retry-after, upload-offset"
 _PREFLIGHT_LIFE_S = 600
 

@@ -21,7 +21,16 @@ from rse_pf.audit.log import AuditLog
 from rse_pf.auth.tokens import Claims
 from rse_pf.config import DataSettings
 from rse_pf.data_server.fair_threads import FairThreads, check_wanted
-from rse_pf.data_server.http import HttpReply, HttpRequest, failure_reply, json_reply, requested_range
+from rse_pf.data_server.http import (
+    HttpReply,
+    HttpRequest,
+    check_preconditions,
+    failure_reply,
+    has_conditions,
+    json_reply,
+    requested_range,
+    wants_range,
+)
 from rse_pf.data_server.photo_localiser import PhotoLocaliser
 from rse_pf.data_server.routes import (
     BYTES,
@@ -157,10 +166,21 @@ class Handlers:
     async def head_object(self, request: HttpRequest, claims: Claims, path: dict[str, str]) -> HttpReply:
         """Return the size."""
         _, size = await self._head(claims, path["digest"])
-        return HttpReply(
-            status=200, headers={**_content_headers(path["digest"]), "Content-Length": str(size)},
-            media_type=BYTES,
-        )  # fmt: skip
+        headers = _content_headers(path["digest"])
+        if not check_preconditions(request, path["digest"]):
+            return HttpReply(status=304, headers=headers, media_type=BYTES)
+        return HttpReply(status=200, headers={**headers, "Content-Length": str(size)}, media_type=BYTES)
+
+    async def _check_change(self, request: HttpRequest, claims: Claims, digest: str) -> None:
+        """Check name and conditions of a change; raises BadRequest or PreconditionFailed."""
+        self.objects.name(claims, digest)
+        if has_conditions(request):
+            tag: str | None = digest
+            try:
+                await self._head(claims, digest)
+            except NotFound:
+                tag = None
+            check_preconditions(request, tag)
 
     async def _head(self, claims: Claims, digest: str) -> tuple[str, int]:
         """Return name and size of an object; raises NotFound."""
@@ -173,13 +193,14 @@ class Handlers:
 
     async def put_object(self, request: HttpRequest, claims: Claims, path: dict[str, str]) -> HttpReply:
         """Store a small object."""
-        self.objects.name(claims, path["digest"])
+        await self._check_change(request, claims, path["digest"])
         data = await request.body(self._settings.part_bytes)
         new = await self.threads.run(claims.robot, self.objects.put, claims, path["digest"], data)
         return json_reply(201 if new else 200, StoredObject(digest=path["digest"], size=len(data)))
 
     async def delete_object(self, request: HttpRequest, claims: Claims, path: dict[str, str]) -> HttpReply:
         """Remove an object."""
+        await self._check_change(request, claims, path["digest"])
         await self.threads.run(claims.robot, self.objects.delete, claims, path["digest"])
         return HttpReply(status=204)
 
@@ -361,11 +382,14 @@ class Handlers:
     ) -> HttpReply:
         """Reply with an object or a range of it; *first* is the first piece of the whole, if it is known."""
         store, ttl_s = self._store, PRESIGNED_URL_TTL_S
+        if not check_preconditions(request, digest):
+            return HttpReply(status=304, headers=_content_headers(digest), media_type=BYTES)
         if request.headers.get("x-accept-direct") == "1" and isinstance(store, PresigningStore):
             url = await self.threads.run(robot, lambda: store.presigned_get(name, ttl_s=ttl_s))
             return HttpReply(status=307, headers={"Location": url, **_content_headers(digest)})
         try:
-            part = requested_range(request.headers.get("range"), size)
+            text = request.headers.get("range") if wants_range(request, digest) else None
+            part = requested_range(text, size)
         except BadRequest as error:
             refused = failure_reply(error)
             return HttpReply(status=416, body=refused.body, headers={"Content-Range": f"bytes */{size}"})

@@ -45,12 +45,16 @@ __all__ = [
     "HttpReply",
     "HttpRequest",
     "MethodNotAllowed",
+    "PreconditionFailed",
     "Receive",
     "Send",
     "TooManyRequests",
+    "check_preconditions",
     "failure_reply",
+    "has_conditions",
     "json_reply",
     "requested_range",
+    "wants_range",
 ]
 
 _T = TypeVar("_T")
@@ -73,19 +77,25 @@ class MethodNotAllowed(BadRequest):
         self.allowed = allowed
 
 
+class PreconditionFailed(Conflict):
+    """A condition of the request's header does not hold: nothing was read or changed."""
+
+
 class TooManyRequests(Busy):
     """This robot asks more than its share; the others do not notice."""
 
 
 _STATUS: dict[type[RsePfError], int] = {
-    MethodNotAllowed: 405, TooManyRequests: 429,
+    MethodNotAllowed: 405, PreconditionFailed: 412, TooManyRequests: 429,
     Unauthorized: 401, Forbidden: 403, NotFound: 404, Expired: 408, Conflict: 409, LimitExceeded: 413,
     QuotaExceeded: 413, Crashed: 413, BadRequest: 400, InvalidCamera: 400, Busy: 503, WorkerLost: 503,
     Archived: 409, StoreFull: 507, StoreError: 503, MissingExtra: 501,
 }  # fmt: skip
 _FRAMES = {"content-length", "transfer-encoding"}
 """A request with none of these headers has no body."""
-_RANGE = re.compile(r"bytes=(\d{0,18})-(\d{0,18})")
+_RANGE = re.compile(r"bytes=(\d{0,18})-(\d{0,18})", re.IGNORECASE)
+_TAG_LISTS = frozenset({"if-match", "if-none-match"})
+_ENTITY_TAG = re.compile(r'(W/)?"([^"]*)"')
 
 
 class HttpFailure(msgspec.Struct, frozen=True, kw_only=True):
@@ -113,9 +123,12 @@ class HttpRequest:
         self.method = str(scope["method"])
         self.path = str(scope["path"])
         self.peer = str((scope.get("client") or ("",))[0])
-        self.headers = {
-            name.decode("latin-1").lower(): value.decode("latin-1") for name, value in scope["headers"]
-        }
+        self.headers: dict[str, str] = {}
+        for raw_name, raw_value in scope["headers"]:
+            name, value = raw_name.decode("latin-1").lower(), raw_value.decode("latin-1")
+            # A list may come in several lines (RFC 9110, Sect. 5.3).
+            is_continued = name in _TAG_LISTS and name in self.headers
+            self.headers[name] = f"{self.headers[name]}, {value}" if is_continued else value
         query = scope["query_string"]
         self.query = dict(parse_qsl(query.decode("latin-1"), keep_blank_values=True)) if query else {}
         self.received_bytes = 0
@@ -264,6 +277,61 @@ def failure_reply(error: RsePfError) -> HttpReply:
     if error.retry_after_ms is not None:
         headers["Retry-After"] = str(max(1, math.ceil(error.retry_after_ms / 1000)))
     return json_reply(status, HttpFailure(code=error.code, message=error.message, hint=error.hint), headers)
+
+
+def has_conditions(request: HttpRequest) -> bool:
+    """Return whether *request* is conditional, apart from a condition for its range."""
+    return not _TAG_LISTS.isdisjoint(request.headers)
+
+
+def check_preconditions(request: HttpRequest, tag: str | None) -> bool:
+    """Return whether *request* is to be carried out; False: it reads what the client has, answer 304.
+
+    Args:
+        request: With ``If-Match`` or ``If-None-Match``, or without both.
+        tag: The opaque part of the strong entity tag of the object; None: there is no object.
+
+    Raises:
+        PreconditionFailed: The object is not in the state that the client expects.
+
+    Source:
+        RFC 9110, Sect. 13.2.2. There is no date of an object, so that conditions by date are ignored.
+    """
+    expected, unwanted = (request.headers.get(name) for name in ("if-match", "if-none-match"))
+    if expected is not None and not _names_tag(expected, tag, is_weak_enough=False):
+        raise PreconditionFailed(
+            f"If-Match: {expected[:100]} does not name the object, whose entity tag is {_shown(tag)}",
+            hint="read it again, or leave the header out",
+        )
+    if unwanted is None or not _names_tag(unwanted, tag, is_weak_enough=True):
+        return True
+    if request.method in ("GET", "HEAD"):
+        return False
+    raise PreconditionFailed(
+        f"If-None-Match: {unwanted[:100]} names the object, whose entity tag is {_shown(tag)}",
+        hint="leave the header out to carry the request out nevertheless",
+    )
+
+
+def wants_range(request: HttpRequest, tag: str) -> bool:
+    """Return whether a ``Range`` is to be obeyed: without ``If-Range``, or with *tag* in it.
+
+    Source:
+        RFC 9110, Sect. 13.1.5: strong comparison; a date never holds, since objects have none.
+    """
+    condition = request.headers.get("if-range")
+    return condition is None or condition.strip() == f'"{tag}"'
+
+
+def _names_tag(text: str, tag: str | None, *, is_weak_enough: bool) -> bool:
+    """Return whether a list of entity tags, or ``*``, names *tag*; weak tags count if *is_weak_enough*."""
+    if tag is None or text.strip() == "*":
+        return tag is not None
+    return any(named == tag and (is_weak_enough or not weak) for weak, named in _ENTITY_TAG.findall(text))
+
+
+def _shown(tag: str | None) -> str:
+    return "none, since it does not exist" if tag is None else f'"{tag}"'
 
 
 def requested_range(text: str | None, size: int) -> tuple[int, int] | None:

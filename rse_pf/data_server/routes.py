@@ -170,6 +170,11 @@ PHOTO_COST = 10.0
 _LIST_COST, _COMMIT_COST = 5.0, 20.0
 _WHOLE_NUMBER = {"type": "integer", "minimum": 0}
 _RANGE = Field(name="Range", place="header", doc="one range of bytes, as bytes=START-END")
+_IF_RANGE = Field(name="If-Range", place="header", doc="the ETag for which the range holds; else all bytes")
+_CONDITIONS = (
+    Field(name="If-Match", place="header", doc="ETags, of which the object must have one, or *"),
+    Field(name="If-None-Match", place="header", doc="ETags, of which the object must have none, or *"),
+)
 _OFFSET = Field(
     name="Upload-Offset", place="header", doc="where this part begins", schema=_WHOLE_NUMBER, required=True
 )
@@ -209,6 +214,8 @@ _LENS = (
     ),
 )  # fmt: skip
 
+_CHANGED = {412: HttpFailure}
+_READ = {200: bytes, 206: bytes, 304: None, 307: None, 416: HttpFailure, **_CHANGED}
 _BAD, _NOT_FOUND, _CONFLICT = {400: HttpFailure}, {404: HttpFailure}, {409: HttpFailure}
 _STORING = {408: HttpFailure, 413: HttpFailure, 503: HttpFailure, 507: HttpFailure}
 _WORKING = {408: HttpFailure, 413: HttpFailure, 503: HttpFailure}
@@ -236,22 +243,25 @@ ROUTES: tuple[Route, ...] = (
         doc="List this robot's objects", fields=(_AFTER, _LIMIT), replies={200: ObjectPage, **_BAD},
     ),
     Route(
-        operation="get_object", method="GET", path=_OBJECT, scope="data:read", fields=(_RANGE, _DIRECT),
-        doc="Return an object or one range of it",
-        replies={200: bytes, 206: bytes, 307: None, 416: HttpFailure, **_NOT_FOUND},
+        operation="get_object", method="GET", path=_OBJECT, scope="data:read",
+        fields=(_RANGE, _IF_RANGE, *_CONDITIONS, _DIRECT), doc="Return an object or one range of it",
+        replies={**_READ, **_NOT_FOUND},
     ),
     Route(
         operation="head_object", method="HEAD", path=_OBJECT, scope="data:read",
-        doc="Return an object's size", replies={200: None, 404: None},
+        fields=_CONDITIONS, doc="Return an object's size",
+        replies={200: None, 304: None, 404: None, 412: None},
     ),
     Route(
         operation="put_object", method="PUT", path=_OBJECT, scope="data:write", body=bytes,
+        fields=_CONDITIONS,
         doc="Store an object of at most data.part_bytes; 201 means that it is durable, 200 that it existed",
-        replies={200: StoredObject, 201: StoredObject, **_BAD, **_NOT_FOUND, **_STORING},
+        replies={200: StoredObject, 201: StoredObject, **_BAD, **_NOT_FOUND, **_CHANGED, **_STORING},
     ),
     Route(
         operation="delete_object", method="DELETE", path=_OBJECT, scope="data:write",
-        doc="Remove an object; a missing one is no error", replies={204: None, **_NOT_FOUND},
+        fields=_CONDITIONS, doc="Remove an object; a missing one is no error",
+        replies={204: None, **_NOT_FOUND, **_CHANGED},
     ),
     Route(
         operation="begin_upload", method="PUT", path=_UPLOAD, scope="data:write", body=UploadBegin,
@@ -303,8 +313,8 @@ ROUTES: tuple[Route, ...] = (
     ),
     Route(
         operation="get_version", method="GET", path=_VERSION + "/content", scope="maps:read",
-        fields=(_RANGE, _DIRECT), doc="Return the bytes of a version",
-        replies={200: bytes, 206: bytes, 307: None, 416: HttpFailure, **_BAD, **_NOT_FOUND},
+        fields=(_RANGE, _IF_RANGE, *_CONDITIONS, _DIRECT), doc="Return the bytes of a version",
+        replies={**_READ, **_BAD, **_NOT_FOUND},
     ),
     Route(
         operation="move_head", method="PUT", path="/data/v1/maps/{name}/head", scope="maps:write",
@@ -332,6 +342,8 @@ _PATH_SCHEMAS: dict[str, dict[str, Any]] = {
 }
 _JSON = "application/json"
 _DESCRIPTIONS = {
+    304: "The client has it: its ETag is in If-None-Match",
+    412: "If-Match or If-None-Match does not hold; nothing was read or changed",
     307: "The object is at the presigned URL in Location; send no token there",
     200: "Done", 201: "Stored durably", 204: "Done, no content", 206: "The requested range",
     400: "Invalid request", 401: "No valid token", 403: "The token's scopes do not allow this",

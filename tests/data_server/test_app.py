@@ -139,6 +139,72 @@ def test_a_range_is_returned(
     assert answer.headers.get("content-range") == told
 
 
+TAG, OTHER_TAG = f'"{DIGEST}"', f'"{"0" * 64}"'
+
+
+@pytest.mark.parametrize(
+    ("method", "headers", "status"),
+    [
+        ("GET", {"if-none-match": TAG}, 304),
+        ("HEAD", {"if-none-match": TAG}, 304),
+        ("GET", {"if-none-match": f"{OTHER_TAG} , W/{TAG}"}, 304),
+        ("GET", {"if-none-match": "*"}, 304),
+        ("GET", {"if-none-match": OTHER_TAG}, 200),
+        ("GET", {"if-none-match": DIGEST}, 200),
+        ("GET", {"if-none-match": TAG, "range": "bytes=0-9"}, 304),
+        ("GET", {"if-match": TAG}, 200),
+        ("GET", {"if-match": "*", "range": "bytes=0-9"}, 206),
+        ("GET", {"if-match": f"W/{TAG}"}, 412),
+        ("GET", {"if-match": OTHER_TAG, "if-none-match": TAG}, 412),
+        ("GET", {"if-match": OTHER_TAG, "range": "bytes=5000-"}, 412),
+        ("HEAD", {"if-match": OTHER_TAG}, 412),
+        ("GET", {"if-range": TAG, "range": "bytes=0-9"}, 206),
+        ("GET", {"if-range": TAG, "range": "bytes=5000-"}, 416),
+        ("GET", {"if-range": OTHER_TAG, "range": "bytes=0-9"}, 200),
+        ("GET", {"if-range": OTHER_TAG, "range": "bytes=5000-"}, 200),
+        ("GET", {"if-range": f"W/{TAG}", "range": "bytes=0-9"}, 200),
+        ("GET", {"if-range": "Sun, 29 Nov 2026 00:00:00 GMT", "range": "bytes=0-9"}, 200),
+        ("GET", {"if-range": OTHER_TAG}, 200),
+        ("GET", {"if-modified-since": "Sun, 29 Nov 2026 00:00:00 GMT"}, 200),
+        ("PUT", {"if-none-match": "*"}, 412),
+        ("PUT", {"if-match": TAG}, 200),
+        ("DELETE", {"if-match": OTHER_TAG}, 412),
+        ("DELETE", {"if-match": TAG}, 204),
+    ],
+)
+def test_a_condition_decides_whether_a_request_is_carried_out(
+    service: Service, method: str, headers: dict[str, str], status: int
+) -> None:
+    service.ask("PUT", OBJECT, DATA)
+
+    answer = service.ask(method, OBJECT, DATA if method == "PUT" else b"", headers=headers)
+
+    assert answer.status == status
+    if status == 304:
+        assert (answer.headers["etag"], answer.body) == (TAG, b"")
+        assert "content-length" not in answer.headers
+    if method == "GET" and status in (200, 206):
+        assert answer.body == (DATA if status == 200 else DATA[:10])
+    if status == 412 and method != "HEAD":
+        assert answer.json["hint"]
+    assert service.ask("GET", OBJECT).status == (404 if status == 204 else 200)
+
+
+@pytest.mark.parametrize(
+    ("method", "name", "status"),
+    [
+        ("PUT", "if-none-match", 201),
+        ("PUT", "if-match", 412),
+        ("DELETE", "if-match", 412),
+        ("GET", "if-match", 404),
+    ],
+)
+def test_a_condition_of_an_object_that_does_not_exist(
+    service: Service, method: str, name: str, status: int
+) -> None:
+    assert service.ask(method, OBJECT, DATA if method == "PUT" else b"", headers={name: "*"}).status == status
+
+
 @pytest.mark.parametrize("asked", ["bytes=1024-", "bytes=5000-6000", "bytes=-0"])
 def test_a_range_outside_the_object_is_refused_with_the_size(service: Service, asked: str) -> None:
     service.ask("PUT", OBJECT, DATA)

@@ -38,7 +38,9 @@ def test_a_browser_learns_what_a_listed_page_may_send(shared: Service) -> None:
     assert reply.status == 204
     assert reply.headers["access-control-allow-methods"] == "GET, HEAD, PUT, DELETE"
     assert reply.headers["access-control-allow-origin"] == PAGE
-    assert {"authorization", "content-type"} <= set(reply.headers["access-control-allow-headers"].split(", "))
+    assert {"authorization", "content-type", "if-none-match"} <= set(
+        reply.headers["access-control-allow-headers"].split(", ")
+    )
     assert shared.ask("OPTIONS", "/data/v1/nothing", token="", headers=ASKED).status == 404
 
 
