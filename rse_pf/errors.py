@@ -44,6 +44,7 @@ __all__ = [
     "Stale",
     "StoreError",
     "StoreFull",
+    "StoreRefused",
     "TooFewCorrespondences",
     "Unauthorized",
     "UnknownService",
@@ -473,6 +474,16 @@ class StoreFull(StoreError, code="store-full"):
     Cause: Less than 10 % of the store's disk is free, and the tenant holds more than its share of it.
     Check: Run df on the folder of data.store.
     Fix: Delete objects or maps of this tenant, or use a larger disk.
+    """
+
+
+class StoreRefused(StoreError, code="store-refused"):
+    """The bucket refuses this server; no repetition helps until an operator has corrected it.
+
+    Cause: The bucket does not exist, the server's credentials have expired or do not suffice, or its clock is
+        wrong.
+    Check: The message has the code of S3; compare data.store and the role's policy with the deployment.
+    Fix: Follow the hint of the message, then try again.
     """
 
 

@@ -51,6 +51,7 @@ CODES = {
     "Stale": "stale",
     "StoreError": "store",
     "StoreFull": "store-full",
+    "StoreRefused": "store-refused",
     "TooFewCorrespondences": "too-few",
     "Unauthorized": "unauthorized",
     "UnknownService": "unknown-service",

@@ -37,7 +37,16 @@ from client_sdk.network.data_requests import (
 )
 from client_sdk.network.proxies import TunnelRefused
 from rse_pf.config.front_door import LOCALISE_PATH
-from rse_pf.errors import Conflict, ConnectError, NotFound, RsePfError, StoreError, Unauthorized, UsageError
+from rse_pf.errors import (
+    Conflict,
+    ConnectError,
+    NotFound,
+    RsePfError,
+    StoreError,
+    StoreRefused,
+    Unauthorized,
+    UsageError,
+)
 from rse_pf.maps.photos import Lens, MapOutline, PhotoLocation
 
 __all__ = ["DataClient", "DataOptions", "OnBytes", "is_allowed"]
@@ -344,7 +353,7 @@ class DataClient:
                 error = self._requests.failure(status, answer, content)
                 if error is None or status in also:
                     return status, answer, content
-                if status not in _RETRIED:
+                if status not in _RETRIED or isinstance(error, StoreRefused):
                     raise error
                 if content == NO_UPSTREAM:
                     end = min(end, begin + _NO_SERVICE_S)

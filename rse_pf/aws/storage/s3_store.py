@@ -15,7 +15,7 @@ from typing import Any
 
 from rse_pf.aws.clients import error_code, make_client, status_of, with_retries
 from rse_pf.config import PlatformSettings
-from rse_pf.errors import Archived, Conflict, NotFound, StoreError, StoreFull
+from rse_pf.errors import Archived, Conflict, NotFound, StoreError, StoreFull, StoreRefused
 from rse_pf.object_store import ObjectInfo, ObjectStore, Usage, check_name, open_store, usage_of
 
 __all__ = ["S3Store", "open_bucket", "open_data_store"]
@@ -25,6 +25,22 @@ _PART_BYTES = 8 << 20
 """Of a large object; S3 takes parts of 5 MiB or more."""
 _FULL = {"QuotaExceeded", "EntityTooLarge", "InsufficientStorage"}
 _ARCHIVED = "InvalidObjectState"
+_RENEW = "renew the AWS credentials of this machine: sign in again, or give it a role"
+_REFUSED = {
+    "NoSuchBucket": "correct data.store, or deploy the data stack",
+    "RequestTimeTooSkewed": "set the clock of this machine: S3 accepts at most 15 minutes of difference",
+    **dict.fromkeys(
+        (
+            "ExpiredToken",
+            "InvalidAccessKeyId",
+            "InvalidToken",
+            "SignatureDoesNotMatch",
+            "TokenRefreshRequired",
+        ),
+        _RENEW,
+    ),
+}
+"""Code of S3 to the action that helps; for every other code: the policies."""
 
 
 def open_bucket(bucket: str, region: str) -> S3Store:
@@ -92,7 +108,12 @@ class S3Store:
 
     def head(self, name: str) -> ObjectInfo:
         """Return size and name; raises NotFound."""
-        answer = self._ask(name, "head_object", Key=check_name(name))
+        try:
+            answer = self._ask(name, "head_object", Key=check_name(name))
+        except (NotFound, StoreRefused):
+            # The answer to HEAD has no body, and so no code: a list names the cause that it has in common.
+            self._ask(name, "list_objects_v2", Prefix=name, MaxKeys=1)
+            raise
         return ObjectInfo(name=name, size=int(answer["ContentLength"]))
 
     def list(self, prefix: str = "", after: str = "") -> Iterator[ObjectInfo]:
@@ -222,26 +243,21 @@ def _raise_store_errors(name: str) -> Iterator[None]:
         yield
     except ClientError as error:
         code = error_code(error)
-        if code == "NoSuchBucket":
-            raise StoreError(
-                "the bucket does not exist",
-                hint="correct data.store, or deploy the data stack",
-            ) from error
         if code == _ARCHIVED:
             raise Archived(
                 f"{name!r} is archived and cannot be read now",
                 hint=f"restore it: aws s3api restore-object --bucket BUCKET --key {name} "
                 "--restore-request Days=7",
             ) from error
-        if status_of(error) == _NOT_FOUND:
+        if status_of(error) == _NOT_FOUND and code not in _REFUSED:
             raise NotFound(f"no object named {name!r}") from error
         if status_of(error) == _PRECONDITION_FAILED:
             raise _conflict_error(name) from error
         if code in _FULL:
             raise StoreFull(f"no space for {name!r}", hint="free some space") from error
-        raise StoreError(
-            f"S3 refuses {name!r}: {code}", hint="check the role's policy and the bucket's"
-        ) from error
+        hint = _REFUSED.get(code, "check the role's policy and the bucket's")
+        what = "the bucket does not exist" if code == "NoSuchBucket" else f"S3 refuses {name!r}: {code}"
+        raise StoreRefused(what, hint=hint) from error
 
 
 def _conflict_error(name: str) -> Conflict:

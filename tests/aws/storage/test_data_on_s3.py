@@ -15,6 +15,7 @@ from client_sdk.transfer.data_client import DataClient, DataOptions
 from rse_pf.aws import clients
 from rse_pf.aws.clients import make_client
 from rse_pf.aws.storage import S3Store, open_bucket
+from rse_pf.errors import StoreRefused
 from rse_pf.identity import RobotId, object_name
 from rse_pf.object_store import digest_of
 
@@ -75,8 +76,11 @@ def test_large_objects_travel_directly_between_robot_and_bucket(s3_server: str) 
 class Body:
     """What a response of botocore reads its body from."""
 
+    def __init__(self, code: str = "InternalError", *, is_empty: bool = False) -> None:
+        self._text = "" if is_empty else f"<Error><Code>{code}</Code><Message>no</Message></Error>"
+
     def stream(self, *_: Any, **__: Any) -> Iterator[bytes]:
-        yield b"<Error><Code>InternalError</Code><Message>no</Message></Error>"
+        yield self._text.encode()
 
 
 class WithoutPresigning:
@@ -146,3 +150,42 @@ def test_an_s3_that_fails_three_times_in_ten_loses_nothing_acknowledged(
         assert plain.get(object_name(RobotId("default", "robot-1"), digest)) == content
     names = {object_name(RobotId("default", "robot-1"), digest) for digest in acknowledged}
     assert {info.name for info in plain.list("objects/")} == names, "a partial object is left"
+
+
+@pytest.mark.parametrize(
+    ("code", "status", "hint"),
+    [
+        ("NoSuchBucket", 404, "data.store"),
+        ("RequestTimeTooSkewed", 403, "clock"),
+        ("ExpiredToken", 400, "credentials"),
+        ("InvalidAccessKeyId", 403, "credentials"),
+        ("AccessDenied", 403, "policy"),
+    ],
+)
+def test_a_refusal_of_s3_reaches_the_robot_at_once_with_the_action_that_helps(
+    region: str, code: str, status: int, hint: str
+) -> None:
+    from botocore.awsrequest import AWSResponse
+
+    def refuse(request: Any, **_: Any) -> AWSResponse:
+        """As S3, whose answer to HEAD has no body."""
+        body = Body(code, is_empty=request.method == "HEAD")
+        return AWSResponse(request.url, status, {"content-type": "application/xml"}, body)
+
+    bucket_in(region)
+    refusing = make_client("s3", region)
+    refusing.meta.events.register_first("before-send.s3", refuse)
+    service = Service(small_settings(), WithoutPresigning(S3Store(refusing, BUCKET)))
+    pauses: list[float] = []
+
+    with (
+        HttpServer(service) as server,
+        contextlib.closing(client_of(server, service, sleep=pauses.append)) as robot,
+    ):
+        for ask in (lambda: robot.download("0" * 64), lambda: robot.upload(b"small")):
+            with pytest.raises(StoreRefused) as refused:
+                ask()
+            assert hint in refused.value.hint
+            assert (code in refused.value.message) or code == "NoSuchBucket"
+
+    assert pauses == []
