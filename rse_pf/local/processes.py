@@ -15,6 +15,7 @@ import shutil
 import signal
 import subprocess
 import time
+import weakref
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,6 +34,7 @@ __all__ = [
     "last_line",
     "log_size",
     "mark_of",
+    "reap_orphans",
     "remove_old_logs",
     "rotate_logs",
     "rotate_long_logs",
@@ -46,6 +48,10 @@ _LOOK_AGAIN_S = 0.01
 _ROTATE_EVERY_S = 5.0
 _MAX_LOGS, _MAX_LOGS_BYTES = 200, 1 << 30
 _FULL_BYTES = 1 << 16
+_REAP_EVERY_S = 2.0
+"""Between two looks for orphans: whoever waits for a child has reaped it long before the second look."""
+_spawned: weakref.WeakValueDictionary[int, subprocess.Popen[bytes]] = weakref.WeakValueDictionary()
+"""What `spawn` started, by pid: whoever holds the child reaps it, however late."""
 STOP_TIMEOUT_S = 10.0
 """A process that has not ended so long after it was asked to is killed."""
 
@@ -139,10 +145,38 @@ def spawn(
             stderr=subprocess.STDOUT,
             preexec_fn=_child_setup(os.getpid() if dies_with_parent else None),
         )
+    _spawned[process.pid] = process
     _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
     with contextlib.suppress(OSError):  # each robot needs two descriptors; the process may be gone already
         resource.prlimit(process.pid, resource.RLIMIT_NOFILE, (most, most))
     return process
+
+
+async def reap_orphans() -> None:
+    """Reap ended children that this process did not start, until cancelled.
+
+    Without an init, the first process of a container is the parent of every process whose own has ended.
+    """
+    before: set[int] = set()
+    while True:
+        running = {child.pid for ref in _spawned.valuerefs() if (child := ref()) and child.returncode is None}
+        orphans = _ended_children() - running
+        for pid in orphans & before:
+            with contextlib.suppress(ChildProcessError):
+                os.waitpid(pid, os.WNOHANG)
+        before = orphans
+        await asyncio.sleep(_REAP_EVERY_S)
+
+
+def _ended_children() -> set[int]:
+    """Return the pids of the children of this process that have ended and are not reaped."""
+    ended = set()
+    for stat in Path("/proc").glob("[1-9]*/stat"):
+        with contextlib.suppress(OSError):  # it is gone
+            state, parent = stat.read_text(encoding="utf-8").rpartition(")")[2].split()[:2]
+            if state == "Z" and int(parent) == os.getpid():
+                ended.add(int(stat.parent.name))
+    return ended
 
 
 class ServerProcess:

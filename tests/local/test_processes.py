@@ -253,3 +253,36 @@ def test_the_oldest_logs_of_ended_processes_are_removed_and_nothing_else(tmp_pat
     assert sorted(path.name for path in tmp_path.iterdir()) == [
         audit.name, "server-0.log", "server-4.log", "server-5.log",
     ]  # fmt: skip
+
+
+_PARENT_OF_ORPHANS = """
+import asyncio, sys
+from pathlib import Path
+from rse_pf.linux import PR_SET_CHILD_SUBREAPER, prctl
+from rse_pf.local.processes import reap_orphans, spawn
+
+async def main() -> None:
+    prctl(PR_SET_CHILD_SUBREAPER, 1)
+    here = Path(sys.argv[1])
+    reaper = asyncio.ensure_future(reap_orphans())
+    child = spawn(["sh", "-c", "sleep 0.1 & echo $! > orphan; exit 7"], log=here / "log", folder=here,
+                  dies_with_parent=True)
+    while not (here / "orphan").exists() or not (here / "orphan").read_text():
+        await asyncio.sleep(0.01)
+    orphan = Path("/proc") / (here / "orphan").read_text().strip()
+    while orphan.exists():
+        await asyncio.sleep(0.05)
+    print(child.wait())
+    reaper.cancel()
+
+asyncio.run(main())
+"""
+
+
+def test_a_process_without_an_init_reaps_orphans_and_no_child_that_it_holds(tmp_path: Path) -> None:
+    ended = subprocess.run(
+        [sys.executable, "-c", _PARENT_OF_ORPHANS, str(tmp_path)],
+        capture_output=True, text=True, timeout=60, check=False,
+    )  # fmt: skip
+
+    assert (ended.stdout, ended.stderr) == ("7\n", "")

@@ -35,7 +35,7 @@ from rse_pf.local.control.scale_modifier import bounds_for
 from rse_pf.local.disk_watch import DiskWatch
 from rse_pf.local.firewall import check_lan_settings, check_listener, ensure_key, key_file, robots_url
 from rse_pf.local.lan.listener import LanListener, authority_file
-from rse_pf.local.processes import STOP_TIMEOUT_S, is_alive, mark_of, rotate_logs, send_signal
+from rse_pf.local.processes import STOP_TIMEOUT_S, is_alive, mark_of, reap_orphans, rotate_logs, send_signal
 from rse_pf.local.servers.backend_servers import (
     RSE_PF,
     BackendServer,
@@ -433,6 +433,8 @@ class LocalPlatform:
         self._disks.on_space = self._control.retry_replacements
         self._fleet.keep(self._disks.watch())
         self._fleet.keep(rotate_logs(self.state, _LOG_FILE_BYTES, self._fleet.members))
+        if os.getpid() == 1:
+            self._fleet.keep(reap_orphans())
         if self.lan is not None:
             renewed = functools.partial(self._emit, "certificate-renewed")
             self._fleet.keep(self.lan.keep_valid(self.name, renewed, self._report_unwritten_state))
