@@ -69,8 +69,8 @@ class BackendServers(Construct):
         self._allow_audit(audit_logs)
         self.facts = {
             "package": package.s3_object_url, "sha256": package_sums, "region": settings.cloud.region,
-            "bucket": artifacts.bucket_name, "keys": key_set, "group": names.group,
-            "hook": names.drain_hook, "launch": names.launch_hook,
+            "domain": cdk.Aws.URL_SUFFIX, "bucket": artifacts.bucket_name, "keys": key_set,
+            "group": names.group, "hook": names.drain_hook, "launch": names.launch_hook,
             "retry_s": f"{retry_within_s():g}",
             "store": f"s3:{maps.bucket_name}" if maps is not None else settings.data.store,
             "audit": audit_logs.bucket_name,

@@ -21,6 +21,7 @@ from rse_pf.config.validation import (
     SettingRow,
     check_buckets,
     check_burst_url,
+    check_cidr,
     check_deployment,
     check_origin,
     check_range,
@@ -351,6 +352,7 @@ def _check_contradictions(s: PlatformSettings) -> None:
         check_origin("serving.allowed_origins", origin)
     check_elasticity(dataclasses.asdict(s.scaling), dataclasses.asdict(s.cloud))
     check_deployment(s.cloud.name, s.cloud.bootstrap_qualifier)
+    check_cidr("cloud.robot_cidr", s.cloud.robot_cidr)
     for name in ("replica_maps", "replica_artifacts"):
         check_buckets(f"cloud.{name}", getattr(s.cloud, name))
     _check_live_ports(s)

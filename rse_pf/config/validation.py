@@ -6,6 +6,7 @@ Every error names the setting, the value and its limit, and says what to do.
 from __future__ import annotations
 
 import difflib
+import ipaddress
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -18,6 +19,7 @@ __all__ = [
     "SettingRow",
     "check_buckets",
     "check_burst_url",
+    "check_cidr",
     "check_deployment",
     "check_origin",
     "check_range",
@@ -31,6 +33,7 @@ _DEPLOYMENT = re.compile(r"(?:[a-z](?:[a-z0-9-]{0,14}[a-z0-9])?)?")
 _QUALIFIER = re.compile(r"[a-z0-9]{1,10}")
 _ORIGIN = re.compile(r"[a-z][a-z0-9+.-]*://(?:[a-z0-9._-]+|\[[0-9a-f:.]+\])(?::[0-9]{1,5})?", re.IGNORECASE)
 _BURST_URL = re.compile(r"(?:https?://(?:[A-Za-z0-9._-]+|\[[0-9A-Fa-f:.]+\])(?::[0-9]{1,5})?)?/[!-~]{0,200}")
+_PREFIX = re.compile(r"/[0-9]{1,2}$")
 _BUCKET = re.compile(r"[a-z0-9][a-z0-9.-]{1,61}[a-z0-9]")
 WHERE = 'in cdk.json, context."rse-pf"'
 
@@ -122,6 +125,19 @@ def check_burst_url(name: str, url: str) -> None:
             f"{name} = {_shown(url)} is no place to send commands to",
             hint=f"use /burst, or an address such as https://robots.example.org/burst, {WHERE}",
         )
+
+
+def check_cidr(name: str, cidr: str) -> None:
+    """Raise SettingsError if *cidr* is not a range of IPv4 addresses with the length of its prefix."""
+    try:
+        if _PREFIX.search(cidr) is None:
+            raise ValueError
+        ipaddress.IPv4Network(cidr, strict=False)  # AWS clears the bits behind the prefix
+    except ValueError:
+        raise SettingsError(
+            f"{name} = {_shown(cidr)} is no range of IPv4 addresses",
+            hint=f"write it as 192.0.2.0/24, with a prefix of 0 to 32 bits, {WHERE}",
+        ) from None
 
 
 def check_buckets(name: str, buckets: str) -> None:

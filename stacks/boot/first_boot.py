@@ -106,7 +106,7 @@ def fetched(facts):
     """Return the package's bytes and the name of this instance."""
     token = imds("api/token")
     bucket, _, name = facts["package"].split("://", 1)[1].partition("/")
-    host = f"{bucket}.s3.{facts['region']}.amazonaws.com"
+    host = f"{bucket}.s3.{facts['region']}.{facts['domain']}"
     return asked(host, "/" + urllib.parse.quote(name), facts, token), imds("meta-data/instance-id", token)
 
 
@@ -119,7 +119,7 @@ def abandon(facts):
             "InstanceId": imds("meta-data/instance-id", token), "LifecycleActionResult": "ABANDON",
             "LifecycleHookName": facts["launch"], "Version": "2011-01-01",
         }  # fmt: skip
-        host = f"autoscaling.{facts['region']}.amazonaws.com"
+        host = f"autoscaling.{facts['region']}.{facts['domain']}"
         asked(host, "/?" + urllib.parse.urlencode(sorted(call.items())), facts, token, "autoscaling")
     except (OSError, ValueError, IndexError) as error:
         say(f"first boot: not abandoned: {error}")

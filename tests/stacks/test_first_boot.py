@@ -16,7 +16,7 @@ import pytest
 
 from lambda_pnp.keys import signed_request
 from rse_pf.config import PlatformSettings
-from stacks.boot.first_boot import signed_headers, verified
+from stacks.boot.first_boot import fetched, signed_headers, verified
 from stacks.boot.install import environment_file, units_of
 
 NOW = datetime(2026, 11, 21, 6, 0, 0, tzinfo=timezone.utc)
@@ -79,6 +79,25 @@ def test_the_script_with_its_facts_fits_into_the_user_data(assembly: Any) -> Non
     length = sum(len(part) if isinstance(part, str) else 128 for part in parts)
 
     assert length < USER_DATA_BYTES
+
+
+def test_a_boot_asks_hosts_of_the_partition_of_its_region(
+    assembly: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hosts: list[str] = []
+
+    def answer(request: Any, **_: Any) -> io.BytesIO:
+        hosts.append(request.host)
+        if request.full_url.endswith("/role"):
+            return io.BytesIO(b'{"AccessKeyId": "a", "SecretAccessKey": "b", "Token": "c"}')
+        return io.BytesIO(b"role")
+
+    monkeypatch.setattr("urllib.request.urlopen", answer)
+    fetched({"package": "s3://assets/boot.zip", "region": "cn-north-1", "domain": "amazonaws.com.cn"})
+
+    assert "assets.s3.cn-north-1.amazonaws.com.cn" in hosts
+    data = assembly.one("AWS::EC2::LaunchTemplate")["LaunchTemplateData"]["UserData"]["Fn::Base64"]
+    assert {"Ref": "AWS::URLSuffix"} in data["Fn::Join"][1]
 
 
 def packed(files: dict[str, bytes], listed: dict[str, bytes] | None = None) -> tuple[bytes, str]:

@@ -98,7 +98,8 @@ class World:
                     made.write(file, file.relative_to(package).as_posix())
         self.inside("fill", str(archive))
         facts = {
-            "package": "s3://assets/package.zip", "sha256": digest, "region": REGION, "bucket": "artifacts",
+            "package": "s3://assets/package.zip", "sha256": digest, "region": REGION,
+            "domain": "amazonaws.com", "bucket": "artifacts",
             "keys": "keys.json", "group": "rse-pf", "hook": "rse-pf-drain", "store": "s3:maps",
             "launch": "rse-pf-launch", "retry_s": "120", "audit": "audit", **changes,
         }  # fmt: skip
