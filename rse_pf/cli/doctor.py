@@ -10,18 +10,17 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import importlib
-import importlib.util
 import os
 import platform
 import re
 import resource
 import subprocess
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 from rse_pf.cli.extras import EXTRAS, VERBS_NEED, modules_of
+from rse_pf.cli.packages import Defect, find_defect
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import ConfigurationError, MissingExtra
 from rse_pf.native import load_core, open_solver
@@ -55,7 +54,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     """Print every finding; 1 if something required failed."""
-    return report(check_machine(settings), "ready: rse-pf local, or rse-pf demo")
+    has_demo = find_defect("cv2", EXTRAS["demo"].modules["cv2"]) is None
+    return report(check_machine(settings), f"ready: rse-pf local{', or rse-pf demo' if has_demo else ''}")
 
 
 def report(findings: Iterable[Finding], ready: str) -> int:
@@ -86,26 +86,33 @@ def _system(settings: PlatformSettings) -> Iterator[Finding]:
 
 def _extras(settings: PlatformSettings) -> Iterator[Finding]:
     """Yield a line for each extra, and then which verbs work and which do not."""
-    absent = {module for extra in EXTRAS.values() for module in extra.modules if not _has(module)}
+    packages = {module: name for extra in EXTRAS.values() for module, name in extra.modules.items()}
+    found = {module: find_defect(module, package) for module, package in packages.items()}
+    defects = {module: defect for module, defect in found.items() if defect is not None}
     for name, extra in EXTRAS.items():
-        missing = ", ".join(module for module in extra.modules if module in absent)
-        fix = MissingExtra.command(*([] if name == "base" else [name]))
-        title = f"extra {name}: {missing} cannot be imported" if missing else f"extra {name}"
-        yield _finding(f"{title}; for {extra.enables}", fix if missing else "", is_required=extra.is_required)
-    yield from _verbs(absent)
+        broken = [defects[module] for module in extra.modules if module in defects]
+        fixes = [defect.fix or MissingExtra.command(*([] if name == "base" else [name])) for defect in broken]
+        absent = [module for module in extra.modules if module in defects and not defects[module].fix]
+        problems = [f"{', '.join(absent)} cannot be imported"] if absent else []
+        problems = "; ".join([*problems, *(defect.problem for defect in broken if defect.fix)])
+        title = f"extra {name}: {problems}" if broken else f"extra {name}"
+        fix = " && ".join(dict.fromkeys(fixes))
+        yield _finding(f"{title}; for {extra.enables}", fix, is_required=extra.is_required)
+    yield from _verbs(defects)
 
 
-def _verbs(absent: set[str]) -> Iterator[Finding]:
+def _verbs(defects: Mapping[str, Defect]) -> Iterator[Finding]:
     lacking = {
-        verb: [extra for extra in extras if absent & modules_of(extra).keys()]
+        verb: [extra for extra in extras if defects.keys() & modules_of(extra).keys()]
         for verb, extras in VERBS_NEED.items()
     }
     yield _finding(f"verbs that work here: {', '.join(verb for verb, lacks in lacking.items() if not lacks)}")
     for verb, lacks in lacking.items():
         if lacks:
-            missing = {module for extra in lacks for module in absent & modules_of(extra).keys()}
-            title = f"rse-pf {verb} does not work here: it needs {', '.join(sorted(missing))}"
-            yield _finding(title, MissingExtra.command(*lacks))
+            broken = {module for extra in lacks for module in defects.keys() & modules_of(extra).keys()}
+            title = f"rse-pf {verb} does not work here: it needs {', '.join(sorted(broken))}"
+            fixes = [defects[module].fix or MissingExtra.command(*lacks) for module in sorted(broken)]
+            yield _finding(title, " && ".join(dict.fromkeys(fixes)))
 
 
 def _solver(settings: PlatformSettings) -> Iterator[Finding]:
@@ -212,12 +219,3 @@ def _finding(what: str, fix: str = "", *, is_required: bool = False) -> Finding:
     """Return what is ok if it needs no *fix*; else it warns, or fails if it *is_required*."""
     grade = "fail" if is_required else "warn"
     return Finding(grade=grade if fix else "ok", what=what, fix=fix)
-
-
-def _has(module: str) -> bool:
-    """Whether *module* can be imported; a broken native library counts as absent."""
-    try:
-        importlib.import_module(module)
-    except (ImportError, OSError):
-        return False
-    return True

@@ -9,7 +9,8 @@ import importlib.util
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from rse_pf.errors import MissingExtra
+from rse_pf.cli.packages import Defect, find_defect, find_misuse
+from rse_pf.errors import ConfigurationError, MissingExtra
 
 __all__ = ["EXTRAS", "VERBS_NEED", "Extra", "extra_of_module", "modules_of", "require"]
 
@@ -142,11 +143,20 @@ def modules_of(extra: str) -> dict[str, str]:
 
 
 def require(verb: str) -> None:
-    """Raise MissingExtra, before any work, if *verb* needs a package that is not installed."""
+    """Refuse *verb* before any work if it needs a package that is not installed, or OpenCV does not work.
+
+    Raises:
+        MissingExtra: A package is not installed.
+        ConfigurationError: The folder ``cv2``, which several packages install, is damaged.
+    """
     for extra in VERBS_NEED[verb]:
-        for module, package in modules_of(extra).items():
+        modules = modules_of(extra)
+        for module, package in modules.items():
             if importlib.util.find_spec(module) is None:
                 raise MissingExtra(package, extra)
+        if "cv2" in modules and find_misuse("cv2", modules["cv2"]) is not None:
+            defect = find_defect("cv2", modules["cv2"]) or Defect(problem="cv2 does not work")
+            raise ConfigurationError(defect.problem, hint=defect.fix)
 
 
 def extra_of_module(module: str) -> MissingExtra | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import socket
 import subprocess
 import sys
@@ -49,19 +50,75 @@ def test_a_taken_front_door_is_a_warning() -> None:
 
 
 def test_a_missing_required_extra_fails_and_an_optional_one_warns(monkeypatch: pytest.MonkeyPatch) -> None:
-    present = doctor.importlib.import_module
-
-    def without(name: str) -> object:
-        if name in ("picows", "matplotlib"):
-            raise ImportError(name)
-        return present(name)
-
-    monkeypatch.setattr(doctor.importlib, "import_module", without)
+    present = importlib.util.find_spec
+    absent = ("picows", "matplotlib")
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name in absent else present(name))
     found = findings()
 
     assert only("extra backend: picows", found).grade == "fail"
     assert only("extra backend: picows", found).fix == "pip install 'rse-pf[backend]'"
     assert only("extra experiments: matplotlib", found).grade == "warn"
+
+
+# Only the distributions of the folder install cv2.
+ISOLATED = """
+import importlib.metadata as metadata, sys
+sys.path.insert(0, sys.argv[1])
+here = metadata.packages_distributions()
+real = {dist.metadata["Name"] for dist in metadata.distributions(path=sys.argv[1:2])}
+here["cv2"] = sorted(real)
+metadata.packages_distributions = lambda: here
+from rse_pf.cli.main import main
+sys.exit(main(sys.argv[2:]))
+"""
+
+
+REINSTALL = "pip install --force-reinstall --no-deps 'opencv-python-headless"
+
+
+@pytest.mark.parametrize(
+    ("packages", "code", "problem", "fix"),
+    [
+        ({}, "", "does not work: AttributeError", REINSTALL),
+        ({}, "raise ImportError('numpy.core.multiarray')", "does not work: ImportError: numpy", REINSTALL),
+        ({"opencv-python-headless": "5.0.0"}, "", "opencv-python-headless 5.0.0 is installed", "pip install"),
+        ({"opencv-python": "5.1"}, "", "opencv-python 5.1 is installed", "pip uninstall --yes opencv-python"),
+        (
+            {"opencv-python-headless": "4.11.0", "opencv-contrib-python": "4.11.0"}, "",
+            "opencv-contrib-python 4.11.0 and opencv-python-headless 4.11.0 both install cv2",
+            f"pip uninstall --yes opencv-contrib-python && {REINSTALL}",
+        ),
+    ],
+)  # fmt: skip
+def test_an_opencv_that_does_not_work_is_named_with_its_repair_and_ends_the_demo_in_one_line(
+    tmp_path: Path, packages: dict[str, str], code: str, problem: str, fix: str
+) -> None:
+    (tmp_path / "cv2").mkdir()
+    for package, version in packages.items():
+        about = tmp_path / f"{package.replace('-', '_')}-{version}.dist-info"
+        about.mkdir()
+        (about / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: {version}\n")
+    (tmp_path / "cv2" / "__init__.py").write_text(code)
+
+    def run(*words: str) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            [sys.executable, "-c", ISOLATED, str(tmp_path), *words],
+            capture_output=True, text=True, check=False, timeout=100,
+        )  # fmt: skip
+
+    lines = run("doctor").stdout.splitlines()
+    (extra,) = [line for line in lines if "extra demo" in line]
+    assert extra.startswith("warn")
+    assert problem in extra
+    assert fix in lines[lines.index(extra) + 1]
+    assert lines[-1] == "ready: rse-pf local"
+
+    demo = run("demo", "--frames", "2", "--robots", "1", "--out", str(tmp_path / "out"))
+    message, hint = demo.stderr.splitlines()
+    assert problem in message
+    assert hint.startswith("  hint: ")
+    assert fix in hint
+    assert demo.returncode == 2
 
 
 def test_a_missing_native_core_fails_with_the_command_that_builds_it(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,0 +1,153 @@
+"""Find what is wrong with an installed package: its version, another package in its folder, or its use.
+
+The declared versions are those of the metadata of rse-pf.  A package is imported and called once, since a
+damaged package, or a folder that hides it, can often be imported.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import importlib
+import importlib.util
+import io
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from importlib import metadata
+from typing import Any
+
+__all__ = ["Defect", "find_defect", "find_misuse"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Defect:
+    """What is wrong with a package, and the command that repairs it; empty: its extra is not installed."""
+
+    problem: str
+    fix: str = ""
+
+
+def find_defect(module: str, package: str) -> Defect | None:
+    """Return what is wrong with *module* of *package*; None if nothing is."""
+    if importlib.util.find_spec(module) is None:
+        return Defect(problem=f"{module} cannot be imported")
+    installed = {name: metadata.version(name) for name in _owners_of().get(module, ())}
+    named = [f"{name} {version}" for name, version in sorted(installed.items())]
+    others = sorted(installed.keys() - {package})
+    wanted = _declared().get(package, "")
+    remove = f"pip uninstall --yes {' '.join(others)} && " if others else ""
+    if others and package in installed:
+        problem = f"{' and '.join(named)} both install {module}"
+        return Defect(problem=problem, fix=f"{remove}{_reinstall(package)}")
+    if not all(_is_in(version, wanted) for version in installed.values()):
+        problem = f"{', '.join(named)} is installed, and {package}{wanted} is required"
+        return Defect(problem=problem, fix=f"{remove}pip install '{package}{wanted}'")
+    return find_misuse(module, package)
+
+
+def find_misuse(module: str, package: str) -> Defect | None:
+    """Import *module* and call it; return what is wrong if that fails."""
+    try:
+        with contextlib.redirect_stderr(io.StringIO()):  # numpy prints a page for an extension of another ABI
+            made = importlib.import_module(module)
+            _CALLS.get(module, _no_call)(made)
+    except ModuleNotFoundError as error:
+        return Defect(problem=f"{error.name or module} cannot be imported")
+    except Exception as error:  # noqa: BLE001 - a damaged package may raise anything
+        spec = importlib.util.find_spec(module)
+        places = [] if spec is None else list(spec.submodule_search_locations or [spec.origin])
+        cause = (str(error).splitlines() or [""])[0][:200]
+        problem = f"{module} in {places[0] if places else '?'} does not work: {type(error).__name__}: {cause}"
+        remove = f"rm -r '{places[0]}'; " if places else ""
+        return Defect(problem=problem, fix=f"{remove}{_reinstall(package)}")
+    return None
+
+
+def _reinstall(package: str) -> str:
+    return f"pip install --force-reinstall --no-deps '{package}{_declared().get(package, '')}'"
+
+
+def _no_call(module: Any) -> None:
+    pass
+
+
+def _detect_features(cv2: Any) -> None:
+    import numpy as np
+
+    cv2.ORB_create(8).detectAndCompute(np.zeros((64, 64), np.uint8), None)
+
+
+_CALLS: Mapping[str, Callable[[Any], object]] = {
+    "numpy": lambda numpy: numpy.linalg.inv(numpy.eye(2)),
+    "websockets": lambda websockets: websockets.connect,
+    "msgspec": lambda msgspec: msgspec.json.decode(msgspec.json.encode([1])),
+    "simdjson": lambda simdjson: simdjson.Parser().parse(b"[1]"),
+    "uvloop": lambda uvloop: uvloop.new_event_loop().close(),
+    "httptools": lambda httptools: httptools.parse_url(b"/"),
+    "lupa": lambda lupa: lupa.LuaRuntime().eval("1"),
+    "prometheus_client": lambda prometheus_client: prometheus_client.CollectorRegistry(),
+    "jwt": lambda jwt: jwt.encode({}, "k" * 32, algorithm="HS256"),
+    "cv2": _detect_features,
+    "h5py": lambda h5py: h5py.File("unused", "w", driver="core", backing_store=False).close(),
+    "yaml": lambda yaml: yaml.safe_load("[1]"),
+    "gtsam": lambda gtsam: gtsam.Pose3(),
+    "onnxruntime": lambda onnxruntime: onnxruntime.get_available_providers(),
+    "pyrealsense2": lambda pyrealsense2: pyrealsense2.config(),
+    **{
+        module: functools.partial(lambda name, _: importlib.import_module(name), f"{module}.{part}")
+        for module, part in (
+            ("isal", "isal_zlib"), ("packaging", "version"), ("PIL", "Image"), ("rich", "progress"),
+            ("cryptography", "hazmat.primitives.asymmetric.ed25519"), ("mcap", "writer"),
+            ("rosbags", "rosbag1"), ("matplotlib", "figure"),
+        )
+    },
+}  # fmt: skip
+"""Module to a call of it that needs its compiled parts, or an import of them."""
+
+
+@functools.cache
+def _owners_of() -> Mapping[str, list[str]]:
+    """Return module to the distributions that install it."""
+    return {module: [_normal(name) for name in names] for module, names in _all_owners().items()}
+
+
+def _all_owners() -> Mapping[str, list[str]]:
+    return metadata.packages_distributions()
+
+
+@functools.cache
+def _declared() -> dict[str, str]:
+    """Return package to declared versions, such as ``>=4.10,<5``; empty if rse-pf has no metadata."""
+    try:
+        lines = metadata.requires("rse-pf") or []
+    except metadata.PackageNotFoundError:
+        return {}
+    parts = (re.match(r"([A-Za-z0-9._-]+)(?:\[[^]]*\])?\s*\(?([^;)]*)", line) for line in lines)
+    return {_normal(part[1]): part[2].strip() for part in parts if part}
+
+
+def _normal(name: str) -> str:
+    """Return *name* as package indexes write it (PEP 503)."""
+    return re.sub(r"[-_.]+", "-", name).lower()
+
+
+def _is_in(version: str, wanted: str) -> bool:
+    """Return whether *version* is one of *wanted*; only ``>=``, ``<`` and ``==`` restrict it."""
+    number = _number(version)
+    for operator, limit in re.findall(r"(>=|==|<)\s*([^,\s]+)", wanted):
+        bound = _number(limit)
+        if (operator == ">=" and number < bound) or (operator == "<" and number >= bound):
+            return False
+        if operator == "==" and version != limit:
+            return False
+    return True
+
+
+def _number(version: str) -> list[int]:
+    """Return the release segment of *version*, without zeros at its end."""
+    release = re.match(r"[0-9]+(?:\.[0-9]+)*", version)
+    number = [int(part) for part in release[0].split(".")] if release else []
+    while number and number[-1] == 0:
+        number.pop()
+    return number
