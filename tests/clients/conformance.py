@@ -16,7 +16,6 @@ import sys
 import tempfile
 import time
 from collections.abc import AsyncIterator
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -76,7 +75,7 @@ def main() -> int:
 def write(out: Path, runs: int, rows: list[dict[str, Any]]) -> None:
     """Write out/clients.json."""
     document = {
-        "version": version("rse-pf"), "date": time.strftime("%Y-%m-%d", time.gmtime()),
+        "date": time.strftime("%Y-%m-%d", time.gmtime()),
         "load_average": round(os.getloadavg()[0], 2), "runs": runs, "rows": rows,
     }  # fmt: skip
     out.parent.mkdir(parents=True, exist_ok=True)
