@@ -94,8 +94,8 @@ def _extras(settings: PlatformSettings) -> Iterator[Finding]:
         fixes = [defect.fix or MissingExtra.command(*([] if name == "base" else [name])) for defect in broken]
         absent = [module for module in extra.modules if module in defects and not defects[module].fix]
         problems = [f"{', '.join(absent)} cannot be imported"] if absent else []
-        problems = "; ".join([*problems, *(defect.problem for defect in broken if defect.fix)])
-        title = f"extra {name}: {problems}" if broken else f"extra {name}"
+        problems += [defect.problem for defect in broken if defect.fix]
+        title = f"extra {name}: {'; '.join(problems)}" if broken else f"extra {name}"
         fix = " && ".join(dict.fromkeys(fixes))
         yield _finding(f"{title}; for {extra.enables}", fix, is_required=extra.is_required)
     yield from _verbs(defects)

@@ -15,6 +15,7 @@ import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib import metadata
+from pathlib import Path
 from typing import Any
 
 __all__ = ["Defect", "find_defect", "find_misuse"]
@@ -56,16 +57,24 @@ def find_misuse(module: str, package: str) -> Defect | None:
         return Defect(problem=f"{error.name or module} cannot be imported")
     except Exception as error:  # noqa: BLE001 - a damaged package may raise anything
         spec = importlib.util.find_spec(module)
-        places = [] if spec is None else list(spec.submodule_search_locations or [spec.origin])
+        place = "" if spec is None else [*(spec.submodule_search_locations or ()), spec.origin or ""][0]
         cause = (str(error).splitlines() or [""])[0][:200]
-        problem = f"{module} in {places[0] if places else '?'} does not work: {type(error).__name__}: {cause}"
-        remove = f"rm -r '{places[0]}'; " if places else ""
+        problem = f"{module} in {place} does not work: {type(error).__name__}: {cause}"
+        remove = "" if _is_part_of(package, place) else f"rm -r '{place}'; "
         return Defect(problem=problem, fix=f"{remove}{_reinstall(package)}")
     return None
 
 
 def _reinstall(package: str) -> str:
     return f"pip install --force-reinstall --no-deps '{package}{_declared().get(package, '')}'"
+
+
+def _is_part_of(package: str, place: str) -> bool:
+    """Return whether *place* lies where *package* is installed, so that pip replaces it."""
+    try:
+        return Path(str(metadata.distribution(package).locate_file(Path(place).name))) == Path(place)
+    except metadata.PackageNotFoundError:
+        return False
 
 
 def _no_call(module: Any) -> None:
@@ -109,11 +118,8 @@ _CALLS: Mapping[str, Callable[[Any], object]] = {
 @functools.cache
 def _owners_of() -> Mapping[str, list[str]]:
     """Return module to the distributions that install it."""
-    return {module: [_normal(name) for name in names] for module, names in _all_owners().items()}
-
-
-def _all_owners() -> Mapping[str, list[str]]:
-    return metadata.packages_distributions()
+    owners = metadata.packages_distributions()
+    return {module: [_normal(name) for name in names] for module, names in owners.items()}
 
 
 @functools.cache
