@@ -24,7 +24,7 @@ from client_sdk.live import LiveMapper
 from client_sdk.mapper import Mapper
 from client_sdk.robot import Robot
 from ros_bridge.access import connect_robot
-from ros_bridge.incoming import NO_MESSAGE, IncomingFrames, PairedImages, Role
+from ros_bridge.incoming import IncomingFrames, PairedImages, Role
 from ros_bridge.map_services import MapServices, as_json
 from ros_bridge.options import BridgeOptions
 from ros_bridge.outgoing import Message, OutgoingMessages
@@ -184,8 +184,7 @@ class Bridge:
         try:
             tracked = await self._track(frame)
         except UsageError as error:
-            self._reason = error.message
-            self._incoming.left_out["not tracked"] += 1
+            self._incoming.check.refuse("not tracked", error.message)
             return
         self.track_s.append(time.perf_counter() - started)
         del self.track_s[:-10_000]
@@ -242,7 +241,7 @@ class Bridge:
 
     async def _report(self) -> None:
         """Publish how the bridge is, each second, whether frames come or not."""
-        last, received, logged = 0, Counter[str](), ""
+        last, received, logged, check = 0, Counter[str](), "", self._incoming.check
         while True:
             connected = self._robot is None or self._robot.connected
             cause = "" if self._robot is None or connected else self._robot.stats.last_error
@@ -255,16 +254,19 @@ class Bridge:
                 "scale": self._mapper.scale,
                 "track ms (median)": f"{1e3 * median(self.track_s):.1f}" if self.track_s else "",
                 "connected": str(connected).lower(),
-                **{f"left out: {why}": str(count) for why, count in sorted(self._incoming.left_out.items())},
+                **{f"left out: {why}": str(count) for why, count in sorted(check.left_out.items())},
             }
             trouble = "" if connected else f"no connection to the platform{cause and f': {cause}'}"
-            trouble = trouble or self._reason or self._incoming.trouble
+            trouble = (
+                trouble or check.fault or self._reason or self._silence(received, last) or check.shortage
+            )
             if isinstance(self._mapper, LiveMapper):
                 values |= {"map": self._mapper.name, "map state": self._mapper.state}
                 values["aligned"] = str(self._mapper.aligned).lower()
                 trouble = trouble or self._mapper.trouble or self._mapper.reason
-            if trouble in ("", NO_MESSAGE) and self.frames == last:
-                trouble = self._silence(received)
+            if not trouble and self.frames == last:
+                trouble = f"no new frame of {self._options.named(self._options.colour)}"
+            check.next_report()
             last, received = self.frames, Counter(self._incoming.received)
             self._publish(
                 self._outgoing.diagnostics(
@@ -273,8 +275,10 @@ class Bridge:
             )
             await asyncio.sleep(_DIAGNOSTICS_EVERY_S)
 
-    def _silence(self, before: Counter[str]) -> str:
-        """Return which topics of images sent nothing since *before*, where no frame came."""
+    def _silence(self, before: Counter[str], frames_before: int) -> str:
+        """Return which topics of images sent nothing since *before*; empty if there was a frame."""
+        if self.frames != frames_before:
+            return ""
         partner = self._options.partner
         topics = {"colour": self._options.colour}
         if partner:
@@ -283,9 +287,7 @@ class Bridge:
         silent = [
             self._options.named(name) for role, name in topics.items() if name and now[role] == before[role]
         ]
-        if silent:
-            return f"no new message of {' and '.join(silent)}"
-        return f"no new frame of {self._options.named(self._options.colour)}"
+        return f"no new message of {' and '.join(silent)}" if silent else ""
 
 
 @contextlib.asynccontextmanager

@@ -1,6 +1,6 @@
 """From the bytes of image messages to frames: paired by their time stamps, undistorted, with depth in metres.
 
-It never waits and never grows: what does not fit is counted in `IncomingFrames.left_out`.  The time of a
+It never waits and never grows: what does not fit is counted in `IncomingFrames.check`.  The time of a
 frame is the stamp that the camera's driver gave, never the time of arrival.
 """
 
@@ -12,25 +12,31 @@ from collections import Counter, deque
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
+import numpy as np
+
 from client_sdk.bags.bag_file import BrokenMessage
 from client_sdk.bags.images import ImageFormat, check_image, decode_colour, decode_depth, format_of
-from client_sdk.bags.lens import Rectifier, lens_of
+from client_sdk.bags.lens import Lens, Rectifier, lens_of
 from client_sdk.bags.message_maker import MessageMaker
 from client_sdk.bags.message_types import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, IMU
 from client_sdk.cameras.source import no_depth
 from client_sdk.frontend import Frame, load_opencv
+from client_sdk.source_facts import MAX_MEDIAN_DEPTH_M, MIN_MEDIAN_DEPTH_M, median_depth_m
+from ros_bridge.input_check import InputCheck
 from ros_bridge.options import BridgeOptions
 from ros_bridge.rig_topics import RigTopics
 from rse_pf.errors import RsePfError
 from rse_pf.geometry import Camera
 
-__all__ = ["NO_MESSAGE", "IncomingFrames", "PairedImages", "Role", "kind_of"]
+__all__ = ["IncomingFrames", "PairedImages", "Role", "kind_of"]
 
 Role = Literal["colour", "depth", "right", "info", "right_info", "imu"]
-NO_MESSAGE = "no message yet"
 _FAULTS = (ArithmeticError, AttributeError, LookupError, TypeError, ValueError)
 _JUMP_NS = 1_000_000_000
 """A stamp that lies so far back is of a clock that was set, or of a bag that is played again."""
+_INFOS: tuple[Role, ...] = ("info", "right_info")
+_MAX_CAMERAS = 10  # camera_infos: images that wait are older than the last few changes of a lens at most
+_REPEATED = "repeated"
 _NAMES = {"depth": "depth", "right": "right image"}
 _WAITING = 30
 """So many images of a topic wait for their partner."""
@@ -50,6 +56,35 @@ def _stamp_ns(message: Any) -> int:
     return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
 
 
+class _RepeatedImage(BrokenMessage):
+    """An image has the bytes of the image before it."""
+
+
+@dataclass(frozen=True, slots=True)
+class _StatedCamera:
+    """A camera_info from its stamp on: its lens, the first camera, the map between both, and what changed."""
+
+    stamp_ns: int
+    lens: Lens
+    rectified: Camera
+    rectifier: Rectifier
+    change: str
+
+
+def _change_of(topic: str, first: Lens, lens: Lens) -> str:
+    """Return which numbers of a camera_info changed; raises BrokenMessage if the images have another size."""
+    pairs = {
+        name: (getattr(first.camera, name), getattr(lens.camera, name))
+        for name in ("width", "height", "fx", "fy", "cx", "cy")
+    }
+    pairs |= {name: (getattr(first, name), getattr(lens, name)) for name in ("distortion", "is_fisheye")}
+    changed = ", ".join(f"{name} {old} to {new}" for name, (old, new) in pairs.items() if old != new)
+    line = f"{topic} has changed: {changed}"
+    if "width" in changed or "height" in changed:
+        raise BrokenMessage(line)
+    return line
+
+
 @dataclass(frozen=True, slots=True)
 class PairedImages:
     """The messages of one frame: time stamp, frame of the camera, colours, and what belongs to them.
@@ -66,14 +101,13 @@ class PairedImages:
 class IncomingFrames:
     """Pairs the images of two topics; any thread may `add`, another may `take` and `decode`.
 
-    ``rig`` is what is known of a pair and of an IMU.
+    ``rig`` is what is known of a pair and of an IMU; ``check`` counts what is left out, and says why.
     """
 
     def __init__(self, maker: MessageMaker, options: BridgeOptions) -> None:
-        self.left_out: Counter[str] = Counter()
+        self.check = InputCheck()
         self.received: Counter[str] = Counter({"colour": 0, "depth": 0, "info": 0})
         self.rig = RigTopics(options)
-        self.trouble = NO_MESSAGE
         self._maker, self._options = maker, options
         self._bound_ns = round(1e9 * options.pair_within_s)
         self._partner = options.partner
@@ -86,16 +120,23 @@ class IncomingFrames:
         self._last_ns = -1
         self._jump_ns = 0
         self._stragglers: Counter[str] = Counter()
-        self._camera: tuple[Camera, Rectifier] | None = None
+        self._cameras: deque[_StatedCamera] = deque(maxlen=_MAX_CAMERAS)
+        self._first_lenses: dict[Role, Lens] = {}
+        self._unusable_infos: dict[Role, str] = {}
+        self._newest_ns: dict[str, int] = {}
+        self._last_pixels: dict[str, Any] = {}
 
     def add(self, role: Role, data: bytes | memoryview) -> bool:
         """Take the bytes of a message; return whether a frame became ready.  Nothing is raised."""
         with self._lock:
             self.received[role] += 1
+            if role == "colour":
+                self.check.count_colour()
             try:
                 message = self._maker.decode(self._kinds[role], data)
-                if role in ("info", "right_info"):
+                if role in _INFOS:
                     self._learn_camera(role, message)
+                    self._unusable_infos.pop(role, None)
                     return False
                 if role == "imu":
                     waited = self._waits_for_imu()
@@ -103,22 +144,26 @@ class IncomingFrames:
                     return waited and not self._waits_for_imu()
                 self._check(role, message)
             except (BrokenMessage, RsePfError, *_FAULTS) as error:
-                self.left_out["broken"] += 1
-                self.trouble = f"a message of {getattr(self._options, role)} cannot be used: {error}"
+                fault = f"a message of {self._topic(role)} cannot be used: {error}"
+                if role in _INFOS:
+                    self._unusable_infos[role] = fault
+                self.check.refuse("broken", fault)
                 return False
             stamp_ns = _stamp_ns(message)
+            if self._is_stamp_wrong(role, stamp_ns):
+                return False
             if stamp_ns < self._last_ns - _JUMP_NS:
                 self._begin_again(role, stamp_ns)
             elif self._is_straggler(role, stamp_ns):
-                self.left_out["before the clock jumped back"] += 1
+                self._leave_out("before the clock jumped back", role)
                 return False
             elif stamp_ns <= self._last_ns:
-                self.left_out["too late"] += 1
+                self._leave_out("too late", role)
                 return False
             bisect.insort(self._waiting[role], (stamp_ns, message), key=lambda each: each[0])
             if len(self._waiting[role]) > _WAITING:
                 del self._waiting[role][0]
-                self.left_out["without partner"] += 1
+                self._leave_out("without partner", role, self._no_partner)
             before = len(self._ready)
             self._pair()
             return len(self._ready) > before
@@ -130,11 +175,10 @@ class IncomingFrames:
 
     def decode(self, images: PairedImages) -> Frame | None:
         """Return a frame without distortion; None, and a count, if its images make no sense."""
-        camera = self._camera
         try:
-            if camera is None:
-                raise BrokenMessage(f"no camera_info came on {self._options.info}")
-            wanted, rectifier = camera
+            stated = self._camera_at(images.stamp_ns)
+            wanted, rectifier = stated.rectified, stated.rectifier
+            self._refuse_repeated(images)
             rgb = decode_colour(images.colour)
             if rgb.shape[:2] != (wanted.height, wanted.width):
                 raise BrokenMessage(
@@ -152,14 +196,79 @@ class IncomingFrames:
             if images.partner is not None:
                 depth_m = decode_depth(images.partner, self._options.depth_scale)
                 if depth_m.shape != rgb.shape[:2]:
-                    raise BrokenMessage(f"depth on {self._options.depth} is not registered to the colours")
+                    raise BrokenMessage(f"depth on {self._topic('depth')} is not registered to the colours")
+                self._refuse_other_unit(depth_m)
                 made = replace(made, depth_m=rectifier.depth(depth_m))
+            if stated.change:
+                with self._lock:
+                    self.check.note(f"{stated.change}; images are mapped to the first camera")
             return replace(made, rgb=rectifier.colour(rgb))
         except (BrokenMessage, RsePfError, *_FAULTS) as error:
             with self._lock:
-                self.left_out["broken"] += 1
-                self.trouble = str(error)
+                self.check.refuse(_REPEATED if isinstance(error, _RepeatedImage) else "broken", str(error))
             return None
+
+    def _camera_at(self, stamp_ns: int) -> _StatedCamera:
+        """Return the camera that was stated last before an image.
+
+        Raises:
+            BrokenMessage: There is none, or the newest camera_info cannot be used.
+        """
+        with self._lock:
+            for fault in self._unusable_infos.values():
+                raise BrokenMessage(fault)
+            if not self._cameras:
+                raise BrokenMessage(f"no camera_info came on {self._topic('info')}")
+            newest_first = reversed(self._cameras)
+            return next((each for each in newest_first if each.stamp_ns <= stamp_ns), self._cameras[0])
+
+    def _topic(self, role: str) -> str:
+        return self._options.named(str(getattr(self._options, role)))
+
+    def _leave_out(self, reason: str, role: str, sentence: str = "") -> None:
+        is_colour = role == "colour"
+        self.check.leave_out(reason, sentence=sentence, colours=is_colour, partners=not is_colour)
+
+    @property
+    def _no_partner(self) -> str:
+        name = _NAMES[self._partner or "depth"]
+        return f"colours have no {name} within {self._options.pair_within_s:g} s"
+
+    def _is_stamp_wrong(self, role: Role, stamp_ns: int) -> bool:
+        """Refuse the stamp of an image that was never set, or that the image before has, too."""
+        before_ns, self._newest_ns[role] = self._newest_ns.get(role), stamp_ns
+        if stamp_ns <= 0:
+            fault = "header.stamp is not set"
+        elif stamp_ns == before_ns:
+            fault = f"header.stamp stands still at {stamp_ns / 1e9:.3f} s"
+        else:
+            return False
+        self.check.refuse("stamp", f"images of {self._topic(role)} cannot be put in order: {fault}")
+        return True
+
+    def _refuse_repeated(self, images: PairedImages) -> None:
+        """Refuse an image with the bytes of the image before: noise changes those of a stationary camera.
+
+        Depth of a plane may be the same for a moving camera, and so may be images of one brightness.
+        """
+        for role, message in (("colour", images.colour), ("right", images.partner)):
+            if role not in ("colour", self._partner):
+                continue
+            pixels = np.asarray(message.data)
+            before, self._last_pixels[role] = self._last_pixels.get(role), pixels
+            if before is not None and np.array_equal(before, pixels) and np.ptp(pixels):
+                raise _RepeatedImage(
+                    f"{self._topic(role)} repeats an image with a new stamp: its camera is frozen"
+                )
+
+    def _refuse_other_unit(self, depth_m: Any) -> None:
+        median_m = median_depth_m([depth_m])
+        if median_m is not None and not MIN_MEDIAN_DEPTH_M <= median_m <= MAX_MEDIAN_DEPTH_M:
+            raise BrokenMessage(
+                f"the median depth of {self._topic('depth')} is {median_m:g} m, not within "
+                f"{MIN_MEDIAN_DEPTH_M:g}..{MAX_MEDIAN_DEPTH_M:g} m: 32FC1 is in metres, and 16UC1 has "
+                f"depth_scale = {self._options.depth_scale:g} units a metre"
+            )
 
     def _waits_for_imu(self) -> bool:
         """Return whether the only frame that is ready waits for the sample after it."""
@@ -169,7 +278,7 @@ class IncomingFrames:
         """Return the rectified pair of a frame as it came, and the message of its right image."""
         rectification = self.rig.rectification
         if rectification is None:
-            raise BrokenMessage(f"no camera_info came on {self._options.right_info}")
+            raise BrokenMessage(f"no camera_info came on {self._topic('right_info')}")
         gray = load_opencv().cvtColor(decode_colour(right), load_opencv().COLOR_RGB2GRAY)
         return replace(
             left, rgb=rectification.left(left.rgb), camera=rectification.camera,
@@ -184,8 +293,9 @@ class IncomingFrames:
         self._jump_ns = stamp_ns
         self._stragglers = Counter(dict.fromkeys(self._waiting, _WAITING))
         self._stragglers[role] = 0
-        self.left_out["before the clock jumped back"] += sum(map(len, self._waiting.values()))
-        for waiting in self._waiting.values():
+        for name, waiting in self._waiting.items():
+            for _ in waiting:
+                self._leave_out("before the clock jumped back", name)
             waiting.clear()
         self._last_ns = -1
 
@@ -198,12 +308,23 @@ class IncomingFrames:
         return is_old
 
     def _learn_camera(self, role: Role, message: Any) -> None:
-        """Take the camera of the first good message; later ones of the same camera cost nothing."""
+        """Take a camera; images of a later camera of the same size are mapped to the first one.
+
+        A pair is rectified once, so that a change of its cameras is refused; a file of a rig outranks both.
+        """
         self.rig.learn(role, message)
-        if self._camera is None and role == "info":
-            is_rectified = "rect" in self._options.colour.rsplit("/", 1)[-1]
-            lens = lens_of(message, self._options.info, is_rectified=is_rectified)
-            self._camera = (lens.camera, Rectifier(lens, lens.camera))
+        if role == "right_info" and self._options.rig:
+            return
+        images = self._options.colour if role == "info" else self._options.right
+        lens = lens_of(message, self._topic(role), is_rectified="rect" in images.rsplit("/", 1)[-1])
+        first = self._first_lenses.setdefault(role, lens)
+        change = "" if lens == first else _change_of(self._topic(role), first, lens)
+        is_pair = self._partner == "right"
+        if change and is_pair and not self._options.rig:
+            raise BrokenMessage(f"{change}; a pair is rectified once: start the bridge again")
+        if role == "info" and (not self._cameras or (self._cameras[-1].lens != lens and not is_pair)):
+            rectifier = Rectifier(lens, first.camera)
+            self._cameras.append(_StatedCamera(_stamp_ns(message), lens, first.camera, rectifier, change))
 
     def _check(self, role: Role, message: Any) -> None:
         """Refuse an image that is cut off, or unlike the first one of its topic."""
@@ -238,21 +359,16 @@ class IncomingFrames:
                 return  # a nearer one may still arrive
             del colours[0]
             if gap_ns > self._bound_ns:
-                self.left_out["without partner"] += 1
-                self.trouble = (
-                    f"colours have no {_NAMES[self._partner]} within {self._options.pair_within_s:g} s"
-                )
+                self._leave_out("without partner", "colour", self._no_partner)
                 continue
             self._make_ready(stamp_ns, colour, partners[nearest][1])
-            self.left_out["without partner"] += nearest
+            self.check.leave_out("without partner", colours=0, partners=nearest)
             del partners[: nearest + 1]
 
     def _make_ready(self, stamp_ns: int, colour: Any, partner: Any) -> None:
         frame = self._options.camera_frame or str(colour.header.frame_id).lstrip("/") or "camera"
         self._ready.append(PairedImages(stamp_ns, frame, colour, partner))
         self._last_ns = stamp_ns
-        if self.trouble.startswith(("no message", "colours have no")):
-            self.trouble = ""
         if len(self._ready) > self._options.queue_frames:
             self._ready.popleft()
-            self.left_out["too fast"] += 1
+            self.check.leave_out("too fast", sentence="they come faster than they are tracked")

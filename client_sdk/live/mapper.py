@@ -164,6 +164,7 @@ class LiveMapper:
         self._tasks: list[asyncio.Task[None]] = []
         self._adding: asyncio.Future[Any] | None = None
         self._trouble = ""
+        self._place_trouble = ""
         self._one_frame = asyncio.Lock()
         self._is_known = False
         self._is_open = False
@@ -337,8 +338,9 @@ class LiveMapper:
 
     @property
     def trouble(self) -> str:
-        """Why the oldest waiting keyframe is not kept yet, or updates do not come; empty if all is well."""
-        return (self._sender.trouble if self._is_open else "") or self._trouble
+        """Why keyframes are not kept, updates do not come, or no place is looked up; empty if all is well."""
+        unaligned = "" if self.aligned else self._place_trouble
+        return (self._sender.trouble if self._is_open else "") or self._trouble or unaligned
 
     @property
     def keyframes_waiting(self) -> int:
@@ -588,11 +590,13 @@ class LiveMapper:
             answer = await self._robot.call(
                 "live-relocalise", request, RelocaliseReply, deadline_s=self.options.deadline_s, keep=True
             )
+            self._place_trouble = ""
             self._verdicts[answer.reply.verdict] += 1
             self._asked_in_vain = self._asked_in_vain + 1 if answer.reply.verdict == "none" else 0
             self._announce(self._alignments.relocalised(keyframe.segment, pose, answer.reply))
         except RsePfError as error:
             self._verdicts[error.code] += 1
+            self._place_trouble = f"{error.code}: {error.message}"
 
     async def _follow(self) -> None:
         """Follow the updates of the map until cancelled."""

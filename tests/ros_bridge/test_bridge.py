@@ -166,6 +166,21 @@ async def test_diagnostics_count_what_was_left_out_and_say_why() -> None:
     assert "cannot be used" in status.message
 
 
+async def test_a_camera_that_repeats_an_image_with_new_stamps_gets_a_warning_and_no_pose() -> None:
+    heard = Heard()
+    async with running(heard) as bridge:
+        await drive(bridge, heard, 2)
+        for row in range(2, 5):
+            send(bridge, frame_at(1, depth=True), row)
+        heard.messages.clear()
+        await heard.until(count_of(DIAGNOSTICS, 2))
+
+    status = heard.of(DIAGNOSTICS, MAKER)[-1].status[0]
+    assert status.level == 1
+    assert "/camera/color/image_raw repeats an image with a new stamp" in status.message
+    assert not heard.of(POSE_WITH_COVARIANCE, MAKER)
+
+
 async def test_a_frame_without_texture_is_counted_as_lost_and_the_next_one_goes_on() -> None:
     heard = Heard()
     async with running(heard) as bridge:

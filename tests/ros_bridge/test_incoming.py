@@ -10,6 +10,7 @@ from client_sdk.bags.message_types import CAMERA_INFO, IMAGE
 from client_sdk.frontend import Frame
 from ros_bridge import BridgeOptions, IncomingFrames
 from ros_bridge.incoming import Role
+from ros_bridge.input_check import InputCheck
 from tests.client_sdk.bags.small_bags import camera_info, raw_image, scene, stamp_of
 
 SHOWN = scene()
@@ -86,7 +87,7 @@ def test_colours_without_depth_within_the_bound_are_left_out_and_counted() -> No
     robot.depth(stamp_of(1))
 
     assert robot.taken() == [stamp_of(1)]
-    assert robot.frames.left_out["without partner"] == 2
+    assert robot.frames.check.left_out["without partner"] == 2
 
 
 def test_frames_leave_in_the_order_of_their_stamps_and_late_ones_are_counted() -> None:
@@ -95,10 +96,10 @@ def test_frames_leave_in_the_order_of_their_stamps_and_late_ones_are_counted() -
         robot.colour(stamp)
     for stamp in (stamp_of(0), stamp_of(1)):
         robot.depth(stamp)
-    robot.colour(stamp_of(0))
+    robot.colour(stamp_of(0) + MS)
 
     assert robot.taken() == [stamp_of(0), stamp_of(1)]
-    assert robot.frames.left_out["too late"] == 1
+    assert robot.frames.check.left_out["too late"] == 1
 
 
 def test_a_bag_that_is_played_again_gives_frames_again() -> None:
@@ -114,7 +115,7 @@ def test_a_bag_that_is_played_again_gives_frames_again() -> None:
     robot.depth(stamp_of(0))
 
     assert robot.taken()[-2:] == [stamp_of(20), stamp_of(0)]
-    assert robot.frames.left_out == {"without partner": 0, "before the clock jumped back": 1}
+    assert robot.frames.check.left_out == {"without partner": 0, "before the clock jumped back": 1}
 
 
 def test_the_oldest_frame_is_dropped_where_too_many_wait() -> None:
@@ -123,7 +124,7 @@ def test_the_oldest_frame_is_dropped_where_too_many_wait() -> None:
         robot.colour(stamp_of(row))
 
     assert robot.taken() == [stamp_of(2), stamp_of(3)]
-    assert robot.frames.left_out["too fast"] == 2
+    assert robot.frames.check.left_out["too fast"] == 2
 
 
 def test_without_depth_each_colour_image_is_a_frame() -> None:
@@ -140,7 +141,7 @@ def test_images_that_wait_for_depth_are_bounded() -> None:
         robot.colour(stamp_of(0) + number * MS)
 
     assert robot.taken() == []
-    assert robot.frames.left_out["without partner"] == 70
+    assert robot.frames.check.left_out["without partner"] == 70
 
 
 @pytest.mark.parametrize("cut", [0, 3, 40, 2000])
@@ -151,27 +152,27 @@ def test_a_broken_message_is_counted_and_the_next_one_is_taken(cut: int) -> None
     assert not robot.frames.add("colour", whole[:cut])
     assert robot.colour(stamp_of(1))
 
-    assert robot.frames.left_out["broken"] == 1
+    assert robot.frames.check.left_out["broken"] == 1
     assert robot.taken() == [stamp_of(1)]
 
 
 def test_a_topic_of_the_wrong_content_says_so() -> None:
     robot = Robot()
     robot.send("colour", raw_image(robot.maker, stamp_of(0), SHOWN.depths_mm[0], "16UC1"))
-    assert "holds depth, where colour is expected" in robot.frames.trouble
+    assert "holds depth, where colour is expected" in robot.frames.check.fault
 
 
 def test_frames_before_any_camera_info_are_left_out() -> None:
     robot = Robot(depth="")
-    robot.frames._camera = None
+    robot.frames._cameras.clear()
     robot.colour(stamp_of(0))
     assert robot.frame() is None
-    assert "no camera_info" in robot.frames.trouble
+    assert "no camera_info" in robot.frames.check.fault
 
 
 def test_a_lens_with_distortion_is_undistorted() -> None:
     robot = Robot(depth="")
-    robot.frames._camera = None
+    robot.frames._cameras.clear()
     robot.send("info", camera_info(robot.maker, stamp_of(0), (0.3, -0.1, 0.0, 0.0, 0.0)))
     robot.colour(stamp_of(0))
     frame = robot.frame()
@@ -193,4 +194,105 @@ def test_a_topic_that_lags_behind_when_the_bag_begins_again_hides_no_partner() -
     robot.depth(stamp_of(1))
 
     assert robot.taken() == [stamp_of(row) for row in (0, 1, 20, 0, 1)]
-    assert robot.frames.left_out["before the clock jumped back"] == 2
+    assert robot.frames.check.left_out["before the clock jumped back"] == 2
+
+
+def with_lens(maker: MessageMaker, fx: float, **other: object) -> object:
+    K = np.array([fx, 0, 31.5, 0, fx, 23.5, 0, 0, 1.0])
+    return camera_info(maker, stamp_of(1), k=K, **other)
+
+
+def test_images_of_a_camera_info_that_changed_are_mapped_to_the_first_one_and_it_is_named() -> None:
+    robot = Robot(depth="")
+    robot.send("info", with_lens(robot.maker, 96.0))
+    robot.colour(stamp_of(0), 0)
+    robot.colour(stamp_of(1), 1)
+
+    before = robot.frame()
+    assert before is not None
+    assert np.array_equal(before.rgb, SHOWN.colours[0])
+    assert not robot.frames.check.fault
+    after = robot.frame()
+    assert after is not None
+    assert after.camera == before.camera
+    assert np.allclose(after.rgb[23, 20], SHOWN.colours[1][23, 13], atol=2)
+    assert "camera_info has changed: fx 60.0 to 96.0" in robot.frames.check.fault
+
+
+@pytest.mark.parametrize(
+    ("other", "named"),
+    [
+        ({"k": np.zeros(9)}, "holds no calibration"),
+        ({"k": np.full(9, np.nan)}, "holds no calibration"),
+        ({"distortion": (0.1, 0.2), "model": "thin_prism_of_vendor"}, "unknown model thin_prism_of_vendor"),
+        ({"width": 32, "height": 24}, "has changed: width 64 to 32"),
+    ],
+    ids=["zeros", "nan", "model", "size"],
+)
+@pytest.mark.parametrize("is_first", [True, False])
+def test_a_camera_info_that_cannot_be_used_is_named_and_its_images_are_left_out(
+    other: dict[str, object], named: str, is_first: bool
+) -> None:
+    if is_first and "width" in other:
+        named = "do not fit the camera_info of 32x24 px"
+    robot = Robot(depth="")
+    if is_first:
+        robot.frames = IncomingFrames(robot.maker, BridgeOptions.of({"depth": ""}))
+    robot.send("info", camera_info(robot.maker, stamp_of(0), **other))  # type: ignore[arg-type]
+    robot.colour(stamp_of(0))
+
+    assert robot.frame() is None
+    assert named in robot.frames.check.fault
+
+
+@pytest.mark.parametrize(("stamps", "named"), [([0, 0], "is not set"), ([5, 5], "stands still at")])
+def test_images_whose_stamps_give_no_order_are_named(stamps: list[int], named: str) -> None:
+    robot = Robot(depth="")
+    for row, stamp in enumerate(stamps):
+        robot.colour(stamp, row)
+
+    assert named in robot.frames.check.fault
+    assert robot.taken() == [stamp for stamp in stamps[:1] if stamp]
+
+
+def test_an_image_with_the_bytes_of_the_one_before_is_left_out_and_named() -> None:
+    robot = Robot(depth="")
+    for row, shown in enumerate((0, 0, 1)):
+        robot.colour(stamp_of(row), shown)
+
+    assert [robot.frame() is not None for _ in range(3)] == [True, False, True]
+    assert "repeats an image" in robot.frames.check.fault
+
+
+@pytest.mark.parametrize("unit", [1000.0, 0.001], ids=["millimetres", "kilometres"])
+def test_depth_of_another_unit_is_named_with_its_median(unit: float) -> None:
+    robot = Robot()
+    robot.colour(stamp_of(0))
+    depth = (SHOWN.depths_mm[0] / 1000 * unit).astype(np.float32)
+    robot.send("depth", raw_image(robot.maker, stamp_of(0), depth, "32FC1"))
+
+    assert robot.frame() is None
+    assert "the median depth of /camera/aligned_depth_to_color/image_raw is " in robot.frames.check.fault
+
+
+def test_most_images_left_out_are_named_and_few_are_not() -> None:
+    robot = Robot(depth="", queue_frames=1)
+    for row in range(5):
+        robot.colour(stamp_of(row), row)
+    assert robot.frames.check.shortage.startswith("4 of 5 images were left out")
+
+    for row in range(5, 11):
+        robot.colour(stamp_of(row), row % 5)
+        robot.taken()
+    assert not robot.frames.check.shortage
+
+
+def test_a_fault_leaves_the_status_five_reports_later() -> None:
+    check = InputCheck()
+    check.refuse("broken", "it is cut off")
+    faults = []
+    for _ in range(6):
+        faults.append(check.fault)
+        check.next_report()
+
+    assert faults == ["it is cut off"] * 5 + [""]

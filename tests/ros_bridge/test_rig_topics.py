@@ -101,7 +101,7 @@ def test_a_pair_has_the_baseline_of_both_camera_infos(is_ros1: bool) -> None:
 
     frame = robot.pair(1)
 
-    assert frame is not None, robot.frames.trouble
+    assert frame is not None, robot.frames.check.fault
     assert frame.stereo is not None
     assert frame.stereo.baseline_m == pytest.approx(BASELINE_M)
     assert not frame.depth_m.any()
@@ -112,7 +112,7 @@ def test_swapped_cameras_are_told_and_give_no_frame() -> None:
     robot = Robot()
     robot.infos(FX * BASELINE_M)
 
-    assert "swapped" in robot.frames.trouble
+    assert "swapped" in robot.frames.check.fault
     assert robot.pair(1) is None
 
 
@@ -127,8 +127,8 @@ def test_a_file_of_a_rig_rectifies_the_pair_and_places_the_imu(tmp_path: Path) -
         robot.imu(stamp_of(0) + number * step_ns)
     first, second = robot.pair(0), robot.pair(1)
 
-    assert first is not None, robot.frames.trouble
-    assert second is not None, robot.frames.trouble
+    assert first is not None, robot.frames.check.fault
+    assert second is not None, robot.frames.check.fault
     assert second.stereo is not None
     assert second.imu is not None
     assert first.imu is not None
@@ -152,7 +152,7 @@ def test_a_frame_waits_for_the_sample_after_it_but_not_for_a_silent_imu(tmp_path
     images = robot.frames.take()
     assert images is not None
     frame = robot.frames.decode(images)
-    assert frame is not None, robot.frames.trouble
+    assert frame is not None, robot.frames.check.fault
     assert frame.imu is not None
     assert frame.imu.timestamps_s[-1] > frame.timestamp_s
 
@@ -168,8 +168,8 @@ def test_a_sample_that_is_not_finite_is_counted_and_left_out(tmp_path: Path) -> 
 
     robot.imu(stamp_of(0), rate=float("nan"))
 
-    assert robot.frames.left_out["broken"] == 1
-    assert "not finite" in robot.frames.trouble
+    assert robot.frames.check.left_out["broken"] == 1
+    assert "not finite" in robot.frames.check.fault
 
 
 def test_the_right_topic_takes_the_place_of_depth() -> None:

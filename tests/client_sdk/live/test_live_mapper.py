@@ -19,7 +19,7 @@ from client_sdk.live import BlockingLiveMapper, Correction, LiveMapper, LiveOpti
 from client_sdk.live.sender import keyframe_request
 from client_sdk.live.waiting_keyframes import Base, WaitingKeyframe, WaitingKeyframes, rebase
 from rse_pf.config import SessionSettings
-from rse_pf.errors import BadRequest, Busy, Forbidden, UsageError
+from rse_pf.errors import BadRequest, Busy, Forbidden, MissingExtra, UsageError
 from rse_pf.geometry import exp_se3
 from rse_pf.slam.keyframe import Keyframe, decode_keyframe, encode_keyframe, make_features
 from rse_pf.wire import Command, make_codec
@@ -287,6 +287,22 @@ async def test_a_map_that_begins_anew_gets_new_numbers_and_old_alignments_are_fo
         robot.tell("alignment/me", alignment("me", T_MAP_ODOM, segment=0))
         await robot.until(lambda: mapper.aligned)
         assert len(mapper.map_trajectory) == 1  # the first segment was of the old map
+
+
+async def test_a_platform_that_cannot_look_up_places_is_named_until_the_robot_is_aligned(
+    robot: FakeLiveRobot,
+) -> None:
+    robot.foreign_keyframes = 50
+    robot.before_answer = failing(MissingExtra("gtsam", "maps"), "live-relocalise", 1000)
+    async with live_map(robot) as mapper:
+        await drive(mapper, range(3))
+        await robot.until(lambda: "live-relocalise" in robot.asked)
+        await drive(mapper, range(3, 5))
+        assert mapper.trouble == "missing-extra: gtsam is not installed: it is in the extra 'maps'"
+
+        robot.tell("alignment/me", alignment("me", T_MAP_ODOM))
+        await robot.until(lambda: mapper.aligned)
+        assert not mapper.trouble
 
 
 async def test_a_lost_robot_begins_a_segment_and_asks_where_it_is(robot: FakeLiveRobot) -> None:
