@@ -109,6 +109,8 @@ export interface Stats {
   heldByBusy: number;
   /** and by what the Welcome allows. */
   heldByLimit: number;
+  /** Functions of the program that threw, or whose promise was rejected: callbacks and the token function. */
+  callbackErrors: number;
 }
 
 export interface Robot {

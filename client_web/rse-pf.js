@@ -2,8 +2,8 @@
  * RSE-PF for browsers, web workers and Node: one robot, connected to the backend servers of a platform.
  *
  * The rules are those of docs/protocol.md; its section is named where a rule is applied.  The module has no
- * dependencies, stores nothing and writes nothing to the console.  Inside, times are seconds of a clock that
- * never jumps; names that begin with `_` are internal, and the minifier may shorten them.
+ * dependencies, stores nothing, and writes to the console only what functions of the program throw.  Inside, times
+ * are seconds of a clock that never jumps; names that begin with `_` are internal, and the minifier may shorten them.
  */
 
 const FIRST_TRIES = 4;
@@ -46,9 +46,6 @@ const ending = (resolve, reject, ms, late) => {
     failed ? reject(failed) : resolve(value);
   };
 };
-
-/** Call a program's function so that its errors cannot disturb the session. */
-const later = (call, ...words) => queueMicrotask(() => call(...words));
 
 // The codes that are used most.
 const CONNECT = "connect";
@@ -197,6 +194,7 @@ export const connect = async (url, options = {}) => {
   const lanes = { __proto__: null };
   const counts = {
     sent: 0, answered: 0, resent: 0, reconnects: 0, moves: 0, bytesUp: 0, bytesDown: 0, heldByBusy: 0, heldByLimit: 0,
+    callbackErrors: 0,
   };
   let { token } = options;
   let current = null;
@@ -217,12 +215,26 @@ export const connect = async (url, options = {}) => {
   let error = null;
   let roundTripMs = null;
 
+  /** Call a function of the program; what it throws, at once or as a promise, is reported, and rejects. */
+  const guarded = async (call, ...words) => {
+    try {
+      return await call(...words);
+    } catch (failed) {
+      counts.callbackErrors++;
+      console.error("rse-pf: a function of the program failed:", failed);
+      throw failed;
+    }
+  };
+
+  /** Call a function of the program when this turn is over, so that it cannot disturb the session. */
+  const later = (...words) => Promise.resolve().then(() => guarded(...words)).catch(nothing);
+
   // --- connect, reconnect, move --------------------------------------------------------------------------
 
   const isSource = typeof token === "function";
   const freshToken = async () => {
     try {
-      return trimmed(isSource ? await token() : token);
+      return trimmed(isSource ? await guarded(token) : token);
     } catch (failed) {
       throw wrong(CONNECT, "no token: " + failed?.name, "correct its function");
     }
@@ -813,7 +825,7 @@ export const connect = async (url, options = {}) => {
         let state;
         while ((state ??= await (await http("PUT", path, textOf({ size }), signal)).json()).offset < size) {
           const { offset } = state;
-          onProgress(offset, size);
+          later(onProgress, offset, size);
           const part = bytes.subarray(offset, offset + min(state.part_bytes, MAX_PART_BYTES));
           try {
             state = await (await http("PATCH", path, part, signal, { "Upload-Offset": offset })).json();
@@ -824,7 +836,7 @@ export const connect = async (url, options = {}) => {
           }
         }
       }
-      onProgress(size, size);
+      later(onProgress, size, size);
       return digest;
     },
 

@@ -84,7 +84,7 @@ def echo(message: dict[str, Any]) -> bytes | None:
         return said(WELCOME)
     if message["type"] == "ping":
         return said({"type": "pong", "sent_s": message["sent_s"], "received_s": 1.0, "answered_s": 1.0})
-    return said({"type": "result", "id": message["id"], "reply": message["payload"]})
+    return said({"type": "result", "id": message["id"], "reply": message.get("payload")})
 
 
 def test_a_payload_that_has_no_json_is_a_typed_error_and_the_next_call_works() -> None:
@@ -160,6 +160,58 @@ def test_a_token_function_that_throws_is_a_typed_error_of_an_upload() -> None:
     """
 
     assert against(echo, program) == "connect"
+
+
+def test_callbacks_that_fail_are_counted_and_printed_and_the_robot_goes_on() -> None:
+    def answers(message: dict[str, Any]) -> bytes | None:
+        if message["type"] == "subscribe":
+            return said({"type": "update", "id": message["id"], "key": "k", "payload": 1, "seq": 1})
+        return echo(message)
+
+    program = """
+    let printed = 0;
+    console.error = () => printed++;
+    const fail = () => { throw new Error("of a callback"); };
+    let isUp = false;
+    const token = () => isUp ? "t" : (isUp = true, fail());
+    const ended = new Promise((done) => setTimeout(done, 20e3, "late"));
+    let finish;
+    const isClosed = new Promise((done) => finish = done);
+    const onChange = (what) => { finish(what); return Promise.reject(new Error("of a promise")); };
+    const robot = await connect(url, { token, onChange });
+    await new Promise((done) => robot.subscribe("a", (key) => { done(); fail(); }));
+    const codes = [await codeOf(robot.call("echo", 1))];
+    const own = await new Promise((done) =>
+      robot.subscribe("b", () => {
+        robot.call("echo", 2).then(({ reply }) => done(reply)).then(robot.close);
+        fail();
+      }));
+    const what = await Promise.race([isClosed, ended]);
+    await new Promise((done) => setTimeout(done));
+    const { callbackErrors, sent, answered } = robot.stats;
+    say([codes, own, what, callbackErrors, printed, sent, answered]);
+    """
+
+    assert against(answers, program) == [["ok"], 2, "ended", 4, 4, 2, 2]
+
+
+def test_a_program_that_blocks_for_long_connects_again_and_sends_nothing_twice() -> None:
+    commands: list[int] = []
+
+    def answers(message: dict[str, Any]) -> bytes | None:
+        if message["type"] == "command":
+            commands.append(message["id"])
+        return echo(message)
+
+    program = """
+    const robot = await connect(url, { token: "t" });
+    const until = performance.now() + 10e3;
+    while (performance.now() < until);
+    say([await codeOf(robot.call("echo", 1)), robot.stats.resent]);
+    """
+
+    assert against(answers, program) == ["ok", 0]
+    assert len(commands) == 1
 
 
 STRICT = """
