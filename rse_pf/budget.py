@@ -15,7 +15,7 @@ import zlib
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from types import ModuleType
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -43,6 +43,7 @@ __all__ = [
 ]
 
 Text = bytes | bytearray
+_Text = TypeVar("_Text", bytes, bytearray, Text)
 
 MESSAGE_INFLATE_RATIO = 100.0
 """Inflated size over wire size of a robot's message."""
@@ -213,7 +214,7 @@ def _inflated(data: bytes, max_bytes: int, library: ModuleType) -> tuple[bytes, 
         raise _not_zlib_error() from error
 
 
-def _whole(text: Text, stream: Any, size: int, max_bytes: int) -> Any:
+def _whole(text: _Text, stream: Any, size: int, max_bytes: int) -> _Text:
     """Return *text*, which *stream* inflated from *size* bytes, if it is complete and not too long."""
     if len(text) > max_bytes:
         raise _bomb_error(size, max_bytes)
