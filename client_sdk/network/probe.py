@@ -18,8 +18,8 @@ from rse_pf.errors import RsePfError
 
 __all__ = ["Probed", "dial", "port_of", "probe"]
 
-_COMMON_NAME = b"\x55\x04\x03"  # object identifier 2.5.4.3 (RFC 5280, A.1)
-_ORGANISATION = b"\x55\x04\x0a"  # object identifier 2.5.4.10
+_COMMON_NAME = b"\x55\x04\x03"  # DER of the object identifier id-at-commonName (RFC 5280, A.1)
+_ORGANISATION = b"\x55\x04\x0a"  # the same of id-at-organizationName
 _VERSION = 0xA0  # tag of the optional first field of a certificate
 _ENOUGH_BYTES = 4096
 """Of an answer without TLS: its head, and the begin of a page."""

@@ -17,7 +17,8 @@ from rse_pf.errors import RsePfError, UsageError
 VARIABLES = ("HTTP_PROXY", "HTTPS_PROXY", "ALL_PROXY", "NO_PROXY")
 TIMINGS = ConnectTimings(connect_timeout_s=1.0, reconnect_max_s=0.01)
 OPTIONS = DataOptions(timeout_s=1.0, deadline_s=0.5, first_pause_s=0.01)
-URL = "http://robot:s%40cret@proxy.example:3128"
+CREDENTIALS = "robot:s%40cret@"
+URL = "http://" + CREDENTIALS + "proxy.example:3128"
 
 
 @pytest.fixture(autouse=True)
@@ -83,7 +84,7 @@ def test_no_proxy_exempts_hosts_suffixes_ports_and_networks(exempt, host, is_dir
 
 
 @pytest.mark.parametrize(
-    "value", ["socks5h://h:1080", "https://h:3128", "http://", "http://a:b@c:d", "http://[::1"]
+    "value", ["socks5h://h:1080", "https://h:443", "http://", "http://a:b@c:d", "http://[::1"]
 )
 async def test_a_variable_without_an_http_proxy_is_named_and_its_value_is_not_shown(value, environment):
     environment("ALL_PROXY", value)
