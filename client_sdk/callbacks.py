@@ -70,7 +70,6 @@ class Callbacks:
     def call(self, name: str, function: Callable[..., Any], *arguments: Any, default: Any = None) -> Any:
         """Call *function* now and return its value, or *default* after an exception."""
         began, process = time.monotonic(), os.getpid()
-        value = default
         try:
             value = function(*arguments)
             if inspect.iscoroutine(value):
@@ -79,8 +78,8 @@ class Callbacks:
         except BaseException as error:
             if _is_interrupt(error):
                 raise
-            value = default
             self.report(name, error)
+            return default
         finally:
             _end_child(process, name)
         self._report_slow(name, time.monotonic() - began)
@@ -102,7 +101,6 @@ class Callbacks:
             await asyncio.wait({work}, timeout=TOKEN_LIMIT_S)
         finally:
             work.cancel()  # without effect on a token that came
-        self._report_slow("the token callable", time.monotonic() - began)
         error: BaseException
         if not work.done():
             error = TimeoutError(f"no token within {TOKEN_LIMIT_S:g} s")
@@ -111,6 +109,7 @@ class Callbacks:
         elif (raised := work.exception()) is not None:
             error = raised
         else:
+            self._report_slow("the token callable", time.monotonic() - began)
             return work.result()
         raise self.token_error(error)
 
@@ -138,7 +137,7 @@ class Callbacks:
     def _report_slow(self, name: str, took_s: float) -> None:
         if took_s > self._slow_s and self._is_new((name, "slow", "")):
             _log.error(
-                "%s took %.1f s, more than %.1f s; hint: return sooner, and do long work in a thread",
+                "%s took %.1f s, and session.ping_timeout_s is %.1f s; hint: do long work in a thread",
                 name, took_s, self._slow_s,
             )  # fmt: skip
 
