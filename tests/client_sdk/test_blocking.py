@@ -85,7 +85,8 @@ def test_a_call_ends_at_its_deadline_although_the_event_loop_hangs(url):
 
     def clock():
         if hangs.is_set():
-            may_go_on.wait(60)
+            may_go_on.wait(10)
+            hangs.clear()
         return time.monotonic()
 
     with client_sdk.connect_blocking(url, clock=clock) as robot:
@@ -94,7 +95,6 @@ def test_a_call_ends_at_its_deadline_although_the_event_loop_hangs(url):
         with pytest.raises(Expired, match=r"no answer within 0\.7 s"):
             robot.call("echo", {"value": 1}, deadline_s=0.2)
         assert time.monotonic() - began < 0.2 + LATE_S
-        hangs.clear()
         may_go_on.set()
 
 
