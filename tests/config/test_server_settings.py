@@ -39,7 +39,7 @@ def changed(row: SettingRow) -> tuple[PlatformSettings, PlatformSettings] | None
     else:
         tries += [
             "other", "https://robots.example.org", "https://robots.example.org/burst", "weekdays 08:00 min 3",
-            "Asia/Seoul", "m7i.large",
+            "Asia/Seoul", "m7i.large", "192.0.2.0/24",
         ]  # fmt: skip
     companions = TOGETHER.get((row.group, row.name), {})
     try:

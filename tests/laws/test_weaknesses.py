@@ -40,6 +40,11 @@ HARMLESS: Mapping[tuple[str, str], str] = {
 """File and rule of bandit to why it is no weakness."""
 
 NO_SECRETS: Mapping[tuple[str, str], str] = {
+    (
+        "client_sdk/network/foreign_answers.py",
+        "Basic Auth Credentials",
+    ): "the words USER and PASSWORD of a hint",
+    ("docs/local.md", "Basic Auth Credentials"): "the words USER and PASSWORD",
     ("docs/protocol.md", "JSON Web Token"): "the page's example; its signature says 'signature'",
     ("docs/protocol.md", "Base64 High Entropy String"): "the same",
     ("rse_pf/aws/money/leftovers.py", "Secret Keyword"): "a sentence about the secret, not the secret",
