@@ -169,6 +169,75 @@ void calls_of_many_threads_end_when_the_client_closes() {
     }
 }
 
+/// A server that speaks the protocol on one connection: answers commands with their payload, and sends an update at once.
+class SpeakingServer {
+  public:
+    SpeakingServer() : acceptor_(io_, {asio::ip::address_v4::loopback(), 0}), thread_([this] { serve(); }) {}
+    ~SpeakingServer() { thread_.join(); }
+    std::string url() const { return "ws://127.0.0.1:" + std::to_string(acceptor_.local_endpoint().port()) + "/ws"; }
+    std::atomic<int> commands{0};
+
+  private:
+    void serve() {
+        namespace websocket = boost::beast::websocket;
+        websocket::stream<tcp::socket> socket(acceptor_.accept());
+        socket.set_option(websocket::stream_base::decorator(
+            [](websocket::response_type& answer) { answer.set("Sec-WebSocket-Protocol", "rse-pf.v1.bin"); }));
+        boost::system::error_code failed;
+        socket.accept(failed);
+        socket.binary(true);
+        for (boost::beast::flat_buffer buffer; !failed; buffer.clear()) {
+            socket.read(buffer, failed);
+            if (failed) return;
+            const auto* data = static_cast<const char*>(buffer.data().data());
+            const json said = json::from_msgpack(data, data + buffer.size());
+            const std::string type = said["type"];
+            json answer;
+            if (type == "hello") answer = {{"type", "welcome"}, {"server", "s"}, {"limits", {{"max_in_flight", 8}}}};
+            else if (type == "ping") answer = {{"type", "pong"}, {"sent_s", said["sent_s"]}, {"received_s", 1.0}, {"answered_s", 1.0}};
+            else if (type == "subscribe") answer = {{"type", "update"}, {"id", said["id"]}, {"topic", said["topic"]}, {"seq", 1}, {"key", "k"}, {"payload", 1}};
+            else if (type == "command") answer = {{"type", "result"}, {"id", said["id"]}, {"reply", said["payload"]}};
+            commands += type == "command";
+            if (!answer.is_null()) socket.write(asio::buffer(encoded(answer)), failed);
+        }
+    }
+    asio::io_context io_;
+    tcp::acceptor acceptor_;
+    std::thread thread_;
+};
+
+template <class T> bool ends_soon(std::future<T>& result) { return result.wait_for(std::chrono::seconds(20)) == std::future_status::ready; }
+
+void callbacks_neither_hold_up_nor_end_the_connection() {
+    SpeakingServer server;
+    Client client(to(server.url()));
+    client.connect();
+    std::promise<void> began, release, over;
+    auto has_begun = began.get_future(), is_over = over.get_future();
+    auto may_end = release.get_future().share();
+    client.subscribe("a", [&](const std::string&, const json&) {
+        began.set_value();
+        may_end.wait();
+        throw std::runtime_error("of a callback");
+    });
+    expect(ends_soon(has_begun), "an update");
+    auto answered = client.call("echo", 1);
+    expect(ends_soon(answered.result), "an answer while a callback blocks");
+    release.set_value();
+    client.call("echo", 2, {}, [&](Outcome<Answer> outcome) {
+        auto own = client.call("echo", 3);
+        expect(outcome.ok() && ends_soon(own.result), "a callback calls its own robot");
+        const Stats stats = client.stats();
+        expect(stats.callback_errors == 1 && stats.last_error == "of a callback", "counted once");
+        client.close();
+        client.close();
+        over.set_value();
+    });
+    expect(ends_soon(is_over), "a callback closes its client");
+    expect(server.commands == 3, "nothing was sent twice");
+    expect_error("disconnected", [&] { client.call("echo", 4).get(); }, "a call after the end");
+}
+
 void digests_are_those_of_sha256() {
     expect(sha256("abc") == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad", "abc");
 }
@@ -184,6 +253,7 @@ int main() {
     another_program_answers();
     a_token_source_is_asked_again_after_a_refusal();
     calls_of_many_threads_end_when_the_client_closes();
+    callbacks_neither_hold_up_nor_end_the_connection();
     digests_are_those_of_sha256();
     std::printf(failures() == 0 ? "all hold\n" : "%d do not hold\n", failures());
     return failures() == 0 ? 0 : 1;

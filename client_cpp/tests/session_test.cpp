@@ -278,7 +278,7 @@ void no_exception_leaves_a_callback() {
     Bench bench;
     bench.session.submit({70, "echo", {}, {}, [](Outcome<Answer>) { throw std::runtime_error("of a callback"); }}, 0);
     bench.hear(bench.link, result(70), 0.1);
-    expect(bench.session.stats.callback_exceptions == 1 && bench.session.stats.last_error == "of a callback", "counted, not thrown");
+    expect(bench.session.stats.callback_errors == 1 && bench.session.stats.last_error == "of a callback", "counted, not thrown");
 }
 
 void bytes_of_a_stranger_are_refused() {

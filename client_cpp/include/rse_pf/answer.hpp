@@ -27,7 +27,7 @@ struct CallOptions {
     /// Answer this command of the stream even if newer ones follow.
     bool keep = false;
     std::string trace{};
-    /// Called with the share that is done (0 to 1) and the last step of a long service, on the client's thread.
+    /// Called with the share that is done (0 to 1) and the last step of a long service, on the thread of callbacks.
     std::function<void(double, const std::string&)> on_progress{};
 };
 

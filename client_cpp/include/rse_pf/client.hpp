@@ -1,7 +1,7 @@
 // A robot's connection to the platform: commands, poses, subscriptions; safe to call from any thread.
 //
-// A client has one thread. Every callback runs on it and must return soon, since pings wait for it; what a callback
-// throws ends there and is counted in `Stats`. A callback may call every method but those that wait.
+// A client has two threads: of its connection and of its callbacks. A callback may call every method, wait for the future
+// of a call, and take its time: only other callbacks wait for it. What it throws ends there and is counted in `Stats`.
 #pragma once
 
 #include <atomic>
@@ -12,6 +12,7 @@
 #include <thread>
 #include <utility>
 
+#include "detail/callbacks.hpp"
 #include "detail/connection.hpp"
 #include "pnp.hpp"
 
@@ -21,7 +22,7 @@ class Client {
   public:
     /// Store how to connect; nothing is opened yet. Throws Error `usage` if the address cannot be used.
     explicit Client(Options options)
-        : core_(std::make_shared<Core>(std::move(options))) {}
+        : callbacks_(std::make_shared<detail::Callbacks>()), core_(std::make_shared<Core>(with_deferred(std::move(options)))) {}
 
     ~Client() { close(); }
     Client(const Client&) = delete;
@@ -37,19 +38,24 @@ class Client {
             core->connection->open([opened](std::optional<Failure> failure) { opened->set_value(std::move(failure)); });
         });
         if (!posted) throw Error("disconnected", "the client was closed", "make another client");
-        thread_ = std::thread([core = core_] {
-            core->thread = std::this_thread::get_id();
-            core->connection->io.run();  // nothing below it throws: handlers catch what callbacks throw
-            core->ended.set_value();
-        });
+        {
+            const std::lock_guard one_at_a_time(core_->posting);
+            thread_ = std::thread([core = core_] {
+                core->connection->io.run();  // nothing below it throws
+                core->ended.set_value();
+            });
+            callback_thread_ = std::thread([callbacks = callbacks_] { callbacks->run(); });
+        }
         if (auto failure = result.get()) {
             close();
             throw Error(std::move(*failure));
         }
     }
 
-    /// Close the connection; unanswered commands end as `disconnected`. A destructor does the same.
+    /// Close the connection; unanswered commands end as `disconnected`. A destructor does the same. It returns after all
+    /// callbacks, unless a callback calls it; any thread may call it, and again.
     void close() {
+        std::thread connection, callbacks;
         {
             const std::lock_guard one_at_a_time(core_->posting);
             if (!core_->closed.exchange(true) && core_->started) {  // what was posted before is answered; nothing is posted after it
@@ -58,48 +64,37 @@ class Client {
                     core->guard.reset();
                 });
             }
+            connection.swap(thread_);
+            callbacks.swap(callback_thread_);
         }
-        if (!thread_.joinable()) return;
-        if (on_own_thread()) {
-            thread_.detach();  // from a callback: the thread keeps what it needs until it has ended
-        } else {
-            thread_.join();
-        }
+        if (!connection.joinable()) return callbacks_->wait();
+        connection.join();
+        callbacks_->end();
+        if (callbacks.get_id() == std::this_thread::get_id()) callbacks.detach();  // it keeps what it needs until it has ended
+        else callbacks.join();
     }
 
     /// Send a command. *payload* is JSON (`array` makes arrays of numbers).
     Call<Answer> call(const std::string& service, const json& payload, CallOptions options = {}) {
         auto promise = std::make_shared<std::promise<Answer>>();
         auto result = promise->get_future();
-        const auto id = call(service, payload, std::move(options), [promise](Outcome<Answer> outcome) { settle(*promise, std::move(outcome)); });
+        const auto id = submit(service, encoded(payload), std::move(options), [promise](Outcome<Answer> outcome) { settle(*promise, std::move(outcome)); });
         return {id, std::move(result)};
     }
-    /// Send a command; *on_end* is called once, on the client's thread. Returns the command's id.
+    /// Send a command; *on_end* is called once, on the thread of callbacks. Returns the command's id.
     std::uint64_t call(const std::string& service, const json& payload, CallOptions options, OnEnd<Answer> on_end) {
         return send(service, encoded(payload), std::move(options), std::move(on_end));
     }
     /// The same with a payload that is MessagePack already.
     std::uint64_t send(const std::string& service, std::string payload, CallOptions options, OnEnd<Answer> on_end) {
-        const std::uint64_t id = core_->next_id++;
-        auto command = std::make_shared<detail::Command>(detail::Command{id, service, std::move(payload), std::move(options), std::move(on_end)});
-        const bool posted = core_->started && post([core = core_, command] {
-            auto& connection = *core->connection;
-            if (const Failure* why = connection.reason()) {
-                connection.session.refuse(*command, *why);
-                return;
-            }
-            connection.session.submit(std::move(*command), detail::now_s());
-            connection.pump();
-        });
-        if (!posted && command->on_end) command->on_end(Failure{"disconnected", "the client is not connected", "call connect first"});
-        return id;
+        return submit(service, std::move(payload), std::move(options), detail::deferred(callbacks_, on_end), on_end);
     }
 
     /// Estimate the pose of one image. In a stream (here `pose`) the newest image wins.
     Call<Pose> pnp(const PnpRequest& request, CallOptions options = in_stream("pose")) {
         auto promise = std::make_shared<std::promise<Pose>>();
         auto result = promise->get_future();
-        const auto id = pnp(request, std::move(options), [promise](Outcome<Pose> outcome) { settle(*promise, std::move(outcome)); });
+        const auto id = submit("pnp", encoded(request), std::move(options), [promise](Outcome<Answer> outcome) { settle(*promise, pose_in(outcome)); });
         return {id, std::move(result)};
     }
     std::uint64_t pnp(const PnpRequest& request, CallOptions options, OnEnd<Pose> on_end) {
@@ -120,7 +115,7 @@ class Client {
     /// *on_update* gets the present value of every key, and then each newer one.
     std::uint64_t subscribe(const std::string& topic, OnUpdate on_update, OnSubscriptionEnd on_end = {}) {
         const std::uint64_t id = core_->next_id++;
-        post([core = core_, id, topic, on_update = std::move(on_update), on_end = std::move(on_end)] {
+        post([core = core_, id, topic, on_update = detail::deferred(callbacks_, std::move(on_update)), on_end = detail::deferred(callbacks_, std::move(on_end))] {
             auto& connection = *core->connection;
             if (connection.fatal) {
                 connection.session.tell(on_end, *connection.fatal);
@@ -145,12 +140,15 @@ class Client {
 
     /// Return the counts so far.
     Stats stats() const {
-        const auto read = [core = core_] {
+        const auto read = [core = core_, callbacks = callbacks_] {
             Stats stats = core->connection->session.stats;
+            auto [errors, last] = callbacks->errors();
+            stats.callback_errors += errors;
+            if (stats.last_error.empty()) stats.last_error = std::move(last);
             stats.unanswered = core->connection->session.unanswered();
             return stats;
         };
-        if (!core_->started || on_own_thread()) return read();
+        if (!core_->started) return read();
         auto promise = std::make_shared<std::promise<Stats>>();
         auto result = promise->get_future();
         if (post([promise, read] { promise->set_value(read()); })) return result.get();
@@ -178,13 +176,34 @@ class Client {
         boost::asio::executor_work_guard<boost::asio::io_context::executor_type> guard;
         std::atomic<std::uint64_t> next_id{1};
         std::atomic<bool> started{false}, closed{false};
-        std::atomic<std::thread::id> thread{};
         std::mutex posting;
         std::promise<void> ended;
         std::shared_future<void> has_ended = ended.get_future().share();
     };
 
-    bool on_own_thread() const { return std::this_thread::get_id() == core_->thread; }
+    Options with_deferred(Options options) const {
+        options.on_change = detail::deferred(callbacks_, std::move(options.on_change));
+        return options;
+    }
+
+    /// Send a command; *on_end* is called on the connection's thread, or *at_once* here if there is no connection.
+    std::uint64_t submit(const std::string& service, std::string payload, CallOptions options, OnEnd<Answer> on_end, OnEnd<Answer> at_once = {}) {
+        if (!at_once) at_once = on_end;
+        options.on_progress = detail::deferred(callbacks_, std::move(options.on_progress));
+        const std::uint64_t id = core_->next_id++;
+        auto command = std::make_shared<detail::Command>(detail::Command{id, service, std::move(payload), std::move(options), std::move(on_end)});
+        const bool posted = core_->started && post([core = core_, command] {
+            auto& connection = *core->connection;
+            if (const Failure* why = connection.reason()) {
+                connection.session.refuse(*command, *why);
+                return;
+            }
+            connection.session.submit(std::move(*command), detail::now_s());
+            connection.pump();
+        });
+        if (!posted && at_once) at_once(Failure{"disconnected", "the client is not connected", "call connect first"});
+        return id;
+    }
 
     /// Let the client's thread do *work*; returns false if the client was closed, and nothing is done.
     template <class Work> bool post(Work&& work) const {
@@ -207,8 +226,9 @@ class Client {
         }
     }
 
+    std::shared_ptr<detail::Callbacks> callbacks_;
     std::shared_ptr<Core> core_;
-    std::thread thread_;
+    std::thread thread_, callback_thread_;
 };
 
 }  // namespace rse_pf

@@ -36,7 +36,7 @@ struct Options {
     double reconnect_long_max_s = 40;  ///< longest pause after minutes without a connection; after a refusal half of it at least
     double answer_timeout_s = 5;   ///< deadline of a command that sets none
     int first_tries = 4;           ///< attempts of `Client::connect` before it gives up
-    OnChange on_change{};          ///< called on the client's thread
+    OnChange on_change{};          ///< called on the thread of callbacks
 };
 
 namespace detail {
@@ -533,6 +533,10 @@ class Connection : public std::enable_shared_from_this<Connection> {
                 if (!here) return;
                 here->token_pending_ = false;
                 here->token_error_ = error;
+                if (!token) {
+                    ++here->session.stats.callback_errors;
+                    here->session.stats.last_error = "no token: " + error;
+                }
                 if (!here->shut_) then(token);
             });
         });

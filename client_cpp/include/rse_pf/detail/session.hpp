@@ -22,7 +22,7 @@ namespace rse_pf {
 struct Stats {
     std::uint64_t sent = 0, answered = 0, failed = 0, resent = 0, reconnects = 0, moves = 0;
     std::uint64_t dropped_answers = 0;      ///< to ids that were answered already, or were given up
-    std::uint64_t callback_exceptions = 0;  ///< exceptions of callbacks, which end there
+    std::uint64_t callback_errors = 0;      ///< exceptions of callbacks and of the token source, which end there
     std::uint64_t bytes_in = 0, bytes_out = 0;
     std::map<std::string, std::uint64_t> failures_by_code{};
     /// Commands that were not sent at once although there was a connection: after a busy answer (to
@@ -84,10 +84,10 @@ class Session {
         try {
             callback(std::forward<Arguments>(arguments)...);
         } catch (const std::exception& error) {
-            ++stats.callback_exceptions;
+            ++stats.callback_errors;
             stats.last_error = error.what();
         } catch (...) {
-            ++stats.callback_exceptions;
+            ++stats.callback_errors;
         }
     }
 

@@ -1,0 +1,89 @@
+// The thread that runs the callbacks of a program, so that none of them can hold up the connection.
+#pragma once
+
+#include <condition_variable>
+#include <cstdint>
+#include <deque>
+#include <exception>
+#include <functional>
+#include <memory>
+#include <mutex>
+#include <string>
+#include <thread>
+#include <utility>
+
+namespace rse_pf::detail {
+
+/// A queue of callbacks: `run` calls them in their order on one thread; what they throw ends there and is counted.
+class Callbacks {
+  public:
+    void add(std::function<void()> callback) {
+        const std::lock_guard lock(mutex_);
+        waiting_.push_back(std::move(callback));
+        changed_.notify_all();
+    }
+    /// Let `run` return after the callbacks that wait.
+    void end() {
+        const std::lock_guard lock(mutex_);
+        is_ending_ = true;
+        changed_.notify_all();
+    }
+    /// Wait until `run` has returned; in a callback, do not.
+    void wait() {
+        std::unique_lock lock(mutex_);
+        if (thread_ != std::this_thread::get_id()) changed_.wait(lock, [this] { return thread_ == std::thread::id(); });
+    }
+    void run() {
+        std::unique_lock lock(mutex_);
+        thread_ = std::this_thread::get_id();
+        for (;;) {
+            changed_.wait(lock, [this] { return is_ending_ || !waiting_.empty(); });
+            if (waiting_.empty()) break;
+            auto callback = std::move(waiting_.front());
+            waiting_.pop_front();
+            lock.unlock();
+            std::string error;
+            bool has_failed = true;
+            try {
+                callback();
+                has_failed = false;
+            } catch (const std::exception& failed) {
+                error = failed.what();
+            } catch (...) {
+                error = "an exception";
+            }
+            callback = nullptr;  // what it captured ends without the lock, too
+            lock.lock();
+            if (!has_failed) continue;
+            ++errors_;
+            last_error_ = std::move(error);
+        }
+        thread_ = {};
+        changed_.notify_all();
+    }
+    /// Return how many callbacks threw, and the text of the last exception.
+    std::pair<std::uint64_t, std::string> errors() const {
+        const std::lock_guard lock(mutex_);
+        return {errors_, last_error_};
+    }
+
+  private:
+    mutable std::mutex mutex_;
+    std::condition_variable changed_;
+    std::deque<std::function<void()>> waiting_;
+    std::uint64_t errors_ = 0;
+    std::string last_error_;
+    std::thread::id thread_;
+    bool is_ending_ = false;
+};
+
+/// Return a function that lets *callbacks* call *callback* later; empty if *callback* is.
+template <class... Arguments>
+std::function<void(Arguments...)> deferred(const std::shared_ptr<Callbacks>& callbacks, std::function<void(Arguments...)> callback) {
+    if (!callback) return {};
+    return [callbacks, callback = std::move(callback)](Arguments... arguments) {
+        callbacks->add([callback, arguments...] { callback(arguments...); });
+    };
+}
+
+}  // namespace rse_pf::detail
