@@ -51,6 +51,11 @@ def kind_of(role: Role, topic: str) -> str:
     return COMPRESSED_IMAGE if topic.rstrip("/").endswith(("compressed", "compressedDepth")) else IMAGE
 
 
+def _cause(error: Exception) -> str:
+    """Return an error in one line; hints are those of bags."""
+    return error.message if isinstance(error, RsePfError) else str(error)
+
+
 def _stamp_ns(message: Any) -> int:
     stamp = message.header.stamp
     return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
@@ -144,7 +149,7 @@ class IncomingFrames:
                     return waited and not self._waits_for_imu()
                 self._check(role, message)
             except (BrokenMessage, RsePfError, *_FAULTS) as error:
-                fault = f"a message of {self._topic(role)} cannot be used: {error}"
+                fault = f"a message of {self._topic(role)} cannot be used: {_cause(error)}"
                 if role in _INFOS:
                     self._unusable_infos[role] = fault
                 self.check.refuse("broken", fault)
@@ -205,7 +210,7 @@ class IncomingFrames:
             return replace(made, rgb=rectifier.colour(rgb))
         except (BrokenMessage, RsePfError, *_FAULTS) as error:
             with self._lock:
-                self.check.refuse(_REPEATED if isinstance(error, _RepeatedImage) else "broken", str(error))
+                self.check.refuse(_REPEATED if isinstance(error, _RepeatedImage) else "broken", _cause(error))
             return None
 
     def _camera_at(self, stamp_ns: int) -> _StatedCamera:

@@ -243,6 +243,7 @@ def test_a_camera_info_that_cannot_be_used_is_named_and_its_images_are_left_out(
 
     assert robot.frame() is None
     assert named in robot.frames.check.fault
+    assert "hint" not in robot.frames.check.fault
 
 
 @pytest.mark.parametrize(("stamps", "named"), [([0, 0], "is not set"), ([5, 5], "stands still at")])
