@@ -31,6 +31,7 @@ from rse_pf.errors import (
 from rse_pf.geometry import Array, Camera
 
 __all__ = [
+    "COLLINEAR",
     "PART_ABIS",
     "Evidence",
     "NativeOptions",
@@ -48,20 +49,20 @@ __all__ = [
 
 Part = TypeVar("Part")
 
-_ABI = 3
+_ABI = 4
 PART_ABIS = {"check": 2, "cloud": 1, "depth": 1, "match": 4, "stereo": 1, "track": 2}
 """The version of each header ``rse_pf_PART.h`` that this package calls."""
 _FILE = "librse_pf_native.so"
-_PROPOSE = 2
 _LANES = {"avx512": 0, "avx2": 4, "portable": 1}
-# rse_pf_pnp_request: abi, flags, rows, points, pixels | camera, options.
-_HEAD = struct.Struct("=IIqQQ")
+# rse_pf_pnp_request: abi, flags, rows, points, pixels, pose | camera, options.
+_HEAD = struct.Struct("=IIqQQQ")
 _BODY = struct.Struct("=ddddiiddiidddd")
-# rse_pf_pnp_result: status, reason, three counts, four measures | pose | covariance.
-_RESULT = struct.Struct("=iiqqqdddd")
+# rse_pf_pnp_result: status, reason, three counts, six measures | pose | covariance.
+_RESULT = struct.Struct("=iiqqqdddddd")
 _POSE_AT, _COVARIANCE_AT = _RESULT.size, _RESULT.size + 16 * 8
 _RESULT_BYTES = _COVARIANCE_AT + 36 * 8
-_COLLINEAR = 0.02
+_STATUSES_WITHOUT_EVIDENCE = (1, 2, 3, 11)
+COLLINEAR = 0.02  # width over length of matches below which no pose is given
 
 _REASONS = (
     "", "few-inliers", "low-inlier-ratio", "nearly-collinear", "clustered", "poorly-constrained", "ambiguous",
@@ -87,13 +88,31 @@ class NativeOptions(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Evidence(msgspec.Struct, frozen=True, kw_only=True, eq=False):
-    """A pose and what speaks for it; the fields are those of `rse_pf.pnp.PnpSolution`."""
+    """A pose and its evidence; the first five fields are those of `rse_pf.pnp.PnpSolution`.
+
+    Attributes:
+        independent: How many inliers count as independent: neighbours in the image count once.
+        log10_false_alarms: log10 of the expected number of random poses with such inliers.
+        thinness: Width over length of all matches, in space or in the image, whichever is less; only where
+            chance explains the pose.
+        inlier_thinness: Width over length of the inliers in the image.
+        radius_px: Root mean square distance of the inliers from their centre in the image.
+        other_rmse_px: Of the second pose of a plane; 0 without a second pose.
+        refusal: The error of the first rule that refuses the pose; None if it is accepted.
+    """
 
     T_camera_world: Array
     inliers: npt.NDArray[np.intp]
     rmse_px: float
     covariance: Array
     reason: str
+    independent: int
+    log10_false_alarms: float
+    thinness: float
+    inlier_thinness: float
+    radius_px: float
+    other_rmse_px: float
+    refusal: RsePfError | None
 
 
 class _Buffers(threading.local):
@@ -129,74 +148,69 @@ class NativeSolver:
         self.lanes = lanes
         """``avx512``, ``avx2`` or ``portable``: the instructions that this processor gets."""
 
-    def solve(self, points_world: Array, pixels: Array, camera: Camera, options: NativeOptions) -> Evidence:
-        """Estimate the camera pose with its evidence.
+    def judge(
+        self,
+        points_world: Array,
+        pixels: Array,
+        camera: Camera,
+        options: NativeOptions,
+        T_camera_world: Array | None = None,
+    ) -> Evidence:
+        """Return a camera pose with its evidence, also where a rule refuses the pose.
 
         Args:
             points_world: ``(n, 3)``, metres, world frame; ``n >= 4``.
             pixels: ``(n, 2)``, undistorted pixels.
             camera: Intrinsics of the image the pixels come from.
             options: How to solve.
+            T_camera_world: The ``(4, 4)`` pose to judge; None to estimate the pose.
 
         Raises:
             BadRequest: Shapes do not fit, or a number is not finite or absurd.
-            DegenerateGeometry: The points lie on one line or coincide, or two poses fit alike.
-            NoConsensus: No pose agrees with more rows than chance would give.
         """
-        n = len(pixels)
-        inliers = np.empty(n, dtype=np.int64)
-        # The arrays stay referenced during the call: the request holds their addresses only.
-        arrays = self._write_request(points_world, pixels, camera, options)
-        values = self._run(address_of(inliers))
-        del arrays
-        status, reason, count = values[:3]
-        if status:
-            raise _solver_error(values, n, options)
-        buffers = self._buffers
-        return Evidence(
-            T_camera_world=buffers.pose.copy(),
-            inliers=inliers[:count],
-            rmse_px=values[5],
-            covariance=buffers.covariance.copy(),
-            reason=_REASONS[reason],
-        )
-
-    def propose(
-        self, points_world: Array, pixels: Array, camera: Camera, options: NativeOptions
-    ) -> Array | None:
-        """Return the ``(3, 4)`` pose [R | t] without evidence, or None where there is none."""
-        arrays = self._write_request(points_world, pixels, camera, options, flags=_PROPOSE)
-        values = self._run(0)
-        del arrays
-        return None if values[0] else self._buffers.pose[:3].copy()
-
-    def _write_request(
-        self, points_world: Array, pixels: Array, camera: Camera, options: NativeOptions, *, flags: int = 0
-    ) -> tuple[Array, Array]:
-        """Write what is solved into the request; return the arrays that it points to."""
         # The library trusts these: what is not contiguous, not aligned or not float64 is copied.
         points_world, pixels = aligned(points_world, np.float64), aligned(pixels, np.float64)
-        if points_world.shape != (len(pixels), 3) or pixels.shape != (len(pixels), 2):
+        n = len(pixels)
+        if points_world.shape != (n, 3) or pixels.shape != (n, 2):
             raise BadRequest(
                 f"points {points_world.shape} and pixels {pixels.shape} are not (n, 3) and (n, 2)",
                 hint="send one pixel for each point",
             )
-        request = self._buffers.request
-        flags |= _LANES[options.lanes]
-        _HEAD.pack_into(request, 0, _ABI, flags, len(pixels), address_of(points_world), address_of(pixels))
-        request[_HEAD.size : _HEAD.size + _BODY.size] = _pack(camera, options)
-        return points_world, pixels
-
-    def _run(self, inliers_at: int) -> tuple[Any, ...]:
-        """Solve the request that was written last."""
+        pose = None if T_camera_world is None else aligned(T_camera_world, np.float64)
+        inliers = np.empty(n, dtype=np.int64)
         buffers = self._buffers
-        self._call(buffers.request_at, inliers_at, buffers.result_at)
-        return _RESULT.unpack_from(buffers.result)
+        _HEAD.pack_into(
+            buffers.request, 0, _ABI, _LANES[options.lanes], n, address_of(points_world), address_of(pixels),
+            0 if pose is None else address_of(pose),
+        )  # fmt: skip
+        buffers.request[_HEAD.size : _HEAD.size + _BODY.size] = _pack(camera, options)
+        self._call(buffers.request_at, address_of(inliers), buffers.result_at)
+        values = _RESULT.unpack_from(buffers.result)
+        status, reason, count, independent, _, rmse, other_rmse, thinness, radius, inlier_thinness, chance = (
+            values
+        )
+        refusal = _solver_error(values, n, options) if status else None
+        if refusal is not None and status in _STATUSES_WITHOUT_EVIDENCE:
+            raise refusal
+        return Evidence(
+            T_camera_world=buffers.pose.copy() if pose is None else pose,
+            inliers=inliers[:count],
+            rmse_px=rmse,
+            covariance=buffers.covariance.copy(),
+            reason=_REASONS[reason],
+            independent=independent,
+            log10_false_alarms=chance,
+            thinness=thinness,
+            inlier_thinness=inlier_thinness,
+            radius_px=radius,
+            other_rmse_px=other_rmse,
+            refusal=refusal,
+        )
 
 
 def _solver_error(values: tuple[Any, ...], n: int, options: NativeOptions) -> RsePfError:
-    """Return the error of what `_RESULT` unpacks; the sentences are those of `rse_pf.pnp.solver`."""
-    status, _, count, independent, other, rmse_px, other_rmse_px, thinness, radius_px = values
+    """Return the error of a status other than 0."""
+    status, _, count, independent, other, rmse_px, other_rmse_px, thinness, radius_px, *_ = values
     everywhere = "match points all over the image, or skip this frame"
     match status:
         case 2 | 3:
@@ -214,7 +228,7 @@ def _solver_error(values: tuple[Any, ...], n: int, options: NativeOptions) -> Rs
         case 5:
             return DegenerateGeometry(
                 f"the points that agree lie on one line or coincide (width/length {thinness:.3f} is below "
-                f"{_COLLINEAR})",
+                f"{COLLINEAR})",
                 hint=everywhere,
             )
         case 6:

@@ -21,7 +21,7 @@ def main() -> None:
     short = problem.points_world[:-1].copy()
     points = np.lib.stride_tricks.as_strided(short, shape=problem.points_world.shape)
     options = native_options(PnpOptions(), WeakLimits())
-    native.open_solver(path).solve(points, problem.pixels, problem.camera, options)
+    native.open_solver(path).judge(points, problem.pixels, problem.camera, options)
 
 
 if __name__ == "__main__":

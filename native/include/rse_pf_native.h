@@ -1,4 +1,4 @@
-/* The C ABI of the native core: one call from matches to a pose with its evidence.
+/* The C ABI of the native core: one call from matches, or from a pose and matches, to a pose with its evidence.
  *
  * Every function may be called from any thread at any time.  Equal requests give equal bytes on every
  * processor, whatever was solved before.  A request is never written to. */
@@ -10,14 +10,13 @@
 extern "C" {
 #endif
 
-#define RSE_PF_NATIVE_ABI 3
+#define RSE_PF_NATIVE_ABI 4
 
 /* Flags of a request. */
 #define RSE_PF_PNP_PORTABLE 1u /* Use no AVX, for tests: the bytes of the result are the same. */
-#define RSE_PF_PNP_PROPOSE 2u  /* Return the pose only, without inliers and evidence. */
 #define RSE_PF_PNP_AVX2 4u     /* Use no AVX-512, for tests as well. */
 
-/* What became of a request; all but the first leave no pose. */
+/* What became of a request; all but the first refuse the pose. */
 enum rse_pf_pnp_status {
     RSE_PF_PNP_SOLVED = 0,
     RSE_PF_PNP_BAD_REQUEST = 1,   /* A size, an option or the ABI does not fit. */
@@ -50,6 +49,7 @@ typedef struct rse_pf_pnp_request {
     int64_t rows;   /* 4 and more */
     const double *points_world; /* rows x 3, metres, world frame, row-major */
     const double *pixels;       /* rows x 2, undistorted pixels, row-major */
+    const double *T_camera_world; /* row-major, the pose to judge; null: find one */
     double fx, fy, cx, cy;      /* pixels */
     int32_t width, height;      /* pixels */
     double inlier_px;
@@ -62,8 +62,9 @@ typedef struct rse_pf_pnp_result {
     int32_t status;
     int32_t reason;
     int64_t count, independent, other_count;
-    double rmse_px, other_rmse_px, thinness, radius_px;
-    double T_camera_world[16]; /* row-major */
+    double rmse_px, other_rmse_px, thinness, radius_px; /* other_rmse_px: 0 without a second pose */
+    double inlier_thinness, log10_false_alarms;
+    double T_camera_world[16]; /* row-major; zeros where there is none */
     double covariance[36];     /* of the twist (rho metres, phi radians) left of the pose */
 } rse_pf_pnp_result;
 
@@ -73,8 +74,8 @@ uint32_t rse_pf_native_abi(void);
 /* Return "avx512", "avx2" or "portable": the instructions that this processor gets. */
 const char *rse_pf_native_lanes(void);
 
-/* Estimate the camera pose.  inliers has room for as many numbers as the request has rows (it may be null
- * with RSE_PF_PNP_PROPOSE); the first `count` of them become the sorted row numbers that agree. */
+/* Estimate or judge the camera pose.  inliers has room for as many numbers as the request has rows; the first
+ * `count` of them become the sorted row numbers that agree, also where the pose is refused. */
 void rse_pf_pnp_solve(const rse_pf_pnp_request *request, int64_t *inliers, rse_pf_pnp_result *result);
 
 #ifdef __cplusplus

@@ -87,10 +87,10 @@ int32_t checked(const rse_pf_pnp_request& request, const int64_t* inliers) {
     const bool is_whole =
         request.abi == RSE_PF_NATIVE_ABI && within(static_cast<double>(request.rows), 4, static_cast<double>(kMaxRows)) &&
         request.points_world != nullptr && request.pixels != nullptr &&
-        (inliers != nullptr || (request.flags & RSE_PF_PNP_PROPOSE) != 0) && request.width > 0 &&
-        request.height > 0 && within(request.fx, 1e-9, 1e9) && within(request.fy, 1e-9, 1e9) &&
-        within(request.cx, -1e9, 1e9) && within(request.cy, -1e9, 1e9) && within(request.inlier_px, 1e-9, 1e4) &&
-        within(request.confidence, 1e-9, 1.0 - 1e-12) && request.max_iterations > 0;
+        inliers != nullptr && request.width > 0 && request.height > 0 && within(request.fx, 1e-9, 1e9) &&
+        within(request.fy, 1e-9, 1e9) && within(request.cx, -1e9, 1e9) && within(request.cy, -1e9, 1e9) &&
+        within(request.inlier_px, 1e-9, 1e4) && within(request.confidence, 1e-9, 1.0 - 1e-12) &&
+        request.max_iterations > 0;
     if (!is_whole) return RSE_PF_PNP_BAD_REQUEST;
     if (!are_sane(request.points_world, 3 * request.rows)) return RSE_PF_PNP_BAD_POINTS;
     if (!are_sane(request.pixels, 2 * request.rows)) return RSE_PF_PNP_BAD_PIXELS;

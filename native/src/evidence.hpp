@@ -1,6 +1,4 @@
 // Evidence for and against a proposed pose: probability of chance, geometry, covariance.
-//
-// The rules are those of rse_pf/pnp/evidence.py, which says more about each; tests compare the two.
 #pragma once
 
 #include "kernels.hpp"
@@ -16,15 +14,15 @@ constexpr int kManyCells = 24;
 constexpr double kMaxLog10FalseAlarms = -5.0;
 constexpr double kLog10E = 0.43429448190325183;
 
-// Say whether chance may explain that `inliers` of n rows agree within largest_error2 (px^2).
+// Return log10 of the expected number of random poses that `inliers` of n rows fit within largest_error2 (px^2).
 // Source: Moisan and Stival, IJCV 2004; for PnP: Moulon et al., ACCV 2012.
-static bool is_chance(int64_t n, int64_t inliers, double largest_error2, double area_px2) {
-    if (inliers <= 3) return true;
+static double log10_false_alarms(int64_t n, int64_t inliers, double largest_error2, double area_px2) {
+    if (inliers <= 3) return kInfinity;
     const double disc = kPi * (largest_error2 > kMinError2 ? largest_error2 : kMinError2) / area_px2;
     const double log = natural_log(4.0 * static_cast<double>(n - 3)) + log_choose(n, inliers) +
                        log_choose(inliers, 3) +
                        static_cast<double>(inliers - 3) * natural_log(disc < 1.0 ? disc : 1.0);
-    return log * kLog10E > kMaxLog10FalseAlarms;
+    return log * kLog10E;
 }
 
 // Return how many of the inliers count as independent: those in the same or in adjacent cells of the image
@@ -127,19 +125,14 @@ static double width_to_length(const double* x, const double* y, const double* z,
     return square_root((width2 > 0.0 ? width2 : 0.0) / length2);
 }
 
-// How the inliers lie in the image, as Shape in evidence.py has it.
-struct Shape {
-    double thinness, radius_px;
-};
-
-static Shape shape_of(const rse_pf::Workspace& view, int64_t count, const rse_pf_pnp_request& request) {
+// Write how the inliers lie in the image: width over length, and the root mean square distance from their centre.
+static void write_shape(const rse_pf::Workspace& view, int64_t count, const rse_pf_pnp_request& request,
+                        rse_pf_pnp_result& result) {
     typedef Lanes<double> F;
-    const double* const pixel_u = view.u;
-    const double* const pixel_v = view.v;
     F u = all(0.0), v = u, uu = u, uv = u, vv = u;
     const int64_t whole = count / kLanes * kLanes;
     for (int64_t i = 0; i < whole; i += kLanes) {
-        const F pu = load(pixel_u + i), pv = load(pixel_v + i);
+        const F pu = load(view.u + i), pv = load(view.v + i);
         u = u + pu;
         v = v + pv;
         uu = uu + pu * pu;
@@ -149,7 +142,7 @@ static Shape shape_of(const rse_pf::Workspace& view, int64_t count, const rse_pf
     double su = sum<double>(u), sv = sum<double>(v), suu = sum<double>(uu), suv = sum<double>(uv),
            svv = sum<double>(vv);
     for (int64_t i = whole; i < count; ++i) {
-        const double pu = pixel_u[i], pv = pixel_v[i];
+        const double pu = view.u[i], pv = view.v[i];
         su += pu;
         sv += pv;
         suu += pu * pu;
@@ -160,19 +153,17 @@ static Shape shape_of(const rse_pf::Workspace& view, int64_t count, const rse_pf
     const double xx = suu - su * mean_u, xy = suv - su * mean_v, yy = svv - sv * mean_v;
     const double half = 0.5 * (xx - yy), mean = 0.5 * (xx + yy), root = square_root(half * half + xy * xy);
     const double length2 = mean + root, width2 = mean - root, spread = length2 + width2;
-    Shape shape;
-    shape.radius_px = square_root((spread > 0.0 ? spread : 0.0) / k);
+    result.radius_px = square_root((spread > 0.0 ? spread : 0.0) / k);
     // No inlier lies further out than the corner of the image (or, outside it, than three times the rms).
     const double at_u = mean_u + request.cx, at_v = mean_v + request.cy;
     const double other_u = request.width - at_u, other_v = request.height - at_v;
     const double reach_u = at_u > other_u ? at_u : other_u, reach_v = at_v > other_v ? at_v : other_v;
-    const double corner2 = reach_u * reach_u + reach_v * reach_v, rms2 = 9.0 * shape.radius_px * shape.radius_px;
+    const double corner2 = reach_u * reach_u + reach_v * reach_v, rms2 = 9.0 * result.radius_px * result.radius_px;
     const double margin = width2 - kOutlierFactor * (corner2 > rms2 ? corner2 : rms2);
     if (margin > kClearlyWide * kClearlyWide * length2)
-        shape.thinness = square_root(margin / length2);
+        result.inlier_thinness = square_root(margin / length2);
     else
-        shape.thinness = width_to_length(pixel_u, pixel_v, nullptr, count, view.along, view.aside);
-    return shape;
+        result.inlier_thinness = width_to_length(view.u, view.v, nullptr, count, view.along, view.aside);
 }
 
 struct Symmetric3 {

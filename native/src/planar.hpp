@@ -1,7 +1,6 @@
 // The second pose of a plane: under weak perspective, a plane and its mirror image look alike.
 //
-// Source: Schweighofer and Pinz, PAMI 2006; Collins and Bartoli, IJCV 2014.  The steps are those of
-// rse_pf/pnp/planar_ambiguity.py.
+// Source: Schweighofer and Pinz, PAMI 2006; Collins and Bartoli, IJCV 2014.
 #pragma once
 
 #include "kernels.hpp"

@@ -1,6 +1,4 @@
 // From matches to a pose with its evidence, or to the reason why there is none.
-//
-// The rules and their order are those of rse_pf/pnp/solver.py; tests compare the two.
 #pragma once
 
 #include "evidence.hpp"
@@ -24,6 +22,13 @@ static void give(double (&out)[16], const Pose& pose, const Vector3& centre) {
     out[15] = 1.0;
 }
 
+// Return the pose of the caller, which `give` wrote.
+static Pose taken(const double* T, const Vector3& centre) {
+    Pose pose = {{{T[0], T[1], T[2]}, {T[4], T[5], T[6]}, {T[8], T[9], T[10]}}, {T[3], T[7], T[11]}};
+    pose.t = pose.t + rotated(pose.R, centre);
+    return pose;
+}
+
 // Degenerate input says more than "no consensus".
 static int32_t without_pose(const rse_pf::Task& task, int64_t count) {
     const rse_pf::Workspace& data = *task.workspace;
@@ -32,16 +37,17 @@ static int32_t without_pose(const rse_pf::Task& task, int64_t count) {
     result.count = count;
     result.thinness = width_to_length(data.all.x, data.all.y, data.all.z, n, data.along, data.aside);
     if (result.thinness < kCollinear) return RSE_PF_PNP_COLLINEAR;
-    result.thinness = width_to_length(data.all.u, data.all.v, nullptr, n, data.along, data.aside);
+    const double of_pixels = width_to_length(data.all.u, data.all.v, nullptr, n, data.along, data.aside);
+    result.thinness = of_pixels < result.thinness ? of_pixels : result.thinness;
     return result.thinness < kCollinear ? RSE_PF_PNP_COLLINEAR : RSE_PF_PNP_NO_CONSENSUS;
 }
 
-static int32_t weakness(const rse_pf_pnp_request& request, const rse_pf_pnp_result& result, const Shape& shape) {
+static int32_t weakness(const rse_pf_pnp_request& request, const rse_pf_pnp_result& result) {
     const double count = static_cast<double>(result.count);
     const double(&C)[36] = result.covariance;
     if (count < request.weak_inliers) return RSE_PF_PNP_FEW_INLIERS;
     if (count < request.weak_inlier_ratio * static_cast<double>(request.rows)) return RSE_PF_PNP_LOW_INLIER_RATIO;
-    if (shape.thinness < kNearlyCollinear) return RSE_PF_PNP_NEARLY_COLLINEAR;
+    if (result.inlier_thinness < kNearlyCollinear) return RSE_PF_PNP_NEARLY_COLLINEAR;
     if (2.0 * static_cast<double>(result.independent) < request.weak_inliers) return RSE_PF_PNP_CLUSTERED;
     if (C[0] + C[7] + C[14] > request.weak_translation_m * request.weak_translation_m ||
         C[21] + C[28] + C[35] > request.weak_rotation_rad * request.weak_rotation_rad)
@@ -70,9 +76,11 @@ static int32_t judged(const rse_pf::Task& task, const Vector3& centre) {
     const int64_t n = request.rows;
     const SearchOptions options = {limit2, request.confidence, request.max_iterations, request.min_iterations};
     Pose pose;
-    if (!propose(task, optics, options, centre, pose)) return without_pose(task, 0);
+    if (request.T_camera_world != nullptr)
+        pose = taken(request.T_camera_world, centre);
+    else if (!propose(task, optics, options, centre, pose))
+        return without_pose(task, 0);
     give(result.T_camera_world, pose, centre);
-    if ((request.flags & RSE_PF_PNP_PROPOSE) != 0) return RSE_PF_PNP_SOLVED;
 
     project(data.all, n, optics, pose, data);
     const int64_t count = gather(data, n, limit2, task.inliers);
@@ -89,35 +97,39 @@ static int32_t judged(const rse_pf::Task& task, const Vector3& centre) {
     result.independent =
         independent_inliers(data.u, data.v, count, request.cx, request.cy, static_cast<double>(request.width));
     const int64_t places = n - (count - result.independent);
-    if (is_chance(places, result.independent, limit2, area) &&
-        is_chance(places, result.independent, largest, area)) {
-        if (!is_chance(n, count, largest, area)) return RSE_PF_PNP_COPIES;
-        return without_pose(task, count);
-    }
-    const Shape shape = shape_of(data, count, request);
-    result.thinness = shape.thinness;
-    result.radius_px = shape.radius_px;
-    if (shape.thinness < kCollinear) return RSE_PF_PNP_COLLINEAR;
-    if (shape.radius_px < request.inlier_px) return RSE_PF_PNP_ONE_PLACE;
+    result.log10_false_alarms = log10_false_alarms(places, result.independent, largest, area);
+    // The first rule that refuses gives the status; the figures of the others are written as well.
+    int32_t status = RSE_PF_PNP_SOLVED;
+    if (result.log10_false_alarms > kMaxLog10FalseAlarms)
+        status = log10_false_alarms(n, count, largest, area) > kMaxLog10FalseAlarms ? without_pose(task, count)
+                                                                                    : RSE_PF_PNP_COPIES;
+    write_shape(data, count, request, result);
     const double freedom = 2.0 * static_cast<double>(count) - 6.0;
     const double noise2 = squares / (freedom > 1.0 ? freedom : 1.0);
     const double variance = noise2 > kNoiseFloor2 ? noise2 : kNoiseFloor2;
     Normal normal;
     int64_t agree = 0;
     linearised<double, Loss::kSquared>(data.inliers, count, optics, pose, 0.0, normal, agree);
-    if (!covariance_of(normal, variance, result.covariance)) return RSE_PF_PNP_UNCONSTRAINED;
-    result.reason = weakness(request, result, shape);
+    const bool is_constrained = covariance_of(normal, variance, result.covariance);
+    if (status == RSE_PF_PNP_SOLVED) {
+        result.thinness = result.inlier_thinness;
+        if (result.thinness < kCollinear) status = RSE_PF_PNP_COLLINEAR;
+        else if (result.radius_px < request.inlier_px) status = RSE_PF_PNP_ONE_PLACE;
+        else if (!is_constrained) status = RSE_PF_PNP_UNCONSTRAINED;
+    }
+    result.reason = weakness(request, result);
     if (depth_variation(data, count) < kWeakPerspective) {
         Pose twin;
         const double second = second_pose(data, count, optics, pose, centre, twin);
         if (second >= 0.0) {
             result.other_rmse_px = square_root(second / static_cast<double>(count));
             const double difference = (second - squares) / variance;
-            if (difference < kSameFit) return RSE_PF_PNP_TWO_POSES;
+            if (difference < kSameFit && status == RSE_PF_PNP_SOLVED) status = RSE_PF_PNP_TWO_POSES;
             if (difference < kSimilarFit) result.reason = RSE_PF_PNP_AMBIGUOUS;
         }
     }
-    if (static_cast<double>(count) >= request.weak_inlier_ratio * static_cast<double>(n)) return RSE_PF_PNP_SOLVED;
+    const bool most_agree = static_cast<double>(count) >= request.weak_inlier_ratio * static_cast<double>(n);
+    if (status != RSE_PF_PNP_SOLVED || most_agree) return status;
 
     // Where most rows disagree, test whether the world is mirrored: its reflection then fits far better.
     SearchOptions few = options;

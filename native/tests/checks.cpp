@@ -234,8 +234,11 @@ void check_hostile() {
         for (double& each : points) each = hostile(kind);
         for (double& each : pixels) each = hostile(other);
         std::vector<int64_t> inliers(n);
+        std::vector<double> pose(16);
+        for (double& each : pose) each = hostile(kind);
         rse_pf_pnp_request request = request_of(points, pixels);
-        request.flags = static_cast<uint32_t>(random_bits() % 4);
+        request.T_camera_world = i % 3 == 0 ? pose.data() : nullptr;
+        request.flags = static_cast<uint32_t>(random_bits() % 8);
         request.max_iterations = static_cast<int32_t>(1 + random_bits() % 50);
         request.inlier_px = i % 2 == 0 ? 8.0 : uniform(1e-3, 100.0);
         rse_pf_pnp_result result;

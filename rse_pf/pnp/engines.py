@@ -1,8 +1,7 @@
 """Two robust PnP engines behind one contract: the native core, and the paper's ``solvePnPRansac`` of OpenCV.
 
-An engine proposes a pose; `rse_pf.pnp.solver` decides whether to accept it.  Engines are deterministic (fixed
-seeds, one thread) and raise no exceptions of their libraries.  The native core can also judge its pose in the
-same call: `native_evidence`.
+The native core judges the poses of both.  Engines are deterministic (fixed seeds, one thread) and raise no
+exceptions of their libraries.
 """
 
 from __future__ import annotations
@@ -22,15 +21,20 @@ __all__ = [
     "Engine",
     "available_engines",
     "engine_for",
-    "native_evidence",
     "native_options",
 ]
 
 # Refinements of the opencv engine, each on the inliers of the previous one.
 _MAX_REFINEMENTS = 4
+# Largest coordinate that OpenCV gets; the native core refuses larger ones, and those that are not finite.
+_MAX_ABS = 1e6
 
-Engine = Callable[[Array, Array, Camera, PnpOptions], "Array | None"]
-"""``(points_world (n, 3), pixels (n, 2), camera, options)`` to ``(3, 4)`` [R | t], or None."""
+Engine = Callable[[Array, Array, Camera, PnpOptions, WeakLimits], native.Evidence]
+"""``(points_world (n, 3), pixels (n, 2), camera, options, weak)`` to a pose with its evidence; ``n >= 4``.
+
+Raises:
+    BadRequest: A number is not finite or absurd.
+"""
 
 
 def engine_for(name: str) -> Engine:
@@ -66,8 +70,9 @@ def _opencv_engine() -> Engine:
     except ImportError as error:
         raise MissingExtra("opencv-python-headless", "vision") from error
     cv2.setNumThreads(1)
+    solver = native.native_solver()
 
-    def solve(points_world: Array, pixels: Array, camera: Camera, options: PnpOptions) -> Array | None:
+    def propose(points_world: Array, pixels: Array, camera: Camera, options: PnpOptions) -> Array | None:
         """RANSAC with P3P, then Levenberg-Marquardt on the inliers (RSE-PF paper, Sect. 6.1)."""
         matrix = camera.matrix
         cv2.setRNGSeed(0)
@@ -96,10 +101,21 @@ def _opencv_engine() -> Engine:
                 before, rows = rows, np.flatnonzero(agree)
                 if len(rows) < 4 or np.array_equal(before, rows):
                     break
-            pose: Array = np.hstack([cv2.Rodrigues(rotation)[0], translation])
+            pose: Array = np.vstack([np.hstack([cv2.Rodrigues(rotation)[0], translation]), [0, 0, 0, 1]])
         except cv2.error:
             return None
         return pose
+
+    def solve(
+        points_world: Array, pixels: Array, camera: Camera, options: PnpOptions, weak: WeakLimits
+    ) -> native.Evidence:
+        """Judge the pose that OpenCV proposes."""
+        pose = None
+        if np.abs(points_world).max() <= _MAX_ABS and np.abs(pixels).max() <= _MAX_ABS:
+            pose = propose(points_world, pixels, camera, options)
+        if pose is None:
+            pose = np.full((4, 4), np.nan)  # which agrees with no match
+        return solver.judge(points_world, pixels, camera, native_options(options, weak), pose)
 
     return solve
 
@@ -123,36 +139,15 @@ def native_options(options: PnpOptions, weak: WeakLimits) -> native.NativeOption
 def _native_engine() -> Engine:
     solver = native.native_solver()
 
-    def solve(points_world: Array, pixels: Array, camera: Camera, options: PnpOptions) -> Array | None:
+    def solve(
+        points_world: Array, pixels: Array, camera: Camera, options: PnpOptions, weak: WeakLimits
+    ) -> native.Evidence:
         """LO-RANSAC with P3P, then robust refinement (``native/src/robust.hpp``)."""
-        return solver.propose(points_world, pixels, camera, native_options(options, _NO_LIMITS))
+        return solver.judge(points_world, pixels, camera, native_options(options, weak))
 
     return solve
 
 
-def native_evidence(
-    points_world: Array, pixels: Array, camera: Camera, options: PnpOptions, weak: WeakLimits
-) -> native.Evidence:
-    """Return the native core's pose with its evidence: what `solve_pnp` does, in one call.
-
-    Args:
-        points_world: ``(n, 3)``, metres, world frame; ``n >= 4``.
-        pixels: ``(n, 2)``, undistorted pixels.
-        camera: Intrinsics of the image the pixels come from.
-        options: RANSAC settings; the engine in them is not looked at.
-        weak: Where a pose stops being ``ok``.
-
-    Raises:
-        BadRequest: A number is not finite or absurd.
-        DegenerateGeometry: The points lie on one line or coincide, or two poses fit alike.
-        NoConsensus: No pose agrees with more correspondences than chance would give.
-        MissingExtra: The library is not installed.
-        ConfigurationError: The library does not fit.
-    """
-    return native.native_solver().solve(points_world, pixels, camera, native_options(options, weak))
-
-
-_NO_LIMITS = WeakLimits()
 ENGINES: dict[str, Callable[[], Engine]] = {
     "native": _native_engine,
     "opencv": _opencv_engine,

@@ -23,7 +23,7 @@ EVERY = pytest.mark.parametrize("engine", ["native", "opencv"])
 RIGHT_M, RIGHT_DEG = 0.1, 2.0
 KINDS = ("room", "room", "room", "room", "plane", "near-line", "few", "few")
 OPTIONS, LIMITS = PnpOptions(), WeakLimits()
-OLD, PYTHON = "poselib of 0.1.0", "native pose, Python evidence"
+OLD = "poselib of 0.1.0"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,7 +81,9 @@ def old_engine() -> engines.Engine:
     """Return PoseLib with the settings of version 0.1.0: three times the trials."""
     import poselib  # the reference of this comparison
 
-    def solve(points_world: Array, pixels: Array, camera: Camera, options: PnpOptions) -> Array | None:
+    def solve(
+        points_world: Array, pixels: Array, camera: Camera, options: PnpOptions, weak: WeakLimits
+    ) -> native.Evidence:
         model = {
             "model": "PINHOLE", "width": camera.width, "height": camera.height,
             "params": [camera.fx, camera.fy, camera.cx, camera.cy],
@@ -91,21 +93,29 @@ def old_engine() -> engines.Engine:
             "min_iterations": min(options.min_iterations, options.max_iterations),
             "success_prob": options.confidence,
         }  # fmt: skip
-        pose: Array = poselib.estimate_absolute_pose(pixels, points_world, model, ransac, {})[0].Rt
-        return pose
+        pose = np.eye(4)
+        pose[:3] = poselib.estimate_absolute_pose(pixels, points_world, model, ransac, {})[0].Rt
+        limits = engines.native_options(options, weak)
+        return native.native_solver().judge(points_world, pixels, camera, limits, pose)
 
     return solve
 
 
 @contextlib.contextmanager
 def references() -> Iterator[None]:
-    """Let `solve_pnp` know PoseLib as 0.1.0 used it, and the native pose with the Python evidence."""
+    """Let `solve_pnp` know PoseLib as 0.1.0 used it."""
     engines.ENGINES[OLD] = old_engine
-    engines.ENGINES[PYTHON] = engines.ENGINES["native"]
     try:
         yield
     finally:
-        del engines.ENGINES[OLD], engines.ENGINES[PYTHON]
+        del engines.ENGINES[OLD]
+
+
+def accepted(found: native.Evidence) -> native.Evidence:
+    """Return an accepted pose; raise the error of a refused one."""
+    if found.refusal is not None:
+        raise found.refusal
+    return found
 
 
 def outcome(work: Callable[[], Any]) -> tuple[str, str, Any]:
@@ -124,20 +134,19 @@ def same_bytes(one: native.Evidence | None, other: native.Evidence | None) -> bo
     return all(
         np.asarray(getattr(one, name)).tobytes() == np.asarray(getattr(other, name)).tobytes()
         for name in native.Evidence.__struct_fields__
-        if name != "reason"
+        if name not in ("reason", "refusal")
     )
 
 
 def judgements(each: Case) -> tuple[tuple[str, str, Any], ...]:
-    """Return the outcomes of PoseLib, of the library, of it without AVX2, and with the Python evidence."""
+    """Return the outcomes of PoseLib, of the library, and of the library without AVX2."""
     solver, limits = native.native_solver(), engines.native_options(OPTIONS, LIMITS)
     narrow = msgspec.structs.replace(limits, lanes="portable")
     points, pixels, camera = each.points_world, each.pixels, each.camera
     return (
         outcome(lambda: solve_pnp(points, pixels, camera, OPTIONS, default_engine=OLD)),
-        outcome(lambda: solver.solve(points, pixels, camera, limits)),
-        outcome(lambda: solver.solve(points, pixels, camera, narrow)),
-        outcome(lambda: solve_pnp(points, pixels, camera, OPTIONS, default_engine=PYTHON)),
+        outcome(lambda: accepted(solver.judge(points, pixels, camera, limits))),
+        outcome(lambda: accepted(solver.judge(points, pixels, camera, narrow))),
     )
 
 
@@ -151,7 +160,7 @@ def compare(cases: Iterator[Case]) -> dict[str, Any]:
     errors_mm: dict[str, list[float]] = {"poselib": [], "native": []}
     lanes_differ = 0
     for problem in cases:
-        old, ours, without_avx2, _ = judgements(problem)
+        old, ours, without_avx2 = judgements(problem)
         lanes_differ += ours[:2] != without_avx2[:2] or not same_bytes(ours[2], without_avx2[2])
         row = tally.setdefault(problem.kind, Counter())
         row["n"] += 1
@@ -183,7 +192,7 @@ def mean_normalised_error(problems: int, outlier_ratio: float) -> float:
     errors2 = []
     for seed in range(problems):
         p = make_problem(seed=seed, n=100, outlier_ratio=outlier_ratio)
-        solution = solver.solve(p.points_world, p.pixels, KINECT, limits)
+        solution = solver.judge(p.points_world, p.pixels, KINECT, limits)
         D = p.T_camera_world @ inverse(solution.T_camera_world)
         turn = [D[2, 1] - D[1, 2], D[0, 2] - D[2, 0], D[1, 0] - D[0, 1]]
         xi = np.array([*D[:3, 3], *(0.5 * np.array(turn))])

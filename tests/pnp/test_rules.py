@@ -2,20 +2,29 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
-from rse_pf.errors import BadRequest, PnpError
-from rse_pf.pnp import PnpOptions, WeakLimits, available_engines, solve_pnp
+from rse_pf import native
+from rse_pf.errors import BadRequest
+from rse_pf.geometry import Array
+from rse_pf.pnp import PnpOptions, WeakLimits, available_engines
+from rse_pf.pnp.engines import engine_for, native_options
 from rse_pf.pnp.problems import DEGENERATE, PnpProblem, make_degenerate, make_problem
-from rse_pf.pnp.rules import PoseJudgement, Rule
+from rse_pf.pnp.rules import Rule, rules_of
+
+OPTIONS, LIMITS = PnpOptions(), WeakLimits()
 
 
-def judged(problem: PnpProblem, T_camera_world: object) -> list[Rule]:
-    judgement = PoseJudgement(
-        T_camera_world, problem.points_world, problem.pixels, problem.camera,
-        inlier_px=PnpOptions().inlier_px, weak=WeakLimits(),
-    )  # fmt: skip
-    return [rule for rule, _ in judgement.ask()]
+def rules(problem: PnpProblem, found: native.Evidence | None) -> tuple[Rule, ...]:
+    return rules_of(len(problem.pixels), found, inlier_px=OPTIONS.inlier_px, weak=LIMITS)
+
+
+def judged(problem: PnpProblem, T_camera_world: Array) -> native.Evidence:
+    limits = native_options(OPTIONS, LIMITS)
+    return native.native_solver().judge(
+        problem.points_world, problem.pixels, problem.camera, limits, T_camera_world
+    )
 
 
 def problems() -> list[PnpProblem]:
@@ -34,20 +43,25 @@ def problems() -> list[PnpProblem]:
 @pytest.mark.parametrize("engine", available_engines())
 def test_the_rules_that_a_pose_breaks_are_the_reason_of_its_verdict(engine: str) -> None:
     verdicts: dict[str, int] = {}
+    refused = 0
     for problem in problems():
         try:
-            solution = solve_pnp(
-                problem.points_world, problem.pixels, problem.camera, PnpOptions(engine=engine)
-            )
-        except (BadRequest, PnpError):
+            found = engine_for(engine)(problem.points_world, problem.pixels, problem.camera, OPTIONS, LIMITS)
+        except BadRequest:
             continue
-        rules = judged(problem, solution.T_camera_world)
-        broken = [rule.name for rule in rules if not rule.is_kept]
+        broken = [rule for rule in rules(problem, found) if not rule.is_kept]
+        if found.refusal is not None:
+            refused += 1
+            # Whether the world is mirrored is no figure of the pose.
+            assert any(rule.refuses for rule in broken) or "mirrored" in found.refusal.message
+            continue
+        names = [rule.name for rule in broken]
 
-        assert all(rule.is_kept for rule in rules if rule.refuses)
-        assert solution.reason == ("ambiguous" if "ambiguous" in broken else next(iter(broken), ""))
-        verdicts[solution.reason] = verdicts.get(solution.reason, 0) + 1
+        assert not any(rule.refuses for rule in broken)
+        assert found.reason == ("ambiguous" if "ambiguous" in names else next(iter(names), ""))
+        verdicts[found.reason] = verdicts.get(found.reason, 0) + 1
 
+    assert refused >= 20
     assert verdicts[""] >= 5
     assert len(verdicts) >= 3, "some poses are weak, for more than one reason"
 
@@ -55,8 +69,26 @@ def test_the_rules_that_a_pose_breaks_are_the_reason_of_its_verdict(engine: str)
 def test_without_a_pose_the_rules_say_why() -> None:
     problem = make_problem(seed=1, n=20, outlier_ratio=0.0)
 
-    rules = judged(problem, None)
+    found = judged(problem, np.full((4, 4), np.nan))
 
-    assert [(rule.name, rule.is_kept) for rule in rules] == [
+    assert [(rule.name, rule.is_kept) for rule in rules(problem, found)] == [
         ("too-few", True), ("no-consensus", False), ("degenerate", True),
     ]  # fmt: skip
+
+
+def test_three_matches_break_the_only_rule_about_them() -> None:
+    problem = make_problem(seed=1, n=3, outlier_ratio=0.0)
+
+    assert [(rule.name, rule.is_kept) for rule in rules(problem, None)] == [("too-few", False)]
+
+
+def test_a_refused_pose_shows_the_rules_behind_the_first_that_refuses() -> None:
+    problem = make_degenerate("duplicated", seed=1)
+
+    found = engine_for("native")(problem.points_world, problem.pixels, problem.camera, OPTIONS, LIMITS)
+
+    shown = rules(problem, found)
+
+    assert found.refusal is not None
+    assert next(rule.name for rule in shown if not rule.is_kept) == "no-consensus"
+    assert {"few-inliers", "clustered", "poorly-constrained"} <= {rule.name for rule in shown}

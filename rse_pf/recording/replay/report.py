@@ -10,10 +10,11 @@ import numpy as np
 import numpy.typing as npt
 
 from rse_pf.errors import RsePfError
-from rse_pf.geometry import Array, Camera, pose_difference, transform
-from rse_pf.pnp import PnpOptions, WeakLimits, evidence
-from rse_pf.pnp.engines import engine_for
-from rse_pf.pnp.rules import PoseJudgement, Rule
+from rse_pf.geometry import Array, pose_difference, transform
+from rse_pf.native import Evidence, native_solver
+from rse_pf.pnp import PnpOptions, WeakLimits
+from rse_pf.pnp.engines import engine_for, native_options
+from rse_pf.pnp.rules import MATCHES_OF_A_POSE, Rule, rules_of
 from rse_pf.recording.reader import RecordedCommand
 from rse_pf.recording.replay.picture import match_picture
 from rse_pf.recording.replay.solving import Again, Overrides, Resolver, pnp_reply
@@ -28,6 +29,7 @@ _ERROR_EDGES_PX = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0, math.i
 _DEPTH_BINS = 12
 _GRID = (8, 6)
 _MAX_NUMBER = 1e12
+_LIMITS = WeakLimits()
 
 
 class Attempt(msgspec.Struct, frozen=True, kw_only=True):
@@ -104,15 +106,15 @@ class CommandReport(msgspec.Struct, frozen=True, kw_only=True):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Problem:
-    """The matches of a command, its options, and the pose that is looked at: recorded, or proposed."""
+    """The matches of a command, its options, and a pose with its evidence: recorded, or solved again."""
 
     points: Array
     pixels: Array
     request: PnpRequest
     options: PnpOptions
-    recorded: PnpReply | None
     T_camera_world: Array | None
     inliers: npt.NDArray[np.intp]
+    rules: tuple[Rule, ...]
 
 
 def report_of(
@@ -143,7 +145,6 @@ def report_of(
     if problem is None:
         return base
     tried = _attempt("", resolver.again(command, overrides), pose) if overrides.changes else None
-    view = _view(problem)
     picture = b""
     if with_picture:
         picture = match_picture(
@@ -157,8 +158,8 @@ def report_of(
         tried_name=_name_of(overrides),
         engines=_engines(command, resolver, pose),
         options=_options(command, resolver, problem, pose),
-        rules=_finite_rules(problem),
-        errors_px=_errors(view, problem),
+        rules=problem.rules,
+        errors_px=_errors(problem),
         depths_m=_depths(problem),
         grid_inliers=_grid(problem, agrees=True),
         grid_outliers=_grid(problem, agrees=False),
@@ -221,35 +222,38 @@ def _problem(command: RecordedCommand, resolver: Resolver, pose: PnpReply | None
     options = request.options or PnpOptions()
     n = len(pixels)
     if pose is not None:
-        T_camera_world: Array | None = np.asarray(pose.T_camera_world, dtype=np.float64).reshape(4, 4)
+        recorded: Array = np.asarray(pose.T_camera_world, dtype=np.float64).reshape(4, 4)
+        T_camera_world: Array | None = recorded
         rows = np.asarray(pose.inliers).astype(np.intp)
         inliers = rows[(rows >= 0) & (rows < n)]
+        found = _evidence(points, pixels, request, options, recorded)
     else:
-        engine = options.engine or resolver.default_engine
-        T_camera_world = _propose(points, pixels, request.camera, options, engine) if n >= 4 else None
-        inliers = np.empty(0, dtype=np.intp)
-        if T_camera_world is not None:
-            view = evidence.view_of(T_camera_world, points, pixels, request.camera)
-            inliers = (view[evidence.ERROR2] <= options.inlier_px**2).nonzero()[0]
+        found = _evidence(points, pixels, request, options, options.engine or resolver.default_engine)
+        inliers = np.empty(0, dtype=np.intp) if found is None else found.inliers
+        T_camera_world = None if found is None or not inliers.size else found.T_camera_world
+    rules: tuple[Rule, ...] = ()
+    if found is not None or n < MATCHES_OF_A_POSE:
+        rules = rules_of(n, found, inlier_px=options.inlier_px, weak=_LIMITS)
     return _Problem(
-        points=points, pixels=pixels, request=request, options=options, recorded=pose,
+        points=points, pixels=pixels, request=request, options=options,
         T_camera_world=T_camera_world, inliers=inliers,
+        rules=tuple(msgspec.structs.replace(rule, measured=_plain(rule.measured)) for rule in rules),
     )  # fmt: skip
 
 
-def _propose(
-    points_world: Array, pixels: Array, camera: Camera, options: PnpOptions, engine: str
-) -> Array | None:
-    """Return the ``(4, 4)`` pose that *engine* proposes before any rule is asked, None if it has none."""
+def _evidence(
+    points_world: Array, pixels: Array, request: PnpRequest, options: PnpOptions, pose: Array | str
+) -> Evidence | None:
+    """Return the evidence of a recorded pose or of that of an engine, None for input that has no pose."""
+    if len(pixels) < MATCHES_OF_A_POSE:
+        return None
     try:
-        pose = engine_for(engine)(points_world, pixels, camera, options)
+        if isinstance(pose, str):
+            return engine_for(pose)(points_world, pixels, request.camera, options, _LIMITS)
+        limits = native_options(options, _LIMITS)
+        return native_solver().judge(points_world, pixels, request.camera, limits, pose)
     except RsePfError:
         return None
-    if pose is None or not np.isfinite(pose).all():
-        return None
-    T_camera_world = np.eye(4)
-    T_camera_world[:3] = pose
-    return T_camera_world
 
 
 def _attempt(name: str, again: Again, recorded: PnpReply | None) -> Attempt:
@@ -311,43 +315,20 @@ def _name_of(overrides: Overrides) -> str:
     return " ".join(f"--{name} {value}" for name, value in given.items() if value is not None)
 
 
-def _finite_rules(problem: _Problem) -> tuple[Rule, ...]:
-    with np.errstate(all="ignore"):
-        try:
-            judgement = PoseJudgement(
-                problem.T_camera_world,
-                problem.points,
-                problem.pixels,
-                problem.request.camera,
-                inlier_px=problem.options.inlier_px,
-                weak=WeakLimits(),
-            )
-            rules = [rule for rule, _ in judgement.ask()]
-        except (RsePfError, ValueError, ArithmeticError, np.linalg.LinAlgError):
-            return ()  # numbers that no pose has
-    return tuple(msgspec.structs.replace(rule, measured=_plain(rule.measured)) for rule in rules)
-
-
-def _view(problem: _Problem) -> Array | None:
-    if problem.T_camera_world is None or not len(problem.pixels):
-        return None
-    with np.errstate(all="ignore"):
-        return evidence.view_of(
-            problem.T_camera_world, problem.points, problem.pixels, problem.request.camera
-        )
-
-
 def _agrees(problem: _Problem) -> npt.NDArray[np.bool_]:
     agrees = np.zeros(len(problem.pixels), dtype=np.bool_)
     agrees[problem.inliers] = True
     return agrees
 
 
-def _errors(view: Array | None, problem: _Problem) -> Histogram | None:
-    """Return the reprojection errors."""
-    if view is None:
+def _errors(problem: _Problem) -> Histogram | None:
+    """Return the reprojection errors, which are infinite behind the camera."""
+    if problem.T_camera_world is None or not len(problem.pixels):
         return None
-    errors = np.sqrt(np.nan_to_num(view[evidence.ERROR2], nan=np.inf))
+    with np.errstate(all="ignore"):
+        points_camera = transform(problem.T_camera_world, problem.points)
+        errors = np.hypot(*(problem.request.camera.project(points_camera) - problem.pixels).T)
+    errors[~(points_camera[:, 2] > 0.0) | np.isnan(errors)] = np.inf
     return _histogram(errors, _agrees(problem), _ERROR_EDGES_PX)
 
 
