@@ -12,6 +12,7 @@ import numpy.typing as npt
 from rse_pf.config import PnpSettings
 from rse_pf.errors import LimitExceeded, TooFewCorrespondences
 from rse_pf.geometry import Camera
+from rse_pf.native import native_solver
 from rse_pf.pnp import DepthNoise, PnpOptions, PnpSolution, refine_with_depth, solve_pnp
 from rse_pf.service import Registry
 from rse_pf.wire.arrays import Array, reshaped
@@ -138,7 +139,12 @@ def wire_types(registry: Registry) -> PnpTypes | None:
 
 
 def register(registry: Registry, settings: PnpSettings) -> None:
-    """Add ``pnp`` to *registry*, with the limits and the engine of *settings*."""
+    """Add ``pnp`` to *registry*, with the limits and the engine of *settings*.
+
+    Raises:
+        MissingExtra: The native core is not installed.
+    """
+    native_solver()  # which every engine needs: a missing core is reported before the first command
     defaults = PnpOptions(max_iterations=settings.max_iterations)
     engine = settings.engine
 

@@ -45,6 +45,10 @@ NO_SECRETS: Mapping[tuple[str, str], str] = {
         "Basic Auth Credentials",
     ): "the words USER and PASSWORD of a hint",
     ("docs/local.md", "Basic Auth Credentials"): "the words USER and PASSWORD",
+    (
+        "tests/client_sdk/test_foreign_answers.py",
+        "Basic Auth Credentials",
+    ): "made up, for a proxy of the test",
     ("docs/protocol.md", "JSON Web Token"): "the page's example; its signature says 'signature'",
     ("docs/protocol.md", "Base64 High Entropy String"): "the same",
     ("rse_pf/aws/money/leftovers.py", "Secret Keyword"): "a sentence about the secret, not the secret",
