@@ -49,6 +49,8 @@ NO_SECRETS: Mapping[tuple[str, str], str] = {
         "tests/client_sdk/test_foreign_answers.py",
         "Basic Auth Credentials",
     ): "made up, for a proxy of the test",
+    ("tests/client_sdk/test_proxies.py", "Basic Auth Credentials"): "the same",
+    ("tests/hostile/test_floods.py", "Hex High Entropy String"): "digits of a long number",
     ("docs/protocol.md", "JSON Web Token"): "the page's example; its signature says 'signature'",
     ("docs/protocol.md", "Base64 High Entropy String"): "the same",
     ("rse_pf/aws/money/leftovers.py", "Secret Keyword"): "a sentence about the secret, not the secret",
