@@ -109,7 +109,8 @@ def signed_request(
     bucket, _, keys = environment["RSE_PF_KEYS"].partition("/")
     name = f"{keys.rpartition('/')[0]}/control/{control}".lstrip("/") if control else keys
     region = environment["AWS_REGION"]
-    host, stamp = f"{bucket}.s3.{region}.amazonaws.com", now.strftime("%Y%m%dT%H%M%SZ")
+    domain = environment.get("RSE_PF_AWS_DOMAIN", "amazonaws.com")
+    host, stamp = f"{bucket}.s3.{region}.{domain}", now.strftime("%Y%m%dT%H%M%SZ")
     digest = hashlib.sha256(b"").hexdigest()
     headers = {"host": host, "x-amz-content-sha256": digest, "x-amz-date": stamp}
     if environment.get("AWS_SESSION_TOKEN"):

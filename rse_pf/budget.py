@@ -35,7 +35,7 @@ __all__ = [
     "check_json_counts",
     "check_msgpack",
     "check_size",
-    "inflate_message",
+    "inflate_short",
     "inflate_up_to",
     "inflate_within",
     "measure_msgpack",
@@ -62,7 +62,6 @@ LIST_VALUES, MAP_VALUES = 3, 6
 _PIECE_BYTES = 32768
 _FLAT_FROM = 32
 """Shorter lists are read value by value."""
-_NOT_BRACKETS = bytes(set(range(256)) - set(b"[]{}"))
 _NOT_BRACKETS_OR_QUOTES = bytes(set(range(256)) - set(b'[]{}"'))
 
 _NOT_BACKSLASH = re.compile(rb"[^\\]")
@@ -170,11 +169,11 @@ def inflate_within(data: bytes, budget: Budget) -> Text:
     return _whole(text, stream, len(data), max_bytes)
 
 
-def inflate_message(data: bytes, budget: Budget, library: ModuleType = zlib) -> bytes:
-    """Return the inflated bytes of the message *data*, whose size is checked already.
+def inflate_short(data: bytes, budget: Budget, library: ModuleType) -> bytes:
+    """Return the inflated bytes of the short zlib stream *data*.
 
     Args:
-        data: One zlib stream.
+        data: One zlib stream of a few kB.
         budget: The limits.
         library: ``zlib``, or ``isal.isal_zlib``.
 
@@ -188,10 +187,12 @@ def inflate_message(data: bytes, budget: Budget, library: ModuleType = zlib) -> 
     if len(text) > plain_bytes:
         # The ratio limits large results only: a bomb reaches the plain size with its first bytes.
         used_bytes = len(data) - len(stream.unconsumed_tail)
-        if used_bytes * budget.inflate_ratio > plain_bytes:
+        if used_bytes * budget.inflate_ratio <= plain_bytes:
+            raise _bomb_error(len(data), plain_bytes)
+        try:
             text += stream.decompress(stream.unconsumed_tail, max_bytes + 1 - plain_bytes)
-        else:
-            max_bytes = plain_bytes  # the limit that the message broke
+        except library.error as error:
+            raise _not_zlib_error() from error
     return _whole(text, stream, len(data), max_bytes)
 
 
@@ -433,14 +434,12 @@ def check_json(text: Text, budget: Budget) -> None:
 def check_json_containers(text: Text, budget: Budget) -> None:
     """Raise LimitExceeded if *text* holds more lists and objects, or levels of them, than *budget* allows.
 
-    Brackets inside strings are told apart only if all brackets together exceed a limit.
+    Brackets inside strings are left out, for which the text is read once more if it has many brackets.
     """
     max_depth = budget.depth
     max_lists = budget.containers
     count = text.count(b"[") + text.count(b"{")
     if count <= max_depth:
-        return
-    if count <= max_lists and _depth(text.translate(None, _NOT_BRACKETS)) <= max_depth:
         return
     brackets = b"".join(_without_strings(text, _NOT_BRACKETS_OR_QUOTES))
     if brackets.count(b"[") + brackets.count(b"{") > max_lists:

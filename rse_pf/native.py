@@ -177,6 +177,8 @@ class NativeSolver:
                 hint="send one pixel for each point",
             )
         pose = None if T_camera_world is None else aligned(T_camera_world, np.float64)
+        if pose is not None and pose.shape != (4, 4):
+            raise BadRequest(f"the pose {pose.shape} is not (4, 4)", hint="give T_camera_world")
         inliers = np.empty(n, dtype=np.int64)
         buffers = self._buffers
         _HEAD.pack_into(
@@ -336,7 +338,7 @@ def load_core(open_part: Callable[[Path], Part]) -> Part:
     path = find_library()
     if path is None:
         error = MissingExtra("the native core", "vision")
-        error.hint = f"make native in a checkout; {error.hint} on a robot"
+        error.hint = "make native in a checkout; elsewhere pip install ./native of a checkout"
         raise error
     return open_part(path)
 

@@ -67,7 +67,10 @@ class ServerlessStack(cdk.Stack):
                 function_name=names.function, memory_size=LAMBDA_MEMORY_MB,
                 timeout=cdk.Duration.seconds(LAMBDA_TIMEOUT_S),
                 reserved_concurrent_executions=settings.cloud.lambda_concurrency,
-                environment={"RSE_PF_KEYS": f"{artifacts.bucket_name}/{KEYS_NAME}"},
+                environment={
+                    "RSE_PF_KEYS": f"{artifacts.bucket_name}/{KEYS_NAME}",
+                    "RSE_PF_AWS_DOMAIN": cdk.Aws.URL_SUFFIX,
+                },
             )  # fmt: skip
         acknowledge(function, "the newest runtime with wheels of every package in the lock", "L1")
         self._behind_the_load_balancer(names, function)

@@ -446,7 +446,10 @@ def _claims_in(claims: dict[str, Any], key_id: str) -> _SignedClaims:
         if isinstance(stamp, bool) or not isinstance(stamp, (int, float)) or not 0 <= stamp < 1e11:
             raise _TokenRefused("bad-time")
     robot, token_id = claims["sub"], claims["jti"]
-    tenant, scopes = str(claims.get("tenant", DEFAULT_TENANT)), str(claims.get("scope", "")).split()
+    tenant, scope = claims.get("tenant", DEFAULT_TENANT), claims.get("scope", "")
+    if not (isinstance(tenant, str) and tenant and isinstance(scope, str)):
+        raise _TokenRefused("bad-subject")
+    scopes = scope.split()
     # JSON can hold half a surrogate pair, which no log and no object name can.
     is_printable = "".join((robot, token_id, tenant, *scopes)).isprintable()
     if not (0 < len(robot) <= 64 and 0 < len(token_id) <= 64 and is_printable):

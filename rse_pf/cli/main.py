@@ -128,6 +128,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _EXIT_PIPE
     except ModuleNotFoundError as error:
         return _report(_missing_extra(error))
+    except ImportError as error:
+        cause = (str(error).splitlines() or [""])[0]
+        return _report(
+            ConfigurationError(
+                f"an installed package does not work: {cause}", hint="install it again with pip"
+            )
+        )
     except OSError as error:
         return _report(error_of_system(error))
     return code

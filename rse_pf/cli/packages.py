@@ -34,6 +34,10 @@ def find_defect(module: str, package: str) -> Defect | None:
     if importlib.util.find_spec(module) is None:
         return Defect(problem=f"{module} cannot be imported")
     installed = {name: metadata.version(name) for name in _owners_of().get(module, ())}
+    with contextlib.suppress(
+        metadata.PackageNotFoundError
+    ):  # Python 3.10 knows some owners by their name only
+        installed[package] = metadata.version(package)
     named = [f"{name} {version}" for name, version in sorted(installed.items())]
     others = sorted(installed.keys() - {package})
     wanted = _declared().get(package, "")
@@ -119,7 +123,7 @@ _CALLS: Mapping[str, Callable[[Any], object]] = {
 def _owners_of() -> Mapping[str, list[str]]:
     """Return module to the distributions that install it."""
     owners = metadata.packages_distributions()
-    return {module: [_normal(name) for name in names] for module, names in owners.items()}
+    return {module: [_normal(name) for name in names if name] for module, names in owners.items()}
 
 
 @functools.cache

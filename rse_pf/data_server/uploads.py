@@ -27,10 +27,9 @@ from rse_pf.object_store import DirectoryStore, ObjectInfo, ObjectStore, Presign
 __all__ = ["Objects"]
 
 _DIGEST = re.compile(r"[0-9a-f]{64}")
-_MAX_OPEN_UPLOADS = 1000
+_MAX_OPEN_UPLOADS = 1000  # of one robot
 UPLOAD_TTL_S = 86_400.0
 """An unfinished upload is deleted after this: a robot that is off the network for a day begins again."""
-"""Of one robot."""
 _FEW_PARTS, _SHORT_PART_BYTES = 64, 65_536
 """An upload has at most so many parts, and one more for each so many bytes of the object."""
 _PIECE_BYTES = 1 << 20

@@ -173,7 +173,7 @@ def _ended_children() -> set[int]:
     ended = set()
     for stat in Path("/proc").glob("[1-9]*/stat"):
         with contextlib.suppress(OSError):  # it is gone
-            state, parent = stat.read_text(encoding="utf-8").rpartition(")")[2].split()[:2]
+            state, parent = stat.read_text(encoding="utf-8", errors="replace").rpartition(")")[2].split()[:2]
             if state == "Z" and int(parent) == os.getpid():
                 ended.add(int(stat.parent.name))
     return ended

@@ -21,7 +21,7 @@ from rse_pf.budget import (
     check_json_containers,
     check_msgpack,
     check_size,
-    inflate_message,
+    inflate_short,
     inflate_up_to,
     inflate_within,
 )
@@ -245,7 +245,7 @@ class _JsonCodec:
             return data
         if len(data) > _MAX_FAST_BYTES:
             return inflate_within(data, self._budget)
-        return inflate_message(data, self._budget, self._zlib)
+        return inflate_short(data, self._budget, self._zlib)
 
     def _read_with_msgspec(self, text: bytes | bytearray) -> FromRobot:
         check_json(text, self._budget)

@@ -30,6 +30,7 @@ from rse_pf.wire import (
     Result,
     Welcome,
     codec_for,
+    make_codec,
 )
 from rse_pf.wire.codec import stored
 from rse_pf.wire.server_codec import make_server_codec
@@ -271,6 +272,30 @@ def test_brackets_inside_strings_are_not_depth(name: str, text: str) -> None:
     message = Command(id=1, service="echo", payload={text: [text, "x", {"y": text}]})
 
     assert codec.decode_from_robot(codec.encode(message)) == message
+
+
+@pytest.mark.parametrize("name", CODECS)
+def test_closing_brackets_inside_a_string_hide_no_depth(name: str) -> None:
+    deep: Any = 1
+    for _ in range(40):
+        deep = [deep]
+    data = make_server_codec(name).encode(Command(id=1, service="echo", payload={"a": "]" * 60, "b": deep}))
+
+    for codec in (make_server_codec(name), make_codec(name)):
+        with pytest.raises(LimitExceeded):
+            codec.decode_from_robot(data)
+
+
+def test_a_damaged_stream_that_inflates_to_much_is_a_bad_message() -> None:
+    letters = np.random.default_rng(1).integers(97, 123, 6000).astype(np.uint8).tobytes().decode()
+    data = zlib.compress(command(f'"{50 * letters}"'))
+    wrong = data[:-1] + bytes([data[-1] ^ 1])
+
+    assert len(data) < 16_384
+    for codec in (make_server_codec("zlib"), make_codec("zlib")):
+        assert isinstance(codec.decode_from_robot(data), Command)
+        with pytest.raises(BadMessage):
+            codec.decode_from_robot(wrong)
 
 
 @pytest.mark.parametrize("padding", ['"\\\\"', '"\\\\\\""', '"\\""'])

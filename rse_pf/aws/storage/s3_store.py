@@ -59,6 +59,8 @@ class S3Store:
     def __init__(self, client: Any, bucket: str) -> None:
         self._client = client
         self._bucket = bucket
+        self._has_listed = False
+        """Whether a list of the bucket succeeded, so that a missing object is no missing bucket."""
 
     def get(self, name: str) -> bytes:
         """Return the object; raises NotFound, or Archived if a rule of the bucket has archived it."""
@@ -110,9 +112,11 @@ class S3Store:
         """Return size and name; raises NotFound."""
         try:
             answer = self._ask(name, "head_object", Key=check_name(name))
-        except (NotFound, StoreRefused):
-            # The answer to HEAD has no body, and so no code: a list names the cause that it has in common.
-            self._ask(name, "list_objects_v2", Prefix=name, MaxKeys=1)
+        except (NotFound, StoreRefused) as error:
+            # The answer to HEAD has no body, and so no code: a list names the cause, as a missing bucket.
+            if isinstance(error, StoreRefused) or not self._has_listed:
+                self._ask(name, "list_objects_v2", Prefix=name, MaxKeys=1)
+                self._has_listed = True
             raise
         return ObjectInfo(name=name, size=int(answer["ContentLength"]))
 

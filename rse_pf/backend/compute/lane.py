@@ -41,7 +41,7 @@ class ComputeLane(CommandQueue, Generic[Answer]):
         send: Callable[[Answer, float], None],
         send_refusal: Callable[[RefusedCommand, float], None],
     ) -> None:
-        """Start the threads; they do nothing before the first command.
+        """Compute nothing yet; the threads start with the first command.
 
         Args:
             names: Names of the limited services.
