@@ -147,6 +147,7 @@ def register(registry: Registry, settings: PnpSettings) -> None:
     native_solver()  # which every engine needs: a missing core is reported before the first command
     defaults = PnpOptions(max_iterations=settings.max_iterations)
     engine = settings.engine
+    own_iterations = PnpOptions().max_iterations
 
     @registry.service("pnp", cheap=True)
     def pnp(request: PnpRequest) -> PnpReply:
@@ -165,7 +166,7 @@ def register(registry: Registry, settings: PnpSettings) -> None:
                 hint="loosen the matcher, or skip this frame",
             )
         options = request.options or defaults
-        if options.max_iterations == PnpOptions().max_iterations:  # left out, so the server's limit holds
+        if options is not defaults and options.max_iterations == own_iterations:  # left out, so the server's limit holds
             options = msgspec.structs.replace(options, max_iterations=defaults.max_iterations)
         if options.max_iterations > settings.max_iterations:
             raise LimitExceeded(
