@@ -7,7 +7,7 @@ import hashlib
 import ssl
 from collections.abc import Awaitable, Callable
 
-from client_sdk.network.data_requests import MAX_SINGLE_PUT_BYTES, DataRequests
+from client_sdk.network.data_requests import MAX_SINGLE_PUT_BYTES, DataRequests, StoredReply
 from rse_pf.errors import LimitExceeded, Unauthorized
 
 __all__ = ["RobotObjects"]
@@ -66,7 +66,8 @@ class RobotObjects:
 
 def _put(requests: DataRequests, data: bytes, token: str) -> str:
     digest = hashlib.sha256(data).hexdigest()
-    error = requests.failure(*requests.request("PUT", f"/data/v1/objects/{digest}", data, {}, token))
+    response = requests.request("PUT", f"/data/v1/objects/{digest}", data, {}, token)
+    error = requests.failure(*response)
     if error is not None:
         raise error
-    return digest
+    return requests.decode(response, StoredReply, digest).digest

@@ -6,7 +6,10 @@ import http.client
 import json
 import socket
 import ssl
+from typing import TypeVar
 from urllib.parse import SplitResult
+
+import msgspec
 
 from client_sdk.network.dialling import explain_unconnected, split_address
 from client_sdk.network.foreign_answers import (
@@ -30,6 +33,7 @@ __all__ = [
     "NO_UPSTREAM",
     "DataRequests",
     "Response",
+    "StoredReply",
     "open_connection",
 ]
 
@@ -41,6 +45,14 @@ _PROBE_S = 1.0
 """How long a peer that gave no usable answer may take when it is asked again; a live one needs less."""
 _HTTP_SCHEMES = {"ws": "http", "wss": "https"}
 Response = tuple[int, http.client.HTTPMessage, bytes]
+T = TypeVar("T")
+
+
+class StoredReply(msgspec.Struct, frozen=True, kw_only=True):
+    """The begin of every reply about an object: its sha256 and its length."""
+
+    digest: str
+    size: int
 
 
 class DataRequests:
@@ -104,19 +116,41 @@ class DataRequests:
         self._has_answered = True
         return answer.status, answer.headers, content
 
-    def failure(self, status: int, headers: http.client.HTTPMessage, content: bytes) -> RsePfError | None:
-        """Return the typed error of an answer, None if it is a success of the data service.
+    def failure(
+        self,
+        status: int,
+        headers: http.client.HTTPMessage,
+        content: bytes,
+        also: tuple[int, ...] = (),
+    ) -> RsePfError | None:
+        """Return the typed error of an answer, None if it is a success, or the caller expects its status.
 
         Login pages and proxies answer with 200 and redirects, too; none of their answers is a success.
         """
-        lower = {name.lower(): value for name, value in headers.items()}
-        answer = HttpAnswer(status=status, headers=lower, body=content)
-        if not answer.is_foreign and status < 400:
+        answer = _answer_of(status, headers, content)
+        if not answer.is_foreign and (status < 300 or status in also):
             return None
         if content == NO_UPSTREAM:
             return self.no_service()
         error = None if answer.is_foreign else _error_of(content)
         return error or explain_answer(self._parts.geturl(), answer)
+
+    def decode(self, response: Response, kind: type[T], digest: str = "") -> T:
+        """Return the reply in a success, of an object with *digest* if it is given; bytes are not decoded.
+
+        Raises:
+            ConnectError: The data service does not write this: somebody else answered.
+        """
+        if kind is bytes:
+            return response[2]  # type: ignore[return-value]
+        try:
+            reply = msgspec.json.decode(response[2], type=kind)
+        except (ValueError, RecursionError):  # msgspec.DecodeError and UnicodeDecodeError are ValueErrors
+            reply = None
+        is_other = isinstance(reply, StoredReply) and digest not in ("", reply.digest)
+        if reply is None or is_other:
+            raise explain_answer(self._parts.geturl(), _answer_of(*response))
+        return reply
 
     def no_service(self) -> ConnectError:
         """Return what `NO_UPSTREAM` means."""
@@ -176,6 +210,11 @@ def open_connection(
         made.default_port = http.client.HTTPS_PORT  # of the header Host
     made.sock = connected
     return made
+
+
+def _answer_of(status: int, headers: http.client.HTTPMessage, content: bytes) -> HttpAnswer:
+    lower = {name.lower(): value for name, value in headers.items()}
+    return HttpAnswer(status=status, headers=lower, body=content)
 
 
 def _error_of(content: bytes) -> RsePfError | None:

@@ -21,7 +21,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, TypeVar
 from urllib.parse import quote, urlencode, urlsplit
 
 import msgspec
@@ -33,6 +33,7 @@ from client_sdk.network.data_requests import (
     NO_UPSTREAM,
     DataRequests,
     Response,
+    StoredReply,
     open_connection,
 )
 from client_sdk.network.proxies import TunnelRefused
@@ -48,6 +49,7 @@ from rse_pf.errors import (
     UsageError,
 )
 from rse_pf.maps.photos import Lens, MapOutline, PhotoLocation
+from rse_pf.maps.record import MapRecord
 
 __all__ = ["DataClient", "DataOptions", "OnBytes", "is_allowed"]
 
@@ -59,6 +61,37 @@ _PRESIGNED_TRIES = 3
 _REDIRECTED = 307
 _NO_SERVICE_S = 5.0
 _RETRIED = {408, 429, 500, 502, 503, 504}
+T = TypeVar("T")
+
+
+class _ObjectPage(msgspec.Struct, frozen=True, kw_only=True):
+    objects: list[StoredReply]
+    next: str | None = None
+
+
+class _PresignedPut(msgspec.Struct, frozen=True, kw_only=True):
+    url: str
+    headers: dict[str, str]
+
+
+class _Upload(StoredReply, frozen=True, kw_only=True):
+    offset: int
+    part_bytes: int
+    direct: _PresignedPut | None = None
+
+
+class _MapName(msgspec.Struct, frozen=True, kw_only=True):
+    name: str
+    head: str
+
+
+class _MapPage(msgspec.Struct, frozen=True, kw_only=True):
+    maps: list[_MapName]
+
+
+class _MapVersion(msgspec.Struct, frozen=True, kw_only=True):
+    id: str
+    record: MapRecord
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -128,7 +161,9 @@ class DataClient:
         with self._lock, _Source(source) as opened:
             size, digest = opened.size, opened.digest()
             if size <= MAX_SINGLE_PUT_BYTES:
-                self._request("PUT", f"/data/v1/objects/{digest}", opened.read(0, size))
+                self._request(
+                    "PUT", f"/data/v1/objects/{digest}", StoredReply, opened.read(0, size), digest=digest
+                )
                 self._report(progress, size, size)
             else:
                 self._upload_parts(opened, digest, progress)
@@ -149,35 +184,36 @@ class DataClient:
     def delete(self, digest: str) -> None:
         """Remove an object; a missing one is no error."""
         with self._lock:
-            self._request("DELETE", f"/data/v1/objects/{digest}")
+            self._request("DELETE", f"/data/v1/objects/{digest}", bytes)
 
     def objects(self) -> Iterator[tuple[str, int]]:
         """Yield digest and size of each of this robot's objects."""
         after = ""
         while True:
             with self._lock:
-                page = self._json("GET", f"/data/v1/objects?after={after}")
-            yield from ((str(entry["digest"]), int(entry["size"])) for entry in page["objects"])
-            if page["next"] is None:
+                page = self._reply("GET", f"/data/v1/objects?after={after}", _ObjectPage)
+            yield from ((entry.digest, entry.size) for entry in page.objects)
+            if page.next is None:
                 return
-            after = page["next"]
+            after = page.next
 
     def maps(self) -> dict[str, str]:
         """Return the maps of this tenant: name to id of the head."""
         with self._lock:
-            return {entry["name"]: entry["head"] for entry in self._json("GET", "/data/v1/maps")["maps"]}
+            return {entry.name: entry.head for entry in self._reply("GET", "/data/v1/maps", _MapPage).maps}
 
     def map_version(self, name: str, version: str = "head") -> dict[str, Any]:
         """Return ``id`` and ``record`` of a version of a map."""
         with self._lock:
-            description: dict[str, Any] = self._json("GET", f"/data/v1/maps/{name}/versions/{version}")
-            return description
+            reply = self._reply("GET", f"{_versions(name)}/{version}", _MapVersion)
+        description: dict[str, Any] = msgspec.to_builtins(reply)
+        return description
 
     def download_map(self, name: str, version: str = "head", progress: OnBytes | None = None) -> bytes:
         """Return a version's bytes, for `rse_pf.maps.format.decode_map`."""
         description = self.map_version(name, version)
         with self._lock:
-            path = f"/data/v1/maps/{name}/versions/{description['id']}/content"
+            path = f"{_versions(name)}/{description['id']}/content"
             return self._download(path, description["record"]["digest"], None, progress)
 
     def commit_map(self, name: str, data: bytes, *, parent: str | None, note: str = "") -> str:
@@ -188,8 +224,7 @@ class DataClient:
         """
         body = {"digest": self.upload(data), "parent": parent, "note": note}
         with self._lock:
-            made = self._json("POST", f"/data/v1/maps/{name}/versions", json.dumps(body).encode())
-        return str(made["id"])
+            return self._reply("POST", _versions(name), _MapVersion, json.dumps(body).encode()).id
 
     def update_map(self, name: str, data: bytes, *, note: str = "") -> str:
         """Upload the bytes of a map and make them the head, whatever it was; return the version's id.
@@ -220,44 +255,48 @@ class DataClient:
         query |= {"distortion": ",".join(map(repr, lens.distortion))} if lens.distortion else {}
         with self._lock:
             path = f"{LOCALISE_PATH}{quote(name, safe='')}?{urlencode(query)}"
-            return msgspec.json.decode(self._request("POST", path, photo)[2], type=PhotoLocation)
+            return self._reply("POST", path, PhotoLocation, photo)
 
     def map_outline(self, name: str) -> MapOutline:
         """Return the head of a map as it is seen from above; raises as `localise`."""
         with self._lock:
             path = f"{LOCALISE_PATH}{quote(name, safe='')}"
-            return msgspec.json.decode(self._request("GET", path)[2], type=MapOutline)
+            return self._reply("GET", path, MapOutline)
 
     def _upload_parts(self, opened: _Source, digest: str, progress: OnBytes | None) -> None:
         path, size = f"/data/v1/uploads/{digest}", opened.size
         begin = json.dumps({"size": size}).encode()
-        state = self._begin(path, begin, opened, progress)
-        part_bytes = min(int(state["part_bytes"]), self._options.part_bytes)
-        offset = int(state["offset"])
+        state = self._begin(path, begin, opened, digest, progress)
+        part_bytes = min(state.part_bytes, self._options.part_bytes)
+        offset = state.offset
         self._report(progress, offset, size)
         while offset < size:
             part = opened.read(offset, min(part_bytes, size - offset))
             try:
-                state = self._json("PATCH", path, part, {"Upload-Offset": str(offset)})
+                state = self._reply(
+                    "PATCH", path, _Upload, part, {"Upload-Offset": str(offset)}, digest=digest
+                )
             except (
                 Conflict,
                 NotFound,
             ):  # the answer to this part was lost, or another process uploads the same object
-                state = self._json("PUT", path, begin)
-            offset = int(state["offset"])
+                state = self._reply("PUT", path, _Upload, begin, digest=digest)
+            offset = state.offset
             self._report(progress, offset, size)
 
-    def _begin(self, path: str, begin: bytes, opened: _Source, progress: OnBytes | None) -> Any:
+    def _begin(
+        self, path: str, begin: bytes, opened: _Source, digest: str, progress: OnBytes | None
+    ) -> _Upload:
         """Open an upload, and send the object to a presigned address if the service offers one."""
         tries, pause = _PRESIGNED_TRIES, self._options.first_pause_s
         while True:
-            state = self._json("PUT", path, begin)
-            direct = state.get("direct")
-            if direct is None or not tries or not is_allowed(direct["url"], secure=self._requests.secure):
+            state = self._reply("PUT", path, _Upload, begin, digest=digest)
+            direct = state.direct
+            if direct is None or not tries or not is_allowed(direct.url, secure=self._requests.secure):
                 return state
             tries -= 1
             body = opened.pieces(functools.partial(self._report, progress))
-            if not _ask_bucket("PUT", direct["url"], direct["headers"], body, self._options.timeout_s):
+            if not _ask_bucket("PUT", direct.url, direct.headers, body, self._options.timeout_s):
                 self._options.sleep(pause)
                 pause *= 2
 
@@ -267,7 +306,9 @@ class DataClient:
         while route.tries:
             if not route.url:
                 offer = {**headers, "X-Accept-Direct": "1"}
-                status, answer, piece = self._request("GET", path, None, offer, also=(416,))
+                status, answer, piece = self._request(
+                    "GET", path, bytes, None, offer, also=(_REDIRECTED, 416)
+                )
                 route.url = answer.get("Location", "") if status == _REDIRECTED else ""
                 if status != _REDIRECTED:
                     return status, answer, piece
@@ -277,7 +318,7 @@ class DataClient:
                     return response
             route.url, route.tries = "", route.tries - 1  # expired, or the bucket cannot be reached
             options.sleep(options.first_pause_s)
-        return self._request("GET", path, None, headers, also=(416,))
+        return self._request("GET", path, bytes, None, headers, also=(416,))
 
     def _download(self, path: str, digest: str, to: Path | None, progress: OnBytes | None) -> bytes:
         partial = None if to is None else to.with_name(f".{to.name}.{digest[:16]}.part")
@@ -326,15 +367,16 @@ class DataClient:
         if progress is not None:
             self._callbacks.call("progress", progress, done, size)
 
-    def _json(
-        self, method: str, path: str, body: bytes | None = None, headers: dict[str, str] | None = None
-    ) -> Any:
-        return json.loads(self._request(method, path, body, headers)[2])
+    def _reply(
+        self, method: str, path: str, kind: type[T], body: bytes | None = None,
+        headers: dict[str, str] | None = None, digest: str = "",
+    ) -> T:  # fmt: skip
+        return self._request(method, path, kind, body, headers, digest=digest)[2]
 
     def _request(
-        self, method: str, path: str, body: bytes | None = None, headers: dict[str, str] | None = None,
-        also: tuple[int, ...] = (),
-    ) -> Response:  # fmt: skip
+        self, method: str, path: str, kind: type[T], body: bytes | None = None,
+        headers: dict[str, str] | None = None, *, also: tuple[int, ...] = (), digest: str = "",
+    ) -> tuple[int, http.client.HTTPMessage, T]:  # fmt: skip
         """Repeat a request until it succeeds or is refused; all requests of this class are idempotent."""
         options = self._options
         begin, pause = options.clock(), options.first_pause_s
@@ -344,15 +386,16 @@ class DataClient:
             after_s = 0.0
             try:
                 token = self._read_token()
-                status, answer, content = self._requests.request(method, path, body, headers or {}, token)
+                response = self._requests.request(method, path, body, headers or {}, token)
+                status, answer, content = response
+                error = self._requests.failure(*response, also)
+                if error is None:
+                    return status, answer, self._requests.decode(response, kind, digest)
             except ConnectError as broken:
                 if self._requests.is_wrong_address:
                     raise
                 error = broken
             else:
-                error = self._requests.failure(status, answer, content)
-                if error is None or status in also:
-                    return status, answer, content
                 if status not in _RETRIED or isinstance(error, StoreRefused):
                     raise error
                 if content == NO_UPSTREAM:
@@ -436,6 +479,10 @@ def _ask_bucket(
         if connection is not None:
             connection.close()
     return response if answer.status in ((200, 206, 416) if method == "GET" else (200, 201)) else None
+
+
+def _versions(name: str) -> str:
+    return f"/data/v1/maps/{quote(name, safe='')}/versions"
 
 
 def _append(path: Path | None, piece: bytes) -> None:

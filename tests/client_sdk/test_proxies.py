@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import base64
+import hashlib
 
+import msgspec
 import pytest
 from fake_peers import after_request, http, peer, proxy_to, silent
 from fake_platform import FakePlatform
@@ -110,7 +112,8 @@ async def test_a_robot_behind_a_proxy_reaches_a_host_that_only_the_proxy_knows(e
 
 def test_data_goes_through_the_proxy_too(environment):
     asked: list[str] = []
-    answer = http("201 Created\r\nContent-Type: application/json", "{}")
+    stored = msgspec.json.encode({"digest": hashlib.sha256(b"").hexdigest(), "size": 0}).decode()
+    answer = http("201 Created\r\nContent-Type: application/json", stored)
     with peer(after_request(answer)) as service, peer(proxy_to(service, asked)) as port:
         environment("all_proxy", f"http://127.0.0.1:{port}")
         DataClient("http://robots.invalid:8700", "t", OPTIONS).upload(b"")

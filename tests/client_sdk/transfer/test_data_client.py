@@ -14,6 +14,7 @@ import pytest
 
 from client_sdk.transfer.data_client import DataClient, DataOptions
 from rse_pf.errors import ConnectError, NotFound, QuotaExceeded, StoreError, Unauthorized, UsageError
+from rse_pf.maps.photos import Lens
 
 DATA = random.Random(1).randbytes(700_000)
 DIGEST = hashlib.sha256(DATA).hexdigest()
@@ -76,7 +77,7 @@ class FakeService:
             return 200, {}, json.dumps(state).encode()
         if method == "PUT":
             self.objects[digest] = body
-            return 201, {}, b"{}"
+            return 201, {}, json.dumps({"digest": digest, "size": len(body)}).encode()
         if digest not in self.objects:
             return failure(404, "not-found")
         whole = self.objects[digest]
@@ -192,6 +193,60 @@ def test_an_upload_of_another_process_is_resumed(service: FakeService, robot: Ro
 
     assert service.objects[DIGEST] == DATA
     assert [method for method, _ in service.asked].count("PATCH") == 2
+
+
+def last(robot: Robot, answer: Answer) -> Script:
+    """Return a script that gives *answer* when the deadline has passed."""
+
+    def script(method: str, path: str, headers: dict[str, str], body: bytes) -> Answer:
+        robot.now += DataOptions().deadline_s
+        return answer
+
+    return script
+
+
+OTHER = json.dumps({"digest": "0" * 64, "size": 5, "offset": 5, "part_bytes": 5}).encode()
+
+
+@pytest.mark.parametrize("data", [b"small", DATA])
+@pytest.mark.parametrize(
+    "other", [(307, {}, b""), (200, {}, b""), (200, {}, b"{}"), (200, {}, b"\xff"), (200, {}, OTHER)]
+)
+def test_only_the_data_service_can_report_that_an_object_is_stored(
+    service: FakeService, robot: Robot, other: Answer, data: bytes
+) -> None:
+    service.script = last(robot, other)
+
+    with pytest.raises(ConnectError, match=r"http://127\.0\.0\.1"):
+        robot.client.upload(data)
+    assert service.objects == {}
+
+    service.script = once((200, {}, b"{}"), "PUT")
+    assert service.objects[robot.client.upload(data)] == data
+
+
+LENS = Lens(fx=500.0, fy=500.0, cx=320.0, cy=240.0)
+
+
+@pytest.mark.parametrize("body", [b"", b"{}", b"[1]", b'{"id":7}'])
+@pytest.mark.parametrize(
+    "ask",
+    [
+        lambda client: list(client.objects()),
+        lambda client: client.maps(),
+        lambda client: client.map_version("k\u00fcche"),
+        lambda client: client.download_map("my map"),
+        lambda client: client.localise("kitchen", b"", LENS),
+        lambda client: client.map_outline("kitchen"),
+    ],
+)
+def test_a_reply_that_no_data_service_writes_is_a_failed_connection(
+    service: FakeService, robot: Robot, ask: Callable[[DataClient], object], body: bytes
+) -> None:
+    service.script = last(robot, (200, {}, body))
+
+    with pytest.raises(ConnectError, match="answers 200 OK as no RSE-PF server does"):
+        ask(robot.client)
 
 
 def test_a_refusal_is_final_and_typed(service: FakeService, robot: Robot) -> None:
