@@ -1,6 +1,6 @@
 """Ask a peer that gave no usable answer again: does it speak TLS, of which authority, and what without TLS?
 
-It is asked without a token.  Blocking, for at most three times the timeout; `foreign_answers` explains the
+It is asked without a token.  Blocking, for at most twice the timeout; `foreign_answers` explains the
 result.
 """
 
@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import socket
 import ssl
+import time
 from dataclasses import dataclass
 from urllib.parse import SplitResult
 
@@ -48,6 +49,8 @@ def port_of(parts: SplitResult) -> int:
 def dial(parts: SplitResult, timeout_s: float) -> socket.socket:
     """Return a TCP connection to the host of *parts*, through the proxy of the environment if it has one.
 
+    Connecting to the proxy and its answer take at most *timeout_s* each.
+
     Raises:
         OSError: There is no connection to the host.
         TunnelRefused: The proxy opens none, or cannot be reached.
@@ -62,7 +65,8 @@ def dial(parts: SplitResult, timeout_s: float) -> socket.socket:
         made = socket.create_connection((proxy.host, proxy.port), timeout_s)
         try:
             made.sendall(proxy.connect_request(host, port))
-            check_tunnel(address, proxy, _read_head(made))
+            check_tunnel(address, proxy, _read_head(made, time.monotonic() + timeout_s))
+            made.settimeout(timeout_s)
         except BaseException:
             made.close()
             raise
@@ -73,28 +77,51 @@ def dial(parts: SplitResult, timeout_s: float) -> socket.socket:
 
 
 def probe(parts: SplitResult, timeout_s: float) -> Probed:
-    """Return what the peer at *parts* shows with TLS, or else what it sends without."""
+    """Return what the peer at *parts* shows with TLS, or else what it sends without, in *timeout_s* each."""
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
+    deadline = time.monotonic() + timeout_s
     with (
         contextlib.suppress(OSError, ValueError, RsePfError, TunnelRefused),
-        dial(parts, timeout_s) as made,
+        _dial_until(parts, deadline) as made,
         context.wrap_socket(made, server_hostname=parts.hostname) as secured,
     ):
         return Probed(certificate=secured.getpeercert(binary_form=True) or b"")
     data, host = b"", parts.netloc.rpartition("@")[2]
-    with contextlib.suppress(OSError, ValueError, RsePfError, TunnelRefused), dial(parts, timeout_s) as made:
+    deadline = time.monotonic() + timeout_s
+    with (
+        contextlib.suppress(OSError, ValueError, RsePfError, TunnelRefused),
+        _dial_until(parts, deadline) as made,
+    ):
         request = f"GET {parts.path or '/'} HTTP/1.1\r\nHost: {host}\r\nConnection: close\r\n\r\n"
         made.sendall(request.encode("ascii", "ignore"))
-        while len(data) < _ENOUGH_BYTES and (more := made.recv(_ENOUGH_BYTES)):
+        while len(data) < _ENOUGH_BYTES and (more := _receive(made, _ENOUGH_BYTES, deadline)):
             data += more
     return Probed(data=data)
 
 
-def _read_head(made: socket.socket) -> bytes:
+def _dial_until(parts: SplitResult, deadline: float) -> socket.socket:
+    made = dial(parts, deadline - time.monotonic())
+    _limit(made, deadline)
+    return made
+
+
+def _limit(made: socket.socket, deadline: float) -> None:
+    """Let the next operation, whose parts share one timeout, end at *deadline* of the monotonic clock."""
+    made.settimeout(max(0.001, deadline - time.monotonic()))  # 0 would mean without blocking
+
+
+def _receive(made: socket.socket, max_bytes: int, deadline: float) -> bytes:
+    if time.monotonic() >= deadline:
+        raise TimeoutError("the peer sends too slowly")
+    _limit(made, deadline)
+    return made.recv(max_bytes)
+
+
+def _read_head(made: socket.socket, deadline: float) -> bytes:
     """Read byte by byte: what follows the head belongs to the server behind the proxy."""
     head = b""
-    while not is_complete_head(head) and (byte := made.recv(1)):
+    while not is_complete_head(head) and (byte := _receive(made, 1, deadline)):
         head += byte
     return head
 

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import socket
 import ssl
+import threading
 import time
 from dataclasses import dataclass, replace
+from urllib.parse import urlsplit
 
 import pytest
 from fake_peers import after_request, at_once, http, peer, silent, tls_context, with_tls
 
 import client_sdk
+from client_sdk.network.probe import probe
 from client_sdk.network.timings import ConnectTimings
 from client_sdk.transfer.data_client import DataClient, DataOptions
 from rse_pf.auth import certificates
@@ -197,6 +201,23 @@ async def test_a_peer_that_sends_nothing():
         error = await robot_error(f"ws://127.0.0.1:{port}/ws")
     assert "sends no answer" in error.message
     assert "host and port" in error.hint
+
+
+@pytest.mark.parametrize("has_proxy", [False, True])
+def test_a_peer_that_never_stops_sending_slowly_ends_no_later_than_a_silent_one(has_proxy, monkeypatch):
+    def trickle(made: socket.socket) -> None:
+        for _ in range(200):
+            made.sendall(b"x")
+            threading.Event().wait(0.05)
+
+    with peer(trickle) as port:
+        if has_proxy:
+            monkeypatch.setenv("HTTPS_PROXY", f"http://127.0.0.1:{port}")
+            monkeypatch.setenv("HTTP_PROXY", f"http://127.0.0.1:{port}")
+        began = time.monotonic()
+        probed = probe(urlsplit("ws://robots.invalid/ws" if has_proxy else f"ws://127.0.0.1:{port}/ws"), 0.3)
+    assert probed.certificate is None
+    assert time.monotonic() - began < 5.0
 
 
 async def test_a_peer_that_closes_without_a_word():
