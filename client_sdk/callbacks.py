@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import asyncio
 import concurrent.futures
+import contextlib
 import functools
 import inspect
 import logging
@@ -128,15 +129,19 @@ class Callbacks:
         frames = traceback.extract_tb(error.__traceback__)
         place = f"{frames[-1].filename}:{frames[-1].lineno}" if frames else ""
         if self._is_new((name, type(error).__name__, place)):
-            cause = error.message if isinstance(error, RsePfError) else " ".join(str(error).split())
-            _log.error(
+            if isinstance(error, RsePfError):
+                cause = error.message
+            else:  # str(error) may raise
+                text = "".join(traceback.format_exception_only(type(error), error))
+                cause = " ".join(text.partition(": ")[2].split())
+            _log_error(
                 "%s raised %s: %s; the robot goes on", name, type(error).__name__, cause,
                 exc_info=error if has_traceback else None,
             )  # fmt: skip
 
     def _report_slow(self, name: str, took_s: float) -> None:
         if took_s > self._slow_s and self._is_new((name, "slow", "")):
-            _log.error(
+            _log_error(
                 "%s took %.1f s, and session.ping_timeout_s is %.1f s; hint: do long work in a thread",
                 name, took_s, self._slow_s,
             )  # fmt: skip
@@ -150,7 +155,16 @@ class Callbacks:
 
     def _work(self, waiting: queue.SimpleQueue[Callable[[], object] | None]) -> None:
         while (work := waiting.get()) is not None:
-            work()
+            try:
+                work()
+            except BaseException as error:  # noqa: BLE001  the calls that wait are still due
+                self.report("a callable", error)
+
+
+def _log_error(text: str, *values: object, exc_info: BaseException | None = None) -> None:
+    """Log by the handlers and filters of the program, which may raise as all of its callables."""
+    with contextlib.suppress(Exception):
+        _log.error(text, *values, exc_info=exc_info)
 
 
 def _is_interrupt(error: BaseException) -> bool:
@@ -194,5 +208,5 @@ def _in_thread(function: Callable[[], Awaitable[str]]) -> concurrent.futures.Fut
 def _end_child(process: int, name: str) -> None:
     """End a child that *name* made by a fork and returned from: it would write on the parent's sockets."""
     if os.getpid() != process:
-        _log.error("%s forked, and its child returned; hint: end the child by os._exit", name)
+        _log_error("%s forked, and its child returned; hint: end the child by os._exit", name)
         os._exit(1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import os
 import threading
 import time
@@ -27,6 +28,14 @@ def raise_cancelled(*_):
 
 async def is_async(*_):
     raise AssertionError("never awaited")
+
+
+def raise_without_text(*_):
+    class Wordless(Exception):
+        def __str__(self):
+            raise KeyError("no text")
+
+    raise Wordless
 
 
 def tracebacks(caplog):
@@ -107,6 +116,31 @@ def test_a_token_callable_that_fails_is_asked_again(error, is_blocking, caplog):
         assert served.server.tokens == ["Bearer t1", "Bearer t4"]
     assert (stats.callback_errors, stats.reconnects) == (2, 1)
     assert len(tracebacks(caplog)) in (1, 2)  # a cancellation may be raised in two lines of asyncio
+
+
+@pytest.mark.parametrize("has_filter", [False, True])
+@pytest.mark.parametrize("function", [raise_error, raise_without_text])
+def test_callables_of_a_blocking_robot_are_called_after_one_whose_report_fails(function, has_filter):
+    changes, logger, is_over = [], logging.getLogger("client_sdk"), threading.Event()
+
+    def change(what, why):
+        changes.append(what)
+        if len(changes) == 1:
+            function()
+        is_over.set()
+
+    if has_filter:
+        logger.addFilter(raise_error)
+    try:
+        with server_thread() as served:
+            connecting = client_sdk.connect_blocking(
+                served.url, on_change=change, settings=QUICK, timings=TIMINGS
+            )
+            with connecting:
+                served.cut()
+                assert is_over.wait(10)
+    finally:
+        logger.removeFilter(raise_error)
 
 
 async def test_a_callable_that_blocks_asyncio_is_reported(caplog):
