@@ -11,7 +11,7 @@ from urllib.parse import SplitResult
 
 import msgspec
 
-from client_sdk.network.dialling import explain_unconnected, split_address
+from client_sdk.network.dialling import explain_unconnected, show_wrong_url, split_address
 from client_sdk.network.foreign_answers import (
     HttpAnswer,
     explain_answer,
@@ -69,7 +69,9 @@ class DataRequests:
         Raises:
             UsageError: *url* is not such an address.
         """
-        error = UsageError(f"{url!r} is not an address of a data service", hint="write https://HOST")
+        error = UsageError(
+            f"{show_wrong_url(url)!r} is not an address of a data service", hint="write https://HOST"
+        )
         parts = split_address(url, ("http", "https", "ws", "wss"), error)
         scheme = _HTTP_SCHEMES.get(parts.scheme, parts.scheme)
         netloc = parts.netloc.rpartition("@")[2]

@@ -34,6 +34,7 @@ __all__ = [
     "dial_error_of",
     "explain_unconnected",
     "hide_password",
+    "show_wrong_url",
     "split_address",
     "unconnected_error",
     "unreachable",
@@ -181,8 +182,16 @@ def split_address(url: str, schemes: tuple[str, ...], error: UsageError) -> Spli
     return parts
 
 
+def show_wrong_url(url: str) -> str:
+    """Return what may be shown of a text that may be no URL: nothing of user name, password and query."""
+    scheme, separator, rest = str(url).rpartition("@")[0].partition("://")
+    shown = str(url).rpartition("@")[2].partition("?")[0]
+    return f"{scheme}://{shown}" if separator and rest else shown
+
+
 def hide_password(url: str) -> str:
     """Return *url* without user name and password; raises UsageError if it is no WebSocket address."""
-    error = UsageError(f"{url!r} is not a WebSocket address", hint="write ws://HOST:PORT/ws or wss://HOST/ws")
+    hint = "write ws://HOST:PORT/ws or wss://HOST/ws"
+    error = UsageError(f"{show_wrong_url(url)!r} is not a WebSocket address", hint=hint)
     parts = split_address(url, ("ws", "wss"), error)
     return f"{parts.scheme}://{parts.netloc.rpartition('@')[2]}{parts.path}"

@@ -286,7 +286,7 @@ def _explain_redirect(address: str, answer: HttpAnswer) -> ConnectError:
     if target.hostname == web.hostname and target.scheme in _DEFAULT_PORTS:
         is_login = _LOGIN.search(f"{target.path}?{target.query}") is not None
         if not is_login and target.scheme == "https" and web.scheme == "http":
-            secure = f"{_OTHER_SCHEME[parts.scheme]}://{target.netloc}{parts.path}"
+            secure = f"{_OTHER_SCHEME[parts.scheme]}://{target.netloc.rpartition('@')[2]}{parts.path}"
             return ConnectError(says, hint=f"write {_clean(secure, _MAX_ADDRESS)}: TLS is required there")
         if not is_login:
             return ConnectError(says, hint=_CHECK_PORT)

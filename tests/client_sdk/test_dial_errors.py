@@ -7,11 +7,13 @@ import socket
 
 import pytest
 
+import client_sdk
 from client_sdk.network.dialling import dial_error_of, hide_password, unconnected_error, unreachable
+from client_sdk.transfer.data_client import DataClient
 from rse_pf.auth.tokens import KeySet
 from rse_pf.backend.gateway.handshake import HandshakePolicy, HandshakeRequest, Rejected
 from rse_pf.config import PlatformSettings
-from rse_pf.errors import ConnectError, Forbidden, Unauthorized
+from rse_pf.errors import ConnectError, Forbidden, Unauthorized, UsageError
 from rse_pf.wire.refusal import refusal_body
 
 REFUSALS = [(401, "unauthorized", Unauthorized), (403, "forbidden", Forbidden)]
@@ -135,6 +137,24 @@ def test_other_statuses_allow_another_attempt_and_hint_at_the_cause(status, is_w
 @pytest.mark.parametrize(("header", "after_s"), [("", 0.0), ("5", 5.0), ("86400", 300.0), ("soon", 0.0)])
 def test_the_wait_that_a_server_asks_for_is_bounded(header, after_s):
     assert dial_error_of("ws://host/ws", 503, {"retry-after": header}).after_s == after_s
+
+
+@pytest.mark.parametrize(
+    "url", ["wws://robot:secret@host/ws", "ws://r:secret@:80/ws", "host?t=secret"]
+)
+@pytest.mark.parametrize("use", [client_sdk.connect, lambda url: DataClient(url, "t"), hide_password])
+def test_a_refused_address_is_shown_without_credentials(use, url):
+    with pytest.raises(UsageError) as raised:
+        use(url)
+    assert "secret" not in str(raised.value)
+    assert "is not a" in raised.value.message
+
+
+def test_the_address_of_a_redirect_is_shown_without_credentials():
+    headers = {"Location": "https://robot:secret@host/a?token=secret"}
+    error = dial_error_of("ws://host/ws", 301, headers).error
+    assert "secret" not in error.message + error.hint
+    assert "wss://host/ws" in error.hint
 
 
 def test_a_shown_address_holds_no_credentials():
