@@ -17,6 +17,7 @@ from client_sdk.network.foreign_answers import (
     explain_answer,
     explain_certificate,
     explain_silence,
+    is_of_tls_server,
 )
 from client_sdk.network.probe import dial, port_of, probe
 from client_sdk.network.proxies import TunnelRefused
@@ -175,8 +176,11 @@ class DataRequests:
             data, speaks_tls = known.data, known.certificate is not None
             if isinstance(broken, http.client.BadStatusLine) and not isinstance(broken, ConnectionResetError):
                 data = data or str(broken).encode("latin-1", "replace")
-            self.is_wrong_address = self.secure != speaks_tls and (speaks_tls or bool(data))
-            return explain_silence(address, broken, certificate=known.certificate, data=data)
+            has_other = bool(data) and not is_of_tls_server(data)
+            self.is_wrong_address = self.secure != speaks_tls and (speaks_tls or has_other)
+            return explain_silence(
+                address, broken, certificate=known.certificate, data=data, within_s=self._timeout_s
+            )
         return ConnectError(
             f"no answer from {self.host}: {broken or type(broken).__name__}",
             hint="call again to resume the transfer",

@@ -20,6 +20,7 @@ from client_sdk.network.foreign_answers import (
     explain_bytes,
     explain_certificate,
     explain_silence,
+    is_of_tls_server,
     parse_answer,
 )
 from client_sdk.network.probe import Probed
@@ -107,7 +108,12 @@ def explain_unconnected(address: str, error: OSError) -> ConnectError:
 
 
 def unreachable(
-    address: str, error: Exception, *, first_bytes: bytes = b"", probed: Probed | None = None
+    address: str,
+    error: Exception,
+    *,
+    first_bytes: bytes = b"",
+    probed: Probed | None = None,
+    within_s: float | None = None,
 ) -> DialError:
     """Return the error of an attempt that was connected and got no HTTP/1.1 answer from *address*.
 
@@ -116,13 +122,17 @@ def unreachable(
         error: Of the attempt.
         first_bytes: That the peer sent, and that are no HTTP/1.1.
         probed: What the peer shows when it is asked again; None if it was not.
+        within_s: How long the attempt waited for the answer, None if that is unknown.
     """
     if first_bytes:
         is_wrong = parse_answer(first_bytes) is None
         return DialError(explain_bytes(address, first_bytes), is_late=True, is_wrong_address=is_wrong)
     known = probed or Probed()
-    explained = explain_silence(address, error, certificate=known.certificate, data=known.data)
-    is_wrong = known.certificate is not None if address.startswith("ws:") else bool(known.data)
+    explained = explain_silence(
+        address, error, certificate=known.certificate, data=known.data, within_s=within_s
+    )
+    has_other = bool(known.data) and not is_of_tls_server(known.data)
+    is_wrong = known.certificate is not None if address.startswith("ws:") else has_other
     return DialError(explained, is_late=True, is_wrong_address=is_wrong)
 
 

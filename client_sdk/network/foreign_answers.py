@@ -165,7 +165,7 @@ def explain_bytes(address: str, data: bytes) -> ConnectError:
 
 
 def explain_silence(
-    address: str, error: Exception, *, certificate: bytes | None, data: bytes
+    address: str, error: Exception, *, certificate: bytes | None, data: bytes, within_s: float | None = None
 ) -> ConnectError:
     """Return what it means that *address* accepted a connection and sent no answer that can be read.
 
@@ -174,6 +174,7 @@ def explain_silence(
         error: Of the attempt.
         certificate: That a second attempt with TLS was shown, None if the peer does not speak TLS.
         data: The peer's answer to a second attempt without TLS.
+        within_s: How long the attempt waited for the answer, None if that is unknown.
     """
     answer = parse_answer(data)
     is_http = answer is not None
@@ -194,7 +195,10 @@ def explain_silence(
         hint = refused if "alert" in reason else _CHECK_PORT
         return ConnectError(f"{address} ends the TLS handshake: {reason}", hint=hint)
     is_late = isinstance(error, (TimeoutError, asyncio.TimeoutError))
-    cause = "sends no answer" if is_late else "closed the connection without an answer"
+    within = "" if within_s is None else f" within {within_s:g} s"
+    cause = f"sends no answer{within}" if is_late else "closed the connection without an answer"
+    if is_http or certificate is not None:  # in the scheme of the address: the others were explained above
+        return ConnectError(f"{address} {cause}", hint="try again; see the load of the server")
     hint = (
         "check host and port of the URL; on the platform, rse-pf local status shows whether its servers run"
     )

@@ -215,7 +215,9 @@ class Dialler:
             # An address where a WebSocket was once open has the right scheme and program.
             is_asked = not seen and url not in self._opened
             probed = await self._probe(url) if is_asked else None
-            raise unreachable(address, error, first_bytes=bytes(seen), probed=probed) from error
+            raise unreachable(
+                address, error, first_bytes=bytes(seen), probed=probed, within_s=options["open_timeout"]
+            ) from error
         self._opened.add(url)
         if websocket.subprotocol != self._subprotocol:
             websocket.transport.abort()

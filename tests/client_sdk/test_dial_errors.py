@@ -9,6 +9,7 @@ import pytest
 
 import client_sdk
 from client_sdk.network.dialling import dial_error_of, hide_password, unconnected_error, unreachable
+from client_sdk.network.probe import Probed
 from client_sdk.transfer.data_client import DataClient
 from rse_pf.auth.tokens import KeySet
 from rse_pf.backend.gateway.handshake import HandshakePolicy, HandshakeRequest, Rejected
@@ -93,6 +94,27 @@ def test_a_connection_that_was_accepted_counts_whatever_came_then():
     assert unreachable("ws://host/ws", TimeoutError()).is_late
 
 
+@pytest.mark.parametrize(
+    ("address", "probed"),
+    [
+        ("ws://host/ws", Probed(data=b"HTTP/1.1 426 Upgrade Required\r\n\r\n")),
+        ("wss://host/ws", Probed(certificate=b"")),
+    ],
+)
+def test_a_slow_server_of_ours_is_not_taken_for_another_program(address, probed):
+    failed = unreachable(address, TimeoutError(), probed=probed, within_s=5.0)
+
+    assert failed.error.message == f"{address} sends no answer within 5 s"
+    assert failed.error.hint == "try again; see the load of the server"
+    assert not failed.is_wrong_address
+
+
+def test_bytes_of_a_tls_server_do_not_prove_a_wrong_address():
+    alert = Probed(data=b"\x15\x03\x01\x00\x02\x02\x46")
+
+    assert not unreachable("wss://host/ws", TimeoutError(), probed=alert).is_wrong_address
+
+
 def test_the_cause_and_the_time_of_a_refusal_reach_the_robot():
     body = refusal_body(
         "unauthorized", "tokens issued before noon are revoked", "sign another one",
@@ -139,9 +161,7 @@ def test_the_wait_that_a_server_asks_for_is_bounded(header, after_s):
     assert dial_error_of("ws://host/ws", 503, {"retry-after": header}).after_s == after_s
 
 
-@pytest.mark.parametrize(
-    "url", ["wws://robot:secret@host/ws", "ws://r:secret@:80/ws", "host?t=secret"]
-)
+@pytest.mark.parametrize("url", ["wws://robot:secret@host/ws", "ws://r:secret@:80/ws", "host?t=secret"])
 @pytest.mark.parametrize("use", [client_sdk.connect, lambda url: DataClient(url, "t"), hide_password])
 def test_a_refused_address_is_shown_without_credentials(use, url):
     with pytest.raises(UsageError) as raised:

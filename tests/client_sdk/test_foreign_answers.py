@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import socket
 import ssl
 import threading
@@ -10,7 +11,7 @@ from dataclasses import dataclass, replace
 from urllib.parse import urlsplit
 
 import pytest
-from fake_peers import after_request, at_once, http, peer, silent, tls_context, with_tls
+from fake_peers import after_request, at_once, http, peer, read_head, silent, tls_context, with_tls
 
 import client_sdk
 from client_sdk.network.probe import probe
@@ -199,7 +200,7 @@ def test_a_certificate_of_another_host_or_another_time(names, made_s, hint, auth
 async def test_a_peer_that_sends_nothing():
     with peer(silent) as port:
         error = await robot_error(f"ws://127.0.0.1:{port}/ws")
-    assert "sends no answer" in error.message
+    assert "sends no answer within 1 s, as a program of another protocol does" in error.message
     assert "host and port" in error.hint
 
 
@@ -218,6 +219,24 @@ def test_a_peer_that_never_stops_sending_slowly_ends_no_later_than_a_silent_one(
         probed = probe(urlsplit("ws://robots.invalid/ws" if has_proxy else f"ws://127.0.0.1:{port}/ws"), 0.3)
     assert probed.certificate is None
     assert time.monotonic() - began < 5.0
+
+
+async def test_a_server_that_answers_only_when_it_is_asked_again_is_slow():
+    for ask in (robot_error, lambda url: asyncio.to_thread(data_error, url.replace("ws:", "http:"))):
+        requests = []
+
+        def answer_late(made: socket.socket, requests: list[bytes] = requests) -> None:
+            head = read_head(made)
+            requests.append(head)
+            if b"Authorization" in head:
+                silent(made)
+            elif head.startswith(b"GET"):
+                made.sendall(http("426 Upgrade Required"))
+
+        with peer(answer_late) as port:
+            error = await ask(f"ws://127.0.0.1:{port}/ws")
+        assert "sends no answer within 1 s" in error.message
+        assert error.hint == "try again; see the load of the server"
 
 
 async def test_a_peer_that_closes_without_a_word():
