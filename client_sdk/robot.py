@@ -199,7 +199,12 @@ class Robot:
         return self.__aenter__().__await__()
 
     async def close(self) -> None:
-        """Close the connection; unanswered commands end with Disconnected."""
+        """Close the connection; unanswered commands end with Disconnected.
+
+        In a child of a fork nothing happens: the connection belongs to the parent.
+        """
+        if os.getpid() != self._process:
+            return
         self._open = False
         for event in self._session.abandon("disconnected", "the robot closed its connection"):
             if isinstance(event, Answered | SubscriptionEnded):

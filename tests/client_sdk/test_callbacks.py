@@ -220,6 +220,24 @@ async def test_a_call_that_its_own_callable_cancels_ends_and_is_not_sent_again()
     assert [command.payload for command in server.all_commands] == [{"value": 1}, {"value": 2}]
 
 
+async def test_a_robot_closed_in_a_child_of_a_fork_stays_connected_in_the_parent():
+    async with FakeServer().running() as server, robot(server.url) as a_robot:
+        child = os.fork()
+        if child == 0:
+            status = 1
+            try:
+                a_robot.close().send(None)
+            except StopIteration:
+                status = 0
+            finally:
+                os._exit(status)
+        _, status = await asyncio.to_thread(os.waitpid, child, 0)
+
+        assert os.waitstatus_to_exitcode(status) == 0
+        assert (await a_robot.call("echo", {"value": 2})).reply == {"value": 2}
+        assert a_robot.stats.reconnects == 0
+
+
 def test_the_child_of_a_callable_that_forks_does_not_go_on_as_the_robot(caplog):
     children = []
 
