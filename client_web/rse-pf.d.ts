@@ -4,7 +4,7 @@
 export type Numbers = ArrayLike<number>;
 
 export interface RobotOptions {
-  /** The robot's token, or a function that returns a fresh one for each connect and each renewal. */
+  /** The robot's token, or a function that returns a fresh one within 30 s for each connect and each renewal. */
   token?: string | (() => string | Promise<string>);
   /** How the token travels: as a sub-protocol (default), or as a header, which only Node can set. */
   tokenIn?: "protocol" | "header";

@@ -12,6 +12,8 @@ const LONG_TRY_MS = 11e3;
 const PING_S = 2;
 const PONG_S = 3;
 const ANSWER_S = 5;
+// A service that issues tokens answers within seconds; a later answer counts as none.
+const TOKEN_MS = 3e4;
 const MAX_DEADLINE_MS = 3.6e6;
 const MAX_INFLATED_BYTES = 1 << 20;
 const MAX_BUFFERED_BYTES = 1 << 16;
@@ -144,9 +146,7 @@ const sha256 = async (bytes) => {
 const isExpired = (token) => {
   try {
     return parse(atob(token.split(".")[1].replace(/[-_]/g, (sign) => (sign < "_" ? "+" : "/")))).exp < unixTime();
-  } catch {
-    return false;
-  }
+  } catch {}
 };
 
 const trimmed = (token) => `${token || ""}`.trim();
@@ -221,20 +221,29 @@ export const connect = async (url, options = {}) => {
       return await call(...words);
     } catch (failed) {
       counts.callbackErrors++;
-      console.error("rse-pf: a function of the program failed:", failed);
+      console.error("rse-pf: a callback failed:", failed);
       throw failed;
     }
   };
 
   /** Call a function of the program when this turn is over, so that it cannot disturb the session. */
-  const later = (...words) => Promise.resolve().then(() => guarded(...words)).catch(nothing);
+  const later = async (...words) => {
+    await 0;
+    guarded(...words).catch(nothing);
+  };
 
   // --- connect, reconnect, move --------------------------------------------------------------------------
 
   const isSource = typeof token === "function";
+  /** Ask the token function of the program; rejects if it has not answered within TOKEN_MS. */
+  const askToken = () => {
+    let timeout;
+    const late = (_, reject) => (timeout = setTimeout(reject, TOKEN_MS, new DOMException("no token", "TimeoutError")));
+    return Promise.race([token(), new Promise(late)]).finally(() => clearTimeout(timeout));
+  };
   const freshToken = async () => {
     try {
-      return trimmed(isSource ? await guarded(token) : token);
+      return trimmed(isSource ? await guarded(askToken) : token);
     } catch (failed) {
       throw wrong(CONNECT, "no token: " + failed?.name, "correct its function");
     }

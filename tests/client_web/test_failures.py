@@ -162,6 +162,36 @@ def test_a_token_function_that_throws_is_a_typed_error_of_an_upload() -> None:
     assert against(echo, program) == "connect"
 
 
+# The time limit of a token function, 30 s, is 30 ms.
+QUICK = """
+const { setTimeout } = globalThis;
+globalThis.setTimeout = (work, ms, ...words) => setTimeout(work, ms === 30e3 ? 30 : ms, ...words);
+console.error = () => {};
+const never = new Promise(() => {});
+"""
+
+
+def test_a_token_function_that_never_answers_counts_as_failed_and_is_asked_again() -> None:
+    program = f"""{QUICK}
+    let asked = 0;
+    const robot = await connect(url, {{ token: () => asked++ ? "t" : never }});
+    say([await codeOf(robot.call("echo", 1)), asked, robot.stats.callbackErrors]);
+    """
+
+    assert against(echo, program) == ["ok", 2, 1]
+
+
+def test_a_first_connect_rejects_when_its_token_function_never_answers() -> None:
+    program = f"""{QUICK}
+    let asked = 0;
+    const late = new Promise((done) => setTimeout(done, 20e3, "late"));
+    const connected = codeOf(connect(url, {{ token: () => (asked++, never) }}));
+    say([await Promise.race([connected, late]), asked]);
+    """
+
+    assert against(echo, program) == ["connect", 4]
+
+
 def test_callbacks_that_fail_are_counted_and_printed_and_the_robot_goes_on() -> None:
     def answers(message: dict[str, Any]) -> bytes | None:
         if message["type"] == "subscribe":
