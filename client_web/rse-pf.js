@@ -2,7 +2,7 @@
  * RSE-PF for browsers, web workers and Node: one robot, connected to the backend servers of a platform.
  *
  * The rules are those of docs/protocol.md; its section is named where a rule is applied.  The module has no
- * dependencies, stores nothing, and writes to the console only what functions of the program throw.  Inside, times
+ * dependencies, stores nothing, and writes to the console only what callbacks throw.  Inside, times
  * are seconds of a clock that never jumps; names that begin with `_` are internal, and the minifier may shorten them.
  */
 
@@ -55,7 +55,7 @@ const UNSUPPORTED = "unsupported";
 const USAGE = "usage";
 // The sentences that are used twice.
 const NO_ANSWER = "no answer";
-const TOO_LARGE = "a message is too large";
+const TOO_LARGE = "message too large";
 
 /** An error with a stable code of docs/protocol.md, section 5. */
 export class RsePfError extends Error {
@@ -135,7 +135,7 @@ const rounded = (values, scale) => from(values, (value) => round(value * scale) 
 
 const sha256 = async (bytes) => {
   if (!crypto.subtle) {
-    throw wrong(UNSUPPORTED, "no sha256 on this page", "use https or localhost");
+    throw wrong(UNSUPPORTED, "no sha256 here", "use https or localhost");
   }
   return from(bytesOf(await crypto.subtle.digest("SHA-256", bytes)), (byte) => byte.toString(16).padStart(2, "0")).join("");
 };
@@ -152,7 +152,7 @@ const isExpired = (token) => {
 const trimmed = (token) => `${token || ""}`.trim();
 const bearer = (token) => (token ? { Authorization: "Bearer " + token } : {});
 
-const BROKEN = ["protocol", "a defect of this client"];
+const BROKEN = ["protocol", "defect of this client"];
 /** Close codes after which a robot connects again much later (section 6): code and sentence of its error. */
 const REFUSALS = {
   1002: BROKEN,
@@ -160,8 +160,8 @@ const REFUSALS = {
   1008: BROKEN,
   1009: ["too-large", TOO_LARGE],
   4400: BROKEN,
-  4406: [UNSUPPORTED, "another protocol version", "update rse-pf.js"],
-  4409: ["conflict", "another one replaced it", "one token for each robot"],
+  4406: [UNSUPPORTED, "other protocol version", "update rse-pf.js"],
+  4409: ["conflict", "another one replaced it", "one token per robot"],
 };
 
 /** Node's words for an attempt that reached nobody; a browser tells no more than whether it is online. */
@@ -191,6 +191,7 @@ export const connect = async (url, options = {}) => {
   const links = new Set();
   const pending = new Map();
   const subscriptions = new Map();
+  const printed = new Set();
   const lanes = { __proto__: null };
   const counts = {
     sent: 0, answered: 0, resent: 0, reconnects: 0, moves: 0, bytesUp: 0, bytesDown: 0, heldByBusy: 0, heldByLimit: 0,
@@ -221,7 +222,9 @@ export const connect = async (url, options = {}) => {
       return await call(...words);
     } catch (failed) {
       counts.callbackErrors++;
-      console.error("rse-pf: a callback failed:", failed);
+      // The place that throws, or the text of what has none: each is printed once.
+      const what = `${/.*:\d+:\d+/.exec(failed?.stack) ?? failed}`;
+      if (printed.size < printed.add(what).size) console.error("rse-pf callback:", failed);
       throw failed;
     }
   };
@@ -245,7 +248,7 @@ export const connect = async (url, options = {}) => {
     try {
       return trimmed(isSource ? await guarded(askToken) : token);
     } catch (failed) {
-      throw wrong(CONNECT, "no token: " + failed?.name, "correct its function");
+      throw wrong(CONNECT, "no token: " + failed?.name, "fix its function");
     }
   };
 
@@ -306,7 +309,7 @@ export const connect = async (url, options = {}) => {
       notBefore = now() + 5;
     }
     const refusalOfCode = REFUSALS[code];
-    let failed = wrong(...(refusalOfCode || [CONNECT, "closed with " + code, "is it up, the token valid, the origin allowed?"]));
+    let failed = wrong(...(refusalOfCode || [CONNECT, "closed with " + code, "up? token valid? origin allowed?"]));
     // An attempt that was given up may still replace the connection that came after it.
     const isOwn = code === 4409 && (current?._moveUntil || now() < lateUntil);
     if (refusalOfCode && (link === current || !current) && !isOwn) refused(failed);
@@ -452,7 +455,7 @@ export const connect = async (url, options = {}) => {
     renewal(failed);
     settleAll(pending, failed);
     subscriptions.forEach((each) => later(each._onEnd, failed));
-    for (const link of links) lose(link, failed);
+    links.forEach((link) => lose(link, failed));
     later(onChange, "ended", failed.message);
   };
 
@@ -661,12 +664,11 @@ export const connect = async (url, options = {}) => {
         if (each._at) counts.resent++;
         each._link = current;
         each._at = time;
-        const left = max(0, min(MAX_DEADLINE_MS, (each._until - time) * 1e3));
-        send(current, `${each._head},"deadline_ms":${left},"payload":${each._payload}}`, each);
+        send(current, `${each._head},"deadline_ms":${max(0, min(MAX_DEADLINE_MS, (each._until - time) * 1e3))},"payload":${each._payload}}`, each);
         if (each._isCancelled) withdraw(each);
       });
     }
-    for (const link of links) if (link._isLeaving && sentOn(link).every((each) => each._isCancelled)) lose(link);
+    links.forEach((link) => link._isLeaving && sentOn(link).every((each) => each._isCancelled) && lose(link));
     schedule();
   };
 
@@ -678,7 +680,7 @@ export const connect = async (url, options = {}) => {
       if (each._isCancelled) settle(each, cancelled());
       else giveUp(each, expired(each, time));
     });
-    for (const link of links) check(link, time);
+    links.forEach((link) => check(link, time));
     flush();
   };
 
@@ -851,7 +853,7 @@ export const connect = async (url, options = {}) => {
 
     download: async (digest, { signal } = {}) => {
       const bytes = bytesOf(await (await http("GET", "objects/" + digest, null, signal)).arrayBuffer());
-      if ((await sha256(bytes)) !== digest) throw wrong("store", "the digest does not match", "try again");
+      if ((await sha256(bytes)) !== digest) throw wrong("store", "its digest differs", "try again");
       return bytes;
     },
 
