@@ -140,6 +140,31 @@ void a_token_source_is_asked_again_after_a_refusal() {
     expect_error("connect", [&] { Client(options).connect(); }, "a source that throws");
 }
 
+void a_token_source_that_hangs_is_given_up_and_asked_again() {
+    Server server(refusal);
+    Options options = to(server.url());
+    const auto asked = std::make_shared<std::atomic<int>>(0);
+    std::promise<void> release;
+    options.token_source = [asked, may_answer = release.get_future().share()] {
+        ++*asked;
+        may_answer.wait();
+        return std::string("late");
+    };
+    detail::SessionTimes times;
+    times.token_timeout = 0.05;
+    auto connection = std::make_shared<detail::Connection>(options, times);
+    std::optional<Failure> failure;
+    connection->open([&](std::optional<Failure> failed) {
+        failure = std::move(failed);
+        release.set_value();
+        connection->shut(*failure);
+    });
+    connection->io.run_for(std::chrono::seconds(20));
+    expect(failure && failure->code == "connect" && failure->message.find("no answer in time") != std::string::npos, "given up");
+    expect(*asked == 2 && connection->session.stats.callback_errors == 2, "each call counts as failed");
+    expect(server.connections == 0, "no late token is used");
+}
+
 void calls_of_many_threads_end_when_the_client_closes() {
     Server server("");
     for (int round = 0; round < 5; ++round) {
@@ -252,6 +277,7 @@ int main() {
     a_refusal_names_the_time_from_which_tokens_are_accepted();
     another_program_answers();
     a_token_source_is_asked_again_after_a_refusal();
+    a_token_source_that_hangs_is_given_up_and_asked_again();
     calls_of_many_threads_end_when_the_client_closes();
     callbacks_neither_hold_up_nor_end_the_connection();
     digests_are_those_of_sha256();

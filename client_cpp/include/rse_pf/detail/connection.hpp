@@ -17,7 +17,8 @@
 namespace rse_pf {
 
 /// A token, or a function that returns a fresh one for each connection and each renewal. The function is called on a
-/// thread of its own, one call at a time; what it throws counts as "no token".
+/// thread of its own, one call at a time; what it throws counts as "no token", and so does a call that takes more than
+/// 30 s: its answer is ignored, and the next call does not wait for it.
 using TokenSource = std::function<std::string()>;
 
 /// What changed: `connected`, `lost`, `moved`, `refused` or `ended`, and the server's name or the reason. A client that
@@ -58,7 +59,7 @@ class Connection : public std::enable_shared_from_this<Connection> {
   public:
     Connection(Options options, SessionTimes times)
         : session(times, options.sdk), options_(std::move(options)), address_(address_of(options_.url)),
-          tls_(tls_context(address_, {options_.ca_file})), token_(options_.token), tick_(io), retry_(io), resolver_(io), random_(std::random_device{}()) {
+          tls_(tls_context(address_, {options_.ca_file})), token_(options_.token), token_timeout_s_(times.token_timeout), tick_(io), retry_(io), token_timer_(io), resolver_(io), random_(std::random_device{}()) {
         if (address_.target.empty()) address_.target = "/ws";
     }
     ~Connection() {
@@ -110,6 +111,7 @@ class Connection : public std::enable_shared_from_this<Connection> {
         session.abandon(*fatal);
         tick_.cancel();
         retry_.cancel();
+        token_timer_.cancel();
         resolver_.cancel();
         if (dialing_) drop(dialing_);
         const auto old = leaving_;
@@ -516,9 +518,16 @@ class Connection : public std::enable_shared_from_this<Connection> {
     /// Call the token source on a thread of its own; the answer comes back to this one.
     void ask_token(std::function<void(std::optional<std::string>)> then) {
         token_pending_ = true;
+        const auto number = ++token_calls_;
         if (token_thread_.joinable()) token_thread_.join();
         const auto self = shared_from_this();
-        token_thread_ = std::thread([self, then = std::move(then), source = options_.token_source] {
+        token_timer_.expires_after(std::chrono::duration_cast<std::chrono::milliseconds>(std::chrono::duration<double>(token_timeout_s_)));
+        token_timer_.async_wait([self, number, then](error_code stopped) {
+            if (stopped || !self->is_awaited(number)) return;
+            self->token_thread_.detach();
+            self->answered(std::nullopt, "no answer in time", then);
+        });
+        token_thread_ = std::thread([self, number, then = std::move(then), source = options_.token_source] {
             std::optional<std::string> token;
             std::string error;
             try {
@@ -528,25 +537,33 @@ class Connection : public std::enable_shared_from_this<Connection> {
             } catch (...) {
                 error = "an exception";
             }
-            asio::post(self->io, [weak = std::weak_ptr<Connection>(self), then, token, error] {
+            asio::post(self->io, [weak = std::weak_ptr<Connection>(self), number, then, token, error] {
                 const auto here = weak.lock();
-                if (!here) return;
-                here->token_pending_ = false;
-                here->token_error_ = error;
-                if (!token) {
-                    ++here->session.stats.callback_errors;
-                    here->session.stats.last_error = "no token: " + error;
-                }
-                if (!here->shut_) then(token);
+                if (here && here->is_awaited(number)) here->answered(token, error, then);
             });
         });
+    }
+
+    /// Return whether call *number* of the token source has no answer yet, and was not given up.
+    bool is_awaited(std::uint64_t number) const { return token_pending_ && number == token_calls_; }
+
+    void answered(const std::optional<std::string>& token, const std::string& error, const std::function<void(std::optional<std::string>)>& then) {
+        token_pending_ = false;
+        token_timer_.cancel();
+        token_error_ = error;
+        if (!token) {
+            ++session.stats.callback_errors;
+            session.stats.last_error = "no token: " + error;
+        }
+        if (!shut_) then(token);
     }
 
     Options options_;
     Address address_;
     std::shared_ptr<asio::ssl::context> tls_;
     std::string token_, renewing_, token_error_;
-    asio::steady_timer tick_, retry_;
+    double token_timeout_s_;
+    asio::steady_timer tick_, retry_, token_timer_;
     asio::ip::basic_resolver<tcp, asio::io_context::executor_type> resolver_;
     std::vector<tcp::endpoint> known_;
     std::mt19937_64 random_;
@@ -556,6 +573,7 @@ class Connection : public std::enable_shared_from_this<Connection> {
     std::thread token_thread_;
     double next_tick_ = 0, dial_began_ = 0, adopted_ = 0, move_until_ = 0, failing_since_ = never, clock_offset_ = 0;
     int attempt_ = 0;
+    std::uint64_t token_calls_ = 0;
     bool shut_ = false, token_pending_ = false, asked_again_ = false, looking_ = false;
 };
 

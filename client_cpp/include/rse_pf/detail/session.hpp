@@ -40,6 +40,7 @@ namespace detail {
 /// Times of a session, in seconds; the defaults are those of the protocol page.
 struct SessionTimes {
     double answer_timeout = 5, ping_interval = 2, ping_timeout = 3, hello_timeout = 5, stall_timeout = 1;
+    double token_timeout = 30;  ///< a service that issues tokens answers within seconds; a later answer is a failure
 };
 
 /// What the robot knows of one connection.
