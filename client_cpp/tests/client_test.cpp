@@ -263,6 +263,25 @@ void callbacks_neither_hold_up_nor_end_the_connection() {
     expect_error("disconnected", [&] { client.call("echo", 4).get(); }, "a call after the end");
 }
 
+void a_newer_value_replaces_one_that_waits_and_answers_all_stay() {
+    const auto callbacks = std::make_shared<detail::Callbacks>();
+    std::string called;
+    std::function<void(const std::string&, const json&)> on_update = [&](const std::string& key, const json& value) { called += key + value.dump() + " "; };
+    std::function<void(int)> on_end = [&](int number) { called += "answer" + std::to_string(number) + " "; };
+    const auto key_of = [](const std::string& key, const json&) { return key; };
+    const auto first = detail::newest(callbacks, on_update, 1, key_of), second = detail::newest(callbacks, on_update, 2, key_of);
+    const auto ends = detail::deferred(callbacks, on_end);
+    for (int i = 0; i < 1000; ++i) {
+        first("a", i);
+        if (i < 2) ends(i);
+        first("b", i);
+        second("a", i + 1000);
+    }
+    callbacks->end();
+    callbacks->run();
+    expect(called == "a999 answer0 b999 a1999 answer1 ", "the newest of each key: " + called.substr(0, 80));
+}
+
 void digests_are_those_of_sha256() {
     expect(sha256("abc") == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad", "abc");
 }
@@ -280,6 +299,7 @@ int main() {
     a_token_source_that_hangs_is_given_up_and_asked_again();
     calls_of_many_threads_end_when_the_client_closes();
     callbacks_neither_hold_up_nor_end_the_connection();
+    a_newer_value_replaces_one_that_waits_and_answers_all_stay();
     digests_are_those_of_sha256();
     std::printf(failures() == 0 ? "all hold\n" : "%d do not hold\n", failures());
     return failures() == 0 ? 0 : 1;

@@ -112,10 +112,12 @@ class Client {
     }
 
     /// Ask for the updates of *topic*, such as `live/MAP`, on this connection and all later ones; returns an id.
-    /// *on_update* gets the present value of every key, and then each newer one.
+    /// *on_update* gets the present value of every key, and then newer ones: a newer one replaces one that still waits for
+    /// the thread of callbacks.
     std::uint64_t subscribe(const std::string& topic, OnUpdate on_update, OnSubscriptionEnd on_end = {}) {
         const std::uint64_t id = core_->next_id++;
-        post([core = core_, id, topic, on_update = detail::deferred(callbacks_, std::move(on_update)), on_end = detail::deferred(callbacks_, std::move(on_end))] {
+        on_update = detail::newest(callbacks_, std::move(on_update), id, [](const std::string& key, const json&) { return key; });
+        post([core = core_, id, topic, on_update = std::move(on_update), on_end = detail::deferred(callbacks_, std::move(on_end))] {
             auto& connection = *core->connection;
             if (connection.fatal) {
                 connection.session.tell(on_end, *connection.fatal);
@@ -189,8 +191,8 @@ class Client {
     /// Send a command; *on_end* is called on the connection's thread, or *at_once* here if there is no connection.
     std::uint64_t submit(const std::string& service, std::string payload, CallOptions options, OnEnd<Answer> on_end, OnEnd<Answer> at_once = {}) {
         if (!at_once) at_once = on_end;
-        options.on_progress = detail::deferred(callbacks_, std::move(options.on_progress));
         const std::uint64_t id = core_->next_id++;
+        options.on_progress = detail::newest(callbacks_, std::move(options.on_progress), id, [](double, const std::string&) { return std::string(); });
         auto command = std::make_shared<detail::Command>(detail::Command{id, service, std::move(payload), std::move(options), std::move(on_end)});
         const bool posted = core_->started && post([core = core_, command] {
             auto& connection = *core->connection;

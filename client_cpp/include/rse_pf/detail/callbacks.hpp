@@ -6,8 +6,10 @@
 #include <deque>
 #include <exception>
 #include <functional>
+#include <map>
 #include <memory>
 #include <mutex>
+#include <optional>
 #include <string>
 #include <thread>
 #include <utility>
@@ -17,9 +19,22 @@ namespace rse_pf::detail {
 /// A queue of callbacks: `run` calls them in their order on one thread; what they throw ends there and is counted.
 class Callbacks {
   public:
-    void add(std::function<void()> callback) {
+    /// Values of which the newest is enough: id of a subscription and key of its updates; id of a command, for progress.
+    using Key = std::pair<std::uint64_t, std::string>;
+
+    /// Let `run` call *callback*, in place of the one with the same *key* if that still waits.
+    void add(std::function<void()> callback, std::optional<Key> key = {}) {
         const std::lock_guard lock(mutex_);
-        waiting_.push_back(std::move(callback));
+        if (key) {
+            auto& waits = newest_[*key];
+            if (waits) {
+                waits->swap(callback);  // what the older one captured ends without the lock
+                return;
+            }
+            waits = &waiting_.emplace_back(std::move(callback), std::move(key)).first;
+        } else {
+            waiting_.emplace_back(std::move(callback), std::nullopt);
+        }
         changed_.notify_all();
     }
     /// Let `run` return after the callbacks that wait.
@@ -39,8 +54,9 @@ class Callbacks {
         for (;;) {
             changed_.wait(lock, [this] { return is_ending_ || !waiting_.empty(); });
             if (waiting_.empty()) break;
-            auto callback = std::move(waiting_.front());
+            auto [callback, key] = std::move(waiting_.front());
             waiting_.pop_front();
+            if (key) newest_.erase(*key);
             lock.unlock();
             std::string error;
             bool has_failed = true;
@@ -70,7 +86,8 @@ class Callbacks {
   private:
     mutable std::mutex mutex_;
     std::condition_variable changed_;
-    std::deque<std::function<void()>> waiting_;
+    std::deque<std::pair<std::function<void()>, std::optional<Key>>> waiting_;
+    std::map<Key, std::function<void()>*> newest_;  ///< those in `waiting_` that have a key
     std::uint64_t errors_ = 0;
     std::string last_error_;
     std::thread::id thread_;
@@ -83,6 +100,15 @@ std::function<void(Arguments...)> deferred(const std::shared_ptr<Callbacks>& cal
     if (!callback) return {};
     return [callbacks, callback = std::move(callback)](Arguments... arguments) {
         callbacks->add([callback, arguments...] { callback(arguments...); });
+    };
+}
+
+/// The same for values of which the newest is enough: *key_of* returns their key, within *id*.
+template <class KeyOf, class... Arguments>
+std::function<void(Arguments...)> newest(const std::shared_ptr<Callbacks>& callbacks, std::function<void(Arguments...)> callback, std::uint64_t id, KeyOf key_of) {
+    if (!callback) return {};
+    return [callbacks, callback = std::move(callback), id, key_of](Arguments... arguments) {
+        callbacks->add([callback, arguments...] { callback(arguments...); }, Callbacks::Key{id, key_of(arguments...)});
     };
 }
 
