@@ -263,6 +263,29 @@ void callbacks_neither_hold_up_nor_end_the_connection() {
     expect_error("disconnected", [&] { client.call("echo", 4).get(); }, "a call after the end");
 }
 
+void no_exception_of_a_callback_leaves_a_call() {
+    Client client(to("ws://127.0.0.1:1/ws"));
+    std::string codes;
+    const auto fails = [&](auto outcome) {
+        codes += outcome.failure().code + " ";
+        throw std::runtime_error("of a callback");
+    };
+    const auto call_twice = [&](const std::string& when) {
+        try {
+            client.call("echo", 1, {}, fails);
+            client.pnp({}, {}, fails);
+        } catch (const std::exception& error) {
+            expect(false, when + ": " + error.what());
+        }
+    };
+    call_twice("before connect");
+    client.close();
+    call_twice("after close");
+    const Stats stats = client.stats();
+    expect(codes == "disconnected disconnected disconnected disconnected ", "each is called once: " + codes);
+    expect(stats.callback_errors == 4 && stats.last_error == "of a callback", "counted");
+}
+
 void a_newer_value_replaces_one_that_waits_and_answers_all_stay() {
     const auto callbacks = std::make_shared<detail::Callbacks>();
     std::string called;
@@ -299,6 +322,7 @@ int main() {
     a_token_source_that_hangs_is_given_up_and_asked_again();
     calls_of_many_threads_end_when_the_client_closes();
     callbacks_neither_hold_up_nor_end_the_connection();
+    no_exception_of_a_callback_leaves_a_call();
     a_newer_value_replaces_one_that_waits_and_answers_all_stay();
     digests_are_those_of_sha256();
     std::printf(failures() == 0 ? "all hold\n" : "%d do not hold\n", failures());

@@ -81,7 +81,8 @@ class Client {
         const auto id = submit(service, encoded(payload), std::move(options), [promise](Outcome<Answer> outcome) { settle(*promise, std::move(outcome)); });
         return {id, std::move(result)};
     }
-    /// Send a command; *on_end* is called once, on the thread of callbacks. Returns the command's id.
+    /// Send a command; *on_end* is called once, on the thread of callbacks, or before this returns if `connect` was not
+    /// called or the client was closed. Returns the command's id.
     std::uint64_t call(const std::string& service, const json& payload, CallOptions options, OnEnd<Answer> on_end) {
         return send(service, encoded(payload), std::move(options), std::move(on_end));
     }
@@ -188,7 +189,7 @@ class Client {
         return options;
     }
 
-    /// Send a command; *on_end* is called on the connection's thread, or *at_once* here if there is no connection.
+    /// Send a command; *on_end* is called on the connection's thread, or *at_once* here if the client does not run.
     std::uint64_t submit(const std::string& service, std::string payload, CallOptions options, OnEnd<Answer> on_end, OnEnd<Answer> at_once = {}) {
         if (!at_once) at_once = on_end;
         const std::uint64_t id = core_->next_id++;
@@ -203,7 +204,7 @@ class Client {
             connection.session.submit(std::move(*command), detail::now_s());
             connection.pump();
         });
-        if (!posted && at_once) at_once(Failure{"disconnected", "the client is not connected", "call connect first"});
+        if (!posted && at_once) callbacks_->call([&at_once] { at_once(Failure{"disconnected", "the client is not connected", "call connect first"}); });
         return id;
     }
 

@@ -58,24 +58,25 @@ class Callbacks {
             waiting_.pop_front();
             if (key) newest_.erase(*key);
             lock.unlock();
-            std::string error;
-            bool has_failed = true;
-            try {
-                callback();
-                has_failed = false;
-            } catch (const std::exception& failed) {
-                error = failed.what();
-            } catch (...) {
-                error = "an exception";
-            }
+            call(callback);
             callback = nullptr;  // what it captured ends without the lock, too
             lock.lock();
-            if (!has_failed) continue;
-            ++errors_;
-            last_error_ = std::move(error);
         }
         thread_ = {};
         changed_.notify_all();
+    }
+    /// Call *callback* on this thread.
+    template <class Callback> void call(const Callback& callback) {
+        std::string error = "an exception";
+        try {
+            return callback();
+        } catch (const std::exception& failed) {
+            error = failed.what();
+        } catch (...) {
+        }
+        const std::lock_guard lock(mutex_);
+        ++errors_;
+        last_error_ = std::move(error);
     }
     /// Return how many callbacks threw, and the text of the last exception.
     std::pair<std::uint64_t, std::string> errors() const {
