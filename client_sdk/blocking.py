@@ -29,7 +29,6 @@ if TYPE_CHECKING:
 __all__ = ["BlockingRobot", "connect_blocking"]
 
 GRACE_S = 0.5  # an answer at the deadline, or Expired, comes by itself within this time unless the loop hangs
-SNAPSHOT_S = 1.0  # what only reads or writes a value in the loop takes no longer
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -117,7 +116,7 @@ class BlockingRobot(Closing):
         async def begin() -> Updates:
             return self._robot.subscribe(topic)
 
-        return BlockingUpdates(self._wait(begin(), SNAPSHOT_S), self._wait)
+        return BlockingUpdates(self._wait(begin()), self._wait)
 
     def record_frame(self, frame: Frame, T_odom_camera: npt.NDArray[np.float64] | None = None) -> None:
         """Record a thumbnail of *frame* and its pose by odometry, as `Robot.record_frame` does."""
@@ -125,7 +124,7 @@ class BlockingRobot(Closing):
         async def record() -> None:
             self._robot.record_frame(frame, T_odom_camera)
 
-        self._wait(record(), SNAPSHOT_S)
+        self._wait(record())
 
     @property
     def connected(self) -> bool:
@@ -145,7 +144,7 @@ class BlockingRobot(Closing):
             return self._robot.stats
 
         try:
-            return self._wait(snapshot(), SNAPSHOT_S)
+            return self._wait(snapshot())
         except (Disconnected, UsageError):  # no other thread changes the robot now
             return self._robot.stats
 

@@ -98,6 +98,26 @@ def test_a_call_ends_at_its_deadline_although_the_event_loop_hangs(url):
         may_go_on.set()
 
 
+def test_a_snapshot_is_returned_however_long_the_event_loop_was_busy(url):
+    hangs, is_busy, may_go_on = threading.Event(), threading.Event(), threading.Event()
+
+    def clock():
+        if hangs.is_set():
+            is_busy.set()
+            may_go_on.wait(10)
+            hangs.clear()
+        return time.monotonic()
+
+    with client_sdk.connect_blocking(url, clock=clock) as robot:
+        hangs.set()
+        calling = threading.Thread(target=robot.call, args=("echo", {"value": 1}))
+        calling.start()
+        assert is_busy.wait(10)
+        threading.Timer(1.5, may_go_on.set).start()
+        assert robot.stats.reconnects == 0
+        calling.join(10)
+
+
 def test_threads_that_call_while_the_robot_is_closed_all_end_with_an_answer_or_one_error(url):
     for _ in range(3):
         robot = client_sdk.connect_blocking(url).__enter__()
