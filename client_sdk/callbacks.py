@@ -37,7 +37,7 @@ class Callbacks:
     """The callables of one program, and how many of their calls failed."""
 
     def __init__(self, slow_s: float = SLOW_S) -> None:
-        """Call in the event loop that runs; a call that takes longer than *slow_s* is reported."""
+        """Call in the event loop that runs; a call that blocks it for longer than *slow_s* is reported."""
         self.errors = 0
         self._slow_s = slow_s
         self._reported: set[tuple[str, str, str]] = set()
@@ -83,7 +83,8 @@ class Callbacks:
             return default
         finally:
             _end_child(process, name)
-        self._report_slow(name, time.monotonic() - began)
+        if _has_running_loop():
+            self._report_slow(name, time.monotonic() - began)
         return value
 
     async def fetch_token(self, function: Callable[[], Awaitable[str]]) -> Any:
@@ -97,20 +98,19 @@ class Callbacks:
             work = asyncio.ensure_future(_awaited(function))
         else:
             work = asyncio.wrap_future(_in_thread(function))
-        began = time.monotonic()
         try:
             await asyncio.wait({work}, timeout=TOKEN_LIMIT_S)
+            is_late = not work.done()
         finally:
             work.cancel()  # without effect on a token that came
         error: BaseException
-        if not work.done():
+        if is_late:
             error = TimeoutError(f"no token within {TOKEN_LIMIT_S:g} s")
         elif work.cancelled():
             error = asyncio.CancelledError()
         elif (raised := work.exception()) is not None:
             error = raised
         else:
-            self._report_slow("the token callable", time.monotonic() - began)
             return work.result()
         raise self.token_error(error)
 
@@ -165,6 +165,12 @@ def _log_error(text: str, *values: object, exc_info: BaseException | None = None
     """Log by the handlers and filters of the program, which may raise as all of its callables."""
     with contextlib.suppress(Exception):
         _log.error(text, *values, exc_info=exc_info)
+
+
+def _has_running_loop() -> bool:
+    with contextlib.suppress(RuntimeError):
+        return asyncio.get_running_loop().is_running()
+    return False
 
 
 def _is_interrupt(error: BaseException) -> bool:

@@ -13,7 +13,8 @@ from fakes import FakeServer, answer_at_once, answer_nothing
 from quick_robots import QUICK, TIMINGS, robot
 
 import client_sdk
-from rse_pf.errors import Disconnected
+from client_sdk import callbacks
+from rse_pf.errors import ConnectError, Disconnected
 from rse_pf.wire import Progress
 from tests.client_sdk.server_thread import server_thread
 
@@ -158,6 +159,38 @@ async def test_a_callable_that_blocks_asyncio_is_reported(caplog):
         assert (await a_robot.call("echo", {"value": 2}, deadline_s=20)).reply == {"value": 2}
         assert a_robot.stats.callback_errors == 1
     assert "on_change took 1." in caplog.text
+
+
+async def test_a_token_callable_that_only_awaits_is_not_reported_as_slow(caplog):
+    async def token():
+        await asyncio.sleep(1.5 * QUICK.ping_timeout_s)
+        return "t1"
+
+    async with FakeServer().running() as server, robot(server.url, token=token) as a_robot:
+        assert a_robot.stats.callback_errors == 0
+    assert "took" not in caplog.text
+
+
+@pytest.mark.parametrize("has_thread", [False, True])
+async def test_a_token_callable_that_hangs_is_reported_as_late(has_thread, monkeypatch, caplog):
+    monkeypatch.setattr(callbacks, "TOKEN_LIMIT_S", 0.1)
+    calling = callbacks.Callbacks()
+    if has_thread:
+        calling.start_thread()
+
+    with pytest.raises(ConnectError, match="TimeoutError"):
+        await calling.fetch_token(asyncio.Event().wait)
+    assert "no token within 0.1 s" in caplog.text
+    calling.end_thread()
+
+
+async def test_a_callable_outside_the_event_loop_is_not_reported_as_slow(caplog):
+    calling = callbacks.Callbacks(slow_s=-1.0)
+
+    await asyncio.to_thread(calling.call, "progress", int)
+    assert calling.errors == 0
+    calling.call("progress", int)
+    assert calling.errors == 1
 
 
 def test_a_callable_of_a_blocking_robot_may_block_without_cost_to_the_connection():
