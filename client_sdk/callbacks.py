@@ -44,9 +44,10 @@ class Callbacks:
         self._lock = threading.Lock()
         self._queue: queue.SimpleQueue[Callable[[], object] | None] | None = None
         self._thread: threading.Thread | None = None
+        self._token_loop: asyncio.AbstractEventLoop | None = None
 
     def start_thread(self) -> None:
-        """Call in a thread from now on, and token callables in threads of their own."""
+        """Call in a thread from now on, and token callables in the loop of another one."""
         self._queue = queue.SimpleQueue()
         self._thread = threading.Thread(
             target=self._work, args=(self._queue,), name="rse-pf-callbacks", daemon=True
@@ -57,6 +58,7 @@ class Callbacks:
         """End the thread after the calls that wait; it does not wait for itself."""
         if self._queue is not None and self._thread is not None:
             self._queue.put(None)
+            self._end_token_loop()
             if self._thread is not threading.current_thread():
                 self._thread.join(JOIN_S)
 
@@ -97,7 +99,7 @@ class Callbacks:
         if self._queue is None:
             work = asyncio.ensure_future(_awaited(function))
         else:
-            work = asyncio.wrap_future(_in_thread(function))
+            work = asyncio.wrap_future(self._in_thread(function))
         try:
             await asyncio.wait({work}, timeout=TOKEN_LIMIT_S)
             is_late = not work.done()
@@ -105,6 +107,7 @@ class Callbacks:
             work.cancel()  # without effect on a token that came
         error: BaseException
         if is_late:
+            self._end_token_loop()  # the call may block it for ever
             error = TimeoutError(f"no token within {TOKEN_LIMIT_S:g} s")
         elif work.cancelled():
             error = asyncio.CancelledError()
@@ -138,6 +141,20 @@ class Callbacks:
                 "%s raised %s: %s; the robot goes on", name, type(error).__name__, cause,
                 exc_info=error if has_traceback else None,
             )  # fmt: skip
+
+    def _in_thread(self, function: Callable[[], Awaitable[str]]) -> concurrent.futures.Future[Any]:
+        """Await *function* in the loop of a thread for which neither a robot nor an exit waits."""
+        if self._token_loop is None:
+            self._token_loop = asyncio.new_event_loop()
+            threading.Thread(
+                target=_run_loop, args=(self._token_loop,), name="rse-pf-token", daemon=True
+            ).start()
+        return asyncio.run_coroutine_threadsafe(_awaited(function), self._token_loop)
+
+    def _end_token_loop(self) -> None:
+        loop, self._token_loop = self._token_loop, None
+        if loop is not None:
+            loop.call_soon_threadsafe(loop.stop)
 
     def _report_slow(self, name: str, took_s: float) -> None:
         if took_s > self._slow_s and self._is_new((name, "slow", "")):
@@ -179,6 +196,16 @@ def _is_interrupt(error: BaseException) -> bool:
     return is_exit and threading.current_thread() is threading.main_thread()
 
 
+def _run_loop(loop: asyncio.AbstractEventLoop) -> None:
+    try:
+        loop.run_forever()
+        for task in asyncio.all_tasks(loop):
+            task.cancel()
+        loop.run_until_complete(asyncio.sleep(0))
+    finally:
+        loop.close()
+
+
 async def _awaited(function: Callable[[], Awaitable[str]]) -> Any:
     process = os.getpid()
     try:
@@ -189,26 +216,12 @@ async def _awaited(function: Callable[[], Awaitable[str]]) -> Any:
                 hint="pass an async function, such as read_enrolment(FILE).token",
             )
         return await made
+    except (SystemExit, KeyboardInterrupt) as error:  # asyncio would end its loop by them
+        if _is_interrupt(error):
+            raise
+        raise RuntimeError(f"the token callable raised {type(error).__name__}") from error
     finally:
         _end_child(process, "the token callable")
-
-
-def _in_thread(function: Callable[[], Awaitable[str]]) -> concurrent.futures.Future[Any]:
-    """Await *function* in a thread with a loop of its own, which neither a robot nor an exit waits for."""
-    future: concurrent.futures.Future[Any] = concurrent.futures.Future()
-
-    def work() -> None:
-        try:
-            token = asyncio.run(_awaited(function))
-        except BaseException as error:  # noqa: BLE001  the event loop of the robot reports it
-            if future.set_running_or_notify_cancel():
-                future.set_exception(error)
-        else:
-            if future.set_running_or_notify_cancel():
-                future.set_result(token)
-
-    threading.Thread(target=work, name="rse-pf-token", daemon=True).start()
-    return future
 
 
 def _end_child(process: int, name: str) -> None:

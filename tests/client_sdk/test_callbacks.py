@@ -184,6 +184,31 @@ async def test_a_token_callable_that_hangs_is_reported_as_late(has_thread, monke
     calling.end_thread()
 
 
+async def test_token_callables_of_a_blocking_robot_share_a_loop_until_one_hangs(monkeypatch):
+    monkeypatch.setattr(callbacks, "TOKEN_LIMIT_S", 0.5)
+    calling, may_go_on, seen = callbacks.Callbacks(), threading.Event(), []
+    calling.start_thread()
+
+    async def token():
+        seen.append((asyncio.get_running_loop(), threading.current_thread()))
+        if len(seen) == 3:
+            may_go_on.wait(10)
+        return "t"
+
+    for is_late in (False, False, True, False):
+        if is_late:
+            with pytest.raises(ConnectError):
+                await calling.fetch_token(token)
+        else:
+            assert await calling.fetch_token(token) == "t"
+    may_go_on.set()
+    calling.end_thread()
+    assert seen[0] == seen[1] == seen[2] != seen[3]
+    for _, thread in seen:
+        await asyncio.to_thread(thread.join, 10)
+        assert not thread.is_alive()
+
+
 async def test_a_callable_outside_the_event_loop_is_not_reported_as_slow(caplog):
     calling = callbacks.Callbacks(slow_s=-1.0)
 
