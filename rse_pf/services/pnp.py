@@ -166,7 +166,8 @@ def register(registry: Registry, settings: PnpSettings) -> None:
                 hint="loosen the matcher, or skip this frame",
             )
         options = request.options or defaults
-        if options is not defaults and options.max_iterations == own_iterations:  # left out, so the server's limit holds
+        if options is not defaults and options.max_iterations == own_iterations:
+            # The robot left it out, so the limit of the server holds.
             options = msgspec.structs.replace(options, max_iterations=defaults.max_iterations)
         if options.max_iterations > settings.max_iterations:
             raise LimitExceeded(
