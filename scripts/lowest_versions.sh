@@ -22,5 +22,6 @@ printf "%s\n" "$PWD" "$PWD/native" > "$("$place/bin/python" -c 'import sysconfig
 
 "$place/bin/python" --version
 "$place/bin/python" -m rse_pf.cli.main demo --robots 1 --frames 10 --out out/lowest/demo
-"$place/bin/python" tests/clients/conformance.py --only python,raw --leave-out returns/disabled,returns/away \
+# Left out, besides two that wait for half a minute: progress, since its merge needs the extra maps.
+"$place/bin/python" tests/clients/conformance.py --only python,raw --leave-out returns/disabled,returns/away,progress \
   --out out/lowest/clients.json
