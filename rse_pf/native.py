@@ -338,7 +338,7 @@ def load_core(open_part: Callable[[Path], Part]) -> Part:
     path = find_library()
     if path is None:
         error = MissingExtra("the native core", "vision")
-        error.hint = "make native in a checkout; elsewhere pip install ./native of a checkout"
+        error.hint = f"make native in a checkout; or pip install its folder native, then {error.hint}"
         raise error
     return open_part(path)
 

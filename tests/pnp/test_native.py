@@ -262,7 +262,9 @@ def test_a_missing_library_is_one_error_that_says_how_to_get_it(monkeypatch):
     with pytest.raises(MissingExtra, match="the native core is not installed") as caught:
         native.load_core(native.open_solver)
 
-    assert caught.value.hint == "make native in a checkout; pip install 'rse-pf[vision]' on a robot"
+    assert caught.value.hint == (
+        "make native in a checkout; or pip install its folder native, then pip install 'rse-pf[vision]'"
+    )
 
 
 def test_a_file_that_is_no_library_is_refused_with_the_command_that_builds_one(tmp_path):
