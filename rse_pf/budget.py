@@ -451,7 +451,7 @@ def check_json_containers(text: Text, budget: Budget) -> None:
 def check_json_counts(text: Text, budget: Budget) -> None:
     """Raise LimitExceeded if *text* holds more values, long numbers or memory than *budget* allows.
 
-    Marks inside strings are told apart only if all marks together exceed a limit.
+    Marks inside strings count, too, unless that alone would exceed a limit.
     """
     if len(text) <= _SHORT_BYTES:
         return

@@ -59,7 +59,8 @@ _HEAD = struct.Struct("=IIqQQQ")
 _BODY = struct.Struct("=ddddiiddiidddd")
 # rse_pf_pnp_result: status, reason, three counts, six measures | pose | covariance.
 _RESULT = struct.Struct("=iiqqqdddddd")
-_POSE_AT, _COVARIANCE_AT = _RESULT.size, _RESULT.size + 16 * 8
+_POSE_AT = _RESULT.size
+_COVARIANCE_AT = _POSE_AT + 16 * 8
 _RESULT_BYTES = _COVARIANCE_AT + 36 * 8
 _STATUSES_WITHOUT_EVIDENCE = (1, 2, 3, 11)
 COLLINEAR = 0.02  # width over length of matches below which no pose is given

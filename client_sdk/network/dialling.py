@@ -1,8 +1,8 @@
 """What a failed attempt to connect means for the next one, and how an address is shown.
 
 Nothing here opens a socket.  `foreign_answers` names the cause if somebody else than our servers answered.
-Only a refusal with the mark of our servers concerns the robot itself: it may last, so the robot is told, and
-tries again much later.  Nothing ends a robot for good.
+Only a refusal with the mark of our servers concerns the robot itself: it may last, so it is reported, and
+the robot tries again much later.  Nothing ends a robot for good.
 """
 
 from __future__ import annotations

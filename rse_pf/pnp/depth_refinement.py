@@ -22,8 +22,10 @@ from rse_pf.pnp.solver import PnpSolution
 __all__ = ["DepthNoise", "refine_with_depth"]
 
 _PORTABLE = 1
-_REFINED, _KEPT = 0, 1
-_COLUMNS, _SPARE_ROWS = 11, 4  # of the workspace
+_REFINED = 0  # status of the core: the depths changed the pose
+_KEPT = 1  # status of the core: the pose without depths stays
+_COLUMNS = 11  # numbers of the workspace for each match
+_SPARE_ROWS = 4  # rows of the workspace beyond one for each match
 _MAX_DEPTH_M = 1e3
 
 

@@ -1,4 +1,4 @@
-"""The codecs of a server against ourselves and against strangers."""
+"""The codecs of a server: messages of our robots, and malformed input."""
 
 from __future__ import annotations
 

@@ -515,7 +515,7 @@ class Listener(picows.WSListener):  # type: ignore[misc]
     def close(self, code: int, reason: str) -> None:
         self._transport.send_close(code, reason.encode()[:_MAX_CLOSE_REASON_BYTES])
         # Closing with unread bytes would reset the connection, and the robot would not see the code.
-        with contextlib.suppress(OSError):  # the robot reset it, and the loop has not heard of that yet
+        with contextlib.suppress(OSError):  # the robot reset it, and the loop has not noticed yet
             self._transport.underlying_transport.write_eof()
         if self._linger is None:
             self._linger = self._loop.call_later(_LINGER_S, self._transport.disconnect, False)
