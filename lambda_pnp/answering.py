@@ -33,6 +33,7 @@ from rse_pf.errors import (
 )
 from rse_pf.service import Registry, dispatch, failure_of
 from rse_pf.services import pnp
+from rse_pf.services.pnp_reader import pnp_reader
 from rse_pf.wire import SUBPROTOCOLS, Codec, Command, Failure, codec_for
 from rse_pf.wire.envelope import undecodable_id
 from rse_pf.wire.server_codec import make_server_codec
@@ -96,9 +97,9 @@ class Answering:
         self._keys = keys
         self._registry = Registry()
         pnp.register(self._registry, settings.pnp)
-        types = pnp.wire_types(self._registry)
         self._codecs: dict[str, Codec] = {
-            name: make_server_codec(name, settings.session, pnp=types) for name in SUBPROTOCOLS
+            name: make_server_codec(name, settings.session, read_first=pnp_reader(self._registry, name))
+            for name in SUBPROTOCOLS
         }
 
     def answer(

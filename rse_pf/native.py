@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 from functools import cache, lru_cache
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal, NamedTuple, TypeVar
 
 import msgspec
 import numpy as np
@@ -49,19 +49,27 @@ __all__ = [
 
 Part = TypeVar("Part")
 
-_ABI = 4
+_ABI = 5
 PART_ABIS = {"check": 2, "cloud": 1, "depth": 1, "match": 4, "stereo": 1, "track": 2}
 """The version of each header ``rse_pf_PART.h`` that this package calls."""
 _FILE = "librse_pf_native.so"
 _LANES = {"avx512": 0, "avx2": 4, "portable": 1}
-# rse_pf_pnp_request: abi, flags, rows, points, pixels, pose | camera, options.
-_HEAD = struct.Struct("=IIqQQQ")
-_BODY = struct.Struct("=ddddiiddiidddd")
-# rse_pf_pnp_result: status, reason, three counts, six measures | pose | covariance.
+# rse_pf_pnp_request: abi, flags, rows | points, pixels | pose | camera, options.
+_HEAD, _ARRAYS, _POINTER = struct.Struct("=IIq"), struct.Struct("=QQ"), struct.Struct("=Q")
+_BODY = struct.Struct("=Qddddiiddiidddd")
+_BODY_AT = _HEAD.size + _ARRAYS.size
+_REQUEST_BYTES = _BODY_AT + _BODY.size
+_FIRST_ROWS = 512
+# rse_pf_pnp_result: status, reason, three counts, six measures | pose | covariance | its upper triangle.
 _RESULT = struct.Struct("=iiqqqdddddd")
 _POSE_AT = _RESULT.size
 _COVARIANCE_AT = _POSE_AT + 16 * 8
-_RESULT_BYTES = _COVARIANCE_AT + 36 * 8
+_UPPER_AT = _COVARIANCE_AT + 36 * 8
+_RESULT_BYTES = _UPPER_AT + 22 * 4
+# rse_pf_lists: numbers, room | count, ends | rest.
+_FOUND, _FOUND_AT = struct.Struct("=qqqq"), 16
+_MAX_REST_BYTES = 1024
+_MAX_NUMBERS = 30_000  # of 5,000 matches with depths
 _STATUSES_WITHOUT_EVIDENCE = (1, 2, 3, 11)
 COLLINEAR = 0.02  # width over length of matches below which no pose is given
 
@@ -116,23 +124,62 @@ class Evidence(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     refusal: RsePfError | None
 
 
+class Pose(NamedTuple):
+    """A pose that no rule refuses, in the arrays of a reply.
+
+    Attributes:
+        T_camera_world: ``(16,)``, row-major.
+        inliers: Sorted row numbers, uint32.
+        rmse_px: Root mean square reprojection error over the inliers.
+        covariance: ``(21,)`` float32, the upper triangle of the ``(6, 6)`` covariance.
+        reason: Why the pose is weak; empty for a pose that is ok.
+    """
+
+    T_camera_world: Array
+    inliers: npt.NDArray[np.uint32]
+    rmse_px: float
+    covariance: npt.NDArray[np.float32]
+    reason: str
+
+
 class _Buffers(threading.local):
-    """The request and the result of one thread, with views of their parts."""
+    """What one thread lends to the library; to look up the addresses of other arrays would take longer."""
 
     def __init__(self) -> None:
-        request = np.zeros(_HEAD.size + _BODY.size, dtype=np.uint8)
-        result = np.zeros(_RESULT_BYTES, dtype=np.uint8)
+        request, result = np.zeros(_REQUEST_BYTES, dtype=np.uint8), np.zeros(_RESULT_BYTES, dtype=np.uint8)
         self.request = memoryview(request)  # type: ignore[arg-type]
         self.result = memoryview(result)  # type: ignore[arg-type]
         self.request_at, self.result_at = address_of(request), address_of(result)
-        self.pose = result[_POSE_AT:_COVARIANCE_AT].view(np.float64).reshape(4, 4)
-        self.covariance = result[_COVARIANCE_AT:].view(np.float64).reshape(6, 6)
+        self.pose = result[_POSE_AT:_COVARIANCE_AT].view(np.float64)
+        self.covariance = result[_COVARIANCE_AT:_UPPER_AT].view(np.float64).reshape(6, 6)
+        self.upper = result[_UPPER_AT:].view(np.float32)[:21]
+        self.hold(_FIRST_ROWS)
+
+    def hold(self, rows: int) -> None:
+        """Make room for *rows* points and pixels, and for as many inliers."""
+        self.rows = rows
+        self.points_world, self.pixels = np.empty(3 * rows), np.empty(2 * rows)
+        self.inliers = np.empty(rows, dtype=np.uint32)
+        self.inliers_at = address_of(self.inliers)
+        _ARRAYS.pack_into(self.request, _HEAD.size, address_of(self.points_world), address_of(self.pixels))
+
+
+class _Lists(threading.local):
+    """What one thread lends to the library for the lists of numbers in a text."""
+
+    def __init__(self) -> None:
+        self.numbers = np.empty(_MAX_NUMBERS)
+        lists = np.zeros(_FOUND_AT + _FOUND.size + _MAX_REST_BYTES, dtype=np.uint8)
+        self.lists = memoryview(lists)  # type: ignore[arg-type]
+        self.lists_at = address_of(lists)
+        self.rest = self.lists[_FOUND_AT + _FOUND.size :]
+        struct.pack_into("=Qq", self.lists, 0, address_of(self.numbers), _MAX_NUMBERS)
 
 
 @lru_cache(maxsize=256)
 def _pack(camera: Camera, options: NativeOptions) -> bytes:
     return _BODY.pack(
-        camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height,
+        0, camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height,
         options.inlier_px, options.confidence, options.max_iterations,
         min(options.min_iterations, options.max_iterations),
         options.weak_inliers, options.weak_inlier_ratio, options.weak_translation_m,
@@ -143,11 +190,36 @@ def _pack(camera: Camera, options: NativeOptions) -> bytes:
 class NativeSolver:
     """The solver of one loaded library; every thread may call it."""
 
-    def __init__(self, call: Callable[[int, int, int], None], lanes: str) -> None:
-        self._call = call
-        self._buffers = _Buffers()
+    def __init__(
+        self,
+        call: Callable[[int, int, int], None],
+        cut: Callable[[bytes, int, int], int],
+        lanes: str,
+    ) -> None:
+        self._call, self._cut = call, cut
+        self._buffers, self._lists = _Buffers(), _Lists()
         self.lanes = lanes
         """``avx512``, ``avx2`` or ``portable``: the instructions that this processor gets."""
+
+    def solve(self, points_world: Array, pixels: Array, camera: Camera, options: NativeOptions) -> Pose:
+        """Return a camera pose that no rule refuses.
+
+        Args:
+            points_world: ``(3n,)`` or ``(n, 3)``, metres, world frame; ``n >= 4``.
+            pixels: ``(2n,)`` or ``(n, 2)``, undistorted pixels.
+            camera: Intrinsics of the image the pixels come from.
+            options: How to solve.
+
+        Raises:
+            BadRequest: Sizes do not fit, or a number is not finite or absurd.
+            NoConsensus: No pose agrees with more rows than chance would give.
+            DegenerateGeometry: A rule refuses the pose.
+        """
+        values, inliers = self._solve(points_world, pixels, camera, options, None)
+        if values[0]:
+            raise _solver_error(values, pixels.size // 2, options)
+        buffers = self._buffers
+        return Pose(buffers.pose.copy(), inliers, values[5], buffers.upper.copy(), _REASONS[values[1]])
 
     def judge(
         self,
@@ -160,44 +232,29 @@ class NativeSolver:
         """Return a camera pose with its evidence, also where a rule refuses the pose.
 
         Args:
-            points_world: ``(n, 3)``, metres, world frame; ``n >= 4``.
-            pixels: ``(n, 2)``, undistorted pixels.
-            camera: Intrinsics of the image the pixels come from.
-            options: How to solve.
+            points_world: As in `solve`.
+            pixels: As in `solve`.
+            camera: As in `solve`.
+            options: As in `solve`.
             T_camera_world: The ``(4, 4)`` pose to judge; None to estimate the pose.
 
         Raises:
-            BadRequest: Shapes do not fit, or a number is not finite or absurd.
+            BadRequest: Sizes do not fit, or a number is not finite or absurd.
         """
-        # The library trusts these: what is not contiguous, not aligned or not float64 is copied.
-        points_world, pixels = aligned(points_world, np.float64), aligned(pixels, np.float64)
-        n = len(pixels)
-        if points_world.shape != (n, 3) or pixels.shape != (n, 2):
-            raise BadRequest(
-                f"points {points_world.shape} and pixels {pixels.shape} are not (n, 3) and (n, 2)",
-                hint="send one pixel for each point",
-            )
         pose = None if T_camera_world is None else aligned(T_camera_world, np.float64)
         if pose is not None and pose.shape != (4, 4):
             raise BadRequest(f"the pose {pose.shape} is not (4, 4)", hint="give T_camera_world")
-        inliers = np.empty(n, dtype=np.int64)
-        buffers = self._buffers
-        _HEAD.pack_into(
-            buffers.request, 0, _ABI, _LANES[options.lanes], n, address_of(points_world), address_of(pixels),
-            0 if pose is None else address_of(pose),
-        )  # fmt: skip
-        buffers.request[_HEAD.size : _HEAD.size + _BODY.size] = _pack(camera, options)
-        self._call(buffers.request_at, address_of(inliers), buffers.result_at)
-        values = _RESULT.unpack_from(buffers.result)
-        status, reason, count, independent, _, rmse, other_rmse, thinness, radius, inlier_thinness, chance = (
+        values, inliers = self._solve(points_world, pixels, camera, options, pose)
+        status, reason, _, independent, _, rmse, other_rmse, thinness, radius, inlier_thinness, chance = (
             values
         )
-        refusal = _solver_error(values, n, options) if status else None
+        refusal = _solver_error(values, pixels.size // 2, options) if status else None
         if refusal is not None and status in _STATUSES_WITHOUT_EVIDENCE:
             raise refusal
+        buffers = self._buffers
         return Evidence(
-            T_camera_world=buffers.pose.copy() if pose is None else pose,
-            inliers=inliers[:count],
+            T_camera_world=buffers.pose.reshape(4, 4).copy() if pose is None else pose,
+            inliers=inliers.astype(np.intp),
             rmse_px=rmse,
             covariance=buffers.covariance.copy(),
             reason=_REASONS[reason],
@@ -209,6 +266,45 @@ class NativeSolver:
             other_rmse_px=other_rmse,
             refusal=refusal,
         )
+
+    def _solve(
+        self, points_world: Array, pixels: Array, camera: Camera, options: NativeOptions, pose: Array | None
+    ) -> tuple[tuple[Any, ...], npt.NDArray[np.uint32]]:
+        """Return the numbers of the result and the inliers; the arrays are in the buffers of the thread."""
+        n = pixels.size // 2
+        if points_world.size != 3 * n or pixels.size != 2 * n:
+            raise BadRequest(
+                f"points {points_world.shape} and pixels {pixels.shape} are not (n, 3) and (n, 2)",
+                hint="send one pixel for each point",
+            )
+        buffers = self._buffers
+        if n > buffers.rows:
+            buffers.hold(n)
+        buffers.points_world[: 3 * n] = points_world if points_world.ndim == 1 else points_world.reshape(-1)
+        buffers.pixels[: 2 * n] = pixels if pixels.ndim == 1 else pixels.reshape(-1)
+        _HEAD.pack_into(buffers.request, 0, _ABI, _LANES[options.lanes], n)
+        buffers.request[_BODY_AT:] = _pack(camera, options)
+        if pose is not None:
+            _POINTER.pack_into(buffers.request, _BODY_AT, address_of(pose))
+        self._call(buffers.request_at, buffers.inliers_at, buffers.result_at)
+        values = _RESULT.unpack_from(buffers.result)
+        return values, buffers.inliers[: values[2]].copy()
+
+    def cut_lists(self, text: bytes) -> tuple[memoryview, list[Array]] | None:
+        """Return the JSON *text* without its lists of numbers, and the lists.
+
+        The string ``"\\u000K"`` takes the place of list K in the text, which is valid until the next call of
+        this thread.  None means that the text is not read here: it has no lists, more than three, or others
+        than of numbers, a number has more than 15 digits or an exponent, or a backslash is in it.
+        """
+        buffers = self._lists
+        size = self._cut(text, len(text), buffers.lists_at)
+        if size < 0:
+            return None
+        count, *ends = _FOUND.unpack_from(buffers.lists, _FOUND_AT)
+        numbers = buffers.numbers[: ends[count - 1]].copy()
+        starts = (0, *ends)
+        return buffers.rest[:size], [numbers[starts[i] : ends[i]] for i in range(count)]
 
 
 def _solver_error(values: tuple[Any, ...], n: int, options: NativeOptions) -> RsePfError:
@@ -287,6 +383,8 @@ def address_of(array: npt.NDArray[Any]) -> int:
 
 def aligned(array: npt.NDArray[Any], dtype: type | None = None) -> npt.NDArray[Any]:
     """Return *array*, or a copy that is contiguous and aligned as C expects, and of *dtype*."""
+    if type(array) is np.ndarray and array.dtype.type is dtype and array.flags.carray:
+        return array
     whole = np.ascontiguousarray(array, dtype=dtype)
     return whole if whole.flags.aligned else whole.copy()
 
@@ -358,10 +456,13 @@ def core_function(part: str, name: str, arguments: Sequence[Any], result: Any) -
 
 def open_solver(path: Path) -> NativeSolver:
     """Load the library at *path*; raises ConfigurationError as `load_part` says."""
-    solve, lanes = load_part(path, "native", _ABI, "rse_pf_pnp_solve", "rse_pf_native_lanes")
+    solve, cut, lanes = load_part(
+        path, "native", _ABI, "rse_pf_pnp_solve", "rse_pf_cut_lists", "rse_pf_native_lanes"
+    )
     lanes.restype = ctypes.c_char_p
+    cut.argtypes, cut.restype = (ctypes.c_char_p, ctypes.c_int64, ctypes.c_void_p), ctypes.c_int64
     solve.argtypes, solve.restype = (ctypes.c_void_p, ctypes.c_void_p, ctypes.c_void_p), None
-    return NativeSolver(solve, lanes().decode())
+    return NativeSolver(solve, cut, lanes().decode())
 
 
 @cache

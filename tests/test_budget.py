@@ -118,8 +118,8 @@ def test_marks_within_a_word_are_no_values(monkeypatch):
     assert decoded.payload == text
 
 
-LONG_NUMBERS = ("1" * 20, "12345678901234567890.5e-300", "0." + "0" * 30 + "1" * 20, "-1." + "0" * 19)
-SHORT_NUMBERS = ("0.00012345678901234567", "-1.2345678901234567e-05", "1" * 19, "5e-324", "0." + "0" * 60)
+LONG_NUMBERS = ("1" * 20, "12345678901234567890.5e-30", "0." + "0" * 30 + "1" * 20, "-1." + "0" * 19)
+SHORT_NUMBERS = ("0.00012345678901234567", "-1.2345678901234567e-05", "1" * 19, "5e-99", "0." + "0" * 60)
 
 
 def is_within(text: str) -> bool:
@@ -143,6 +143,12 @@ def test_few_numbers_may_have_more_than_19_digits(number):
 @pytest.mark.parametrize("number", SHORT_NUMBERS)
 def test_many_numbers_may_have_19_digits(number):
     assert is_within("[" + f"{number}," * 10_000 + "1]")
+
+
+@pytest.mark.parametrize("number", ["5e-324", "1.7E308", "0.1e+0100"])
+def test_few_numbers_may_have_an_exponent_of_three_digits(number):
+    assert is_within("[" + f"{number}," * 199 + number + "]")
+    assert not is_within("[" + f"{number}," * 200 + number + "]")
 
 
 WIDE = Budget(

@@ -10,7 +10,7 @@
 extern "C" {
 #endif
 
-#define RSE_PF_NATIVE_ABI 4
+#define RSE_PF_NATIVE_ABI 5
 
 /* Flags of a request. */
 #define RSE_PF_PNP_PORTABLE 1u /* Use no AVX, for tests: the bytes of the result are the same. */
@@ -66,6 +66,7 @@ typedef struct rse_pf_pnp_result {
     double inlier_thinness, log10_false_alarms;
     double T_camera_world[16]; /* row-major; zeros where there is none */
     double covariance[36];     /* of the twist (rho metres, phi radians) left of the pose */
+    float upper_triangle[22];  /* of the covariance, row after row; the last one is 0 */
 } rse_pf_pnp_result;
 
 /* Return RSE_PF_NATIVE_ABI of the library, to compare with the header's. */
@@ -76,7 +77,25 @@ const char *rse_pf_native_lanes(void);
 
 /* Estimate or judge the camera pose.  inliers has room for as many numbers as the request has rows; the first
  * `count` of them become the sorted row numbers that agree, also where the pose is refused. */
-void rse_pf_pnp_solve(const rse_pf_pnp_request *request, int64_t *inliers, rse_pf_pnp_result *result);
+void rse_pf_pnp_solve(const rse_pf_pnp_request *request, uint32_t *inliers, rse_pf_pnp_result *result);
+
+#define RSE_PF_MAX_LISTS 3
+#define RSE_PF_MAX_REST 1024
+
+typedef struct rse_pf_lists {
+    double *numbers; /* of all lists, one behind the other; `room` of them */
+    int64_t room;
+    int64_t count;                  /* lists that were found */
+    int64_t ends[RSE_PF_MAX_LISTS]; /* of each list in `numbers` */
+    char rest[RSE_PF_MAX_REST];
+} rse_pf_lists;
+
+/* Cut the lists of numbers out of a JSON text: `rest` becomes the text with the string "\u000K" in the place of
+ * list K, which the text itself cannot hold, since one with a backslash is not read.
+ *
+ * Returns the size of the rest; -1 if it is too long, if there are other lists or too many of them, and for a number
+ * with an exponent or more than 15 digits, which this function could not round as IEEE 754 does. */
+int64_t rse_pf_cut_lists(const char *text, int64_t bytes, rse_pf_lists *lists);
 
 #ifdef __cplusplus
 }

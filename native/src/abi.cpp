@@ -83,7 +83,7 @@ bool are_sane(const double* numbers, int64_t count) {
     return wrong == 0;
 }
 
-int32_t checked(const rse_pf_pnp_request& request, const int64_t* inliers) {
+int32_t checked(const rse_pf_pnp_request& request, const uint32_t* inliers) {
     const bool is_whole =
         request.abi == RSE_PF_NATIVE_ABI && within(static_cast<double>(request.rows), 4, static_cast<double>(kMaxRows)) &&
         request.points_world != nullptr && request.pixels != nullptr &&
@@ -122,7 +122,7 @@ __attribute__((visibility("default"))) const char* rse_pf_native_lanes(void) {
     return widest == Lanes::avx512 ? "avx512" : widest == Lanes::avx2 ? "avx2" : "portable";
 }
 
-__attribute__((visibility("default"))) void rse_pf_pnp_solve(const rse_pf_pnp_request* request, int64_t* inliers,
+__attribute__((visibility("default"))) void rse_pf_pnp_solve(const rse_pf_pnp_request* request, uint32_t* inliers,
                                                              rse_pf_pnp_result* result) {
     std::memset(result, 0, sizeof *result);
     result->status = checked(*request, inliers);

@@ -147,7 +147,7 @@ static bool refine(const rse_pf::Columns<double>& rows, int64_t count, const Opt
 }
 
 // Copy the rows whose squared error in the view is at most limit2, and note their numbers; return how many.
-static int64_t gather(const rse_pf::Workspace& data, int64_t n, double limit2, int64_t* numbers) {
+static int64_t gather(const rse_pf::Workspace& data, int64_t n, double limit2, uint32_t* numbers) {
     const rse_pf::Columns<double>&from = data.all, &to = data.inliers;
     int64_t count = 0;
     for (int64_t i = 0; i < n; ++i) {
@@ -156,7 +156,7 @@ static int64_t gather(const rse_pf::Workspace& data, int64_t n, double limit2, i
         to.z[count] = from.z[i];
         to.u[count] = from.u[i];
         to.v[count] = from.v[i];
-        if (numbers != nullptr) numbers[count] = i;
+        if (numbers != nullptr) numbers[count] = static_cast<uint32_t>(i);
         count += data.error2[i] <= limit2 ? 1 : 0;
     }
     for (int64_t i = count; i < padded(count); ++i) {

@@ -194,6 +194,11 @@ static void solve_task(const rse_pf::Task& task) {
     const Vector3 centre = centre_of(*task.request);
     fill_rows(task, centre);
     task.result->status = judged(task, centre);
+    float* upper = task.result->upper_triangle;
+    for (int row = 0; row < 6; ++row) {
+        for (int column = row; column < 6; ++column)
+            *upper++ = static_cast<float>(task.result->covariance[6 * row + column]);
+    }
 }
 
 }  // namespace RSE_PF_ISA

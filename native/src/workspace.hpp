@@ -23,7 +23,7 @@ struct Workspace {
 struct Task {
     const rse_pf_pnp_request* request;
     Workspace* workspace;
-    int64_t* inliers;
+    uint32_t* inliers;
     rse_pf_pnp_result* result;
 };
 

@@ -233,7 +233,7 @@ void check_hostile() {
         std::vector<double> points(3 * n), pixels(2 * n);
         for (double& each : points) each = hostile(kind);
         for (double& each : pixels) each = hostile(other);
-        std::vector<int64_t> inliers(n);
+        std::vector<uint32_t> inliers(n);
         std::vector<double> pose(16);
         for (double& each : pose) each = hostile(kind);
         rse_pf_pnp_request request = request_of(points, pixels);
@@ -250,9 +250,35 @@ void check_hostile() {
         expect(result.count >= 0 && result.count <= request.rows, "inliers are rows");
         for (int64_t k = 0; k < result.count; ++k) {
             const int64_t row = inliers[static_cast<size_t>(k)];
-            expect(row >= (k > 0 ? inliers[static_cast<size_t>(k - 1)] + 1 : 0) && row < request.rows, "in order");
+            expect(row >= (k > 0 ? int64_t{inliers[static_cast<size_t>(k - 1)]} + 1 : 0) && row < request.rows, "in order");
         }
     }
+}
+
+void check_lists() {
+    static constexpr char kSigns[] = "[[],,::{}\"\\ .-+eE00123456789";
+    for (int i = 0; i < 20000; ++i) {
+        // The memory of the text and of the numbers ends behind the last one, so that the sanitizers notice more.
+        std::vector<char> text(static_cast<size_t>(random_bits() % (i % 100 == 0 ? 3000 : 60)));
+        for (char& each : text) each = kSigns[random_bits() % (sizeof kSigns - 1)];
+        std::vector<double> numbers(static_cast<size_t>(random_bits() % 8));
+        rse_pf_lists lists = {numbers.data(), static_cast<int64_t>(numbers.size()), 0, {}, {}};
+        const int64_t size = rse_pf_cut_lists(text.data(), static_cast<int64_t>(text.size()), &lists);
+        expect(size >= -1 && size <= RSE_PF_MAX_REST, "the rest of a text is short");
+        if (size < 0) continue;
+        int64_t last = 0;
+        for (int64_t k = 0; k < lists.count; ++k) {
+            expect(lists.ends[k] > last && lists.ends[k] <= lists.room, "lists of numbers follow each other");
+            last = lists.ends[k];
+        }
+    }
+    const char known[] = "{\"a\":[1, -2.50 ,0.125],\"b\":[123456789012345]}";
+    double numbers[4] = {};
+    rse_pf_lists lists = {numbers, 4, 0, {}, {}};
+    const int64_t size = rse_pf_cut_lists(known, sizeof known - 1, &lists);
+    expect(size == 27 && std::memcmp(lists.rest, "{\"a\":\"\\u0000\",\"b\":\"\\u0001\"}", 27) == 0, "lists are cut out");
+    expect(lists.count == 2 && lists.ends[0] == 3 && lists.ends[1] == 4, "lists are counted");
+    expect(numbers[0] == 1.0 && numbers[1] == -2.5 && numbers[2] == 0.125 && numbers[3] == 123456789012345.0, "read");
 }
 
 // The memory of each array ends behind its last number, so that the sanitizers notice a step too far.
@@ -357,7 +383,7 @@ void check_fits() {
 void check_allocations() {
     const int64_t n = 300;
     std::vector<double> points(3 * n), pixels(2 * n);
-    std::vector<int64_t> inliers(n);
+    std::vector<uint32_t> inliers(n);
     for (int64_t i = 0; i < n; ++i) {
         const auto p = static_cast<size_t>(3 * i), q = static_cast<size_t>(2 * i);
         points[p + 2] = uniform(1, 5);
@@ -393,6 +419,7 @@ int main() {
     check_sampler();
     check_allocations();
     check_hostile();
+    check_lists();
     check_matches_near();
     check_fits();
     std::printf(failures == 0 ? "all checks passed (%s)\n" : "checks failed (%s)\n", rse_pf_native_lanes());

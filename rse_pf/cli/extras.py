@@ -38,7 +38,7 @@ EXTRAS: dict[str, Extra] = {
     ),
     "backend": Extra(
         modules={
-            "rse_pf_native": "rse-pf-native", "isal": "isal", "simdjson": "pysimdjson",
+            "rse_pf_native": "rse-pf-native", "isal": "isal",
             **_same("picows", "aiofastnet", "uvloop", "uvicorn", "httptools", "lupa", "packaging"),
             "prometheus_client": "prometheus-client",
         },

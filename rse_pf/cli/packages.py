@@ -95,7 +95,6 @@ _CALLS: Mapping[str, Callable[[Any], object]] = {
     "numpy": lambda numpy: numpy.linalg.inv(numpy.eye(2)),
     "websockets": lambda websockets: websockets.connect,
     "msgspec": lambda msgspec: msgspec.json.decode(msgspec.json.encode([1])),
-    "simdjson": lambda simdjson: simdjson.Parser().parse(b"[1]"),
     "uvloop": lambda uvloop: uvloop.new_event_loop().close(),
     "httptools": lambda httptools: httptools.parse_url(b"/"),
     "lupa": lambda lupa: lupa.LuaRuntime().eval("1"),

@@ -10,21 +10,23 @@ import numpy as np
 import numpy.typing as npt
 
 from rse_pf.config import PnpSettings
-from rse_pf.errors import LimitExceeded, TooFewCorrespondences
+from rse_pf.errors import BadRequest, LimitExceeded, TooFewCorrespondences
 from rse_pf.geometry import Camera
 from rse_pf.native import native_solver
 from rse_pf.pnp import DepthNoise, PnpOptions, PnpSolution, refine_with_depth, solve_pnp
+from rse_pf.pnp.engines import native_options
+from rse_pf.pnp.options import WeakLimits
 from rse_pf.service import Registry
 from rse_pf.wire.arrays import Array, reshaped
-from rse_pf.wire.server_codec import PnpTypes
 
-__all__ = ["PnpReply", "PnpRequest", "make_request", "register", "wire_types"]
+__all__ = ["PnpReply", "PnpRequest", "make_request", "register"]
 
 _UPPER = np.triu_indices(6)
 _FLAT_UPPER = 6 * _UPPER[0] + _UPPER[1]
 _POINT_DECIMALS = 4
 _PIXEL_DECIMALS = 2
 _DEPTH_DECIMALS = 3
+_WEAK_LIMITS = WeakLimits()
 # Matches of one command; more cost time, and do not make the pose better.
 MAX_CORRESPONDENCES = 5000
 
@@ -123,48 +125,21 @@ def make_request(
     )
 
 
-def wire_types(registry: Registry) -> PnpTypes | None:
-    """Return what the codecs of a server decode a `pnp` command to, None if *registry* offers another one.
-
-    What runs in another process is sent there as the robot sent it.
-    """
-    own = any(
-        each.name == "pnp"
-        and each.request_type is PnpRequest
-        and each.kind == "stateless"
-        and not each.limited
-        for each in registry
-    )
-    return PnpTypes(PnpRequest, camera=Camera, options=PnpOptions, depth_noise=DepthNoise) if own else None
-
-
 def register(registry: Registry, settings: PnpSettings) -> None:
     """Add ``pnp`` to *registry*, with the limits and the engine of *settings*.
 
     Raises:
         MissingExtra: The native core is not installed.
     """
-    native_solver()  # which every engine needs: a missing core is reported before the first command
+    solver = native_solver()  # which every engine needs: a missing core is reported before the first command
     defaults = PnpOptions(max_iterations=settings.max_iterations)
-    engine = settings.engine
     own_iterations = PnpOptions().max_iterations
 
     @registry.service("pnp", cheap=True)
     def pnp(request: PnpRequest) -> PnpReply:
         """Estimate the camera pose of one frame."""
-        points_world = reshaped("points_world", request.points_world, 3)
-        pixels = reshaped("pixels", request.pixels, 2)
-        n = len(points_world)
-        if n > MAX_CORRESPONDENCES:
-            raise LimitExceeded(
-                f"{n} correspondences are above {MAX_CORRESPONDENCES}",
-                hint="send the best matches only",
-            )
-        if n < 4:
-            raise TooFewCorrespondences(
-                f"got {n} correspondences, a pose needs at least 4",
-                hint="loosen the matcher, or skip this frame",
-            )
+        points_world, pixels = request.points_world, request.pixels
+        _check_sizes(points_world, pixels)
         options = request.options or defaults
         if options is not defaults and options.max_iterations == own_iterations:
             # The robot left it out, so the limit of the server holds.
@@ -174,10 +149,41 @@ def register(registry: Registry, settings: PnpSettings) -> None:
                 f"{options.max_iterations} iterations are above {settings.max_iterations}",
                 hint="ask for fewer",
             )
-        solution = solve_pnp(points_world, pixels, request.camera, options, default_engine=engine)
-        if request.depths_m is not msgspec.UNSET and request.depths_m is not None:
-            solution = refine_with_depth(
-                solution, points_world, pixels, request.depths_m, request.camera,
-                request.depth_noise or DepthNoise(),
+        engine = options.engine or settings.engine
+        depths_m = None if request.depths_m is msgspec.UNSET else request.depths_m
+        if engine == "native" and depths_m is None:
+            # As `solve_pnp`, in the arrays of the reply: most commands are answered here.
+            found = solver.solve(points_world, pixels, request.camera, native_options(options, _WEAK_LIMITS))
+            return PnpReply(
+                T_camera_world=found.T_camera_world, inliers=found.inliers, rmse_px=found.rmse_px,
+                covariance=found.covariance, verdict="weak" if found.reason else "ok", reason=found.reason,
+                engine=engine,
             )  # fmt: skip
+        points_world, pixels = points_world.reshape(-1, 3), pixels.reshape(-1, 2)
+        solution = solve_pnp(points_world, pixels, request.camera, options, default_engine=engine)
+        if depths_m is not None:
+            noise = request.depth_noise or DepthNoise()
+            solution = refine_with_depth(solution, points_world, pixels, depths_m, request.camera, noise)
         return PnpReply.of(solution)
+
+
+def _check_sizes(points_world: Array, pixels: Array) -> None:
+    """Raise an error unless the arrays hold 4 to `MAX_CORRESPONDENCES` points and pixels."""
+    n = pixels.size // 2
+    if 4 <= n <= MAX_CORRESPONDENCES and points_world.size == 3 * n and pixels.size == 2 * n:
+        return
+    points_world, pixels = reshaped("points_world", points_world, 3), reshaped("pixels", pixels, 2)
+    n = len(points_world)
+    if n > MAX_CORRESPONDENCES:
+        raise LimitExceeded(
+            f"{n} correspondences are above {MAX_CORRESPONDENCES}", hint="send the best matches only"
+        )
+    if n < 4:
+        raise TooFewCorrespondences(
+            f"got {n} correspondences, a pose needs at least 4",
+            hint="loosen the matcher, or skip this frame",
+        )
+    raise BadRequest(
+        f"points {points_world.shape} and pixels {pixels.shape} are not (n, 3) and (n, 2)",
+        hint="send one pixel for each point",
+    )

@@ -1,8 +1,7 @@
 """Bytes to messages and back: JSON, JSON+zlib (the paper's) and MessagePack with raw arrays.
 
 Input is untrusted: limits hold *while* decoding, and only errors of `rse_pf.errors` are raised.  A codec
-keeps no state between messages.  These codecs need what a robot installs; servers read JSON with faster
-libraries (`rse_pf.wire.server_codec`).
+keeps no state between messages.
 """
 
 from __future__ import annotations
@@ -34,12 +33,10 @@ __all__ = [
     "CODECS",
     "SUBPROTOCOLS",
     "Codec",
+    "ReadFirst",
     "as_type",
-    "check_codec",
     "codec_for",
-    "decode_guarded",
     "deflated",
-    "json_codec",
     "make_codec",
     "stored",
 ]
@@ -65,9 +62,9 @@ _LEVEL_OF_NUMBERS, _BYTES_PER_NUMBER = 4, 16
 # A server's messages are short: level 6 saves 5 of 794 bytes and costs a third more time.
 _REPLY_LEVEL = 1
 
-# A shorter reply is stored: one packet of 1,460 bytes holds it in either case, and deflating the reply to 200
-# matches from 1,390 to 770 bytes takes 7 us, which is as much as the rest of encoding it.
-_STORED_BYTES = 1_400
+# A shorter reply is stored.  Deflating the reply to 200 matches from 1,520 to 860 bytes, which saves one
+# packet, takes 10 us, which is twice the rest of encoding it.
+_STORED_BYTES = 2_800
 _STORED_HEAD = b"\x78\x01\x01"
 # Longer messages are inflated by zlib: isal takes 0.4 us for an empty block, which is 5 ms of this size.
 _MAX_FAST_BYTES = 16_384
@@ -78,6 +75,10 @@ _FROM_ROBOT = frozenset(get_args(FromRobot))
 _UNDECODABLE = (msgspec.DecodeError, RecursionError, ValueError, TypeError, OverflowError)
 """What decoders raise; a `msgspec.ValidationError` is a DecodeError, a UnicodeDecodeError a ValueError."""
 _UNENCODABLE = (RecursionError, ValueError, TypeError, OverflowError)
+
+
+ReadFirst = Callable[[bytes | bytearray], Command | None]
+"""Returns the command in a message of a robot, inflated; None if it leaves the message to the codec."""
 
 
 class Codec(Protocol):
@@ -99,44 +100,30 @@ class Codec(Protocol):
         """Return the message of a server in *data*; raises BadMessage or LimitExceeded."""
 
 
-def make_codec(name: str, limits: SessionSettings | None = None) -> Codec:
+def make_codec(
+    name: str,
+    limits: SessionSettings | None = None,
+    *,
+    zlib_library: ModuleType = zlib,
+    read_first: ReadFirst | None = None,
+) -> Codec:
     """Return the codec called *name*: ``zlib``, ``json`` or ``bin``.
 
     Args:
         name: Which one.
         limits: What is accepted from the other side.
+        zlib_library: ``zlib``, or ``isal.isal_zlib``.
+        read_first: As in `rse_pf.wire.server_codec.make_server_codec`.
 
     Raises:
         UnsupportedProtocol: There is no such codec.
     """
-    check_codec(name)
-    session = limits or SessionSettings()
-    return _BinaryCodec(session) if name == "bin" else json_codec(session, is_compressed=name == "zlib")
-
-
-def json_codec(
-    limits: SessionSettings,
-    *,
-    is_compressed: bool,
-    zlib_library: ModuleType = zlib,
-    read: Callable[[bytes | bytearray], FromRobot] | None = None,
-) -> Codec:
-    """Return the codec ``zlib`` or ``json``.
-
-    Args:
-        limits: What is accepted from the other side.
-        is_compressed: Whether messages are deflated.
-        zlib_library: ``zlib``, or ``isal.isal_zlib``.
-        read: Returns the message of a robot in a JSON text and raises ProtocolError; None for the reader of
-            `msgspec`.
-    """
-    return _JsonCodec(limits, is_compressed, zlib_library, read)
-
-
-def check_codec(name: str) -> None:
-    """Raise UnsupportedProtocol if there is no codec called *name*."""
     if name not in CODECS:
         raise UnsupportedProtocol(f"no codec named {name!r}", hint=f"choose one of {', '.join(CODECS)}")
+    session = limits or SessionSettings()
+    if name == "bin":
+        return _BinaryCodec(session, read_first)
+    return _JsonCodec(session, name == "zlib", zlib_library, read_first)
 
 
 def as_type(value: Any, kind: type[T]) -> T:
@@ -197,14 +184,14 @@ class _JsonCodec:
         limits: SessionSettings,
         is_compressed: bool,
         zlib_library: ModuleType,
-        read: Callable[[bytes | bytearray], FromRobot] | None,
+        read_first: ReadFirst | None,
     ) -> None:
         self.name = "zlib" if is_compressed else "json"
         self.is_text = not is_compressed
         self._budget = Budget.of_messages(limits)
         self._is_compressed = is_compressed
         self._zlib = zlib_library
-        self._read = read or self._read_with_msgspec
+        self._read_first = read_first
         self._encode = msgspec.json.Encoder(enc_hook=arrays.json_encode_hook).encode
         self._from_robot = msgspec.json.Decoder(FromRobot).decode
         self._from_server = msgspec.json.Decoder(FromServer).decode
@@ -236,7 +223,7 @@ class _JsonCodec:
     def decode_from_server(self, data: bytes) -> FromServer:
         text = self._open(data)
         check_json_containers(text, self._budget)
-        message: FromServer = decode_guarded(self._from_server, text)
+        message: FromServer = _decode_guarded(self._from_server, text)
         return message
 
     def _open(self, data: bytes) -> bytes | bytearray:
@@ -247,9 +234,11 @@ class _JsonCodec:
             return inflate_within(data, self._budget)
         return inflate_short(data, self._budget, self._zlib)
 
-    def _read_with_msgspec(self, text: bytes | bytearray) -> FromRobot:
+    def _read(self, text: bytes | bytearray) -> FromRobot:
+        if self._read_first is not None and (command := self._read_first(text)) is not None:
+            return command
         check_json(text, self._budget)
-        message: FromRobot = decode_guarded(self._from_robot, text)
+        message: FromRobot = _decode_guarded(self._from_robot, text)
         return message
 
 
@@ -257,8 +246,9 @@ class _BinaryCodec:
     name = "bin"
     is_text = False
 
-    def __init__(self, limits: SessionSettings) -> None:
+    def __init__(self, limits: SessionSettings, read_first: ReadFirst | None) -> None:
         self._budget = Budget.of_messages(limits)
+        self._read_first = read_first
         self._encode = msgspec.msgpack.Encoder(enc_hook=arrays.binary_encode_hook).encode
         self._from_robot = msgspec.msgpack.Decoder(FromRobot, ext_hook=arrays.extension_hook).decode
         self._from_server = msgspec.msgpack.Decoder(FromServer, ext_hook=arrays.extension_hook).decode
@@ -271,8 +261,10 @@ class _BinaryCodec:
 
     def decode_from_robot(self, data: bytes) -> FromRobot:
         check_size(data, self._budget)
+        if self._read_first is not None and (command := self._read_first(data)) is not None:
+            return command
         is_checked = check_msgpack(data, self._budget)
-        message: FromRobot = decode_guarded(self._from_robot, data)
+        message: FromRobot = _decode_guarded(self._from_robot, data)
         if not is_checked and type(message) is Command and type(message.payload) in _CONTAINERS:
             _check_nesting(message.payload, self._budget.depth)
         return message
@@ -282,12 +274,12 @@ class _BinaryCodec:
 
     def decode_from_server(self, data: bytes) -> FromServer:
         check_size(data, self._budget)
-        message: FromServer = decode_guarded(self._from_server, data)
+        message: FromServer = _decode_guarded(self._from_server, data)
         _check_nesting(getattr(message, "reply", None), self._budget.depth)
         return message
 
 
-def decode_guarded(decode: Callable[[Any], Any], data: Any) -> Any:
+def _decode_guarded(decode: Callable[[Any], Any], data: Any) -> Any:
     """Decode *data*, turning every exception of the decoder into `BadMessage`."""
     try:
         return decode(data)

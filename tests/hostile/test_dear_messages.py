@@ -19,7 +19,8 @@ from rse_pf.errors import ProtocolError
 from rse_pf.pnp.problems import KINECT, make_problem
 from rse_pf.service import dispatch
 from rse_pf.services.builtin import builtin_services
-from rse_pf.services.pnp import make_request, wire_types
+from rse_pf.services.pnp import make_request
+from rse_pf.services.pnp_reader import pnp_reader
 from rse_pf.wire import CODECS, Command, make_codec
 from rse_pf.wire.server_codec import make_server_codec
 
@@ -62,7 +63,7 @@ def test_messages_of_the_sdk_are_far_below_the_limits(
 @pytest.mark.parametrize("inside", [b"[", b'{"type":"command","id":1,"service":"pnp","payload":"'])
 def test_refusing_a_bomb_costs_less_than_two_poses(inside: bytes) -> None:
     registry = builtin_services(PlatformSettings())
-    codec = make_server_codec("zlib", pnp=wire_types(registry))
+    codec = make_server_codec("zlib", read_first=pnp_reader(registry, "zlib"))
     problem = make_problem(seed=1, n=200)
     request = make_request(problem.points_world, problem.pixels, KINECT)
     pose = codec.encode(Command(id=1, service="pnp", payload=request))

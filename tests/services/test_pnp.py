@@ -14,7 +14,8 @@ from rse_pf.pnp import DepthNoise, PnpOptions, refine_with_depth, solve_pnp
 from rse_pf.pnp.problems import KINECT
 from rse_pf.service import dispatch
 from rse_pf.services.builtin import builtin_services
-from rse_pf.services.pnp import PnpReply, PnpRequest, make_request, wire_types
+from rse_pf.services.pnp import PnpReply, PnpRequest, make_request
+from rse_pf.services.pnp_reader import pnp_reader
 from rse_pf.wire import CODECS, Command, Failure, Result, as_type, make_codec
 from rse_pf.wire.server_codec import make_server_codec
 
@@ -35,7 +36,7 @@ def _views(n: int = 60) -> tuple[Array, Array, Array]:
 
 
 def _answer(payload: Any, codec_name: str = "json") -> PnpReply | Failure:
-    codec = make_server_codec(codec_name, pnp=wire_types(_REGISTRY))
+    codec = make_server_codec(codec_name, read_first=pnp_reader(_REGISTRY, codec_name))
     arrived = codec.decode_from_robot(codec.encode(Command(id=1, service="pnp", payload=payload)))
     assert isinstance(arrived, Command)
     answer = dispatch(_REGISTRY, arrived, lambda: 0.0)

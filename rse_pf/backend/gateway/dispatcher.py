@@ -29,7 +29,7 @@ from rse_pf.backend.rosbridge.topics import RosbridgeTopics
 from rse_pf.backend.scheduling.command_queue import CommandQueue
 from rse_pf.backend.scheduling.scheduler import QueueBacklog, QueuedCommand, RefusedCommand
 from rse_pf.errors import Busy, NotFound, UnknownService
-from rse_pf.services.pnp import wire_types
+from rse_pf.services.pnp_reader import pnp_reader
 from rse_pf.silent_connections import SilentConnections
 from rse_pf.wire import CODECS, Codec, Command, Failure
 from rse_pf.wire.envelope import peek
@@ -82,9 +82,9 @@ class Dispatcher:
         self._topics = topics
         self._token_watch = token_watch
         self._names = frozenset(service.name for service in answers.registry)
-        types = wire_types(answers.registry)
         self._codecs: dict[str, Codec] = {
-            name: make_server_codec(name, settings.session, pnp=types) for name in CODECS
+            name: make_server_codec(name, settings.session, read_first=pnp_reader(answers.registry, name))
+            for name in CODECS
         }
         serving = settings.serving
         self._awaited: SilentConnections[RobotConnection] = SilentConnections(

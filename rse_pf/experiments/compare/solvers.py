@@ -20,7 +20,8 @@ from rse_pf.errors import error_from_code
 from rse_pf.pnp import PnpOptions
 from rse_pf.service import dispatch
 from rse_pf.services.builtin import builtin_services
-from rse_pf.services.pnp import PnpReply, make_request, wire_types
+from rse_pf.services.pnp import PnpReply, make_request
+from rse_pf.services.pnp_reader import pnp_reader
 from rse_pf.wire import Command, Failure, Result, as_type
 from rse_pf.wire.server_codec import make_server_codec
 
@@ -52,7 +53,7 @@ class InProcessSolver:
         self.server_s = 0.0
         self.inside_s = 0.0
         self._registry = builtin_services(settings)
-        self._codec = make_server_codec(_CODEC, pnp=wire_types(self._registry))
+        self._codec = make_server_codec(_CODEC, read_first=pnp_reader(self._registry, _CODEC))
         self._commands = 0
 
     async def ask(self, query: PoseQuery) -> PoseAnswer:
