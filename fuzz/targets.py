@@ -31,7 +31,7 @@ from rse_pf.services.builtin import builtin_services
 from rse_pf.services.pnp import PnpRequest
 from rse_pf.services.pnp_reader import pnp_reader
 from rse_pf.wire import CODECS, Codec, Command, Failure, Result, as_type, make_codec
-from rse_pf.wire.arrays import json_encode_hook
+from rse_pf.wire.arrays import decode_hook, json_encode_hook
 from rse_pf.wire.envelope import peek, undecodable_id
 from rse_pf.wire.server_codec import make_server_codec
 
@@ -95,8 +95,10 @@ def _outcome(chosen: Codec, data: bytes) -> tuple[str, bytes]:
     try:
         message = chosen.decode_from_robot(data)
         if isinstance(message, Command) and message.service == "pnp":
-            payload = {} if message.payload is None else message.payload
-            message = msgspec.structs.replace(message, payload=as_type(payload, PnpRequest))
+            request = as_type({} if message.payload is None else message.payload, PnpRequest)
+            for array in (request.points_world, request.pixels):
+                decode_hook(np.ndarray, array)  # a server leaves numbers that are not finite to the solver
+            message = msgspec.structs.replace(message, payload=request)
     except RsePfError as error:
         return "zlib" if "zlib" in error.message else error.code, b""
     return "read", _encode(message)
