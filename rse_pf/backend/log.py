@@ -34,10 +34,13 @@ _encode = msgspec.json.Encoder().encode
 class JsonLog:
     """The log of one process; its methods only append to a list."""
 
-    def __init__(self, *, level: str, server: str, wall_clock: Callable[[], float], fd: int = 2) -> None:
+    def __init__(
+        self, *, level: str, server: str, wall_clock: Callable[[], float], fd: int = 2, **about: str
+    ) -> None:
+        """Write nothing yet; every line has the fields *about*, unless it has its own."""
         self.dropped = 0
+        self._about = {"server": server, **about}
         self._lowest = _LEVELS[level]
-        self._server = server
         self._wall_clock = wall_clock
         self._fd = fd
         self._lines: deque[bytes] = deque()
@@ -84,8 +87,8 @@ class JsonLog:
         for name, value in fields.items():
             if isinstance(value, str) and len(value) > _MAX_TEXT:
                 fields[name] = value[-_MAX_TRACEBACK:] if name == "traceback" else value[:_MAX_TEXT]
-        about = {"time": self._wall_clock(), "level": level, "event": event, "server": self._server}
-        line = json_line({**about, **fields}, _encode)
+        head = {"time": self._wall_clock(), "level": level, "event": event}
+        line = json_line({**head, **self._about, **fields}, _encode)
         if len(self._lines) >= _MAX_HELD_LINES:
             self.dropped += 1
             return

@@ -169,7 +169,7 @@ WRONG_INPUTS: tuple[WrongInput, ...] = (
     WrongInput("local logs server-1", USAGE, "takes no server", "name it with --server"),
     WrongInput("local roll server-1", USAGE, "takes no server", "leave the name out"),
     WrongInput("local drain", USAGE, "drain needs a server", "rse-pf local status shows their names"),
-    WrongInput("local status --follow", USAGE, "--server and --follow are for logs", "see rse-pf local --help"),
+    WrongInput("local status --follow", USAGE, "are for logs and events", "see rse-pf local --help"),
     WrongInput("local status --lan 10.1.2.3", USAGE, "--lan, --metrics-port and --record are for the start", "see rse-pf local --help"),
     WrongInput("local --lan status", USAGE, "--lan status is not an address", "for example: --lan 192.168.1.20; ip"),
     WrongInput("local status --burst", USAGE, "--burst is for the start of a platform", "see rse-pf local --help"),

@@ -15,11 +15,11 @@ from rse_pf.child.limited import LimitedProcesses
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError
 from rse_pf.fleet_page import clouds
+from rse_pf.fleet_page.feeds.events import group_of
 from rse_pf.fleet_page.feeds.live_feed import SCOPES, RobotPaths, histories, plain
 from rse_pf.fleet_page.feeds.platform_feed import (
     LocalFeed,
     fleet_document,
-    group_of,
     moved_robots,
 )
 from rse_pf.fleet_page.hub import Hub

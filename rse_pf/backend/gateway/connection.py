@@ -174,6 +174,11 @@ class RobotConnection:
         return self.session is not None and self.session.state == "opening"
 
     @property
+    def is_shown(self) -> bool:
+        """Whether an operator sees the robot: it said Hello, and does not belong to the platform itself."""
+        return self.session is not None and not self.is_opening and not self.is_synthetic
+
+    @property
     def may_move(self) -> bool:
         """Whether the robot said Hello and can be asked to leave for another server."""
         return self.session is not None and self.session.state == "open" and not self._assembler.closed

@@ -190,11 +190,13 @@ class Dispatcher:
                     service = self._answers.label(queued.command.service)
                     if not connection.is_synthetic:
                         self.context.metrics.requests[service, "disconnected"] += 1
-        self.context.log.debug("disconnected", robot=connection.robot)
+        if connection.is_shown:
+            self.context.log.info("robot-offline", robot=connection.robot)
 
     def greet(self, connection: RobotConnection, now: float) -> None:
         """Note that a robot said Hello; while the server leaves, ask the robot to move at once."""
-        self.context.log.debug("connected", robot=connection.robot)
+        if connection.is_shown:
+            self.context.log.info("robot-online", robot=connection.robot)
         self._token_watch.report_hello(connection)
         if self._move is not None:
             connection.move(*self._move, now)

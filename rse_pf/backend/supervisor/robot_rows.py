@@ -17,7 +17,7 @@ MAX_ROBOT_ROWS = 500
 
 
 def robot_rows(connections: Iterable[RobotConnection], now: float) -> list[dict[str, Any]]:
-    """Return a row for each robot that said Hello, by tenant and name, as plain JSON values.
+    """Return a row for each robot that an operator sees, by tenant and name, as plain JSON values.
 
     Args:
         connections: Of the worker.
@@ -33,6 +33,6 @@ def robot_rows(connections: Iterable[RobotConnection], now: float) -> list[dict[
             "last_result": connection.last_result,
         }
         for connection in connections
-        if connection.session is not None and not connection.is_opening and not connection.is_closing
+        if connection.session is not None and connection.is_shown and not connection.is_closing
     ]
     return sorted(rows, key=lambda row: (row["tenant"], row["robot"]))

@@ -32,4 +32,4 @@ async def update_workers(trust: TrustStore, workers: Sequence[WorkerProcess], lo
     if is_new:
         for worker in workers:
             worker.order(TrustOrder(trust.snapshot))
-        log.info("trust", bytes=len(trust.snapshot))
+        log.info("access-control-read", bytes=len(trust.snapshot))

@@ -13,6 +13,8 @@ examples:
   rse-pf local status
   rse-pf local robots
   rse-pf local logs --server server-1 --follow
+  rse-pf local logs --since 5m --level warning
+  rse-pf local events --follow --json
   rse-pf local drain server-1
   rse-pf local roll
   rse-pf local pause server-1 --for 0.3
@@ -24,7 +26,6 @@ from __future__ import annotations
 
 import argparse
 import asyncio
-import collections
 import functools
 import math
 import os
@@ -46,7 +47,8 @@ DEFAULT_NAME = "default"
 _BURST_PORT = 8702
 _FAULTS = ("kill", "pause", "resume", "slow", "partition")
 _OF_A_SERVER = (*_FAULTS, "drain")
-_ACTIONS = ("start", "stop", "status", "robots", "logs", "drain", "roll", *_FAULTS, "kill-balancer")
+_OF_LOGS = ("logs", "events")
+_ACTIONS = ("start", "stop", "status", "robots", *_OF_LOGS, "drain", "roll", *_FAULTS, "kill-balancer")
 _LINES = 100
 _FOLLOW_S = 0.2
 _SAMPLE_S = 0.5
@@ -63,7 +65,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "server", nargs="?", metavar="SERVER", help="the server to drain, kill, pause, resume, slow, ..."
     )
-    parser.add_argument("--json", action="store_true", help="status, robots: as JSON")
+    parser.add_argument("--json", action="store_true", help="status, robots, logs, events: as JSON")
     parser.add_argument(
         "--for", dest="for_s", type=float, metavar="S",
         help="pause, slow, partition: end after S seconds (without: pause stays, the others end with Ctrl-C)",
@@ -91,11 +93,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="port on loopback of the metrics of all servers; 0 takes a free one (local.metrics_port, "
         f"default {defaults.metrics_port})",
     )  # fmt: skip
-    parser.add_argument("--server", dest="of_server", metavar="ID", help="logs: of this process only")
-    parser.add_argument("--follow", action="store_true", help="logs: go on with new lines until Ctrl-C")
-    parser.add_argument(
+    logs = parser.add_argument_group("logs and events")
+    logs.add_argument("--server", dest="of_server", metavar="ID", help="of this process only")
+    logs.add_argument("--follow", action="store_true", help="go on with new lines until Ctrl-C")
+    logs.add_argument(
+        "--since", metavar="TIME", help='all lines of the last 90s, 5m, 2h or 1d, or since "2026-03-01 14:30"'
+    )
+    logs.add_argument("--robot", default="", metavar="NAME", help="lines about this robot only")
+    logs.add_argument("--tenant", default="", metavar="NAME", help="lines about this tenant only")
+    logs.add_argument(
         "--level", choices=("debug", "info", "warning", "error"), default="debug",
-        help="logs: lines of at least this level (default: all)",
+        help="lines of at least this level (default: all)",
     )  # fmt: skip
     parser.add_argument("--no-page", action="store_true", help="start no fleet page")
     parser.add_argument(
@@ -132,7 +140,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
         stopped = stop_platform(folder)
         show(f"platform {args.name!r} {'is stopped' if stopped else 'was not running'}")
         return 0
-    if args.action == "logs":
+    if args.action in _OF_LOGS:
         return _logs(args, folder)
     if args.action != "start":
         return _on_running(args, folder)
@@ -190,12 +198,16 @@ def _check(args: argparse.Namespace) -> None:
             f"rse-pf local {args.action} needs a server", hint="rse-pf local status shows their names"
         )
     if args.action not in _OF_A_SERVER and args.server is not None:
-        hint = "name it with --server" if args.action == "logs" else "leave the name out"
+        hint = "name it with --server" if args.action in _OF_LOGS else "leave the name out"
         raise UsageError(f"rse-pf local {args.action} takes no server", hint=hint)
     if args.action != "start" and args.burst is not None:
         raise UsageError("--burst is for the start of a platform", hint="see rse-pf local --help")
-    if args.action != "logs" and (args.of_server or args.follow):
-        raise UsageError("--server and --follow are for logs", hint="see rse-pf local --help")
+    of_logs = (args.of_server, args.follow, args.since, args.robot, args.tenant)
+    if args.action not in _OF_LOGS and any(of_logs):
+        raise UsageError(
+            "--server, --follow, --since, --robot and --tenant are for logs and events",
+            hint="see rse-pf local --help",
+        )
     of_start = (args.lan, args.metrics_port, args.record)
     if args.action != "start" and any(value is not None for value in of_start):
         raise UsageError(
@@ -282,15 +294,31 @@ def _describe_outcome(server: Any, done: str) -> str:
 
 
 def _logs(args: argparse.Namespace, folder: Path) -> int:
-    from rse_pf.cli.local_platform.logs import LogFollower, format_line, last_lines, log_files
+    from rse_pf.cli.local_platform import logs
 
-    follower = LogFollower(folder, args.of_server, args.level)
-    for line in last_lines(log_files(folder, args.of_server), args.level, _LINES):
-        show(format_line(line))
+    is_events = args.action == "events"
+    wanted = logs.LogFilter(
+        level=args.level,
+        since_s=-math.inf if args.since is None else logs.since_time_s(args.since, time.time()),
+        robot=args.robot,
+        tenant=args.tenant,
+        events_only=is_events,
+    )
+    to_text = logs.format_event if is_events else logs.format_line
+    to_document = logs.event_document if is_events else logs.line_document
+
+    def show_line(line: logs.LogLine) -> None:
+        if args.json:
+            show_json(to_document(line))
+        else:
+            show(to_text(line))
+
+    follower = logs.LogFollower(folder, args.of_server, wanted)
+    for line in logs.last_lines(logs.log_files(folder, args.of_server), wanted, _LINES):
+        show_line(line)
     if args.follow:
         signal.pthread_sigmask(signal.SIG_BLOCK, _STOPPERS)
-        wait = functools.partial(_wait, math.inf, _FOLLOW_S)
-        follower.follow(lambda line: show(format_line(line)), wait)
+        follower.follow(show_line, functools.partial(_wait, math.inf, _FOLLOW_S))
     return 0
 
 
@@ -426,43 +454,17 @@ def _lan_lines(platform: Any, which: str) -> list[str]:
 
 
 def _show(event: Any) -> None:
-    text = _TEXTS.get(event["event"])
-    if text is not None:
-        values = {
-            key: ", ".join(map(str, value)) if isinstance(value, list) else value
-            for key, value in event.items()
-        }
-        show(text.format_map(collections.defaultdict(lambda: "-", values)))
+    from rse_pf.cli.local_platform.logs import local_time
+    from rse_pf.fleet_page.feeds.events import EVENTS, event_sentence
+
+    if event["event"] in EVENTS and event["event"] not in _QUIET:
+        show(f"{local_time(time.time())}  {event_sentence(event)}")
 
 
-_TEXTS = {
-    "adopted": "adopted from an earlier control plane: {servers}",
-    "balancer-back": "the load balancer is back after {seconds} s",
-    "balancer-failed": "the load balancer does not start: {reason}",
-    "balancer-gone": "the load balancer ended: {reason}",
-    "crash-loop": "servers end too soon after their start: the next one starts in {wait_s} s",
-    "data-server-down": "data server {name} ended ({code})",
-    "data-server-failed": "data server {name} does not start: {error}",
-    "data-server-silent": "data server {name} does not answer and is killed",
-    "data-server-up": "data server {name} is ready (pid {pid})",
-    "disk-full": "{reason}",
-    "disk-low": "{reason}",
-    "disk-ok": "there is space again: {reason}",
-    "drain-over": "{server} has left after {seconds} s",
-    "drain-start": "{server} drains ({reason}); its robots move",
-    "grow": "{servers} more: {reason}",
-    "certificate-renewed": "the certificate was renewed; robots notice nothing",
-    "metrics-port-taken": "port {port} is taken: metrics are on another port",
-    "not-written": "{reason}",
-    "platform-ready": "the platform is ready after {seconds:.1f} s",
-    "rebalance": "{robots} robots of {server} are asked to move",
-    "replace": "{server} is replaced by {by}: {reason}",
-    "roll-step": "{server} is replaced ({number} of {of})",
-    "roll-stopped": "{server} did not become healthy, so the old servers stay",
-    "server-failed": "{server} did not start: {reason}",
-    "server-gone": "{server} ended (exit code {exit_code}){cause}",
-    "server-ready": "{server} is ready (pid {pid})",
-    "server-unhealthy": "{server} is unhealthy: {reason}",
-    "shrink": "{servers} less: {reason}",
-}
-"""The line for each event; an event without a line is not shown."""
+_QUIET = frozenset(
+    (
+        "data-server-start", "platform-gone", "server-healthy", "server-launched", "server-out",
+        "standby-started",
+    )
+)  # fmt: skip
+"""Events that the terminal does not show: another event of the same server follows at once."""

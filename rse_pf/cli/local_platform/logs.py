@@ -1,40 +1,115 @@
-"""The action logs: the logs of all processes of a platform in one, by time; also of one that has ended.
+"""The actions logs and events: the logs of all processes of a platform in one, by time; also of one that
+has ended.
 
-Servers write JSON, one object a line; other processes write text.  A log that was rotated or belongs to a
-server that started later is followed, too.
+Servers write JSON, one object a line; other processes write text.  What the control plane did is read from
+its audit log.  A log that was rotated or belongs to a server that started later is followed, too.
 """
 
 from __future__ import annotations
 
 import json
+import math
+import re
 import time
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
+from rse_pf.audit.entry import parse_entry
+from rse_pf.audit.log import CONTROL_PLANE, audit_folder
 from rse_pf.errors import UsageError
+from rse_pf.fleet_page.feeds.audit_log import PLATFORM
+from rse_pf.fleet_page.feeds.events import EVENTS, event_sentence, level_of
 
-__all__ = ["LEVELS", "LogFollower", "LogLine", "format_line", "last_lines", "log_files"]
+__all__ = [
+    "ALL_LINES",
+    "LEVELS",
+    "LogFilter",
+    "LogFollower",
+    "LogLine",
+    "event_document",
+    "format_event",
+    "format_line",
+    "last_lines",
+    "line_document",
+    "local_time",
+    "log_files",
+    "since_time_s",
+]
 
 LEVELS = ("debug", "info", "warning", "error")
+# Bytes at the end of each log that are read, unless a time is given from which on lines are wanted.
 _TAIL_BYTES = 1 << 20
-_HEAD = ("time", "level", "event", "server", "traceback")
+_HEAD = ("time", "level", "event", "traceback")
+# Events that backend servers report themselves.
+_OF_SERVERS = ("robot-", "live-")
+_AGE = re.compile(r"(?P<count>\d{1,9}(\.\d{1,9})?)(?P<unit>[smhd])")
+_UNIT_S = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LogLine:
-    """One line of the log of ``source``.  ``time_s`` is Unix time."""
+    """One line of the log of ``source``.
+
+    ``time_s`` is Unix time; ``fields`` is empty for a line of text.
+    """
 
     time_s: float
     source: str
     level: str
     text: str
+    fields: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LogFilter:
+    """Which lines are wanted: least level, earliest Unix time, robot and tenant; an empty name is any."""
+
+    level: str = "debug"
+    since_s: float = -math.inf
+    robot: str = ""
+    tenant: str = ""
+    events_only: bool = False
+
+    def accepts(self, line: LogLine) -> bool:
+        """Return whether *line* is wanted."""
+        return (
+            (line.level not in LEVELS or LEVELS.index(line.level) >= LEVELS.index(self.level))
+            and line.time_s >= self.since_s
+            and self.robot in ("", line.fields.get("robot"))
+            and self.tenant in ("", line.fields.get("tenant"))
+            and (not self.events_only or _is_event(line))
+        )
+
+
+ALL_LINES = LogFilter()
+
+
+def since_time_s(text: str, now_s: float) -> float:
+    """Return the Unix time that *text* means: an age such as 5m, or a date and time.
+
+    A date without a time zone is in that of this machine.
+
+    Raises:
+        UsageError: It is neither.
+    """
+    age = _AGE.fullmatch(text)
+    if age is not None:
+        return now_s - float(age["count"]) * _UNIT_S[age["unit"]]
+    try:
+        return datetime.fromisoformat(text).timestamp()
+    except (ValueError, OverflowError, OSError):
+        raise UsageError(
+            f"--since {text[:40]!r} is no age and no time",
+            hint='write an age such as 90s, 5m, 2h or 1d, or a time such as "2026-03-01 14:30:00"',
+        ) from None
 
 
 def log_files(folder: Path, server: str | None) -> list[Path]:
     """Return the logs of *folder*, or that of *server*; raises UsageError if there is none."""
-    files = sorted(folder.glob("*.log"))
+    files = _all_files(folder)
     chosen = [file for file in files if server is None or file.stem == server]
     if chosen:
         return chosen
@@ -46,26 +121,50 @@ def log_files(folder: Path, server: str | None) -> list[Path]:
     raise UsageError(f"there is no log of {str(server)[:80]!r}", hint=f"there are logs of {names}")
 
 
-def last_lines(files: Sequence[Path], level: str, count: int) -> list[LogLine]:
-    """Return the newest *count* lines of at least *level* of all files, oldest first."""
-    lines = [line for file in files for line in _parse(file, _tail(file), level)]
-    return sorted(lines, key=lambda line: line.time_s)[-count:]
+def last_lines(files: Sequence[Path], wanted: LogFilter, count: int) -> list[LogLine]:
+    """Return the *wanted* lines of all files, oldest first: the newest *count*, or all since a time."""
+    is_open = math.isinf(wanted.since_s)
+    tail_bytes = _TAIL_BYTES if is_open else None
+    lines = [line for file in files for line in _parse(file, _tail(file, tail_bytes), wanted)]
+    lines.sort(key=lambda line: line.time_s)
+    return lines[-count:] if is_open else lines
+
+
+def local_time(time_s: float) -> str:
+    """Return *time_s* (Unix time) as date and time in the time zone of this machine."""
+    return time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(time_s))
 
 
 def format_line(line: LogLine) -> str:
     """Return *line* for a person, in the local time of this machine."""
-    clock = time.strftime("%H:%M:%S", time.localtime(line.time_s))
-    return f"{clock}  {line.source}  {line.level:7}  {line.text}"
+    return f"{local_time(line.time_s)}  {line.source}  {line.level:7}  {line.text}"
+
+
+def line_document(line: LogLine) -> dict[str, Any]:
+    """Return *line* as plain JSON values."""
+    fields = line.fields or {"text": line.text}
+    return {**fields, "time": line.time_s, "source": line.source, "level": line.level}
+
+
+def format_event(line: LogLine) -> str:
+    """Return the event in *line* as a sentence for a person."""
+    return f"{local_time(line.time_s)}  {event_sentence(line.fields)}"
+
+
+def event_document(line: LogLine) -> dict[str, Any]:
+    """Return the event in *line* as plain JSON values; tenant and robot are null where it has none."""
+    details = {name: value for name, value in line.fields.items() if name not in _HEAD}
+    return {"time": line.time_s, "kind": line.fields["event"], "tenant": None, "robot": None, **details}
 
 
 class LogFollower:
     """Reads what is appended to the logs of a folder from now on."""
 
-    def __init__(self, folder: Path, server: str | None, level: str) -> None:
+    def __init__(self, folder: Path, server: str | None = None, wanted: LogFilter = ALL_LINES) -> None:
         """Begin at the present end of every log."""
         self._folder = folder
         self._server = server
-        self._level = level
+        self._wanted = wanted
         self._read = {file: _size(file) for file in self._files()}
         self._rest: dict[Path, bytes] = {}
 
@@ -81,11 +180,7 @@ class LogFollower:
                 take(line)
 
     def _files(self) -> list[Path]:
-        return [
-            file
-            for file in sorted(self._folder.glob("*.log"))
-            if self._server is None or file.stem == self._server
-        ]
+        return [file for file in _all_files(self._folder) if self._server in (None, file.stem)]
 
     def _of(self, file: Path) -> list[LogLine]:
         at, size = self._read.get(file, 0), _size(file)
@@ -101,25 +196,46 @@ class LogFollower:
             return []
         self._read[file] = at + len(data)
         whole, _, self._rest[file] = (self._rest.get(file, b"") + data).rpartition(b"\n")
-        return list(_parse(file, whole, self._level))
+        return list(_parse(file, whole, self._wanted))
 
 
-def _parse(file: Path, data: bytes, level: str) -> Iterator[LogLine]:
-    """Yield the lines of *data* of at least *level*; a line of text has the level of the line before it.
+def _is_event(line: LogLine) -> bool:
+    """Return whether *line* is an event; the control plane reports all but those of robots and live maps."""
+    kind = line.fields.get("event", "")
+    return kind in EVENTS and (line.source == CONTROL_PLANE or kind.startswith(_OF_SERVERS))
+
+
+def _all_files(folder: Path) -> list[Path]:
+    """Return the logs of all processes, and the audit log of the control plane."""
+    return [*sorted(folder.glob("*.log")), *audit_folder(folder).glob(f"{CONTROL_PLANE}.jsonl")]
+
+
+def _parse(file: Path, data: bytes, wanted: LogFilter) -> Iterator[LogLine]:
+    """Yield the *wanted* lines of *data*; a line of text has time and level of the line before it.
 
     Text before the first line with a time has the time at which the file was written last.
     """
-    least = LEVELS.index(level)
     time_s, last = _written_s(file), "info"
     for text in data.decode("utf-8", "replace").splitlines():
         if not text.strip():
             continue
-        document = _document(text)
+        document = _entry_document(text) if file.stem == CONTROL_PLANE else _document(text)
         if document is not None:
             time_s, last = float(document["time"]), str(document["level"])
-        if last not in LEVELS or LEVELS.index(last) >= least:
-            body = text if document is None else _body(document)
-            yield LogLine(time_s=time_s, source=file.stem, level=last, text=body)
+        body = text if document is None else _body(document, file.stem)
+        line = LogLine(time_s=time_s, source=file.stem, level=last, text=body, fields=document or {})
+        if wanted.accepts(line):
+            yield line
+
+
+def _entry_document(text: str) -> dict[str, Any] | None:
+    """Return the entry of the control plane's audit log in *text* as a line of a log."""
+    entry = parse_entry(text.encode())
+    if entry is None:
+        return None
+    event = entry.action.removeprefix(PLATFORM)
+    subject = {"server": entry.subject} if entry.subject else {}
+    return {"time": entry.time, "level": level_of(event), "event": event, **subject, **entry.detail}
 
 
 def _document(text: str) -> dict[str, Any] | None:
@@ -133,8 +249,12 @@ def _document(text: str) -> dict[str, Any] | None:
     return {"level": "info", **document} if "event" in document else None
 
 
-def _body(document: dict[str, Any]) -> str:
-    fields = " ".join(f"{name}={_word(value)}" for name, value in document.items() if name not in _HEAD)
+def _body(document: Mapping[str, Any], source: str) -> str:
+    fields = " ".join(
+        f"{name}={_word(value)}"
+        for name, value in document.items()
+        if name not in _HEAD and (name != "server" or source == CONTROL_PLANE)
+    )
     trace = str(document.get("traceback", "")).strip().rpartition("\n")[2]
     return " ".join(word for word in (str(document["event"]), fields, trace) if word)
 
@@ -144,12 +264,13 @@ def _word(value: Any) -> str:
     return json.dumps(text) if not text or " " in text else text
 
 
-def _tail(file: Path) -> bytes:
+def _tail(file: Path, most: int | None) -> bytes:
+    """Return the whole lines in the last *most* bytes of *file*; None reads all."""
     try:
         with file.open("rb") as opened:
-            start = max(0, _size(file) - _TAIL_BYTES)
+            start = 0 if most is None else max(0, _size(file) - most)
             opened.seek(start)
-            data = opened.read(_TAIL_BYTES)
+            data = opened.read(most)
     except OSError:
         return b""
     return data.partition(b"\n")[2] if start else data

@@ -56,7 +56,7 @@ def _import_slowly(ordered: threading.Event) -> None:
             return
         importlib.import_module(name)
     importlib.import_module("rse_pf.backend.supervisor").warm_up()
-    show("warm")
+    show("imported everything that a server needs, and waits for its start")
 
 
 if __name__ == "__main__":

@@ -188,7 +188,7 @@ async def _run(source: Path, settings: PlatformSettings, *, once: bool) -> int:
         place = Path(temporary)
         install(service.folder, place / "services", dependencies)
         chosen = settings.replace(services={"folder": str(place / "services"), "accept_weak_isolation": True})
-        output = LogFollower(place / "platform", None, "info")
+        output = LogFollower(place / "platform")
         stopped = asyncio.Event()
         for number in (signal.SIGINT, signal.SIGTERM):
             asyncio.get_running_loop().add_signal_handler(number, stopped.set)

@@ -24,8 +24,9 @@ from rse_pf.config import PlatformSettings
 from rse_pf.errors import RsePfError
 from rse_pf.fleet_page.feeds.audit_log import AuditRows
 from rse_pf.fleet_page.feeds.command_log import CommandLog
+from rse_pf.fleet_page.feeds.events import event_sentence, group_of
 from rse_pf.fleet_page.feeds.percentiles import LastMinute, buckets_of
-from rse_pf.fleet_page.feeds.sentences import event_sentence, waiting_for
+from rse_pf.fleet_page.feeds.sentences import waiting_for
 from rse_pf.fleet_page.hub import Hub
 from rse_pf.identity import DEFAULT_TENANT
 from rse_pf.local.processes import is_alive, mark_of
@@ -35,7 +36,7 @@ from rse_pf.local.together import run_together
 from rse_pf.scaling.profile import cadence_of
 from rse_pf.terminal import printable
 
-__all__ = ["LocalFeed", "fleet_document", "group_of", "moved_robots"]
+__all__ = ["LocalFeed", "fleet_document", "moved_robots"]
 
 _ROBOTS_EVERY_S = 1.0
 _METRICS_EVERY_S = 5.0
@@ -51,13 +52,6 @@ _MAX_TOLD_MOVES = 50
 _MAX_GONE = 500
 _UNREADABLE = (RsePfError, OSError, ValueError, KeyError, TypeError)
 """A server of another version, or one that is just killed, may answer anything: it is asked again."""
-_TROUBLE = ("gone", "failed", "unhealthy", "crash", "silent", "down", "taken", "not-")
-_SCALING = frozenset(
-    (
-        "grow", "shrink", "replace", "drain-start", "drain-over", "roll-step", "roll-stopped", "rebalance",
-        "robot-moved",
-    )
-)  # fmt: skip
 
 
 class LocalFeed:
@@ -259,17 +253,6 @@ def moved_robots(before: Mapping[str, str], after: Mapping[str, str]) -> list[tu
         for robot, server in after.items()
         if robot in before and before[robot] != server
     ]
-
-
-def group_of(kind: str) -> str:
-    """Return the filter under which an event of *kind* is found."""
-    if kind.startswith(("server-killed", "server-paused", "server-resumed", "balancer-killed", "fault")):
-        return "fault"
-    if kind.startswith("audit"):
-        return "audit"
-    if any(word in kind for word in _TROUBLE):
-        return "trouble"
-    return "scaling" if kind in _SCALING else "other"
 
 
 def _robot(tenant: str, name: str) -> str:

@@ -1,4 +1,4 @@
-"""What the scale modifier waits for and what an event means, in words; pure.
+"""What the scale modifier waits for, in words; pure.
 
 The sentences follow `rse_pf.scaling.policy.decide`, whose result they announce: a test compares the two.
 """
@@ -13,7 +13,7 @@ from rse_pf.config.elasticity import IDLE_CPU_PERCENT, UNDERUSED_CPU_PERCENT
 from rse_pf.scaling.policy import BIG_STEP, STEP
 from rse_pf.scaling.profile import cadence_of
 
-__all__ = ["event_sentence", "waiting_for"]
+__all__ = ["waiting_for"]
 
 _NUMBERS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten")
 
@@ -43,21 +43,6 @@ def waiting_for(policy: Mapping[str, Any], settings: ScalingSettings, *, servers
         *reasons,
         _underused_reason(samples, policy, settings, servers) or "the servers are neither busy nor idle",
     ]
-
-
-def event_sentence(event: Mapping[str, Any]) -> str:
-    """Return *event* as a sentence; its kind and details if it has none of its own."""
-    kind = str(event.get("event", ""))
-    text = _EVENTS.get(kind)
-    values = {name: _format_value(value) for name, value in event.items()}
-    if text is not None:
-        return text.format_map(_Missing(values))
-    details = [
-        f"{name} {value}"
-        for name, value in values.items()
-        if value and name not in ("event", "time_s", "number")
-    ]
-    return f"{kind.replace('-', ' ')}: {', '.join(details)}" if details else kind.replace("-", " ")
 
 
 def _busy_reason(
@@ -136,54 +121,3 @@ def _servers(count: int, *, more: bool = False) -> str:
 def _count_phrase(count: int, noun: str) -> str:
     word = _NUMBERS[count] if 0 <= count < len(_NUMBERS) else str(count)
     return f"{word} {noun}{'' if count == 1 else 's'}"
-
-
-def _format_value(value: Any) -> str:
-    return ", ".join(map(str, value)) if isinstance(value, list | tuple) else str(value)
-
-
-class _Missing(dict[str, str]):
-    def __missing__(self, key: str) -> str:
-        return "-"
-
-
-_EVENTS = {
-    "adopted": "servers of an earlier control plane were adopted: {servers}",
-    "balancer-back": "the load balancer is back after {seconds} s",
-    "balancer-failed": "the load balancer does not start: {reason}",
-    "balancer-gone": "the load balancer ended: {reason}",
-    "balancer-killed": "the load balancer was killed",
-    "certificate-renewed": "the certificate was renewed",
-    "crash-loop": "servers end too soon after their start: the next one starts in {wait_s} s",
-    "data-server-down": "data server {name} ended ({code})",
-    "data-server-failed": "data server {name} does not start: {error}",
-    "data-server-silent": "data server {name} does not answer and is killed",
-    "data-server-start": "data server {name} starts",
-    "data-server-up": "data server {name} is ready",
-    "drain-over": "{server} has left after {seconds} s",
-    "drain-start": "{server} drains ({reason}); its robots move",
-    "grow": "{servers} more: {reason}",
-    "control-plane-silent": "the control plane does not answer",
-    "metrics-port-taken": "port {port} is taken: the metrics have another one",
-    "not-written": "something could not be written: {reason}",
-    "over": "the control plane has ended",
-    "platform-gone": "the platform has ended",
-    "platform-ready": "the platform is ready after {seconds} s",
-    "rebalance": "{robots} robots of {server} are asked to move",
-    "replace": "{server} is replaced by {by}: {reason}",
-    "robot-moved": "{robot} moved from {before} to {server}",
-    "roll-step": "{server} is replaced, one of {of}",
-    "roll-stopped": "{server} did not become healthy, so the old servers stay",
-    "server-failed": "{server} did not start: {reason}",
-    "server-gone": "{server} ended (exit code {exit_code})",
-    "server-healthy": "{server} is healthy and takes robots",
-    "server-killed": "{server} was killed by the operator",
-    "server-launched": "{server} starts",
-    "server-out": "{server} gets no robots any more",
-    "server-paused": "{server} was paused by the operator",
-    "server-ready": "{server} is ready",
-    "server-resumed": "{server} goes on",
-    "server-unhealthy": "{server} is unhealthy: {reason}",
-    "shrink": "{servers} less: {reason}",
-    "standby-started": "a warm standby was started",
-}

@@ -12,7 +12,7 @@ from rse_pf.identity import RobotId
 def connection(name: str, tenant: str = "default", **changed: Any) -> Any:
     fields = {
         "robot": RobotId(tenant, name), "session": SimpleNamespace(codec=SimpleNamespace(name="bin")),
-        "opened_s": 10.0, "commands": 3, "last_result": "busy", "is_opening": False, "is_closing": False,
+        "opened_s": 10.0, "commands": 3, "last_result": "busy", "is_shown": True, "is_closing": False,
         **changed,
     }  # fmt: skip
     return SimpleNamespace(**fields)
@@ -33,7 +33,7 @@ def test_robots_are_listed_by_tenant_and_name_with_the_age_of_their_connections(
 def test_sockets_that_are_no_robots_yet_or_any_more_are_left_out() -> None:
     others = [
         connection("a", session=None),
-        connection("b", is_opening=True),
+        connection("b", is_shown=False),
         connection("c", is_closing=True),
     ]
 

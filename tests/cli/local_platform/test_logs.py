@@ -3,12 +3,25 @@
 from __future__ import annotations
 
 import json
+import math
 import os
+from datetime import datetime, timezone
 from pathlib import Path
 
 import pytest
 
-from rse_pf.cli.local_platform.logs import LogFollower, format_line, last_lines, log_files
+from rse_pf.cli.local_platform.logs import (
+    ALL_LINES,
+    LogFilter,
+    LogFollower,
+    event_document,
+    format_event,
+    format_line,
+    last_lines,
+    line_document,
+    log_files,
+    since_time_s,
+)
 from rse_pf.errors import UsageError
 
 
@@ -34,21 +47,21 @@ def events(found: list) -> list[str]:
 
 
 def test_lines_of_all_processes_are_in_the_order_of_their_times(folder: Path) -> None:
-    found = last_lines(log_files(folder, None), "debug", 10)
+    found = last_lines(log_files(folder, None), ALL_LINES, 10)
 
     assert events(found) == ["server-ready", "command", "a", "[warning]", "defect"]
-    assert events(last_lines(log_files(folder, None), "debug", 2)) == ["[warning]", "defect"]
+    assert events(last_lines(log_files(folder, None), ALL_LINES, 2)) == ["[warning]", "defect"]
 
 
 def test_a_level_and_a_server_choose(folder: Path) -> None:
-    assert events(last_lines(log_files(folder, None), "error", 10)) == ["defect"]
-    assert events(last_lines(log_files(folder, "server-2"), "debug", 10)) == ["command", "a"]
+    assert events(last_lines(log_files(folder, None), LogFilter(level="error"), 10)) == ["defect"]
+    assert events(last_lines(log_files(folder, "server-2"), ALL_LINES, 10)) == ["command", "a"]
 
 
 def test_a_line_shows_its_fields_and_the_end_of_a_traceback(folder: Path) -> None:
-    found = last_lines(log_files(folder, None), "debug", 10)
+    found = last_lines(log_files(folder, None), ALL_LINES, 10)
 
-    assert format_line(found[1])[8:] == '  server-2  debug    command robot="r 1" id=7'
+    assert format_line(found[1])[19:] == '  server-2  debug    command robot="r 1" id=7'
     assert format_line(found[-1]).endswith("error    defect ZeroDivisionError")
 
 
@@ -61,7 +74,7 @@ def test_an_unknown_server_and_an_empty_folder_are_refused_with_what_there_is(fo
 
 
 def test_what_is_appended_is_followed_also_in_a_rotated_and_in_a_new_log(folder: Path) -> None:
-    follower = LogFollower(folder, None, "info")
+    follower = LogFollower(folder, wanted=LogFilter(level="info"))
     assert follower.new_lines() == []
 
     with (folder / "server-1.log").open("a") as log:
@@ -75,3 +88,80 @@ def test_what_is_appended_is_followed_also_in_a_rotated_and_in_a_new_log(folder:
 
     (folder / "server-1.log").write_text(line(50, "rotated"))
     assert events(follower.new_lines()) == ["rotated"]
+
+
+def entry(time_s: float, action: str, subject: str = "", **detail: object) -> str:
+    fields = {"time": time_s, "actor": "control-plane", "action": action, "subject": subject}
+    return json.dumps({**fields, "detail": detail}) + "\n"
+
+
+@pytest.fixture
+def with_events(folder: Path) -> Path:
+    (folder / "audit").mkdir()
+    (folder / "audit" / "control-plane.jsonl").write_text(
+        entry(15, "platform.server-healthy", "server-2", pid=7)
+        + entry(33, "platform.server-gone", "server-2", exit_code=-9, cause="")
+    )
+    with (folder / "server-1.log").open("a") as log:
+        log.write(line(34, "robot-offline", robot="r1", tenant="acme"))
+        log.write(line(35, "robot-online", robot="r1", tenant="default"))
+    return folder
+
+
+def chosen(folder: Path, **wanted: object) -> list[str]:
+    return events(last_lines(log_files(folder, None), LogFilter(**wanted), 10))
+
+
+def test_what_the_control_plane_did_is_among_the_lines_with_the_level_of_its_kind(with_events: Path) -> None:
+    found = last_lines(log_files(with_events, "control-plane"), ALL_LINES, 10)
+
+    assert [(line.level, line.text) for line in found] == [
+        ("info", "server-healthy server=server-2 pid=7"),
+        ("warning", 'server-gone server=server-2 exit_code=-9 cause=""'),
+    ]
+
+
+def test_time_robot_and_tenant_choose_lines(with_events: Path) -> None:
+    assert chosen(with_events, since_s=33.0) == ["server-gone", "robot-offline", "robot-online"]
+    assert chosen(with_events, robot="r1", tenant="acme") == ["robot-offline"]
+    assert chosen(with_events, tenant="default") == ["robot-online"]
+    many = [line(40 + number / 1e3, "drain") for number in range(200)]
+    (with_events / "server-3.log").write_text("".join(many))
+    assert len(last_lines(log_files(with_events, "server-3"), LogFilter(since_s=40.0), 10)) == len(many)
+
+
+def test_a_line_as_json_has_its_fields_its_time_and_its_source(with_events: Path) -> None:
+    found = last_lines(log_files(with_events, "server-2"), ALL_LINES, 10)
+
+    command = line_document(found[0])
+    assert (command["time"], command["source"], command["event"]) == (20.0, "server-2", "command")
+    text = {"text": "a thread died", "time": 20.0, "source": "server-2", "level": "debug"}
+    assert line_document(found[1]) == text
+
+
+def test_events_are_the_lines_that_a_program_can_follow(with_events: Path) -> None:
+    found = last_lines(log_files(with_events, None), LogFilter(events_only=True), 10)
+
+    documents = [event_document(each) for each in found]
+    assert [each["kind"] for each in documents] == [
+        "server-healthy", "server-gone", "robot-offline", "robot-online",
+    ]  # fmt: skip
+    assert documents[1]["robot"] is None
+    offline = {"time": 34.0, "kind": "robot-offline", "tenant": "acme", "robot": "r1", "server": "s"}
+    assert documents[2] == offline
+    assert format_event(found[2]).endswith("  acme/r1 is no longer connected to s")
+    assert format_event(found[3]).endswith("  r1 is connected to s")
+
+
+def test_a_time_is_an_age_or_a_date_and_everything_else_is_refused() -> None:
+    now_s = 1_800_000_000.0
+
+    ages = {"90s": 90.0, "5m": 300.0, "1.5h": 5400.0, "2d": 172_800.0}
+    assert {text: now_s - since_time_s(text, now_s) for text in ages} == ages
+    date = datetime(2026, 3, 1, 14, 30, tzinfo=timezone.utc)
+    assert since_time_s("2026-03-01 14:30+00:00", now_s) == date.timestamp()
+    assert since_time_s("2026-03-01 14:30", now_s) == date.replace(tzinfo=None).timestamp()
+    for text in ("5", "5 minutes", "yesterday", "-5m", "14:30", "", "9999999999d"):
+        with pytest.raises(UsageError) as caught:
+            assert math.isnan(since_time_s(text, now_s)), text
+        assert "5m" in caught.value.hint

@@ -11,7 +11,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import functools
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Coroutine, Iterable
 from typing import Any
 
 import msgspec
@@ -52,6 +52,7 @@ from rse_pf.live_map.outcomes import (
     Joined,
     LinkRemoved,
     OptimiseWanted,
+    Outcome,
     Unaligned,
 )
 from rse_pf.slam.keyframe import decode_keyframe
@@ -384,6 +385,7 @@ class LiveOwner:
         """Apply an entry; return what to tell, and the objects of culled keyframes; in the map's thread."""
         applied = self._state.apply(position, events)
         outcomes = [each for found in applied.outcomes for each in found]
+        self._log_alignments(outcomes)
         told: list[dict[str, Any]] = []
         keyframes = [event for event in events if isinstance(event, KeyframeAdded)]
         if (
@@ -396,6 +398,18 @@ class LiveOwner:
             told += self._book.place(event)
         culled = [i for each in outcomes if isinstance(each, Culled) for i in each.ids]
         return applied, told, self._state.live_map.objects_of(culled) if culled else []
+
+    def _log_alignments(self, outcomes: Iterable[Outcome]) -> None:
+        for each in outcomes:
+            if isinstance(each, Joined):
+                self._context.log.info(
+                    "live-aligned", map=self._context.map_name, robot=self._name_of(each.robot)
+                )
+            elif isinstance(each, Unaligned):
+                self._context.log.warning(
+                    "live-alignment-lost", map=self._context.map_name, robot=self._name_of(each.robot),
+                    reason=each.reason,
+                )  # fmt: skip
 
     def _settle(self, batch: list[Submitted], applied: Applied) -> None:
         for each, outcomes, defect in zip(batch, applied.outcomes, applied.defects, strict=True):

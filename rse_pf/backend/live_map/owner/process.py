@@ -157,7 +157,9 @@ class _Process:
         self._socket = socket_
         self._name = f"{order.server}-{secrets.token_hex(8)}"
         self._threads = OwnerThreads()
-        self._log = JsonLog(level=settings.serving.log_level, server=order.server, wall_clock=time.time)
+        self._log = JsonLog(
+            level=settings.serving.log_level, server=order.server, wall_clock=time.time, tenant=order.tenant
+        )  # fmt: skip
         self._lease = OwnerLease(
             store, lease_name(order.tenant, order.map_name), owner=self._name,
             server=order.server, clock=time.monotonic,
@@ -202,8 +204,8 @@ class _Process:
 
         state = await self._retry(lambda act: self._threads.compute(Urgency.APPLY, act), take)
         self._log.info(
-            "live-map-owned", map=self._order.map_name, tenant=self._order.tenant, epoch=record.epoch,
-            version=state.position, keyframes=state.keyframes, seconds=round(time.monotonic() - began_s, 3),
+            "live-map-owned", map=self._order.map_name, epoch=record.epoch, version=state.position,
+            keyframes=state.keyframes, seconds=round(time.monotonic() - began_s, 3),
         )  # fmt: skip
         return state, log
 
@@ -239,7 +241,7 @@ class _Process:
         orders.cancel()
         if how != "lost":
             await server.close()
-        self._log.info("live-map-given-up", map=order.map_name, tenant=order.tenant, how=how)
+        self._log.info("live-map-given-up", map=order.map_name, how=how)
         self._log.close()
 
     def _context(

@@ -11,11 +11,14 @@ import pytest
 from rse_pf.backend.live_map.owner.lease import verdict_on
 from rse_pf.backend.live_map.owner.live_owner import MapMoves
 from rse_pf.backend.live_map.owner.log import LiveLog
+from rse_pf.backend.live_map.owner.state import MapKind
 from rse_pf.errors import BadRequest, Conflict, InternalError, NotFound, StoreError
 from rse_pf.identity import RobotId
-from rse_pf.live_map.events import MapStarted, decode_events
+from rse_pf.live_map.events import Event, KeyframeAdded, MapStarted, decode_events
+from rse_pf.live_map.outcomes import Joined, Outcome, Unaligned
 from rse_pf.maps.registry import MapRegistry
 from rse_pf.object_store import MemoryStore
+from tests.backend.live_map.fake_map import FAKE_MAP, FakeMap
 from tests.backend.live_map.owner_bench import FOLDER, MAP, ROBOT, Bench, FailingStore, InlineThreads, settle
 
 _T = TypeVar("_T")
@@ -57,6 +60,26 @@ async def test_a_keyframe_that_is_sent_again_is_acknowledged_and_not_added_twice
     await asyncio.gather(owner.keyframe(0), owner.keyframe(0))
     assert (await owner.keyframe(0))["number"] == 1
     assert owner.state.keyframes == 1
+
+
+async def test_the_log_says_when_a_robot_is_aligned_and_when_it_no_longer_is():
+    class Joining(FakeMap):
+        def apply(self, event: Event) -> list[Outcome]:
+            outcomes = super().apply(event)
+            if isinstance(event, KeyframeAdded) and event.number == 0:
+                outcomes.append(Joined(robot=event.robot, segment=0, links=3))
+            elif isinstance(event, KeyframeAdded):
+                outcomes.append(Unaligned(robot=event.robot, segment=0, reason="no loop closure"))
+            return outcomes
+
+    bench = Bench(kind=MapKind(empty=Joining, restore=Joining.restore, started_from=FAKE_MAP.started_from))
+    owner = await bench.own("a")
+    for number in range(2):
+        await owner.keyframe(number)
+
+    about = {"map": MAP, "robot": ROBOT.name}
+    assert ("info", "live-aligned", about) in bench.log.events
+    assert ("warning", "live-alignment-lost", {**about, "reason": "no loop closure"}) in bench.log.events
 
 
 async def test_keyframes_of_one_robot_may_be_on_their_way_at_the_same_time_but_none_ahead():

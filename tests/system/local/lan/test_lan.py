@@ -98,7 +98,7 @@ class Lan:
     def wait_for_trust(self) -> None:
         """Wait until the server has read the roster, as it does twice a second."""
         deadline = time.monotonic() + SOON_S
-        while '"event":"trust"' not in (self.folder / "server-1.log").read_text():
+        while '"event":"access-control-read"' not in (self.folder / "server-1.log").read_text():
             assert time.monotonic() < deadline, "the server has not read the roster"
             threading.Event().wait(0.02)
 
