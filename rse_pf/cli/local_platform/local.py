@@ -17,6 +17,7 @@ examples:
   rse-pf local events --follow --json
   rse-pf local drain server-1
   rse-pf local roll
+  rse-pf local roll --settings settings.json
   rse-pf local pause server-1 --for 0.3
   rse-pf local slow server-2 --percent 10 --for 30
   rse-pf local stop
@@ -340,6 +341,8 @@ def _operate(args: argparse.Namespace, state: Any) -> int:
     from rse_pf.cli.local_platform.operations import operate
 
     parameters = {} if args.server is None else {"server": args.server}
+    if args.action == "roll" and args.settings is not None:
+        parameters = {"settings": str(args.settings.absolute())}
     try:
         operate(state, args.action, _show, **parameters)
     except KeyboardInterrupt:

@@ -93,7 +93,7 @@ class ControlPlane:
         )
         self._fleet = fleet
         self._load_balancer = load_balancer
-        self._settings = settings
+        self.settings = settings
         self._elastic = options.elastic
         self._compress = options.compress
         self._is_idle = not options.elastic and options.on_sample is None
@@ -187,9 +187,9 @@ class ControlPlane:
         """Count *ok*; the clock is compressed, too, so that the grace period is shorter."""
         health = member.health
         now_s = time.monotonic() * self._compress
-        member.health = observe(health, ok, self._settings.health, now_s=now_s)
+        member.health = observe(health, ok, self.settings.health, now_s=now_s)
         if member.health.state == "unhealthy" and health.state != "unhealthy":
-            failed = self._settings.health.unhealthy_checks
+            failed = self.settings.health.unhealthy_checks
             self._emit("server-unhealthy", server=member.name, reason=f"{failed} checks in a row failed")
             self._act_soon()
 
@@ -251,7 +251,7 @@ class ControlPlane:
             silent,
             member.observed,
             observed,
-            capacity=capacity_cores(self._settings.serving, workers, self._cores),
+            capacity=capacity_cores(self.settings.serving, workers, self._cores),
         )
         if observed is not None:
             member.observed = observed
@@ -312,7 +312,7 @@ class ControlPlane:
         while True:
             try:
                 self._load_balancer.launch()
-                await self._load_balancer.wait_live(self._settings.local.start_timeout_s)
+                await self._load_balancer.wait_live(self.settings.local.start_timeout_s)
                 return
             except ConfigurationError as error:
                 self._emit("balancer-failed", reason=error.message, wait_s=pause_s)

@@ -115,7 +115,7 @@ class Fleet:
         self.launched = 0
         self._backend_servers = backend_servers
         self._load_balancer = load_balancer
-        self._settings = settings
+        self.settings = settings
         self._compress = compress
         self._calm_s = _CALM_S / compress
         self._warm_up_s = settings.scaling.warm_up_s / compress
@@ -317,8 +317,8 @@ class Fleet:
 
     async def finish_drain(self, member: Member, began_s: float) -> dict[str, Any]:
         """Wait until the balancer has dropped it, let it move its robots, and wait until it has left."""
-        serving, session = self._settings.serving, self._settings.session
-        notice_s = time_to_notice_s(self._settings.health, local=True)
+        serving, session = self.settings.serving, self.settings.session
+        notice_s = time_to_notice_s(self.settings.health, local=True)
         if await self._load_balancer.wait_gone(member.name, STOP_TIMEOUT_S):
             self._emit("server-out", server=member.name)
         server = member.server
@@ -373,7 +373,7 @@ class Fleet:
 
     async def _start(self, member: Member) -> None:
         try:
-            await self.bring_up(member, self._settings.local.start_timeout_s)
+            await self.bring_up(member, self.settings.local.start_timeout_s)
         except ConfigurationError as error:
             self._emit("server-failed", server=member.name, reason=error.message)
             if member.server is not None:  # announced, but never healthy: `_watch` handles its end

@@ -6,12 +6,15 @@ import asyncio
 import functools
 import json
 from collections.abc import AsyncGenerator, Callable, Coroutine, Mapping, Sequence
+from pathlib import Path
 from typing import Any, Protocol
 
+from rse_pf.config import PlatformSettings, load_settings
 from rse_pf.errors import ConfigurationError, UsageError
 from rse_pf.local.control.control_port import METRICS_TYPE, serve_control_port
 from rse_pf.local.control.federation import federate_pages
 from rse_pf.local.control.operations import OVER, Operations
+from rse_pf.local.control.settings_change import SettingsChange
 from rse_pf.local.servers.backend_servers import BackendServer
 from rse_pf.local.servers.control_client import ControlPort
 
@@ -39,8 +42,11 @@ class OperatedPlatform(Protocol):
     async def drain(self, name: str, reason: str = "asked") -> dict[str, Any]:
         """Let *name* leave."""
 
-    async def roll(self) -> None:
-        """Replace every server."""
+    def check_roll(self, settings: PlatformSettings) -> SettingsChange:
+        """Return what a roll with *settings* changes; raises UsageError."""
+
+    async def roll(self, change: SettingsChange | None = None) -> None:
+        """Replace every server; with *change*, the new ones have other settings."""
 
     def kill(self, name: str) -> None:
         """End *name* as a crash would; raises UsageError."""
@@ -135,7 +141,9 @@ class OperatorPort:
         return self._operations.begin("drain", lambda: self._platform.drain(name))
 
     def _roll(self, query: Mapping[str, str]) -> AsyncGenerator[Event, None]:
-        return self._operations.begin("roll", self._platform.roll)
+        file = query.get("settings")
+        change = None if file is None else self._platform.check_roll(load_settings(Path(file)))
+        return self._operations.begin("roll", lambda: self._platform.roll(change))
 
     def _move(self, query: Mapping[str, str]) -> AsyncGenerator[Event, None]:
         name, robots = query.get("server", ""), _count(query.get("robots", ""))

@@ -32,6 +32,7 @@ from rse_pf.local.control.fleet import Fleet, FleetReports, Member
 from rse_pf.local.control.operator_port import OperatorPort
 from rse_pf.local.control.platform_recording import PlatformRecording
 from rse_pf.local.control.scale_modifier import bounds_for
+from rse_pf.local.control.settings_change import SettingsChange, settings_change
 from rse_pf.local.disk_watch import DiskWatch
 from rse_pf.local.firewall import check_lan_settings, check_listener, ensure_key, key_file, robots_url
 from rse_pf.local.lan.listener import LanListener, authority_file
@@ -114,8 +115,8 @@ class LocalPlatform:
         self.name = name or state.name
         self.state = state.absolute()
         self.settings = settings
-        self._placement = local_placement(settings, self.state)
-        self._disks = DiskWatch(self.state, self._placement.store, emit=self._emit)
+        store = local_placement(settings, self.state).store
+        self._disks = DiskWatch(self.state, store, emit=self._emit)
         self._count = settings.local.servers if servers is None else servers
         self._wanted_port = settings.local.port if port is None else port
         self._has_data = data
@@ -137,7 +138,7 @@ class LocalPlatform:
             write=self._disks.write, lan=self.lan,
         )  # fmt: skip
         self.data_servers = LocalDataServers(
-            settings, folder=self.state, store=self._placement.store, dies_with_parent=not adoptable,
+            settings, folder=self.state, store=store, dies_with_parent=not adoptable,
             replaces=control.elastic, program=program, is_full=self._disks.is_full,
             emit=self._report_data_change,
         )  # fmt: skip
@@ -321,15 +322,54 @@ class LocalPlatform:
         await self._wait_until_healthy([new])
         return new
 
-    async def roll(self) -> None:
-        """Replace every server, one by one: the new one serves before the old one is drained.
-
-        A warm standby of before is ended first: it has the old release in its memory.
+    def check_roll(self, settings: PlatformSettings) -> SettingsChange:
+        """Return what a roll with *settings* changes.
 
         Raises:
-            ConfigurationError: A new server did not become healthy, and was withdrawn; the roll has stopped
-                and the old servers that are left serve on.
+            UsageError: Nothing changes, or a change needs a restart of the platform.
+            ConfigurationError: A platform that is open to its network cannot have them.
         """
+        change = settings_change(self.settings, settings)
+        if self.lan is not None:
+            check_lan_settings(change.settings)
+        return change
+
+    async def roll(self, change: SettingsChange | None = None) -> None:
+        """Replace every server, one by one: the new one serves before the old one is drained.
+
+        The data service is replaced last; its clients repeat what they asked for meanwhile.  A warm standby
+        of before is ended first: it has the old release in its memory.  *change* has the settings of the
+        new servers; None leaves them as they are.
+
+        Raises:
+            ConfigurationError: A new server did not become healthy, and was withdrawn; the roll has stopped,
+                and the old servers that are left serve on.  Servers that start later have the old settings.
+        """
+        before = self.settings
+        if change is not None:
+            self._emit("roll-settings", settings=change.words)
+            self._write_settings(change.settings)
+        try:
+            await self._replace_servers()
+            await self.data_servers.restart(STOP_TIMEOUT_S)
+        except BaseException:
+            self._write_settings(before)
+            raise
+        self._fleet.settings = self._control.settings = self.settings
+        self._write_state()
+
+    def _write_settings(self, settings: PlatformSettings) -> None:
+        """Take *settings* for the servers that start from now on; raises ConfigurationError."""
+        file = settings_file(self.state)
+        try:
+            replace_json(file, local_placement(settings, self.state).document(settings), indent=1)
+        except OSError as error:
+            raise ConfigurationError(
+                f"{file} cannot be written: {error.strerror}", hint="free some space, or make it writable"
+            ) from error
+        self.settings = settings
+
+    async def _replace_servers(self) -> None:
         self._control.hold = True
         try:
             servers = [server.name for server in self.servers]
@@ -420,7 +460,7 @@ class LocalPlatform:
     async def _start(self, previous: PlatformState | None, end: float) -> None:
         self._key = ensure_key(self.state, seed=secrets.token_bytes(32), key_id=secrets.token_hex(4))
         token = ensure_control_token(control_token_file(self.state), seed=secrets.token_bytes(32))
-        replace_json(settings_file(self.state), self._placement.document(self.settings), indent=1)
+        self._write_settings(self.settings)
         self._recording.begin()
         self._disks.prepare()
         self._control.start_checks()

@@ -117,6 +117,21 @@ class LocalDataServers:
             await self._launch()
         self._watching = asyncio.create_task(self._watch())
 
+    async def restart(self, timeout_s: float) -> None:
+        """Replace the process, if there is one, by one that reads the settings anew, at the same port.
+
+        Raises:
+            ConfigurationError: It did not start; that is tried again from now on.
+        """
+        if self._watching is None:
+            return
+        await self.forget()
+        await self.process.stop(signal.SIGTERM, timeout_s)
+        try:
+            await self._launch()
+        finally:
+            self._watching = asyncio.create_task(self._watch())
+
     def adopt(self, mark: ProcessMark, port: int) -> None:
         """Watch the process of an earlier control plane, and replace it when it ends."""
         self.process.mark, self.port = mark, port

@@ -1,0 +1,75 @@
+"""Which settings of a running platform a roll can change; pure.
+
+New backend servers and the new data service of a roll read the settings anew.  The control plane and the load
+balancer keep those that they were started with.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from rse_pf.config import PlatformSettings, setting_rows
+from rse_pf.errors import UsageError
+
+__all__ = ["SettingsChange", "settings_change"]
+
+_OF_OTHER_PROGRAMS = ("batch.", "cloud.")
+"""Groups that no process of a local platform reads."""
+_OF_OPTIONS = frozenset(
+    (
+        "local.servers", "local.port", "local.metrics_port", "recording.folder", "services.folder",
+        "services.accept_weak_isolation", "burst.url",
+    )
+)  # fmt: skip
+"""Options of the start may have set these: they keep their values unless the file sets another one."""
+_KEPT_UNTIL_RESTART = (
+    "local.", "scaling.", "health.", "recording.", "data.store", "serving.host", "serving.rosbridge",
+    "session.hello_timeout_s", "session.ping_interval_s", "session.ping_timeout_s",
+)  # fmt: skip
+"""Groups and settings that the control plane or the load balancer reads at its start."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SettingsChange:
+    """The settings after a roll, and each change in words."""
+
+    settings: PlatformSettings
+    words: tuple[str, ...]
+
+
+def settings_change(running: PlatformSettings, wanted: PlatformSettings) -> SettingsChange:
+    """Return what a roll changes with a file that has *wanted*.
+
+    Raises:
+        UsageError: Nothing changes, or a change needs a restart of the platform.
+    """
+    before = _values(running)
+    defaults = _values(PlatformSettings())
+    changed = {
+        name: value
+        for name, value in _values(wanted).items()
+        if value != before[name]
+        and not name.startswith(_OF_OTHER_PROGRAMS)
+        and not (name in _OF_OPTIONS and value == defaults[name])
+    }
+    if not changed:
+        raise UsageError(
+            "the file changes no setting of the platform that runs: no server was replaced",
+            hint="leave --settings out to replace the servers as they are",
+        )
+    kept = [name for name in changed if name.startswith(_KEPT_UNTIL_RESTART)]
+    if kept:
+        raise UsageError(
+            f"{', '.join(kept)} {'needs' if len(kept) == 1 else 'need'} a restart of the platform",
+            hint="take the change out of the file and roll with the others, or see docs/howto/upgrade.md",
+        )
+    groups: dict[str, dict[str, object]] = {}
+    for name, value in changed.items():
+        group, _, setting = name.partition(".")
+        groups.setdefault(group, {})[setting] = value
+    words = tuple(f"{name} = {value!r} (was {before[name]!r})" for name, value in changed.items())
+    return SettingsChange(settings=running.replace(**groups), words=words)
+
+
+def _values(settings: PlatformSettings) -> dict[str, object]:
+    return {f"{row.group}.{row.name}": row.value for row in setting_rows(settings)}
