@@ -83,6 +83,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="store of the maps: dir:PATH or s3:BUCKET (default: data.store, or that of rse-pf local)",
     )
     common.add_argument(
+        "--name", dest="platform", metavar="PLATFORM", help="platform of this machine whose maps are meant"
+    )
+    common.add_argument(
         "--tenant", default="default", help="tenant that owns the maps (default: %(default)s)"
     )
     common.add_argument("--json", action="store_true", help="print JSON")
@@ -150,7 +153,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
         return run_bags(args, settings)
     if args.action == "localise" and is_remote(args):
         return localise_photos(args)
-    chosen = with_store(args.store, settings)
+    chosen = with_store(args.store, settings, args.platform)
     if args.action in ("live", "publish"):
         return (run_live if args.action == "live" else run_publish)(args, chosen)
     maps = open_maps(chosen, args.tenant)

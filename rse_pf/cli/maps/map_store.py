@@ -29,12 +29,18 @@ _MAP_NAME = re.compile(r"[a-z0-9][a-z0-9-]{0,63}")
 _NO_NAME = re.compile(r"[^a-z0-9]+")
 
 
-def with_store(named: str | None, settings: PlatformSettings) -> PlatformSettings:
-    """Return the settings with the store that is *named*, or that is found.
+def with_store(
+    named: str | None, settings: PlatformSettings, platform: str | None = None
+) -> PlatformSettings:
+    """Return the settings with the store that is *named*, that of the local *platform*, or that is found.
 
     Raises:
-        UsageError: The folder that is named is not there, or none was named and none found.
+        UsageError: Store and platform were named both, what is named is not there, or none was found.
     """
+    if platform is not None:
+        if named is not None:
+            raise UsageError("--store and --name both name a store", hint="leave one of them out")
+        named = f"{_FOLDER}{_objects_of(_folder_named(platform))}"
     chosen = settings if named is None else settings.replace(data={"store": named})
     if chosen.data.store == _IN_MEMORY:
         folder = None if named is not None else _objects_of_platform()
@@ -115,6 +121,17 @@ def keep_map(data: bytes, name: str, settings: PlatformSettings, author: str) ->
     return {"store": settings.data.store, "map": name, "map_version": version.id}
 
 
+def _folder_named(platform: str) -> Path:
+    folder = state_folder(platform, os.environ)
+    if not folder.is_dir():
+        known = ", ".join(sorted(each.name for each in folder.parent.glob("*/"))) or "none"
+        raise UsageError(
+            f"there is no platform {platform!r} on this machine",
+            hint=f"--name takes the name of rse-pf local; known: {known}",
+        )
+    return folder
+
+
 def _objects_of_platform() -> Path:
     """Return the folder of objects of the one platform that runs here, or that of ``rse-pf local``."""
     own = state_folder("default", os.environ)
@@ -126,7 +143,11 @@ def _objects_of_platform() -> Path:
             continue
         if state is not None and is_alive(state.control_plane):
             running.append(folder)
-    folder = running[0] if len(running) == 1 else own
+    return _objects_of(running[0] if len(running) == 1 else own)
+
+
+def _objects_of(folder: Path) -> Path:
+    """Return the folder of objects of the platform whose state is in *folder*."""
     try:
         known = platform_settings(folder)
     except ConfigurationError:

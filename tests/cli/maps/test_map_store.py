@@ -172,6 +172,23 @@ def test_the_store_of_the_one_platform_that_runs_is_found(
     assert "cellar" in capsys.readouterr().out
 
 
+def test_maps_of_a_named_platform_are_found_whether_it_runs_or_not(
+    state_home: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name, kept in (("default", "cellar"), ("lab", "attic")):
+        (state_home / "rse-pf" / name / "objects").mkdir(parents=True)
+        commit(state_home / "rse-pf" / name / "objects", kept)
+
+    assert main(["map", "list", "--name", "lab"]) == 0
+    assert "attic" in capsys.readouterr().out
+    assert main(["map", "list", "--name", "nowhere"]) == 2
+    error = capsys.readouterr().err
+    assert "there is no platform 'nowhere'" in error
+    assert "default, lab" in error
+    assert main(["map", "list", "--name", "lab", "--store", "dir:x"]) == 2
+    assert "both name a store" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("name", ["", "Hall", "a/b", "hall\nx", "../x", "h" * 65])
 def test_a_wrong_name_of_a_map_is_refused_before_the_drive(
     folder: Path, name: str, capsys: pytest.CaptureFixture[str]
