@@ -77,14 +77,13 @@ def serve_page(
         raise MissingExtra("uvicorn", "backend") from error
     port = int(listening.getsockname()[1])
     sessions = PageSessions(secret=lambda: secrets.token_urlsafe(24))
-    hosts = frozenset((f"{_LOOPBACK}:{port}", f"localhost:{port}"))
     fallback = secrets.token_hex(32)
     announce = None if platform is None else platform / ANNOUNCEMENT
 
     def admin_token() -> str:
         return fallback if platform is None else read_control_token(control_token_file(platform))
 
-    access = PageAccess(sessions=sessions, admin_token=admin_token, hosts=lambda: hosts)
+    access = PageAccess(sessions=sessions, admin_token=admin_token)
     app = FleetApp(hub, access, page_files(), actions)
     config = uvicorn.Config(
         app, http=bounded_protocol(most=_MAX_SILENT, most_idle=_MAX_SILENT), ws="none", lifespan="off",

@@ -30,9 +30,7 @@ class Page:
         self.hub = Hub()
         self.sessions = PageSessions(secret=lambda: f"secret-{next(numbers)}")
         self.done: list[tuple[str, dict[str, str]]] = []
-        access = PageAccess(
-            sessions=self.sessions, admin_token=lambda: ADMIN, hosts=lambda: frozenset((HOST,))
-        )
+        access = PageAccess(sessions=self.sessions, admin_token=lambda: ADMIN)
         actions = PageActions(operate=self._operate, page=self._page)
         self.app = FleetApp(self.hub, access, FILES, actions, clock=lambda: 0.0)
 
@@ -118,7 +116,9 @@ def test_without_a_session_nothing_is_told_or_done(method: str, target: str, hea
         {"sec-fetch-site": "cross-site"},
         {"sec-fetch-site": "same-site"},
         {"host": "rebound.example:8701"},
-        {"host": "127.0.0.1:80"},
+        {"host": "127.0.0.1.rebound.example:8701"},
+        {"host": "localhost:8701@rebound.example"},
+        {"host": "127.0.0.2:8701"},
     ],
 )
 def test_other_origins_and_names_are_refused_even_with_a_session(headers: dict[str, str]) -> None:
@@ -129,6 +129,16 @@ def test_other_origins_and_names_are_refused_even_with_a_session(headers: dict[s
         status, _, _ = page.ask(method, target, {"action": "kill", "server": "s"}, {**session, **headers})
         assert status == 403, (method, target)
     assert page.done == []
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1:9999", "localhost:9999", "[::1]:9999", "localhost"])
+def test_a_page_behind_a_forwarded_port_is_served_to_itself_only(host: str) -> None:
+    page = Page()
+    session = page.session("operate")
+    order = {"action": "kill", "server": "server-1"}
+
+    assert page.ask("POST", "/act", order, {**session, "host": host, "origin": f"http://{host}"})[0] == 200
+    assert page.ask("POST", "/act", order, {**session, "host": host, "origin": f"http://{HOST}"})[0] == 403
 
 
 def test_a_key_that_was_used_is_refused() -> None:

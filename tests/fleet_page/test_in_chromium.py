@@ -6,15 +6,20 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import re
+import socket
+import socketserver
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 import pytest
 
@@ -120,7 +125,7 @@ class Window:
             self.wrong.append(f"console: {message.text}")
 
     def _request(self, request: Any) -> None:
-        if not request.url.startswith(("http://127.0.0.1:", "data:", "blob:")):
+        if not request.url.startswith(("http://127.0.0.1:", "http://localhost:", "data:", "blob:")):
             self.wrong.append(f"outside: {request.url}")
 
     def save(self, name: str) -> None:
@@ -159,6 +164,56 @@ def test_every_view_shows_a_running_platform_and_asks_nobody_outside(browser: An
     assert window.wrong == []
     assert max(delays) <= 1000
     page.close()
+
+
+@contextlib.contextmanager
+def forwarded(port: int) -> Iterator[int]:
+    """Forward a free port to *port*, as ``ssh -L`` does; yield the free one."""
+
+    def pump(source: socket.socket, sink: socket.socket) -> None:
+        with contextlib.suppress(OSError):
+            while data := source.recv(1 << 16):
+                sink.sendall(data)
+            sink.shutdown(socket.SHUT_WR)
+
+    class Forward(socketserver.BaseRequestHandler):
+        def handle(self) -> None:
+            with socket.create_connection(("127.0.0.1", port)) as other:
+                back = threading.Thread(target=pump, args=(other, self.request))
+                back.start()
+                pump(self.request, other)
+                back.join()
+
+    with socketserver.ThreadingTCPServer(("127.0.0.1", 0), Forward) as server:
+        server.daemon_threads = True
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield server.server_address[1]
+        server.shutdown()
+
+
+def test_a_forwarded_port_shows_the_robots_of_all_tenants_and_not_the_page(
+    browser: Any, running: Running
+) -> None:
+    swarm = running.swarm(3, 30, "--fps", "1")
+    url = urlsplit(running.url())
+    assert url.port is not None
+    with forwarded(url.port) as port:
+        window = Window(browser)
+        page = window.page
+        page.goto(url._replace(netloc=f"localhost:{port}").geturl())
+        page.locator("#robots tbody tr").nth(2).wait_for(timeout=60_000)
+        page.keyboard.press("2")  # the page connects as a robot for live maps
+        page.locator("#tab-map[aria-selected=true]").wait_for()
+        page.keyboard.press("1")
+        page.wait_for_timeout(3000)
+        rows = [row.split("\t") for row in page.locator("#robots tbody tr").all_inner_texts()]
+        window.save("robots")
+        assert [row[0] for row in rows] == ["default"] * 3
+        assert all("fleet-page" not in row[1] for row in rows)
+        assert window.wrong == []
+        page.close()
+    swarm.terminate()
+    swarm.communicate(timeout=60)
 
 
 UNNAMED = """
@@ -430,7 +485,7 @@ def test_hostile_names_are_text(browser: Any, running: Running) -> None:
             "last_action": HOSTILE, "percentiles": {}, "bytes_in": 0, "bytes_out": 0, "requests": 0,
             "period_s": 60,
         }),
-        ("robots", "now", [[HOSTILE, HOSTILE, "zlib", 1.0, 1, HOSTILE]]),
+        ("robots", "now", [[HOSTILE, HOSTILE, "zlib", 1.0, 1, HOSTILE, HOSTILE, HOSTILE]]),
         ("event", "", {
             "time_s": time.time(), "kind": HOSTILE, "text": HOSTILE, "server": HOSTILE, "group": "other",
         }),

@@ -157,7 +157,8 @@ class LocalFeed:
             for row in json.loads(page).get("robots", []) if page else []:
                 robot = _robot(str(row["tenant"]), str(row["robot"]))
                 last = printable(str(row["last_result"] or "-"))
-                rows.append([robot, name, row["codec"], row["connected_s"], row["commands"], last])
+                who = [printable(str(row["tenant"])), printable(str(row["robot"]))]
+                rows.append([robot, name, row["codec"], row["connected_s"], row["commands"], last, *who])
         where = {str(row[0]): str(row[1]) for row in rows}
         for robot, before, after in moved_robots(self._where, where)[:_MAX_TOLD_MOVES]:
             self._event({"event": "robot-moved", "robot": robot, "before": before, "server": after})

@@ -5,6 +5,7 @@ import { clock, confirmed, duration, element, number, setText, state, toast } fr
 import { isOperator, post } from "./session.js";
 
 const MAX_DOTS = 500;
+const MAX_LISTED = 200;
 
 export function fleetView(root) {
   const box = (title) => {
@@ -46,6 +47,14 @@ export function fleetView(root) {
   const racks = element("div", { class: "racks" });
   const racksNote = element("p", { class: "soft" });
   const recent = element("div", {});
+  const robotRows = element("tbody");
+  const robotsNote = element("p", { class: "soft" });
+  const head = (title, kind = null) => element("th", { scope: "col", class: kind }, title);
+  const robotsPanel = element("div", { class: "panel" }, element("h2", {}, "Robots"),
+    element("div", { class: "scroll" }, element("table", { id: "robots" },
+      element("caption", { class: "hidden" }, "Connected robots"),
+      element("thead", {}, element("tr", {}, head("Tenant"), head("Robot"), head("Server"), head("Connected for", "number"),
+        head("Commands", "number"), head("Last answer"))), robotRows)), robotsNote);
   const racksPanel = element("div", { class: "panel" }, element("h2", {}, "Robots on their servers"), racks, racksNote);
   const unknown = element("ul", { class: "soft" });
   const cloudPanels = element("div", { class: "grid wide", hidden: true },
@@ -54,6 +63,7 @@ export function fleetView(root) {
     element("div", { class: "grid" }, ...Object.values(boxes).map((each) => each.panel)),
     waitingPanel,
     serverPanel,
+    robotsPanel,
     cloudPanels,
     element("div", { class: "grid wide" }, ...chartPanels),
     element("div", { class: "grid wide" }, racksPanel,
@@ -90,7 +100,7 @@ export function fleetView(root) {
     }
     takeServers(told.servers);
     cloudPanels.hidden = !told.cloud;
-    racksPanel.hidden = Boolean(told.cloud);
+    racksPanel.hidden = robotsPanel.hidden = Boolean(told.cloud);
     if (told.cloud) takeCloud(told);
   }
 
@@ -180,6 +190,12 @@ export function fleetView(root) {
     for (const each of racks.children) {
       each.querySelector(".dots").setAttribute("aria-label", `${counts[each.dataset.server] ?? 0} robots on ${each.dataset.server}`);
     }
+    const listed = told.slice(0, MAX_LISTED);
+    robotRows.replaceChildren(...listed.map(([, server, , connected, commands, last, tenant, name]) => element("tr", {},
+      element("td", {}, tenant), element("th", { scope: "row" }, name), element("td", {}, server),
+      element("td", { class: "number" }, duration(connected)), element("td", { class: "number" }, number(commands)),
+      element("td", {}, last))));
+    setText(robotsNote, told.length > MAX_LISTED ? `${MAX_LISTED} of ${told.length} robots are listed` : told.length ? "" : "No robot is connected.");
     setText(racksNote, told.length > MAX_DOTS ? `${MAX_DOTS} of ${told.length} robots are drawn`
       : told.length ? "One dot is one robot; an outline says that it has just moved, a square that its last command failed." : "No robot is connected.");
   }
