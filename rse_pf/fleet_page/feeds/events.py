@@ -63,6 +63,8 @@ def level_of(kind: str) -> str:
 
 
 def _format_value(value: Any) -> str:
+    if value is None:
+        return "unknown"
     return ", ".join(map(str, value)) if isinstance(value, list | tuple) else str(value)
 
 
@@ -102,7 +104,7 @@ EVENTS: Mapping[str, str] = {
     "over": "the control plane has ended",
     "platform-gone": "the platform has ended",
     "platform-ready": "the platform is ready after {seconds} s",
-    "rebalance": "{robots} robots of {server} are asked to move",
+    "rebalance": "{server} asks {robots} of its robots to move",
     "replace": "{server} is replaced by {by}: {reason}",
     "robot-moved": "{robot} moved from {before} to {server}",
     "robot-offline": "{robot} is no longer connected to {server}",

@@ -19,7 +19,7 @@ export function fleetView(root) {
   };
   const waiting = element("div", {});
   const waitingPanel = element("div", { class: "panel waiting", "aria-live": "polite" },
-    element("h2", {}, "What the scale modifier waits for"), waiting);
+    element("h2", {}, "When servers are added or removed next"), waiting);
   const charts = {};
   const chartPanels = [
     ["cpu", "CPU of the servers, %", { unit: "%", top: 100 }],
@@ -51,7 +51,7 @@ export function fleetView(root) {
   const robotsNote = element("p", { class: "soft" });
   const head = (title, kind = null) => element("th", { scope: "col", class: kind }, title);
   const robotsPanel = element("div", { class: "panel" }, element("h2", {}, "Robots"),
-    element("div", { class: "scroll" }, element("table", { id: "robots" },
+    element("div", { class: "scroll tall" }, element("table", { id: "robots" },
       element("caption", { class: "hidden" }, "Connected robots"),
       element("thead", {}, element("tr", {}, head("Tenant"), head("Robot"), head("Server"), head("Connected for", "number"),
         head("Commands", "number"), head("Last answer"))), robotRows)), robotsNote);
@@ -78,7 +78,7 @@ export function fleetView(root) {
     const rate = told.requests;
     setText(boxes.robots.big, number(told.robots));
     setText(boxes.robots.small, told.cloud ? `${number(rate, 1)} commands a second in the last minute` : `${number(rate)} commands in the last second`);
-    setText(boxes.firewall.big, told.tls ? "TLS, tokens" : told.cloud ? told.protocols.join(", ") || "not known" : "loopback");
+    setText(boxes.firewall.big, told.tls ? "TLS, tokens" : told.cloud ? told.protocols.join(", ") || "not known" : "this machine only");
     setText(boxes.firewall.small, told.url || "nobody can connect yet");
     setText(boxes.balancer.big, told.balancer ? "runs" : told.cloud ? told.balancer_state : "is down");
     setText(boxes.balancer.small, `${megabytes(told.bytes_in)} in, ${megabytes(told.bytes_out)} out a second`);
@@ -92,7 +92,7 @@ export function fleetView(root) {
       : told.cloud ? "no answer times were published"
         : p.covered_s ? `no command in the last ${p.covered_s < 59 ? `${Math.round(p.covered_s)} s` : "minute"}` : "answer times are being read");
     setText(boxes.modifier.big, `${told.min_servers ?? "–"} to ${told.max_servers ?? "–"}`);
-    setText(boxes.modifier.small, `servers; busy above ${number(told.busy_percent)} % CPU, judged each ${number(told.period_s)} s${told.last_action ? `; last: ${told.last_action}` : ""}`);
+    setText(boxes.modifier.small, `servers; busy above ${number(told.busy_percent)} % CPU, measured every ${number(told.period_s)} s${told.last_action ? `; last: ${told.last_action}` : ""}`);
     const said = told.waiting.map((text) => `${text[0].toUpperCase()}${text.slice(1)}.`);
     if (waiting.dataset.text !== said.join("\n")) {
       waiting.dataset.text = said.join("\n");
