@@ -12,7 +12,10 @@ from rse_pf.errors import Unauthorized
 __all__ = ["strip_token"]
 
 _TOKEN = re.compile(r"[!-~]+")
-_HINT = "pass the text that rse-pf token issue ROBOT prints, or an async function that returns it"
+_HINT = (
+    "pass the text that rse-pf token issue ROBOT prints, or a function that returns it: an async one to "
+    "connect, a plain one to DataClient (client_sdk.enrolment.read_enrolment returns both)"
+)
 
 
 def strip_token(token: object) -> str:

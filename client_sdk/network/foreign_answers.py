@@ -227,7 +227,10 @@ def explain_certificate(
     elif is_enrolled:
         hint = "enrol again: rse-pf robot enrol ROBOT --out FILE, with --authority and its authority's file"
     elif by.startswith(_OUR_AUTHORITY):
-        hint = "connect by the file of rse-pf robot enrol ROBOT --out FILE, made by this platform"
+        hint = (
+            "connect by the file of rse-pf robot enrol ROBOT --out FILE, made by this platform; if you did, "
+            "enrol again with --authority and the file of that authority"
+        )
     else:
         hint = (
             "connect by the file of rse-pf robot enrol ROBOT --out FILE; with a certificate of your own, add "

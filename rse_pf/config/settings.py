@@ -71,7 +71,7 @@ class ServingSettings:
     max_unauthenticated_per_source: int = setting(50, unit="sockets", doc="the same for each source address; not counted behind trusted proxies; 0 is off", low=0)
     max_accepts_per_s: float = setting(500.0, unit="sockets/s", doc="sockets that have begun to send and are passed to a worker each second; more wait; 0 is off", low=0)
     max_handshakes_per_source_per_s: float = setting(200.0, unit="handshakes/s", doc="handshakes of one source address; more are refused with 429; 0 is off", low=0)
-    trusted_proxies: int = setting(1, unit="proxies", doc="load balancers that append to x-forwarded-for; 0: robots connect directly", low=0, high=8)
+    trusted_proxies: int = setting(1, unit="proxies", doc="proxies between robots and servers that append to x-forwarded-for, the load balancer of the platform included: 1, or 2 behind a proxy of your own; 0: robots connect to the servers directly", low=0, high=8)
     allowed_origins: str = setting("", doc="origins of web pages that may connect, such as https://robots.example.org, with spaces between; pages of the platform itself always may")
     slow_reader_timeout_s: float = setting(1.0, unit="s", doc="a slow reader is disconnected after this", low=0.05)
     emulated_cores: float = setting(0.0, unit="cores", doc="CPU seconds per second that each worker may use, to emulate a smaller server; 0 is off", low=0, high=64)

@@ -153,7 +153,7 @@ async def test_a_plain_address_of_a_server_with_tls(authority, tmp_path):
 @pytest.mark.parametrize(
     ("issuer", "hint"),
     [
-        ("RSE-PF authority of platform acme", "rse-pf robot enrol ROBOT --out FILE, made by this platform"),
+        ("RSE-PF authority of platform acme", "enrol again with --authority"),
         ("ACME Root", "--authority"),
         ("ACME Web Proxy CA", "set SSL_CERT_FILE to the certificate of 'ACME Web Proxy CA'"),
     ],
