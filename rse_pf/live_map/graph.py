@@ -67,7 +67,7 @@ class Segment:
     component: int = 0
     told: Array | None = None
     covariance: Array = field(default_factory=lambda: _FLOOR.copy())
-    reason: str = "no link of it is believed yet"
+    reason: str = "no loop closure between its keyframes and the map is accepted yet"
     version: bool = False
     """Whether these are keyframes of the version that the map started from."""
     contradictions: int = 0
