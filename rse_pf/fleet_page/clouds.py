@@ -15,12 +15,9 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rse_pf.aws.storage import open_data_store
 from rse_pf.child.limited import Handler, LimitedProcesses, ProcessLimits
-from rse_pf.config import PlatformSettings
 from rse_pf.errors import NotFound, RsePfError
-from rse_pf.local.servers.backend_servers import local_placement
-from rse_pf.local.state import platform_settings
+from rse_pf.fleet_page.tenant_maps import map_label, platform_store, split_label, tenants_with
 from rse_pf.maps.registry import MapRegistry
 
 if TYPE_CHECKING:
@@ -38,7 +35,6 @@ _MEMORY_BYTES = 2 << 30
 _MAX_REPLY_BYTES = 32 << 20
 _CPU_S = 30.0
 _MAX_LISTED = 200
-_TENANT = "default"
 
 
 class MapPages:
@@ -82,34 +78,33 @@ class MapPages:
         """End the processes."""
         self._processes.close()
 
-    def _registry(self) -> MapRegistry:
-        settings = platform_settings(self._folder) or PlatformSettings()
-        store = local_placement(settings, self._folder).store
-        return MapRegistry(open_data_store(settings.replace(data={"store": store})), _TENANT)
-
     def _maps(self) -> list[dict[str, Any]]:
-        registry = self._registry()
+        store = platform_store(self._folder)
         return [
             {
-                "map": name,
+                "map": map_label(tenant, name),
                 "versions": [
                     {"id": record.id, "number": record.number, "points": record.points}
                     for record in reversed(registry.versions(name)[-_MAX_LISTED:])
                 ],
             }
+            for tenant in tenants_with(store, "maps")
+            for registry in (MapRegistry(store, tenant),)
             for name in registry.names()[:_MAX_LISTED]
         ]
 
     def _cloud(self, query: Mapping[str, str]) -> bytes:
-        registry = self._registry()
-        name = query.get("map", "")
+        label = query.get("map", "")
+        tenant, name = split_label(label)
+        registry = MapRegistry(platform_store(self._folder), tenant)
         if name not in registry.names():
             raise NotFound("there is no such map", hint="see rse-pf map list")
-        key = name, registry.record(name, query.get("version") or "head").id
+        version = registry.record(name, query.get("version") or "head").id
+        key = label, version
         with self._packing:
             packed = self._ready.get(key)
             if packed is None:
-                packed = self._processes.call(registry.data(*key), _CPU_S)
+                packed = self._processes.call(registry.data(name, version), _CPU_S)
                 self._ready[key] = packed
             self._ready.move_to_end(key)
             while len(self._ready) > 1 and sum(map(len, self._ready.values())) > _KEPT_BYTES:

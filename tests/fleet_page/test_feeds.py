@@ -13,7 +13,7 @@ import pytest
 from rse_pf.auth.roster import check_scopes, scopes_allow
 from rse_pf.child.limited import LimitedProcesses
 from rse_pf.config import PlatformSettings
-from rse_pf.errors import UsageError
+from rse_pf.errors import RsePfError, UsageError
 from rse_pf.fleet_page import clouds
 from rse_pf.fleet_page.feeds.events import group_of
 from rse_pf.fleet_page.feeds.live_feed import SCOPES, RobotPaths, histories, plain
@@ -197,6 +197,23 @@ async def test_the_cloud_that_a_page_shows_first_is_packed_once_and_before_it_is
 
     assert head == same
     assert len(packed) == 1
+
+
+async def test_versions_of_all_tenants_are_listed_and_read_under_the_name_of_their_tenant(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = DirectoryStore(tmp_path / "objects")
+    version = MapVersion(keyframes=(), points=np.ones((3, 3), np.float32), colours=np.ones((3, 3), np.uint8))
+    for tenant, name in (("default", "hall"), ("acme", "hall"), ("acme", "yard")):
+        MapRegistry(store, tenant).commit(name, encode_map(version), parent=None, author="r", created_s=1.0)
+    monkeypatch.setattr(LimitedProcesses, "call", lambda self, data, timeout_s: clouds.packer("")(data))
+    pages = clouds.MapPages(tmp_path)
+
+    assert [each["map"] for each in json.loads((await pages.maps())[1])] == ["hall", "acme/hall", "acme/yard"]
+    assert (await pages.cloud({"map": "acme/yard"}))[1]
+    for label in ("yard", "other/hall", "acme/../hall"):
+        with pytest.raises(RsePfError):
+            await pages.cloud({"map": label})
 
 
 async def test_a_watcher_hears_states_and_events_and_watchers_are_bounded() -> None:

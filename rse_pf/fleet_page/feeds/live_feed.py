@@ -10,7 +10,7 @@ import contextlib
 import math
 import secrets
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ from rse_pf.auth.roster import SYNTHETIC
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import RsePfError, UsageError
 from rse_pf.fleet_page.hub import Hub
+from rse_pf.fleet_page.tenant_maps import map_label, platform_store, split_label, tenants_with
 from rse_pf.local.firewall import read_key
 from rse_pf.local.state import PlatformState, platform_settings, read_state
 from rse_pf.terminal import printable
@@ -60,57 +61,74 @@ class LiveFeed:
         if state is None or not state.url or state.lan:
             return  # by TLS with a private authority: see docs/fleet_page.md
         settings = platform_settings(self._folder) or PlatformSettings()
+        tenants = await asyncio.to_thread(self._tenants)
 
-        async def token() -> str:
-            return _token(state, settings)
+        def token_of(tenant: str) -> Callable[[], Awaitable[str]]:
+            async def token() -> str:
+                return _token(state, settings, tenant)
+
+            return token
 
         try:
-            async with connect(state.url, token=token, codec="json") as robot:
-                while self._hub.watches("maps"):
-                    await self._follow_if_asked(robot)
+            async with contextlib.AsyncExitStack() as connected:
+                robots = {
+                    tenant: await connected.enter_async_context(
+                        connect(state.url, token=token_of(tenant), codec="json")
+                    )
+                    for tenant in tenants
+                }
+                while self._hub.watches("maps") and await asyncio.to_thread(self._tenants) == tenants:
+                    await self._follow_if_asked(robots)
         finally:
             for task in self._followed.values():
                 task.cancel()
             self._followed.clear()
 
-    async def _follow_if_asked(self, robot: Any) -> None:
-        listed = (await robot.call("live-list", {})).reply
-        names = [str(entry["name"]) for entry in listed.get("maps", [])]
-        self._hub.put("maps", "live", names)
+    def _tenants(self) -> list[str]:
+        return tenants_with(platform_store(self._folder), "live")
+
+    async def _follow_if_asked(self, robots: Mapping[str, Any]) -> None:
+        """List the live maps through the connection of each tenant, and follow those that a page shows."""
+        labels: dict[str, Any] = {}
+        for tenant, robot in robots.items():
+            listed = (await robot.call("live-list", {})).reply.get("maps", [])
+            labels.update({map_label(tenant, str(entry["name"])): robot for entry in listed[:_MAX_MAPS]})
+        self._hub.put("maps", "live", list(labels))
         for _ in range(round(_LIST_EVERY_S / _LOOK_S)):
-            for name in names[:_MAX_MAPS]:
-                if name not in self._followed and self._hub.watches(LIVE + name):
-                    self._followed[name] = asyncio.ensure_future(self._follow(robot, name))
+            for label, robot in labels.items():
+                if label not in self._followed and self._hub.watches(LIVE + label):
+                    self._followed[label] = asyncio.ensure_future(self._follow(robot, label))
             await asyncio.sleep(_LOOK_S)
 
-    async def _follow(self, robot: Any, name: str) -> None:
-        reading = asyncio.ensure_future(self._follow_history(robot, name))
+    async def _follow(self, robot: Any, label: str) -> None:
+        reading = asyncio.ensure_future(self._follow_history(robot, label))
         try:
-            await self._follow_updates(robot, name)
+            await self._follow_updates(robot, label)
         finally:
             reading.cancel()
 
-    async def _follow_history(self, robot: Any, name: str) -> None:
+    async def _follow_history(self, robot: Any, label: str) -> None:
         """Tell where all robots have been, also before anybody looked, from the keyframes of the map."""
         version = -1
         while True:
-            if self._hub.watches(LIVE + name):
+            if self._hub.watches(LIVE + label):
                 with contextlib.suppress(RsePfError):
-                    shown = (await robot.call("live-show", {"map": name, "paths": True}, keep=True)).reply
+                    request = {"map": split_label(label)[1], "paths": True}
+                    shown = (await robot.call("live-show", request, keep=True)).reply
                     if shown.get("version") != version:
                         version = shown.get("version")
                         for key, value in histories(shown.get("paths", ())).items():
-                            self._hub.put(LIVE + name, f"history/{key}", value)
+                            self._hub.put(LIVE + label, f"history/{key}", value)
             await asyncio.sleep(_HISTORY_EVERY_S)
 
-    async def _follow_updates(self, robot: Any, name: str) -> None:
+    async def _follow_updates(self, robot: Any, label: str) -> None:
         paths = RobotPaths()
-        async for key, value in robot.subscribe(LIVE + name):
+        async for key, value in robot.subscribe(LIVE + split_label(label)[1]):
             message = plain(value)
-            self._hub.put(LIVE + name, printable(str(key)), message)
+            self._hub.put(LIVE + label, printable(str(key)), message)
             path = paths.take(message)
             if path is not None:
-                self._hub.put(LIVE + name, f"path/{message['robot']}", path)
+                self._hub.put(LIVE + label, f"path/{message['robot']}", path)
 
 
 class RobotPaths:
@@ -191,11 +209,11 @@ def _position_in_odometry(T_map_odom: Sequence[float], T_map_camera: Sequence[fl
     ]
 
 
-def _token(state: PlatformState, settings: PlatformSettings) -> str:
+def _token(state: PlatformState, settings: PlatformSettings, tenant: str) -> str:
     if not state.key_file:
         raise UsageError("the platform has no key", hint="start it again")
     key = read_key(Path(state.key_file))
     return key.issue(
         _ROBOT, now=time.time(), token_id=secrets.token_hex(8), settings=settings.auth,
-        ttl_s=min(_TTL_S, settings.auth.token_ttl_s), scopes=SCOPES,
+        ttl_s=min(_TTL_S, settings.auth.token_ttl_s), scopes=SCOPES, tenant=tenant,
     )  # fmt: skip
