@@ -32,7 +32,7 @@ from rse_pf.object_store import DirectoryStore
 OTHER_PROGRAMS = (
     "npx", "aws", "dask", "python", ".", "grep", "sudo", "g++", "cmake", "mkdir", "build/first_pose",
     "client_cpp/build/rse_pf_tum_robot", "roscore", "roslaunch", "rosbag",
-    "rse-pf-ros", "export", "pip", "python3.11", "ros2", "sleep", "umask",
+    "rse-pf-ros", "export", "pip", "python3.11", "ros2", "sleep", "umask", "curl", "kill",
 )  # fmt: skip
 BLOCK = re.compile(r"^```(\w*)\n(.*?)^```", re.DOTALL | re.MULTILINE)
 IN_A_LINE = re.compile(r"`((?:rse-pf|make) [^`]*)`")
