@@ -15,7 +15,7 @@ from system.local.test_control_plane import SETTINGS, News, asking, check, platf
 
 from client_sdk.transfer.data_client import DataClient, DataOptions
 from rse_pf.config import PlatformSettings
-from rse_pf.errors import ConfigurationError
+from rse_pf.errors import ConfigurationError, QuotaExceeded
 from rse_pf.local.control.platform import LocalPlatform
 from rse_pf.local.servers.backend_servers import RSE_PF
 from rse_pf.local.state import platform_settings
@@ -116,6 +116,9 @@ async def test_a_roll_with_settings_changes_all_servers_and_loses_nothing(tmp_pa
         assert await uploading > 0
         expected = PlatformSettings().replace(**wanted)
         assert {page["settings"] for page in await cloud.status()} == {expected.digest()}
+        other = DataClient(cloud.url, cloud.issue_token("other"))
+        with contextlib.closing(other), pytest.raises(QuotaExceeded, match="5000000"):
+            await asyncio.to_thread(other.upload, bytes(6_000_000))
 
         code, said = await rolled(cloud, file)
         assert (code, said.count("hint:")) == (2, 1)
