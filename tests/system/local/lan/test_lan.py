@@ -335,7 +335,7 @@ def test_every_server_is_replaced_while_a_robot_works_and_nothing_is_lost(
     assert said.splitlines() == [f"pose by {after.name} (4, 4)", "sent - answered = 0 failed = 0"]
     code, report, errors = rolled
     assert (code, errors) == (0, "")
-    assert report.startswith(f"{before} is replaced (1 of 1)\n")
+    assert f"  {before} is replaced (1 of 1)\n" in report
     assert report.endswith("every server was replaced\n")
     (row,) = shown["robots"]
     assert (row["robot"], row["tenant"], row["server"], row["codec"]) == ("robot-1", "default", before, "bin")
