@@ -7,6 +7,9 @@ image shows.
 from __future__ import annotations
 
 import os
+import re
+import struct
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -25,9 +28,14 @@ MAX_PHOTO_PIXELS = 1 << 24
 _LIMIT = "OPENCV_IO_MAX_IMAGE_PIXELS"
 """OpenCV reads it when it is loaded, and compares it with the size in an image's header."""
 _JPEG, _PNG = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"
-_MAX_SEGMENTS = 1000
-"""Before the size of a JPEG, or the pixels of a PNG."""
-_MAX_SCANS = 64
+_MAX_SEGMENTS = 1000  # of a JPEG, before its size
+_FILL_BYTES = re.compile(rb"\xff*(?=\xff)")  # may come before each marker of a JPEG
+_MAX_CHUNKS = 10_000  # of a PNG: programs write pixels in chunks of 8 KiB and more
+_CRITICAL_CHUNKS = (b"IHDR", b"PLTE", b"IDAT", b"IEND")
+_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # of a pixel, by the colour type of a PNG
+_MAX_PNG_BYTES = 4 * MAX_PHOTO_PIXELS  # inflated: four channels of 8 bits
+_EXTRA_ROW_BYTES = 4  # the filter bytes and the last bits of a row in all seven passes of an interlaced PNG
+_MAX_SCANS = 20
 """Each scan of a progressive JPEG goes over the whole image, however few bytes it has; cameras write ten."""
 _FRAMES, _NO_FRAMES = range(0xC0, 0xD0), (0xC4, 0xC8, 0xCC)
 _DECODED_FRAMES = (0xC0, 0xC1, 0xC2)
@@ -120,6 +128,8 @@ def decode_photo(data: bytes) -> npt.NDArray[np.uint8]:
         MissingExtra: OpenCV is not installed.
     """
     width, height = photo_size(data)
+    if data.startswith(_PNG):
+        data = _critical_png(data)
     cv2 = load_opencv()
     flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
     try:
@@ -151,8 +161,8 @@ def _jpeg_segments(data: bytes) -> Iterator[tuple[int, bytes]]:
     """Yield marker and content of the first segments, as far as they are whole."""
     at = 2
     for _ in range(_MAX_SEGMENTS):
-        while data[at : at + 2] == b"\xff\xff":
-            at += 1
+        fill = _FILL_BYTES.match(data, at)
+        at = at if fill is None else fill.end()
         length = int.from_bytes(data[at + 2 : at + 4], "big")
         if data[at : at + 1] != b"\xff" or length < 2 or at + 2 + length > len(data):
             return
@@ -161,21 +171,58 @@ def _jpeg_segments(data: bytes) -> Iterator[tuple[int, bytes]]:
 
 
 def _png_size(data: bytes) -> tuple[int, int]:
-    at, size = len(_PNG), (0, 0)
-    for number in range(_MAX_SEGMENTS):
-        length, name = int.from_bytes(data[at : at + 4], "big"), data[at + 4 : at + 8]
-        if len(name) < 4 or at + 12 + length > len(data) or (number == 0) != (name == b"IHDR"):
+    size, has_pixels = (0, 0), False
+    for number, (name, chunk) in enumerate(_png_chunks(data)):
+        if (number == 0) != (name == b"IHDR"):
             break
         if name == b"IHDR":
-            if length != 13:
+            if len(chunk) != 25:
                 break
-            size = (
-                int.from_bytes(data[at + 8 : at + 12], "big"),
-                int.from_bytes(data[at + 12 : at + 16], "big"),
-            )
+            size = int.from_bytes(chunk[8:12], "big"), int.from_bytes(chunk[12:16], "big")
         elif name == b"acTL":
             raise BadRequest("the image is animated", hint=_HINT)
-        elif name == b"IDAT":
+        has_pixels = has_pixels or name == b"IDAT"
+    else:
+        if has_pixels:
             return size
-        at += 12 + length
     raise BadRequest("the image does not state its size, or has no pixels", hint=_HINT)
+
+
+def _png_chunks(data: bytes) -> Iterator[tuple[bytes, bytes]]:
+    """Yield the name and all bytes of each chunk, which the last one ends.
+
+    Raises:
+        BadRequest: A chunk is not whole.
+        LimitExceeded: There are more than `_MAX_CHUNKS`.
+    """
+    at = len(_PNG)
+    for _ in range(_MAX_CHUNKS):
+        end = at + 12 + int.from_bytes(data[at : at + 4], "big")
+        if end > len(data):
+            raise BadRequest("the image has no end", hint=_HINT)
+        name = data[at + 4 : at + 8]
+        yield name, data[at:end]
+        if name == b"IEND":
+            return
+        at = end
+    raise LimitExceeded(f"the image has more than {_MAX_CHUNKS} chunks", hint=_HINT)
+
+
+def _critical_png(data: bytes) -> bytes:
+    """Return a PNG without what its pixels do not need: libpng would inflate it, or print about it.
+
+    Raises:
+        BadRequest: Its pixels are damaged, or inflate to more than its head states.
+    """
+    chunks = [chunk for name, chunk in _png_chunks(data) if name in _CRITICAL_CHUNKS]
+    width, height, bits, colour = struct.unpack_from(">IIBB", chunks[0], 8)
+    row_bytes = _EXTRA_ROW_BYTES + (width * bits * _CHANNELS.get(colour, 0) + 7) // 8
+    max_bytes = min(height * row_bytes, _MAX_PNG_BYTES)
+    packed = b"".join(chunk[8:-4] for chunk in chunks if chunk[4:8] == b"IDAT")
+    try:
+        inflated = zlib.decompressobj().decompress(packed, max_bytes + 1)
+    except zlib.error:
+        raise BadRequest("the image is damaged", hint=_HINT) from None
+    if len(inflated) > max_bytes:
+        raise BadRequest(f"the pixels of the image are above {max_bytes} bytes", hint=_HINT)
+    return b"".join((_PNG, *chunks))

@@ -3,19 +3,25 @@
 from __future__ import annotations
 
 import struct
+import time
+import zlib
 from typing import Any
 
 import numpy as np
 import pytest
 
 cv2 = pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
-from hostile.hostile_images import HARMLESS, hostile_images, photo  # noqa: E402
+from hostile.hostile_images import HARMLESS, chunk, hostile_images, photo, png  # noqa: E402
 
 from rse_pf import images  # noqa: E402
 from rse_pf.errors import BadRequest, LimitExceeded  # noqa: E402
 from rse_pf.images import MAX_PHOTO_PIXELS, decode_photo, photo_size  # noqa: E402
 
 IMAGES = hostile_images()
+ADAM7 = (
+    (0, 0, 8, 8), (4, 0, 8, 8), (0, 4, 4, 8), (2, 0, 4, 4), (0, 2, 2, 4), (1, 0, 2, 2), (0, 1, 1, 2),
+)  # fmt: skip
+"""First column and row, and steps, of the seven passes of an interlaced PNG (W3C PNG, Sect. 8.2)."""
 
 
 @pytest.mark.parametrize("kind", [".jpg", ".png"])
@@ -58,7 +64,7 @@ def test_a_hostile_image_is_refused_in_one_line_or_harmless(name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "name", ["jpeg of 65535x65535", "jpeg of ten thousand scans", "jpeg of 65 scans", "png of 65536x257"]
+    "name", ["jpeg of 65535x65535", "jpeg of ten thousand scans", "jpeg of many scans", "png of 65536x257"]
 )
 def test_a_bomb_is_refused_before_anything_is_decoded(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     def load() -> Any:
@@ -68,3 +74,50 @@ def test_a_bomb_is_refused_before_anything_is_decoded(name: str, monkeypatch: py
 
     with pytest.raises(LimitExceeded):
         decode_photo(IMAGES[name])
+
+
+def test_what_a_png_holds_beside_its_pixels_costs_nothing(capfd: pytest.CaptureFixture[str]) -> None:
+    bomb = chunk(b"zTXt", b"a\0\0" + zlib.compress(bytes(1 << 25), 9))
+    plain, began_s = png(), time.process_time()
+
+    for extra in (bomb * 100, chunk(b"tIME", b"x") * 5000, chunk(b"gAMA", b"\0\0\1\0")):
+        np.testing.assert_array_equal(decode_photo(png(before=extra)), decode_photo(plain))
+
+    assert time.process_time() - began_s < 0.5
+    assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize("colour", [0, 2, 4, 6])
+@pytest.mark.parametrize("size", [(1, 1), (3, 5), (64, 48), (1, 300), (300, 1)])
+def test_an_interlaced_png_inflates_to_more_than_a_plain_one_and_is_a_photo(
+    colour: int, size: tuple[int, int]
+) -> None:
+    width, height = size
+    channels = {0: 1, 2: 3, 4: 2, 6: 4}[colour]
+    rows = bytearray()
+    for x, y, step_x, step_y in ADAM7:
+        columns = len(range(x, width, step_x))
+        rows += bytes(len(range(y, height, step_y)) * (1 + columns * channels) * (columns > 0))
+
+    image = decode_photo(png(width, height, colour=colour, interlace=1, pixels=zlib.compress(rows)))
+
+    assert image.shape == (height, width, 3)
+
+
+def test_pixels_above_what_the_head_states_are_refused_before_they_are_inflated() -> None:
+    data = png(pixels=zlib.compress(bytes(1 << 28), 9))
+    began_s = time.process_time()
+
+    with pytest.raises(BadRequest, match="above 9408 bytes"):
+        decode_photo(data)
+
+    assert time.process_time() - began_s < 0.2
+
+
+def test_fill_bytes_before_a_marker_are_skipped() -> None:
+    data, began_s = photo(), time.process_time()
+
+    filled = data[:2] + b"\xff" * 3_000_000 + data[2:]
+
+    np.testing.assert_array_equal(decode_photo(filled), decode_photo(data))
+    assert time.process_time() - began_s < 0.3

@@ -23,6 +23,7 @@ import os
 import signal
 import socket
 import struct
+import sys
 import threading
 import time
 import traceback
@@ -473,6 +474,7 @@ def _work(
         if die_with_parent(template):
             limit_memory(memory_bytes, beyond_now=True)
             be_killed_first()
+            _silence_libraries()
             while _answer(connection, handler, cpu_s):
                 pass
         os._exit(0)
@@ -480,6 +482,15 @@ def _work(
         os._exit(_OUT_OF_MEMORY)
     finally:
         os._exit(1)
+
+
+def _silence_libraries() -> None:
+    """Drop what native code prints, which the bytes of a call may choose; a traceback goes to the log."""
+    sys.stderr = os.fdopen(os.dup(2), "w", buffering=1)
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 1)
+    os.dup2(nowhere, 2)
+    os.close(nowhere)
 
 
 def _answer(connection: socket.socket, handler: Handler, cpu_s: float) -> bool:

@@ -52,6 +52,9 @@ def make(configuration):
             raise BadRequest("no", hint="ask for less", retry_after_ms=5.0)
         if word == "defect":
             raise ZeroDivisionError("secret")
+        if word == "print":
+            os.write(1, b"what a library prints\\n")
+            os.write(2, b"what a library prints\\n")
         if word == "exit":
             raise SystemExit(3)
         if word == "long":
@@ -268,6 +271,18 @@ def test_a_defect_of_the_handler_is_internal_and_goes_to_the_log(
 
     assert "secret" not in raised.value.message
     assert "Traceback" in capfd.readouterr().err
+
+
+def test_what_libraries_print_does_not_reach_the_log(
+    own: LimitedProcesses, capfd: pytest.CaptureFixture[str]
+):
+    assert own.call(b"print", LONG_S) == b"done"
+
+    with pytest.raises(InternalError):
+        own.call(b"defect", LONG_S)
+    log = capfd.readouterr()
+    assert "library" not in log.out + log.err
+    assert "Traceback" in log.err
 
 
 def test_what_others_left_in_a_process_does_not_end_a_call(processes: LimitedProcesses):
