@@ -33,7 +33,7 @@ _FILL_BYTES = re.compile(rb"\xff*(?=\xff)")  # may come before each marker of a 
 _MAX_CHUNKS = 10_000  # of a PNG: programs write pixels in chunks of 8 KiB and more
 _CRITICAL_CHUNKS = (b"IHDR", b"PLTE", b"IDAT", b"IEND")
 _CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # of a pixel, by the colour type of a PNG
-_MAX_PNG_BYTES = 4 * MAX_PHOTO_PIXELS  # inflated: four channels of 8 bits
+_MAX_PNG_BYTES = 5 * MAX_PHOTO_PIXELS  # inflated: four channels of 8 bits, and filter bytes
 _EXTRA_ROW_BYTES = 4  # the filter bytes and the last bits of a row in all seven passes of an interlaced PNG
 _MAX_SCANS = 20
 """Each scan of a progressive JPEG goes over the whole image, however few bytes it has; cameras write ten."""

@@ -52,6 +52,7 @@ __all__ = [
     "LimitedProcesses",
     "Overran",
     "ProcessLimits",
+    "limit_cpu",
     "run",
 ]
 
@@ -90,7 +91,7 @@ class ProcessLimits:
     memory_bytes: int
     """What calls may allocate, beside what the template has allocated."""
     cpu_s: float = 60.0
-    """CPU seconds of one call, however busy the machine is."""
+    """CPU seconds of one call, however busy the machine is; its handler may allow less by `limit_cpu`."""
     max_reply_bytes: int = _MAX_REPLY_BYTES
     """A process that replies with more has failed."""
 
@@ -120,7 +121,6 @@ class LimitedProcesses:
             "target": target, "configuration": configuration, "limits": [limits.memory_bytes, limits.cpu_s]
         }  # fmt: skip
         self._memory_bytes = limits.memory_bytes
-        self._cpu_s = limits.cpu_s
         self._max_reply_bytes = limits.max_reply_bytes
         self._template = _Template(order, niceness)
         self._free = _FreeSlots(count)
@@ -171,9 +171,9 @@ class LimitedProcesses:
                     _, cpu_s = self._end(slot, process)
                     raise Overran(timeout_s, cpu_s) from None
                 except _ProcessEnded as ended:
-                    how, _ = self._end(slot, process)
+                    how, cpu_s = self._end(slot, process)
                     if is_new or how == _NO_TIME:
-                        raise self._crash(ended.reason or how) from None
+                        raise self._crash(ended.reason or how, cpu_s) from None
                 finally:
                     if charge is not None:
                         charge(process.cpu_s - before_s)
@@ -194,11 +194,11 @@ class LimitedProcesses:
         slot.forget()
         return self._template.end(process)
 
-    def _crash(self, how: str) -> Crashed:
+    def _crash(self, how: str, cpu_s: float) -> Crashed:
         if how == _NO_MEMORY:
             how = f"it needs more than {self._memory_bytes / 1e6:.0f} MB of memory"
         elif how == _NO_TIME:
-            how = f"it needs more than {self._cpu_s:g} s of CPU time"
+            how = f"it used {cpu_s:.1f} s of CPU time, which is more than it may"
         return Crashed(f"the process that worked on this ended: {how}", hint="send less at once")
 
 
@@ -484,6 +484,11 @@ def _work(
         os._exit(1)
 
 
+def limit_cpu(cpu_s: float) -> None:
+    """End this process after *cpu_s* more seconds of CPU time unless it answers before; 0: never."""
+    signal.setitimer(signal.ITIMER_PROF, cpu_s)
+
+
 def _silence_libraries() -> None:
     """Drop what native code prints, which the bytes of a call may choose; a traceback goes to the log."""
     sys.stderr = os.fdopen(os.dup(2), "w", buffering=1)
@@ -502,7 +507,7 @@ def _answer(connection: socket.socket, handler: Handler, cpu_s: float) -> bool:
     data = connection.recv(length, socket.MSG_WAITALL)
     if len(data) < length:
         return False
-    signal.setitimer(signal.ITIMER_PROF, cpu_s)
+    limit_cpu(cpu_s)
     try:
         kind, reply = _DONE, handler(data)
     except MemoryError:
@@ -513,7 +518,7 @@ def _answer(connection: socket.socket, handler: Handler, cpu_s: float) -> bool:
     except BaseException:  # noqa: BLE001  the reason goes to the log, and the process answers the next call
         traceback.print_exc()
         kind, reply = _DEFECT, b""
-    signal.setitimer(signal.ITIMER_PROF, 0.0)
+    limit_cpu(0.0)
     try:
         connection.sendall(_REPLY.pack(kind, len(reply), time.process_time()))
         connection.sendall(reply)

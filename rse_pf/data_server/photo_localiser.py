@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from rse_pf.child.limited import Handler
+from rse_pf.child.limited import Handler, limit_cpu
 from rse_pf.config import PlatformSettings
 from rse_pf.data_server.robot_processes import RobotProcesses, max_map_bytes, shared_store
 from rse_pf.errors import MissingExtra
@@ -32,6 +32,7 @@ TARGET = f"{__name__}:make_handler"
 LEAST_PROCESSES = 3
 """A robot has one of them at most, and a tenant all but one and never more than six (`FairThreads`)."""
 _CACHED_MAPS = 4
+_MAX_PHOTO_S = 3.0  # of CPU time without that for the map: 16 megapixels take 0.7 s, other photos wait for it
 
 
 class _Request(msgspec.Struct, frozen=True, kw_only=True):
@@ -107,6 +108,7 @@ def make_handler(configuration: str) -> Handler:
         if request.photo is None or request.lens is None:
             reply = outline_of(map_version, version)
         else:
+            limit_cpu(_MAX_PHOTO_S)
             reply = location_of(localise_photo(request.photo, request.lens, index), version)
         return msgspec.msgpack.encode(reply)
 

@@ -17,6 +17,7 @@ from rse_pf.errors import BadRequest, Busy, Crashed, Expired, InternalError, Rse
 _HANDLER = '''
 import os, resource, signal, socket, time
 from pathlib import Path
+from rse_pf.child.limited import limit_cpu
 from rse_pf.errors import BadRequest
 from rse_pf.linux import prctl
 
@@ -38,6 +39,9 @@ def make(configuration):
             kept.append(bytearray(int(rest)))
         if word == "signal":
             os.kill(os.getpid(), int(rest))
+        if word == "less":
+            limit_cpu(0.05)
+            word = "loop"
         if word == "burn":
             end = time.process_time() + float(rest)
             while time.process_time() < end:
@@ -214,7 +218,8 @@ def test_a_process_has_its_limits_and_none_of_the_sockets_of_its_owner(processes
         (b"signal 11", "SIGSEGV"),
         (b"signal 6", "SIGABRT"),
         (b"signal 9", "SIGKILL"),
-        (b"loop", "0.3 s of CPU"),
+        (b"loop", r"used 0\.[34] s of CPU"),
+        (b"less", r"used 0\.[01] s of CPU"),
         (b"long 2000000", "2000000 bytes"),
     ],
 )
