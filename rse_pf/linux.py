@@ -14,8 +14,8 @@ from pathlib import Path
 
 __all__ = [
     "PR_CAPBSET_DROP", "PR_SET_CHILD_SUBREAPER", "PR_SET_DUMPABLE", "PR_SET_NO_NEW_PRIVS", "PR_SET_SECCOMP",
-    "be_killed_first", "cpu_seconds", "die_with_parent", "disk_free_percent", "limit_memory",
-    "page_table_bytes", "prctl", "proportional_bytes",
+    "be_killed_first", "close_other_descriptors", "cpu_seconds", "die_with_parent", "disk_free_percent",
+    "limit_memory", "page_table_bytes", "prctl", "proportional_bytes",
     "raise_descriptor_limit", "resident_bytes", "run_as_batch", "set_process_name",
 ]  # fmt: skip
 
@@ -63,6 +63,12 @@ def limit_memory(memory_bytes: int, *, beyond_now: bool = False) -> None:
         memory_bytes += pages * os.sysconf("SC_PAGE_SIZE")
     resource.setrlimit(resource.RLIMIT_DATA, (memory_bytes, memory_bytes))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+
+
+def close_other_descriptors(keep: int) -> None:
+    """Close every file that a parent left open, but *keep* and the standard ones."""
+    os.closerange(3, keep)
+    os.closerange(max(3, keep + 1), 1 << 16)
 
 
 def cpu_seconds(pid: int) -> float:

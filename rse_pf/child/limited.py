@@ -44,7 +44,7 @@ from rse_pf.errors import (
     error_from_code,
 )
 from rse_pf.ipc import receive_bytes
-from rse_pf.linux import be_killed_first, die_with_parent, limit_memory
+from rse_pf.linux import be_killed_first, close_other_descriptors, die_with_parent, limit_memory
 
 __all__ = [
     "DEFAULT_NICENESS",
@@ -470,7 +470,7 @@ def _work(
     """Answer calls until the connection ends; never return."""
     try:
         template = os.getppid()
-        owner.close()
+        close_other_descriptors(connection.fileno())
         if die_with_parent(template):
             limit_memory(memory_bytes, beyond_now=True)
             be_killed_first()

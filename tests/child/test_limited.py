@@ -67,8 +67,9 @@ def make(configuration):
             core = resource.getrlimit(resource.RLIMIT_CORE)
             score = Path("/proc/self/oom_score_adj").read_text().strip()
             threads = len(os.listdir("/proc/self/task"))
-            sockets = sum(os.readlink(f"/proc/self/fd/{fd}").startswith("socket") for fd in fds())
-            return repr((core, score, threads, sockets, os.nice(0))).encode()
+            return repr((core, score, threads, os.nice(0))).encode()
+        if word == "descriptors":
+            return "\\n".join(os.readlink(f"/proc/self/fd/{fd}").split(":")[0] for fd in fds()).encode()
         return b"done"
 
     return handle
@@ -204,10 +205,21 @@ def test_a_call_is_charged_for_the_cpu_time_of_each_process_that_worked_on_it(
     assert 0.9 * expected <= sum(call_s) < expected + 0.1
 
 
-def test_a_process_has_its_limits_and_none_of_the_sockets_of_its_owner(processes: LimitedProcesses):
+def test_a_process_has_its_limits(processes: LimitedProcesses):
     told = processes.call(b"limits", LONG_S)
 
-    assert told.decode() == repr(((0, 0), "1000", 1, 1, min(19, os.nice(0) + 5)))
+    assert told.decode() == repr(((0, 0), "1000", 1, min(19, os.nice(0) + 5)))
+
+
+def test_a_process_has_one_socket_and_the_log_and_nothing_of_its_owner_or_siblings(handler: str):
+    with made_of(handler, count=2) as made, beside(lambda: made.call(b"sleep", 2.0), Overran):
+        first = made.pids()[1:]
+        while not (first and is_working(first[0])):
+            threading.Event().wait(0.005)
+            first = made.pids()[1:]
+        held = made.call(b"descriptors", LONG_S).decode().splitlines()
+
+    assert (held.count("socket"), held.count("anon_inode"), len(held)) == (1, 0, 5), held
 
 
 @pytest.mark.parametrize(

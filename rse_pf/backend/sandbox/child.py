@@ -25,7 +25,7 @@ from typing import Any
 from rse_pf.backend.sandbox import isolation
 from rse_pf.errors import ConfigurationError, InternalError, LimitExceeded, RsePfError, message_of
 from rse_pf.ipc import encode_message, encode_reply, receive
-from rse_pf.linux import die_with_parent
+from rse_pf.linux import close_other_descriptors, die_with_parent
 from rse_pf.services.custom.installed import InstalledService
 from rse_pf.services.custom.runtime import Runtime, open_runtime
 
@@ -92,7 +92,7 @@ def run_sandbox(plan: SandboxPlan, channel: int, output: int, uid: int | None) -
     code = 1
     try:
         _reset_process(output)
-        isolation.close_other_descriptors(channel)
+        close_other_descriptors(channel)
         with socket.socket(fileno=channel) as connection:
             _isolate(plan, uid)
             connection.sendall(encode_message(["ready"]))

@@ -20,7 +20,6 @@ from rse_pf.linux import PR_CAPBSET_DROP, PR_SET_DUMPABLE, PR_SET_NO_NEW_PRIVS, 
 __all__ = [
     "ISOLATION",
     "IsolationUnavailable",
-    "close_other_descriptors",
     "enter_namespaces",
     "forbid_system_calls",
     "give_up_privileges",
@@ -180,12 +179,6 @@ def forbid_system_calls(languages: Collection[str] = LANGUAGES) -> None:
     program = struct.pack("@HxxxxxxP", len(code) // 8, ctypes.addressof(buffer))
     _call("seccomp", prctl, PR_SET_NO_NEW_PRIVS, 1)
     _call("seccomp", prctl, PR_SET_SECCOMP, _SECCOMP_MODE_FILTER, program)
-
-
-def close_other_descriptors(keep: int) -> None:
-    """Close every file that a parent left open, but *keep* and the standard ones."""
-    os.closerange(3, keep)
-    os.closerange(max(3, keep + 1), 1 << 16)
 
 
 def _free_mount_point(readable: Sequence[Path]) -> str:
