@@ -7,6 +7,7 @@ radians) on the left of its pose.
 
 from __future__ import annotations
 
+import re
 from typing import Annotated, Literal
 
 import msgspec
@@ -46,6 +47,7 @@ LIVE_TOPIC = "live/"
 """Beginning of the topics of live maps; the name of the map follows."""
 
 _MapName = Annotated[str, msgspec.Meta(pattern=r"^[a-z0-9][a-z0-9-]{0,63}\Z")]
+_VERSION = re.compile(r"|head|[0-9a-f]{6,64}")
 _Count = Annotated[int, msgspec.Meta(ge=0, le=2**53 - 1)]
 
 
@@ -124,6 +126,13 @@ class LiveStart(_Value, frozen=True, kw_only=True):
     map: _MapName
     source: Annotated[str, msgspec.Meta(max_length=160)] = msgspec.field(name="from", default="")
     equal_rooms_m: Annotated[float, msgspec.Meta(ge=0.0, le=100.0)] = 0.0
+
+    def source_version(self) -> tuple[str, str]:
+        """Return the map and the version that ``source`` names; a version alone is one of this map."""
+        name, at, version = self.source.partition("@")
+        if at:
+            return name, version
+        return (self.map, name or "head") if _VERSION.fullmatch(name) else (name, "head")
 
 
 LiveRequest = KeyframeRequest | LiveRelocalise | LiveMapRequest | LiveForget | LiveStart

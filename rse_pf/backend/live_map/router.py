@@ -47,6 +47,7 @@ from rse_pf.wire.live_map import (
     KeyframeRequest,
     LiveRelocalise,
     LiveRequest,
+    LiveStart,
     map_of_topic,
 )
 
@@ -148,6 +149,8 @@ class LiveMapRouter(CommandQueue):
         request = _request_of(service, {} if command.payload is None else command.payload)
         right = "maps:write" if service in _FOR_OPERATORS else "maps:live"
         forbidden = _forbidden(claims, right, request.map)
+        if forbidden is None and isinstance(request, LiveStart):
+            forbidden = _forbidden_source(claims, request)
         if forbidden is not None:
             raise forbidden
         _check_keyframe(request)
@@ -291,6 +294,12 @@ def _forbidden(claims: Claims | None, right: str, map_name: str) -> RsePfError |
     if claims is None or scopes_allow(claims.scopes, right, map_name):
         return None
     return Forbidden(f"this token does not hold the scope {right}/{map_name}", hint="issue one that does")
+
+
+def _forbidden_source(claims: Claims | None, request: LiveStart) -> RsePfError | None:
+    """Return why a token does not allow to begin a map with another one: who starts it, may read it then."""
+    source, _ = request.source_version()
+    return None if source == request.map else _forbidden(claims, "maps:read", source)
 
 
 def _forbidden_to_read(claims: Claims | None, map_name: str) -> RsePfError | None:

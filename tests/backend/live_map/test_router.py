@@ -231,6 +231,34 @@ async def test_the_scope_of_the_map_decides(service: str, scopes: tuple[str, ...
         assert allowed or (isinstance(answer, Failure) and answer.code == "forbidden")
 
 
+@pytest.mark.parametrize(
+    ("source", "scopes", "allowed"),
+    [
+        ("secret", ("maps:write/m",), False),
+        ("secret@ab12cd", ("maps:write/m", "maps:live/secret"), False),
+        ("secret", ("maps:write/m", "maps:read/secret"), True),
+        ("secret@ab12cd", ("maps:write/m", "maps:read"), True),
+        ("m@ab12cd", ("maps:write/m",), True),
+        ("ab12cd", ("maps:write/m",), True),
+        ("head", ("maps:write/m",), True),
+        ("", ("maps:write/m",), True),
+    ],
+)
+async def test_a_map_begins_with_another_one_for_who_may_read_that(
+    source: str, scopes: tuple[str, ...], allowed: bool
+) -> None:
+    async with a_router() as parts:
+        connection = FakeReader()
+        connection.claims = claims(*scopes)
+        parts.owners.answer = lambda operation, payload: {}
+
+        answer = await parts.ask("live-start", {"map": "m", "from": source}, connection=connection)
+
+        assert isinstance(answer, Result) is allowed
+        assert len(parts.owners.asked) == allowed
+        assert allowed or (isinstance(answer, Failure) and "maps:read/secret" in answer.message)
+
+
 async def test_a_robot_lists_the_maps_of_its_tenant_that_it_may_enter() -> None:
     async with a_router() as parts:
         parts.owners.maps = {"default": [{"name": "a"}, {"name": "b"}], "acme": [{"name": "secret"}]}

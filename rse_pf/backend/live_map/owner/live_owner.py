@@ -326,7 +326,7 @@ class LiveOwner:
             )
         if request.source:
             version, source = await self._context.threads.background(
-                lambda: version_to_start_from(self._context.maps, self._context.map_name, request.source)
+                lambda: version_to_start_from(self._context.maps, request)
             )
             event = await self._context.threads.background(
                 lambda: self._context.kind.started_from(version, source)

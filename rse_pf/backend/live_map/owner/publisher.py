@@ -11,7 +11,6 @@ import asyncio
 import contextlib
 import dataclasses
 import functools
-import re
 from collections.abc import Callable, Sequence
 
 from rse_pf.backend.live_map.owner.context import OwnerContext
@@ -32,6 +31,7 @@ from rse_pf.maps.format import UP_FIELD, MapVersion, encode_map
 from rse_pf.maps.registry import MapOrigin, MapRecord, MapRegistry
 from rse_pf.maps.removal import superseded
 from rse_pf.object_store import digest_of
+from rse_pf.wire.live_map import LiveStart
 
 __all__ = ["AUTOMATIC_NOTES", "Publisher", "version_to_start_from"]
 
@@ -49,7 +49,6 @@ _FIRST_RETRY_S, _LAST_RETRY_S = 5.0, 600.0
 """A version that could not be stored is tried again after these times; encoding a large map takes seconds."""
 _NEVER = -1
 _TRIES = 5
-_VERSION = re.compile(r"head|[0-9a-f]{6,64}")
 
 
 class Publisher:
@@ -276,26 +275,14 @@ def _publish_version(
     raise AssertionError("the last try returns or raises")
 
 
-def version_to_start_from(maps: MapRegistry, map_name: str, source: str) -> tuple[MapVersion, str]:
-    """Return the version that *source* names, and its full name ``MAP@ID``.
-
-    Args:
-        maps: Of the tenant.
-        map_name: Of the live map.
-        source: ``MAP@VERSION``, a version of the map *map_name*, or another map, whose head is meant; "" is
-            the head of *map_name*.
+def version_to_start_from(maps: MapRegistry, request: LiveStart) -> tuple[MapVersion, str]:
+    """Return the version that *request* names, and its full name ``MAP@ID``.
 
     Raises:
         InternalError: The version is damaged.
         NotFound: There is no such map or version.
     """
-    name, at, version = source.partition("@")
-    if not at:
-        name, version = (map_name, source or "head") if _is_version(source) else (source, "head")
+    name, version = request.source_version()
     record = maps.record(name, version)
     with errors_of_maps(f"{name}@{record.id} cannot be read"):
         return maps.load(name, record.id), f"{name}@{record.id}"
-
-
-def _is_version(source: str) -> bool:
-    return not source or _VERSION.fullmatch(source) is not None
