@@ -11,14 +11,15 @@ import json
 import os
 import secrets
 import stat
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from rse_pf.errors import UsageError
 
 __all__ = [
-    "OWNER_ONLY", "TEMPORARY_PREFIX", "check_exists", "create_private_file", "read_private_file",
-    "read_regular_file", "replace_file", "replace_json", "sync_folder",
+    "OWNER_ONLY", "TEMPORARY_PREFIX", "check_exists", "create_private_file", "read_document",
+    "read_private_file", "read_regular_file", "replace_file", "replace_json", "sync_folder",
 ]  # fmt: skip
 
 OWNER_ONLY = 0o600
@@ -28,6 +29,7 @@ TEMPORARY_PREFIX = ".part-"
 _BY_UMASK = 0o666
 _OTHERS = 0o077
 _MAX_BYTES = 1 << 20
+_MAX_DOCUMENT_BYTES = 16 << 20
 
 
 def check_exists(path: Path | str, hint: str) -> None:
@@ -92,6 +94,34 @@ def read_regular_file(path: Path, max_bytes: int) -> bytes:
     if len(data) > max_bytes:
         raise OSError(errno.EFBIG, f"it is longer than {max_bytes} bytes", str(path))
     return data
+
+
+def read_document(
+    path: Path,
+    content: str,
+    *,
+    hint: str,
+    parse: Callable[[str], Any] = json.loads,
+    max_bytes: int = _MAX_DOCUMENT_BYTES,
+) -> Any:
+    """Return the value of a file of JSON, TOML or YAML that may come from anybody.
+
+    Args:
+        path: The file.
+        content: What the file holds, for the error: "a report of a map".
+        hint: What to do if it holds something else.
+        parse: Returns the value of a text, or raises ValueError.
+        max_bytes: Of the file.
+
+    Raises:
+        UsageError: The file cannot be read, is too long, or is not what *parse* takes.
+    """
+    try:
+        return parse(read_regular_file(path, max_bytes).decode())
+    except OSError as error:
+        raise UsageError(f"cannot read {path}: {error.strerror}", hint=hint) from error
+    except (ValueError, RecursionError, MemoryError) as error:
+        raise UsageError(f"{path} is not {content}: {error}", hint=hint) from error
 
 
 def read_private_file(path: Path, content: str, *, hint: str) -> bytes:

@@ -28,7 +28,7 @@ from client_sdk.frontend import load_opencv
 from client_sdk.image_map import ImageMap
 from rse_pf.config.validation import did_you_mean
 from rse_pf.errors import InvalidCamera, UsageError
-from rse_pf.files import read_regular_file
+from rse_pf.files import read_document
 from rse_pf.geometry import Array, Camera
 from rse_pf.images import MAX_IMAGE_PIXELS
 
@@ -171,14 +171,9 @@ def read_intrinsics(path: Path | str) -> Intrinsics:
 
 def read_json(path: Path, hint: str) -> Any:
     """Return what a small file of JSON holds; raises UsageError."""
-    try:
-        return json.loads(read_regular_file(path, _MAX_FILE_BYTES))
-    except FileNotFoundError as error:
-        raise UsageError(
-            f"there is no {path}, and the intrinsics are not known", hint=TYPICAL_HINT
-        ) from error
-    except (OSError, ValueError, RecursionError) as error:
-        raise UsageError(f"{path} is not a file of intrinsics", hint=hint) from error
+    if not path.exists():
+        raise UsageError(f"there is no {path}, and the intrinsics are not known", hint=TYPICAL_HINT)
+    return read_document(path, "a file of intrinsics", hint=hint, max_bytes=_MAX_FILE_BYTES)
 
 
 @contextlib.contextmanager

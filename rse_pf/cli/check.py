@@ -17,7 +17,7 @@ import argparse
 import asyncio
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from client_sdk.check.drive_check import check_lines
 from client_sdk.source_facts import DoubtLog, check_accepted, ended_early, unresolved
@@ -25,11 +25,11 @@ from rse_pf.cli.extras import require
 from rse_pf.cli.sensors import add_accept_argument, add_sensor_arguments, show_source
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import RsePfError, UsageError
-from rse_pf.files import read_regular_file, replace_file
+from rse_pf.files import read_document, replace_file
 from rse_pf.terminal import show, show_json, show_progress
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
 
     from client_sdk.check.findings import CheckReport
     from client_sdk.check.motion import MotionReference
@@ -41,7 +41,6 @@ __all__ = ["add_arguments", "run"]
 
 _MOST_LIVE = 3000
 """A device is looked at for so many frames unless --frames says another number."""
-_MAX_REPORT_BYTES = 16 << 20
 _OF_RECORDINGS = ("rgb.txt", "intrinsics.json", "metadata.yaml")
 """Folders with one of these are recordings or bags, whatever report somebody left in them."""
 
@@ -102,10 +101,8 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
 
 def _show_results(args: argparse.Namespace, file: Path) -> int:
     """Show what was found while a map was made: its results have no images."""
-    try:
-        told = json.loads(read_regular_file(file, _MAX_REPORT_BYTES)).get("check")
-    except (OSError, ValueError, AttributeError) as error:
-        raise UsageError(f"{file} is not a report of a map", hint="check the recording itself") from error
+    report = read_document(file, "a report of a map", hint="check the recording itself")
+    told = report.get("check") if isinstance(report, dict) else None
     if not isinstance(told, dict):
         raise UsageError(
             f"{args.source} was not checked while it was made, and its results have no images",
@@ -118,8 +115,15 @@ def _show_results(args: argparse.Namespace, file: Path) -> int:
     if args.json:
         show_json(told, indent=2)
     else:
-        show(*check_lines(told, is_whole=True))
+        show(*_lines_of_results(told, file))
     return 1 if told.get("findings") or told.get("source") or told.get("poses") == 0 else 0
+
+
+def _lines_of_results(told: Mapping[str, Any], file: Path) -> list[str]:
+    try:
+        return check_lines(told, is_whole=True)
+    except (TypeError, ValueError, AttributeError, MemoryError) as error:
+        raise UsageError(f"{file} is not a report of a map", hint="check the recording itself") from error
 
 
 def _checked(

@@ -56,7 +56,7 @@ class ServerPlacement:
             return cls.of(settings, **changes)
         try:
             document = json.loads(file.read_text(encoding="utf-8"))
-        except (OSError, ValueError) as error:
+        except (OSError, ValueError, RecursionError) as error:
             raise SettingsError(f"cannot read {file}: {error}", hint="name another file") from error
         placed = document.get(_FILE_KEY, {})
         unknown = set(placed) - set(cls.__slots__) if isinstance(placed, dict) else {_FILE_KEY}

@@ -95,6 +95,27 @@ def test_results_that_were_not_checked_name_the_recording(
     assert "check the recording itself" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    "text",
+    [
+        '{"check": {"findings": "x"}}', '{"check": {"findings": [1, null, {}]}}',
+        '{"check": {"findings": [{"cost": "x"}]}}', '{"check": {"findings": [[[]]]}}',
+        '{"check": {"findings": 5}}', '{"check": {"findings": [], "notes": 5}}',
+        '{"check": {"findings": [], "source": ["x"]}}', "[]", '{"check": 5}', '{"check": {"frames": 9',
+        '{"check":' + "[" * 200_000 + "]" * 200_000 + "}", '{"check": {"frames": ' + "9" * 5000 + "}}",
+    ],
+)  # fmt: skip
+def test_results_that_no_map_has_are_refused_in_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str
+) -> None:
+    (tmp_path / "report.json").write_text(text)
+
+    assert main(["check", str(tmp_path)]) == 2
+    said, hint = capsys.readouterr().err.splitlines()
+    assert "report.json" in said or "was not checked" in said
+    assert hint == "  hint: check the recording itself" or "are checked" in hint
+
+
 @pytest.mark.parametrize("option", ["--odometry", "--intrinsics", "--write", "--out"])
 def test_results_of_a_map_take_no_other_option(
     option: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]

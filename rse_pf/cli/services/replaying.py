@@ -11,6 +11,7 @@ from typing import Any
 
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError
+from rse_pf.files import read_document
 from rse_pf.services.custom.installed import InstalledService
 from rse_pf.services.custom.output import shown_output
 from rse_pf.terminal import counted, show
@@ -69,12 +70,7 @@ def plain(value: Any) -> Any:
 
 
 def _read_request(path: Path) -> dict[str, Any]:
-    try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise UsageError(f"cannot read {path}: {error.strerror}", hint=_HINT) from error
-    except (ValueError, RecursionError) as error:
-        raise UsageError(f"{path} is not JSON: {error}", hint=_HINT) from error
+    found = read_document(path, "JSON", hint=_HINT)
     if not isinstance(found, dict) or "request" not in found:
         raise UsageError(f"{path} holds no request", hint=_HINT)
     return found

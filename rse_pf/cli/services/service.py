@@ -49,6 +49,7 @@ from rse_pf.cli.services.publishing import add_publish_arguments, publish_servic
 from rse_pf.cli.services.replaying import Recorded, plain, recorded_requests, replay
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import RsePfError, UsageError
+from rse_pf.files import read_document
 from rse_pf.local.state import read_state, state_folder
 from rse_pf.services.custom.installed import install, installed_services
 from rse_pf.services.custom.native import INCLUDE_FOLDER
@@ -294,16 +295,14 @@ async def _call(name: str, request: str | None, platform: str, settings: Platfor
 
 def _payload(request: str | None) -> Any:
     text = request or "{}"
-    try:
-        if text.startswith("@"):
-            text = Path(text[1:]).read_text(encoding="utf-8")
-        payload = json.loads(text)
-    except OSError as error:
-        raise UsageError(f"cannot read {request}: {error.strerror}", hint="name a file after @") from error
-    except ValueError as error:
-        raise UsageError(
-            f"--request is not JSON: {error}", hint="write --request '{\"points\": [0, 0, 1]}'"
-        ) from error
+    hint = "write --request '{\"points\": [0, 0, 1]}'"
+    if text.startswith("@"):
+        payload = read_document(Path(text[1:]), "JSON", hint=hint)
+    else:
+        try:
+            payload = json.loads(text)
+        except (ValueError, RecursionError) as error:
+            raise UsageError(f"--request is not JSON: {error}", hint=hint) from error
     if isinstance(payload, dict) and "request" in payload and set(payload) <= _RECORDED_FIELDS:
         return payload["request"]
     return payload

@@ -22,7 +22,7 @@ from client_sdk.slots import load_features
 from client_sdk.tracking.monocular_tracker import MonocularOptions
 from rse_pf.config.validation import did_you_mean
 from rse_pf.errors import RsePfError, UsageError
-from rse_pf.files import read_regular_file
+from rse_pf.files import read_document
 
 __all__ = ["BUILT_IN", "SLOTS", "Configuration", "configurations_of", "failure_line"]
 
@@ -40,7 +40,7 @@ SLOTS = ("features", "motion", "loops", "optimiser")
 _OPTIONS = ("base", "depth", "frontend", "monocular")
 _FEATURES = re.compile(r"features-(\d{1,6})")
 _MIN_FEATURES, _MAX_FEATURES = 50, 20_000
-_MAX_BYTES = 1 << 20
+_MAX_BYTES = 16 << 10  # of TOML: the time for a name grows with the square of its parts
 _Options = TypeVar("_Options", FrontEndOptions, MonocularOptions)
 
 
@@ -181,14 +181,9 @@ def _read_toml(path: Path) -> tuple[Mapping[str, Any], Mapping[str, Callable[...
             hint="use Python 3.11, or write the same in NAME.py",
         )
     toml: Any = importlib.import_module("tomllib")
-    try:
-        values: dict[str, Any] = toml.loads(read_regular_file(path, _MAX_BYTES).decode())
-    except OSError as error:
-        raise UsageError(f"cannot read {path}: {error.strerror}", hint="name another file") from error
-    except ValueError as error:  # wrong TOML, or wrong UTF-8
-        raise UsageError(
-            f"{path} is no TOML: {error}", hint='write lines such as base = "default"'
-        ) from error
+    values: dict[str, Any] = read_document(
+        path, "TOML", hint='write lines such as base = "default"', parse=toml.loads, max_bytes=_MAX_BYTES
+    )
     for name in values:
         if name not in _OPTIONS:
             hint = did_you_mean(name, _OPTIONS, f"known are {', '.join(_OPTIONS)}")

@@ -20,6 +20,7 @@ from rse_pf.experiments.paper.mapping import CLOUD, map_figures
 from rse_pf.experiments.paper.robustness import robustness_figures
 from rse_pf.experiments.results.live_faults import live_fault_figures
 from rse_pf.experiments.results.records import EVENTS, Records, parameters_of, read_records
+from rse_pf.files import read_document
 
 __all__ = [
     "FigureCheck",
@@ -197,11 +198,7 @@ def _leaves(
 def read_report(folder: Path) -> dict[str, Any]:
     """Return the report in *folder*; raises UsageError."""
     path = folder / "report.json"
-    try:
-        report = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        why = getattr(error, "strerror", None) or error
-        raise UsageError(f"cannot read {path}: {why}", hint=_HINT) from error
+    report = read_document(path, "a report", hint=_HINT)
     if not isinstance(report, dict):
         raise UsageError(f"{path} is not a report", hint=_HINT)
     return report

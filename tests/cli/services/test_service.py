@@ -67,8 +67,9 @@ def test_an_installed_service_is_listed_and_refused_after_a_change(
     assert "was changed after it was installed" in capsys.readouterr().err
 
 
-def test_a_request_that_is_not_json_says_where(capsys: pytest.CaptureFixture[str]) -> None:
-    assert "--request is not JSON" in complaint(capsys, "call", "mine", "--request", "{points")
+@pytest.mark.parametrize("request_text", ["{points", "[" * 100_000], ids=["no JSON", "deep"])
+def test_a_request_that_is_not_json_says_where(capsys: pytest.CaptureFixture[str], request_text: str) -> None:
+    assert "--request is not JSON" in complaint(capsys, "call", "mine", "--request", request_text)
 
 
 def test_a_recorded_request_that_is_not_json_names_its_file(capsys: pytest.CaptureFixture[str]) -> None:

@@ -74,7 +74,10 @@ def test_functions_of_a_file_become_slots_that_the_mapper_takes(tmp_path: Path) 
     [
         ("a.toml", "features = 500\n", "sets features, which is no part"),
         ("a.toml", "fronted = 500\n", "sets fronted"),
-        ("a.toml", "[frontend\n", "is no TOML"),
+        ("a.toml", "[frontend\n", "is not TOML"),
+        ("a.toml", "base = " + "[" * 3000 + "]" * 3000, "is not TOML"),
+        ("a.toml", ".".join("a" * 8000) + " = 1", "sets a, which is no part"),
+        ("a.toml", ".".join("a" * 50_000) + " = 1", "longer than 16384 bytes"),
         ("a.toml", "[frontend]\nfeatures = 'many'\n", "frontend.features = 'many' is no int"),
         ("a.toml", "[frontend]\nfeatures = true\n", "frontend.features = True is no int"),
         ("a.toml", "[frontend]\nfeatures = 5\n", "must not be below"),
