@@ -14,7 +14,7 @@ import numpy as np
 from client_sdk.rigs.intrinsics import INTRINSICS_HINT, Intrinsics, lens_model, told_with
 from client_sdk.rigs.rig import Rig, RigCamera, RigImu
 from rse_pf.errors import MissingExtra, UsageError
-from rse_pf.files import read_regular_file
+from rse_pf.files import read_document
 from rse_pf.geometry import Array, Camera, inverse
 
 __all__ = ["read_kalibr"]
@@ -62,7 +62,7 @@ def _lens(values: Any) -> Intrinsics:
     model, distortion = values["camera_model"], values.get("distortion_model", "none")
     if model != "pinhole" or distortion not in _MODELS:
         raise UsageError(
-            f"a camera of model {model} with distortion {distortion} is not known",
+            f"a camera of model {model!s:.40} with distortion {distortion!s:.40} is not known",
             hint="calibrate with pinhole-radtan or pinhole-equi",
         )
     fx, fy, cx, cy = (float(value) for value in values["intrinsics"])
@@ -106,11 +106,24 @@ def _read_yaml(path: Path) -> Any:
         yaml: Any = importlib.import_module("yaml")
     except ImportError as error:
         raise MissingExtra("pyyaml", "vision") from error
-    try:
-        text = read_regular_file(path, _MAX_BYTES).decode()
-        values = yaml.safe_load(text.removeprefix("%YAML:1.0"))
-    except (OSError, ValueError, yaml.YAMLError, RecursionError) as error:
-        raise UsageError(f"{path} is no camchain of Kalibr", hint=INTRINSICS_HINT) from error
-    if not isinstance(values, dict):
-        raise UsageError(f"{path} is no camchain of Kalibr", hint=INTRINSICS_HINT)
-    return values
+
+    class LoaderWithoutAliases(yaml.SafeLoader):  # type: ignore[misc]  # PyYAML has no types
+        """Refuses aliases: nested ones unfold to gigabytes wherever a value is used."""
+
+        def compose_node(self, parent: Any, index: Any) -> Any:
+            if self.check_event(yaml.AliasEvent):
+                raise ValueError("it has aliases (*NAME): write each value out")
+            return super().compose_node(parent, index)
+
+    def parse(text: str) -> Any:
+        try:
+            values = LoaderWithoutAliases(text.removeprefix("%YAML:1.0")).get_single_data()
+        except yaml.YAMLError as error:
+            raise ValueError("it is not YAML") from error
+        if not isinstance(values, dict):
+            raise ValueError("it names no camera")
+        return values
+
+    return read_document(
+        path, "a camchain of Kalibr", hint=INTRINSICS_HINT, parse=parse, max_bytes=_MAX_BYTES
+    )

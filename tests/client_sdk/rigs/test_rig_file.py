@@ -57,6 +57,15 @@ def rows(pose: Array) -> str:
     return json.dumps(pose.tolist())
 
 
+def nested_aliases(name: str) -> str:
+    """Return a camchain of some hundred bytes, of which *name* unfolds to 10^9 numbers."""
+    lists = [
+        f"a{row}: &a{row} [" + ", ".join([f"*a{row - 1}" if row else "1"] * 10) + "]" for row in range(9)
+    ]
+    camera = {"camera_model": "pinhole", "intrinsics": "[1, 1, 1, 1]", "resolution": "[2, 2]", name: "*a8"}
+    return "\n".join([*lists, "cam0:", *(f"  {key}: {value}" for key, value in camera.items())])
+
+
 def camchain(folder: Path, *, with_imu: bool) -> Path:
     poses = {"imu0": T_IMU_LEFT, "imu1": T_IMU_LEFT @ T_LEFT_RIGHT}
     lines = {
@@ -154,15 +163,19 @@ def test_a_broken_rig_is_one_line(tmp_path: Path, text: str, says: str) -> None:
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ("a: [", "no camchain"),
-        ("- 1", "no camchain"),
-        ("[" * 100_000, "no camchain"),
-        ("a: &a [1]\n" * 3 + "cam0: *a", "no camchain"),
+        ("a: [", "not a camchain of Kalibr"),
+        ("- 1", "not a camchain of Kalibr"),
+        ("[" * 100_000, "not a camchain of Kalibr"),
+        ("a: &a [1]\n" * 3 + "cam0: *a", "not a camchain of Kalibr"),
+        ("cam0: &a [*a, *a]", "aliases"),
+        (nested_aliases("T_cam_imu"), "aliases"),
+        (nested_aliases("camera_model"), "aliases"),
+        ("cam0: {camera_model: [" + "1, " * 50_000 + "]}", r"model \[1, 1, .{20,40} with"),
         ("cam0: {camera_model: omni}", "model omni"),
         ("cam0: {camera_model: pinhole, distortion_model: radtan}", "has no intrinsics"),
-        ("!!python/object/apply:os.system ['true']", "no camchain"),
+        ("!!python/object/apply:os.system ['true']", "not a camchain of Kalibr"),
         ("cam1: {}", "no camera cam0"),
-        (" " * 300_000, "no camchain"),
+        (" " * 300_000, "longer than 262144 bytes"),
     ],
 )
 def test_a_hostile_camchain_is_one_line(tmp_path: Path, text: str, says: str) -> None:
