@@ -120,9 +120,14 @@ def _listener(settings: PlatformSettings, port: int, lan: LanListener | None) ->
         "common_http_protocol_options": {
             # For connections without a request; an open WebSocket is a request.
             "idle_timeout": _seconds(settings.session.hello_timeout_s),
+            # Else a client without a token keeps its place by requests for nothing.  After this time a
+            # connection closes with its next reply; what is open then, also a WebSocket, is not cut.
+            "max_connection_duration": _seconds(settings.session.hello_timeout_s),
             "max_headers_count": _MAX_HEADERS,
             "headers_with_underscores_action": "REJECT_REQUEST",
         },
+        # After max_connection_duration, for the next request.
+        "drain_timeout": _seconds(settings.session.hello_timeout_s),
         # The default of 1 s makes every close take a second, and hides a dead server from its robots.
         "delayed_close_timeout": "0s",
         "request_headers_timeout": _seconds(settings.session.hello_timeout_s),
