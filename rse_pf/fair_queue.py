@@ -54,12 +54,15 @@ class FairQueue(Generic[Item]):
 
     def peek(self) -> Item | None:
         """Return the next item without removing it; None if none waits or may run."""
-        robot = self._next()
+        robot = self._next(self._max_per_tenant)
         return None if robot is None else self._tenants[robot.tenant][robot][0]
 
-    def take(self) -> Item | None:
-        """Remove the next item and return it; it runs until `release`.  None if none waits or may run."""
-        robot = self._next()
+    def take(self, *, only_newcomers: bool = False) -> Item | None:
+        """Remove the next item and return it; it runs until `release`.  None if none waits or may run.
+
+        With *only_newcomers* it is of a tenant of which nothing runs.
+        """
+        robot = self._next(1 if only_newcomers else self._max_per_tenant)
         if robot is None:
             return None
         robots = self._tenants[robot.tenant]
@@ -109,8 +112,8 @@ class FairQueue(Generic[Item]):
         tenants = len(self._tenants) + (not robots)
         return min(1 + self._count, rounds * (len(robots) + (robot not in robots)) * tenants)
 
-    def _next(self) -> RobotId | None:
-        best, fewest = None, self._max_per_tenant
+    def _next(self, max_per_tenant: float) -> RobotId | None:
+        best, fewest = None, max_per_tenant
         for tenant, robots in self._tenants.items():
             running = self._running[tenant]
             if running < fewest:

@@ -1,8 +1,8 @@
 """Threads that work for robots in turn, so that the slow work of one robot delays no other for long.
 
-The order is that of `FairQueue`.  A robot never has more than one thread and a tenant never all of them, if
-there are several.  Work that is no longer wanted is not started; work that runs ends at its next call of
-`check_wanted`.
+The order is that of `FairQueue`.  A robot never has more than one thread.  If there are several, the last
+free one goes to a tenant that has none: two tenants with slow work do not delay a third.  Work that is no
+longer wanted is not started; work that runs ends at its next call of `check_wanted`.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ class FairThreads:
         self._free = threads
         self._lock = threading.Lock()  # held for some microseconds, never during work
         self._queue: FairQueue[_Task] = FairQueue(
-            max_running_per_robot=1, max_running_per_tenant=min(_MAX_PER_TENANT, max(1, threads - 1))
+            max_running_per_robot=1, max_running_per_tenant=_MAX_PER_TENANT
         )
 
     async def run(self, robot: RobotId, function: Callable[..., _T], *arguments: Any) -> _T:
@@ -99,7 +99,10 @@ class FairThreads:
 
     def _start(self) -> None:
         """Start what may run now; the lock is held."""
-        while self._free > 0 and (task := self._queue.take()) is not None:
+        while self._free > 0:
+            task = self._queue.take(only_newcomers=self._free == 1 < self._most)
+            if task is None:
+                return
             if not task.is_wanted:
                 self._queue.release(task.robot)
                 continue

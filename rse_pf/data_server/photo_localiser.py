@@ -30,7 +30,7 @@ __all__ = ["LEAST_PROCESSES", "TARGET", "PhotoLocaliser", "make_handler"]
 
 TARGET = f"{__name__}:make_handler"
 LEAST_PROCESSES = 3
-"""A robot has one of them at most, and a tenant all but one and never more than six (`FairThreads`)."""
+"""A robot has one of them at most, and the last one waits for a tenant that has none (`FairThreads`)."""
 _CACHED_MAPS = 4
 _MAX_PHOTO_S = 3.0  # of CPU time without that for the map: 16 megapixels take 0.7 s, other photos wait for it
 

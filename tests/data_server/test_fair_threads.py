@@ -71,6 +71,19 @@ async def test_a_tenant_never_has_all_of_a_few_threads() -> None:
     few.close()
 
 
+async def test_two_tenants_never_have_all_of_a_few_threads() -> None:
+    gate, few = Gate(), FairThreads(3)
+
+    robots = [RobotId(tenant, f"robot-{number}") for number in range(4) for tenant in ("acme", "umbrella")]
+    flood = [asyncio.ensure_future(few.run(robot, gate.work)) for robot in robots]
+    await gate.wait_entered(2)
+    assert await asyncio.wait_for(few.run(OTHER, int, "5"), TIMEOUT_S) == 5
+    assert not gate.entered.acquire(blocking=False)
+    gate.open.set()
+    await asyncio.wait_for(asyncio.gather(*flood), TIMEOUT_S)
+    few.close()
+
+
 async def test_a_robot_is_served_beside_the_flood_of_another(threads: FairThreads) -> None:
     gate = Gate()
 
