@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 from rse_pf.auth.roster import ROBOT_KEY, Roster
 from rse_pf.aws.storage import open_data_store
+from rse_pf.cli.access.access_control import described
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import Conflict, NotFound, UsageError
 from rse_pf.identity import RobotId
@@ -57,7 +58,7 @@ def run_adopt(args: argparse.Namespace, settings: PlatformSettings, roster: Rost
     source = robot._replace(enrolment=_thumbprint(args.from_key))
     adopted = adopt(_open_store(args, settings), robot, source=source)
     show(
-        f"robot {str(robot)!r} has {counted(adopted.objects, 'object')} more, "
+        f"{described(robot.name, robot.tenant)} has {counted(adopted.objects, 'object')} more, "
         f"{counted(adopted.object_bytes, 'byte')}, and "
         f"{counted(adopted.snapshots, 'snapshot')} of services"
     )

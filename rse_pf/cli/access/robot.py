@@ -5,7 +5,8 @@ connect with client_sdk.connect(enrolment=FILE).  Where a private key must not t
 with keygen, and the operator enrols the public half.  An enrolled robot signs its own short-lived tokens.
 Every change reaches all servers of the platform within 2 s; --cloud means the deployment on AWS.  remove
 deletes the public key, so tokens signed by the robot are refused; disable refuses all tokens of the robot,
-also those of rse-pf token issue.
+also those of rse-pf token issue.  A robot that is enrolled in another tenant than the default one is named
+with --tenant; list shows all tenants without it.
 
 A name with another key is another robot, which sees nothing of the one before.  adopt gives the robot that
 has the name now what was stored under the name without a key, or, with --from-key, under its earlier key.
@@ -15,6 +16,7 @@ examples:
   rse-pf robot keygen --out robot.key > robot.json
   rse-pf robot enrol robot-1 --public-key robot.json --scope services:pnp
   rse-pf robot list
+  rse-pf robot list --tenant acme
   rse-pf robot disable robot-1
   rse-pf robot enable robot-1
   rse-pf robot remove robot-1
@@ -24,14 +26,11 @@ examples:
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 import time
 from pathlib import Path
 from typing import Any
 
-from rse_pf.audit.entry import Value
-from rse_pf.audit.operator import record
 from rse_pf.auth.roster import (
     DenyList,
     EnrolledRobot,
@@ -43,16 +42,26 @@ from rse_pf.auth.roster import (
     public_key_of,
 )
 from rse_pf.auth.trust_store import AccessControlStore
+from rse_pf.cli.access.access_control import (
+    add_place,
+    choose_robot,
+    described,
+    format_time,
+    max_token_s,
+    open_access_control,
+    record_action,
+)
 from rse_pf.cli.access.enrolment import enrolment_lines, make_enrolment
 from rse_pf.config import PlatformSettings
-from rse_pf.config.resource_names import ResourceNames
 from rse_pf.errors import UsageError
+from rse_pf.identity import DEFAULT_TENANT
 from rse_pf.terminal import show, show_json
 
-__all__ = ["add_arguments", "add_place", "max_token_s", "open_access_control", "record_action", "run"]
+__all__ = ["add_arguments", "run"]
 
-_DEFAULT = "default"
 _ACTIONS = ("keygen", "enrol", "list", "disable", "enable", "remove", "adopt")
+_ALSO_NOT_ENROLLED = ("disable", "adopt")
+"""Actions that a robot without a key of its own, which uses tokens of the platform, may be named for."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -99,15 +108,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--store", help="adopt: dir:PATH or s3:BUCKET (default: data.store, or the local platform's)"
     )
+    parser.add_argument(
+        "--not-enrolled", action="store_true",
+        help="disable, adopt: a robot without a key of its own, which uses tokens of rse-pf token issue",
+    )  # fmt: skip
     parser.add_argument("--json", action="store_true", help="list: as JSON")
     add_place(parser)
-
-
-def add_place(parser: argparse.ArgumentParser) -> None:
-    """Declare which platform is meant, and which tenant."""
-    parser.add_argument("--tenant", default=_DEFAULT, help=f"whose robot (default: {_DEFAULT})")
-    parser.add_argument("--cloud", action="store_true", help="the deployment on AWS in cloud.region")
-    parser.add_argument("--name", default=_DEFAULT, help=f"which local platform (default: {_DEFAULT})")
 
 
 def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
@@ -121,72 +127,29 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     access, now = open_access_control(args, settings), time.time()
     if args.action == "list":
         return _list(args, access)
-    robot, tenant = check_robot(args.robot), check_tenant(args.tenant)
-    longest = max_token_s(settings)
     if args.action == "enrol":
+        args.tenant = check_tenant(DEFAULT_TENANT if args.tenant is None else args.tenant)
         return _enrol(args, access, now, settings)
-    if args.action == "adopt":
-        from rse_pf.cli.access.adopt import run_adopt
+    args.tenant = _tenant(args, access)
+    actions = {"adopt": _adopt, "remove": _remove, "disable": _disable, "enable": _enable}
+    return actions[args.action](args, access, settings)
 
-        adopted = run_adopt(args, settings, access.roster())
-        record_action(
-            args, settings, "robot.adopted", robot, tenant=tenant, source=args.from_key,
-            objects=adopted.objects, snapshots=adopted.snapshots,
+
+def _tenant(args: argparse.Namespace, access: AccessControlStore) -> str:
+    """Return the tenant of the robot that *args* mean; raises UsageError if there is no such robot."""
+    if args.not_enrolled:
+        check_robot(args.robot)
+        return check_tenant(DEFAULT_TENANT if args.tenant is None else args.tenant)
+    if args.action == "enable":
+        return choose_robot(
+            args.robot, args.tenant, access.deny_list().disabled, state="disabled",
+            hint="rse-pf robot list shows who is",
         )  # fmt: skip
-        return 0
-    if args.action == "remove":
-        return _remove(args, access, settings)
-    if args.action == "disable":
-        access.change_deny_list(
-            lambda denied: denied.pruned(now=now, max_token_s=longest).with_robot(tenant, robot, now)
-        )
-        record_action(args, settings, "robot.disabled", robot, tenant=tenant)
-        show(f"robot {robot!r} is disabled: its connections end within 2 s, and all its tokens are refused")
-        return 0
-    if not access.deny_list().is_disabled(tenant, robot):
-        raise UsageError(f"robot {robot!r} is not disabled", hint="rse-pf robot list shows who is")
-
-    def enabled(denied: DenyList) -> DenyList:
-        remaining = denied.pruned(now=now, max_token_s=longest).without_robot(tenant, robot)
-        return remaining.with_tokens_before(tenant, robot, float(int(now)))
-
-    access.change_deny_list(enabled)
-    record_action(args, settings, "robot.enabled", robot, tenant=tenant)
-    show(f"robot {robot!r} is enabled again, for tokens issued from now on")
-    return 0
-
-
-def open_access_control(args: argparse.Namespace, settings: PlatformSettings) -> AccessControlStore:
-    """Return the access control store of the platform in *args*; raises UsageError if there is none."""
-    if args.cloud:
-        from rse_pf.aws.account import open_account
-        from rse_pf.aws.storage.key_store import open_key_store
-
-        account, names = open_account(settings.cloud.region), ResourceNames(settings.cloud.name)
-        return open_key_store(account, names).access_control_store()
-    from rse_pf.local.disk_watch import access_control_store
-    from rse_pf.local.firewall import key_set_file
-    from rse_pf.local.state import state_folder
-
-    folder = state_folder(args.name, os.environ)
-    if not key_set_file(folder).exists():
-        raise UsageError(f"there is no platform {args.name!r}", hint="start one with rse-pf local")
-    return access_control_store(folder)
-
-
-def record_action(
-    args: argparse.Namespace, settings: PlatformSettings, action: str, subject: str, **detail: Value
-) -> None:
-    """Record an action in the audit log of a local platform; in a cloud the bucket keeps all versions."""
-    if not args.cloud:
-        from rse_pf.local.state import state_folder
-
-        record(state_folder(args.name, os.environ), action, subject, **detail)
-
-
-def max_token_s(settings: PlatformSettings) -> float:
-    """Return the longest time for which a token may be valid after it was issued, in seconds."""
-    return float(settings.auth.token_ttl_s + settings.auth.leeway_s)
+    others = "; one that has none but tokens of rse-pf token issue: add --not-enrolled"
+    return choose_robot(
+        args.robot, args.tenant, access.roster().robots, state="enrolled",
+        hint="rse-pf robot list shows who is" + others * (args.action in _ALSO_NOT_ENROLLED),
+    )  # fmt: skip
 
 
 def _check(args: argparse.Namespace) -> None:
@@ -210,6 +173,8 @@ def _check(args: argparse.Namespace) -> None:
         raise UsageError("--url and --authority are for enrol --out", hint="see rse-pf robot --help")
     if args.action != "adopt" and (args.from_key or args.store):
         raise UsageError("--from-key and --store are for adopt", hint="see rse-pf robot --help")
+    if args.action not in _ALSO_NOT_ENROLLED and args.not_enrolled:
+        raise UsageError("--not-enrolled is for disable and adopt", hint="see rse-pf robot --help")
     if args.action != "enrol" and (args.scope or args.quota):
         raise UsageError("--scope and --quota are for enrol", hint="enrol the robot again to change them")
 
@@ -239,21 +204,32 @@ def _enrol(
     record_action(
         args, settings, "robot.enrolled", robot.robot, tenant=robot.tenant, key=robot.key_id, scopes=allowed
     )
-    show(f"robot {robot.robot!r} is enrolled with {robot.key_id}; it may use {allowed}")
+    who = described(robot.robot, robot.tenant)
+    show(f"{who} is enrolled with {robot.key_id}; it may use {allowed}")
     if before is not None and before.x != robot.x:
-        tenant = "" if robot.tenant == _DEFAULT else f" --tenant {robot.tenant}"
         show(
             "its earlier key is refused within 2 s; to give it what it stored under that key:  "
-            f"rse-pf robot adopt {robot.robot} --from-key {before.key_id}{tenant}"
+            f"rse-pf robot adopt {robot.robot} --from-key {before.key_id} --tenant {robot.tenant}"
         )
     if enrolment is not None:
         show(*enrolment_lines(enrolment, args.out))
     return 0
 
 
+def _adopt(args: argparse.Namespace, access: AccessControlStore, settings: PlatformSettings) -> int:
+    from rse_pf.cli.access.adopt import run_adopt
+
+    adopted = run_adopt(args, settings, access.roster())
+    record_action(
+        args, settings, "robot.adopted", args.robot, tenant=args.tenant, source=args.from_key,
+        objects=adopted.objects, snapshots=adopted.snapshots,
+    )  # fmt: skip
+    return 0
+
+
 def _remove(args: argparse.Namespace, access: AccessControlStore, settings: PlatformSettings) -> int:
     enrolled = access.roster().find(args.tenant, args.robot)
-    if enrolled is None:
+    if enrolled is None:  # another operator has just removed it
         raise UsageError(f"robot {args.robot!r} is not enrolled", hint="rse-pf robot list shows who is")
 
     def without(roster: Roster) -> Roster:
@@ -261,7 +237,37 @@ def _remove(args: argparse.Namespace, access: AccessControlStore, settings: Plat
 
     access.change_roster(without)
     record_action(args, settings, "robot.removed", args.robot, tenant=args.tenant, key=enrolled.key_id)
-    show(f"robot {args.robot!r} is removed: tokens signed by {enrolled.key_id} are refused within 2 s")
+    who = described(args.robot, args.tenant)
+    show(f"{who} is removed: tokens signed by {enrolled.key_id} are refused within 2 s")
+    return 0
+
+
+def _disable(args: argparse.Namespace, access: AccessControlStore, settings: PlatformSettings) -> int:
+    robot, tenant, now = args.robot, args.tenant, time.time()
+    longest = max_token_s(settings)
+    access.change_deny_list(
+        lambda denied: denied.pruned(now=now, max_token_s=longest).with_robot(tenant, robot, now)
+    )
+    record_action(args, settings, "robot.disabled", robot, tenant=tenant)
+    who = described(robot, tenant)
+    show(
+        f"{who} is disabled: its connections end within 2 s, and all its tokens are refused",
+        f"to let it in again:  rse-pf robot enable {robot} --tenant {tenant}",
+    )
+    return 0
+
+
+def _enable(args: argparse.Namespace, access: AccessControlStore, settings: PlatformSettings) -> int:
+    robot, tenant, now = args.robot, args.tenant, time.time()
+    longest, from_s = max_token_s(settings), float(int(now))
+
+    def enabled(denied: DenyList) -> DenyList:
+        remaining = denied.pruned(now=now, max_token_s=longest).without_robot(tenant, robot)
+        return remaining.with_tokens_before(tenant, robot, from_s)
+
+    access.change_deny_list(enabled)
+    record_action(args, settings, "robot.enabled", robot, tenant=tenant)
+    show(f"{described(robot, tenant)} is enabled again, for tokens issued since {format_time(from_s)}")
     return 0
 
 
@@ -286,23 +292,36 @@ def _quota(text: str) -> tuple[str, float]:
 
 def _list(args: argparse.Namespace, access: AccessControlStore) -> int:
     roster, denied = access.roster(), access.deny_list()
-    rows = [_row(robot, denied) for robot in roster.robots if robot.tenant == args.tenant]
+    rows = [_row(robot, denied) for robot in roster.robots]
     for entry in denied.disabled:
-        if entry.tenant == args.tenant and roster.find(entry.tenant, entry.robot) is None:
-            rows.append({"robot": entry.robot, "state": "disabled", "key": "no key of its own", "scopes": []})
+        if roster.find(entry.tenant, entry.robot) is None:
+            rows.append(
+                {
+                    "tenant": entry.tenant,
+                    "robot": entry.robot,
+                    "state": "disabled",
+                    "key": "no key of its own",
+                    "scopes": [],
+                }
+            )
+    rows = [row for row in rows if args.tenant in (None, row["tenant"])]
+    rows.sort(key=lambda row: row["tenant"])
     if args.json:
         show_json(rows, indent=2)
         return 0
     for row in rows:
-        show(f"{row['robot']}  {row['state']}  {row['key']}  {' '.join(row['scopes'])}".rstrip())
+        columns = (row["tenant"], row["robot"], row["state"], row["key"], " ".join(row["scopes"]))
+        show("  ".join(columns).rstrip())
     if not rows:
-        show("no robot is enrolled or disabled; other robots use tokens of rse-pf token issue")
+        where = "" if args.tenant is None else f" in tenant {args.tenant!r}"
+        show(f"no robot is enrolled or disabled{where}; other robots use tokens of rse-pf token issue")
     return 0
 
 
 def _row(robot: EnrolledRobot, denied: DenyList) -> dict[str, Any]:
     state = "disabled" if denied.is_disabled(robot.tenant, robot.robot) else "enrolled"
     return {
+        "tenant": robot.tenant,
         "robot": robot.robot,
         "state": state,
         "key": robot.key_id,

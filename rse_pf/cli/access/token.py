@@ -32,11 +32,20 @@ from typing import TYPE_CHECKING, Any
 from rse_pf.auth.roster import check_robot, check_tenant
 from rse_pf.auth.tokens import KeySet, SigningKey, unverified_parts
 from rse_pf.auth.trust_store import AccessControlStore
-from rse_pf.cli.access.robot import add_place, max_token_s, open_access_control, record_action
+from rse_pf.cli.access.access_control import (
+    add_place,
+    choose_robot,
+    described,
+    format_time,
+    max_token_s,
+    open_access_control,
+    record_action,
+)
 from rse_pf.config import PlatformSettings
 from rse_pf.config.resource_names import ResourceNames
 from rse_pf.errors import ConfigurationError, Unauthorized, UsageError
 from rse_pf.files import OWNER_ONLY, replace_file
+from rse_pf.identity import DEFAULT_TENANT
 from rse_pf.terminal import show, show_json
 
 if TYPE_CHECKING:
@@ -71,6 +80,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--all-of", metavar="ROBOT", help="revoke: every token issued to this robot until now"
     )
+    parser.add_argument(
+        "--not-enrolled", action="store_true",
+        help="revoke --all-of: a robot without a key of its own, which uses tokens of rse-pf token issue",
+    )  # fmt: skip
     parser.add_argument("--key", type=Path, metavar="FILE", help="issue: sign with this key")
     parser.add_argument(
         "--ttl",
@@ -88,6 +101,8 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     """Do one action, by the settings that the platform was started with unless told otherwise."""
     if args.force and args.action != "retire":
         raise UsageError("--force is for retire", hint="see rse-pf token --help")
+    if args.not_enrolled and args.all_of is None:
+        raise UsageError("--not-enrolled is for revoke --all-of", hint="see rse-pf token --help")
     if args.action in _KEY_ACTIONS:
         return _change_keys(args, settings)
     if args.action == "revoke":
@@ -112,6 +127,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
 
 def _issue(args: argparse.Namespace, settings: PlatformSettings) -> int:
     now, token_id = time.time(), secrets.token_hex(8)
+    tenant = check_tenant(DEFAULT_TENANT if args.tenant is None else args.tenant)
     token = _signing_key(args, settings, now).issue(
         check_robot(args.subject),
         now=now,
@@ -119,10 +135,10 @@ def _issue(args: argparse.Namespace, settings: PlatformSettings) -> int:
         settings=settings.auth,
         ttl_s=args.ttl,
         scopes=tuple(args.scope),
-        tenant=check_tenant(args.tenant),
+        tenant=tenant,
     )
     if args.key is None:
-        record_action(args, settings, "token.issued", args.subject, tenant=args.tenant, token=token_id)
+        record_action(args, settings, "token.issued", args.subject, tenant=tenant, token=token_id)
     show(token)
     return 0
 
@@ -132,18 +148,33 @@ def _revoke(args: argparse.Namespace, settings: PlatformSettings) -> int:
         raise UsageError(
             "rse-pf token revoke needs a token, or --all-of ROBOT", hint="a token or - comes last"
         )
+    return _revoke_token(args, settings) if args.all_of is None else _revoke_all(args, settings)
+
+
+def _revoke_all(args: argparse.Namespace, settings: PlatformSettings) -> int:
+    access, now, longest = open_access_control(args, settings), time.time(), max_token_s(settings)
+    robot, from_s = check_robot(args.all_of), float(int(now) + 1)  # tokens have whole seconds, rounded down
+    tenant = check_tenant(DEFAULT_TENANT if args.tenant is None else args.tenant)
+    if not args.not_enrolled:
+        tenant = choose_robot(
+            robot, args.tenant, access.roster().robots, state="enrolled",
+            hint="rse-pf robot list shows who is; one that has none but tokens of rse-pf token issue: add "
+            "--not-enrolled",
+        )  # fmt: skip
+    access.change_deny_list(
+        lambda denied: denied.pruned(now=now, max_token_s=longest).with_tokens_before(tenant, robot, from_s)
+    )
+    record_action(args, settings, "token.revoked-all", robot, tenant=tenant)
+    show(
+        f"tokens of {described(robot, tenant)} from before {format_time(from_s)} are refused, and their "
+        "connections end within 2 s",
+        f"later tokens are valid; to keep the robot out:  rse-pf robot disable {robot} --tenant {tenant}",
+    )
+    return 0
+
+
+def _revoke_token(args: argparse.Namespace, settings: PlatformSettings) -> int:
     now, longest = time.time(), max_token_s(settings)
-    if args.all_of is not None:
-        robot, tenant = check_robot(args.all_of), check_tenant(args.tenant)
-        from_s = float(int(now) + 1)  # tokens hold their time of issue in whole seconds, rounded down
-        open_access_control(args, settings).change_deny_list(
-            lambda denied: denied.pruned(now=now, max_token_s=longest).with_tokens_before(
-                tenant, robot, from_s
-            )
-        )
-        record_action(args, settings, "token.revoked-all", robot, tenant=tenant)
-        show(f"every token of {robot!r} until now is revoked; tokens issued after one second are valid")
-        return 0
     header, claims = unverified_parts(_token(args.subject))
     name, token_id, over = claims.get("sub"), claims.get("jti"), claims.get("exp")
     if not isinstance(name, str) or not isinstance(token_id, str) or not isinstance(over, (int, float)):
@@ -153,20 +184,24 @@ def _revoke(args: argparse.Namespace, settings: PlatformSettings) -> int:
     if over + settings.auth.leeway_s < now:
         raise UsageError("this token has expired already", hint="there is nothing to do")
     access = open_access_control(args, settings)
-    tenant = _tenant_of(access, header, claims)
+    keys, key_id = _keys(args, settings), str(header.get("kid"))
+    if not keys.knows(key_id):
+        raise UsageError(
+            f"no server of this platform accepts this token: the key {key_id[:80]!r} is not known",
+            hint="if another platform issued it, name that one with --name or --cloud",
+        )
+    enrolled = keys.robot_of(key_id)  # the roster says whose a token is that a robot signed
+    tenant = str(claims.get("tenant", DEFAULT_TENANT)) if enrolled is None else enrolled.tenant
     until_s = min(float(over), now + longest)
     access.change_deny_list(
         lambda denied: denied.pruned(now=now, max_token_s=longest).with_token(tenant, name, token_id, until_s)
     )
     record_action(args, settings, "token.revoked", name, tenant=tenant, token=token_id)
-    show(f"token {token_id} of {name!r} is revoked: its connections end within 2 s")
+    show(
+        f"token {token_id} of {described(name, tenant)} is revoked: it is refused from now on, and its "
+        "connections end within 2 s; other tokens of the robot stay valid"
+    )
     return 0
-
-
-def _tenant_of(access: AccessControlStore, header: dict[str, Any], claims: dict[str, Any]) -> str:
-    """Return the tenant of a token's robot: the roster's if the robot signed it, else the token's."""
-    enrolled = [robot for robot in access.roster().robots if robot.key_id == header.get("kid")]
-    return enrolled[0].tenant if enrolled else str(claims.get("tenant", "default"))
 
 
 def _signing_key(args: argparse.Namespace, settings: PlatformSettings, now: float) -> SigningKey:

@@ -149,7 +149,7 @@ def test_a_key_that_is_none_is_refused(capsys: Capture, platform: Path, key: str
 
 
 def test_adoption_needs_the_store(capsys: Capture, platform: Path) -> None:
-    assert main(["robot", "adopt", "robot-1"]) == 2
+    assert main(["robot", "adopt", "robot-1", "--not-enrolled"]) == 2
     assert "--store" in capsys.readouterr().err
     assert main(["robot", "list", "--from-key", "x"]) == 2
 

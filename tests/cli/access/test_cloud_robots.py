@@ -129,7 +129,7 @@ def test_concurrent_changes_of_two_operators_are_both_kept(
         swap(self, name, expected, data)
 
     monkeypatch.setattr(S3Store, "compare_and_swap", late)
-    output_of(capsys, "robot", "disable", "robot-1", "--cloud")
+    output_of(capsys, "robot", "disable", "robot-1", "--not-enrolled", "--cloud")
 
     assert {each.robot for each in other.deny_list().disabled} == {"robot-1", "robot-2"}
 
@@ -166,7 +166,7 @@ def test_one_fetch_of_the_agent_and_one_refresh_of_the_server_apply_a_change(
     assert known() == ["", "", ""]
     output_of(capsys, "token", "revoke", tokens[1], "--cloud")
     assert known() == ["", "revoked", ""]
-    output_of(capsys, "token", "revoke", "--all-of", "robot-2", "--cloud")
+    output_of(capsys, "token", "revoke", "--all-of", "robot-2", "--not-enrolled", "--cloud")
     assert known() == ["", "revoked", "issued-too-early"]
     output_of(capsys, "robot", "disable", "robot-1", "--cloud")
     assert known() == ["disabled", "revoked", "issued-too-early"]

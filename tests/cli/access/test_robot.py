@@ -6,6 +6,7 @@ import asyncio
 import base64
 import io
 import json
+import re
 import stat
 import time
 from pathlib import Path
@@ -13,11 +14,12 @@ from pathlib import Path
 import pytest
 
 from rse_pf.auth.robot_key import RobotKey
-from rse_pf.auth.tokens import KeySet, token_problem, verify_token
+from rse_pf.auth.tokens import Claims, KeySet, SigningKey, token_problem, verify_token
 from rse_pf.auth.trust_store import AccessControlStore
 from rse_pf.cli.main import main
 from rse_pf.config import AuthSettings
 from rse_pf.errors import Unauthorized, UsageError
+from rse_pf.identity import RobotId
 from rse_pf.local.firewall import key_file, key_set_file
 from rse_pf.object_store import DirectoryStore
 
@@ -122,9 +124,9 @@ def test_a_disabled_robot_is_refused_whoever_signed_and_an_enabled_one_needs_a_f
 
 
 def test_a_robot_without_a_key_of_its_own_can_be_disabled_too(capsys: Capture, platform: Path) -> None:
-    said(capsys, "robot", "disable", "other")
+    said(capsys, "robot", "disable", "other", "--not-enrolled")
 
-    assert "other  disabled  no key of its own" in said(capsys, "robot", "list")
+    assert "default  other  disabled  no key of its own" in said(capsys, "robot", "list")
     assert problem(platform, issued(capsys, "other")) == "disabled"
 
 
@@ -156,9 +158,101 @@ def test_a_token_that_a_robot_signed_is_revoked_in_the_tenant_of_the_roster(
 def test_all_tokens_of_a_robot_until_now_are_revoked(capsys: Capture, platform: Path) -> None:
     mine, others = issued(capsys), issued(capsys, "robot-2")
 
-    said(capsys, "token", "revoke", "--all-of", "robot-1")
+    said(capsys, "token", "revoke", "--all-of", "robot-1", "--not-enrolled")
 
     assert (problem(platform, mine), problem(platform, others)) == ("issued-too-early", "")
+
+
+CHANGES = ("robot disable", "robot remove", "robot adopt", "token revoke --all-of")
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_a_robot_of_another_tenant_is_changed_only_with_its_tenant(
+    capsys: Capture, platform: Path, change: str
+) -> None:
+    token = asyncio.run(enrolled(capsys, "robot-1", "--tenant", "acme").token())
+    (platform / "objects").mkdir()
+    words = (*change.split(), "robot-1")
+
+    for tenant in ([], ["--tenant", "acmee"]):
+        problem_line, hint = refused(capsys, *words, *tenant)
+        assert "the enrolled robot 'robot-1' is of tenant 'acme', and not of" in problem_line
+        assert "--tenant acme" in hint
+    assert problem(platform, token) == ""
+    assert "'robot-1' of tenant 'acme'" in said(capsys, *words, "--tenant", "acme").replace(
+        "acme/robot-1", ""
+    )
+    assert (problem(platform, token) != "") == (change != "robot adopt")
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_a_name_that_two_tenants_have_is_changed_only_with_its_tenant(
+    capsys: Capture, platform: Path, change: str
+) -> None:
+    for tenant in ("default", "acme"):
+        Path("robot-1.key").unlink(missing_ok=True)
+        enrolled(capsys, "robot-1", "--tenant", tenant)
+
+    problem_line, hint = refused(capsys, *change.split(), "robot-1")
+
+    assert "is of tenants 'acme', 'default'" in problem_line
+    assert "--tenant acme" in hint
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_a_robot_that_is_nowhere_is_not_changed(capsys: Capture, platform: Path, change: str) -> None:
+    enrolled(capsys, "robot-1")
+
+    assert "robot 'robot-2' is not enrolled in any tenant" in refused(capsys, *change.split(), "robot-2")[0]
+
+    assert trusted(platform).denies(_claims("robot-2")) == ""
+
+
+def _claims(robot: str) -> Claims:
+    return Claims(robot=RobotId("default", robot), token_id="t", issued_s=1.0, expires_s=2.0, key_id="k")
+
+
+def test_a_disabled_robot_of_another_tenant_is_enabled_only_with_its_tenant(
+    capsys: Capture, platform: Path
+) -> None:
+    enrolled(capsys, "robot-1", "--tenant", "acme")
+    said(capsys, "robot", "disable", "robot-1", "--tenant", "acme")
+
+    assert "is of tenant 'acme', and not of 'default'" in refused(capsys, "robot", "enable", "robot-1")[0]
+
+    assert "of tenant 'acme'" in said(capsys, "robot", "enable", "robot-1", "--tenant", "acme")
+
+
+def test_a_revocation_says_whose_tokens_are_refused_and_since_when(capsys: Capture, platform: Path) -> None:
+    enrolled(capsys, "robot-1", "--tenant", "acme")
+
+    first, second = said(capsys, "token", "revoke", "--all-of", "robot-1", "--tenant", "acme").splitlines()
+
+    assert re.search(
+        r"'robot-1' of tenant 'acme' from before 20\d\d-\d\d-\d\d \d\d:\d\d:\d\dZ are refused", first
+    )
+    assert "rse-pf robot disable robot-1 --tenant acme" in second
+
+
+def test_a_token_of_another_platform_is_not_revoked(capsys: Capture, platform: Path) -> None:
+    signer = SigningKey.from_seed(b"t" * 32, "another")
+    token = signer.issue("robot-1", now=time.time(), token_id="t", settings=SETTINGS)
+
+    assert "the key 'another' is not known" in refused(capsys, "token", "revoke", token)[0]
+
+
+def test_the_list_has_the_robots_of_all_tenants_or_of_one(capsys: Capture, platform: Path) -> None:
+    enrolled(capsys, "robot-1", "--tenant", "acme")
+    enrolled(capsys, "robot-2")
+    said(capsys, "robot", "disable", "robot-3", "--tenant", "beta", "--not-enrolled")
+
+    listed = [line.split("  ")[:3] for line in said(capsys, "robot", "list").splitlines()]
+    assert listed == [
+        ["acme", "robot-1", "enrolled"], ["beta", "robot-3", "disabled"], ["default", "robot-2", "enrolled"],
+    ]  # fmt: skip
+    rows = json.loads(said(capsys, "robot", "list", "--json", "--tenant", "acme"))
+    assert [(row["tenant"], row["robot"]) for row in rows] == [("acme", "robot-1")]
+    assert "in tenant 'acmee'" in said(capsys, "robot", "list", "--tenant", "acmee")
 
 
 def test_after_a_rotation_both_keys_are_trusted_and_after_two_the_first_is_not(
@@ -198,6 +292,8 @@ def test_a_roster_that_is_empty_says_so(capsys: Capture, platform: Path) -> None
         ("robot enrol robot-1 --public-key public.json --quota data_bytes", "is not a quota"),
         ("robot disable", "needs the name"),
         ("robot disable robot-1 --scope services:pnp", "--scope"),
+        ("robot remove robot-1 --not-enrolled", "--not-enrolled"),
+        ("token revoke x.y.z --not-enrolled", "--not-enrolled"),
         ("robot enable robot-1", "is not disabled"),
         ("robot list robot-1", "names no robot"),
         ("robot list --name nowhere", "no platform"),

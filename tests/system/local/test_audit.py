@@ -111,7 +111,7 @@ async def test_a_platform_records_its_actions_its_robots_and_its_operator(
 
         async with connect(cloud.url, token=cloud.issue_token("robot-1")):
             pass
-        assert await asyncio.to_thread(main, ["robot", "disable", "robot-7", "--name", "audited"]) == 0
+        assert await asyncio.to_thread(main, ["robot", "disable", "robot-7", "--not-enrolled", "--name", "audited"]) == 0
         (server,) = [who for who in log_names(audit) if who.startswith("server-")]
 
     assert {entry.subject for entry in entries(audit, server) if entry.action == "auth.accepted"} == {

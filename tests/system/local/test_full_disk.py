@@ -88,10 +88,10 @@ async def live_through_a_full_disk(disk: Path, fill: Callable[[Path], Path]) -> 
         hog = fill(disk)
         await until(lambda: "disk-full" in names())
 
-        assert verb(robot_verb, "disable", "stolen") == 0
-        assert verb(token_verb, "revoke", "--all-of", "lost") == 0
+        assert verb(robot_verb, "disable", "stolen", "--not-enrolled") == 0
+        assert verb(token_verb, "revoke", "--all-of", "lost", "--not-enrolled") == 0
         for number in range(40):  # the reserve is not used up by commands
-            assert verb(robot_verb, "disable", f"other-{number}") == 0
+            assert verb(robot_verb, "disable", f"other-{number}", "--not-enrolled") == 0
         await until(lambda: not any(robots[name].connected for name in ("stolen", "lost")))
         for name in ("stolen", "lost"):
             assert await fails(robots[name])

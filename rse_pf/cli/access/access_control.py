@@ -1,0 +1,117 @@
+"""Which platform, tenant and robot a command of an operator means, and the record of what it did.
+
+A command that changes a robot is refused unless that robot is there: a wrong name or a tenant that was left
+out must not look like a success.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import time
+from collections.abc import Iterable
+
+from rse_pf.audit.entry import Value
+from rse_pf.audit.operator import record
+from rse_pf.auth.roster import DisabledRobot, EnrolledRobot, check_robot, check_tenant
+from rse_pf.auth.trust_store import AccessControlStore
+from rse_pf.config import PlatformSettings
+from rse_pf.config.resource_names import ResourceNames
+from rse_pf.errors import UsageError
+from rse_pf.identity import DEFAULT_TENANT
+
+__all__ = [
+    "add_place", "add_platform", "choose_robot", "described", "format_time", "max_token_s",
+    "open_access_control", "record_action",
+]  # fmt: skip
+
+_PLATFORM = "default"
+
+
+def add_place(parser: argparse.ArgumentParser) -> None:
+    """Declare which tenant is meant, and which platform."""
+    parser.add_argument(
+        "--tenant",
+        help=f"whose robot (default: {DEFAULT_TENANT}, if no other tenant has a robot of this name)",
+    )
+    add_platform(parser)
+
+
+def add_platform(parser: argparse.ArgumentParser) -> None:
+    """Declare which platform is meant."""
+    parser.add_argument("--cloud", action="store_true", help="the deployment on AWS in cloud.region")
+    parser.add_argument("--name", default=_PLATFORM, help=f"which local platform (default: {_PLATFORM})")
+
+
+def choose_robot(
+    name: str, tenant: str | None, listed: Iterable[EnrolledRobot | DisabledRobot], *, state: str, hint: str
+) -> str:
+    """Return the tenant of the robot that a command means.
+
+    Without a *tenant* the robot must be listed in the default tenant, and in no other one.
+
+    Args:
+        name: Of the robot.
+        tenant: That the command names, None if it names none.
+        listed: The robots that the command can change.
+        state: In which they are: enrolled or disabled.
+        hint: What to do if none of them has this name.
+
+    Raises:
+        UsageError: There is no such robot, or several tenants have one.
+    """
+    check_robot(name)
+    wanted = check_tenant(DEFAULT_TENANT if tenant is None else tenant)
+    tenants = sorted({each.tenant for each in listed if each.robot == name})
+    if wanted in tenants and (tenant is not None or len(tenants) == 1):
+        return wanted
+    if not tenants:
+        raise UsageError(f"robot {name!r} is not {state} in any tenant", hint=hint)
+    where = f"tenant{'s' * (len(tenants) > 1)} {', '.join(map(repr, tenants))}"
+    missing = "" if wanted in tenants else f", and not of {wanted!r}"
+    raise UsageError(
+        f"the {state} robot {name!r} is of {where}{missing}", hint=f"name the tenant: --tenant {tenants[0]}"
+    )
+
+
+def described(robot: str, tenant: str) -> str:
+    """Return a robot as messages name it, always with its tenant."""
+    return f"robot {robot!r} of tenant {tenant!r}"
+
+
+def format_time(time_s: float) -> str:
+    """Return a Unix time as messages have it."""
+    return time.strftime("%Y-%m-%d %H:%M:%SZ", time.gmtime(time_s))
+
+
+def open_access_control(args: argparse.Namespace, settings: PlatformSettings) -> AccessControlStore:
+    """Return the access control store of the platform in *args*; raises UsageError if there is none."""
+    if args.cloud:
+        from rse_pf.aws.account import open_account
+        from rse_pf.aws.storage.key_store import open_key_store
+
+        account, names = open_account(settings.cloud.region), ResourceNames(settings.cloud.name)
+        return open_key_store(account, names).access_control_store()
+    from rse_pf.local.disk_watch import access_control_store
+    from rse_pf.local.firewall import key_set_file
+    from rse_pf.local.state import state_folder
+
+    folder = state_folder(args.name, os.environ)
+    if not key_set_file(folder).exists():
+        raise UsageError(f"there is no platform {args.name!r}", hint="start one with rse-pf local")
+    return access_control_store(folder)
+
+
+def record_action(
+    args: argparse.Namespace, settings: PlatformSettings, action: str, subject: str, **detail: Value
+) -> None:
+    """Record an action in the audit log of a local platform; in a cloud the bucket keeps all versions."""
+    if not args.cloud:
+        from rse_pf.local.state import state_folder
+
+        record(state_folder(args.name, os.environ), action, subject, **detail)
+
+
+def max_token_s(settings: PlatformSettings) -> float:
+    """Return the longest time for which a token may be valid after it was issued, in seconds."""
+    return float(settings.auth.token_ttl_s + settings.auth.leeway_s)
