@@ -7,7 +7,8 @@ something fit, and to read or to remove is never refused.
 
 The bytes of a tenant count for all processes: ``accounts/TENANT`` holds what was counted last and what was
 granted since then, and changes by compare-and-swap.  A process draws a few MiB at a time and spends them from
-memory.  The bytes of a robot count for one process, which counts again what others stored every `_RECOUNT_S`
+memory.  ``accounts/TENANT.quota`` holds the quota that an operator gave to this tenant alone.  The bytes of
+a robot count for one process, which counts again what others stored every `_RECOUNT_S`
 in a folder (reading only what changed) and every `_SLOW_RECOUNT_S` in other stores.
 
 On a disk with little free space each tenant may fill its share: what all tenants hold and what is free,
@@ -39,7 +40,9 @@ from rse_pf.object_store import (
     name_segment,
 )
 
-__all__ = ["Accounts", "TenantAccount"]
+__all__ = [
+    "Accounts", "TenantAccount", "own_quota_bytes", "set_own_quota", "stored_by_tenant", "tenant_folders",
+]  # fmt: skip
 
 _K = TypeVar("_K")
 _T = TypeVar("_T")
@@ -106,10 +109,10 @@ class TenantAccount:
         self._drawn_bytes, self._drawn_s = 0, _NEVER
         self._share_bytes, self._share_s = 0.0, _NEVER
 
-    @property
     def quota_bytes(self) -> int:
-        """What the tenant may store."""
-        return self._settings.tenant_quota_bytes
+        """Return what the tenant may store, which an operator may change at any time; raises StoreError."""
+        own = own_quota_bytes(self._store, self._folder)
+        return self._settings.tenant_quota_bytes if own is None else own
 
     def try_charge(self, size: int) -> bool:
         """Charge an object of *size* bytes unless that needs the store; return whether it was charged."""
@@ -130,7 +133,7 @@ class TenantAccount:
             freed: Bytes that are removed when the object is written.
 
         Raises:
-            QuotaExceeded: The tenant would store more than ``data.tenant_quota_bytes``.
+            QuotaExceeded: The tenant would store more than its own quota, or ``data.tenant_quota_bytes``.
             StoreFull: The disk is nearly full, and the tenant holds more than its share of it.
             StoreError: The store fails.
         """
@@ -176,10 +179,8 @@ class TenantAccount:
                     if ledger != _ledger(known):
                         self._store.compare_and_swap(self._name, known, _encode(ledger))
                 raise refused
-            free_bytes = min(
-                self._settings.tenant_quota_bytes - ledger.used_bytes - margin, self._free_bytes()
-            )
-            drawn = max(charge, min(_MAX_DRAWN_BYTES, free_bytes // _DRAWN_SHARE))
+            free_bytes = min(self.quota_bytes() - ledger.used_bytes - margin, self._free_bytes())
+            drawn = max(charge, min(_MAX_DRAWN_BYTES, int(free_bytes // _DRAWN_SHARE)))
             try:
                 self._store.compare_and_swap(self._name, known, _encode(_with_grant(ledger, now, drawn)))
             except Conflict:
@@ -201,12 +202,16 @@ class TenantAccount:
         return _Ledger(begun_s, charged, tuple(grant for grant in granted if grant[0] > begun_s - _WRITTEN_S))
 
     def _refusal(self, ledger: _Ledger, charge: int, margin: int) -> QuotaExceeded | StoreFull | None:
-        used, most = ledger.used_bytes, self._settings.tenant_quota_bytes
+        used, own = ledger.used_bytes, own_quota_bytes(self._store, self._folder)
+        most, name = self._settings.tenant_quota_bytes, "data.tenant_quota_bytes"
+        if own is not None:
+            most, name = own, "its own quota"
         if used + charge + margin > most:
+            more = charge + max(0, margin)
             return QuotaExceeded(
-                f"the tenant {self._tenant!r} stores {used} bytes; {charge} more are above its quota {most}",
-                hint="delete objects, remove old versions of maps (rse-pf map prune), or raise "
-                "data.tenant_quota_bytes",
+                f"the tenant {self._tenant!r} stores {used} bytes; {more} more are above {name} {most}",
+                hint="delete objects, remove old versions of maps (rse-pf map prune), or raise the quota: "
+                f"rse-pf tenant quota {self._tenant} --quota data_bytes=N",
             )
         free = self._free_bytes()
         if free >= charge:
@@ -220,10 +225,10 @@ class TenantAccount:
             hint="delete objects or maps of this tenant, or use a larger disk",
         )
 
-    def _free_bytes(self) -> int:
+    def _free_bytes(self) -> float:
         """Return how many bytes are free above the reserve of the disk."""
         if not isinstance(self._store, DirectoryStore):
-            return self._settings.tenant_quota_bytes
+            return float("inf")
         free, total = self._store.space()
         return free - int(total * _RESERVE_SHARE)
 
@@ -234,9 +239,7 @@ class TenantAccount:
         now = self._wall_clock()
         if 0.0 <= now - self._share_s < _SHARE_S:
             return self._share_bytes
-        folders = {self._folder}
-        for area in ("objects", "maps", "live"):
-            folders.update(self._store.folders(f"{area}/"))
+        folders = {self._folder, *tenant_folders(self._store)}
         held = sum(stored_by_tenant(self._store, folder, self._check).charged_bytes for folder in folders)
         self._share_s, self._share_bytes = now, (held + self._store.space()[0]) / max(2, len(folders))
         return self._share_bytes
@@ -256,6 +259,40 @@ def _with_grant(ledger: _Ledger, now: float, size: int) -> _Ledger:
     if before and before[-1][0] == at:
         before, size = before[:-1], before[-1][1] + size
     return msgspec.structs.replace(ledger, granted=(*before, (at, size)))
+
+
+def own_quota_bytes(store: ObjectStore, folder: str) -> int | None:
+    """Return the quota that an operator gave to the tenant with this folder; None if the setting applies.
+
+    Raises:
+        StoreError: The store fails, or the quota is damaged.
+    """
+    try:
+        return int(store.get(_quota_name(folder)))
+    except NotFound:
+        return None
+    except ValueError as error:
+        raise StoreError("the quota of the tenant is damaged", hint="set it: rse-pf tenant quota") from error
+
+
+def set_own_quota(store: ObjectStore, folder: str, quota_bytes: int | None) -> None:
+    """Give a tenant a quota of its own; None means ``data.tenant_quota_bytes``.
+
+    Processes see it when they draw bytes next, at most `_DRAWN_S` later.
+    """
+    if quota_bytes is None:
+        store.delete(_quota_name(folder))
+    else:
+        store.put(_quota_name(folder), str(quota_bytes).encode())
+
+
+def _quota_name(folder: str) -> str:
+    return f"accounts/{folder}.quota"
+
+
+def tenant_folders(store: ObjectStore) -> set[str]:
+    """Return the folders of all tenants that store anything."""
+    return {folder for area in _OF_TENANT for folder in store.folders(f"{area}/")}
 
 
 def stored_by_tenant(store: ObjectStore, folder: str, check: Callable[[], None] = lambda: None) -> Usage:
@@ -334,7 +371,7 @@ class Accounts:
         tenant = self.tenant(robot.tenant)
         with account.lock:
             self._count_if_old(account, robot)
-            self._check_robot(account.stored + account.writing, charge, max_bytes)
+            self._check_robot(robot, account.stored + account.writing, charge, max_bytes)
             account.writing += charge
             counted_s = account.counted_s
         is_stored = is_charged = False
@@ -358,7 +395,8 @@ class Accounts:
         account = self._account(robot)
         with account.lock:
             self._count_if_old(account, robot)
-            self._check_robot(account.stored + account.writing, Usage(1, charge_of(size)), max_bytes)
+            used, charge = account.stored + account.writing, Usage(1, charge_of(size))
+            self._check_robot(robot, used, charge, max_bytes)
 
     def release(self, robot: RobotId, size: int) -> None:
         """Count one object of *size* bytes less."""
@@ -410,8 +448,10 @@ class Accounts:
             account.stored = total + charged_to(self._store, robot, self._check)
             account.counted_s = now
 
-    def _check_robot(self, used: Usage, charge: Usage, max_bytes: float | None) -> None:
-        most = self._settings.quota_bytes if max_bytes is None else max_bytes
+    def _check_robot(self, robot: RobotId, used: Usage, charge: Usage, max_bytes: float | None) -> None:
+        most, name = self._settings.quota_bytes, "data.quota_bytes"
+        if max_bytes is not None:
+            most, name = int(max_bytes), "its own quota"
         if used.objects + charge.objects > self._settings.max_objects:
             raise QuotaExceeded(
                 f"this robot has {used.objects} objects, the limit is {self._settings.max_objects}",
@@ -419,9 +459,10 @@ class Accounts:
             )
         if used.charged_bytes + charge.charged_bytes > most:
             raise QuotaExceeded(
-                f"{used.charged_bytes} + {charge.charged_bytes} bytes are more than the quota of {most:.0f}; "
-                f"a short object counts as {MIN_CHARGE_BYTES}",
-                hint="delete objects, or raise data.quota_bytes",
+                f"this robot stores {used.charged_bytes} bytes; {charge.charged_bytes} more are above {name} "
+                f"{most}; a short object counts as {MIN_CHARGE_BYTES}",
+                hint=f"delete objects, or raise the quota: rse-pf robot quota {robot.name} "
+                f"--tenant {robot.tenant} --quota data_bytes=N",
             )
 
 

@@ -306,9 +306,14 @@ class Busy(CommandFailed, code="busy"):
 class QuotaExceeded(CommandFailed, code="quota"):
     """This robot or tenant exceeds its quota.
 
-    Cause: The robot sends faster than its rate limit, or it or its tenant has too many commands waiting.
-    Check: Compare the rate of the robot with rse-pf settings session and rse-pf settings serving.
-    Fix: Wait retry_after_ms and send less often, or raise the limit that the message names.
+    Cause: The message names the limit: commands (the robot sends faster than its rate limit, or it or its
+        tenant has too many commands waiting), or stored bytes (the robot or its tenant would store more than
+        its quota; each object counts as 4096 bytes at least).
+    Check: For commands compare the rate of the robot with rse-pf settings session and rse-pf settings
+        serving; for bytes see rse-pf tenant list and, for quotas of robots, rse-pf robot list --json.
+    Fix: For commands wait retry_after_ms and send less often. For bytes delete objects or remove old versions
+        of maps (rse-pf map prune), or raise the quota: rse-pf tenant quota, rse-pf robot quota, or the
+        setting that the message names.
     """
 
 

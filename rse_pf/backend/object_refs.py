@@ -17,7 +17,7 @@ import msgspec
 
 from rse_pf.accounts import Accounts
 from rse_pf.auth.tokens import Claims
-from rse_pf.backend.robot_store import quota_bytes, store_within_quota
+from rse_pf.backend.robot_store import store_within_quota
 from rse_pf.config import DataSettings
 from rse_pf.errors import BadRequest, LimitExceeded, NotFound, QuotaExceeded, StoreError
 from rse_pf.identity import RobotId, object_name
@@ -150,7 +150,7 @@ class ObjectRefs:
         reply = msgspec.msgpack.encode(result.reply, enc_hook=binary_encode_hook)
         if len(reply) > MAX_OBJECT_BYTES_PER_COMMAND:
             return too_large
-        max_bytes = quota_bytes(claims, self.data.quota_bytes)
+        max_bytes = None if claims is None else claims.quota("data_bytes")
         accounts = Accounts(self.store, self.data)
         try:
             digest = store_within_quota(self.store, accounts, robot, reply, max_bytes)

@@ -1,19 +1,18 @@
 """The object store as a backend server uses it: written within a robot's quota.
 
-The quota is that of the data service: ``data_bytes`` of the robot's token, or else ``data.quota_bytes``.
+The quota is that of the data service: the robot's own in the roster, or else ``data.quota_bytes``.
 Nothing is removed to make an object fit.
 """
 
 from __future__ import annotations
 
 from rse_pf.accounts import Accounts
-from rse_pf.auth.tokens import Claims
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import NotFound
 from rse_pf.identity import RobotId, object_name
 from rse_pf.object_store import ObjectStore, digest_of
 
-__all__ = ["is_shared", "quota_bytes", "store_within_quota"]
+__all__ = ["is_shared", "store_within_quota"]
 
 _PRIVATE_STORE = "memory:"
 
@@ -23,13 +22,8 @@ def is_shared(settings: PlatformSettings) -> bool:
     return settings.data.store != _PRIVATE_STORE
 
 
-def quota_bytes(claims: Claims | None, default: float) -> float:
-    """Return how much a robot may store: what its token says, or *default*."""
-    return (claims.quota("data_bytes") if claims is not None else None) or default
-
-
 def store_within_quota(
-    store: ObjectStore, accounts: Accounts, robot: RobotId, data: bytes, max_bytes: float
+    store: ObjectStore, accounts: Accounts, robot: RobotId, data: bytes, max_bytes: float | None
 ) -> str:
     """Store *data* durably as an object of the robot, and return its digest.
 

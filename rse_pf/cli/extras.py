@@ -103,6 +103,7 @@ VERBS_NEED: dict[str, tuple[str, ...]] = {
     "fleet --cloud": ("aws", "backend"),
     "swarm": ("local",),
     "token": ("keys",),
+    "tenant": (),
     "robot": ("keys",),
     "service": ("local",),
     "service publish": ("aws",),

@@ -33,6 +33,7 @@ VERBS = {
     "fleet": "print a new address of the fleet page, which shows a running platform in a browser",
     "swarm": "load a platform with many robots, and measure what they see",
     "token": "issue a robot's token, or show what one contains",
+    "tenant": "list tenants with what they store, and change the quota of one",
     "robot": "enrol robots with keys of their own, disable them, revoke tokens",
     "service": "write, test, run and install a service of your own: Python, C/C++ or Lua",
     "serve": "run one backend server, as EC2 runs it",
@@ -51,7 +52,7 @@ VERBS = {
 
 _FOLDERS = {
     "local": "local_platform", "fleet": "local_platform",
-    "token": "access", "robot": "access", "audit": "access",
+    "token": "access", "tenant": "access", "robot": "access", "audit": "access",
     "service": "services",
     "serve": "servers", "data": "servers",
     "camera": "maps", "map": "maps",

@@ -9,7 +9,7 @@ from rse_pf.accounts import Accounts
 from rse_pf.auth.tokens import Claims
 from rse_pf.backend.jobs.process import JobRequest, store_reply
 from rse_pf.backend.object_refs import ObjectRefs
-from rse_pf.backend.robot_store import quota_bytes, store_within_quota
+from rse_pf.backend.robot_store import store_within_quota
 from rse_pf.config import DataSettings, PlatformSettings
 from rse_pf.errors import QuotaExceeded
 from rse_pf.identity import RobotId, object_name
@@ -41,12 +41,6 @@ def of(store: str, max_message_bytes: int = 2000) -> PlatformSettings:
             "session": {"max_message_bytes": max_message_bytes},
         }
     )
-
-
-def test_the_quota_is_that_of_the_token_or_else_of_the_settings():
-    assert quota_bytes(claims(data_bytes=7.0), 10.0) == 7.0
-    assert quota_bytes(claims(), 10.0) == 10.0
-    assert quota_bytes(None, 10.0) == 10.0
 
 
 def test_an_object_that_fits_exactly_is_stored_and_one_byte_more_is_not():

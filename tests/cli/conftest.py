@@ -29,6 +29,7 @@ ROWS = (
     ("SigningKey8FF1", "AWS::SecretsManager::Secret", "signing-key"),
     ("Artifacts1F2E", "AWS::S3::Bucket", "artifacts"),
     ("AuditLogs3C4D", "AWS::S3::Bucket", "audit-logs"),
+    ("Maps5E6F", "AWS::S3::Bucket", "maps"),
 )
 
 
@@ -49,7 +50,7 @@ def cloud(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.chdir(tmp_path)
     with emulated_aws(monkeypatch, request.node.nodeid):
         s3 = make_client("s3", REGION)
-        for name in ("artifacts", "audit-logs"):
+        for name in ("artifacts", "audit-logs", "maps"):
             s3.create_bucket(Bucket=name, CreateBucketConfiguration={"LocationConstraint": REGION})
         make_client("secretsmanager", REGION).create_secret(Name="signing-key", SecretString="k]:vE{")
         account = Account(

@@ -48,6 +48,9 @@ EXECUTED_IN = {
     "rse-pf map prune": "tests/cli/test_pages.py",
     "rse-pf map export": "tests/cli/test_pages.py",
     "rse-pf robot adopt": "tests/cli/access/test_adopt.py",
+    "rse-pf robot quota": "tests/cli/access/test_tenant.py",
+    "rse-pf tenant quota": "tests/cli/access/test_tenant.py",
+    "rse-pf tenant list": "tests/cli/access/test_tenant.py",
 }
 """Commands that need a store or a robot with a past: another test makes it, and runs them."""
 _START = re.compile(r"rse-pf local(?= --(?!lan)| *$)")

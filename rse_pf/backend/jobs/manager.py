@@ -24,7 +24,6 @@ from rse_pf.backend.jobs.process import JobRequest
 from rse_pf.backend.jobs.record_gc import RECORD_TTL_S, RecordCollector
 from rse_pf.backend.jobs.runner import WAITING, JobContext, JobOutcome, JobSignals, run_job
 from rse_pf.backend.ports import Log
-from rse_pf.backend.robot_store import quota_bytes
 from rse_pf.backend.scheduling.command_queue import CommandQueue, QueueReport
 from rse_pf.backend.scheduling.scheduler import QueueBacklog, QueuedCommand
 from rse_pf.config import PlatformSettings
@@ -119,7 +118,7 @@ class JobManager(CommandQueue):
         """
         if self._leaving:
             return
-        command = queued.command
+        command, claims = queued.command, queued.owner.claims
         try:
             key = job_key(command.service, command.payload, self._settings_digest)
         except BadRequest as error:
@@ -136,7 +135,7 @@ class JobManager(CommandQueue):
                 payload=command.payload,
                 robot=queued.robot,
                 key=key,
-                quota_bytes=quota_bytes(queued.owner.claims, self._context.settings.data.quota_bytes),
+                quota_bytes=None if claims is None else claims.quota("data_bytes"),
                 trace=command.trace,
             )
             if not self._has_capacity(request):

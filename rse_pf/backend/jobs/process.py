@@ -52,13 +52,16 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class JobRequest:
-    """A job that a robot asked for; ``quota_bytes`` limits all that the robot stores, results included."""
+    """A job that a robot asked for.
+
+    ``quota_bytes`` limits all that the robot stores, results included; None for ``data.quota_bytes``.
+    """
 
     service: str
     payload: Any
     robot: RobotId
     key: str
-    quota_bytes: float
+    quota_bytes: float | None
     trace: str = ""
     """Of the command that asked for it first."""
 

@@ -13,7 +13,7 @@ from collections.abc import Iterable
 
 from rse_pf.audit.entry import Value
 from rse_pf.audit.operator import record
-from rse_pf.auth.roster import DisabledRobot, EnrolledRobot, check_robot, check_tenant
+from rse_pf.auth.roster import DisabledRobot, EnrolledRobot, check_quotas, check_robot, check_tenant
 from rse_pf.auth.trust_store import AccessControlStore
 from rse_pf.config import PlatformSettings
 from rse_pf.config.resource_names import ResourceNames
@@ -22,7 +22,7 @@ from rse_pf.identity import DEFAULT_TENANT
 
 __all__ = [
     "add_place", "add_platform", "choose_robot", "described", "format_time", "max_token_s",
-    "open_access_control", "record_action",
+    "open_access_control", "read_quotas", "record_action",
 ]  # fmt: skip
 
 _PLATFORM = "default"
@@ -72,6 +72,27 @@ def choose_robot(
     raise UsageError(
         f"the {state} robot {name!r} is of {where}{missing}", hint=f"name the tenant: --tenant {tenants[0]}"
     )
+
+
+def read_quotas(words: Iterable[str]) -> dict[str, float]:
+    """Return the quotas in the options ``--quota NAME=N``; without those whose N is ``default``.
+
+    Raises:
+        UsageError: One of them is no quota.
+    """
+    quotas: dict[str, float] = {}
+    for word in words:
+        name, _, number = word.partition("=")
+        try:
+            limit = 1.0 if number == "default" else float(number)
+        except ValueError as error:
+            raise UsageError(
+                f"{word[:80]!r} is not a quota", hint="for example: data_bytes=1e9, or data_bytes=default"
+            ) from error
+        check_quotas({name: limit})
+        if number != "default":
+            quotas[name] = limit
+    return quotas
 
 
 def described(robot: str, tenant: str) -> str:

@@ -20,6 +20,7 @@ examples:
   rse-pf robot disable robot-1
   rse-pf robot enable robot-1
   rse-pf robot remove robot-1
+  rse-pf robot quota robot-1 --quota data_bytes=5e9
   rse-pf robot adopt robot-1
 """
 
@@ -31,11 +32,12 @@ import time
 from pathlib import Path
 from typing import Any
 
+import msgspec
+
 from rse_pf.auth.roster import (
     DenyList,
     EnrolledRobot,
     Roster,
-    check_quotas,
     check_robot,
     check_scopes,
     check_tenant,
@@ -49,6 +51,7 @@ from rse_pf.cli.access.access_control import (
     format_time,
     max_token_s,
     open_access_control,
+    read_quotas,
     record_action,
 )
 from rse_pf.cli.access.enrolment import enrolment_lines, make_enrolment
@@ -59,7 +62,7 @@ from rse_pf.terminal import show, show_json
 
 __all__ = ["add_arguments", "run"]
 
-_ACTIONS = ("keygen", "enrol", "list", "disable", "enable", "remove", "adopt")
+_ACTIONS = ("keygen", "enrol", "list", "disable", "enable", "remove", "quota", "adopt")
 _ALSO_NOT_ENROLLED = ("disable", "adopt")
 """Actions that a robot without a key of its own, which uses tokens of the platform, may be named for."""
 
@@ -99,7 +102,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="NAME=N",
-        help="enrol: data_bytes, how much it may store (default: data.quota_bytes)",
+        help="enrol, quota: data_bytes, how much it may store, or default (data.quota_bytes)",
     )
     parser.add_argument(
         "--from-key", default="", metavar="KEY",
@@ -131,7 +134,9 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
         args.tenant = check_tenant(DEFAULT_TENANT if args.tenant is None else args.tenant)
         return _enrol(args, access, now, settings)
     args.tenant = _tenant(args, access)
-    actions = {"adopt": _adopt, "remove": _remove, "disable": _disable, "enable": _enable}
+    actions = {
+        "adopt": _adopt, "remove": _remove, "disable": _disable, "enable": _enable, "quota": _change_quotas,
+    }  # fmt: skip
     return actions[args.action](args, access, settings)
 
 
@@ -175,8 +180,10 @@ def _check(args: argparse.Namespace) -> None:
         raise UsageError("--from-key and --store are for adopt", hint="see rse-pf robot --help")
     if args.action not in _ALSO_NOT_ENROLLED and args.not_enrolled:
         raise UsageError("--not-enrolled is for disable and adopt", hint="see rse-pf robot --help")
-    if args.action != "enrol" and (args.scope or args.quota):
-        raise UsageError("--scope and --quota are for enrol", hint="enrol the robot again to change them")
+    if args.action != "enrol" and args.scope:
+        raise UsageError("--scope is for enrol", hint="enrol the robot again to change its scopes")
+    if (args.action == "quota") > bool(args.quota) or (args.quota and args.action not in ("enrol", "quota")):
+        raise UsageError("--quota is for enrol and for quota, which needs it", hint="--quota data_bytes=1e9")
 
 
 def _enrol(
@@ -188,7 +195,7 @@ def _enrol(
         tenant=args.tenant,
         x=public_key_of(_text(args.public_key)) if enrolment is None else str(enrolment.key["x"]),
         scopes=check_scopes(tuple(args.scope)),
-        quotas=check_quotas(dict(_quota(text) for text in args.quota)),
+        quotas=read_quotas(args.quota),
         enrolled_s=round(now, 3),
     )
     if enrolment is not None:
@@ -282,12 +289,24 @@ def _text(path: Path) -> str:
         ) from error
 
 
-def _quota(text: str) -> tuple[str, float]:
-    name, _, number = text.partition("=")
-    try:
-        return name, float(number)
-    except ValueError as error:
-        raise UsageError(f"{text[:80]!r} is not a quota", hint="for example: data_bytes=1e9") from error
+def _change_quotas(args: argparse.Namespace, access: AccessControlStore, settings: PlatformSettings) -> int:
+    quotas = read_quotas(args.quota)
+
+    def changed(roster: Roster) -> Roster:
+        return Roster(
+            robots=tuple(
+                msgspec.structs.replace(robot, quotas=quotas)
+                if (robot.tenant, robot.robot) == (args.tenant, args.robot)
+                else robot
+                for robot in roster.robots
+            )
+        )
+
+    access.change_roster(changed)
+    limit = f"{quotas['data_bytes']:.0f} bytes" if quotas else "what data.quota_bytes says"
+    record_action(args, settings, "robot.quota", args.robot, tenant=args.tenant, limit=limit)
+    show(f"{described(args.robot, args.tenant)} may store {limit}; all servers know it within 2 s")
+    return 0
 
 
 def _list(args: argparse.Namespace, access: AccessControlStore) -> int:

@@ -29,29 +29,27 @@ _MAP_NAME = re.compile(r"[a-z0-9][a-z0-9-]{0,63}")
 _NO_NAME = re.compile(r"[^a-z0-9]+")
 
 
-def with_store(
-    named: str | None, settings: PlatformSettings, platform: str | None = None
-) -> PlatformSettings:
-    """Return the settings with the store that is *named*, that of the local *platform*, or that is found.
+def with_store(named: str | None, settings: PlatformSettings, name: str | None = None) -> PlatformSettings:
+    """Return the settings with the store that is *named*, that of the platform *name*, or that is found.
+
+    A store of a platform comes with the quota of tenants that the platform has.
 
     Raises:
-        UsageError: Store and platform were named both, what is named is not there, or none was found.
+        UsageError: The folder that is named is not there, or none was named and none found.
     """
-    if platform is not None:
-        if named is not None:
-            raise UsageError("--store and --name both name a store", hint="leave one of them out")
-        named = f"{_FOLDER}{_objects_of(_folder_named(platform))}"
     chosen = settings if named is None else settings.replace(data={"store": named})
-    if chosen.data.store == _IN_MEMORY:
-        folder = None if named is not None else _objects_of_platform()
-        if folder is None or not folder.is_dir():
-            own = state_folder("default", os.environ) / _OBJECTS
-            raise UsageError(
-                "no store is named, and one in memory belongs to another process",
-                hint=f"name --store dir:PATH; that of rse-pf local is dir:{own}",
-            )
-        chosen = settings.replace(data={"store": f"{_FOLDER}{folder}"})
+    folder = _platform_folder(name)
+    if named is None and (name is not None or chosen.data.store == _IN_MEMORY):
+        chosen = _with_store_of(folder, settings)
     kind, _, path = chosen.data.store.partition(":")
+    own = folder / _OBJECTS
+    if chosen.data.store == _IN_MEMORY or (named is None and path == str(own) and not own.is_dir()):
+        raise UsageError(
+            "no store is named, and one in memory belongs to another process"
+            if name is None
+            else f"the platform {name!r} of this machine has stored nothing yet",
+            hint=f"name --store dir:PATH; that of rse-pf local is dir:{own}",
+        )
     # An empty list of maps would look like an answer.
     if kind == "dir" and not Path(path).is_dir():
         raise UsageError(
@@ -98,7 +96,12 @@ def drive_store(args: argparse.Namespace, settings: PlatformSettings) -> Platfor
     folder: Path | None = args.objects
     if folder is None and settings.data.store != _IN_MEMORY:
         return settings
-    folder = (folder or _objects_of_platform()).absolute()
+    if folder is None:
+        settings = _with_store_of(_platform_folder(None), settings)
+        if not settings.data.store.startswith(_FOLDER):
+            return settings
+        folder = Path(settings.data.store.removeprefix(_FOLDER))
+    folder = folder.absolute()
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -121,37 +124,26 @@ def keep_map(data: bytes, name: str, settings: PlatformSettings, author: str) ->
     return {"store": settings.data.store, "map": name, "map_version": version.id}
 
 
-def _folder_named(platform: str) -> Path:
-    folder = state_folder(platform, os.environ)
-    if not folder.is_dir():
-        known = ", ".join(sorted(each.name for each in folder.parent.glob("*/"))) or "none"
-        raise UsageError(
-            f"there is no platform {platform!r} on this machine",
-            hint=f"--name takes the name of rse-pf local; known: {known}",
-        )
-    return folder
-
-
-def _objects_of_platform() -> Path:
-    """Return the folder of objects of the one platform that runs here, or that of ``rse-pf local``."""
-    own = state_folder("default", os.environ)
+def _platform_folder(name: str | None) -> Path:
+    """Return the folder of a platform: of *name*, of the one that runs here, or of ``rse-pf local``."""
+    own = state_folder(name or "default", os.environ)
     running = []
-    for folder in sorted(own.parent.glob("*/")):
+    for folder in sorted(own.parent.glob("*/")) if name is None else ():
         try:
             state = read_state(folder)
         except RsePfError:
             continue
         if state is not None and is_alive(state.control_plane):
             running.append(folder)
-    return _objects_of(running[0] if len(running) == 1 else own)
+    return running[0] if len(running) == 1 else own
 
 
-def _objects_of(folder: Path) -> Path:
-    """Return the folder of objects of the platform whose state is in *folder*."""
+def _with_store_of(folder: Path, settings: PlatformSettings) -> PlatformSettings:
+    """Return *settings* with the store of the platform in *folder*, and the quota of its tenants."""
     try:
         known = platform_settings(folder)
     except ConfigurationError:
         known = None
-    if known is not None and known.data.store.startswith(_FOLDER):
-        return Path(known.data.store.removeprefix(_FOLDER))
-    return folder / _OBJECTS
+    data = (settings if known is None else known).data
+    store = data.store if known is not None and data.store != _IN_MEMORY else f"{_FOLDER}{folder / _OBJECTS}"
+    return settings.replace(data={"store": store, "tenant_quota_bytes": data.tenant_quota_bytes})

@@ -213,7 +213,7 @@ class Publisher:
         keep, account = self._context.settings.keep_versions, self._context.account
         if not keep:
             return 0
-        most_bytes = account.quota_bytes / _QUOTA_SHARE
+        most_bytes = account.quota_bytes() / _QUOTA_SHARE
 
         def choose(records: Sequence[MapRecord], head: str) -> list[MapRecord]:
             old = superseded(records, head, keep=keep, most_bytes=most_bytes, counts=_is_automatic)
