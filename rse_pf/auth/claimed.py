@@ -6,16 +6,29 @@ Nothing here was verified: anybody can write any name into a token.  Each value 
 from __future__ import annotations
 
 import base64
+import contextlib
 import re
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
+
+from rse_pf.auth.roster import ROBOT_KEY
+from rse_pf.auth.tokens import KeySet
 
 __all__ = ["claimed_by", "source_address"]
 
 _MAX_TOKEN = 8192
 _MAX_CLAIM = 64
 _ADDRESS = re.compile(r"[0-9a-fA-F.:]{2,45}|\[[0-9a-fA-F.:]{2,45}\]:\d{1,5}")
+
+
+_T = TypeVar("_T", bound=msgspec.Struct)
+
+
+class _Header(msgspec.Struct):
+    """The header of a token that nobody verified."""
+
+    kid: Any = None
 
 
 class _Claimed(msgspec.Struct):
@@ -26,19 +39,38 @@ class _Claimed(msgspec.Struct):
     jti: Any = None
 
 
-def claimed_by(token: str) -> dict[str, str]:
-    """Return ``claimed_robot``, ``claimed_tenant`` and ``claimed_token``, as far as *token* names them."""
-    try:
-        _, payload, _ = token[:_MAX_TOKEN].split(".")
-        claimed = msgspec.json.decode(base64.urlsafe_b64decode(payload + "=="), type=_Claimed)
-    except (ValueError, msgspec.MsgspecError, RecursionError):
+def claimed_by(token: str, keys: KeySet | None = None) -> dict[str, str]:
+    """Return ``claimed_robot``, ``claimed_tenant``, ``claimed_token`` and, of a robot's own, ``claimed_key``.
+
+    A robot that signs its own tokens may not know its tenant: it is that of the key in the roster, and
+    unknown for a key that is not enrolled.
+
+    Args:
+        token: Names what is returned, each as far as it does.
+        keys: With the roster; None knows no robot's key.
+    """
+    parts = token[:_MAX_TOKEN].split(".")
+    if len(parts) != 3:
         return {}
+    key_id, claimed = _decode(parts[0], _Header).kid, _decode(parts[1], _Claimed)
+    tenant, robot_key = claimed.tenant, None
+    if isinstance(key_id, str) and key_id.startswith(ROBOT_KEY):
+        enrolled = None if keys is None else keys.robot_of(key_id)
+        tenant, robot_key = None if enrolled is None else enrolled.tenant, key_id
     claims = {
         "claimed_robot": claimed.sub,
-        "claimed_tenant": claimed.tenant,
+        "claimed_tenant": tenant,
         "claimed_token": claimed.jti,
+        "claimed_key": robot_key,
     }
     return {name: value[:_MAX_CLAIM] for name, value in claims.items() if isinstance(value, str) and value}
+
+
+def _decode(part: str, kind: type[_T]) -> _T:
+    """Return a *part* of a token, without members if it is not JSON."""
+    with contextlib.suppress(ValueError, msgspec.MsgspecError, RecursionError):
+        return msgspec.json.decode(base64.urlsafe_b64decode(part + "=="), type=kind)
+    return kind()
 
 
 def source_address(peer: str, forwarded_for: str, trusted_proxies: int) -> str:

@@ -225,7 +225,7 @@ class DataServer:
                 request.headers.get("x-forwarded-for", ""),
                 self._settings.serving.trusted_proxies,
             )
-            about = {"reason": token_problem(error), "source": source, **claimed_by(token)}
+            about = {"reason": token_problem(error), "source": source, **claimed_by(token, keys)}
             line |= about
             if self._audit is not None and self._refusals.take(line["reason"], self._clock()):
                 self.record_counted()

@@ -42,6 +42,25 @@ def entry(action: str, subject: str, actor: str = "server-1", **detail: Any) -> 
             "server-1 refused a token from 192.0.2.2: expired",
         ),
         (
+            entry(
+                "auth.refused",
+                "",
+                source="192.0.2.2",
+                reason="disabled",
+                claimed_robot="r",
+                claimed_tenant="acme",
+            ),
+            "server-1 refused a token that names acme/r from 192.0.2.2: disabled",
+        ),
+        (
+            entry("auth.refused", "", source="192.0.2.2", reason="unknown-key", claimed_robot="r"),
+            "server-1 refused a token that names r from 192.0.2.2: unknown-key",
+        ),
+        (
+            entry("tenant.quota", "acme", "operator", user="ada", data_bytes=5000),
+            "ada let the tenant acme store 5000 bytes",
+        ),
+        (
             entry("token.revoked", "robot-1", "operator", user="ada", tenant="lab", token="ab"),
             "ada revoked the token ab of lab/robot-1",
         ),

@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 from rse_pf.audit.entry import Entry, RefusalLimiter, Value
 from rse_pf.audit.log import SYNC_S, AuditLog
 from rse_pf.auth.claimed import claimed_by
-from rse_pf.auth.tokens import Claims
+from rse_pf.auth.tokens import Claims, KeySet
 from rse_pf.backend.gateway.handshake import Accepted, Rejected
 from rse_pf.backend.ports import Clocks
 
@@ -60,14 +60,16 @@ class AuditRecorder:
         self._next: TimerHandle | None = None
         self._sum: TimerHandle | None = None
 
-    def record_verdict(self, verdict: Accepted | Rejected, source: str, token: str) -> None:
-        """Record the verdict on a handshake with *token* from the address *source*."""
+    def record_verdict(
+        self, verdict: Accepted | Rejected, source: str, token: str, keys: KeySet | None = None
+    ) -> None:
+        """Record the verdict on a handshake with *token* from the address *source*, which *keys* gave."""
         if isinstance(verdict, Accepted):
             if verdict.claims is not None:
                 fields = _token_fields(verdict.claims)
                 self._note("auth.accepted", str(verdict.claims.robot), **fields, source=source)
         elif verdict.status == _UNAUTHORIZED and self._may_record(verdict.reason):
-            self._note("auth.refused", "", reason=verdict.reason, source=source, **claimed_by(token))
+            self._note("auth.refused", "", reason=verdict.reason, source=source, **claimed_by(token, keys))
 
     def record_renewal(self, before: Claims, claims: Claims) -> None:
         """Record the fresh token of a live connection; the same token again is not recorded."""

@@ -106,14 +106,15 @@ class TokenWatch:
         """Judge and record the token that a rosbridge client from *source* showed after its handshake."""
         metrics, now_s = self._context.metrics, self._context.clocks.wall()
         verdict = self._handshake.with_token(token, now_s, codec=ROSBRIDGE, source=source)
-        self._recorder.record_verdict(verdict, source, token)
+        self._recorder.record_verdict(verdict, source, token, self._handshake.keys)
         if isinstance(verdict, Accepted):
             metrics.handshakes["ok"] += 1
             return verdict
         metrics.handshakes[verdict.result] += 1
         self._context.log.info(
-            "refused", result=verdict.result, reason=verdict.reason, source=source, **claimed_by(token)
-        )
+            "refused", result=verdict.result, reason=verdict.reason, source=source,
+            **claimed_by(token, self._handshake.keys),
+        )  # fmt: skip
         return None
 
     def renew(self, connection: RobotConnection, token: str) -> None:

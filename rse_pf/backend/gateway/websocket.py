@@ -269,7 +269,7 @@ class RobotSockets:
             authorization, offered = head.text(b"authorization"), head.words(b"sec-websocket-protocol")
             token = carried_token(authorization, offered)
             verdict = self._verdict(head, authorization, offered, source)
-            self._recorder.record_verdict(verdict, source, token)
+            self._recorder.record_verdict(verdict, source, token, self._handshake.keys)
         except Exception as error:  # noqa: BLE001  the worker serves on
             self._context.log.error("defect", at="handshake", traceback=repr(error))
             verdict = self._handshake.defect
@@ -282,7 +282,7 @@ class RobotSockets:
     def _refuse(self, pending: PendingSocket, verdict: Rejected, source: str, token: str) -> None:
         self._context.metrics.handshakes[verdict.result] += 1
         if verdict.result != HEALTH:
-            about = {"source": source, **claimed_by(token)}
+            about = {"source": source, **claimed_by(token, self._handshake.keys)}
             self._context.log.info("refused", result=verdict.result, reason=verdict.reason, **about)
         pending.close(verdict.answer)
 

@@ -70,13 +70,20 @@ def audit_sentence(who: str, entry: Entry) -> str:
     actor = values.get("user", entry.actor) if entry.actor == OPERATOR else entry.actor
     text = _SENTENCES.get(entry.action)
     if text is not None:
-        return text.format_map(
-            _Missing({**values, "subject": subject or "a robot", "actor": actor, "who": who})
-        )
+        named = {"subject": subject or "a robot", "actor": actor, "who": who, "claim": _claim(values)}
+        return text.format_map(_Missing({**values, **named}))
     details = [f"{name} {value}" for name, value in values.items() if name not in ("tenant", "user")]
     by = [f"by {actor}"] if actor != who else []
     words = " ".join([who, entry.action.replace(".", " ").replace("-", " "), subject, *by]).strip()
     return f"{words}: {', '.join(details)}" if details else words
+
+
+def _claim(values: Mapping[str, str]) -> str:
+    """Return which robot a token that was refused names, as the part of a sentence; empty if none."""
+    robot, tenant = values.get("claimed_robot"), values.get("claimed_tenant")
+    if not robot:
+        return ""
+    return f" that names {RobotId(tenant, robot) if tenant else robot}"
 
 
 def _row(who: str, entry: Entry) -> dict[str, Any]:
@@ -94,7 +101,7 @@ class _Missing(dict[str, str]):
 _SENTENCES: Mapping[str, str] = {
     "auth.accepted": "{who} accepted {subject} from {source} (token {token})",
     "auth.cut-off": "{who} ended the connection of {subject}: {reason}",
-    "auth.refused": "{who} refused a token from {source}: {reason}",
+    "auth.refused": "{who} refused a token{claim} from {source}: {reason}",
     "auth.renewal-refused": "{who} refused the fresh token of {subject}: {reason}",
     "auth.renewed": "{subject} renewed its token at {who}",
     "key.rotated": "{actor} made the key {subject}, which signs tokens from now on",

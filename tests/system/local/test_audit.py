@@ -15,8 +15,10 @@ from guarded_server import GuardedServer
 
 from rse_pf.audit.entry import Entry
 from rse_pf.audit.log import audit_folder, log_files, log_names, read_entries
+from rse_pf.auth.roster import EnrolledRobot, public_key_of
+from rse_pf.auth.tokens import SigningKey
 from rse_pf.cli.main import main
-from rse_pf.config import PlatformSettings
+from rse_pf.config import AuthSettings, PlatformSettings
 from rse_pf.local.control.platform import LocalPlatform
 
 pytestmark = pytest.mark.system
@@ -81,6 +83,28 @@ async def test_a_server_records_accepted_and_refused_robots_and_no_token(tmp_pat
 
 
 @awaited
+async def test_a_refused_robot_with_a_key_of_its_own_is_named_with_its_tenant(tmp_path: Path):
+    key = SigningKey.of_robot(b"r" * 32)
+    robot = EnrolledRobot(robot="robot-1", tenant="acme", x=public_key_of(key.public_json()))
+    token = key.issue("robot-1", now=time.time(), token_id="t-1", settings=AuthSettings())
+    server = GuardedServer(tmp_path)
+    server.access.change_roster(lambda roster: roster.enrolled(robot))
+    server.access.change_deny_list(lambda denied: denied.with_robot("acme", "robot-1", time.time()))
+
+    def refusals() -> list[Entry]:
+        return [entry for entry in entries(tmp_path / "audit", "guarded") if entry.action == "auth.refused"]
+
+    with server:
+        assert (await server.handshake(b"Bearer " + token.encode()))[0] == 401
+        await until(lambda: len(refusals()) > 0, refusals)
+
+    (refused,) = refusals()
+    assert refused.detail["reason"] == "disabled"
+    claimed = [refused.detail[f"claimed_{name}"] for name in ("robot", "tenant", "key")]
+    assert claimed == ["robot-1", "acme", robot.key_id]
+
+
+@awaited
 async def test_the_log_of_a_server_goes_on_over_kills(tmp_path: Path):
     with GuardedServer(tmp_path) as server:
         for number in range(2):
@@ -111,7 +135,8 @@ async def test_a_platform_records_its_actions_its_robots_and_its_operator(
 
         async with connect(cloud.url, token=cloud.issue_token("robot-1")):
             pass
-        assert await asyncio.to_thread(main, ["robot", "disable", "robot-7", "--not-enrolled", "--name", "audited"]) == 0
+        words = ["robot", "disable", "robot-7", "--not-enrolled", "--name", "audited"]
+        assert await asyncio.to_thread(main, words) == 0
         (server,) = [who for who in log_names(audit) if who.startswith("server-")]
 
     assert {entry.subject for entry in entries(audit, server) if entry.action == "auth.accepted"} == {
