@@ -11,6 +11,7 @@ Layout: ``maps/TENANT/NAME/blobs/DIGEST``, ``.../versions/ID`` (ID is the sha256
 from __future__ import annotations
 
 import contextlib
+import functools
 import hashlib
 import re
 import time
@@ -100,7 +101,7 @@ class MapRegistry:
             store: Where the maps lie.
             tenant: Whose maps.
             max_bytes: Size of a map when it is decoded.
-            on_change: Gets ``map.commit``, ``map.head`` or ``map.remove``, map and version.
+            on_change: Gets ``map.commit``, ``map.head``, ``map.remove`` or ``map.restore``, map and version.
             check: Called between two reads of long work; ends the work by the error that it raises.
             wall_clock: Unix seconds.
         """
@@ -221,23 +222,82 @@ class MapRegistry:
             author=origin.author, created_s=origin.created_s, note=origin.note,
             keyframes=summary.keyframes, edges=summary.edges, points=summary.points, robots=summary.robots,
         )  # fmt: skip
-        blob, marks = f"{base}blobs/{digest}", self._marks(name)
-        marks.check(digest)
-        is_new = not self._holds(blob)
+        self._marks(name).check(digest)
+        is_new = not self._holds(f"{base}blobs/{digest}")
         with charged(record, content.size if is_new else 0):
-            if is_new:
-                write(blob)
-            self._store.put(f"{base}versions/{record.id}", msgspec.json.encode(record))
-            try:
-                marks.check(digest)
-            except Busy:
-                self._store.delete(f"{base}versions/{record.id}")
-                raise
-            if not self._holds(blob):  # a removal that did not see the record has ended: none removes it now
-                write(blob)
+            self._put_version(name, record, write, is_new=is_new)
             self._swap(name, parent, record.id)
         self._on_change("map.commit", name, record)
         return record
+
+    def _put_version(
+        self, name: str, record: MapRecord, write: Callable[[str], None], *, is_new: bool
+    ) -> None:
+        """Store a record, and the bytes of its version if they are new.
+
+        Raises:
+            Busy: Another process removes these bytes.
+        """
+        blob = f"{self._base(name)}blobs/{record.digest}"
+        version = f"{self._base(name)}versions/{record.id}"
+        if is_new:
+            write(blob)
+        self._store.put(version, msgspec.json.encode(record))
+        try:
+            self._marks(name).check(record.digest)
+        except Busy:
+            self._store.delete(version)
+            raise
+        if not self._holds(blob):  # a removal that did not see the record has ended: none removes it now
+            write(blob)
+
+    def missing(self, name: str, records: Sequence[MapRecord]) -> list[MapRecord]:
+        """Return those of *records* that are no whole versions of map *name*: lost or damaged ones."""
+        found = []
+        for record in records:
+            self._check()
+            try:
+                self.data(name, record.id)
+            except StoreError:
+                found.append(record)
+        return found
+
+    def restore(
+        self,
+        name: str,
+        records: Sequence[MapRecord],
+        head: str,
+        *,
+        expected: str | None,
+        read: Callable[[MapRecord], bytes],
+        charge: Callable[[int], None],
+    ) -> None:
+        """Store versions that were backed up, and set the head.
+
+        Args:
+            name: Of the map, which may exist.
+            records: Of versions that are missing; their bytes are written in any case.
+            head: Id of a version that is there then.
+            expected: The present head, None if there is none.
+            read: Returns the bytes of a version.
+            charge: Gets how many bytes are added before they are written.
+
+        Raises:
+            Conflict: The head is not *expected*.
+            Busy: A version is being removed.
+            StoreError: The head did not change; and what *charge* raises to refuse the bytes.
+        """
+        self._check_counts(self._base(name), is_new=expected is None)
+        for record in records:
+            self._marks(name).check(record.digest)
+            charge(record.size)
+            write = functools.partial(self._store.put, data=read(record))
+            self._put_version(name, record, write, is_new=True)
+        if expected is None:
+            self._swap(name, None, head)
+            self._on_change("map.restore", name, self.record(name, head))
+        elif expected != head:
+            self.move_head(name, head, expected=expected)
 
     def _check_counts(self, base: str, *, is_new: bool) -> None:
         """Raise LimitExceeded if the tenant has no place for another map, or the map for another version."""

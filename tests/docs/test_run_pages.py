@@ -47,6 +47,8 @@ EXECUTED_IN = {
     "rse-pf map rollback": "tests/cli/test_pages.py",
     "rse-pf map prune": "tests/cli/test_pages.py",
     "rse-pf map export": "tests/cli/test_pages.py",
+    "rse-pf map backup": "tests/cli/maps/test_map_backup.py",
+    "rse-pf map restore": "tests/cli/maps/test_map_backup.py",
     "rse-pf robot adopt": "tests/cli/access/test_adopt.py",
     "rse-pf robot quota": "tests/cli/access/test_tenant.py",
     "rse-pf tenant quota": "tests/cli/access/test_tenant.py",

@@ -139,7 +139,8 @@ def _publication_line(name: str, reply: dict[str, Any]) -> str:
 
 
 def _record(args: argparse.Namespace, settings: PlatformSettings, reply: dict[str, Any]) -> None:
-    record_map_change(settings, "map.commit", args.name, version=reply["version"], number=reply["number"])
+    subject = str(RobotId(args.tenant, args.name))
+    record_map_change(settings, "map.commit", subject, version=reply["version"], number=reply["number"])
 
 
 def _ask(

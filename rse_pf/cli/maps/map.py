@@ -1,4 +1,4 @@
-"""Work with the maps that robots share: show, merge and prune them, localise in them, roll them back.
+"""Work with the maps that robots share: show, merge, prune, back up, localise in them, roll them back.
 
 Works on the store itself (--store; by default data.store, else that of the platform on this machine, where
 from-camera and from-bag keep their maps).  A VERSION is head, or six or more digits of an id; show --all
@@ -16,6 +16,8 @@ examples:
   rse-pf map view kitchen --out kitchen.png --store dir:objects
   rse-pf map diff kitchen 3f9bd1 head --store dir:objects
   rse-pf map live list --store dir:objects
+  rse-pf map backup acme.maps --tenant acme --name lab
+  rse-pf map restore acme.maps --tenant acme --name lab
   rse-pf map prune kitchen --keep 10 --store dir:objects
   rse-pf map export kitchen --format ply --out kitchen.ply --store dir:objects
   rse-pf map export kitchen --format occupancy --out kitchen-plan --store dir:objects
@@ -33,6 +35,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 import numpy as np
 
+from rse_pf.cli.maps.backup import add_backup_arguments, add_restore_arguments, run_backup, run_restore
 from rse_pf.cli.maps.bags import BAG_ACTIONS, add_bag_actions, run_bags
 from rse_pf.cli.maps.export import add_export_arguments, run_export
 from rse_pf.cli.maps.from_camera import add_from_camera_arguments, run_from_camera
@@ -69,6 +72,8 @@ _ACTIONS = {
         "write a version in the format of another program",
         "export kitchen --format colmap --out kitchen-colmap",
     ),
+    "backup": ("write all maps of a tenant into one file", "backup acme.maps --tenant acme"),
+    "restore": ("restore the maps of a tenant from a backup", "restore acme.maps --tenant acme"),
     "publish": ("publish a live map as the next version of its map", "publish warehouse"),
 }
 """Name, one line of help, and an example."""
@@ -88,6 +93,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     common.add_argument(
         "--tenant", default="default", help="tenant that owns the maps (default: %(default)s)"
     )
+    common.add_argument(
+        "--name", dest="platform", metavar="NAME",
+        help="store of this local platform (default: of the one that runs here)",
+    )  # fmt: skip
     common.add_argument("--json", action="store_true", help="print JSON")
     made = {
         name: actions.add_parser(
@@ -115,6 +124,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--keep", type=int, required=True, metavar="N", help="how many of the newest stay, besides the head"
     )
     add_export_arguments(made["export"])
+    add_backup_arguments(made["backup"])
+    add_restore_arguments(made["restore"])
     add_from_camera_arguments(
         actions.add_parser(
             "from-camera", help="make a map from a camera, a video or images",
@@ -153,9 +164,13 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
         return run_bags(args, settings)
     if args.action == "localise" and is_remote(args):
         return localise_photos(args)
+    if args.store is not None and args.platform is not None:
+        raise UsageError("--store and --name name two stores", hint="leave one of them out")
     chosen = with_store(args.store, settings, args.platform)
     if args.action in ("live", "publish"):
         return (run_live if args.action == "live" else run_publish)(args, chosen)
+    if args.action in ("backup", "restore"):
+        return (run_backup if args.action == "backup" else run_restore)(args, chosen)
     maps = open_maps(chosen, args.tenant)
     actions = {
         "list": _list,

@@ -17,6 +17,7 @@ from rse_pf.audit.operator import record_map_change
 from rse_pf.aws.storage import open_data_store
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import ConfigurationError, NotFound, RsePfError, UsageError
+from rse_pf.identity import RobotId
 from rse_pf.local.processes import is_alive
 from rse_pf.local.state import platform_settings, read_state, state_folder
 from rse_pf.maps.registry import MapRecord, MapRegistry
@@ -35,21 +36,22 @@ def with_store(named: str | None, settings: PlatformSettings, name: str | None =
     A store of a platform comes with the quota of tenants that the platform has.
 
     Raises:
-        UsageError: The folder that is named is not there, or none was named and none found.
+        UsageError: The folder that is named is not there, or there is no such platform, or none was named.
     """
     chosen = settings if named is None else settings.replace(data={"store": named})
-    folder = _platform_folder(name)
     if named is None and (name is not None or chosen.data.store == _IN_MEMORY):
-        chosen = _with_store_of(folder, settings)
-    kind, _, path = chosen.data.store.partition(":")
-    own = folder / _OBJECTS
-    if chosen.data.store == _IN_MEMORY or (named is None and path == str(own) and not own.is_dir()):
+        folder = _platform_folder(name)
+        if name is not None and not folder.is_dir():
+            raise UsageError(f"there is no platform {name!r}", hint="start one with rse-pf local")
+        if folder.is_dir():
+            return _with_store_of(folder, settings)
+    if chosen.data.store == _IN_MEMORY:
+        own = _platform_folder(None) / _OBJECTS
         raise UsageError(
-            "no store is named, and one in memory belongs to another process"
-            if name is None
-            else f"the platform {name!r} of this machine has stored nothing yet",
+            "no store is named, and one in memory belongs to another process",
             hint=f"name --store dir:PATH; that of rse-pf local is dir:{own}",
         )
+    kind, _, path = chosen.data.store.partition(":")
     # An empty list of maps would look like an answer.
     if kind == "dir" and not Path(path).is_dir():
         raise UsageError(
@@ -63,7 +65,8 @@ def open_maps(settings: PlatformSettings, tenant: str = "default") -> MapRegistr
     """Return the maps of a tenant in ``data.store``; changes are recorded in the platform's audit log."""
 
     def record(action: str, name: str, version: MapRecord) -> None:
-        record_map_change(settings, action, name, version=version.id, number=version.number)
+        subject = str(RobotId(tenant, name))  # as the data service writes it
+        record_map_change(settings, action, subject, version=version.id, number=version.number)
 
     max_bytes = 4 * settings.data.max_object_bytes
     return MapRegistry(open_data_store(settings), tenant, max_bytes=max_bytes, on_change=record)

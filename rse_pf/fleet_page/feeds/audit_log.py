@@ -107,6 +107,7 @@ _SENTENCES: Mapping[str, str] = {
     "key.rotated": "{actor} made the key {subject}, which signs tokens from now on",
     "map.commit": "{actor} stored version {number} of the map {subject}",
     "map.remove": "{actor} removed version {number} of the map {subject}",
+    "map.restore": "{actor} restored the map {subject}, with version {number} as its head",
     "map.head": "{actor} made version {number} the head of the map {subject}",
     "robot.adopted": "{actor} gave {subject} what its earlier key stored",
     "robot.disabled": "{actor} disabled {subject}",

@@ -21,8 +21,7 @@ DEFAULT_QUOTA = 107374182400
 
 @pytest.fixture
 def store(platform: Path) -> DirectoryStore:
-    """The objects of the platform."""
-    (platform / "objects").mkdir()
+    """The objects of the platform, which has stored nothing yet."""
     return DirectoryStore(platform / "objects")
 
 
