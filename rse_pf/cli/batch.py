@@ -23,6 +23,7 @@ from rse_pf.cli.extras import require
 from rse_pf.cli.maps.merge_output import commit_merge, merge_progress
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import NotFound, UsageError
+from rse_pf.identity import RobotId
 from rse_pf.local.state import state_folder
 from rse_pf.maps.registry import MapOrigin, MapRecord, MapRegistry
 from rse_pf.object_store import ObjectStore
@@ -115,7 +116,8 @@ def _merge(args: argparse.Namespace, settings: PlatformSettings) -> int:
     store = open_data_store(settings)
 
     def record(action: str, name: str, version: MapRecord) -> None:
-        record_map_change(settings, action, name, version=version.id, number=version.number)
+        subject = str(RobotId(args.tenant, name))
+        record_map_change(settings, action, subject, version=version.id, number=version.number)
 
     maps = MapRegistry(
         store, args.tenant, max_bytes=4 * settings.data.max_object_bytes, on_change=record

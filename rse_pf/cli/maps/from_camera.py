@@ -26,6 +26,7 @@ from rse_pf.cli.sensors import add_check_argument, add_sensor_arguments, show_so
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import CommandFailed, RsePfError, UsageError
 from rse_pf.files import replace_file
+from rse_pf.identity import DEFAULT_TENANT
 from rse_pf.maps.format import decode_map
 from rse_pf.terminal import show, show_progress
 
@@ -270,14 +271,16 @@ def _keep(
     data, kept = None, {}
     try:
         data = mapper.encoded_map()
-        kept = keep_map(data, map_name(args), settings, f"rse-pf map {args.action}")
+        author = f"rse-pf map {args.action}"
+        kept = keep_map(data, map_name(args), settings, tenant=args.tenant, author=author)
     except RsePfError as error:
         why = "its scale is not known" if isinstance(error, UsageError) else f"{error.code}: {error.message}"
         if mapper.keyframes == 0:
             why = "it has no keyframe"
         kept, line = {"map": None, "map_reason": why}, f"no map is kept: {why}"
     else:
-        line = f"map: {kept['map']} in {kept['store']}; see rse-pf map show {kept['map']}"
+        tenant = "" if args.tenant == DEFAULT_TENANT else f" --tenant {args.tenant}"
+        line = f"map: {kept['map']} in {kept['store']}; see rse-pf map show {kept['map']}{tenant}"
     if images is not None:
         count = images.finish(None if data is None else decode_map(data))
         kept["images"] = count

@@ -81,6 +81,7 @@ def add_keep_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--map", metavar="NAME", help="name of the map that is kept (default: the name of --out)"
     )
+    parser.add_argument("--tenant", default="default", help="tenant that owns the map (default: %(default)s)")
 
 
 def map_name(args: argparse.Namespace) -> str:
@@ -112,13 +113,15 @@ def drive_store(args: argparse.Namespace, settings: PlatformSettings) -> Platfor
     return settings.replace(data={"store": f"{_FOLDER}{folder}"})
 
 
-def keep_map(data: bytes, name: str, settings: PlatformSettings, author: str) -> dict[str, Any]:
-    """Make *data* the next version of map *name*; return ``store`` and ``map`` as ``map export`` takes them.
+def keep_map(
+    data: bytes, name: str, settings: PlatformSettings, *, tenant: str, author: str
+) -> dict[str, Any]:
+    """Make *data* the next version of a map; return ``store`` and ``map`` as ``map export`` takes them.
 
     Raises:
         RsePfError: It was not kept.
     """
-    maps = open_maps(settings)
+    maps = open_maps(settings, tenant)
     try:
         parent = maps.head(name).id
     except NotFound:

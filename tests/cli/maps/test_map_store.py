@@ -142,6 +142,17 @@ def test_a_second_drive_is_the_next_version(folder: Path, capsys: pytest.Capture
     assert (shown["number"], shown["author"]) == (2, "rse-pf map from-bag")
 
 
+def test_a_drive_is_kept_for_the_tenant_that_is_named(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["map", "from-bag", "drive.bag", "--map", "hall", "--tenant", "acme", *PLATFORM]
+    assert main(words) == 0
+    assert "see rse-pf map show hall --tenant acme" in capsys.readouterr().out
+
+    assert main(["map", "show", "hall", "--tenant", "acme"]) == 0
+    assert main(["map", "show", "hall"]) == 1
+
+
 def test_the_store_of_the_one_platform_that_runs_is_found(
     tmp_path: Path, state_home: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
