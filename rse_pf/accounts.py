@@ -7,7 +7,7 @@ something fit, and to read or to remove is never refused.
 
 The bytes of a tenant count for all processes: ``accounts/TENANT`` holds what was counted last and what was
 granted since then, and changes by compare-and-swap.  A process draws a few MiB at a time and spends them from
-memory.  ``accounts/TENANT.quota`` holds the quota that an operator gave to this tenant alone.  The bytes of
+memory.  ``quotas/TENANT`` holds the quota that an operator gave to this tenant alone.  The bytes of
 a robot count for one process, which counts again what others stored every `_RECOUNT_S`
 in a folder (reading only what changed) and every `_SLOW_RECOUNT_S` in other stores.
 
@@ -287,7 +287,7 @@ def set_own_quota(store: ObjectStore, folder: str, quota_bytes: int | None) -> N
 
 
 def _quota_name(folder: str) -> str:
-    return f"accounts/{folder}.quota"
+    return f"quotas/{folder}"
 
 
 def tenant_folders(store: ObjectStore) -> set[str]:

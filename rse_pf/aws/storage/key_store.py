@@ -143,6 +143,10 @@ class KeyStore:
         """Return the roster and the deny list beside the public keys, which agents fetch repeatedly."""
         return AccessControlStore(self._bucket)
 
+    def published(self) -> KeySet:
+        """Return the public keys that servers fetch; raises NotFound if none were published."""
+        return KeySet.from_json(self._bucket.get(KEYS_NAME).decode())
+
     def publish(self, ring: KeyRing) -> None:
         """Write the public keys, which servers fetch within `spread_s`; create roster and deny list."""
         self.access_control_store().create_missing()

@@ -21,10 +21,13 @@ from rse_pf.errors import UsageError
 from rse_pf.identity import DEFAULT_TENANT
 
 __all__ = [
-    "add_place", "add_platform", "choose_robot", "described", "format_time", "max_token_s",
-    "open_access_control", "read_quotas", "record_action",
+    "NOT_ENROLLED_HINT", "add_place", "add_platform", "choose_robot", "described", "format_time",
+    "max_token_s", "open_access_control", "read_quotas", "record_action",
 ]  # fmt: skip
 
+NOT_ENROLLED_HINT = (
+    "rse-pf robot list shows who is; add --not-enrolled for a robot that uses tokens of rse-pf token issue"
+)
 _PLATFORM = "default"
 
 

@@ -45,6 +45,7 @@ from rse_pf.auth.roster import (
 )
 from rse_pf.auth.trust_store import AccessControlStore
 from rse_pf.cli.access.access_control import (
+    NOT_ENROLLED_HINT,
     add_place,
     choose_robot,
     described,
@@ -145,16 +146,11 @@ def _tenant(args: argparse.Namespace, access: AccessControlStore) -> str:
     if args.not_enrolled:
         check_robot(args.robot)
         return check_tenant(DEFAULT_TENANT if args.tenant is None else args.tenant)
+    hint = NOT_ENROLLED_HINT if args.action in _ALSO_NOT_ENROLLED else "rse-pf robot list shows who is"
     if args.action == "enable":
-        return choose_robot(
-            args.robot, args.tenant, access.deny_list().disabled, state="disabled",
-            hint="rse-pf robot list shows who is",
-        )  # fmt: skip
-    others = "; one that has none but tokens of rse-pf token issue: add --not-enrolled"
-    return choose_robot(
-        args.robot, args.tenant, access.roster().robots, state="enrolled",
-        hint="rse-pf robot list shows who is" + others * (args.action in _ALSO_NOT_ENROLLED),
-    )  # fmt: skip
+        disabled = access.deny_list().disabled
+        return choose_robot(args.robot, args.tenant, disabled, state="disabled", hint=hint)
+    return choose_robot(args.robot, args.tenant, access.roster().robots, state="enrolled", hint=hint)
 
 
 def _check(args: argparse.Namespace) -> None:

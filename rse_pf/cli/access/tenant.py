@@ -38,7 +38,8 @@ from rse_pf.terminal import show, show_json
 
 __all__ = ["add_arguments", "run"]
 
-_COLUMNS = ("tenant", "robots", "stored_bytes", "quota_bytes")
+_COLUMNS = ("tenant", "robots", "stored_bytes", "quota_bytes", "quota_from")
+_SETTING = "data.tenant_quota_bytes"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -88,7 +89,7 @@ def _list(
             "robots": robots[tenant],
             "stored_bytes": stored_by_tenant(store, name_segment(tenant)).charged_bytes,
             "quota_bytes": TenantAccount(store, tenant, settings.data).quota_bytes(),
-            "has_own_quota": own_quota_bytes(store, name_segment(tenant)) is not None,
+            "quota_from": _SETTING if own_quota_bytes(store, name_segment(tenant)) is None else "own",
         }
         for tenant in _tenants(access, store)
     ]
@@ -97,9 +98,8 @@ def _list(
         return 0
     table = [_COLUMNS, *(tuple(str(row[name]) for name in _COLUMNS) for row in rows)]
     widths = [max(map(len, column)) for column in zip(*table, strict=True)]
-    for cells, own in zip(table, (False, *(row["has_own_quota"] for row in rows)), strict=True):
-        line = "  ".join(cell.ljust(width) for cell, width in zip(cells, widths, strict=True))
-        show(f"{line}  own".rstrip() if own else line.rstrip())
+    for cells in table:
+        show("  ".join(cell.ljust(width) for cell, width in zip(cells, widths, strict=True)).rstrip())
     return 0
 
 
@@ -123,6 +123,6 @@ def _set_quota(
     now_bytes = TenantAccount(store, tenant, settings.data).quota_bytes()
     record_action(args, settings, "tenant.quota", tenant, data_bytes=now_bytes)
     stored_bytes = stored_by_tenant(store, name_segment(tenant)).charged_bytes
-    source = "data.tenant_quota_bytes" if quota is None else "its own quota"
+    source = _SETTING if quota is None else "its own quota"
     show(f"tenant {tenant!r} may store {now_bytes} bytes ({source}), and stores {stored_bytes}")
     return 0

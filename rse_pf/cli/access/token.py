@@ -33,6 +33,7 @@ from rse_pf.auth.roster import check_robot, check_tenant
 from rse_pf.auth.tokens import KeySet, SigningKey, unverified_parts
 from rse_pf.auth.trust_store import AccessControlStore
 from rse_pf.cli.access.access_control import (
+    NOT_ENROLLED_HINT,
     add_place,
     choose_robot,
     described,
@@ -158,8 +159,7 @@ def _revoke_all(args: argparse.Namespace, settings: PlatformSettings) -> int:
     if not args.not_enrolled:
         tenant = choose_robot(
             robot, args.tenant, access.roster().robots, state="enrolled",
-            hint="rse-pf robot list shows who is; one that has none but tokens of rse-pf token issue: add "
-            "--not-enrolled",
+            hint=NOT_ENROLLED_HINT,
         )  # fmt: skip
     access.change_deny_list(
         lambda denied: denied.pruned(now=now, max_token_s=longest).with_tokens_before(tenant, robot, from_s)
@@ -311,7 +311,7 @@ def _keys(args: argparse.Namespace, settings: PlatformSettings) -> Any:
 
     if args.cloud:
         store = _key_store(settings)
-        return _with_access_control(store.ring().key_set(), store.access_control_store())
+        return _with_access_control(store.published(), store.access_control_store())
     path = args.keys if args.keys is not None else key_set_file(_folder(args.name))
     try:
         keys = KeySet.from_json(path.read_text(encoding="utf-8"))

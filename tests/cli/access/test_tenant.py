@@ -17,6 +17,7 @@ from rse_pf.object_store import DirectoryStore, ObjectStore, digest_of
 Capture = pytest.CaptureFixture[str]
 MIB = 1 << 20
 DEFAULT_QUOTA = 107374182400
+SETTING = "data.tenant_quota_bytes"
 
 
 @pytest.fixture
@@ -53,16 +54,16 @@ def test_the_list_has_every_tenant_with_robots_or_data(capsys: Capture, store: D
     store.put("objects/beta/r/1", b"x")
 
     assert listed(capsys) == {
-        "Lab_7": {"robots": 1, "stored_bytes": 0, "quota_bytes": DEFAULT_QUOTA, "has_own_quota": False},
-        "acme": {"robots": 2, "stored_bytes": MIB, "quota_bytes": DEFAULT_QUOTA, "has_own_quota": False},
-        "beta": {"robots": 0, "stored_bytes": 4096, "quota_bytes": DEFAULT_QUOTA, "has_own_quota": False},
+        "Lab_7": {"robots": 1, "stored_bytes": 0, "quota_bytes": DEFAULT_QUOTA, "quota_from": SETTING},
+        "acme": {"robots": 2, "stored_bytes": MIB, "quota_bytes": DEFAULT_QUOTA, "quota_from": SETTING},
+        "beta": {"robots": 0, "stored_bytes": 4096, "quota_bytes": DEFAULT_QUOTA, "quota_from": SETTING},
     }
     output_of(capsys, "tenant quota acme --quota data_bytes=2e6")
     assert output_of(capsys, "tenant list").splitlines() == [
-        "tenant  robots  stored_bytes  quota_bytes",
-        "Lab_7   1       0             107374182400",
+        "tenant  robots  stored_bytes  quota_bytes   quota_from",
+        "Lab_7   1       0             107374182400  data.tenant_quota_bytes",
         "acme    2       1048576       2000000       own",
-        "beta    0       4096          107374182400",
+        "beta    0       4096          107374182400  data.tenant_quota_bytes",
     ]
 
 
@@ -149,4 +150,4 @@ def test_bad_input_is_one_line_and_a_hint(
     problem, hint = capsys.readouterr().err.splitlines()
     assert first in problem
     assert "hint" in hint
-    assert not list(store.list("accounts/"))
+    assert not list(store.list("quotas/"))

@@ -6,11 +6,13 @@ import io
 import tarfile
 import threading
 from pathlib import Path
+from typing import Any
 
 import pytest
 from fake_data_service import Service, small_settings
 from maps.sample_maps import make_map
 
+from rse_pf.aws.storage import S3Store
 from rse_pf.cli.main import main
 from rse_pf.identity import RobotId
 from rse_pf.local.firewall import ensure_key
@@ -18,7 +20,7 @@ from rse_pf.maps.charges import charge_name, charged_to
 from rse_pf.maps.format import encode_map
 from rse_pf.maps.registry import MapRegistry
 from rse_pf.maps.removal import superseded
-from rse_pf.object_store import DirectoryStore, digest_of
+from rse_pf.object_store import DirectoryStore, ObjectStore, digest_of
 
 Capture = pytest.CaptureFixture[str]
 ROBOT = RobotId("acme", "robot-1")
@@ -46,7 +48,7 @@ def lab(platform: Path) -> DirectoryStore:
     return DirectoryStore(platform.parent / "lab" / "objects")
 
 
-def commit(store: DirectoryStore, name: str, seed: int, tenant: str = "acme") -> str:
+def commit(store: ObjectStore, name: str, seed: int, tenant: str = "acme") -> str:
     maps = MapRegistry(store, tenant)
     parent = maps.heads().get(name)
     data = encode_map(make_map(seed))
@@ -110,6 +112,20 @@ def test_lost_versions_come_back_and_later_ones_stay(capsys: Capture, store: Dir
     assert maps.head("hall").id == old.id
     assert maps.data("hall", newer)
     assert maps.data("attic")
+
+
+def test_maps_in_a_bucket_are_backed_up_and_restored(capsys: Capture, cloud: Any) -> None:
+    bucket = S3Store(cloud, "maps")
+    commit(bucket, "hall", 1)
+    commit(bucket, "hall", 2)
+    before = [(info.name, bucket.get(info.name)) for info in bucket.list()]
+    run(capsys, "map backup acme.maps --tenant acme --store s3:maps")
+    for name, _ in before:
+        bucket.delete(name)
+
+    assert "2 versions written" in run(capsys, "map restore acme.maps --tenant acme --store s3:maps")
+
+    assert [(info.name, bucket.get(info.name)) for info in bucket.list("maps/")] == before
 
 
 def test_a_damaged_version_is_repaired(capsys: Capture, store: DirectoryStore) -> None:
