@@ -81,7 +81,7 @@ def _write_map(archive: tarfile.TarFile, maps: MapRegistry, name: str) -> tuple[
     _add(archive, f"{name}/blobs/{head.digest}", data)
     blobs, versions = {head.digest}, {head.id}
     _add_record(archive, name, head)
-    for record in maps.versions(name):
+    for record in _versions(maps, name):
         if record.id == head.id:
             continue
         if record.digest not in blobs:
@@ -94,6 +94,14 @@ def _write_map(archive: tarfile.TarFile, maps: MapRegistry, name: str) -> tuple[
         versions.add(record.id)
         _add_record(archive, name, record)
     return head.id, versions
+
+
+def _versions(maps: MapRegistry, name: str) -> list[MapRecord]:
+    """Return the versions of a map; none if all that were listed have been removed while they were read."""
+    try:
+        return maps.versions(name)
+    except NotFound:
+        return []
 
 
 def _read_head(maps: MapRegistry, name: str) -> tuple[MapRecord, bytes]:
