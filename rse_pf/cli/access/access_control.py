@@ -23,6 +23,7 @@ from rse_pf.identity import DEFAULT_TENANT
 __all__ = [
     "NOT_ENROLLED_HINT", "add_place", "add_platform", "choose_robot", "described", "format_time",
     "max_token_s", "open_access_control", "read_quotas", "record_action",
+    "tenant_or_default",
 ]  # fmt: skip
 
 NOT_ENROLLED_HINT = (
@@ -64,7 +65,7 @@ def choose_robot(
         UsageError: There is no such robot, or several tenants have one.
     """
     check_robot(name)
-    wanted = check_tenant(DEFAULT_TENANT if tenant is None else tenant)
+    wanted = tenant_or_default(tenant)
     tenants = sorted({each.tenant for each in listed if each.robot == name})
     if wanted in tenants and (tenant is not None or len(tenants) == 1):
         return wanted
@@ -96,6 +97,11 @@ def read_quotas(words: Iterable[str]) -> dict[str, float]:
         if number != "default":
             quotas[name] = limit
     return quotas
+
+
+def tenant_or_default(tenant: str | None) -> str:
+    """Return the tenant that a command names, or the default one; raises UsageError."""
+    return check_tenant(DEFAULT_TENANT if tenant is None else tenant)
 
 
 def described(robot: str, tenant: str) -> str:

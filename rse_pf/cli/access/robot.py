@@ -40,7 +40,6 @@ from rse_pf.auth.roster import (
     Roster,
     check_robot,
     check_scopes,
-    check_tenant,
     public_key_of,
 )
 from rse_pf.auth.trust_store import AccessControlStore
@@ -54,11 +53,11 @@ from rse_pf.cli.access.access_control import (
     open_access_control,
     read_quotas,
     record_action,
+    tenant_or_default,
 )
 from rse_pf.cli.access.enrolment import enrolment_lines, make_enrolment
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError
-from rse_pf.identity import DEFAULT_TENANT
 from rse_pf.terminal import show, show_json
 
 __all__ = ["add_arguments", "run"]
@@ -132,7 +131,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     if args.action == "list":
         return _list(args, access)
     if args.action == "enrol":
-        args.tenant = check_tenant(DEFAULT_TENANT if args.tenant is None else args.tenant)
+        args.tenant = tenant_or_default(args.tenant)
         return _enrol(args, access, now, settings)
     args.tenant = _tenant(args, access)
     actions = {
@@ -145,7 +144,7 @@ def _tenant(args: argparse.Namespace, access: AccessControlStore) -> str:
     """Return the tenant of the robot that *args* mean; raises UsageError if there is no such robot."""
     if args.not_enrolled:
         check_robot(args.robot)
-        return check_tenant(DEFAULT_TENANT if args.tenant is None else args.tenant)
+        return tenant_or_default(args.tenant)
     hint = NOT_ENROLLED_HINT if args.action in _ALSO_NOT_ENROLLED else "rse-pf robot list shows who is"
     if args.action == "enable":
         disabled = access.deny_list().disabled

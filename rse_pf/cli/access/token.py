@@ -29,7 +29,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rse_pf.auth.roster import check_robot, check_tenant
+from rse_pf.auth.roster import check_robot
 from rse_pf.auth.tokens import KeySet, SigningKey, unverified_parts
 from rse_pf.auth.trust_store import AccessControlStore
 from rse_pf.cli.access.access_control import (
@@ -41,6 +41,7 @@ from rse_pf.cli.access.access_control import (
     max_token_s,
     open_access_control,
     record_action,
+    tenant_or_default,
 )
 from rse_pf.config import PlatformSettings
 from rse_pf.config.resource_names import ResourceNames
@@ -127,10 +128,13 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
 
 
 def _issue(args: argparse.Namespace, settings: PlatformSettings) -> int:
-    now, token_id = time.time(), secrets.token_hex(8)
-    tenant = check_tenant(DEFAULT_TENANT if args.tenant is None else args.tenant)
-    token = _signing_key(args, settings, now).issue(
-        check_robot(args.subject),
+    now, token_id, robot = time.time(), secrets.token_hex(8), check_robot(args.subject)
+    tenant, key = tenant_or_default(args.tenant), _signing_key(args, settings, now)
+    enrolled = () if args.key is not None else open_access_control(args, settings).roster().robots
+    if args.tenant is None and any(each.robot == robot for each in enrolled):
+        tenant = choose_robot(robot, None, enrolled, state="enrolled", hint="")
+    token = key.issue(
+        robot,
         now=now,
         token_id=token_id,
         settings=settings.auth,
@@ -139,7 +143,7 @@ def _issue(args: argparse.Namespace, settings: PlatformSettings) -> int:
         tenant=tenant,
     )
     if args.key is None:
-        record_action(args, settings, "token.issued", args.subject, tenant=tenant, token=token_id)
+        record_action(args, settings, "token.issued", robot, tenant=tenant, token=token_id)
     show(token)
     return 0
 
@@ -155,7 +159,7 @@ def _revoke(args: argparse.Namespace, settings: PlatformSettings) -> int:
 def _revoke_all(args: argparse.Namespace, settings: PlatformSettings) -> int:
     access, now, longest = open_access_control(args, settings), time.time(), max_token_s(settings)
     robot, from_s = check_robot(args.all_of), float(int(now) + 1)  # tokens have whole seconds, rounded down
-    tenant = check_tenant(DEFAULT_TENANT if args.tenant is None else args.tenant)
+    tenant = tenant_or_default(args.tenant)
     if not args.not_enrolled:
         tenant = choose_robot(
             robot, args.tenant, access.roster().robots, state="enrolled",

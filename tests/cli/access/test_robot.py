@@ -163,6 +163,18 @@ def test_all_tokens_of_a_robot_until_now_are_revoked(capsys: Capture, platform: 
     assert (problem(platform, mine), problem(platform, others)) == ("issued-too-early", "")
 
 
+def test_a_token_is_issued_for_an_enrolled_robot_of_another_tenant_only_with_its_tenant(
+    capsys: Capture, platform: Path
+) -> None:
+    enrolled(capsys, "robot-1", "--tenant", "acme")
+
+    assert "is of tenant 'acme', and not of 'default'" in refused(capsys, "token", "issue", "robot-1")[0]
+
+    for tenant in ("acme", "default"):
+        token = issued(capsys, "robot-1", "--tenant", tenant)
+        assert json.loads(said(capsys, "token", "inspect", token))["claims"]["tenant"] == tenant
+
+
 CHANGES = ("robot disable", "robot remove", "robot adopt", "token revoke --all-of")
 
 
