@@ -34,7 +34,7 @@ from client_sdk.stats import Stats, StatsKeeper
 from client_sdk.updates import RobotSubscriptions, Updates
 from rse_pf.config import SessionSettings
 from rse_pf.errors import Disconnected, RsePfError, UsageError, error_from_code
-from rse_pf.wire import CODECS, Failure, as_type, make_codec
+from rse_pf.wire import CODECS, Failure, Welcome, as_type, make_codec
 from rse_pf.wire.client_session import Answered, ClientSession
 from rse_pf.wire.client_subscriptions import SubscriptionEnded, Updated
 from rse_pf.wire.rate_limit import REASONS
@@ -405,6 +405,11 @@ class Robot:
     def connected(self) -> bool:
         """Whether there is a connection to a server now; without one, commands wait for the next."""
         return self._session.current is not None
+
+    @property
+    def welcome(self) -> Welcome | None:
+        """What the present server says of this robot: name, tenant, scopes, limits; None without a server."""
+        return None if self._session.current is None else self._session.current.welcome
 
     @property
     def failure(self) -> RsePfError | None:

@@ -11,6 +11,7 @@ from constructs import Construct
 
 from rse_pf.config import PlatformSettings
 from rse_pf.config.placement import fixed_live_ports
+from rse_pf.config.resource_names import ROSBRIDGE_PORT
 from rse_pf.errors import ConfigurationError
 from stacks.findings import acknowledge
 
@@ -84,8 +85,9 @@ class Firewall(Construct):
 
 def inner_ports(settings: PlatformSettings) -> list[int]:
     """Return the ports of a server that the load balancer uses."""
-    ports = [settings.serving.port, settings.serving.control_port]
-    return [*ports, settings.data.port] if settings.data.enabled else ports
+    data = [settings.data.port] if settings.data.enabled else []
+    rosbridge = [ROSBRIDGE_PORT] if settings.serving.rosbridge else []
+    return [settings.serving.port, settings.serving.control_port, *data, *rosbridge]
 
 
 def live_range(settings: PlatformSettings) -> range | None:

@@ -10,7 +10,7 @@ from constructs import Construct
 
 from rse_pf.config import PlatformSettings
 from rse_pf.config.front_door import BALANCER_IDLE_TIMEOUT_S, DATA_PATH, LOCALISE_PATH
-from rse_pf.config.resource_names import READY_PATH
+from rse_pf.config.resource_names import READY_PATH, ROSBRIDGE_PATH, ROSBRIDGE_PORT
 from rse_pf.scaling.health import CLOUD_INTERVAL_S, CLOUD_TIMEOUT_S, HEALTHY_CHECKS, cloud_checks
 from stacks.data_stack import BALANCER_LOGS
 from stacks.firewall import front_port
@@ -66,6 +66,13 @@ class LoadBalancer(Construct):
                 "NotReady", priority=5,
                 conditions=[elbv2.ListenerCondition.path_patterns([f"/data{READY_PATH}"])],
                 action=elbv2.ListenerAction.fixed_response(404),
+            )  # fmt: skip
+        if settings.serving.rosbridge:
+            self.targets["rosbridge"] = self._targets("Rosbridge", vpc, ROSBRIDGE_PORT, settings)
+            listener.add_target_groups(
+                "RosbridgeRule", priority=15,
+                conditions=[elbv2.ListenerCondition.path_patterns([ROSBRIDGE_PATH])],
+                target_groups=[self.targets["rosbridge"]],
             )  # fmt: skip
         WebFirewall(self, "Waf", alb_arn=self.alb.load_balancer_arn, settings=settings)
 

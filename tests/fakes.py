@@ -200,9 +200,6 @@ class FakeWire:
     def send_pong(self, data: bytes) -> None:
         self.sent.append(data)
 
-    def send_ping(self) -> None:
-        self.sent.append(b"ping")
-
     def pause(self, seconds: float) -> None:
         self.pauses.append(seconds)
 

@@ -64,8 +64,8 @@ class GuardedServer:
         """Everything the server wrote."""
         return (self.folder / "server.log").read_text()
 
-    def start(self) -> None:
-        """Start it and wait until it announces itself."""
+    def start(self, port: int = 0) -> None:
+        """Start it, on a free port or on *port*, and wait until it announces itself."""
         announce = self.folder / "announce.json"
         announce.unlink(missing_ok=True)
         with (self.folder / "server.log").open("ab") as log:
@@ -73,7 +73,7 @@ class GuardedServer:
                 [
                     sys.executable, "-m", "rse_pf.cli.main", "serve", "--settings",
                     str(self.folder / "settings.json"), "--keys", str(self.folder / "keys.json"),
-                    "--port", "0", "--control-port", "0", "--workers", str(self._workers),
+                    "--port", str(port), "--control-port", "0", "--workers", str(self._workers),
                     "--server-id", "guarded", "--announce", str(announce),
                     "--audit", str(self.folder / "audit"),
                 ],
@@ -93,10 +93,10 @@ class GuardedServer:
             self._process.wait()
             self._process = None
 
-    def restart(self) -> None:
+    def restart(self, port: int = 0) -> None:
         """Kill it and start it again on the same folder."""
         self.stop()
-        self.start()
+        self.start(port)
 
     def token(self, robot: str, **more: Any) -> str:
         """Return a token of the platform that was never issued before."""

@@ -41,7 +41,7 @@ from benchmarks.frame.registry import Bar, benchmark
 from benchmarks.frame.statistics import interleaved, percentile
 from rse_pf.auth.tokens import SigningKey
 from rse_pf.config import AuthSettings, PlatformSettings
-from rse_pf.local.balancer.envoy_config import Target
+from rse_pf.local.balancer.envoy_config import DATA_CLUSTER, Target
 from rse_pf.local.balancer.load_balancer import EnvoyLoadBalancer
 
 HERE = Path(__file__).resolve().parents[2]
@@ -251,7 +251,7 @@ def balancer(server: Server, folder: Path) -> Iterator[int]:
 
     async def wait() -> None:
         await made.wait_live(_TIMEOUT_S)
-        made.set_data_targets([Target(name="data", port=server.port, control_port=server.port)])
+        made.set_targets([Target(name="data", port=server.port, control_port=server.port)], DATA_CLUSTER)
         while True:
             with socket.create_connection(("127.0.0.1", made.port)) as connection:
                 connection.sendall(head_of("GET", "/data/v1/objects", token_of("probe")))

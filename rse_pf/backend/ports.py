@@ -35,9 +35,6 @@ class Wire(Protocol):
     def send_pong(self, data: bytes) -> None:
         """Write one pong frame."""
 
-    def send_ping(self) -> None:
-        """Write one ping frame; does nothing on a socket that ended."""
-
     def pause(self, seconds: float) -> None:
         """Read nothing more for *seconds*."""
 

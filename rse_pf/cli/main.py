@@ -38,6 +38,7 @@ VERBS = {
     "service": "write, test, run and install a service of your own: Python, C/C++ or Lua",
     "serve": "run one backend server, as EC2 runs it",
     "data": "run the data service: images, keyframes, clouds and maps by HTTP",
+    "rosbridge": "let programs that speak rosbridge v2 use a platform",
     "camera": "calibrate a camera, print a board for it, check what it gives",
     "map": "show, merge, localise in, roll back and export the maps that robots share",
     "batch": "merge maps that outgrow one process, in parts that survive a crash",
@@ -54,7 +55,7 @@ _FOLDERS = {
     "local": "local_platform", "fleet": "local_platform",
     "token": "access", "tenant": "access", "robot": "access", "audit": "access",
     "service": "services",
-    "serve": "servers", "data": "servers",
+    "serve": "servers", "data": "servers", "rosbridge": "servers",
     "camera": "maps", "map": "maps",
     "cloud": "cloud",
 }  # fmt: skip

@@ -19,6 +19,7 @@ __all__ = [
     "ROBOTS_NAME",
     "ROBOTS_PATH",
     "ROSBRIDGE_PATH",
+    "ROSBRIDGE_PORT",
     "SERVICES_PREFIX",
     "SETTINGS_CONTEXT",
     "STACKS",
@@ -38,7 +39,9 @@ answers, which agents publish and for which no server is ended."""
 # Path of the robots' WebSocket.
 ROBOTS_PATH = "/ws"
 ROSBRIDGE_PATH = "/rosbridge"
-"""At the robots' port, where ``serving.rosbridge`` is on."""
+"""At the load balancer, where ``serving.rosbridge`` is on."""
+ROSBRIDGE_PORT = 8768
+"""Of the rosbridge server on a backend server; rosbridge_suite's 9090 is often taken on a robot's machine."""
 KEYS_NAME = "keys.json"
 """Name of the object in the artifact bucket that holds the public key set."""
 ROBOTS_NAME = "control/robots.json"

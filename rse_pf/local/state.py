@@ -38,7 +38,7 @@ __all__ = [
 
 _FILE = "platform.json"
 _LOCK = "lock"
-_LATER = ("lan", "authority_file")
+_LATER = ("lan", "authority_file", "rosbridge_server")
 """Left out while they are empty: earlier versions refuse fields that they do not know."""
 _NAME = re.compile(r"[a-z0-9][a-z0-9-]{0,31}")
 
@@ -72,6 +72,7 @@ class PlatformState:
     control_token_file: str = ""
     servers: tuple[ServerState, ...] = ()
     data_server: ServerState | None = None
+    rosbridge_server: ServerState | None = None
     load_balancer: ProcessMark | None = None
     port: int = 0
     status_port: int = 0
@@ -82,8 +83,13 @@ class PlatformState:
     def processes(self) -> tuple[ProcessMark, ...]:
         """Return the data path: everything but the control plane."""
         balancer = () if self.load_balancer is None else (self.load_balancer,)
-        data = () if self.data_server is None else (self.data_server.process,)
-        return (*(server.process for server in self.servers), *data, *balancer)
+        return (*(server.process for server in (*self.servers, *self.single_servers)), *balancer)
+
+    @property
+    def single_servers(self) -> tuple[ServerState, ...]:
+        """Data server and rosbridge server, as far as there are such."""
+        both = (self.data_server, self.rosbridge_server)
+        return tuple(server for server in both if server is not None)
 
     def write(self, folder: Path) -> None:
         """Replace the file in *folder* in one step."""
@@ -232,11 +238,12 @@ def _state(document: Any) -> PlatformState:
         raise TypeError("it is not an object")
     balancer = document.pop("load_balancer")
     servers = tuple(map(_server, document.pop("servers")))
-    data = document.pop("data_server", None)
+    data, rosbridge = document.pop("data_server", None), document.pop("rosbridge_server", None)
     return PlatformState(
         **{**document, "control_plane": ProcessMark(**document["control_plane"])},
         servers=servers,
         data_server=None if data is None else _server(data),
+        rosbridge_server=None if rosbridge is None else _server(rosbridge),
         load_balancer=None if balancer is None else ProcessMark(**balancer),
     )
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from rse_pf.config import HealthSettings, PlatformSettings
-from rse_pf.config.resource_names import HEALTH_PATH, READY_PATH
+from rse_pf.config.resource_names import HEALTH_PATH, READY_PATH, ROSBRIDGE_PORT
 
 __all__ = [
     "CLOUD_INTERVAL_S",
@@ -56,7 +56,7 @@ class Health:
 
 
 def cloud_checks(settings: PlatformSettings) -> dict[str, tuple[int, str]]:
-    """Return port and path that the ALB asks, by target group: ``robots`` and, where it runs, ``data``.
+    """Return port and path that the ALB asks, by target group: ``robots``, and what else runs.
 
     A server that fails any of them is ended.  Therefore none may depend on what all servers share, such as
     the bucket: it would end all servers at once.
@@ -64,6 +64,8 @@ def cloud_checks(settings: PlatformSettings) -> dict[str, tuple[int, str]]:
     checks = {"robots": (settings.serving.control_port, READY_PATH)}
     if settings.data.enabled:
         checks["data"] = (settings.data.port, f"/data{HEALTH_PATH}")
+    if settings.serving.rosbridge:
+        checks["rosbridge"] = (ROSBRIDGE_PORT, HEALTH_PATH)
     return checks
 
 

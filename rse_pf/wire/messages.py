@@ -76,6 +76,7 @@ class Welcome(_Message, frozen=True, kw_only=True, tag="welcome"):
 
     ``token_s``: the socket ends in so many seconds, unless a fresh token comes first.  ``burst_url``: where
     commands are answered by HTTP while the servers cannot, an address or a path at the robot's own address.
+    ``tenant`` and ``scopes`` are what the server takes the robot's token for; no scopes allow everything.
     """
 
     server: str
@@ -86,6 +87,8 @@ class Welcome(_Message, frozen=True, kw_only=True, tag="welcome"):
     clock_s: float
     token_s: float | None = None
     burst_url: str = ""
+    tenant: str | None = None
+    scopes: tuple[str, ...] = ()
 
 
 class Command(_Message, frozen=True, kw_only=True, tag="command"):

@@ -6,7 +6,7 @@ Messages and the time go in, decisions come out (`Send`, `Submit`, `Close` ...).
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Literal
 
 import msgspec
 
@@ -53,8 +53,6 @@ __all__ = [
     "PROGRESS",
     "RENEWAL_PAUSE_S",
     "UPDATES",
-    "AskTopics",
-    "Authenticate",
     "BeginUpdates",
     "Close",
     "Decision",
@@ -142,19 +140,7 @@ class EndUpdates(msgspec.Struct, frozen=True, gc=False):
     id: int
 
 
-class Authenticate(msgspec.Struct, frozen=True, gc=False):
-    """Verify this token of a rosbridge client that showed none in its handshake."""
-
-    token: str
-
-
-class AskTopics(msgspec.Struct, frozen=True):
-    """Execute this operation of a rosbridge client on its topics."""
-
-    op: Any
-
-
-Decision = Send | Submit | Withdraw | Renewal | Close | BeginUpdates | EndUpdates | Authenticate | AskTopics
+Decision = Send | Submit | Withdraw | Renewal | Close | BeginUpdates | EndUpdates
 
 
 class ServerSession:
@@ -170,12 +156,8 @@ class ServerSession:
         refused_commands: How many invalid messages arrived whose id could be read, less one for each valid
             command since.
         suspicion: The sum of both; a robot with less is read first.
-        is_pinged: Whether the server asks a silent client by WebSocket pings, because it sends none itself.
-        ends_when_idle: Whether the connection ends with the answer to its last command.
+        tenant: Of the robot, and ``scopes`` of its token; both go into the Welcome.
     """
-
-    is_pinged = False
-    ends_when_idle = False
 
     def __init__(
         self,
@@ -191,6 +173,8 @@ class ServerSession:
         self.state: Literal["opening", "open", "closed"] = "opening"
         self.in_flight = 0
         self.ends_s: float | None = None
+        self.tenant: str | None = None
+        self.scopes: tuple[str, ...] = ()
         self.hears_progress = self.hears_updates = False
         self.topics: dict[int, str] = {}
         self.codec = codec
@@ -239,9 +223,6 @@ class ServerSession:
                 return [] if self.topics.pop(message.id, None) is None else [EndUpdates(message.id)]
             case _:
                 return self._renew(message.token, now)
-
-    def forget_command(self, command_id: int) -> None:
-        """Forget what only a rosbridge client's session keeps of a command that has its final answer."""
 
     def move(self, reason: str, within_ms: float) -> list[Decision]:
         """Ask the robot to connect to another server before it closes this connection."""
@@ -333,6 +314,8 @@ class ServerSession:
             clock_s=now,
             token_s=None if self.ends_s is None else max(0.0, self.ends_s - now),
             burst_url=burst.url if has_burst else "",
+            tenant=self.tenant,
+            scopes=self.scopes,
         )
         return [self._send(welcome)]
 

@@ -3,7 +3,7 @@
 
 Uses the standard library only.  Unpacks the archives beside this file, which first_boot.py has verified, into
 a virtual environment with its bytecode, and starts the units.  A second run has the same result.  The server,
-its agent and the data service run as a user who may write one folder.
+its agent, the data service and the rosbridge server run as a user who may write one folder.
 """
 
 import json
@@ -25,11 +25,13 @@ ARCHIVES = ("libraries-0.tar.gz", "libraries-1.tar.gz", "platform.tar.gz")
 AGENT = "rse-pf-agent.service"
 ALWAYS = ("rse-pf.service", AGENT)
 DATA = "rse-pf-data.service"
+ROSBRIDGE = "rse-pf-rosbridge.service"
 
 
 def units_of(settings):
     """Return the units that start with the machine, for merged *settings* (group to names to values)."""
-    return (*ALWAYS, DATA) if settings["data"]["enabled"] else ALWAYS
+    data = (DATA,) if settings["data"]["enabled"] else ()
+    return (*ALWAYS, *data, ROSBRIDGE) if settings["serving"]["rosbridge"] else (*ALWAYS, *data)
 
 
 def environment_file(facts):

@@ -19,6 +19,7 @@ from typing import Any
 from driver import Driver, Missed
 from link import Link
 from undecodable import as_input
+from websockets.asyncio.client import connect
 
 import client_sdk
 from rse_pf.auth.control_token import bearer, read_control_token
@@ -433,6 +434,20 @@ async def revoked(bench: Bench, driver: Driver, link: Link, robot: str) -> dict[
     must(bool(ends & set(figures["codes"])), f"codes {figures['codes']}")
     must(link.connections == 1, f"{link.connections} connections")
     return {**figures, "connections": link.connections}
+
+
+@scenario("not-finite", "NaN and Infinity of a LaserScan and a NavSatFix arrive, as null")
+async def not_finite(bench: Bench, driver: Driver, link: Link, robot: str) -> dict[str, Any]:
+    await driver.ready()
+    ranges = [1.0, math.nan, math.inf, -math.inf]
+    scan = {"op": "publish", "topic": "/scan", "type": "sensor_msgs/LaserScan", "msg": {"ranges": ranges}}
+    fix = {"op": "publish", "topic": "/fix", "type": "sensor_msgs/NavSatFix", "msg": {"latitude": math.nan}}
+    token = {"Authorization": f"Bearer {bench.token(f'{robot}-sensor')}"}
+    address = f"ws://127.0.0.1:{bench.cloud.port}/rosbridge"
+    async with connect(address, additional_headers=token, proxy=None) as sensor:
+        for message in (scan, fix):
+            await sensor.send(json.dumps(message))  # which writes NaN and Infinity, as roslibpy does
+        return figures_of(await driver.done(20))
 
 
 async def is_back(driver: Driver, from_s: float, within_s: float) -> dict[str, Any]:

@@ -22,7 +22,7 @@ from hostile.smuggling_samples import HIDDEN, REFUSED, SAMPLES, put, upgrade
 
 from rse_pf.backend.gateway.rate_limits import SourceRates
 from rse_pf.config import PlatformSettings
-from rse_pf.local.balancer.envoy_config import Target
+from rse_pf.local.balancer.envoy_config import DATA_CLUSTER, Target
 from rse_pf.local.balancer.load_balancer import EnvoyLoadBalancer
 
 pytestmark = pytest.mark.system
@@ -208,7 +208,7 @@ async def through_the_load_balancer(folder: Path, *, opens: bool) -> tuple[dict[
     try:
         await balancer.wait_live(SOON_S)
         balancer.set_targets([Target(name="robots", port=port, control_port=port)])
-        balancer.set_data_targets([Target(name="data", port=port, control_port=port)])
+        balancer.set_targets([Target(name="data", port=port, control_port=port)], DATA_CLUSTER)
         assert await balancer.wait_healthy(["robots"], SOON_S)
         end = time.monotonic() + SOON_S
         while b" 401 " not in await answer_to(balancer.port, put(b"Content-Length: 0")):

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from typing import Any
 
 import pytest
-from backend.rosbridge.clients import rosbridge_worker
+from guarded_server import GuardedServer
+from rosbridge.conftest import opened
 
-from rse_pf.backend.rosbridge import topics
 from rse_pf.errors import BadRequest
 from rse_pf.wire.live_map import map_of_topic
 
@@ -55,27 +56,28 @@ OPERATIONS: dict[str, dict[str, Any]] = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_a_hostile_name_is_a_typed_refusal_of_every_operation_and_makes_no_topic(name: str) -> None:
-    with rosbridge_worker() as worker:
-        client = worker.client()
-        for operation, fields in OPERATIONS.items():
-            (told,) = client.say({"op": operation, "topic": NAMES[name], **fields})
-            assert told["code"] == "bad-request", operation
-            assert told["hint"]
-            assert len(json.dumps(told)) < 1000
-            assert all(each.isprintable() for each in told["msg"])
-        assert worker.parts.dispatcher.snapshot()["gauges"]["rosbridge_topics"] == 0.0
-        assert not client.closed
+@pytest.fixture(scope="module")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[GuardedServer]:
+    """Return a backend server."""
+    with GuardedServer(tmp_path_factory.mktemp("server"), workers=1) as started:
+        yield started
 
 
-def test_a_name_beyond_every_bound_is_refused_in_few_words() -> None:
-    with rosbridge_worker() as worker:
-        client = worker.client()
-        for _ in range(5):
-            (told,) = client.say({"op": "subscribe", "topic": "/" + "a" * 5_000})
-            assert len(json.dumps(told)) < 1000
-        assert worker.parts.dispatcher.snapshot()["gauges"]["rosbridge_topics"] == 0.0
+async def test_a_hostile_name_is_a_typed_refusal_of_every_operation_and_makes_no_topic(
+    server: GuardedServer,
+) -> None:
+    async with opened(server) as bridge:
+        client = await bridge.client()
+        for name in NAMES.values():
+            for operation, fields in OPERATIONS.items():
+                refused = await client.ask({"op": operation, "topic": name, **fields})
+                assert refused["code"] in ("bad-request", "bad-message"), (operation, name)
+                assert refused["hint"]
+                assert len(json.dumps(refused)) < 1000
+                assert refused["msg"].isprintable()
+        assert (await client.ask({**OPERATIONS["subscribe"], "op": "subscribe", "topic": "a" * 5000}))["code"]
+        answer = await client.ask({"op": "call_service", "service": "/rosapi/topics", "id": "1"})
+        assert answer["values"]["topics"] == []
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -94,49 +96,32 @@ def test_a_name_that_is_nearly_that_of_a_live_map_is_none(topic: str) -> None:
         map_of_topic(topic)
 
 
-def test_two_spellings_are_one_topic_and_two_cases_are_two() -> None:
-    with rosbridge_worker() as worker:
-        talker, plain, slash, other = (worker.client(name) for name in "abcd")
-        plain.say({"op": "subscribe", "topic": "scan"})
-        slash.say({"op": "subscribe", "topic": "/scan"})
-        other.say({"op": "subscribe", "topic": "/Scan"})
-        talker.say({"op": "publish", "topic": "/scan", "msg": {"data": 1}})
+async def test_two_spellings_are_one_topic_and_two_cases_are_two(server: GuardedServer) -> None:
+    async with opened(server) as bridge:
+        talker, plain, slash, other = [await bridge.client(name) for name in "abcd"]
+        for client, topic in ((plain, "scan"), (slash, "/scan"), (other, "/Scan")):
+            await client.send({"op": "subscribe", "topic": topic})
+            await client.settle()
+        for topic in ("/scan", "/Scan"):
+            await talker.send({"op": "publish", "topic": topic, "msg": {"data": topic}})
 
-        assert [each["topic"] for each in (*plain.told(), *slash.told())] == ["scan", "/scan"]
-        assert other.told() == []
-
-
-def test_topics_of_another_tenant_are_neither_heard_nor_named_nor_typed() -> None:
-    with rosbridge_worker() as worker:
-        owner = worker.client("a")
-        owner.say({"op": "advertise", "topic": "/secret", "type": "a/B", "latch": True})
-        owner.say({"op": "publish", "topic": "/secret", "msg": {"data": 1}, "latch": True})
-        stranger = worker.client("b", tenant="other")
-
-        assert stranger.say({"op": "subscribe", "topic": "/secret", "type": "c/D"}) == []
-        (listed,) = stranger.say({"op": "call_service", "service": "/rosapi/topics", "id": "1"})
-        assert listed["values"] == {"topics": ["/secret"], "types": ["c/D"]}, "its own subscription"
-        owner.say({"op": "publish", "topic": "/secret", "msg": {"data": 2}})
-        assert stranger.told() == []
+        assert [(await each.receive())["topic"] for each in (plain, slash)] == ["scan", "/scan"]
+        assert await other.data() == ["/Scan"]
 
 
-def test_beyond_the_quota_of_a_tenant_known_topics_and_other_tenants_go_on(
-    monkeypatch: pytest.MonkeyPatch,
+async def test_topics_of_another_tenant_are_neither_received_nor_named_nor_typed(
+    server: GuardedServer,
 ) -> None:
-    monkeypatch.setattr(topics, "MAX_TOPICS_OF_TENANT", 3)
-    with rosbridge_worker() as worker:
-        greedy, listener = worker.client("a"), worker.client("b")
-        other = worker.client("c", tenant="other")
-        listener.say({"op": "subscribe", "topic": "/known"})
-        greedy.say(*[{"op": "advertise", "topic": f"/t{number}"} for number in range(2)])
-        for number in range(20):
-            (told,) = greedy.say({"op": "advertise", "topic": f"/more{number}"})
-            assert told["code"] == "quota"
-        (told,) = listener.say({"op": "subscribe", "topic": "/late"})
-        assert told["code"] == "quota"
+    async with opened(server) as bridge:
+        owner, stranger = await bridge.client("a"), await bridge.client("b", tenant="other")
+        await owner.send({"op": "advertise", "topic": "/secret", "type": "a/B", "latch": True})
+        await owner.send({"op": "publish", "topic": "/secret", "msg": {"data": 1}, "latch": True})
+        await owner.settle()
+        await stranger.send({"op": "subscribe", "topic": "/secret", "type": "c/D"})
+        listed = await stranger.ask({"op": "call_service", "service": "/rosapi/topics", "id": "1"})
+        assert listed["values"] == {"topics": ["/secret"], "types": ["c/D"]}, "its own subscription"
+        await owner.send({"op": "publish", "topic": "/secret", "msg": {"data": 2}})
+        await owner.settle()
+        await stranger.send({"op": "publish", "topic": "/secret", "msg": {"data": 3}})
 
-        assert greedy.say({"op": "publish", "topic": "/known", "msg": {"data": 1}}) == []
-        assert [each["msg"]["data"] for each in listener.told()] == [1]
-        assert other.say({"op": "advertise", "topic": "/t0"}, {"op": "subscribe", "topic": "/t9"}) == []
-        greedy.connection.on_socket_end()
-        assert listener.say({"op": "subscribe", "topic": "/late"}) == []
+        assert await stranger.data() == [3]

@@ -29,7 +29,7 @@ PUBLIC = PlatformSettings.from_dict(
             "busy_cpu_percent": 60.0, "max_servers": 8, "min_servers": 3, "idle_s": 420, "max_queue_ms": 40,
             "profile": "fast", "schedule": "mon 08:00 min 8", "time_zone": "Asia/Seoul",
         },
-        "serving": {"port": 9001, "control_port": 9002},
+        "serving": {"port": 9001, "control_port": 9002, "rosbridge": True},
     }
 )  # fmt: skip
 

@@ -16,6 +16,7 @@ import pytest
 
 from lambda_pnp.keys import signed_request
 from rse_pf.config import PlatformSettings
+from rse_pf.config.resource_names import ROSBRIDGE_PORT
 from stacks.boot.first_boot import fetched, signed_headers, verified
 from stacks.boot.install import environment_file, units_of
 
@@ -162,7 +163,10 @@ def unit(repository: Path, name: str) -> configparser.ConfigParser:
     return parser
 
 
-@pytest.mark.parametrize("name", ["rse-pf.service", "rse-pf-agent.service", "rse-pf-data.service"])
+@pytest.mark.parametrize(
+    "name",
+    ["rse-pf.service", "rse-pf-agent.service", "rse-pf-data.service", "rse-pf-rosbridge.service"],
+)
 def test_every_service_has_its_own_user_and_walls_and_comes_back(repository: Path, name: str) -> None:
     service = unit(repository, name)["Service"]
 
@@ -213,11 +217,13 @@ def test_a_server_that_was_drained_stays_down(repository: Path) -> None:
     assert unit(repository, "rse-pf.service")["Service"]["Restart"] == "on-failure"
 
 
-def test_a_data_group_is_attached_exactly_when_the_data_unit_starts(assembly: Any) -> None:
+def test_a_group_is_attached_exactly_when_its_unit_starts(assembly: Any) -> None:
     units = units_of(json.loads(json.dumps(assembly.settings.to_dict())))
     ports = {each.get("Port") for each in assembly.all("AWS::ElasticLoadBalancingV2::TargetGroup")}
 
     assert ("rse-pf-data.service" in units) == (assembly.settings.data.port in ports)
+    assert ("rse-pf-rosbridge.service" in units) == (ROSBRIDGE_PORT in ports)
+    assert (ROSBRIDGE_PORT in ports) == assembly.settings.serving.rosbridge
     assert "rse-pf.service" in units
 
 

@@ -230,6 +230,10 @@ def test_the_load_balancer_refuses_what_two_readers_may_understand_differently(a
 def test_nobody_outside_can_have_the_data_service_ask_its_store(assembly: Assembly) -> None:
     rules = {rule["Priority"]: rule for rule in assembly.all("AWS::ElasticLoadBalancingV2::ListenerRule")}
     del rules[20]  # of the burst function
+    rosbridge = rules.pop(15, None)
+    assert (rosbridge is not None) == assembly.settings.serving.rosbridge
+    if rosbridge is not None:
+        assert rosbridge["Conditions"][0]["PathPatternConfig"]["Values"] == ["/rosbridge"]
     if not assembly.settings.data.enabled:
         assert rules == {}
         return

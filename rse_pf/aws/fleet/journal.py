@@ -17,7 +17,7 @@ __all__ = ["UNITS", "Batch", "JournalReader", "journal_command", "make_batch", "
 
 UNITS = (
     "rse-pf.service", "rse-pf-agent.service", "rse-pf-data.service",
-    "cloud-init.service", "cloud-final.service",
+    "rse-pf-rosbridge.service", "cloud-init.service", "cloud-final.service",
 )  # fmt: skip
 """Whose entries are read; the last two are the boot, with what first_boot.py and install.py print."""
 _MAX_BYTES = 1 << 22

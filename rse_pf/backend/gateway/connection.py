@@ -7,7 +7,7 @@ The connection knows no socket library, and takes nothing more once it is closin
 from __future__ import annotations
 
 from collections import deque
-from typing import Any, Protocol
+from typing import Protocol
 
 from msgspec import Struct
 
@@ -20,16 +20,13 @@ from rse_pf.backend.gateway.rate_limits import RobotRates
 from rse_pf.backend.ports import Wire, WorkerContext
 from rse_pf.backend.scheduling.overload import MAX_EARLY_COMMANDS
 from rse_pf.errors import ProtocolError, RsePfError
-from rse_pf.wire import CODECS, Command, Failure, Progress
+from rse_pf.wire import Command, Failure, Progress
 from rse_pf.wire.messages import FromRobot
 from rse_pf.wire.server_session import (
-    CLOSE_GOING_AWAY,
     MAX_BAD_MESSAGES,
-    Authenticate,
     BeginUpdates,
     Close,
     Decision,
-    EndUpdates,
     Renewal,
     Send,
     SendRefusal,
@@ -40,7 +37,6 @@ from rse_pf.wire.server_session import (
 
 __all__ = ["CommandHandler", "RobotConnection"]
 
-_PONG = 10
 _BAD_MESSAGE_PAUSE_S = 0.1
 """After an undecodable message its socket is not read for this, times their number."""
 _MAX_REFUSED = 5
@@ -81,12 +77,6 @@ class CommandHandler(Protocol):
     def unsubscribe(self, connection: RobotConnection, identity: int) -> None:
         """End a subscription."""
 
-    def authenticate(self, connection: RobotConnection, token: str) -> None:
-        """Judge the token of a rosbridge client that showed none in its handshake."""
-
-    def ask_topics(self, connection: RobotConnection, op: Any) -> None:
-        """Execute an operation of a rosbridge client on its topics."""
-
     def greet(self, connection: RobotConnection, now: float) -> None:
         """Note that the robot said Hello."""
 
@@ -100,8 +90,7 @@ class RobotConnection:
     __slots__ = (
         "_assembler", "_awaited_id", "_context", "_deferred", "_early_commands", "_handler", "_wire",
         "allowed_s", "claims", "commands", "ignores_pauses", "is_connected", "last_heard_s", "last_result",
-        "moving_until_s", "number", "opened_s", "paused_until_s", "pinged_s", "recorded", "robot", "session",
-        "tap",
+        "moving_until_s", "number", "opened_s", "paused_until_s", "recorded", "robot", "session", "tap",
     )  # fmt: skip
 
     def __init__(
@@ -129,7 +118,7 @@ class RobotConnection:
         """The claims of the robot's token; None where no token is required."""
         self.session = session
         self.number = number
-        self.opened_s = self.last_heard_s = self.pinged_s = now
+        self.opened_s = self.last_heard_s = now
         self.allowed_s = handler.context.settings.session.answer_timeout_s
         """Time that the last command had, from its arrival to its deadline."""
         self.paused_until_s = float("-inf")
@@ -147,8 +136,7 @@ class RobotConnection:
         self.is_connected = True
         self._handler = handler
         self._context = handler.context
-        # A recording knows the platform's own codecs only.
-        self.tap = None if session is None or session.codec.name not in CODECS else handler.context.tap
+        self.tap = None if session is None else handler.context.tap
         """Takes the messages for a recording, as those of the connection ``recorded``."""
         self.recorded = 0
         if self.tap is not None and session is not None:
@@ -189,8 +177,6 @@ class RobotConnection:
         if self._assembler.is_whole(opcode, fin, rsv, len(payload)):
             self._take(payload, False, now)
             return
-        if opcode == _PONG and self.session is not None and self.session.is_pinged:
-            self.last_heard_s = now
         decision = self._assembler.receive(opcode, fin, rsv, payload, now)
         if isinstance(decision, Received):
             self._take(decision.data, decision.is_text, now)
@@ -205,8 +191,6 @@ class RobotConnection:
         session = self.session
         if self.is_connected and session is not None:
             session.in_flight -= 1
-            if session.is_pinged:
-                session.forget_command(command_id)
             if command_id == self._awaited_id:
                 self._awaited_id = None
                 self._context.loop.call_soon(self._read_deferred)
@@ -215,8 +199,6 @@ class RobotConnection:
                 self._wire.send(data, session.codec.is_text)
                 if self.tap is not None:
                     self.tap.down(self.recorded, data)
-                if session.ends_when_idle and not session.in_flight:
-                    self.close(CLOSE_GOING_AWAY, "moving")
 
     def write(self, data: bytes) -> None:
         """Write one message, unless the connection is closing."""
@@ -250,14 +232,6 @@ class RobotConnection:
         if self.session is not None:
             self.moving_until_s = now + within_ms / 1e3
             self._execute(self.session.move(reason, within_ms), now)
-            if self.session.ends_when_idle and not self.session.in_flight and not self.is_closing:
-                self.close(CLOSE_GOING_AWAY, "moving")
-
-    def ping(self, now: float) -> None:
-        """Ask a silent client by a WebSocket ping whether it is there."""
-        self.pinged_s = now
-        if not self.is_closing:
-            self._wire.send_ping()
 
     def answer_renewal(self, token_s: float | None, now: float) -> None:
         """Tell the robot that its fresh token is valid for *token_s*, s, or with None that it was refused."""
@@ -386,7 +360,7 @@ class RobotConnection:
             self._context.metrics.shed["bad-message"] += 1
             counted = session.bad_messages + min(session.refused_commands, _MAX_REFUSED)
             self._wire.pause(counted * _BAD_MESSAGE_PAUSE_S)
-        elif state == "opening" and session.state == "open" and not session.is_pinged:
+        elif state == "opening" and session.state == "open":
             self._handler.greet(self, now)
 
     def _execute(self, decisions: list[Decision], now: float, size_bytes: int = 0) -> None:
@@ -406,9 +380,5 @@ class RobotConnection:
                 self.close(decision.code, decision.reason)
             elif isinstance(decision, BeginUpdates):
                 handler.subscribe(self, decision.id, decision.topic)
-            elif isinstance(decision, EndUpdates):
-                handler.unsubscribe(self, decision.id)
-            elif isinstance(decision, Authenticate):
-                handler.authenticate(self, decision.token)
             else:
-                handler.ask_topics(self, decision.op)
+                handler.unsubscribe(self, decision.id)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import traceback
 from collections.abc import Sequence
-from functools import partial
 from typing import Any
 
 from rse_pf.backend.gateway.admission import DECODER_FULL, TOO_FAST, TOO_LATE, Admission
@@ -22,25 +21,18 @@ from rse_pf.backend.gateway.stateless_queue import StatelessQueue
 from rse_pf.backend.gateway.token_watch import TokenWatch
 from rse_pf.backend.live_map.router import LiveMapRouter
 from rse_pf.backend.ports import Wire, WorkerContext
-from rse_pf.backend.rosbridge.codec import CODEC as ROSBRIDGE
-from rse_pf.backend.rosbridge.codec import RosbridgeCodec
-from rse_pf.backend.rosbridge.session import RosbridgeSession
-from rse_pf.backend.rosbridge.topics import RosbridgeTopics
 from rse_pf.backend.scheduling.command_queue import CommandQueue
 from rse_pf.backend.scheduling.scheduler import QueueBacklog, QueuedCommand, RefusedCommand
 from rse_pf.errors import Busy, NotFound, UnknownService
 from rse_pf.services.pnp_reader import pnp_reader
-from rse_pf.silent_connections import SilentConnections
 from rse_pf.wire import CODECS, Codec, Command, Failure
 from rse_pf.wire.envelope import peek
 from rse_pf.wire.server_codec import make_server_codec
-from rse_pf.wire.server_session import CLOSE_GOING_AWAY, CLOSE_RATE, CLOSE_TOKEN_OVER, ServerSession
+from rse_pf.wire.server_session import CLOSE_GOING_AWAY, CLOSE_RATE, ServerSession
 
 __all__ = ["Dispatcher"]
 
 _DECODER_RETRY_MS = 500.0
-_TOKEN_S = 3.0
-"""Time from the handshake to the token of a rosbridge client that showed none in it."""
 _NO_JOBS = {"jobs": 0.0, "jobs_pending": 0.0}
 """Alarms read these gauges of every server."""
 
@@ -56,7 +48,6 @@ class Dispatcher:
         token_watch: TokenWatch,
         queues: Sequence[CommandQueue] = (),
         updates: LiveMapRouter | None = None,
-        topics: RosbridgeTopics | None = None,
     ) -> None:
         """Take no connection yet; `start` begins to look for idle ones.
 
@@ -67,7 +58,6 @@ class Dispatcher:
             queues: Where commands wait, beside that of stateless services; the first that offers a service
                 takes its commands.
             updates: Takes subscriptions to live maps; one of *queues*, or None where they are off.
-            topics: Takes the operations of rosbridge clients; None where these are off.
         """
         settings = context.settings
         self.context = context
@@ -79,18 +69,12 @@ class Dispatcher:
         self._queues: tuple[CommandQueue, ...] = (*queues, self.stateless)
         self._answers = answers
         self._updates = updates
-        self._topics = topics
         self._token_watch = token_watch
         self._names = frozenset(service.name for service in answers.registry)
         self._codecs: dict[str, Codec] = {
             name: make_server_codec(name, settings.session, read_first=pnp_reader(answers.registry, name))
             for name in CODECS
         }
-        serving = settings.serving
-        self._awaited: SilentConnections[RobotConnection] = SilentConnections(
-            call_later=context.loop.call_later, seconds=_TOKEN_S,
-            most=serving.max_unauthenticated, most_per_source=serving.max_unauthenticated_per_source,
-        )  # fmt: skip
         self._answer_timeout_s = settings.session.answer_timeout_s
         self._move: tuple[str, float] | None = None
         now = context.clocks.monotonic()
@@ -114,9 +98,7 @@ class Dispatcher:
             None if accepted.expires_s is None else now + accepted.expires_s - self.context.clocks.wall()
         )
         session: ServerSession | None = None
-        if accepted.codec == ROSBRIDGE:
-            session = self._rosbridge_session(accepted)
-        elif accepted.codec:
+        if accepted.codec:
             session = ServerSession(
                 codec=self._codecs[accepted.codec],
                 robot=accepted.robot.name,
@@ -126,65 +108,24 @@ class Dispatcher:
                 burst=self.context.settings.burst,
             )
             session.ends_s = expires_s
+            session.tenant = accepted.robot.tenant
+            session.scopes = () if accepted.claims is None else accepted.claims.scopes
         connection = RobotConnection(self, wire, session, accepted, now=now, number=number)
-        if accepted.awaits_token:
-            self._awaited.enter(connection, partial(_close_without_token, connection), accepted.source)
-        else:
-            self._add_connection(connection, expires_s, now)
+        self.connections.add(connection)
+        self._token_watch.watch(connection, expires_s)
+        for queue in self._queues:
+            queue.enter(connection)
         return connection
 
     def _log_defect(self, error: Exception) -> None:
         text = "".join(traceback.format_exception(error))
         self.context.log.error("defect", traceback=text)
 
-    def _rosbridge_session(self, accepted: Accepted) -> RosbridgeSession:
-        limits = self.context.settings.session
-        return RosbridgeSession(
-            codec=RosbridgeCodec(limits, self._codecs["json"]),
-            server=self.context.server_id, limits=limits, is_open=not accepted.awaits_token,
-        )  # fmt: skip
-
-    def _add_connection(self, connection: RobotConnection, expires_s: float | None, now: float) -> None:
-        """Add a connection whose robot is known; its token ends at *expires_s* (monotonic clock, s)."""
-        self.connections.add(connection)
-        self._token_watch.watch(connection, expires_s)
-        for queue in self._queues:
-            queue.enter(connection)
-        if connection.may_move:  # a rosbridge client says no Hello
-            self.greet(connection, now)
-
-    def authenticate(self, connection: RobotConnection, token: str) -> None:
-        """Judge the token of a rosbridge client that showed none in its handshake."""
-        source = self._awaited.leave(connection)
-        session = connection.session
-        clocks = self.context.clocks
-        if source is None or not isinstance(session, RosbridgeSession):
-            return
-        now = clocks.monotonic()
-        accepted = self._token_watch.judge(token, source)
-        if accepted is None or self.rates.banned_s(accepted.robot, now) > 0:
-            for send in session.token_refusal():
-                connection.write(send.data)
-            connection.close(CLOSE_TOKEN_OVER if accepted is None else CLOSE_RATE, "unauthenticated")
-            return
-        connection.robot, connection.claims = accepted.robot, accepted.claims
-        session.open()
-        ends_s = accepted.expires_s
-        self._add_connection(connection, None if ends_s is None else now + ends_s - clocks.wall(), now)
-
-    def ask_topics(self, connection: RobotConnection, op: Any) -> None:
-        """Execute an operation of a rosbridge client on its topics."""
-        if self._topics is not None and isinstance(connection.session, RosbridgeSession):
-            self._topics.execute(connection, connection.session, op)
-
     def disconnect(self, connection: RobotConnection) -> None:
         """Forget a connection whose socket ended, and what it still waited for."""
-        self._awaited.leave(connection)
         self._token_watch.forget(connection)
         if connection in self.connections:
             self.connections.discard(connection)
-            if self._topics is not None:
-                self._topics.leave(connection)
             for queue in self._queues:
                 for queued in queue.leave(connection):
                     service = self._answers.label(queued.command.service)
@@ -214,7 +155,6 @@ class Dispatcher:
         """Close every socket; what is held is lost, so wait for `held` to be 0 first."""
         for connection in list(self.connections):
             connection.close(CLOSE_GOING_AWAY, "leaving")
-        self._awaited.cut_all()
         self.decoder.close()
         for queue in self._queues:
             queue.close()
@@ -323,7 +263,6 @@ class Dispatcher:
             "cpu_s": self.context.clocks.cpu(),
             "log_lines_dropped": float(self.context.log.dropped),
             **_NO_JOBS,
-            **({} if self._topics is None else self._topics.report()),
             **({} if tap is None else {"recording_dropped": float(tap.dropped)}),
         }
         sections: dict[str, Any] = {}
@@ -348,8 +287,3 @@ class Dispatcher:
         self._lag_s = max(self._lag_s, -self._idle_timeouts.until_tick_s(now))
         self._idle_timeouts.close_idle(self.connections, now)
         self.context.loop.call_later(self._idle_timeouts.until_tick_s(now), self._tick)
-
-
-def _close_without_token(connection: RobotConnection) -> None:
-    if not connection.is_closing:
-        connection.close(CLOSE_TOKEN_OVER, "unauthenticated")

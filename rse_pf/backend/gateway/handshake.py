@@ -27,9 +27,8 @@ from rse_pf.auth.tokens import (
     verify_token,
 )
 from rse_pf.backend.gateway.rate_limits import RATE_BAN_S
-from rse_pf.backend.rosbridge.codec import CODEC as ROSBRIDGE
 from rse_pf.config import PlatformSettings
-from rse_pf.config.resource_names import HEALTH_PATH, ROBOTS_PATH, ROSBRIDGE_PATH
+from rse_pf.config.resource_names import HEALTH_PATH, ROBOTS_PATH
 from rse_pf.errors import Unauthorized
 from rse_pf.identity import DEFAULT_TENANT, RobotId
 from rse_pf.wire import SUBPROTOCOLS, codec_for
@@ -60,19 +59,13 @@ _TOO_LONG = b"HTTP/1.1 431 Request Header Fields Too Large\r\nConnection: close\
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Accepted:
-    """A robot that may upgrade to WebSocket.  ``expires_s`` is Unix time; None never expires.
-
-    One that ``awaits_token`` is nobody yet: a rosbridge client, which shows its token in its first message.
-    ``source`` is the address that it came from.
-    """
+    """A robot that may upgrade to WebSocket.  ``expires_s`` is Unix time; None never expires."""
 
     robot: RobotId
     codec: str
     subprotocol: str
     expires_s: float | None = None
     claims: Claims | None = field(default=None, compare=False)
-    awaits_token: bool = False
-    source: str = field(default="", compare=False)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -223,7 +216,6 @@ class HandshakePolicy:
         self.keys = keys
         self._conformance_echo = conformance_echo
         self._path = ROBOTS_PATH.encode()
-        self._rosbridge = ROSBRIDGE_PATH.encode() if settings.serving.rosbridge else None
         self._origins = AllowedOrigins(settings.serving.allowed_origins)
         self._healthy = _http_answer(200, HEALTH, b'{"status":"ok"}', _JSON)
         self.defect = _rejection(500, "internal", "the handshake failed", "try again")
@@ -273,14 +265,13 @@ class HandshakePolicy:
             return Accepted(robot=RobotId(DEFAULT_TENANT, anonymous), codec="", subprotocol="")
         if path == _HEALTH_PATH:
             return self._healthy
-        asked = path.partition(b"?")[0]
-        if asked not in (self._path, self._rosbridge):
+        if path.partition(b"?")[0] != self._path:
             return self._not_found
         if not self._origins.allows(request.origin, request.host):
             return self._forbidden
         if is_full:
             return self._full
-        codec = ROSBRIDGE if asked == self._rosbridge else codec_for(offered)
+        codec = codec_for(offered)
         name = codec or ""
         if self.keys is None:
             accepted = Accepted(
@@ -288,21 +279,11 @@ class HandshakePolicy:
             )
             return self._no_subprotocol if codec is None else accepted
         token = carried_token(authorization, offered)
-        if codec == ROSBRIDGE and not authorization and not token:
-            unnamed = RobotId(DEFAULT_TENANT, anonymous)
-            return Accepted(robot=unnamed, codec=name, subprotocol="", awaits_token=True)
-        verdict = self.with_token(token, now_s, codec=name)
+        verdict = self._with_token(token, now_s, codec=name)
         return self._no_subprotocol if codec is None and isinstance(verdict, Accepted) else verdict
 
-    def with_token(self, token: str, now_s: float, *, codec: str, source: str = "") -> Accepted | Rejected:
-        """Return the robot that *token* names as accepted, or the rejection.
-
-        Args:
-            token: Of a robot that speaks *codec*.
-            now_s: Unix seconds.
-            codec: "" if it offered none that this server speaks.
-            source: The address that it came from.
-        """
+    def _with_token(self, token: str, now_s: float, *, codec: str) -> Accepted | Rejected:
+        """Return the robot that *token* names as accepted, or the rejection."""
         if self.keys is None:
             return replace(self._no_token, reason=_NO_KEYS)
         try:
@@ -313,7 +294,7 @@ class HandshakePolicy:
             return replace(refused or self._no_token, reason=token_problem(error))
         return Accepted(
             robot=claims.robot, codec=codec, subprotocol=SUBPROTOCOLS.get(codec, ""),
-            expires_s=self.ends_s(claims, now_s), claims=claims, source=source,
+            expires_s=self.ends_s(claims, now_s), claims=claims,
         )  # fmt: skip
 
     def ends_s(self, claims: Claims, now_s: float) -> float:

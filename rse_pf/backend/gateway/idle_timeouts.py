@@ -34,7 +34,6 @@ class IdleTimeouts:
     def __init__(self, settings: SessionSettings, now: float) -> None:
         self._hello_s = settings.hello_timeout_s
         self._max_silence_s = max_silence_s(settings)
-        self._ping_s = settings.ping_interval_s
         self._tick_s = min(_MAX_TICK_S, settings.hello_timeout_s / _TICKS_PER_LIMIT)
         self._next_s = now + self._tick_s
         self._suspects: set[RobotConnection] = set()
@@ -47,7 +46,6 @@ class IdleTimeouts:
         """Close the connections that are idle at *now*, s; call it at each tick.
 
         A connection that seems idle is closed only at the next tick, after the sockets were read once more.
-        A robot that sends no pings of its own is asked by one before.
         """
         late_s = now - self._next_s
         suspects: set[RobotConnection] = set()
@@ -59,8 +57,6 @@ class IdleTimeouts:
                 connection.opened_s = min(now, connection.opened_s + late_s)
             is_opening = connection.is_opening
             idle_s = now - (connection.opened_s if is_opening else connection.last_heard_s)
-            if connection.session.is_pinged and min(idle_s, now - connection.pinged_s) >= self._ping_s:
-                connection.ping(now)
             if idle_s < (self._hello_s if is_opening else self._max_silence_s):
                 continue
             if connection not in self._suspects:

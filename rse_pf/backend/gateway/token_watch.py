@@ -9,13 +9,11 @@ from asyncio import TimerHandle
 from collections.abc import Callable
 from functools import partial
 
-from rse_pf.auth.claimed import claimed_by
 from rse_pf.auth.tokens import Claims, KeySet, claims_problem, renewed_claims
 from rse_pf.backend.gateway.audit_recorder import AuditRecorder
 from rse_pf.backend.gateway.connection import RobotConnection
-from rse_pf.backend.gateway.handshake import Accepted, HandshakePolicy
+from rse_pf.backend.gateway.handshake import HandshakePolicy
 from rse_pf.backend.ports import WorkerContext
-from rse_pf.backend.rosbridge.codec import CODEC as ROSBRIDGE
 from rse_pf.wire.server_session import CLOSE_REPLACED, CLOSE_REVOKED, CLOSE_TOKEN_OVER
 
 __all__ = ["TokenWatch"]
@@ -101,21 +99,6 @@ class TokenWatch:
             return
         self._context.log.info("replaced", robot=connection.robot)
         connection.close(CLOSE_REPLACED, "replaced")
-
-    def judge(self, token: str, source: str) -> Accepted | None:
-        """Judge and record the token that a rosbridge client from *source* showed after its handshake."""
-        metrics, now_s = self._context.metrics, self._context.clocks.wall()
-        verdict = self._handshake.with_token(token, now_s, codec=ROSBRIDGE, source=source)
-        self._recorder.record_verdict(verdict, source, token, self._handshake.keys)
-        if isinstance(verdict, Accepted):
-            metrics.handshakes["ok"] += 1
-            return verdict
-        metrics.handshakes[verdict.result] += 1
-        self._context.log.info(
-            "refused", result=verdict.result, reason=verdict.reason, source=source,
-            **claimed_by(token, self._handshake.keys),
-        )  # fmt: skip
-        return None
 
     def renew(self, connection: RobotConnection, token: str) -> None:
         """Judge a fresh token of a live connection, and move the connection's end or leave it."""

@@ -274,7 +274,7 @@ class RobotSockets:
             self._context.log.error("defect", at="handshake", traceback=repr(error))
             verdict = self._handshake.defect
         if isinstance(verdict, Accepted):
-            self._context.metrics.handshakes["no-token-yet" if verdict.awaits_token else "ok"] += 1
+            self._context.metrics.handshakes["ok"] += 1
             self._serve(pending, verdict, _UPGRADE % head.websocket_key, rest)
         else:
             self._refuse(pending, verdict, source, token)
@@ -325,8 +325,6 @@ class RobotSockets:
                 return banned_rejection(banned_s)
             if not head.websocket_key:
                 return self._handshake.no_request
-            if verdict.awaits_token:
-                return replace(verdict, source=source)
         return verdict
 
 
@@ -484,9 +482,6 @@ class Listener(picows.WSListener):  # type: ignore[misc]
 
     def send_pong(self, data: bytes) -> None:
         self._transport.send_pong(data)
-
-    def send_ping(self) -> None:
-        self._transport.send_ping()
 
     def pause(self, seconds: float) -> None:
         until_s = self._loop.time() + seconds

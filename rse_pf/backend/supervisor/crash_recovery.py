@@ -37,8 +37,7 @@ def restart_delay_s(crashes: int) -> float:
 
 def spare_plans(plans: Sequence[WorkerPlan]) -> list[WorkerPlan]:
     """Return the plans of the processes that wait beside the workers of *plans*."""
-    all_peers = tuple(plan.peers for plan in plans)
-    spare = replace(plans[0], index=-1, is_spare=True, all_peers=all_peers)
+    spare = replace(plans[0], index=-1, is_spare=True)
     return [replace(spare, crash=CrashReport()) for _ in range(_SPARES)]
 
 

@@ -28,7 +28,6 @@ from rse_pf.backend.gateway.migration import plan
 from rse_pf.backend.jobs.slots import make_slot_file
 from rse_pf.backend.log import JsonLog
 from rse_pf.backend.metrics import merge, merge_isolation, render, tenant_cpu_s
-from rse_pf.backend.rosbridge.peers import peer_channels
 from rse_pf.backend.supervisor.accepting import RobotAcceptor
 from rse_pf.backend.supervisor.crash_recovery import CrashRecovery, spare_plans
 from rse_pf.backend.supervisor.listener import bound_socket, check_authentication, open_control
@@ -120,14 +119,13 @@ def serve(
     raise_descriptor_limit()
     count = settings.serving.workers or len(os.sched_getaffinity(0))
     slots = make_slot_file()
-    peers = peer_channels(count if settings.serving.rosbridge else 0) or [(-1, ())] * count
     with ServerRecording(settings, server_id, recording_key) as recording:
         plans = [
             WorkerPlan(
                 settings=settings, keys=keys if settings.auth.required else None, server_id=server_id,
                 services=services, workers=count, index=index, job_slots=slots, supervisor=os.getpid(),
                 conformance_echo=conformance_echo, audit=audit is not None,
-                recording=recording.to_recorder, peers=peers[index],
+                recording=recording.to_recorder,
             )
             for index in range(count)
         ]  # fmt: skip

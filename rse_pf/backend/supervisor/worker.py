@@ -45,8 +45,6 @@ from rse_pf.backend.log import JsonLog
 from rse_pf.backend.object_refs import ObjectRefs
 from rse_pf.backend.ports import Clocks, WorkerContext
 from rse_pf.backend.robot_store import is_shared
-from rse_pf.backend.rosbridge.peers import NoPeers, PeerChannels, WorkerPeers
-from rse_pf.backend.rosbridge.topics import RosbridgeTopics
 from rse_pf.backend.sandbox.circuit_breaker import Block
 from rse_pf.backend.sandbox.manager import SandboxHost, SandboxManager
 from rse_pf.backend.sandbox.reloading import Answer, OnReady, ReloadingSandboxes
@@ -122,10 +120,6 @@ class WorkerPlan:
     """What is left when native code ends it."""
     is_spare: bool = False
     """Whether it waits for a `BeginOrder`, which gives it the index of a worker that crashed."""
-    peers: PeerChannels = (-1, ())
-    """This worker's way to the others, for topics of rosbridge clients."""
-    all_peers: tuple[PeerChannels, ...] = ()
-    """Those of all workers, for one that takes the place of another."""
     recording: int | None = None
     """Socket on which the recorder takes the ends of pipes; None where nothing is recorded."""
 
@@ -175,7 +169,7 @@ def _wait_to_begin(control: socket.socket) -> BeginOrder | None:
 def _plan_of(plan: WorkerPlan, order: BeginOrder) -> WorkerPlan:
     """Return the plan of a process that takes the place of a worker."""
     keys = key_set_from_snapshot(order.snapshot) if order.snapshot and plan.keys is not None else plan.keys
-    return replace(plan, index=order.index, peers=plan.all_peers[order.index], keys=keys)
+    return replace(plan, index=order.index, keys=keys)
 
 
 class _Worker:
@@ -229,7 +223,6 @@ class _Worker:
             tell=self._robot_events.add,
             recorder=self._recorder,
         )
-        self._rosbridge: RosbridgeTopics | None = None
         self._sandboxes = (
             self._run_services(plan, installed, answers) if chosen.folder or chosen.published else None
         )
@@ -248,7 +241,6 @@ class _Worker:
             token_watch=self._token_watch,
             queues=[queue for queue in queues if queue is not None],
             updates=self._live_maps,
-            topics=self._topics(plan, registry.names) if settings.serving.rosbridge else None,
         )
         self._migration = Migration(connections, loop=loop, now=time.monotonic, choose=secrets.choice)
         self._index = plan.index
@@ -350,7 +342,6 @@ class _Worker:
     def _offer(self, names: tuple[str, ...]) -> None:
         """Offer the installed services *names* from now on."""
         self._registry.others = names
-        self._tell_topics(self._registry.names)
         self._answers.offer(
             frozenset((*names, *(service.name for service in self._registry))) | LIVE_SERVICES
         )
@@ -367,21 +358,6 @@ class _Worker:
             self._log.error("services-refused", reason=message_of(error))
             return
         self._sandboxes.replace(services + (published_services() if chosen.published else []))
-
-    def _topics(self, plan: WorkerPlan, services: Sequence[str]) -> RosbridgeTopics:
-        read, _ = plan.peers
-        peers = WorkerPeers(plan.peers, plan.index, loop=self._loop, log=self._log) if read >= 0 else None
-        topics = self._rosbridge = RosbridgeTopics(
-            loop=self._loop, clock=time.monotonic, peers=peers or NoPeers(), services=(),
-        )  # fmt: skip
-        self._tell_topics(services)
-        if peers is not None:
-            peers.begin(on_message=topics.deliver, on_wanted=topics.send_latched)
-        return topics
-
-    def _tell_topics(self, services: Sequence[str]) -> None:
-        if self._rosbridge is not None:
-            self._rosbridge.offer((*services, *(LIVE_SERVICES if self._live_maps else ())))
 
     def _jobs(self, plan: WorkerPlan, answers: Answers) -> JobManager:
         settings = plan.settings

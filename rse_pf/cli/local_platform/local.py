@@ -10,6 +10,7 @@ examples:
   rse-pf local --lan
   rse-pf local --record recordings
   rse-pf local --burst
+  rse-pf local --rosbridge
   rse-pf local status
   rse-pf local robots
   rse-pf local logs --server server-1 --follow
@@ -38,6 +39,7 @@ from typing import Any, NamedTuple
 
 from rse_pf.cli.extras import require
 from rse_pf.config import HealthSettings, PlatformSettings
+from rse_pf.config.resource_names import ROBOTS_PATH, ROSBRIDGE_PATH
 from rse_pf.errors import UsageError
 from rse_pf.terminal import show, show_json, show_page
 
@@ -113,6 +115,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         f"{_BURST_PORT}): robots ask it while no server answers in time",
     )  # fmt: skip
     parser.add_argument(
+        "--rosbridge", action="store_true",
+        help="also serve rosbridge v2 clients, on the path /rosbridge (serving.rosbridge)",
+    )  # fmt: skip
+    parser.add_argument(
         "--no-data", action="store_true", help="start no data service (large data by HTTP under /data/)"
     )
     parser.add_argument(
@@ -152,6 +158,8 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     overrides = {"servers": args.servers, "port": args.port, "metrics_port": args.metrics_port}
     chosen = settings.replace(local={name: value for name, value in overrides.items() if value is not None})
     chosen = with_recordings(_with_services(chosen, args), args.record)
+    if args.rosbridge:
+        chosen = chosen.replace(serving={"rosbridge": True})
     lan = chosen_address(args.lan)
     page = not args.no_page
     burst_port = None if args.burst is None else args.burst or _BURST_PORT
@@ -209,10 +217,10 @@ def _check(args: argparse.Namespace) -> None:
             "--server, --follow, --since, --robot and --tenant are for logs and events",
             hint="see rse-pf local --help",
         )
-    of_start = (args.lan, args.metrics_port, args.record)
+    of_start = (args.lan, args.metrics_port, args.record, args.rosbridge or None)
     if args.action != "start" and any(value is not None for value in of_start):
         raise UsageError(
-            "--lan, --metrics-port and --record are for the start of a platform",
+            "--lan, --metrics-port, --record and --rosbridge are for the start of a platform",
             hint="see rse-pf local --help",
         )
     if args.for_s is not None and (args.action not in ("pause", "slow", "partition") or not args.for_s > 0):
@@ -427,10 +435,12 @@ def _show_welcome(platform: Any, name: str) -> None:
     which = "" if name == DEFAULT_NAME else f" --name {name}"
     has_data = platform.data_servers.process.is_running()
     recordings = platform.settings.recording.folder
+    rosbridge = platform.url.removesuffix(ROBOTS_PATH) + ROSBRIDGE_PATH
     show(
         "",
         f"robots connect to   {platform.url}",
         *([f"large data goes to  {data_url(platform.url)}"] if has_data else []),
+        *([f"rosbridge clients   {rosbridge}"] if platform.settings.serving.rosbridge else []),
         f"a robot's token     rse-pf token issue robot-1{which}",
         *_lan_lines(platform, which),
         f"metrics             {platform.metrics_url}",

@@ -24,12 +24,19 @@ from rse_pf.config.resource_names import HEALTH_PATH, READY_PATH, ROBOTS_PATH, R
 from rse_pf.local.lan.listener import CERTIFICATE_NAME, LanListener, secret_file
 from rse_pf.scaling.health import HEALTHY_CHECKS, LOCAL_INTERVAL_S, LOCAL_TIMEOUT_S
 
-__all__ = ["ADMIN_SOCKET", "CLUSTER", "DATA_CLUSTER", "Target", "endpoints", "envoy_config"]
+__all__ = [
+    "ADMIN_SOCKET", "CLUSTER", "DATA_CLUSTER", "LISTENER", "LOOPBACK_LISTENER", "ROSBRIDGE_CLUSTER", "Target",
+    "endpoints", "envoy_config",
+]  # fmt: skip
 
 CLUSTER = "backend-servers"
 ADMIN_SOCKET = "admin.sock"
 """In the balancer's folder.  The admin page can end the balancer, so it is not on a port."""
 DATA_CLUSTER = "data-servers"
+ROSBRIDGE_CLUSTER = "rosbridge-servers"
+LISTENER = "front-door"
+LOOPBACK_LISTENER = "loopback"
+"""Where the rosbridge server connects the robots of its clients: without TLS, whatever the front door has."""
 _DATA_READY = "/data/readyz"
 _TYPES = "type.googleapis.com/envoy"
 _LOOPBACK = "127.0.0.1"
@@ -60,6 +67,8 @@ def envoy_config(
     port: int,
     endpoints_file: Path,
     data_endpoints_file: Path,
+    rosbridge_endpoints_file: Path,
+    loopback_port: int = 0,
     lan: LanListener | None = None,
 ) -> dict[str, Any]:
     """Return the static configuration.
@@ -69,20 +78,26 @@ def envoy_config(
         port: Of the listener; 0 takes a free one.
         endpoints_file: What `endpoints` returned, as JSON; replaced by rename, never written in place.
         data_endpoints_file: The same for the data servers; without targets ``/data/`` is answered with 503.
+        rosbridge_endpoints_file: The same for the rosbridge server, where ``serving.rosbridge`` is on.
+        loopback_port: Of `LOOPBACK_LISTENER`; 0 takes a free one.
         lan: Listens on its address instead, with TLS and its certificate.
     """
+    listeners = [_listener(settings, port, lan)]
+    clusters = [
+        _cluster(settings, CLUSTER, endpoints_file, READY_PATH, panic_percent=0),
+        # One data server, and its successor on the same port: better asked in vain than not asked.
+        _cluster(settings, DATA_CLUSTER, data_endpoints_file, _DATA_READY, panic_percent=100),
+    ]
+    if settings.serving.rosbridge:
+        listeners.append(_loopback_listener(settings, loopback_port))
+        clusters.append(
+            _cluster(settings, ROSBRIDGE_CLUSTER, rosbridge_endpoints_file, HEALTH_PATH, panic_percent=100)
+        )
     return {
         "node": {"id": "front-door", "cluster": "rse-pf"},  # endpoint files are refused without
         "admin": {"address": {"pipe": {"path": ADMIN_SOCKET, "mode": 0o600}}},
         "overload_manager": _max_connections(_MAX_CONNECTIONS),
-        "static_resources": {
-            "listeners": [_listener(settings, port, lan)],
-            "clusters": [
-                _cluster(settings, CLUSTER, endpoints_file, READY_PATH, panic_percent=0),
-                # One data server, and its successor on the same port: better asked in vain than not asked.
-                _cluster(settings, DATA_CLUSTER, data_endpoints_file, _DATA_READY, panic_percent=100),
-            ],
-        },
+        "static_resources": {"listeners": listeners, "clusters": clusters},
     }
 
 
@@ -153,7 +168,7 @@ def _listener(settings: PlatformSettings, port: int, lan: LanListener | None) ->
         ],
     }
     return {
-        "name": "front-door",
+        "name": LISTENER,
         "address": _address(settings.serving.host if lan is None else lan.address, port),
         # With the default a second Envoy would share a taken port in silence.
         "enable_reuse_port": False,
@@ -164,6 +179,11 @@ def _listener(settings: PlatformSettings, port: int, lan: LanListener | None) ->
         "socket_options": [_kernel_buffer(socket.SO_SNDBUF), _unread_timeout(settings)],
         "filter_chains": [{"filters": [{"name": "http", "typed_config": manager}], **_tls(settings, lan)}],
     }
+
+
+def _loopback_listener(settings: PlatformSettings, port: int) -> dict[str, Any]:
+    plain = settings.replace(local={"certificate": "", "private_key": ""}, serving={"host": _LOOPBACK})
+    return {**_listener(plain, port, None), "name": LOOPBACK_LISTENER}
 
 
 def _tls(settings: PlatformSettings, lan: LanListener | None) -> dict[str, Any]:
@@ -249,6 +269,7 @@ def _virtual_host(settings: PlatformSettings) -> dict[str, Any]:
         "host_selection_retry_max_attempts": "8",
     }
     route = {"cluster": CLUSTER, "timeout": "0s", "idle_timeout": "0s", "retry_policy": retry}
+    rosbridge = [{"match": {"path": ROSBRIDGE_PATH}, "route": {**route, "cluster": ROSBRIDGE_CLUSTER}}]
     # A large upload has no time limit while bytes flow; the data server is stricter.
     # No retries: the robot knows whether a part arrived, and resumes there.
     idle = _seconds(3 * BODY_TIMEOUT_S)
@@ -259,7 +280,7 @@ def _virtual_host(settings: PlatformSettings) -> dict[str, Any]:
         "domains": ["*"],
         "routes": [
             {"match": {"path": ROBOTS_PATH}, "route": route},
-            *(({"match": {"path": ROSBRIDGE_PATH}, "route": route},) if settings.serving.rosbridge else ()),
+            *(rosbridge if settings.serving.rosbridge else ()),
             {"match": {"path": HEALTH_PATH}, "route": {**route, "timeout": timeout}},
             # Each would ask the store; the balancer's own checks do not pass the listener.
             {"match": {"path": _DATA_READY}, "direct_response": {"status": 404}},

@@ -25,6 +25,9 @@ from rse_pf.local.balancer.envoy_config import (
     ADMIN_SOCKET,
     CLUSTER,
     DATA_CLUSTER,
+    LISTENER,
+    LOOPBACK_LISTENER,
+    ROSBRIDGE_CLUSTER,
     Target,
     endpoints,
     envoy_config,
@@ -56,7 +59,7 @@ def envoy_binary() -> str:
 
 
 class EnvoyLoadBalancer:
-    """One Envoy.  ``port`` is 0 before `wait_live`; its admin page is a socket file for this user only."""
+    """One Envoy.  Its ports are 0 before `wait_live`; its admin page is a socket file for this user only."""
 
     def __init__(
         self,
@@ -79,14 +82,19 @@ class EnvoyLoadBalancer:
             lan: Where it listens instead of loopback, with TLS; its files are there before `launch`.
         """
         self.port = 0
+        self.loopback_port = 0
+        """Where the rosbridge server connects; 0 without one."""
         self.process = ServerProcess("load-balancer", folder)
         self._settings = settings
         self._folder = folder
         self._wanted_port = port
         self._dies_with_parent = dies_with_parent
         self._lan = lan
-        self._endpoints = folder / "endpoints.json"
-        self._data_endpoints = folder / "data-endpoints.json"
+        self._endpoints = {
+            CLUSTER: folder / "endpoints.json",
+            DATA_CLUSTER: folder / "data-endpoints.json",
+            ROSBRIDGE_CLUSTER: folder / "rosbridge-endpoints.json",
+        }
         self._write = write
 
     def launch(self) -> None:
@@ -99,15 +107,17 @@ class EnvoyLoadBalancer:
         """
         binary = envoy_binary()
         if self.process.mark is None:
-            self.set_targets(())
-            self.set_data_targets(())
+            for cluster in self._endpoints:
+                self.set_targets((), cluster)
         self.process.kill()  # reaps one that ended by itself
         self._wanted_port = self.port or self._wanted_port
         config = self._folder / "envoy.json"
         (self._folder / ADMIN_SOCKET).unlink(missing_ok=True)
         made = envoy_config(
-            self._settings, port=self._wanted_port, endpoints_file=self._endpoints,
-            data_endpoints_file=self._data_endpoints, lan=self._lan,
+            self._settings, port=self._wanted_port, endpoints_file=self._endpoints[CLUSTER],
+            data_endpoints_file=self._endpoints[DATA_CLUSTER],
+            rosbridge_endpoints_file=self._endpoints[ROSBRIDGE_CLUSTER], loopback_port=self.loopback_port,
+            lan=self._lan,
         )  # fmt: skip
         try:
             replace_json(config, made, indent=1)
@@ -124,7 +134,7 @@ class EnvoyLoadBalancer:
         self.process.mark, self.port = mark, port
 
     async def wait_live(self, timeout_s: float) -> None:
-        """Wait until Envoy listens; sets ``port``.
+        """Wait until Envoy listens; sets ``port`` and ``loopback_port``.
 
         Raises:
             ConfigurationError: Envoy ended, or did not listen in time.
@@ -134,22 +144,21 @@ class EnvoyLoadBalancer:
             if await self._get("/ready") != b"LIVE\n":
                 return False
             page = json.loads(await self._get("/listeners?format=json") or b"{}")
-            listeners = page.get("listener_statuses", [])
-            if listeners:
-                self.port = listeners[0]["local_address"]["socket_address"]["port_value"]
-            return bool(listeners)
+            ports = {
+                each["name"]: each["local_address"]["socket_address"]["port_value"]
+                for each in page.get("listener_statuses", [])
+            }
+            self.port = ports.get(LISTENER, self.port)
+            self.loopback_port = ports.get(LOOPBACK_LISTENER, self.loopback_port)
+            return bool(ports)
 
         if not await self._wait_until(live, timeout_s):
             late = f"did not start within {timeout_s:g} s"
             raise self.process.failed(late if self.process.is_running() else self.process.ending())
 
-    def set_targets(self, targets: Sequence[Target]) -> None:
-        """Let new sockets go to *targets* and nowhere else; open sockets stay where they are."""
-        self._write(self._endpoints, json.dumps(endpoints(targets)))
-
-    def set_data_targets(self, targets: Sequence[Target]) -> None:
-        """Let what is asked under ``/data/`` go to *targets*."""
-        self._write(self._data_endpoints, json.dumps(endpoints(targets, DATA_CLUSTER)))
+    def set_targets(self, targets: Sequence[Target], cluster: str = CLUSTER) -> None:
+        """Let new sockets of *cluster* go to *targets* and nowhere else; open sockets stay where they are."""
+        self._write(self._endpoints[cluster], json.dumps(endpoints(targets, cluster)))
 
     async def stats(self) -> Mapping[str, TargetStats]:
         """Return the targets that Envoy has now, by server name; empty when it does not answer."""

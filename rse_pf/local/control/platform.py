@@ -22,8 +22,10 @@ from typing import Any
 from rse_pf.auth.control_token import ensure_control_token
 from rse_pf.auth.tokens import SigningKey
 from rse_pf.config import PlatformSettings
+from rse_pf.config.resource_names import ROBOTS_PATH
 from rse_pf.errors import ConfigurationError, UsageError
 from rse_pf.files import replace_json
+from rse_pf.local.balancer.envoy_config import DATA_CLUSTER, ROSBRIDGE_CLUSTER
 from rse_pf.local.balancer.load_balancer import EnvoyLoadBalancer
 from rse_pf.local.control.audit_recorder import PlatformAudit
 from rse_pf.local.control.control_plane import ControlOptions, ControlPlane
@@ -36,14 +38,23 @@ from rse_pf.local.control.settings_change import SettingsChange, settings_change
 from rse_pf.local.disk_watch import DiskWatch
 from rse_pf.local.firewall import check_lan_settings, check_listener, ensure_key, key_file, robots_url
 from rse_pf.local.lan.listener import LanListener, authority_file
-from rse_pf.local.processes import STOP_TIMEOUT_S, is_alive, mark_of, reap_orphans, rotate_logs, send_signal
+from rse_pf.local.processes import (
+    STOP_TIMEOUT_S,
+    ended,
+    is_alive,
+    mark_of,
+    reap_orphans,
+    rotate_logs,
+    send_signal,
+)
 from rse_pf.local.servers.backend_servers import (
     RSE_PF,
     BackendServer,
     LocalBackendServers,
     local_placement,
 )
-from rse_pf.local.servers.data_servers import LocalDataServers
+from rse_pf.local.servers.single_servers import local_data_server, local_rosbridge_server
+from rse_pf.local.servers.watched_server import WatchedServer
 from rse_pf.local.state import (
     PlatformLock,
     PlatformState,
@@ -137,11 +148,13 @@ class LocalPlatform:
             settings, folder=self.state, port=self._wanted_port, dies_with_parent=not adoptable,
             write=self._disks.write, lan=self.lan,
         )  # fmt: skip
-        self.data_servers = LocalDataServers(
-            settings, folder=self.state, store=store, dies_with_parent=not adoptable,
-            replaces=control.elastic, program=program, is_full=self._disks.is_full,
-            emit=self._report_data_change,
-        )  # fmt: skip
+        self._single_options: dict[str, Any] = {
+            "folder": self.state, "dies_with_parent": not adoptable, "replaces": control.elastic,
+            "program": program, "is_full": self._disks.is_full, "emit": self._report_single_change,
+        }  # fmt: skip
+        self.data_servers = local_data_server(settings, store=store, **self._single_options)
+        self._rosbridge: WatchedServer | None = None
+        """Made when the port of the balancer is known."""
         reports = FleetReports(emit=self._emit, changed=self._write_state)
         self._fleet = Fleet(
             self.backend_servers, self.load_balancer, settings,
@@ -467,8 +480,12 @@ class LocalPlatform:
         if previous is None:
             await self._begin(end)
         else:
-            await run_together(self._adopt(previous, end), self._adopt_data(previous.data_server))
+            await run_together(self._adopt(previous, end), self._begin_data(previous.data_server))
         self.url = robots_url(self.settings, self.port, self.lan)
+        if self.settings.serving.rosbridge:
+            await self._begin_rosbridge(previous)
+        elif previous is not None and previous.rosbridge_server is not None:
+            send_signal(previous.rosbridge_server.process, signal.SIGTERM)
         await self._open_operator_port(token, 0 if previous is None else previous.status_port)
         self._disks.on_space = self._control.retry_replacements
         self._fleet.keep(self._disks.watch())
@@ -543,16 +560,31 @@ class LocalPlatform:
         reply = await port.ask_once("/status", timeout_s=_ASK_S)
         return None if reply is None else str(reply.document().get("settings", "")) or None
 
-    async def _adopt_data(self, previous: ServerState | None) -> None:
-        """Adopt the data server *previous* if it runs, else start one, on the old port if that is free."""
+    async def _begin_data(self, previous: ServerState | None) -> None:
+        """Adopt the data server *previous*, else start one if robots get the data service."""
+        if self._has_data or (previous is not None and is_alive(previous.process)):
+            await self._begin_single(self.data_servers, DATA_CLUSTER, previous)
+
+    async def _begin_rosbridge(self, previous: PlatformState | None) -> None:
+        """Start the rosbridge server, or adopt the one of *previous* if the balancer that it knows lives."""
+        url = f"ws://{_LOOPBACK}:{self.load_balancer.loopback_port}{ROBOTS_PATH}"
+        self._rosbridge = local_rosbridge_server(self.settings, url=url, **self._single_options)
+        earlier = None if previous is None else previous.rosbridge_server
+        balancer = None if previous is None else previous.load_balancer
+        if earlier is not None and balancer != self.load_balancer.process.mark:
+            send_signal(earlier.process, signal.SIGKILL)
+            await ended(earlier.process)
+        await self._begin_single(self._rosbridge, ROSBRIDGE_CLUSTER, earlier)
+
+    async def _begin_single(self, server: WatchedServer, cluster: str, previous: ServerState | None) -> None:
+        """Adopt the process *previous* if it runs, else start one, on the old port if that is free."""
         if previous is not None and previous.port and is_alive(previous.process):
-            self.data_servers.adopt(previous.process, previous.port)
-            self.load_balancer.set_data_targets([self.data_servers.target])
+            server.adopt(previous.process, previous.port)
+            self.load_balancer.set_targets([server.target], cluster)
             return
         if previous is not None:
             send_signal(previous.process, signal.SIGKILL)  # it had not announced itself: its port is unknown
-        if self._has_data:
-            await self.data_servers.start(0 if previous is None else previous.port)
+        await server.start(0 if previous is None else previous.port)
 
     async def _open_operator_port(self, token: str, earlier: int) -> None:
         """Listen on the wanted port, or on that of an earlier control plane, or on a free one."""
@@ -583,6 +615,7 @@ class LocalPlatform:
                 for name, mark in self.backend_servers.marks.items()
             ),
             data_server=self.data_servers.state,
+            rosbridge_server=None if self._rosbridge is None else self._rosbridge.state,
             load_balancer=self.load_balancer.process.mark,
             port=self.load_balancer.port,
             status_port=self._operator_port.port,
@@ -593,10 +626,12 @@ class LocalPlatform:
         self._disks.write(state_file(self.state), state.to_json())
         self._disks.write(self.state / _TARGETS_FILE, service_discovery(self.name, state.servers))
 
-    def _report_data_change(self, event: str, **details: Any) -> None:
+    def _report_single_change(self, event: str, **details: Any) -> None:
         self._emit(event, **details)
         if event == "data-server-up":
-            self.load_balancer.set_data_targets([self.data_servers.target])
+            self.load_balancer.set_targets([self.data_servers.target], DATA_CLUSTER)
+        elif event == "rosbridge-up" and self._rosbridge is not None:
+            self.load_balancer.set_targets([self._rosbridge.target], ROSBRIDGE_CLUSTER)
         self._write_state()
 
     # --- stop ------------------------------------------------------------------------------------
@@ -607,6 +642,8 @@ class LocalPlatform:
             self._control.stop()
             await self._fleet.close()
             self._operator_port.close()
+            if self._rosbridge is not None:
+                await self._rosbridge.stop(STOP_TIMEOUT_S)
             await asyncio.gather(
                 self.backend_servers.stop(STOP_TIMEOUT_S), self.data_servers.stop(STOP_TIMEOUT_S)
             )
@@ -614,6 +651,8 @@ class LocalPlatform:
         finally:
             self.backend_servers.kill_all()
             self.data_servers.kill_all()
+            if self._rosbridge is not None:
+                self._rosbridge.kill_all()
             self.load_balancer.kill()
             self._fleet.members.clear()
             with contextlib.suppress(OSError):  # the folder may have been removed meanwhile

@@ -18,6 +18,7 @@ from urllib.parse import urlsplit
 
 from rse_pf.auth.control_token import read_control_token
 from rse_pf.config import PlatformSettings
+from rse_pf.config.resource_names import HEALTH_PATH
 from rse_pf.errors import ConfigurationError
 from rse_pf.local.disk_watch import DiskSpace, disk_line, disk_spaces, folders_of
 from rse_pf.local.processes import ProcessMark, is_alive
@@ -43,9 +44,11 @@ async def platform_status(state: PlatformState, *, sample_s: float) -> dict[str,
     file = state.control_token_file
     token = read_control_token(Path(file)) if file else None
     data = () if state.data_server is None else (state.data_server,)
-    servers, data_servers = await asyncio.gather(
+    rosbridge = () if state.rosbridge_server is None else (state.rosbridge_server,)
+    servers, data_servers, rosbridge_servers = await asyncio.gather(
         asyncio.gather(*(_server(server, token, sample_s) for server in state.servers)),
-        asyncio.gather(*map(_data_server, data)),
+        asyncio.gather(*(_single_server(server, "/data/readyz") for server in data)),
+        asyncio.gather(*(_single_server(server, HEALTH_PATH) for server in rosbridge)),
     )
     balancer = state.load_balancer
     folder = Path(state.settings_file).parent
@@ -61,6 +64,7 @@ async def platform_status(state: PlatformState, *, sample_s: float) -> dict[str,
         },
         "servers": list(servers),
         "data_servers": list(data_servers),
+        "rosbridge_servers": list(rosbridge_servers),
         "disks": [{**asdict(space), "warning": disk_line(space)} for space in disks],
     }
 
@@ -76,8 +80,9 @@ def status_table(status: Mapping[str, Any]) -> str:
         ).rstrip()
         for row in rows
     ]
-    for process in status["data_servers"]:
-        lines.append(f"data server  {process['name']} is {process['state']} (pid {process['pid']})")
+    for role in ("data", "rosbridge"):
+        for process in status.get(f"{role}_servers", ()):
+            lines.append(f"{role} server  {process['name']} is {process['state']} (pid {process['pid']})")
     for role, process in (("load balancer", status["balancer"]), ("control plane", status["control_plane"])):
         lines.append(f"{role}  {'runs' if process['running'] else 'does not run'} (pid {process['pid']})")
     taken: defaultdict[str, float] = defaultdict(float)
@@ -109,12 +114,12 @@ def _disks(folder: Path) -> list[DiskSpace]:
     return disk_spaces(folders_of(folder, local_placement(settings, folder).store))
 
 
-async def _data_server(server: ServerState) -> dict[str, Any]:
+async def _single_server(server: ServerState, ready: str) -> dict[str, Any]:
     row: dict[str, Any] = {"name": server.name, "pid": server.process.pid, "port": server.port}
     silent = _state_without_answer(server.process, server.port)
     if silent is not None:
         return {**row, "state": silent}
-    reply = await ControlPort(server.port).ask_once("/data/readyz", timeout_s=_TIMEOUT_S)
+    reply = await ControlPort(server.port).ask_once(ready, timeout_s=_TIMEOUT_S)
     if reply is None:
         return {**row, "state": "silent"}
     return {**row, "state": "ready" if reply.status == 200 else "not ready"}

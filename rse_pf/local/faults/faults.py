@@ -19,7 +19,7 @@ from pathlib import Path
 from rse_pf.config import HealthSettings
 from rse_pf.errors import ConfigurationError, UsageError
 from rse_pf.local.processes import ProcessMark, is_alive, mark_of, send_signal
-from rse_pf.local.servers.data_servers import DATA_CHECK_S
+from rse_pf.local.servers.watched_server import CHECK_S
 from rse_pf.local.state import PlatformState, ServerState
 from rse_pf.scaling.health import LOCAL_INTERVAL_S
 
@@ -40,8 +40,7 @@ PERIOD_S = 0.04
 
 def find_server(state: PlatformState, name: str) -> ServerState:
     """Return the running server called *name*; raises UsageError, which names those that run."""
-    servers = state.servers if state.data_server is None else (*state.servers, state.data_server)
-    alive = [server for server in servers if is_alive(server.process)]
+    alive = [server for server in (*state.servers, *state.single_servers) if is_alive(server.process)]
     for server in alive:
         if server.name == name:
             return server
@@ -56,8 +55,8 @@ def longest_pause_s(state: PlatformState, server: ServerState, health: HealthSet
     """
     if not is_alive(state.control_plane):
         return math.inf
-    is_data = state.data_server is not None and server.name == state.data_server.name
-    return health.unhealthy_checks * (DATA_CHECK_S if is_data else LOCAL_INTERVAL_S)
+    is_single = server.name in {single.name for single in state.single_servers}
+    return health.unhealthy_checks * (CHECK_S if is_single else LOCAL_INTERVAL_S)
 
 
 def tree(root: ProcessMark) -> list[ProcessMark]:

@@ -19,20 +19,15 @@ BAR_S = 5.8
 class Connection:
     """As much of a connection as the idle timeouts look at."""
 
-    def __init__(self, *, is_opening: bool = False, is_pinged: bool = False) -> None:
-        self.session = SimpleNamespace(is_pinged=is_pinged)
+    def __init__(self, *, is_opening: bool = False) -> None:
+        self.session = SimpleNamespace()
         self.is_opening = is_opening
         self.closed: Any = False
-        self.opened_s = self.last_heard_s = self.pinged_s = 0.0
-        self.pings: list[float] = []
+        self.opened_s = self.last_heard_s = 0.0
 
     @property
     def is_closing(self) -> bool:
         return bool(self.closed)
-
-    def ping(self, now: float) -> None:
-        self.pings.append(now)
-        self.pinged_s = now
 
     def close(self, code: int, reason: str) -> None:
         assert not self.closed, "closed twice"
@@ -159,15 +154,3 @@ def test_the_limit_follows_the_settings(interval_s, hello_s):
     noticed_s = closed_at(Worker(robot, settings=settings), robot)
 
     assert interval_s + 1.0 <= noticed_s <= interval_s + 1.3
-
-
-def test_a_client_that_sends_no_pings_is_asked_by_one_and_closed_if_it_does_not_answer():
-    connection, talker = Connection(is_pinged=True), Connection()
-    worker = Worker(connection, talker)
-    worker.run(LIMIT_S - 0.5)
-
-    assert len(connection.pings) == 2, "one for each interval of silence"
-    assert connection.pings[0] == pytest.approx(SETTINGS.ping_interval_s, abs=0.3)
-    assert not talker.pings
-    worker.run(BAR_S)
-    assert connection.closed == (1001, "silent")

@@ -8,69 +8,20 @@ from collections.abc import Callable
 import pytest
 from backend.gateway.worker_parts import WorkerParts, quiet_log, worker_parts
 from backend.live_map.fake_owners import FakeReader
-from backend.rosbridge.clients import Worker, call, rosbridge_worker
 from fakes import FakeLoop
 
 from rse_pf.backend.gateway.connection import RobotConnection
 from rse_pf.backend.live_map.subscriptions import Subscriptions
 from rse_pf.backend.log import JsonLog
-from rse_pf.backend.rosbridge.subscription import Subscription, TopicMessage
 from rse_pf.wire import Command
 
 TIMES = 20
-HOUR_MS = 3_600_000
 
 
 def held(*kinds: type) -> int:
     """Return how many objects of *kinds* live."""
     gc.collect()
     return sum(isinstance(each, kinds) for each in gc.get_objects())
-
-
-def use_rosbridge(worker: Worker) -> None:
-    client, other = worker.client("r"), worker.client("s")
-    for rate, length in ((HOUR_MS, 1), (HOUR_MS, 100), (100, 5), (0, 1)):
-        client.say({"op": "subscribe", "topic": f"/t{rate}_{length}", "id": "s", "throttle_rate": rate,
-                    "queue_length": length})  # fmt: skip
-        for k in range(4):
-            message = {"data": f"{k}" * 1000}
-            other.say({"op": "publish", "topic": f"/t{rate}_{length}", "msg": message, "latch": k == 2})
-    client.wire.unsent = 1 << 20
-    client.say({"op": "subscribe", "topic": "/slow", "id": "s"})
-    other.say({"op": "publish", "topic": "/slow", "msg": {"data": 1}})
-    client.say(call(), {"op": "unsubscribe", "topic": f"/t{HOUR_MS}_1"}, b"\xff")
-    client.connection.on_socket_end()
-    other.connection.on_socket_end()
-
-
-def test_a_rosbridge_client_that_left_is_held_by_nothing() -> None:
-    with rosbridge_worker() as worker:
-        loop = worker.parts.loop
-        use_rosbridge(worker)
-        loop.advance(1.0)
-        kinds = (RobotConnection, Subscription, TopicMessage)
-        timers, objects = loop.timers, held(*kinds)
-        for _ in range(TIMES):
-            use_rosbridge(worker)
-        loop.advance(1.0)
-
-        assert loop.timers == timers
-        assert held(*kinds) <= objects  # what other tests left may end meanwhile
-
-
-def test_messages_of_an_ended_subscription_are_held_by_nothing_although_its_client_stays() -> None:
-    with rosbridge_worker() as worker:
-        client = worker.client("r")
-        client.say(call())
-        timers, messages = worker.parts.loop.timers, held(TopicMessage)
-        for _ in range(TIMES):
-            client.say({"op": "subscribe", "topic": "/t", "id": "s", "throttle_rate": HOUR_MS})
-            for k in range(4):
-                client.say({"op": "publish", "topic": "/t", "msg": {"data": k}})
-            client.say({"op": "unsubscribe", "topic": "/t", "id": "s"})
-
-        assert worker.parts.loop.timers == timers
-        assert held(TopicMessage) <= messages
 
 
 def leave_silently(parts: WorkerParts, connection: RobotConnection) -> None:

@@ -23,7 +23,6 @@ from rse_pf.backend.live_map.router import LiveMapRouter
 from rse_pf.backend.log import JsonLog
 from rse_pf.backend.object_refs import ObjectRefs
 from rse_pf.backend.ports import Clocks, WorkerContext
-from rse_pf.backend.rosbridge.topics import RosbridgeTopics
 from rse_pf.backend.scheduling.command_queue import CommandQueue
 from rse_pf.child.limited import LimitedProcesses
 from rse_pf.config import PlatformSettings
@@ -51,7 +50,6 @@ class WorkerParts:
         store: MemoryStore | None = None,
         queues: Sequence[CommandQueue] = (),
         live_maps: Callable[[WorkerContext, Answers], LiveMapRouter] | None = None,
-        topics: Callable[[WorkerContext], RosbridgeTopics] | None = None,
         processes: LimitedProcesses | None = None,
         emulated_cores: float = 0.0,
     ) -> None:
@@ -104,7 +102,6 @@ class WorkerParts:
             token_watch=self.token_watch,
             queues=[queue for queue in (*queues, updates, lane) if queue is not None],
             updates=updates,
-            topics=None if topics is None else topics(self.context),
         )
         self.dispatcher.start()
         self.scheduler = self.dispatcher.stateless.scheduler

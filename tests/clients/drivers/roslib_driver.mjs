@@ -3,9 +3,9 @@
 // roslib does not connect again by itself; that, and what had no answer then, is done here.
 import { readFileSync } from "node:fs";
 import { createInterface } from "node:readline";
-import { Ros, Service } from "roslib";
+import { Ros, Service, Topic } from "roslib";
 
-const CLAIMS = ["pnp", "typed-error", "busy", "deadline", "stream", "renew", "expired", "revoked"];
+const CLAIMS = ["pnp", "typed-error", "busy", "deadline", "stream", "renew", "expired", "revoked", "not-finite"];
 const PER_S = 10;
 const MAX_UNANSWERED = 6;
 const TYPED_ENDS = { 4401: "unauthorized", 4403: "revoked" };
@@ -203,8 +203,22 @@ async function ended(run) {
   run.done(0);
 }
 
+async function notFinite(run) {
+  const messages = [];
+  for (const [name, messageType] of [["/scan", "sensor_msgs/LaserScan"], ["/fix", "sensor_msgs/NavSatFix"]]) {
+    new Topic({ ros: run.ros, name, messageType }).subscribe((message) => messages.push(message));
+  }
+  await run.begin("echo", { value: 1 }).answer; // the subscriptions are made
+  say({ event: "ready" });
+  while (messages.length < 2) await sleep(20);
+  const found = JSON.stringify(messages);
+  if (found !== '[{"ranges":[1,null,null,null]},{"latitude":null}]') throw new Error(found);
+  run.done(1);
+}
+
 const SCENARIOS = {
   pnp, "typed-error": typedError, busy, deadline, stream, renew: stream, expired: ended, revoked: ended,
+  "not-finite": notFinite,
 };
 
 if (scenario === "--claims") {
@@ -216,7 +230,7 @@ if (scenario === "--claims") {
   try {
     const run = new Run();
     await run.connect();
-    say({ event: "ready" });
+    if (scenario !== "not-finite") say({ event: "ready" }); // which is ready when it has subscribed
     await SCENARIOS[scenario](run);
     process.exit(0);
   } catch (error) {

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import os
+import queue
 import sys
 import threading
 import time
@@ -15,7 +16,7 @@ from typing import Any
 
 import roslibpy
 
-CLAIMS = ["pnp", "typed-error", "busy", "deadline", "stream", "renew"]
+CLAIMS = ["pnp", "typed-error", "busy", "deadline", "stream", "renew", "not-finite"]
 PER_S = 10.0
 MAX_UNANSWERED = 6
 
@@ -55,7 +56,6 @@ class Run:
         self.lock = threading.Lock()
         self.ros.on("ready", self.connected)
         self.ros.run(timeout=10)
-        say(event="ready")
 
     def connected(self, proto: Any) -> None:
         proto.send_ros_message(roslibpy.Message({"op": "auth", "mac": self.token, "level": "", "t": 0}))
@@ -217,9 +217,20 @@ def stream(run: Run) -> None:
     run.done(offered)
 
 
+def not_finite(run: Run) -> None:
+    messages: queue.Queue[Any] = queue.Queue()
+    for topic, kind in (("/scan", "sensor_msgs/msg/LaserScan"), ("/fix", "sensor_msgs/msg/NavSatFix")):
+        roslibpy.Topic(run.ros, topic, kind).subscribe(messages.put)
+    run.ask("echo", {"value": 1})  # the subscriptions are made
+    say(event="ready")
+    assert messages.get(timeout=10) == {"ranges": [1.0, None, None, None]}
+    assert messages.get(timeout=10) == {"latitude": None}
+    run.done(1)
+
+
 SCENARIOS = {
     "pnp": pnp, "typed-error": typed_error, "busy": busy, "deadline": deadline, "stream": stream,
-    "renew": stream,
+    "renew": stream, "not-finite": not_finite,
 }  # fmt: skip
 
 
@@ -232,7 +243,10 @@ def main() -> int:
         say(event="unsupported")
         return 3
     try:
-        SCENARIOS[scenario](Run(transport))
+        run = Run(transport)
+        if scenario != "not-finite":  # which is ready when it has subscribed
+            say(event="ready")
+        SCENARIOS[scenario](run)
     except Exception as error:  # noqa: BLE001  the last line of a driver says what failed
         say(event="error", message=f"{type(error).__name__}: {error}")
         return 1

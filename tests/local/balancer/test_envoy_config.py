@@ -11,6 +11,7 @@ from rse_pf.config.resource_names import READY_PATH
 from rse_pf.local.balancer.envoy_config import (
     CLUSTER,
     DATA_CLUSTER,
+    ROSBRIDGE_CLUSTER,
     Target,
     endpoints,
     envoy_config,
@@ -19,17 +20,22 @@ from rse_pf.scaling.health import HEALTHY_CHECKS, LOCAL_INTERVAL_S, LOCAL_TIMEOU
 
 ENDPOINTS = Path("/somewhere/endpoints.json")
 DATA = Path("/somewhere/data-endpoints.json")
+ROSBRIDGE = Path("/somewhere/rosbridge-endpoints.json")
 
 
 def config(**groups: dict[str, Any]) -> dict[str, Any]:
     return envoy_config(
-        PlatformSettings().replace(**groups), port=0, endpoints_file=ENDPOINTS, data_endpoints_file=DATA
+        PlatformSettings().replace(**groups),
+        port=0,
+        endpoints_file=ENDPOINTS,
+        data_endpoints_file=DATA,
+        rosbridge_endpoints_file=ROSBRIDGE,
     )
 
 
 def listener(made: dict[str, Any]) -> dict[str, Any]:
-    (only,) = made["static_resources"]["listeners"]
-    return only
+    front, *_ = made["static_resources"]["listeners"]
+    return front
 
 
 def manager(made: dict[str, Any]) -> dict[str, Any]:
@@ -91,14 +97,17 @@ def test_only_the_path_of_the_robots_leads_to_a_server() -> None:
     assert only_route(config())["match"] == {"path": "/ws"}
 
 
-def test_rosbridge_has_a_way_to_the_servers_if_it_is_switched_on() -> None:
-    (rosbridge,) = [
-        each
-        for each in routes(config(serving={"rosbridge": True}))
-        if each["match"] == {"path": "/rosbridge"}
-    ]
+def test_rosbridge_has_a_way_to_its_server_and_from_there_without_tls_if_it_is_switched_on() -> None:
+    made = config(
+        serving={"rosbridge": True}, local={"certificate": "/tls/chain.pem", "private_key": "/tls/key.pem"}
+    )
+    (rosbridge,) = [each for each in routes(made) if each["match"] == {"path": "/rosbridge"}]
+    front, loopback = made["static_resources"]["listeners"]
 
-    assert rosbridge["route"] == only_route(config())["route"]
+    assert rosbridge["route"] == {**only_route(config())["route"], "cluster": ROSBRIDGE_CLUSTER}
+    assert "transport_socket" in front["filter_chains"][0]
+    assert "transport_socket" not in loopback["filter_chains"][0]
+    assert loopback["address"]["socket_address"]["address"] == "127.0.0.1"
     assert not [each for each in routes(config()) if each["match"] == {"path": "/rosbridge"}]
 
 

@@ -21,7 +21,7 @@ from rse_pf.auth.tokens import SigningKey
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import StoreFull
 from rse_pf.identity import RobotId, object_name
-from rse_pf.local.servers.data_servers import LocalDataServers
+from rse_pf.local.servers.single_servers import local_data_server
 from rse_pf.object_store import DirectoryStore, digest_of
 
 pytestmark = pytest.mark.system
@@ -43,7 +43,7 @@ class Platform:
         self.loop = asyncio.new_event_loop()
         self.thread = threading.Thread(target=self.loop.run_forever, daemon=True)
         self.thread.start()
-        self.servers = LocalDataServers(SETTINGS, folder=folder, store=f"dir:{store}", emit=self._emit)
+        self.servers = local_data_server(SETTINGS, folder=folder, store=f"dir:{store}", emit=self._emit)
         self._call(self.servers.start())
 
     def _emit(self, event: str, **details: object) -> None:

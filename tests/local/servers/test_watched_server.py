@@ -13,7 +13,8 @@ import pytest
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import ConfigurationError
 from rse_pf.local.processes import is_alive
-from rse_pf.local.servers.data_servers import NICENESS, LocalDataServers
+from rse_pf.local.servers.single_servers import local_data_server
+from rse_pf.local.servers.watched_server import NICENESS
 
 pytestmark = pytest.mark.system
 
@@ -40,7 +41,7 @@ class Box:
         self, folder: Path, program: str, *, health: dict[str, Any] = PATIENT, replaces: bool = True
     ) -> None:
         self.told: asyncio.Queue[str] = asyncio.Queue()
-        self.servers = LocalDataServers(
+        self.servers = local_data_server(
             PlatformSettings().replace(local={"start_timeout_s": 15.0}, health=health),
             folder=folder, store="dir:objects",
             replaces=replaces, program=(sys.executable, "-W", "ignore", "-c", program),

@@ -1,4 +1,4 @@
-"""The data servers box on one machine: an ``rse-pf data`` process, started, watched and replaced.
+"""A server of one process on one machine: started, watched and replaced; of data, or of rosbridge clients.
 
 A replacement takes the port of the process before it, so the load balancer's configuration does not change.
 A process that answers no health check any more is killed and replaced like one that died.
@@ -12,63 +12,65 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from rse_pf.audit.log import audit_folder
-from rse_pf.config import PlatformSettings
 from rse_pf.errors import ConfigurationError
 from rse_pf.linux import run_as_batch
 from rse_pf.local.balancer.envoy_config import Target
-from rse_pf.local.firewall import key_set_file
 from rse_pf.local.processes import ProcessMark, ServerProcess
-from rse_pf.local.servers.backend_servers import RSE_PF
 from rse_pf.local.servers.control_client import ControlPort
-from rse_pf.local.state import ServerState, settings_file
+from rse_pf.local.state import ServerState
 
-__all__ = ["DATA_CHECK_S", "NICENESS", "LocalDataServers"]
+__all__ = ["CHECK_S", "NICENESS", "WatchedServer"]
 
-_LOOPBACK = "127.0.0.1"
-DATA_CHECK_S = 1.0
+CHECK_S = 1.0
 """Between two checks of the service, and how long one may take."""
-_READY, _ALIVE = "/data/readyz", "/data/healthz"
 _FIRST_PAUSE_S, _MAX_PAUSE_S = 0.1, 5.0
 _WAIT_FOR_SPACE_S = 0.5
 NICENESS = 10
-"""Of the data server: on one machine poses go first."""
+"""Of these servers: on one machine poses go first."""
 
 
-class LocalDataServers:
-    """The data service of one platform: one process with a name, and its replacements.
+class WatchedServer:
+    """One process with a name, and its replacements.
 
     ``port`` is that of the process and of its replacements, 0 before the first start.
     """
 
     def __init__(
         self,
-        settings: PlatformSettings,
+        name: str,
         *,
         folder: Path,
-        store: str | None = None,
-        name: str = "data-1",
+        command: Sequence[str],
+        ready: str,
+        alive: str,
+        event: str,
+        unhealthy_checks: int,
+        start_timeout_s: float,
         dies_with_parent: bool = True,
         replaces: bool = True,
-        program: Sequence[str] = RSE_PF,
         is_full: Callable[[], bool] = lambda: False,
         emit: Callable[..., None] = lambda event, **details: None,
     ) -> None:
         """Remember what to start.
 
         Args:
-            settings: Groups data and local.
-            folder: Holds settings and public keys, gets the log and the announcement.
-            store: Overrides ``data.store``; a platform whose store is ``memory:`` names a folder here.
             name: Of the process, in log and events.
+            folder: Gets the log and the announcement.
+            command: What to run; ``--announce`` and ``--port`` with their values follow.
+            ready: Path that answers 200 while requests can be served.
+            alive: Path that answers 200 while the process need not be replaced.
+            event: What the names of the events begin with.
+            unhealthy_checks: After more failed checks than these, the process is killed.
+            start_timeout_s: How long a start may take.
             dies_with_parent: Whether the process ends when this one does.
             replaces: Whether one that ends or hangs is replaced; else only the event is emitted.
-            program: What to run; ``data`` and its options follow.
             is_full: Whether the disk is full now; no process is started then.
-            emit: Gets ``data-server-start`` with name and pid, ``data-server-up`` with port, too,
-                ``data-server-down`` with name and code, ``data-server-silent`` and ``data-server-failed``.
+            emit: Gets EVENT-start with name and pid, EVENT-up with port, too, EVENT-down with name and code,
+                EVENT-silent and EVENT-failed.
         """
-        self._settings = settings
+        self._ready, self._alive, self._event = ready, alive, event
+        self._unhealthy_checks = unhealthy_checks
+        self._start_timeout_s = start_timeout_s
         self._dies_with_parent = dies_with_parent
         self._replaces = replaces
         self._is_full = is_full
@@ -76,11 +78,7 @@ class LocalDataServers:
         self.port = 0
         self.process = ServerProcess(name, folder)
         self._watching: asyncio.Task[None] | None = None
-        self._command = [
-            *program, "data", "--settings", str(settings_file(folder)), "--keys", str(key_set_file(folder)),
-            "--host", _LOOPBACK, "--announce", str(self.process.announcement),
-            "--audit", str(audit_folder(folder)), *(() if store is None else ("--store", store)),
-        ]  # fmt: skip
+        self._command = [*command, "--announce", str(self.process.announcement)]
 
     @property
     def target(self) -> Target:
@@ -105,7 +103,7 @@ class LocalDataServers:
         """Start the process at *port* (0: a free one), wait until it answers, and watch it from then on.
 
         Raises:
-            ConfigurationError: It ended or was not ready within ``local.start_timeout_s``.
+            ConfigurationError: It ended or was not ready in time.
         """
         self.port = port
         try:
@@ -139,7 +137,7 @@ class LocalDataServers:
 
     async def is_ready(self) -> bool:
         """Return whether the service answers and its store does."""
-        return self.port > 0 and await self._is_answering(_READY)
+        return self.port > 0 and await self._is_answering(self._ready)
 
     async def forget(self) -> None:
         """Stop watching, and leave the process running."""
@@ -163,7 +161,7 @@ class LocalDataServers:
         pause_s = _FIRST_PAUSE_S
         while True:
             code = await self._wait_over()
-            self._emit("data-server-down", name=self.process.name, code=code)
+            self._emit(f"{self._event}-down", name=self.process.name, code=code)
             if not self._replaces:
                 return
             while self._is_full():
@@ -173,7 +171,7 @@ class LocalDataServers:
                 await self._launch()
                 pause_s = _FIRST_PAUSE_S
             except ConfigurationError as error:
-                self._emit("data-server-failed", name=self.process.name, error=error.message)
+                self._emit(f"{self._event}-failed", name=self.process.name, error=error.message)
                 await asyncio.sleep(pause_s)
                 pause_s = min(2 * pause_s, _MAX_PAUSE_S)
                 self.port = 0  # another program may hold the old port
@@ -184,17 +182,17 @@ class LocalDataServers:
         failed = 0
         try:
             while not over.done():
-                await asyncio.wait({over}, timeout=DATA_CHECK_S)
-                failed = 0 if await self._is_answering(_ALIVE) else failed + 1
-                if failed > self._settings.health.unhealthy_checks and self._replaces and not over.done():
-                    self._emit("data-server-silent", name=self.process.name, pid=self.process.pid)
+                await asyncio.wait({over}, timeout=CHECK_S)
+                failed = 0 if await self._is_answering(self._alive) else failed + 1
+                if failed > self._unhealthy_checks and self._replaces and not over.done():
+                    self._emit(f"{self._event}-silent", name=self.process.name, pid=self.process.pid)
                     self.process.send(signal.SIGKILL)
             return over.result()
         finally:
             over.cancel()
 
     async def _is_answering(self, path: str) -> bool:
-        reply = await ControlPort(self.port).ask_once(path, timeout_s=DATA_CHECK_S)
+        reply = await ControlPort(self.port).ask_once(path, timeout_s=CHECK_S)
         return reply is not None and reply.status == 200
 
     async def _launch(self) -> None:
@@ -202,11 +200,11 @@ class LocalDataServers:
         self.process.start(command, dies_with_parent=self._dies_with_parent)
         pid = self.process.pid
         run_as_batch(pid, NICENESS)
-        self._emit("data-server-start", name=self.process.name, pid=pid)
+        self._emit(f"{self._event}-start", name=self.process.name, pid=pid)
         try:
-            announcement = await self.process.wait_announced(self._settings.local.start_timeout_s)
+            announcement = await self.process.wait_announced(self._start_timeout_s)
         except BaseException:
             self.process.kill()
             raise
         self.port = announcement["port"]
-        self._emit("data-server-up", name=self.process.name, pid=pid, port=self.port)
+        self._emit(f"{self._event}-up", name=self.process.name, pid=pid, port=self.port)

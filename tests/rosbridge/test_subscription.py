@@ -1,0 +1,32 @@
+"""What waits for subscribers is bounded in number and bytes, for each subscription and for a tenant."""
+
+from __future__ import annotations
+
+import pytest
+
+from rse_pf.rosbridge import subscription as subscriptions
+from rse_pf.rosbridge.subscription import MAX_QUEUE_LENGTH, HeldBytes, Subscription, TopicMessage
+
+
+def test_what_waits_for_one_subscription_is_bounded_in_number_and_bytes() -> None:
+    small, large = Subscription("/small", HeldBytes()), Subscription("/large", HeldBytes())
+    for _ in range(2 * MAX_QUEUE_LENGTH):
+        small.put(TopicMessage(b"1"))
+        large.put(TopicMessage(bytes(200_000)))
+
+    assert (len(small), len(large)) == (MAX_QUEUE_LENGTH, 5)
+
+
+def test_what_waits_for_all_subscribers_of_a_tenant_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(subscriptions, "MAX_HELD_BYTES", 50_000)
+    held, other = HeldBytes(), Subscription("/chat", HeldBytes())
+    own = [Subscription("/chat", held) for _ in range(5)]
+    for _ in range(40):
+        for each in (*own, other):
+            each.put(TopicMessage(bytes(1000)))
+
+    assert sum(map(len, own)) <= 50 + len(own)
+    assert len(other) == 40
+    for each in own:
+        each.clear()
+    assert held.of_tenant == 0
