@@ -57,23 +57,27 @@ class TopicSender:
                 await self._next_due()
                 await self._pace()
                 subscription = await self._next_due()  # the pong may have taken longer than a subscription
-                await self._write(subscription.take(self._clock()))
+                del self._due[subscription]
+                message = subscription.take(self._clock())
+                if subscription:
+                    self._due[subscription] = None  # behind the others
+                await self._write(message)
                 if self._pacing.is_free and self._pong is None:
                     self._pong = asyncio.ensure_future(self._measure())
         finally:
             if self._pong is not None:
                 self._pong.cancel()
+                await asyncio.gather(self._pong, return_exceptions=True)
 
     async def _next_due(self) -> Subscription:
-        """Wait until a subscription has a message that may be sent now, and return the next one in turn."""
+        """Wait until a subscription has a message that may be sent now, and return the first one."""
         while True:
             self._wake.clear()
             now, wait_s = self._clock(), float("inf")
             for subscription in list(self._due):
-                del self._due[subscription]
                 if not subscription:
+                    del self._due[subscription]
                     continue
-                self._due[subscription] = None  # behind the others
                 left_s = subscription.wait_s(now)
                 if left_s <= 0:
                     return subscription

@@ -16,10 +16,8 @@ FIX = """{"op":"publish","topic":"/fix","type":"sensor_msgs/msg/NavSatFix",
 async def test_what_is_not_finite_arrives_as_null(server: GuardedServer) -> None:
     async with opened(server) as bridge:
         client = await bridge.client()
-        await client.send(subscribe("/scan"), subscribe("/fix"), SCAN)
+        await client.send(subscribe("/scan"), subscribe("/fix"), SCAN, FIX)
         assert (await client.receive())["msg"] == {"range_max": 30.0, "ranges": [1.0, None, None, None, 2.5]}
-        await client.send(FIX)
-
         nothing = dict.fromkeys(("latitude", "longitude", "altitude"))
         assert (await client.receive())["msg"] == {**nothing, "status": {"status": -1}}
 
