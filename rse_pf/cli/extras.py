@@ -109,6 +109,7 @@ VERBS_NEED: dict[str, tuple[str, ...]] = {
     "service publish": ("aws",),
     "serve": ("backend",),
     "data": ("backend",),
+    "rosbridge": (),
     "map": (),
     "map from-bag": ("bags",),
     "map to-bag": ("bags",),

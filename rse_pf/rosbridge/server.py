@@ -106,8 +106,10 @@ def serve_rosbridge(
 
     Raises:
         ConfigurationError: The address is taken.
-        UsageError: *url* is not of a platform.
+        UsageError: *url* is not of a platform, or *port* is no port.
     """
+    if not 0 <= port < 65536:
+        raise UsageError(f"{port} is not a port", hint="name one from 1 to 65535, or 0 for a free one")
     if urlsplit(url).scheme not in ("ws", "wss") or not urlsplit(url).hostname:
         raise UsageError(f"{url[:80]!r} is no address of a platform", hint="write ws://HOST:PORT/ws")
     family = socket.AF_INET6 if ":" in host else socket.AF_INET

@@ -15,7 +15,7 @@ from rse_pf.config import PlatformSettings
 
 EMPTY = [
     "demo", "check", "compare", "experiment", "local", "fleet", "swarm", "token", "robot", "service", "serve",
-    "data", "camera", "map", "batch", "replay", "audit", "cloud", "settings", "doctor", "errors",
+    "data", "rosbridge", "camera", "map", "batch", "replay", "audit", "cloud", "settings", "doctor", "errors",
 ]  # fmt: skip
 HELP_S = 0.3
 

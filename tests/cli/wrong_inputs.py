@@ -174,7 +174,7 @@ WRONG_INPUTS: tuple[WrongInput, ...] = (
     WrongInput("local roll --settings range.json", USAGE, "scaling.busy_cpu_percent = 900.0 is above 100", "lower it in cdk.json"),
     WrongInput("map list --name nowhere", USAGE, "there is no platform 'nowhere' on this machine", "known: default"),
     WrongInput("local status --follow", USAGE, "are for logs and events", "see rse-pf local --help"),
-    WrongInput("local status --lan 10.1.2.3", USAGE, "--lan, --metrics-port and --record are for the start", "see rse-pf local --help"),
+    WrongInput("local status --lan 10.1.2.3", USAGE, "--lan, --metrics-port, --record and --rosbridge are for the start", "see rse-pf local --help"),
     WrongInput("local --lan status", USAGE, "--lan status is not an address", "for example: --lan 192.168.1.20; ip"),
     WrongInput("local status --burst", USAGE, "--burst is for the start of a platform", "see rse-pf local --help"),
     WrongInput("local --burst 70000", USAGE, "--burst 70000 is not a port", "name one from 1 to 65535, or leave it out"),

@@ -33,6 +33,7 @@ STATE = PlatformState(
     settings_file="settings.json",
     key_file="key.json",
     servers=(ServerState(name="server-1", process=mark(2), port=10, control_port=11),),
+    rosbridge_server=ServerState(name="rosbridge-1", process=mark(4), port=13),
     load_balancer=mark(3),
     port=12,
 )
@@ -99,7 +100,7 @@ def test_a_platform_that_only_begins_has_no_balancer_yet(tmp_path: Path) -> None
 
 
 def test_the_data_path_is_everything_but_the_control_plane() -> None:
-    assert STATE.processes() == (mark(2), mark(3))
+    assert STATE.processes() == (mark(2), mark(4), mark(3))
 
 
 def test_no_file_means_no_platform(tmp_path: Path) -> None:

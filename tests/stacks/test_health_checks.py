@@ -22,7 +22,7 @@ import client_sdk
 from rse_pf.auth.tokens import SigningKey
 from rse_pf.aws.clients import make_client
 from rse_pf.config import PlatformSettings
-from rse_pf.config.resource_names import READY_PATH
+from rse_pf.config.resource_names import READY_PATH, ROSBRIDGE_PORT
 from rse_pf.errors import StoreError
 from rse_pf.object_store import MemoryStore, digest_of
 from rse_pf.pnp.problems import make_problem
@@ -80,6 +80,7 @@ def checks_that_end_servers(assembly: Assembly) -> list[tuple[str, str]]:
 def test_no_check_that_ends_servers_asks_the_bucket(assembly: Assembly) -> None:
     data, serving = assembly.settings.data, assembly.settings.serving
     checks = dict(checks_that_end_servers(assembly))
+    assert checks.pop(str(ROSBRIDGE_PORT), None) == ("/healthz" if serving.rosbridge else None)
     store = Shared()
 
     answer = Service(small_settings(), store).ask("GET", checks[str(data.port)], token="")

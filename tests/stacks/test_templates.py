@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from rse_pf.config import PlatformSettings
-from rse_pf.config.resource_names import READY_PATH
+from rse_pf.config.resource_names import READY_PATH, ROSBRIDGE_PORT
 from rse_pf.errors import ConfigurationError
 from rse_pf.scaling.alarms import Alarm, Metric, ScalingStep, alarms_of
 from rse_pf.scaling.health import CLOUD_INTERVAL_S, CLOUD_TIMEOUT_S
@@ -78,7 +78,8 @@ def test_the_group_has_the_settings_bounds_and_asks_the_load_balancer(assembly: 
     assert group["HealthCheckType"] == "ELB"
     assert group["HealthCheckGracePeriod"] == 90
     assert group["DefaultInstanceWarmup"] == scaling.warm_up_s
-    assert len(group["TargetGroupARNs"]) == (2 if assembly.settings.data.enabled else 1)
+    services = 1 + assembly.settings.data.enabled + assembly.settings.serving.rosbridge
+    assert len(group["TargetGroupARNs"]) == services
 
 
 def test_alarms_of_this_account_may_publish_to_the_topic_and_nobody_without_tls(assembly: Assembly) -> None:
@@ -186,6 +187,7 @@ def test_servers_reach_the_map_bucket_exactly_when_the_data_service_runs(assembl
 def test_no_target_group_belongs_to_a_service_that_does_not_run(assembly: Assembly) -> None:
     settings = assembly.settings
     ports = {settings.serving.port} | ({settings.data.port} if settings.data.enabled else set())
+    ports |= {ROSBRIDGE_PORT} if settings.serving.rosbridge else set()
 
     groups = assembly.all("AWS::ElasticLoadBalancingV2::TargetGroup")
     assert {each["Port"] for each in groups if each["TargetType"] != "lambda"} == ports

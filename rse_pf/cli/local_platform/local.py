@@ -476,7 +476,7 @@ def _show(event: Any) -> None:
 
 _QUIET = frozenset(
     (
-        "data-server-start", "platform-gone", "server-healthy", "server-launched", "server-out",
+        "data-server-start", "platform-gone", "rosbridge-start", "server-healthy", "server-launched", "server-out",
         "standby-started",
     )
 )  # fmt: skip

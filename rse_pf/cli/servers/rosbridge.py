@@ -13,6 +13,7 @@ from pathlib import Path
 
 from rse_pf.config import PlatformSettings
 from rse_pf.config.resource_names import ROBOTS_PATH, ROSBRIDGE_PORT
+from rse_pf.errors import UsageError
 
 __all__ = ["add_arguments", "run"]
 
@@ -35,6 +36,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     """Serve until a signal ends the process."""
+    if args.announce is not None and not args.announce.absolute().parent.is_dir():
+        raise UsageError(f"there is no folder {args.announce.absolute().parent}", hint="create the folder")
     from rse_pf.rosbridge.server import serve_rosbridge
 
     url = args.url or f"ws://127.0.0.1:{settings.serving.port}{ROBOTS_PATH}"
