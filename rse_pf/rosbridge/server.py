@@ -127,6 +127,9 @@ async def open_rosbridge(settings: PlatformSettings, url: str, listening: socket
     """Accept clients of the platform at *url* on *listening*, and return what does so."""
     session = settings.session
     clients = _Clients(settings, url)
+    # asyncio does this only for sockets that name their protocol; without it, the ping behind a message waits
+    # for the delayed acknowledgement of the message.
+    listening.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     server: Server = await serve(
         clients.serve_client, sock=listening, process_request=clients.answer_request, compression=None,
         max_size=session.max_message_bytes, open_timeout=session.hello_timeout_s,

@@ -113,15 +113,15 @@ async def test_topics_of_another_tenant_are_neither_received_nor_named_nor_typed
     server: GuardedServer,
 ) -> None:
     async with opened(server) as bridge:
-        owner, stranger = await bridge.client("a"), await bridge.client("b", tenant="other")
+        owner, outsider = await bridge.client("a"), await bridge.client("b", tenant="other")
         await owner.send({"op": "advertise", "topic": "/secret", "type": "a/B", "latch": True})
         await owner.send({"op": "publish", "topic": "/secret", "msg": {"data": 1}, "latch": True})
         await owner.settle()
-        await stranger.send({"op": "subscribe", "topic": "/secret", "type": "c/D"})
-        listed = await stranger.ask({"op": "call_service", "service": "/rosapi/topics", "id": "1"})
+        await outsider.send({"op": "subscribe", "topic": "/secret", "type": "c/D"})
+        listed = await outsider.ask({"op": "call_service", "service": "/rosapi/topics", "id": "1"})
         assert listed["values"] == {"topics": ["/secret"], "types": ["c/D"]}, "its own subscription"
         await owner.send({"op": "publish", "topic": "/secret", "msg": {"data": 2}})
         await owner.settle()
-        await stranger.send({"op": "publish", "topic": "/secret", "msg": {"data": 3}})
+        await outsider.send({"op": "publish", "topic": "/secret", "msg": {"data": 3}})
 
-        assert await stranger.data() == [3]
+        assert await outsider.data() == [3]

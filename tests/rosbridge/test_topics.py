@@ -33,17 +33,17 @@ async def test_a_message_reaches_every_subscriber_of_the_tenant_and_nobody_else(
 ) -> None:
     async with opened(server) as bridge:
         talker, listener = await bridge.client(), await bridge.client()
-        stranger = await bridge.client(tenant="other")
-        for each in (talker, listener, stranger):
+        outsider = await bridge.client(tenant="other")
+        for each in (talker, listener, outsider):
             await each.send(subscribe())
         await listener.send(subscribe("chat", "s:2"))
-        assert [await each.settle() for each in (talker, listener, stranger)] == [None] * 3
+        assert [await each.settle() for each in (talker, listener, outsider)] == [None] * 3
         await talker.send({"op": "advertise", "topic": "chat", "type": "std_msgs/String"}, publish("hi"))
-        await stranger.send(publish("of another tenant"))
+        await outsider.send(publish("of another tenant"))
 
         assert await listener.receive() == {"op": "publish", "topic": "/chat", "msg": {"data": "hi"}}
         assert await talker.data() == ["hi"]
-        assert await stranger.data() == ["of another tenant"]
+        assert await outsider.data() == ["of another tenant"]
         await talker.send(publish("next"))
         assert await listener.data() == ["next"], "one message for both subscriptions"
 
