@@ -476,8 +476,8 @@ def _show(event: Any) -> None:
 
 _QUIET = frozenset(
     (
-        "data-server-start", "platform-gone", "rosbridge-start", "server-healthy", "server-launched", "server-out",
-        "standby-started",
+        "data-server-start", "platform-gone", "rosbridge-start", "server-healthy", "server-launched",
+        "server-out", "standby-started",
     )
 )  # fmt: skip
 """Events that the terminal does not show: another event of the same server follows at once."""

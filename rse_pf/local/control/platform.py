@@ -350,8 +350,9 @@ class LocalPlatform:
     async def roll(self, change: SettingsChange | None = None) -> None:
         """Replace every server, one by one: the new one serves before the old one is drained.
 
-        The data service is replaced last; its clients repeat what they asked for meanwhile.  A warm standby
-        of before is ended first: it has the old release in its memory.  *change* has the settings of the
+        The data service and the rosbridge server are replaced last: clients of the one repeat what they
+        asked for meanwhile, clients of the other have to connect again.  A warm standby of before is ended
+        first: it has the old release in its memory.  *change* has the settings of the
         new servers; None leaves them as they are.
 
         Raises:
@@ -365,6 +366,8 @@ class LocalPlatform:
         try:
             await self._replace_servers()
             await self.data_servers.restart(STOP_TIMEOUT_S)
+            if self._rosbridge is not None:
+                await self._rosbridge.restart(STOP_TIMEOUT_S)
         except BaseException:
             self._write_settings(before)
             raise
