@@ -157,11 +157,12 @@ class _Buffers(threading.local):
 
     def hold(self, rows: int) -> None:
         """Make room for *rows* points and pixels, and for as many inliers."""
-        self.rows = rows
-        self.points_world, self.pixels = np.empty(3 * rows), np.empty(2 * rows)
-        self.inliers = np.empty(rows, dtype=np.uint32)
-        self.inliers_at = address_of(self.inliers)
-        _ARRAYS.pack_into(self.request, _HEAD.size, address_of(self.points_world), address_of(self.pixels))
+        points_world, pixels = np.empty(3 * rows), np.empty(2 * rows)
+        inliers = np.empty(rows, dtype=np.uint32)
+        # Nothing from here on can fail for want of memory and leave the address of an array that is gone.
+        _ARRAYS.pack_into(self.request, _HEAD.size, address_of(points_world), address_of(pixels))
+        self.points_world, self.pixels = points_world, pixels
+        self.inliers, self.inliers_at, self.rows = inliers, address_of(inliers), rows
 
 
 class _Lists(threading.local):

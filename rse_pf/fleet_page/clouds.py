@@ -80,18 +80,17 @@ class MapPages:
 
     def _maps(self) -> list[dict[str, Any]]:
         store = platform_store(self._folder)
-        return [
-            {
-                "map": map_label(tenant, name),
-                "versions": [
-                    {"id": record.id, "number": record.number, "points": record.points}
-                    for record in reversed(registry.versions(name)[-_MAX_LISTED:])
-                ],
-            }
-            for tenant in tenants_with(store, "maps")
-            for registry in (MapRegistry(store, tenant),)
-            for name in registry.names()[:_MAX_LISTED]
-        ]
+        maps = []
+        for tenant in tenants_with(store, "maps"):
+            registry = MapRegistry(store, tenant)
+            for name in registry.names()[:_MAX_LISTED]:
+                with suppress(RsePfError):  # a damaged map hides no other one
+                    versions = [
+                        {"id": record.id, "number": record.number, "points": record.points}
+                        for record in reversed(registry.versions(name)[-_MAX_LISTED:])
+                    ]
+                    maps.append({"map": map_label(tenant, name), "versions": versions})
+        return maps
 
     def _cloud(self, query: Mapping[str, str]) -> bytes:
         label = query.get("map", "")

@@ -297,7 +297,8 @@ class MapRegistry:
             self._swap(name, None, head)
             self._on_change("map.restore", name, self.record(name, head))
         elif expected != head:
-            self.move_head(name, head, expected=expected)
+            self._move_head(name, self.record(name, head), expected)
+            self._on_change("map.restore", name, self.record(name, head))
 
     def _check_counts(self, base: str, *, is_new: bool) -> None:
         """Raise LimitExceeded if the tenant has no place for another map, or the map for another version."""
@@ -407,16 +408,21 @@ class MapRegistry:
             Conflict: The head is not *expected*.
             Busy: The version is being removed.
         """
-        record, before, marks = self.record(name, version), self.record(name, expected), self._marks(name)
+        record, before = self.record(name, version), self.record(name, expected)
+        self._move_head(name, record, before.id)
+        self._on_change("map.head", name, record)
+        return record
+
+    def _move_head(self, name: str, record: MapRecord, expected: str) -> None:
+        """Move the head from the version *expected*, which need not be there, to that of *record*."""
+        marks = self._marks(name)
         mark = marks.put(HELD, record.digest)
         try:
             marks.check(record.digest)
             self.record(name, record.id)  # else a removal that did not see the mark has ended
-            self._swap(name, before.id, record.id)
+            self._swap(name, expected, record.id)
         finally:
             marks.clear(mark)
-        self._on_change("map.head", name, record)
-        return record
 
     def remove(
         self, name: str, choose: Callable[[Sequence[MapRecord], str], Sequence[MapRecord]]

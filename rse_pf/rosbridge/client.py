@@ -17,6 +17,7 @@ from websockets.asyncio.server import ServerConnection
 from websockets.exceptions import ConnectionClosed
 
 from client_sdk.robot import MAX_DEADLINE_S, Robot
+from rse_pf.auth.claimed import claimed_by
 from rse_pf.budget import Budget
 from rse_pf.config import SessionSettings
 from rse_pf.errors import (
@@ -39,6 +40,8 @@ from rse_pf.wire.server_session import CLOSE_REPLACED, CLOSE_TOKEN_OVER
 __all__ = ["Client"]
 
 _TRY_AGAIN_LATER = 1013  # close code of RFC 6455's registry: the platform cannot be reached now
+_MAX_AUTH_BYTES = 8192  # of a message that comes before the token
+_MAX_WITHOUT_TOKEN = 10  # messages, after which a client without a token is closed
 _REFUSED_S = 1.0  # an unauthenticated client is closed this much later: an address tries few tokens a second
 _BUSY_MS = 200.0  # after this a client with too many unanswered calls may try again
 _ERROR_LEVELS = ("error", "warning", "info")  # of set_level: those with which a client gets errors
@@ -83,10 +86,11 @@ class Client:
     async def serve(self, authenticated: Callable[[], object]) -> None:
         """Serve until the client leaves or is refused; call *authenticated* when its token is accepted."""
         with contextlib.suppress(ConnectionClosed):
-            if not self._token:
-                await self._await_token()
             try:
-                await self._robot
+                if not self._token:
+                    await self._await_token()
+                if not await self._connect():
+                    return
                 identity = self._identity = self._identify()
             except RsePfError as error:
                 await self._robot.close()
@@ -113,17 +117,49 @@ class Client:
 
     # --- who it is -----------------------------------------------------------------------------
 
+    async def _connect(self) -> bool:
+        """Connect the robot, and return True; False if the client left meanwhile."""
+
+        async def connect() -> None:
+            await self._robot
+
+        connecting = asyncio.ensure_future(connect())
+        left = asyncio.ensure_future(self._socket.wait_closed())
+        await asyncio.wait({connecting, left}, return_when=asyncio.FIRST_COMPLETED)
+        left.cancel()
+        if connecting.done():
+            connecting.result()
+            return True
+        connecting.cancel()
+        await asyncio.gather(connecting, return_exceptions=True)
+        await self._robot.close()
+        return False
+
     async def _await_token(self) -> None:
-        """Read until ``auth`` brings a token; the server bounds the time."""
-        while not self._token:
+        """Read until ``auth`` brings a token; the server bounds the time.
+
+        Raises:
+            Unauthorized: Other messages came, too many or a long one.
+        """
+        for _ in range(_MAX_WITHOUT_TOKEN):
             data = await self._socket.recv(decode=False)
+            if len(data) > _MAX_AUTH_BYTES:
+                break
             try:
                 operation = read_operation(data, self._budget)
                 if operation.op != "auth" or not operation.mac:
                     raise Unauthorized("no token was sent yet", hint="send auth with the token as mac first")
                 self._token = operation.mac
+                return
             except RsePfError as error:
                 await self._refuse(data, error)
+        raise Unauthorized("no token was sent", hint="send auth with the token as mac first")
+
+    def _take_fresh_token(self, token: str, identity: TopicClient) -> None:
+        """Keep *token* for the next renewal; raise Unauthorized for one of another robot."""
+        if claimed_by(token).get("claimed_robot") != identity.robot:
+            raise Unauthorized("this is no token of this robot", hint="the former token stays in use")
+        self._token = token
 
     async def _fresh_token(self) -> str:
         return self._token
@@ -185,7 +221,7 @@ class Client:
             if operation.op == "call_service":
                 await self._begin_call(operation, identity)
             elif operation.op == "auth":
-                self._token = operation.mac or self._token
+                self._take_fresh_token(operation.mac, identity)
             elif operation.op == "set_level":
                 self._gets_errors = operation.level in _ERROR_LEVELS
             elif operation.op != "status":
@@ -212,7 +248,7 @@ class Client:
     async def _call(self, name: str, call: Operation) -> None:
         timeout_s = call.timeout if call.timeout and 0 < call.timeout <= MAX_DEADLINE_S else None
         try:
-            request = msgspec.json.decode(call.args) if bytes(call.args) not in (b"", b"[]") else None
+            request = _decoded(call) if bytes(call.args) not in (b"", b"[]") else None
             answer = await self._robot.call(name, request, deadline_s=timeout_s)
             is_stored = answer.reply is None and answer.object
             reply = response(call, {"object": answer.object} if is_stored else answer.reply)
@@ -256,6 +292,14 @@ class Client:
         task = asyncio.get_running_loop().create_task(work)
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
+
+
+def _decoded(call: Operation) -> Any:
+    """Return the arguments of a call; raises BadRequest."""
+    try:
+        return msgspec.json.decode(call.args)
+    except (msgspec.DecodeError, RecursionError, ValueError) as error:
+        raise BadRequest(f"{call.service}: {str(error)[:150]}", hint="send finite numbers") from error
 
 
 def _argument(call: Operation, name: str) -> str:

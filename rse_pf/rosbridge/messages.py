@@ -124,6 +124,8 @@ def read_operation(data: bytes, budget: Budget) -> Operation:
         if not bytes(operation.msg):
             raise BadMessage("a publish has no msg", hint="send op, topic and msg")
         check_json(bytes(operation.msg), budget)
+    elif operation.op == "call_service":
+        check_json(bytes(operation.args), budget)
     return operation
 
 
@@ -154,9 +156,17 @@ def read_head(data: bytes) -> Head:
         head = msgspec.convert(json.loads(data), Head)
     except _UNDECODABLE:
         return Head()
-    is_id = isinstance(head.id, int) or (isinstance(head.id, str) and len(head.id) <= 256)
-    service = head.service if isinstance(head.service, str) else ""
+    is_id = isinstance(head.id, int) or (_is_text(head.id) and len(head.id) <= 256)
+    service = head.service if _is_text(head.service) else ""
     return Head(head.op, head.id if is_id else None, service[:256])
+
+
+def _is_text(value: Any) -> bool:
+    """Return whether *value* is a text that can be sent; one with a lone surrogate cannot."""
+    try:
+        return isinstance(value, str) and value.encode() is not None
+    except UnicodeEncodeError:
+        return False
 
 
 def publication(topic: str, message: bytes) -> bytes:

@@ -35,6 +35,7 @@ async def test_a_call_reaches_the_service_and_the_answer_has_its_id_and_spelling
         (call(args={"value": 1}, timeout=1e-5), "expired"),
         (call(args={"value": float("nan")}), "bad-message"),
         (call(args={"value": json.loads("[" * 40 + "]" * 40)}), "too-large"),
+        (call(args=json.loads("[" + "4e-324," * 999 + "0]")), "too-large"),
         (call(timeout="soon"), "bad-message"),
         (call("/rosapi/get_time"), "unknown-service"),
         (call("/rosapi/service_type", args={"service": 3}), "bad-request"),
@@ -50,6 +51,45 @@ async def test_a_call_that_fails_is_answered_with_its_id_and_a_typed_error(
         assert (answer["op"], answer["id"], answer["result"]) == ("service_response", "call:1", False)
         assert answer["values"]["code"] == code
         assert answer["values"]["message"]
+
+
+@pytest.mark.parametrize(
+    ("asked", "code"),
+    [
+        ('{"op":"call_service","id":"c","service":"/echo","args":{"value":1e999}}', "bad-request"),
+        ('{"op":"call_service","id":"\\ud800","service":"/echo","args":{}}', "bad-message"),
+    ],
+)
+async def test_what_cannot_be_decoded_or_named_is_refused_and_the_connection_stays(
+    server: GuardedServer, asked: str, code: str
+) -> None:
+    async with opened(server) as bridge:
+        client = await bridge.client()
+
+        assert (await client.ask(asked))["values"]["code"] == code
+        assert await client.settle() is None
+
+
+async def test_a_client_without_a_token_is_closed_after_a_few_messages_or_a_long_one(
+    server: GuardedServer,
+) -> None:
+    async with opened(server) as bridge:
+        many, long = await bridge.open(), await bridge.open()
+        await many.send(*['{"op":"x","id":"\\ud800"}'] * 10)
+        await long.send(call(args={"value": "x" * 9000}))
+
+        assert [await each.close_code() for each in (many, long)] == [4401, 4401]
+
+
+async def test_a_fresh_token_of_another_robot_is_refused_and_the_former_one_stays(
+    server: GuardedServer,
+) -> None:
+    async with opened(server) as bridge:
+        client = await bridge.client("keeper")
+        for token in ("nonsense", bridge.server.token("another")):
+            assert (await client.ask(auth(token)))["code"] == "unauthorized"
+
+        assert (await client.ask(call()))["result"]
 
 
 async def test_a_call_beyond_its_scope_is_forbidden(server: GuardedServer) -> None:

@@ -12,10 +12,12 @@ import os
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 from rse_pf.auth.roster import ROBOT_KEY, Roster
 from rse_pf.aws.storage import open_data_store
 from rse_pf.cli.access.access_control import described
+from rse_pf.cli.maps.map_store import with_store
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import Conflict, NotFound, UsageError
 from rse_pf.identity import RobotId
@@ -78,18 +80,17 @@ def _thumbprint(key_id: str) -> str:
 
 
 def _open_store(args: argparse.Namespace, settings: PlatformSettings) -> ObjectStore:
-    location = args.store or settings.data.store
-    if location == _PRIVATE_STORE:
-        state = state_folder(args.name, os.environ)
-        objects = state / "objects"
-        if not args.cloud and state.is_dir() and not objects.is_dir():
+    if args.store is None and not args.cloud and state_folder(args.name, os.environ).is_dir():
+        settings = with_store(None, settings, args.name)
+        kind, _, folder = settings.data.store.partition(":")
+        if kind == "dir" and not Path(folder).is_dir():
             raise UsageError(
                 f"the platform {args.name!r} of this machine has stored nothing yet",
                 hint="so there is nothing to adopt; or name another store: --store dir:PATH",
             )
-        if args.cloud or not objects.is_dir():
-            raise UsageError("a store in memory belongs to another process", hint="name --store dir:PATH")
-        location = f"dir:{objects}"
+    location = args.store or settings.data.store
+    if location == _PRIVATE_STORE:
+        raise UsageError("a store in memory belongs to another process", hint="name --store dir:PATH")
     return open_data_store(settings.replace(data={"store": location}))
 
 

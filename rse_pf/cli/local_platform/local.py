@@ -311,6 +311,7 @@ def _logs(args: argparse.Namespace, folder: Path) -> int:
         since_s=-math.inf if args.since is None else logs.since_time_s(args.since, time.time()),
         robot=args.robot,
         tenant=args.tenant,
+        process=args.of_server or "",
         events_only=is_events,
     )
     to_text = logs.format_event if is_events else logs.format_line
@@ -322,7 +323,7 @@ def _logs(args: argparse.Namespace, folder: Path) -> int:
         else:
             show(to_text(line))
 
-    follower = logs.LogFollower(folder, args.of_server, wanted)
+    follower = logs.LogFollower(folder, wanted)
     for line in logs.last_lines(logs.log_files(folder, args.of_server), wanted, _LINES):
         show_line(line)
     if args.follow:

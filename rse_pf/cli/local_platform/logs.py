@@ -19,6 +19,7 @@ from typing import Any
 
 from rse_pf.audit.entry import parse_entry
 from rse_pf.audit.log import CONTROL_PLANE, audit_folder
+from rse_pf.audit.log import log_files as log_files_of
 from rse_pf.errors import UsageError
 from rse_pf.fleet_page.feeds.audit_log import PLATFORM
 from rse_pf.fleet_page.feeds.events import EVENTS, event_sentence, level_of
@@ -65,12 +66,15 @@ class LogLine:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LogFilter:
-    """Which lines are wanted: least level, earliest Unix time, robot and tenant; an empty name is any."""
+    """Which lines are wanted: least level, earliest Unix time, robot, tenant, and the process that wrote a
+    line or that it is about; an empty name is any.
+    """
 
     level: str = "debug"
     since_s: float = -math.inf
     robot: str = ""
     tenant: str = ""
+    process: str = ""
     events_only: bool = False
 
     def accepts(self, line: LogLine) -> bool:
@@ -80,6 +84,7 @@ class LogFilter:
             and line.time_s >= self.since_s
             and self.robot in ("", line.fields.get("robot"))
             and self.tenant in ("", line.fields.get("tenant"))
+            and self.process in ("", line.source, line.fields.get("server"), line.fields.get("name"))
             and (not self.events_only or _is_event(line))
         )
 
@@ -108,12 +113,12 @@ def since_time_s(text: str, now_s: float) -> float:
 
 
 def log_files(folder: Path, server: str | None) -> list[Path]:
-    """Return the logs of *folder*, or that of *server*; raises UsageError if there is none."""
-    files = _all_files(folder)
-    chosen = [file for file in files if server is None or file.stem == server]
-    if chosen:
-        return chosen
-    names = ", ".join(file.stem for file in files)
+    """Return the logs of *folder*, also those that were rotated; raises UsageError if *server* has none."""
+    files = [*sorted(folder.glob("*.log.1")), *log_files_of(audit_folder(folder), CONTROL_PLANE)]
+    files += [file for file in _all_files(folder) if file not in files]
+    if files and (server is None or any(_source(file) == server for file in files)):
+        return files
+    names = ", ".join(sorted({_source(file) for file in files}))
     if not names:
         raise UsageError(
             f"no logs in {folder}", hint="start a platform with rse-pf local, or name one with --name"
@@ -160,10 +165,9 @@ def event_document(line: LogLine) -> dict[str, Any]:
 class LogFollower:
     """Reads what is appended to the logs of a folder from now on."""
 
-    def __init__(self, folder: Path, server: str | None = None, wanted: LogFilter = ALL_LINES) -> None:
+    def __init__(self, folder: Path, wanted: LogFilter = ALL_LINES) -> None:
         """Begin at the present end of every log."""
         self._folder = folder
-        self._server = server
         self._wanted = wanted
         self._read = {file: _size(file) for file in self._files()}
         self._rest: dict[Path, bytes] = {}
@@ -180,7 +184,7 @@ class LogFollower:
                 take(line)
 
     def _files(self) -> list[Path]:
-        return [file for file in _all_files(self._folder) if self._server in (None, file.stem)]
+        return _all_files(self._folder)
 
     def _of(self, file: Path) -> list[LogLine]:
         at, size = self._read.get(file, 0), _size(file)
@@ -210,20 +214,25 @@ def _all_files(folder: Path) -> list[Path]:
     return [*sorted(folder.glob("*.log")), *audit_folder(folder).glob(f"{CONTROL_PLANE}.jsonl")]
 
 
+def _source(file: Path) -> str:
+    """Return the name of the process that wrote the log *file*."""
+    return file.name.partition(".")[0]
+
+
 def _parse(file: Path, data: bytes, wanted: LogFilter) -> Iterator[LogLine]:
     """Yield the *wanted* lines of *data*; a line of text has time and level of the line before it.
 
     Text before the first line with a time has the time at which the file was written last.
     """
-    time_s, last = _written_s(file), "info"
+    time_s, last, source = _written_s(file), "info", _source(file)
     for text in data.decode("utf-8", "replace").splitlines():
         if not text.strip():
             continue
-        document = _entry_document(text) if file.stem == CONTROL_PLANE else _document(text)
+        document = _entry_document(text) if source == CONTROL_PLANE else _document(text)
         if document is not None:
             time_s, last = float(document["time"]), str(document["level"])
-        body = text if document is None else _body(document, file.stem)
-        line = LogLine(time_s=time_s, source=file.stem, level=last, text=body, fields=document or {})
+        body = text if document is None else _body(document, source)
+        line = LogLine(time_s=time_s, source=source, level=last, text=body, fields=document or {})
         if wanted.accepts(line):
             yield line
 

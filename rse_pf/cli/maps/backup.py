@@ -49,7 +49,8 @@ def run_backup(args: argparse.Namespace, settings: PlatformSettings) -> int:
         store = open_data_store(settings)
         content = write_backup(file, maps, store, tenant=args.tenant, created_s=time.time())
     size, backed_up = args.file.stat().st_size, counted(len(content.heads), "map")
-    _print(args, content, f"{backed_up} of tenant {args.tenant!r} backed up in {args.file}: {size} bytes")
+    of = f"of tenant {args.tenant!r} in {settings.data.store}"
+    _print(args, content, f"{backed_up} {of} backed up in {args.file}: {size} bytes")
     return 0
 
 
@@ -63,7 +64,8 @@ def run_restore(args: argparse.Namespace, settings: PlatformSettings) -> int:
     _print(
         args,
         backup.content,
-        f"{restored} of tenant {args.tenant!r} restored: {versions} written, all others were there",
+        f"{restored} of tenant {args.tenant!r} restored in {settings.data.store}: {versions} written, "
+        "all others were there",
     )
     return 0
 

@@ -88,15 +88,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="store of the maps: dir:PATH or s3:BUCKET (default: data.store, or that of rse-pf local)",
     )
     common.add_argument(
-        "--name", dest="platform", metavar="PLATFORM", help="platform of this machine whose maps are meant"
+        "--name",
+        dest="platform",
+        metavar="PLATFORM",
+        help="platform of this machine whose maps are meant (default: the one that runs here)",
     )
     common.add_argument(
         "--tenant", default="default", help="tenant that owns the maps (default: %(default)s)"
     )
-    common.add_argument(
-        "--name", dest="platform", metavar="NAME",
-        help="store of this local platform (default: of the one that runs here)",
-    )  # fmt: skip
     common.add_argument("--json", action="store_true", help="print JSON")
     made = {
         name: actions.add_parser(

@@ -42,7 +42,11 @@ def with_store(named: str | None, settings: PlatformSettings, name: str | None =
     if named is None and (name is not None or chosen.data.store == _IN_MEMORY):
         folder = _platform_folder(name)
         if name is not None and not folder.is_dir():
-            raise UsageError(f"there is no platform {name!r}", hint="start one with rse-pf local")
+            known = ", ".join(sorted(each.name for each in folder.parent.glob("*/"))) or "none"
+            raise UsageError(
+                f"there is no platform {name!r} on this machine",
+                hint=f"start one with rse-pf local; known: {known}",
+            )
         if folder.is_dir():
             return _with_store_of(folder, settings)
     if chosen.data.store == _IN_MEMORY:
@@ -131,7 +135,11 @@ def keep_map(
 
 
 def _platform_folder(name: str | None) -> Path:
-    """Return the folder of a platform: of *name*, of the one that runs here, or of ``rse-pf local``."""
+    """Return the folder of a platform: of *name*, of the one that runs here, or of ``rse-pf local``.
+
+    Raises:
+        UsageError: Several run here, and none is named.
+    """
     own = state_folder(name or "default", os.environ)
     running = []
     for folder in sorted(own.parent.glob("*/")) if name is None else ():
@@ -141,7 +149,12 @@ def _platform_folder(name: str | None) -> Path:
             continue
         if state is not None and is_alive(state.control_plane):
             running.append(folder)
-    return running[0] if len(running) == 1 else own
+    if len(running) > 1:
+        names = ", ".join(folder.name for folder in running)
+        raise UsageError(
+            f"several platforms run on this machine: {names}", hint="name one by --name, or its store"
+        )
+    return running[0] if running else own
 
 
 def _with_store_of(folder: Path, settings: PlatformSettings) -> PlatformSettings:

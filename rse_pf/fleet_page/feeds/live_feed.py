@@ -91,8 +91,9 @@ class LiveFeed:
         """List the live maps through the connection of each tenant, and follow those that a page shows."""
         labels: dict[str, Any] = {}
         for tenant, robot in robots.items():
-            listed = (await robot.call("live-list", {})).reply.get("maps", [])
-            labels.update({map_label(tenant, str(entry["name"])): robot for entry in listed[:_MAX_MAPS]})
+            with contextlib.suppress(RsePfError):  # one tenant hides no other one
+                listed = (await robot.call("live-list", {})).reply.get("maps", [])
+                labels.update({map_label(tenant, str(entry["name"])): robot for entry in listed[:_MAX_MAPS]})
         self._hub.put("maps", "live", list(labels))
         for _ in range(round(_LIST_EVERY_S / _LOOK_S)):
             for label, robot in labels.items():

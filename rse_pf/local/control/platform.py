@@ -352,12 +352,13 @@ class LocalPlatform:
 
         The data service and the rosbridge server are replaced last: clients of the one repeat what they
         asked for meanwhile, clients of the other have to connect again.  A warm standby of before is ended
-        first: it has the old release in its memory.  *change* has the settings of the
-        new servers; None leaves them as they are.
+        first: it has the old release in its memory.  *change* has the settings of the new servers; None
+        leaves them as they are.
 
         Raises:
             ConfigurationError: A new server did not become healthy, and was withdrawn; the roll has stopped,
                 and the old servers that are left serve on.  Servers that start later have the old settings.
+                Or every server was replaced, and the data service or the rosbridge server does not start.
         """
         before = self.settings
         if change is not None:
@@ -365,14 +366,14 @@ class LocalPlatform:
             self._write_settings(change.settings)
         try:
             await self._replace_servers()
-            await self.data_servers.restart(STOP_TIMEOUT_S)
-            if self._rosbridge is not None:
-                await self._rosbridge.restart(STOP_TIMEOUT_S)
         except BaseException:
             self._write_settings(before)
             raise
         self._fleet.settings = self._control.settings = self.settings
         self._write_state()
+        await self.data_servers.restart(STOP_TIMEOUT_S)
+        if self._rosbridge is not None:
+            await self._rosbridge.restart(STOP_TIMEOUT_S)
 
     def _write_settings(self, settings: PlatformSettings) -> None:
         """Take *settings* for the servers that start from now on; raises ConfigurationError."""
@@ -388,7 +389,9 @@ class LocalPlatform:
     async def _replace_servers(self) -> None:
         self._control.hold = True
         try:
-            servers = [server.name for server in self.servers]
+            # A server that is starting may have read the former settings already.
+            servers = [m.name for m in self._fleet.members.values() if not (m.leaving or m.out)]
+            await self._wait_until_healthy(servers)
             self.backend_servers.standby.close()
             for number, old in enumerate(servers, 1):
                 self._emit("roll-step", server=old, number=number, of=len(servers))
@@ -570,6 +573,10 @@ class LocalPlatform:
 
     async def _begin_rosbridge(self, previous: PlatformState | None) -> None:
         """Start the rosbridge server, or adopt the one of *previous* if the balancer that it knows lives."""
+        if not self.load_balancer.loopback_port:
+            # The balancer was started without rosbridge, or by an earlier release, and keeps its listeners.
+            self._emit("rosbridge-failed", name="rosbridge", error="the platform has to be restarted for it")
+            return
         url = f"ws://{_LOOPBACK}:{self.load_balancer.loopback_port}{ROBOTS_PATH}"
         self._rosbridge = local_rosbridge_server(self.settings, url=url, **self._single_options)
         earlier = None if previous is None else previous.rosbridge_server

@@ -13,12 +13,15 @@ from rse_pf.errors import UsageError
 
 __all__ = ["SettingsChange", "settings_change"]
 
-_OF_OTHER_PROGRAMS = ("batch.", "cloud.")
-"""Groups that no process of a local platform reads."""
+_UNUSED = (
+    "batch.", "cloud.", "serving.port", "serving.control_port", "serving.control_host", "data.port",
+    "data.host",
+)  # fmt: skip
+"""Groups and settings that no process of a local platform reads: it chooses addresses itself."""
 _OF_OPTIONS = frozenset(
     (
         "local.servers", "local.port", "local.metrics_port", "recording.folder", "services.folder",
-        "services.accept_weak_isolation", "burst.url",
+        "services.accept_weak_isolation", "serving.rosbridge", "burst.url",
     )
 )  # fmt: skip
 """Options of the start may have set these: they keep their values unless the file sets another one."""
@@ -45,13 +48,13 @@ def settings_change(running: PlatformSettings, wanted: PlatformSettings) -> Sett
     """
     before = _values(running)
     defaults = _values(PlatformSettings())
-    changed = {
+    others = {
         name: value
         for name, value in _values(wanted).items()
-        if value != before[name]
-        and not name.startswith(_OF_OTHER_PROGRAMS)
-        and not (name in _OF_OPTIONS and value == defaults[name])
+        if value != before[name] and not name.startswith(_UNUSED)
     }
+    unset = [name for name, value in others.items() if name in _OF_OPTIONS and value == defaults[name]]
+    changed = {name: value for name, value in others.items() if name not in unset}
     if not changed:
         raise UsageError(
             "the file changes no setting of the platform that runs: no server was replaced",
@@ -67,8 +70,9 @@ def settings_change(running: PlatformSettings, wanted: PlatformSettings) -> Sett
     for name, value in changed.items():
         group, _, setting = name.partition(".")
         groups.setdefault(group, {})[setting] = value
-    words = tuple(f"{name} = {value!r} (was {before[name]!r})" for name, value in changed.items())
-    return SettingsChange(settings=running.replace(**groups), words=words)
+    words = [f"{name} = {value!r} (was {before[name]!r})" for name, value in changed.items()]
+    words += [f"{name} stays {before[name]!r}, which the file does not set" for name in unset]
+    return SettingsChange(settings=running.replace(**groups), words=tuple(words))
 
 
 def _values(settings: PlatformSettings) -> dict[str, object]:

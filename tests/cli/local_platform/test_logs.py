@@ -55,7 +55,17 @@ def test_lines_of_all_processes_are_in_the_order_of_their_times(folder: Path) ->
 
 def test_a_level_and_a_server_choose(folder: Path) -> None:
     assert events(last_lines(log_files(folder, None), LogFilter(level="error"), 10)) == ["defect"]
-    assert events(last_lines(log_files(folder, "server-2"), ALL_LINES, 10)) == ["command", "a"]
+    of_server = LogFilter(process="server-2")
+    assert events(last_lines(log_files(folder, "server-2"), of_server, 10)) == ["command", "a"]
+
+
+def test_lines_about_a_server_are_chosen_with_its_own_and_rotated_logs_are_read(folder: Path) -> None:
+    (folder / "data-1.log").write_text(line(40, "server-gone", server="server-2"))
+    (folder / "server-2.log.1").write_text(line(5, "earlier"))
+    found = last_lines(log_files(folder, None), LogFilter(process="server-2", since_s=0.0), 1)
+
+    assert events(found) == ["earlier", "command", "a", "server-gone"]
+    assert {each.source for each in found} == {"server-2", "data-1"}
 
 
 def test_a_line_shows_its_fields_and_the_end_of_a_traceback(folder: Path) -> None:
@@ -113,7 +123,7 @@ def chosen(folder: Path, **wanted: object) -> list[str]:
 
 
 def test_what_the_control_plane_did_is_among_the_lines_with_the_level_of_its_kind(with_events: Path) -> None:
-    found = last_lines(log_files(with_events, "control-plane"), ALL_LINES, 10)
+    found = last_lines(log_files(with_events, None), LogFilter(process="control-plane"), 10)
 
     assert [(line.level, line.text) for line in found] == [
         ("info", "server-healthy server=server-2 pid=7"),
@@ -127,11 +137,14 @@ def test_time_robot_and_tenant_choose_lines(with_events: Path) -> None:
     assert chosen(with_events, tenant="default") == ["robot-online"]
     many = [line(40 + number / 1e3, "drain") for number in range(200)]
     (with_events / "server-3.log").write_text("".join(many))
-    assert len(last_lines(log_files(with_events, "server-3"), LogFilter(since_s=40.0), 10)) == len(many)
+    assert len(
+        last_lines(log_files(with_events, "server-3"), LogFilter(since_s=40.0, process="server-3"), 10)
+    ) == len(many)
 
 
 def test_a_line_as_json_has_its_fields_its_time_and_its_source(with_events: Path) -> None:
-    found = last_lines(log_files(with_events, "server-2"), ALL_LINES, 10)
+    lines = last_lines(log_files(with_events, None), ALL_LINES, 20)
+    found = [each for each in lines if each.source == "server-2"]
 
     command = line_document(found[0])
     assert (command["time"], command["source"], command["event"]) == (20.0, "server-2", "command")

@@ -79,10 +79,11 @@ def test_maps_of_one_tenant_are_restored_with_all_versions_elsewhere(
     before = contents(store)
 
     said = run(capsys, "map backup acme.maps --tenant acme --name default")
-    assert "2 maps of tenant 'acme' backed up in acme.maps" in said
+    assert "2 maps of tenant 'acme' in dir:" in said
+    assert "objects backed up in acme.maps" in said
     said = run(capsys, "map restore acme.maps --tenant acme --name lab")
 
-    assert "2 maps of tenant 'acme' restored: 3 versions written" in said
+    assert "objects: 3 versions written" in said
     assert without_account(contents(lab)) == before
     assert contents(lab, "beta") == {}
     assert charged_to(lab, ROBOT).charged_bytes == 5000
@@ -110,6 +111,18 @@ def test_lost_versions_come_back_and_later_ones_stay(capsys: Capture, store: Dir
     assert maps.head("hall").id == old.id
     assert maps.data("hall", newer)
     assert maps.data("attic")
+
+
+def test_a_head_whose_record_was_lost_is_replaced(capsys: Capture, store: DirectoryStore) -> None:
+    maps = MapRegistry(store, "acme")
+    old = maps.head("hall").id
+    run(capsys, "map backup acme.maps --tenant acme")
+    lost = commit(store, "hall", 5)
+    store.delete(next(info.name for info in store.list() if info.name.endswith(f"versions/{lost}")))
+
+    run(capsys, "map restore acme.maps --tenant acme --overwrite")
+
+    assert maps.head("hall").id == old
 
 
 def test_maps_in_a_bucket_are_backed_up_and_restored(capsys: Capture, cloud: Any) -> None:

@@ -197,7 +197,7 @@ def test_maps_of_a_named_platform_are_found_whether_it_runs_or_not(
     assert "there is no platform 'nowhere'" in error
     assert "default, lab" in error
     assert main(["map", "list", "--name", "lab", "--store", "dir:x"]) == 2
-    assert "both name a store" in capsys.readouterr().err
+    assert "name two stores" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("name", ["", "Hall", "a/b", "hall\nx", "../x", "h" * 65])

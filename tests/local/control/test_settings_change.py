@@ -17,7 +17,11 @@ def test_options_of_the_start_stay_unless_the_file_sets_another_value() -> None:
     change = settings_change(RUNNING, PlatformSettings().replace(session={"max_in_flight": 4}))
 
     assert change.settings == RUNNING.replace(session={"max_in_flight": 4})
-    assert change.words == ("session.max_in_flight = 4 (was 8)",)
+    assert change.words == (
+        "session.max_in_flight = 4 (was 8)",
+        "services.folder stays '/installed', which the file does not set",
+        "local.servers stays 3, which the file does not set",
+    )
     other = settings_change(RUNNING, PlatformSettings().replace(services={"folder": "/others"}))
     assert other.settings.services.folder == "/others"
 
@@ -26,6 +30,7 @@ def test_options_of_the_start_stay_unless_the_file_sets_another_value() -> None:
     ("changes", "said"),
     [
         ({}, "changes no setting"),
+        ({"serving": {"port": 9000}, "data": {"port": 9001}}, "changes no setting"),
         ({"cloud": {"region": "eu-central-1"}, "batch": {"workers": 3}}, "changes no setting"),
         ({"local": {"port": 9000}}, "local.port needs a restart"),
         (
