@@ -11,6 +11,7 @@ import logging
 import os
 import signal
 import socket
+import time
 from functools import partial
 from http import HTTPStatus
 from pathlib import Path
@@ -19,8 +20,8 @@ from urllib.parse import urlsplit
 from websockets.asyncio.server import Server, ServerConnection, serve
 from websockets.http11 import Request, Response
 
-from rse_pf.auth.claimed import source_address
 from rse_pf.auth.origins import ORIGIN_HINT, AllowedOrigins, carried_token
+from rse_pf.backend.gateway.rate_limits import SourceRates
 from rse_pf.config import PlatformSettings
 from rse_pf.config.resource_names import HEALTH_PATH, ROSBRIDGE_PATH
 from rse_pf.errors import ConfigurationError, UsageError
@@ -34,6 +35,9 @@ from rse_pf.wire.server_session import CLOSE_GOING_AWAY, CLOSE_TOKEN_OVER
 
 __all__ = ["open_rosbridge", "serve_rosbridge"]
 
+# Of one address, after a burst.  The platform sees the handshakes of all clients as those of one address, and
+# allows it ten times as many: nobody can use up what the others need.
+_HANDSHAKES_PER_S = 20.0
 _TOKEN_S = 5.0  # from the handshake to a token that the platform has accepted
 
 
@@ -47,6 +51,8 @@ class _Clients:
         live = LIVE_REQUESTS if settings.data.enabled else ()
         self._services = tuple(sorted((*builtin_services(settings).names, *live)))
         serving = settings.serving
+        rate = min(_HANDSHAKES_PER_S, serving.max_handshakes_per_source_per_s)
+        self._rates = SourceRates(settings.replace(serving={"max_handshakes_per_source_per_s": rate}).serving)
         self._silent: SilentConnections[ServerConnection] = SilentConnections(
             call_later=asyncio.get_running_loop().call_later, seconds=_TOKEN_S,
             most=serving.max_unauthenticated, most_per_source=serving.max_unauthenticated_per_source,
@@ -64,6 +70,10 @@ class _Clients:
         if not self._origins.allows(headers.get("Origin", ""), headers.get("Host", "")):
             text = f"web pages of this origin are not allowed; {ORIGIN_HINT}\n"
             return connection.respond(HTTPStatus.FORBIDDEN, text)
+        if self._rates.wait_s(self._source(connection, request), time.monotonic()) > 0:
+            return connection.respond(
+                HTTPStatus.TOO_MANY_REQUESTS, "too many connections of this address: try again later\n"
+            )
         if len(connection.server.connections) > self._settings.serving.max_robots:
             return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, "too many clients: try again later\n")
         return None
@@ -72,19 +82,23 @@ class _Clients:
         """Serve one client whose handshake is done."""
         assert connection.request is not None
         headers = connection.request.headers
-        peer = str(connection.remote_address[0])
-        forwarded = ",".join(headers.get_all("X-Forwarded-For"))
-        source = source_address(peer, forwarded, self._settings.serving.trusted_proxies)
         offered = ",".join(headers.get_all("Sec-WebSocket-Protocol")).replace(" ", "").split(",")
         client = Client(
             connection, url=self._url, token=carried_token(headers.get("Authorization", ""), offered),
             topics=self._topics, services=self._services, session=self._settings.session,
         )  # fmt: skip
-        self._silent.enter(connection, partial(self._cut, connection), source)
+        self._silent.enter(
+            connection, partial(self._cut, connection), self._source(connection, connection.request)
+        )
         try:
             await client.serve(lambda: self._silent.leave(connection))
         finally:
             self._silent.leave(connection)
+
+    def _source(self, connection: ServerConnection, request: Request) -> str:
+        """Return the address of a client."""
+        forwarded = ",".join(request.headers.get_all("X-Forwarded-For"))
+        return self._rates.source(str(connection.remote_address[0]), forwarded)
 
     def _cut(self, connection: ServerConnection) -> None:
         task = asyncio.ensure_future(connection.close(CLOSE_TOKEN_OVER, "no token was accepted in time"))

@@ -146,6 +146,24 @@ async def test_who_shows_no_token_is_closed_and_bounded_for_each_address(server:
         assert [await each.close_code() for each in (*near[1:], far)] == [4401] * 3
 
 
+async def test_one_address_has_its_own_rate_of_handshakes(server: GuardedServer) -> None:
+    async with opened(server) as bridge:
+        port = int(bridge.url.split(":")[2].partition("/")[0])
+
+        async def status(source: str) -> str:
+            reader, writer = await asyncio.open_connection("127.0.0.1", port)
+            writer.write(f"GET /rosbridge HTTP/1.1\r\nHost: x\r\nX-Forwarded-For: {source}\r\n\r\n".encode())
+            line = await reader.readline()
+            writer.close()
+            return line.decode().split()[1]
+
+        seen = [await status("10.0.0.1") for _ in range(1200)]
+
+        assert seen[0] != "429"
+        assert "429" in seen[1000:]
+        assert await status("10.0.0.2") == seen[0]
+
+
 @pytest.mark.slow
 async def test_a_client_outlives_its_token_by_a_fresh_one_and_ends_with_it(server: GuardedServer) -> None:
     async with opened(server) as bridge:
