@@ -16,6 +16,7 @@ from client_sdk.robot import MAX_DEADLINE_S, Robot, connect
 from client_sdk.stats import Stats
 from client_sdk.updates import BlockingUpdates, Updates
 from rse_pf.errors import Disconnected, RsePfError, UsageError
+from rse_pf.wire import Welcome
 
 if TYPE_CHECKING:
     import numpy as np
@@ -130,6 +131,11 @@ class BlockingRobot(Closing):
     def connected(self) -> bool:
         """Whether there is a connection to a server now; without one, commands wait for the next."""
         return self._robot.connected
+
+    @property
+    def welcome(self) -> Welcome | None:
+        """As `Robot.welcome`."""
+        return self._robot.welcome
 
     @property
     def failure(self) -> RsePfError | None:

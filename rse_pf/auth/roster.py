@@ -306,5 +306,8 @@ def check_quotas(quotas: dict[str, float]) -> dict[str, float]:
         if name not in QUOTAS:
             raise UsageError(f"{name[:80]!r} is not a quota", hint=f"known are {', '.join(QUOTAS)}")
         if not (math.isfinite(limit) and limit > 0):
-            raise UsageError(f"the quota {name} = {limit:g} is not above 0", hint="disable the robot instead")
+            raise UsageError(
+                f"the quota {name} = {limit:g} is not above 0",
+                hint="write a number of bytes, or disable the robot",
+            )
     return quotas

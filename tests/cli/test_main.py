@@ -14,8 +14,9 @@ from rse_pf.cli.main import VERBS, main
 from rse_pf.config import PlatformSettings
 
 EMPTY = [
-    "demo", "check", "compare", "experiment", "local", "fleet", "swarm", "token", "robot", "service", "serve",
-    "data", "rosbridge", "camera", "map", "batch", "replay", "audit", "cloud", "settings", "doctor", "errors",
+    "demo", "check", "compare", "experiment", "local", "fleet", "swarm", "token", "tenant", "robot",
+    "service", "serve", "data", "rosbridge", "camera", "map", "batch", "replay", "audit", "cloud", "settings",
+    "doctor", "errors",
 ]  # fmt: skip
 HELP_S = 0.3
 

@@ -186,7 +186,11 @@ def test_every_stack_is_created_and_what_moto_made_equals_the_settings(
         data = next(each for each in targets if each.get("Port") == settings.data.port)
         assert data["HealthCheckPath"] == "/data/healthz"
     assert robots["UnhealthyThresholdCount"] == settings.health.unhealthy_checks
-    assert len(targets) == len(group["TargetGroupARNs"]) == (2 if settings.data.enabled else 1)
+    assert (
+        len(targets)
+        == len(group["TargetGroupARNs"])
+        == 1 + settings.data.enabled + settings.serving.rosbridge
+    )
     (balancer,) = elb.describe_load_balancers()["LoadBalancers"]
     (listener,) = elb.describe_listeners(LoadBalancerArn=balancer["LoadBalancerArn"])["Listeners"]
     expected = ("HTTP", 80) if settings.cloud.allow_insecure else ("HTTPS", 443)

@@ -23,7 +23,7 @@ from rse_pf.identity import DEFAULT_TENANT
 __all__ = [
     "NOT_ENROLLED_HINT", "add_place", "add_platform", "choose_robot", "described", "format_time",
     "max_token_s", "open_access_control", "read_quotas", "record_action",
-    "tenant_or_default",
+    "tenant_or_default", "which_platform",
 ]  # fmt: skip
 
 NOT_ENROLLED_HINT = (
@@ -36,7 +36,7 @@ def add_place(parser: argparse.ArgumentParser) -> None:
     """Declare which tenant is meant, and which platform."""
     parser.add_argument(
         "--tenant",
-        help=f"whose robot (default: {DEFAULT_TENANT}, if no other tenant has a robot of this name)",
+        help=f"tenant of the robot (default: {DEFAULT_TENANT}; to be named if another one has such a robot)",
     )
     add_platform(parser)
 
@@ -109,6 +109,13 @@ def described(robot: str, tenant: str) -> str:
     return f"robot {robot!r} of tenant {tenant!r}"
 
 
+def which_platform(args: argparse.Namespace) -> str:
+    """Return the option that names the platform of *args* in another command, after a space."""
+    if args.cloud:
+        return " --cloud"
+    return "" if args.name == _PLATFORM else f" --name {args.name}"
+
+
 def format_time(time_s: float) -> str:
     """Return a Unix time as messages have it."""
     return time.strftime("%Y-%m-%d %H:%M:%SZ", time.gmtime(time_s))
@@ -128,7 +135,10 @@ def open_access_control(args: argparse.Namespace, settings: PlatformSettings) ->
 
     folder = state_folder(args.name, os.environ)
     if not key_set_file(folder).exists():
-        raise UsageError(f"there is no platform {args.name!r}", hint="start one with rse-pf local")
+        known = ", ".join(sorted(each.name for each in folder.parent.glob("*/"))) or "none"
+        raise UsageError(
+            f"there is no platform {args.name!r}", hint=f"start one with rse-pf local; known: {known}"
+        )
     return access_control_store(folder)
 
 

@@ -117,7 +117,7 @@ def _json_line(who: str, entry: Entry) -> str:
 
 def _line(who: str, entry: Entry) -> str:
     try:
-        when = datetime.fromtimestamp(entry.time, timezone.utc).strftime("%Y-%m-%d %H:%M:%S")
+        when = datetime.fromtimestamp(entry.time, timezone.utc).strftime("%Y-%m-%d %H:%M:%SZ")
     except (OverflowError, ValueError, OSError):  # somebody changed the file
         when = f"time={entry.time!r}"
     actor = [] if entry.actor == who else [f"by {_word(entry.actor)}"]

@@ -54,6 +54,7 @@ from rse_pf.cli.access.access_control import (
     read_quotas,
     record_action,
     tenant_or_default,
+    which_platform,
 )
 from rse_pf.cli.access.enrolment import enrolment_lines, make_enrolment
 from rse_pf.config import PlatformSettings
@@ -254,7 +255,7 @@ def _disable(args: argparse.Namespace, access: AccessControlStore, settings: Pla
     who = described(robot, tenant)
     show(
         f"{who} is disabled: its connections end within 2 s, and all its tokens are refused",
-        f"to let it in again:  rse-pf robot enable {robot} --tenant {tenant}",
+        f"to let it in again:  rse-pf robot enable {robot} --tenant {tenant}{which_platform(args)}",
     )
     return 0
 

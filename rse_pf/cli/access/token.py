@@ -42,6 +42,7 @@ from rse_pf.cli.access.access_control import (
     open_access_control,
     record_action,
     tenant_or_default,
+    which_platform,
 )
 from rse_pf.config import PlatformSettings
 from rse_pf.config.resource_names import ResourceNames
@@ -169,10 +170,12 @@ def _revoke_all(args: argparse.Namespace, settings: PlatformSettings) -> int:
         lambda denied: denied.pruned(now=now, max_token_s=longest).with_tokens_before(tenant, robot, from_s)
     )
     record_action(args, settings, "token.revoked-all", robot, tenant=tenant)
+    others = f"{' --not-enrolled' if args.not_enrolled else ''}{which_platform(args)}"
     show(
         f"tokens of {described(robot, tenant)} from before {format_time(from_s)} are refused, and their "
         "connections end within 2 s",
-        f"later tokens are valid; to keep the robot out:  rse-pf robot disable {robot} --tenant {tenant}",
+        "later tokens are valid; to keep the robot out:  "
+        f"rse-pf robot disable {robot} --tenant {tenant}{others}",
     )
     return 0
 

@@ -67,7 +67,7 @@ class LogLine:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LogFilter:
     """Which lines are wanted: least level, earliest Unix time, robot, tenant, and the process that wrote a
-    line or that it is about; an empty name is any.
+    line or that it is about; an empty name is any.  What befell a server concerns every tenant.
     """
 
     level: str = "debug"
@@ -83,7 +83,7 @@ class LogFilter:
             (line.level not in LEVELS or LEVELS.index(line.level) >= LEVELS.index(self.level))
             and line.time_s >= self.since_s
             and self.robot in ("", line.fields.get("robot"))
-            and self.tenant in ("", line.fields.get("tenant"))
+            and (self.tenant in ("", line.fields.get("tenant")) or _concerns_all(line))
             and self.process in ("", line.source, line.fields.get("server"), line.fields.get("name"))
             and (not self.events_only or _is_event(line))
         )
@@ -201,6 +201,10 @@ class LogFollower:
         self._read[file] = at + len(data)
         whole, _, self._rest[file] = (self._rest.get(file, b"") + data).rpartition(b"\n")
         return list(_parse(file, whole, self._wanted))
+
+
+def _concerns_all(line: LogLine) -> bool:
+    return line.source == CONTROL_PLANE and "tenant" not in line.fields
 
 
 def _is_event(line: LogLine) -> bool:

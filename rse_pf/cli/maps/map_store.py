@@ -13,6 +13,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+from rse_pf.accounts import TenantAccount
 from rse_pf.audit.operator import record_map_change
 from rse_pf.aws.storage import open_data_store
 from rse_pf.config import PlatformSettings
@@ -123,9 +124,11 @@ def keep_map(
     """Make *data* the next version of a map; return ``store`` and ``map`` as ``map export`` takes them.
 
     Raises:
+        QuotaExceeded: The tenant would store more than its quota.
         RsePfError: It was not kept.
     """
     maps = open_maps(settings, tenant)
+    TenantAccount(open_data_store(settings), tenant, settings.data).reserve(len(data))
     try:
         parent = maps.head(name).id
     except NotFound:

@@ -39,7 +39,7 @@ def test_show_prints_all_logs_in_the_order_of_time(folder: Path, capsys: Capture
     assert [line.split()[2:4] for line in lines] == [
         ["server-1", "auth.accepted"], ["operator", "robot.disabled"], ["server-1", "auth.refused"],
     ]  # fmt: skip
-    assert lines[0].startswith("2001-09-09 01:46:40 server-1 auth.accepted robot-1 reason=")
+    assert lines[0].startswith("2001-09-09 01:46:40Z server-1 auth.accepted robot-1 reason=")
 
 
 def test_show_cannot_be_made_to_write_control_characters(folder: Path, capsys: Capture):
