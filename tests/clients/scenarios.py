@@ -327,7 +327,7 @@ async def deadline(bench: Bench, driver: Driver, link: Link, robot: str) -> dict
 @scenario("newest", "of the commands of a stream that wait, the newest is answered")
 async def newest(bench: Bench, driver: Driver, link: Link, robot: str) -> dict[str, Any]:
     await driver.ready()
-    await stall(bench)
+    await stall(bench, 0.9)  # longer than a client's pause between two bursts
     figures = figures_of(await driver.done())
     must(figures["codes"].get("stale", 0) >= 1, f"codes {figures['codes']}")
     must(figures.get("newest_ok", True) is True, "the newest was not answered")
