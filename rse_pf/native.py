@@ -55,7 +55,9 @@ PART_ABIS = {"check": 2, "cloud": 1, "depth": 1, "match": 4, "stereo": 1, "track
 _FILE = "librse_pf_native.so"
 _LANES = {"avx512": 0, "avx2": 4, "portable": 1}
 # rse_pf_pnp_request: abi, flags, rows | points, pixels | pose | camera, options.
-_HEAD, _ARRAYS, _POINTER = struct.Struct("=IIq"), struct.Struct("=QQ"), struct.Struct("=Q")
+_HEAD = struct.Struct("=IIq")
+_ARRAYS = struct.Struct("=QQ")
+_POINTER = struct.Struct("=Q")
 _BODY = struct.Struct("=Qddddiiddiidddd")
 _BODY_AT = _HEAD.size + _ARRAYS.size
 _REQUEST_BYTES = _BODY_AT + _BODY.size
@@ -67,7 +69,8 @@ _COVARIANCE_AT = _POSE_AT + 16 * 8
 _UPPER_AT = _COVARIANCE_AT + 36 * 8
 _RESULT_BYTES = _UPPER_AT + 22 * 4
 # rse_pf_lists: numbers, room | count, ends | rest.
-_FOUND, _FOUND_AT = struct.Struct("=qqqq"), 16
+_FOUND = struct.Struct("=qqqq")
+_FOUND_AT = 16
 _MAX_REST_BYTES = 1024
 _MAX_NUMBERS = 30_000  # of 5,000 matches with depths
 _STATUSES_WITHOUT_EVIDENCE = (1, 2, 3, 11)

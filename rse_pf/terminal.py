@@ -16,6 +16,7 @@ from __future__ import annotations
 import json
 import re
 import sys
+import time
 import unicodedata
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -27,6 +28,7 @@ __all__ = [
     "at_work",
     "counted",
     "error_lines",
+    "format_time",
     "json_line",
     "printable",
     "show",
@@ -61,6 +63,11 @@ def printable(text: str) -> str:
 def counted(number: float, noun: str, plural: str = "") -> str:
     """Return *number* with *noun* in the singular or plural: ``1 robot``, ``2 robots``, ``0 entries``."""
     return f"{number:g} {noun}" if number == 1 else f"{number} {plural or f'{noun}s'}"
+
+
+def format_time(time_s: float) -> str:
+    """Return a Unix time as date and time in UTC."""
+    return time.strftime("%Y-%m-%d %H:%M:%SZ", time.gmtime(time_s))
 
 
 def show(*lines: str, error: bool = False) -> None:

@@ -28,7 +28,7 @@ __all__ = ["pnp_reader"]
 
 Part = TypeVar("Part")
 
-# The name of the service is within so many bytes, before the payload.
+# Only here is the name of the service sought: clients of ours write it before the payload.
 _HEAD_BYTES = 128
 _UNREADABLE = (msgspec.DecodeError, RecursionError, ValueError, TypeError, IndexError, RsePfError)
 

@@ -35,7 +35,7 @@ async def test_a_call_reaches_the_service_and_the_answer_has_its_id_and_spelling
         (call(args={"value": 1}, timeout=1e-5), "expired"),
         (call(args={"value": float("nan")}), "bad-message"),
         (call(args={"value": json.loads("[" * 40 + "]" * 40)}), "too-large"),
-        (call(args=json.loads("[" + "4e-324," * 999 + "0]")), "too-large"),
+        (call("/rosapi/topics", args=json.loads("[" + "4e-324," * 999 + "0]")), "too-large"),
         (call(timeout="soon"), "bad-message"),
         (call("/rosapi/get_time"), "unknown-service"),
         (call("/rosapi/service_type", args={"service": 3}), "bad-request"),
@@ -75,9 +75,12 @@ async def test_a_client_without_a_token_is_closed_after_a_few_messages_or_a_long
 ) -> None:
     async with opened(server) as bridge:
         many, long = await bridge.open(), await bridge.open()
-        await many.send(*['{"op":"x","id":"\\ud800"}'] * 10)
+        await many.send(*['{"op":"x","id":"\\ud800"}'] * 12)
         await long.send(call(args={"value": "x" * 9000}))
 
+        assert (await long.receive())["op"] == "status", "it was not read as a call"
+        refusals = [await many.receive() for _ in range(11)]
+        assert refusals[-1]["msg"].startswith("unauthorized: no token was sent;"), "after ten messages"
         assert [await each.close_code() for each in (many, long)] == [4401, 4401]
 
 

@@ -147,6 +147,7 @@ CHANGES = {
     "a null camera": (CAMERA, "null"),
     "no camera": ('"camera":' + CAMERA + ",", ""),
     "a stream": ('"id":7', '"id":7,"stream":"a b","seq":4,"keep":true'),
+    "a list for a stream": ('"id":7', '"id":7,"stream":[1,2]'),
     "a stream beyond ASCII": ('"id":7', '"id":7,"stream":"\u00e9\U0001f916"'),
     "a long stream": ('"id":7', '"id":7,"stream":"' + 65 * "x" + '"'),
     "the longest stream": ('"id":7', '"id":7,"stream":"' + 64 * "x" + '"'),

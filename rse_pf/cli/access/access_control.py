@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import time
 from collections.abc import Iterable
 
 from rse_pf.audit.entry import Value
@@ -21,7 +20,7 @@ from rse_pf.errors import UsageError
 from rse_pf.identity import DEFAULT_TENANT
 
 __all__ = [
-    "NOT_ENROLLED_HINT", "add_place", "add_platform", "choose_robot", "described", "format_time",
+    "NOT_ENROLLED_HINT", "add_place", "add_platform", "choose_robot", "described",
     "max_token_s", "open_access_control", "read_quotas", "record_action",
     "tenant_or_default", "which_platform",
 ]  # fmt: skip
@@ -114,11 +113,6 @@ def which_platform(args: argparse.Namespace) -> str:
     if args.cloud:
         return " --cloud"
     return "" if args.name == _PLATFORM else f" --name {args.name}"
-
-
-def format_time(time_s: float) -> str:
-    """Return a Unix time as messages have it."""
-    return time.strftime("%Y-%m-%d %H:%M:%SZ", time.gmtime(time_s))
 
 
 def open_access_control(args: argparse.Namespace, settings: PlatformSettings) -> AccessControlStore:

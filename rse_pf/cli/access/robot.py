@@ -48,7 +48,6 @@ from rse_pf.cli.access.access_control import (
     add_place,
     choose_robot,
     described,
-    format_time,
     max_token_s,
     open_access_control,
     read_quotas,
@@ -59,7 +58,7 @@ from rse_pf.cli.access.access_control import (
 from rse_pf.cli.access.enrolment import enrolment_lines, make_enrolment
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError
-from rse_pf.terminal import show, show_json
+from rse_pf.terminal import format_time, show, show_json
 
 __all__ = ["add_arguments", "run"]
 

@@ -37,7 +37,6 @@ from rse_pf.cli.access.access_control import (
     add_place,
     choose_robot,
     described,
-    format_time,
     max_token_s,
     open_access_control,
     record_action,
@@ -49,7 +48,7 @@ from rse_pf.config.resource_names import ResourceNames
 from rse_pf.errors import ConfigurationError, Unauthorized, UsageError
 from rse_pf.files import OWNER_ONLY, replace_file
 from rse_pf.identity import DEFAULT_TENANT
-from rse_pf.terminal import show, show_json
+from rse_pf.terminal import format_time, show, show_json
 
 if TYPE_CHECKING:
     from rse_pf.aws.storage.key_store import KeyStore

@@ -47,7 +47,7 @@ from rse_pf.config import PlatformSettings
 from rse_pf.errors import NotFound, UsageError
 from rse_pf.maps.registry import MapOrigin, MapRecord, MapRegistry, difference
 from rse_pf.maps.removal import freed_bytes, superseded
-from rse_pf.terminal import at_work, counted, show, show_json
+from rse_pf.terminal import at_work, counted, format_time, show, show_json
 
 if TYPE_CHECKING:
     pass
@@ -229,7 +229,7 @@ def _show(args: argparse.Namespace, maps: MapRegistry) -> None:
         *_rows(
             ("version", f"{record.number}  {record.id}"),
             ("parent", record.parent or "-"),
-            ("made by", f"{record.author}, {_format_time(record.created_s)}  {record.note}".rstrip()),
+            ("made by", f"{record.author}, {format_time(record.created_s)}  {record.note}".rstrip()),
             ("keyframes", f"{record.keyframes}  ({_counts(robots)})"),
             ("edges", f"{record.edges}  ({_counts(kinds)})"),
             ("points", record.points),
@@ -350,7 +350,7 @@ def _record_line(record: MapRecord) -> str:
             counted(record.points, "point"),
         )
     )
-    columns = (f"{record.number:>4}", record.id[:_SHORT], _format_time(record.created_s), counts, record.note)
+    columns = (f"{record.number:>4}", record.id[:_SHORT], format_time(record.created_s), counts, record.note)
     return "  ".join(columns).rstrip()
 
 
@@ -364,10 +364,6 @@ def _counts(counted: Counter[str]) -> str:
 
 def _shorten(text: str) -> str:
     return text if len(text) <= _MAX_VALUE else f"{text[:_MAX_VALUE]} ... (whole with --json)"
-
-
-def _format_time(created_s: float) -> str:
-    return time.strftime("%Y-%m-%d %H:%M:%SZ", time.gmtime(created_s))
 
 
 def _rows(*rows: tuple[str, object]) -> list[str]:

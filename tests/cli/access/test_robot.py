@@ -224,6 +224,17 @@ def _claims(robot: str) -> Claims:
     return Claims(robot=RobotId("default", robot), token_id="t", issued_s=1.0, expires_s=2.0, key_id="k")
 
 
+def test_the_next_command_that_is_named_is_for_the_same_platform(capsys: Capture, platform: Path) -> None:
+    platform.rename(platform.with_name("lab"))
+    lab = ("--not-enrolled", "--name", "lab")
+
+    disabled = said(capsys, "robot", "disable", "robot-1", *lab)
+    next_one = disabled.partition("to let it in again:  rse-pf ")[2].split()
+    assert "enabled again" in said(capsys, *next_one)
+    revoked = said(capsys, "token", "revoke", "--all-of", "robot-1", *lab)
+    assert "is disabled" in said(capsys, *revoked.partition("to keep the robot out:  rse-pf ")[2].split())
+
+
 def test_a_disabled_robot_of_another_tenant_is_enabled_only_with_its_tenant(
     capsys: Capture, platform: Path
 ) -> None:

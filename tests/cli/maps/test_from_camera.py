@@ -20,9 +20,11 @@ from client_sdk.frontend import TrackedFrame
 from client_sdk.mapper import Mapper, ask_robot
 from client_sdk.mapping import Trajectory, read_ply, read_trajectory, write_trajectory
 from client_sdk.rigs.intrinsics import Intrinsics, write_intrinsics
+from rse_pf.accounts import set_own_quota
 from rse_pf.cli.main import main
 from rse_pf.cli.maps import from_camera
 from rse_pf.cli.maps.frame_table import FrameTable
+from rse_pf.object_store import DirectoryStore
 from rse_pf.pnp import refine_with_depth, solve_pnp
 from tests.client_sdk.mapper.flat_world import CAMERA, STEP_M, frame_at
 
@@ -135,6 +137,21 @@ def test_a_source_that_fails_keeps_what_was_mapped(folder: Path, capsys: pytest.
     assert "finding ended-early: the source failed after 4 frames, which are kept" in shown.out
     assert "is 32x24 px, the camera of the recording 320x240 px" in shown.err
     assert len(read_trajectory(folder / "out/trajectory.txt")) == 4
+
+
+def test_a_map_above_the_quota_of_its_tenant_is_not_kept_and_the_drive_is(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    truth = Trajectory(np.arange(6) * 0.1, np.tile(np.eye(4), (6, 1, 1)))
+    write_tum(folder / "drive", [frame_at(row, depth=True) for row in range(6)], truth)
+    Path("objects").mkdir()
+    set_own_quota(DirectoryStore(Path("objects")), "acme", 1000)
+
+    main(["map", "from-camera", "drive", *PLATFORM, "--objects", "objects", "--tenant", "acme"])
+
+    assert "no map is kept: quota: the tenant 'acme' stores 0 bytes" in capsys.readouterr().out
+    assert not list(Path("objects").glob("maps/acme/*"))
+    assert len(read_ply(Path("out-camera/map.ply"))[0]) > 100
 
 
 def test_a_finding_about_the_source_is_shown_once(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

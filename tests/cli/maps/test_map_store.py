@@ -176,6 +176,11 @@ def test_the_store_of_the_one_platform_that_runs_is_found(
     assert main(["map", "list"]) == 0
     assert "attic" in capsys.readouterr().out
 
+    replace(state, name="default").write(lab.with_name("default"))
+    assert main(["map", "list"]) == 2
+    assert "several platforms run on this machine: default, lab" in capsys.readouterr().err
+    (lab.with_name("default") / "platform.json").unlink()
+
     commit(tmp_path / "far", "cellar")
     settings = PlatformSettings().replace(data={"store": f"dir:{tmp_path}/far"})
     settings_file(lab).write_text(json.dumps({"context": {"rse-pf": settings.to_dict()}}))
