@@ -15,7 +15,9 @@ import numpy as np
 from fuzz import core_targets, live_targets, map_targets, stereo_targets
 from fuzz.checks import Target, TargetFailure, expect
 from fuzz.meter import Meter
-from rse_pf.backend.gateway.frames import (
+from rse_pf.config import PlatformSettings, SessionSettings
+from rse_pf.errors import InternalError, ProtocolError, RsePfError
+from rse_pf.server.gateway.frames import (
     MAX_CONTROL_PER_S,
     CloseBorder,
     CloseSocket,
@@ -24,8 +26,6 @@ from rse_pf.backend.gateway.frames import (
     Received,
     SendPong,
 )
-from rse_pf.config import PlatformSettings, SessionSettings
-from rse_pf.errors import InternalError, ProtocolError, RsePfError
 from rse_pf.service import Service, dispatch, request_of
 from rse_pf.services.builtin import builtin_services
 from rse_pf.services.pnp import PnpRequest

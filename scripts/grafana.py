@@ -14,8 +14,8 @@ from typing import Any
 from prometheus_client.metrics_core import Metric
 from prometheus_client.parser import text_string_to_metric_families
 
-from rse_pf.backend.metrics import GAUGE_HELP, Metrics, merge, render
 from rse_pf.local.control.federation import federate_pages
+from rse_pf.server.metrics import GAUGE_HELP, Metrics, merge, render
 
 __all__ = ["all_metrics", "dashboard", "main"]
 

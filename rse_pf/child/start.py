@@ -1,6 +1,6 @@
 """Start a child process, and end it.
 
-    child = start_child(ChildPlan(target="rse_pf.backend.jobs.process:run", name="rse-pf job", nice=10))
+    child = start_child(ChildPlan(target="rse_pf.server.jobs.process:run", name="rse-pf job", nice=10))
     child.say({"service": "map-optimise"})
     child.kill()
 

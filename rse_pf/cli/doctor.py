@@ -128,8 +128,8 @@ def _solver(settings: PlatformSettings) -> Iterator[Finding]:
 
 
 def _isolation(settings: PlatformSettings) -> Iterator[Finding]:
-    from rse_pf.backend.sandbox import isolation
-    from rse_pf.backend.sandbox.child import readable_paths
+    from rse_pf.server.sandbox import isolation
+    from rse_pf.server.sandbox.child import readable_paths
 
     def make_root() -> None:
         isolation.enter_namespaces()

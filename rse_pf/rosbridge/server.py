@@ -21,13 +21,13 @@ from websockets.asyncio.server import Server, ServerConnection, serve
 from websockets.http11 import Request, Response
 
 from rse_pf.auth.origins import ORIGIN_HINT, AllowedOrigins, carried_token
-from rse_pf.backend.gateway.rate_limits import SourceRates
 from rse_pf.config import PlatformSettings
 from rse_pf.config.resource_names import HEALTH_PATH, ROSBRIDGE_PATH
 from rse_pf.errors import ConfigurationError, UsageError
 from rse_pf.files import replace_json
 from rse_pf.rosbridge.client import Client
 from rse_pf.rosbridge.topics import Topics
+from rse_pf.server.gateway.rate_limits import SourceRates
 from rse_pf.services.builtin import builtin_services
 from rse_pf.silent_connections import BACKLOG, SilentConnections
 from rse_pf.wire.live_map import LIVE_REQUESTS

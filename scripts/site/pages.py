@@ -34,7 +34,7 @@ SDK = {
 """Section -> names of `client_sdk`; names that stand nowhere get a section of their own."""
 _MODULES = ("client_sdk.cameras", "rse_pf.geometry", "rse_pf.pnp", "rse_pf.auth.robot_key", "rse_pf.service")
 """Further modules whose public names a robot's program or a service uses."""
-_METRIC_SOURCES = ("rse_pf/backend/metrics.py", "rse_pf/local/control/federation.py")
+_METRIC_SOURCES = ("rse_pf/server/metrics.py", "rse_pf/local/control/federation.py")
 _FAMILIES = {
     "CounterMetricFamily": "counter",
     "GaugeMetricFamily": "gauge",

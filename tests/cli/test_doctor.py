@@ -140,7 +140,7 @@ def test_a_native_core_that_does_not_load_fails(monkeypatch: pytest.MonkeyPatch,
 def test_the_means_of_isolation_are_listed(
     monkeypatch: pytest.MonkeyPatch, missing: list[str], grade: str
 ) -> None:
-    monkeypatch.setattr("rse_pf.backend.sandbox.isolation.missing_isolation", lambda _: missing)
+    monkeypatch.setattr("rse_pf.server.sandbox.isolation.missing_isolation", lambda _: missing)
     told = only("isolation", findings())
 
     assert told.grade == grade

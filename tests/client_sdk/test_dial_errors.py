@@ -12,9 +12,9 @@ from client_sdk.network.dialling import dial_error_of, hide_password, unconnecte
 from client_sdk.network.probe import Probed
 from client_sdk.transfer.data_client import DataClient
 from rse_pf.auth.tokens import KeySet
-from rse_pf.backend.gateway.handshake import HandshakePolicy, HandshakeRequest, Rejected
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import ConnectError, Forbidden, Unauthorized, UsageError
+from rse_pf.server.gateway.handshake import HandshakePolicy, HandshakeRequest, Rejected
 from rse_pf.wire.refusal import refusal_body
 
 REFUSALS = [(401, "unauthorized", Unauthorized), (403, "forbidden", Forbidden)]

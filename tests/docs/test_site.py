@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 import client_sdk
-from rse_pf.backend.metrics import Metrics, merge, render
 from rse_pf.cli.main import VERBS
+from rse_pf.server.metrics import Metrics, merge, render
 from scripts.site.pages import cli_page, metrics_page, sdk_page
 
 MAX_CPU_S = 60.0

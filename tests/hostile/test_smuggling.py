@@ -20,10 +20,10 @@ from data_process import DataProcess
 from guarded_server import GuardedServer
 from hostile.smuggling_samples import HIDDEN, REFUSED, SAMPLES, put, upgrade
 
-from rse_pf.backend.gateway.rate_limits import SourceRates
 from rse_pf.config import PlatformSettings
 from rse_pf.local.balancer.envoy_config import DATA_CLUSTER, Target
 from rse_pf.local.balancer.load_balancer import EnvoyLoadBalancer
+from rse_pf.server.gateway.rate_limits import SourceRates
 
 pytestmark = pytest.mark.system
 

@@ -29,7 +29,7 @@ HARMLESS: Mapping[tuple[str, str], str] = {
     ("rse_pf/aws/fleet/instance.py", "B310"): "the instance's own metadata, a literal address",
     ("rse_pf/aws/money/leftovers.py", "B105"): "a sentence about the secret, not the secret",
     (
-        "rse_pf/backend/sandbox/isolation.py",
+        "rse_pf/server/sandbox/isolation.py",
         "B108",
     ): "what an environment does not see; its own scratch folder",
     ("rse_pf/cli/main.py", "B105"): "help of the verb named token",
@@ -57,7 +57,7 @@ NO_SECRETS: Mapping[tuple[str, str], str] = {
     ("rse_pf/aws/money/leftovers.py", "Secret Keyword"): "a sentence about the secret, not the secret",
     ("tests/aws/money/test_leftovers.py", "Secret Keyword"): "a name",
     (
-        "tests/backend/gateway/test_audit_recorder.py",
+        "tests/server/gateway/test_audit_recorder.py",
         "JSON Web Token",
     ): "made up, to be looked for in the audit log",
     ("client_cpp/tests/client_test.cpp", "Hex High Entropy String"): "the SHA-256 of 'abc', of FIPS 180-4",

@@ -8,13 +8,13 @@ import msgspec
 import numpy as np
 import pytest
 
-from rse_pf.backend.live_map.router import _check_keyframe, _request_of
 from rse_pf.errors import BadRequest, InternalError
 from rse_pf.geometry import Array, exp_se3, inverse, rigid, rigid_many
 from rse_pf.live_map.events import KeyframeAdded, LinksMeasured
 from rse_pf.live_map.live_map import LiveMap
 from rse_pf.live_map.versions import started_from
 from rse_pf.maps.format import decode_map, encode_map
+from rse_pf.server.live_map.router import _check_keyframe, _request_of
 from rse_pf.slam.keyframe import encode_keyframe
 from rse_pf.slam.optimise import OptimiseOptions
 from rse_pf.slam.pose_graph import PoseGraph

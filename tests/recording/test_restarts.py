@@ -11,11 +11,11 @@ from pathlib import Path
 
 import pytest
 
-from rse_pf.backend.supervisor.server_recording import ServerRecording
 from rse_pf.config import PlatformSettings
 from rse_pf.identity import RobotId
 from rse_pf.recording.recorder_process import RecorderPlan
 from rse_pf.recording.tap import LOST, OPENED, UP, Handed, PipeReader, RecordingTap, hand_pipe
+from rse_pf.server.supervisor.server_recording import ServerRecording
 
 ROBOT = RobotId("default", "robot-1")
 _DEADLINE_S = 10.0

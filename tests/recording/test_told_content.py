@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from backend.gateway.worker_parts import worker_parts
 from mcap.reader import make_reader
+from server.gateway.worker_parts import worker_parts
 
 from rse_pf.config import PlatformSettings, SessionSettings
 from rse_pf.identity import RobotId

@@ -28,7 +28,7 @@ _SERVE = """
 import json, sys
 from pathlib import Path
 from rse_pf.auth.tokens import KeySet
-from rse_pf.backend.supervisor import serve
+from rse_pf.server.supervisor import serve
 from rse_pf.config import PlatformSettings
 o = json.loads(sys.argv[1])
 sys.exit(serve(PlatformSettings.from_dict(o["settings"]), keys=o["keys"] and KeySet.from_json(o["keys"]),

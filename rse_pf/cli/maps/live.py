@@ -22,7 +22,7 @@ from rse_pf.terminal import counted, show, show_json
 from rse_pf.wire.live_map import LiveForget, LiveMapRequest, LiveRequest, LiveStart
 
 if TYPE_CHECKING:
-    from rse_pf.backend.live_map.map_link import OwnerLinks
+    from rse_pf.server.live_map.map_link import OwnerLinks
 
 __all__ = ["LIVE_ACTIONS", "add_live_arguments", "run_live", "run_publish"]
 
@@ -148,7 +148,7 @@ def _ask(
     deadline_s: float = _DEADLINE_S,
 ) -> dict[str, Any]:  # fmt: skip
     """Return what the owner of the map answers; raises what it refuses, or Busy."""
-    from rse_pf.backend.live_map.owner.lease import map_folder
+    from rse_pf.server.live_map.owner.lease import map_folder
 
     map_folder(args.tenant, args.name)  # refuse a wrong name first
     operator = RobotId(args.tenant, "operator")
@@ -160,8 +160,8 @@ def _ask(
 
 
 async def _with_links(settings: PlatformSettings, act: Callable[[OwnerLinks], Any]) -> Any:
-    from rse_pf.backend.live_map.map_link import OwnerLinks
-    from rse_pf.backend.log import JsonLog
+    from rse_pf.server.live_map.map_link import OwnerLinks
+    from rse_pf.server.log import JsonLog
 
     settings = settings.replace(serving={"log_level": "error"})  # the owner's lines are for a server's log
     log = JsonLog(level="error", server="operator", wall_clock=time.time).start()
@@ -178,10 +178,10 @@ async def _with_links(settings: PlatformSettings, act: Callable[[OwnerLinks], An
 
 def _read(args: argparse.Namespace, settings: PlatformSettings) -> dict[str, Any]:
     """Return what the log says of a map that has no owner now; raises NotFound."""
-    from rse_pf.backend.live_map.owner.lease import decode_lease, lease_name, map_folder
-    from rse_pf.backend.live_map.owner.log import LiveLog
-    from rse_pf.backend.live_map.owner.replies import show_reply
-    from rse_pf.backend.live_map.owner.state import LIVE_MAP, restore
+    from rse_pf.server.live_map.owner.lease import decode_lease, lease_name, map_folder
+    from rse_pf.server.live_map.owner.log import LiveLog
+    from rse_pf.server.live_map.owner.replies import show_reply
+    from rse_pf.server.live_map.owner.state import LIVE_MAP, restore
 
     store = open_data_store(settings)
     name = lease_name(args.tenant, args.name)

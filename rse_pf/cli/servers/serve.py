@@ -108,7 +108,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
             hint="make it, or name another --announce",
         )
     trust = None if args.keys is None else _trust(args.keys)
-    from rse_pf.backend.supervisor import serve
+    from rse_pf.server.supervisor import serve
 
     return serve(
         chosen,

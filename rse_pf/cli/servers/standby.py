@@ -20,7 +20,7 @@ __all__ = ["main"]
 
 _MODULES = (
     "numpy", "jwt", "cryptography.hazmat.primitives.asymmetric.ed25519", "uvloop", "picows",
-    "prometheus_client", "rse_pf.cli.main", "rse_pf.cli.servers.serve", "rse_pf.backend.supervisor",
+    "prometheus_client", "rse_pf.cli.main", "rse_pf.cli.servers.serve", "rse_pf.server.supervisor",
 )  # fmt: skip
 """In the order of their imports, so that the thread can stop between any two of them."""
 _NICENESS = 3
@@ -55,7 +55,7 @@ def _import_slowly(ordered: threading.Event) -> None:
         if ordered.is_set():
             return
         importlib.import_module(name)
-    importlib.import_module("rse_pf.backend.supervisor").warm_up()
+    importlib.import_module("rse_pf.server.supervisor").warm_up()
     show("imported everything that a server needs, and waits for its start")
 
 

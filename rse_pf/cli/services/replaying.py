@@ -47,7 +47,7 @@ def replay(service: InstalledService, recorded: Recorded, settings: PlatformSett
         recorded: Sent one after the other, as one robot.
         settings: Limits of the sandbox.
     """
-    from rse_pf.backend.sandbox.dry_run import dry_run
+    from rse_pf.server.sandbox.dry_run import dry_run
 
     requests = [call["request"] for _, call in recorded]
     missing, runs = dry_run(

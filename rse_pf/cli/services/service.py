@@ -256,7 +256,7 @@ async def _ask_recorded(platform: Any, service: Any, recorded: Recorded, setting
     in a dry run.
     """
     from client_sdk import connect
-    from rse_pf.backend.sandbox.dry_run import dry_run
+    from rse_pf.server.sandbox.dry_run import dry_run
 
     failed = []
     async with connect(platform.url, token=platform.issue_token("robot-1")) as robot:

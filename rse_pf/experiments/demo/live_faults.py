@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
-from rse_pf.backend.live_map.owner.lease import LeaseRecord, decode_lease, lease_name
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import CommandFailed, NotFound, RsePfError
 from rse_pf.experiments.demo.live import LIVE_NAME
@@ -27,6 +26,7 @@ from rse_pf.local.faults.failing_store import failing_environment, set_failing_p
 from rse_pf.local.faults.faults import signal_tree
 from rse_pf.local.faults.network_emulator import PROFILES, LinkProcess
 from rse_pf.object_store import DirectoryStore
+from rse_pf.server.live_map.owner.lease import LeaseRecord, decode_lease, lease_name
 
 __all__ = ["LIVE_FAULTS", "Disturbance", "LiveFault"]
 

@@ -14,15 +14,15 @@ from typing import Any
 
 import msgspec
 
-from rse_pf.backend.live_map.owner.lease import map_folder
-from rse_pf.backend.live_map.owner.log import LiveLog, MapSnapshot
-from rse_pf.backend.live_map.owner.state import LIVE_MAP, MapState
 from rse_pf.child.start import ChildPlan, how_ended, start_child
 from rse_pf.errors import RsePfError, UsageError
 from rse_pf.identity import DEFAULT_TENANT, shown_name
 from rse_pf.ipc import encode_message, receive
 from rse_pf.live_map.events import KeyframeAdded, decode_events
 from rse_pf.object_store import DirectoryStore
+from rse_pf.server.live_map.owner.lease import map_folder
+from rse_pf.server.live_map.owner.log import LiveLog, MapSnapshot
+from rse_pf.server.live_map.owner.state import LIVE_MAP, MapState
 
 __all__ = ["LoggedMap", "read_log", "run"]
 

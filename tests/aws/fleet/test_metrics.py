@@ -13,7 +13,7 @@ from rse_pf.scaling.operator_alarms import STORE_ERRORS, operator_alarms
 
 
 def page(answers: list[tuple[str, float]], **gauges: float) -> str:
-    metrics = pytest.importorskip("rse_pf.backend.metrics")
+    metrics = pytest.importorskip("rse_pf.server.metrics")
     worker = metrics.Metrics()
     for service, duration_s in answers:
         worker.count_answer(service, "ok", duration_s)

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from rse_pf.backend.live_map.owner.lease import OwnerLease, lease_name, map_folder
-from rse_pf.backend.live_map.owner.log import LiveLog
 from rse_pf.cli.main import main
 from rse_pf.live_map.events import OwnerChanged, encode_events
 from rse_pf.object_store import DirectoryStore
+from rse_pf.server.live_map.owner.lease import OwnerLease, lease_name, map_folder
+from rse_pf.server.live_map.owner.log import LiveLog
 
 
 @pytest.fixture

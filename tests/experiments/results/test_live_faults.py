@@ -11,8 +11,6 @@ import numpy as np
 import pytest
 
 from client_sdk.mapping import Trajectory, write_trajectory
-from rse_pf.backend.live_map.owner.lease import map_folder
-from rse_pf.backend.live_map.owner.log import LiveLog
 from rse_pf.errors import UsageError
 from rse_pf.experiments.results.live_error import LIVE_RECORDS, TRUTH
 from rse_pf.experiments.results.live_faults import fault_rows, live_fault_figures
@@ -22,6 +20,8 @@ from rse_pf.geometry import Camera, exp_se3
 from rse_pf.identity import DEFAULT_TENANT
 from rse_pf.live_map.events import KeyframeAdded, OwnerChanged, encode_events
 from rse_pf.object_store import DirectoryStore
+from rse_pf.server.live_map.owner.lease import map_folder
+from rse_pf.server.live_map.owner.log import LiveLog
 from rse_pf.slam.keyframe import Keyframe, encode_keyframe, make_features
 
 NUMBERS = range(4)

@@ -18,9 +18,9 @@ import websockets.exceptions
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rse_pf.backend.log import JsonLog
 from rse_pf.config import PlatformSettings
 from rse_pf.local.control.platform import LocalPlatform
+from rse_pf.server.log import JsonLog
 from rse_pf.wire import SUBPROTOCOLS, Command, Hello, make_codec
 
 CODEC = make_codec("json")

@@ -12,9 +12,9 @@ from typing import Any
 
 import pytest
 
-from rse_pf.backend.sandbox.dry_run import dry_run
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import CommandFailed, ConfigurationError, UsageError
+from rse_pf.server.sandbox.dry_run import dry_run
 from rse_pf.services.custom import dependencies
 from rse_pf.services.custom.dependencies import (
     Dependencies,

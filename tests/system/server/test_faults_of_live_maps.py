@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from backend.live_map.test_served import keyframe
+from server.live_map.test_served import keyframe
 
 from rse_pf.cli.main import main
 from rse_pf.local.faults.faults import signal_tree

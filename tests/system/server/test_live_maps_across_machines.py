@@ -21,22 +21,22 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from backend.live_map.test_served import keyframe
 from guarded_server import KEY
+from server.live_map.test_served import keyframe
 
 import client_sdk
-from rse_pf.backend.live_map.owner.lease import LeaseRecord, decode_lease, lease_name
-from rse_pf.backend.live_map.owner.link_security import (
+from rse_pf.config import PlatformSettings
+from rse_pf.config.settings import LIVE_PORTS
+from rse_pf.ipc import FrameReader, encode_message
+from rse_pf.object_store import DirectoryStore
+from rse_pf.server.live_map.owner.lease import LeaseRecord, decode_lease, lease_name
+from rse_pf.server.live_map.owner.link_security import (
     TOKEN_S,
     LinkClaims,
     client_context,
     internal_key,
     make_token,
 )
-from rse_pf.config import PlatformSettings
-from rse_pf.config.settings import LIVE_PORTS
-from rse_pf.ipc import FrameReader, encode_message
-from rse_pf.object_store import DirectoryStore
 
 pytestmark = [pytest.mark.slow, pytest.mark.system]
 

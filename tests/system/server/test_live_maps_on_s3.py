@@ -9,14 +9,14 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from backend.live_map.test_served import keyframe
 from guarded_server import KEY, GuardedServer
+from server.live_map.test_served import keyframe
 
 import client_sdk
 from rse_pf.aws.clients import make_client
 from rse_pf.aws.storage import open_bucket
-from rse_pf.backend.live_map.owner.lease import decode_lease, lease_name
 from rse_pf.config import PlatformSettings
+from rse_pf.server.live_map.owner.lease import decode_lease, lease_name
 
 pytestmark = [pytest.mark.slow, pytest.mark.system]
 

@@ -499,9 +499,9 @@ def test_a_plain_user_has_the_same_isolation(tmp_path):
     if python is None or shutil.which("setpriv") is None:
         pytest.skip("no python3 outside of this user's home, or no setpriv")
     package = Path(__file__).resolve().parents[3] / "rse_pf"
-    copied = tmp_path / "rse_pf" / "backend" / "sandbox"
+    copied = tmp_path / "rse_pf" / "server" / "sandbox"
     copied.mkdir(parents=True)
-    for source in ("backend/sandbox/isolation.py", "backend/sandbox/seccomp.py", "linux.py"):
+    for source in ("server/sandbox/isolation.py", "server/sandbox/seccomp.py", "linux.py"):
         (tmp_path / "rse_pf" / source).write_text((package / source).read_text())
         (tmp_path / "rse_pf" / source).chmod(0o644)
     for folder in (copied, *copied.parents):
@@ -512,7 +512,7 @@ import os, sys
 sys.dont_write_bytecode = True
 sys.path.insert(0, {str(tmp_path)!r})
 from pathlib import Path
-from rse_pf.backend.sandbox import isolation
+from rse_pf.server.sandbox import isolation
 assert isolation.__file__.startswith({str(tmp_path)!r}), isolation.__file__
 def root():
     isolation.enter_namespaces()

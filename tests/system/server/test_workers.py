@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 
 from rse_pf.auth.tokens import SigningKey
-from rse_pf.backend.supervisor import serve
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import ConfigurationError
+from rse_pf.server.supervisor import serve
 
 pytestmark = pytest.mark.system
 

@@ -1,0 +1,111 @@
+"""Decide whether a server takes a command.
+
+Before a message is decoded, when a refusal is cheapest: the rate of the robot (`RobotRates`), the backlog of
+the server (`Scheduler.unread_pause_s`) and the size, in this order.  Once the command is decoded: its scope,
+its deadline, the number of commands of the robot that wait, and the backlog again.
+Values go in and decisions come out: there is no clock, no queue and no connection here.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from rse_pf.auth.roster import scopes_allow
+from rse_pf.auth.tokens import Claims
+from rse_pf.config import SessionSettings
+from rse_pf.errors import Busy, Forbidden
+from rse_pf.server.gateway.rate_limits import RobotRates
+from rse_pf.server.scheduling.overload import PAUSE_S
+from rse_pf.server.scheduling.scheduler import (
+    BEHIND,
+    BEHIND_HINT,
+    QueueBacklog,
+    QueuedCommand,
+    RefusedCommand,
+    behind_error,
+    expired_error,
+)
+
+__all__ = ["DECODER_FULL", "TOO_FAST", "TOO_LATE", "Admission", "UnreadRefusal", "is_in_scope"]
+
+MAX_QUEUE_PER_ROBOT = 8
+"""Queued commands of one robot, as many as may be unanswered by default; more are refused."""
+_MAX_UNREAD_BYTES = 1 << 24
+"""Bytes of long messages that may wait for the decoder thread of a worker."""
+_SUSPECTS_SHARE = 0.25
+"""Share of `_MAX_UNREAD_BYTES` that is open to robots which sent undecodable messages before."""
+
+
+class UnreadRefusal(NamedTuple):
+    """Why a message is refused as ``busy`` before it is decoded.
+
+    ``reason`` is a label of the metric ``rse_pf_shed_total``.
+    """
+
+    reason: str
+    message: str
+    hint: str
+
+
+TOO_FAST = UnreadRefusal(
+    "rate",
+    "this robot sends more than its rate",
+    "send fewer, or have the operator raise session.max_commands_per_s",
+)
+TOO_LATE = UnreadRefusal("unread", BEHIND, BEHIND_HINT)
+DECODER_FULL = UnreadRefusal(
+    "unread", "too many long messages wait to be read", "try again later, or send less at once"
+)
+
+
+class Admission:
+    """The limits of one worker, and how much of its rate each robot has used."""
+
+    def __init__(self, session: SessionSettings, *, max_queue: int = MAX_QUEUE_PER_ROBOT) -> None:
+        self.rates = RobotRates(session)
+        self._max_queue = max_queue
+
+    def may_wait(self, size_bytes: int, unread_bytes: int, bad_messages: int) -> bool:
+        """Return whether a message that is too long for the event loop may wait for the decoder thread.
+
+        Args:
+            size_bytes: Length of the message on the wire.
+            unread_bytes: Length of the messages that wait for the decoder thread; one alone is always taken.
+            bad_messages: How many messages of the connection could not be decoded.
+        """
+        share = _SUSPECTS_SHARE if bad_messages else 1.0
+        return not unread_bytes or unread_bytes + size_bytes <= share * _MAX_UNREAD_BYTES
+
+    def judge(
+        self, queued: QueuedCommand, claims: Claims | None, backlog: QueueBacklog
+    ) -> RefusedCommand | None:
+        """Return why a decoded command is refused; None if it is admitted.
+
+        Args:
+            queued: The command, with the times of its arrival and of its deadline.
+            claims: The claims of the robot's token; None where no token is required.
+            backlog: The commands that would delay *queued* in the queue that it would join.
+        """
+        service = queued.command.service
+        if claims is not None and not is_in_scope(service, claims):
+            forbidden = Forbidden(
+                f"this token does not hold the scope services:{service}", hint="issue one that does"
+            )
+            return RefusedCommand(queued, forbidden, "scope")
+        if queued.allowed_s <= 0:
+            return RefusedCommand(queued, expired_error(queued, queued.received_s), "expired")
+        if backlog.waiting >= self._max_queue:
+            busy = Busy(
+                f"{backlog.waiting} commands of this robot wait already",
+                hint="send slower, or let newer frames replace older ones",
+                retry_after_ms=1e3 * PAUSE_S,
+            )
+            return RefusedCommand(queued, busy, "robot-queue")
+        if backlog.pause_s:
+            return RefusedCommand(queued, behind_error(backlog.pause_s), "behind")
+        return None
+
+
+def is_in_scope(service: str, claims: Claims) -> bool:
+    """Return whether a token allows commands to *service*."""
+    return not claims.scopes or scopes_allow(claims.scopes, f"services:{service}")

@@ -1,0 +1,312 @@
+"""Judge a WebSocket handshake: path, capacity, token and sub-protocol, before anything is accepted.
+
+Every rejection has a fixed body, and the cause of a rejected token goes to the log only; but a robot whose
+token was signed with its own enrolled key is told why.  What a robot sent and
+the time come in, `Accepted` or `Rejected` goes out.  The head of a request is read here, too: most refusals
+need no WebSocket library then.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from http import HTTPStatus
+
+import msgspec
+
+from rse_pf.auth.origins import ORIGIN_HINT, AllowedOrigins, carried_token
+from rse_pf.auth.tokens import (
+    Claims,
+    KeySet,
+    ProvenRefusal,
+    proven_refusal,
+    token_problem,
+    verify_token,
+)
+from rse_pf.config import PlatformSettings
+from rse_pf.config.resource_names import HEALTH_PATH, ROBOTS_PATH
+from rse_pf.errors import Unauthorized
+from rse_pf.identity import DEFAULT_TENANT, RobotId
+from rse_pf.server.gateway.rate_limits import RATE_BAN_S
+from rse_pf.wire import SUBPROTOCOLS, codec_for
+from rse_pf.wire.refusal import CUT_OFF, refusal_body
+
+__all__ = [
+    "HEALTH", "Accepted", "HandshakePolicy", "HandshakeRequest", "Rejected", "RequestHead",
+    "banned_rejection",
+]  # fmt: skip
+
+HEALTH = "health"
+"""Result of a request for the health page."""
+
+_RETRY_AFTER_S = 2
+_HEALTH_PATH = HEALTH_PATH.encode()
+_NO_KEYS = "no-keys"
+_JSON = {"Content-Type": "application/json"}
+_HEAD = re.compile(
+    rb"GET ([\x21-\x7e\x80-\xff]+) HTTP/1\.1((?:\r\n[0-9A-Za-z!#$%&'*+.^_`|~-]+:[\t\x20-\x7e\x80-\xff]*)*)"
+)
+"""RFC 9112, without the folded lines that it calls obsolete."""
+_MAX_HEADERS = 128
+_SINGLE = (b"content-length", b"sec-websocket-key", b"sec-websocket-version")
+_WEBSOCKET_KEY = re.compile(rb"[A-Za-z0-9+/]{22}==")
+_VERSIONS = (b"13", b"8", b"7")
+_TOO_LONG = b"HTTP/1.1 431 Request Header Fields Too Large\r\nConnection: close\r\nContent-Length: 0\r\n\r\n"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Accepted:
+    """A robot that may upgrade to WebSocket.  ``expires_s`` is Unix time; None never expires."""
+
+    robot: RobotId
+    codec: str
+    subprotocol: str
+    expires_s: float | None = None
+    claims: Claims | None = field(default=None, compare=False)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Rejected:
+    """An HTTP answer instead of the upgrade.  ``reason`` is for the log and never sent."""
+
+    status: int
+    body: bytes
+    result: str
+    reason: str = ""
+    headers: Mapping[str, str] = field(default_factory=dict)
+    answer: bytes = field(default=b"", compare=False, repr=False)
+    """The whole HTTP answer; the connection is closed behind it."""
+
+
+class RequestHead:
+    """The head of an HTTP request that was checked line by line.  A header that is repeated is one list."""
+
+    __slots__ = ("_headers", "path", "websocket_key")
+
+    def __init__(self, path: bytes, headers: dict[bytes, bytes]) -> None:
+        self.path = path
+        self._headers = headers
+        self.websocket_key = self._read_key()
+        """The key of a valid request for an upgrade to WebSocket, empty if this is none."""
+
+    @classmethod
+    def parse(cls, data: bytes) -> RequestHead | None:
+        """Return the head *data*, without its empty line; None if it is no GET that has no body.
+
+        Source:
+            RFC 9112, 3 and 5; RFC 6455, 4.2.1.
+        """
+        request_line = _HEAD.fullmatch(data)
+        if request_line is None:
+            return None
+        lines = request_line[2].split(b"\r\n")
+        if len(lines) - 1 > _MAX_HEADERS:
+            return None
+        headers: dict[bytes, bytes] = {}
+        for line in lines[1:]:
+            name, _, value = line.partition(b":")
+            name = name.lower()
+            if name in headers:
+                if name in _SINGLE:
+                    return None
+                value = headers[name] + b"," + value.strip(b" \t")
+            headers[name] = value.strip(b" \t")
+        length = headers.get(b"content-length", b"0")
+        if b"transfer-encoding" in headers or not length or length.strip(b"0"):
+            return None
+        return cls(request_line[1], headers)
+
+    def text(self, name: bytes) -> str:
+        """Return the header *name*, in lower case letters, "" if it is absent."""
+        value = self._headers.get(name)
+        return "" if value is None else value.decode("ascii", "surrogateescape")
+
+    def words(self, name: bytes) -> list[str]:
+        """Return the entries of the list *name*."""
+        text = self.text(name)
+        return [word.strip() for word in text.split(",")] if "," in text else [text]
+
+    def _read_key(self) -> bytes:
+        headers = self._headers
+        key = headers.get(b"sec-websocket-key", b"")
+        options = headers.get(b"connection", b"").lower()
+        is_upgrade = (
+            headers.get(b"upgrade", b"").lower() == b"websocket"
+            and (options == b"upgrade" or b"upgrade" in options.translate(None, b" \t").split(b","))
+            and headers.get(b"sec-websocket-version") in _VERSIONS
+            and _WEBSOCKET_KEY.fullmatch(key)
+        )
+        return key if is_upgrade else b""
+
+
+def _rejection(status: int, code: str, message: str, hint: str, **headers: str) -> Rejected:
+    body = refusal_body(code, message, hint)
+    return _http_answer(status, code, body, {**_JSON, **{k.replace("_", "-"): v for k, v in headers.items()}})
+
+
+def banned_rejection(seconds: float) -> Rejected:
+    """Return the rejection of a robot that was cut off and is refused for *seconds* more."""
+    wait_s = math.ceil(seconds)
+    rejected = _rejection(
+        429, "quota", f"this robot was cut off, and is refused for another {wait_s} s",
+        "wait, and slow down; the server's log says why", Retry_After=str(wait_s),
+    )  # fmt: skip
+    return replace(rejected, reason="robot-cut-off")
+
+
+def _proven_rejection(proven: ProvenRefusal, now_s: float) -> Rejected | None:
+    """Return the rejection of a robot that proved its key; None if the cause is kept from it, too."""
+    members: dict[str, float] = {"server_s": round(now_s, 3)}
+    cause = proven.cause
+    if cause == "disabled":
+        message, hint = "this robot is disabled", "the operator allows it again by rse-pf robot enable ROBOT"
+    elif cause == "revoked":
+        message, hint = "this token is revoked", "sign another one"
+    elif cause == "issued-too-early":
+        cause, members["valid_from_s"] = CUT_OFF, proven.valid_from_s or 0.0
+        message = f"tokens issued before {_utc(members['valid_from_s'])} are revoked"
+        message += f", and this one was issued {-proven.off_s:.0f} s before the server's present time"
+        hint = "sign another one; if it is refused, too, the clock of this robot is behind by so much: set it"
+    elif cause == "not-yet-valid":
+        message = f"the clock of this robot is {proven.off_s:.0f} s ahead of the server's"
+        hint = "set the clock of this robot"
+    elif cause == "expired":
+        message = f"the token expired {proven.off_s:.0f} s ago by the server's clock"
+        hint = "sign another one; if it is refused, too, the clock of this robot is behind: set it"
+    else:
+        return None
+    body = refusal_body(Unauthorized.code, message, hint, cause=cause, **members)
+    return _http_answer(401, Unauthorized.code, body, {**_JSON, "WWW-Authenticate": "Bearer"})
+
+
+def _utc(unix_s: float) -> str:
+    return time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime(unix_s))
+
+
+def _http_answer(status: int, result: str, body: bytes, headers: Mapping[str, str]) -> Rejected:
+    lines = {**headers, "Content-Length": str(len(body)), "Connection": "close"}
+    head = "".join(f"{name}: {value}\r\n" for name, value in lines.items())
+    answer = f"HTTP/1.1 {status} {HTTPStatus(status).phrase}\r\n{head}\r\n".encode() + body
+    return Rejected(status=status, body=body, result=result, headers=headers, answer=answer)
+
+
+class HandshakeRequest(msgspec.Struct, frozen=True, kw_only=True):
+    """What a handshake is judged by; a header that is absent is empty."""
+
+    path: bytes
+    """With its query."""
+    authorization: str
+    offered: list[str]
+    """Sub-protocols, in the robot's order."""
+    origin: str = ""
+    """Browsers send it."""
+    host: str = ""
+
+
+class HandshakePolicy:
+    """The rules of one worker for handshakes."""
+
+    def __init__(
+        self, settings: PlatformSettings, keys: KeySet | None, *, conformance_echo: bool = False
+    ) -> None:
+        self._settings = settings
+        self.keys = keys
+        self._conformance_echo = conformance_echo
+        self._path = ROBOTS_PATH.encode()
+        self._origins = AllowedOrigins(settings.serving.allowed_origins)
+        self._healthy = _http_answer(200, HEALTH, b'{"status":"ok"}', _JSON)
+        self.defect = _rejection(500, "internal", "the handshake failed", "try again")
+        self._not_found = _rejection(404, "not-found", "nothing is served here", f"connect to {ROBOTS_PATH}")
+        self._full = _rejection(
+            503, "full", "this server serves as many robots as it may", "try again later",
+            Retry_After=str(_RETRY_AFTER_S),
+        )  # fmt: skip
+        self.too_fast = _rejection(
+            429, "quota", "too many handshakes of this address", "wait, and slow down",
+            Retry_After=str(max(1, math.ceil(RATE_BAN_S))),
+        )  # fmt: skip
+        self._no_token = _rejection(
+            401, "unauthorized", "the token is missing or not valid",
+            "issue one with rse-pf token issue ROBOT", WWW_Authenticate="Bearer",
+        )  # fmt: skip
+        self._forbidden = _rejection(
+            403, "forbidden", "web pages of this origin are not allowed", ORIGIN_HINT
+        )
+        self.no_request = _rejection(
+            400, "bad-message", "this is not a request for a WebSocket", "send an upgrade as in RFC 6455"
+        )
+        self.too_long = Rejected(status=431, body=b"", result="too-long", answer=_TOO_LONG)
+        self._no_subprotocol = _rejection(
+            400, "unsupported", "no sub-protocol that this server speaks was offered",
+            f"offer one of {', '.join(SUBPROTOCOLS.values())}",
+        )  # fmt: skip
+
+    def judge(
+        self,
+        request: HandshakeRequest,
+        *,
+        is_full: bool,
+        anonymous: str,
+        now_s: float,
+    ) -> Accepted | Rejected:
+        """Return which robot is accepted, or the HTTP answer that rejects it.
+
+        Args:
+            request: What the robot sent.
+            is_full: Whether the worker has as many robots as it may.
+            anonymous: Name of a robot where no token is required.
+            now_s: Unix seconds.
+        """
+        path, authorization, offered = request.path, request.authorization, request.offered
+        if self._conformance_echo:
+            return Accepted(robot=RobotId(DEFAULT_TENANT, anonymous), codec="", subprotocol="")
+        if path == _HEALTH_PATH:
+            return self._healthy
+        if path.partition(b"?")[0] != self._path:
+            return self._not_found
+        if not self._origins.allows(request.origin, request.host):
+            return self._forbidden
+        if is_full:
+            return self._full
+        codec = codec_for(offered)
+        name = codec or ""
+        if self.keys is None:
+            accepted = Accepted(
+                robot=RobotId(DEFAULT_TENANT, anonymous), codec=name, subprotocol=SUBPROTOCOLS.get(name, "")
+            )
+            return self._no_subprotocol if codec is None else accepted
+        token = carried_token(authorization, offered)
+        verdict = self._with_token(token, now_s, codec=name)
+        return self._no_subprotocol if codec is None and isinstance(verdict, Accepted) else verdict
+
+    def _with_token(self, token: str, now_s: float, *, codec: str) -> Accepted | Rejected:
+        """Return the robot that *token* names as accepted, or the rejection."""
+        if self.keys is None:
+            return replace(self._no_token, reason=_NO_KEYS)
+        try:
+            claims = verify_token(token, keys=self.keys, now=now_s, settings=self._settings.auth)
+        except Unauthorized as error:
+            proven = proven_refusal(error)
+            refused = None if proven is None else _proven_rejection(proven, now_s)
+            return replace(refused or self._no_token, reason=token_problem(error))
+        return Accepted(
+            robot=claims.robot, codec=codec, subprotocol=SUBPROTOCOLS.get(codec, ""),
+            expires_s=self.ends_s(claims, now_s), claims=claims,
+        )  # fmt: skip
+
+    def ends_s(self, claims: Claims, now_s: float) -> float:
+        """Return when a connection with *claims* ends, in Unix seconds; an expired token has its leeway."""
+        leeway_s = self._settings.auth.leeway_s
+        return claims.expires_s if now_s < claims.expires_s else claims.expires_s + leeway_s
+
+    def claims_or_problem(self, token: str, now_s: float) -> Claims | str:
+        """Return the claims of *token*, or the cause of its refusal, which goes to the log only."""
+        if self.keys is None:
+            return _NO_KEYS
+        try:
+            return verify_token(token, keys=self.keys, now=now_s, settings=self._settings.auth)
+        except Unauthorized as error:
+            return token_problem(error)

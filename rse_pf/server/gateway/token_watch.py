@@ -1,0 +1,155 @@
+"""End a worker's connections when their token expires, is revoked, or belongs to a newer connection.
+
+A robot learns no reason beyond the close code.  Keys that cannot be read leave everything as it was known.
+"""
+
+from __future__ import annotations
+
+from asyncio import TimerHandle
+from collections.abc import Callable
+from functools import partial
+
+from rse_pf.auth.tokens import Claims, KeySet, claims_problem, renewed_claims
+from rse_pf.server.gateway.audit_recorder import AuditRecorder
+from rse_pf.server.gateway.connection import RobotConnection
+from rse_pf.server.gateway.handshake import HandshakePolicy
+from rse_pf.server.ports import WorkerContext
+from rse_pf.wire.server_session import CLOSE_REPLACED, CLOSE_REVOKED, CLOSE_TOKEN_OVER
+
+__all__ = ["TokenWatch"]
+
+
+class TokenWatch:
+    """The tokens of one worker's connections; the dispatcher tells which connections begin and end."""
+
+    def __init__(
+        self,
+        context: WorkerContext,
+        connections: set[RobotConnection],
+        handshake: HandshakePolicy,
+        *,
+        tell: Callable[..., None],
+        recorder: AuditRecorder,
+    ) -> None:
+        """Watch *connections*.
+
+        Args:
+            context: The clocks, event loop, log and metrics of the worker.
+            connections: The live connections of this worker; the dispatcher adds and removes them.
+            handshake: Judges fresh tokens, and gets new keys.
+            tell: Sends a message to the supervisor.
+            recorder: Records fresh tokens, and connections that are ended.
+        """
+        self.connections = connections
+        self._handshake = handshake
+        self._context = context
+        self._tell = tell
+        self._recorder = recorder
+        self._by_number: dict[int, RobotConnection] = {}
+        self._timers: dict[RobotConnection, TimerHandle] = {}
+        self._stays: dict[RobotConnection, TimerHandle] = {}
+
+    def trust(self, keys: KeySet) -> None:
+        """Verify tokens with *keys* from now on, and end every connection whose token they do not allow.
+
+        Open connections of enrolled robots take the scopes and quotas of the present roster.
+        """
+        self._handshake.keys = keys
+        for connection in list(self.connections):
+            claims = connection.claims
+            if claims is None or connection.is_closing:
+                continue
+            problem = claims_problem(claims, keys)
+            if problem:
+                self._revoke(connection, claims, problem)
+            else:
+                connection.claims = renewed_claims(claims, keys)
+
+    def watch(self, connection: RobotConnection, expires_s: float | None) -> None:
+        """Watch a connection whose handshake is done; its token ends at *expires_s* (monotonic clock, s)."""
+        claims, keys = connection.claims, self._handshake.keys
+        if claims is not None:
+            self._by_number[connection.number] = connection
+            problem = "" if keys is None else claims_problem(claims, keys)
+            if problem:  # new keys came between the handshake and now
+                self._context.loop.call_soon(self._revoke, connection, claims, problem)
+            elif keys is not None:
+                connection.claims = renewed_claims(claims, keys)
+        self._end_at(connection, expires_s)
+
+    def report_hello(self, connection: RobotConnection) -> None:
+        """Report to the supervisor that a robot said Hello, so that its older connections end."""
+        self._report("arrived", connection)
+
+    def forget(self, connection: RobotConnection) -> None:
+        """Forget a connection."""
+        self._end_at(connection, None)
+        self._end_stay(connection)
+        if self._by_number.pop(connection.number, None) is not None:
+            self._report("left", connection)
+
+    def replace(self, number: int) -> None:
+        """End the connection *number*, because the robot has a newer one; one that moves may finish first."""
+        connection = self._by_number.get(number)
+        if connection is None or connection.is_closing:
+            return
+        left_s = connection.moving_until_s - self._context.clocks.monotonic()
+        if left_s > 0:
+            self._stay(connection, left_s)
+            return
+        self._context.log.info("replaced", robot=connection.robot)
+        connection.close(CLOSE_REPLACED, "replaced")
+
+    def renew(self, connection: RobotConnection, token: str) -> None:
+        """Judge a fresh token of a live connection, and move the connection's end or leave it."""
+        before, clocks = connection.claims, self._context.clocks
+        now, wall_s = clocks.monotonic(), clocks.wall()
+        claims = self._handshake.claims_or_problem(token, wall_s)
+        token_s = None
+        if isinstance(claims, Claims) and before is not None and before.robot == claims.robot:
+            connection.claims = claims
+            self._recorder.record_renewal(before, claims)
+            token_s = self._handshake.ends_s(claims, wall_s) - wall_s
+            self._end_at(connection, now + token_s)
+            self._context.metrics.handshakes["renewed"] += 1
+        else:
+            self._context.metrics.handshakes["renewal-refused"] += 1
+            reason = claims if isinstance(claims, str) else "wrong-robot"
+            self._context.log.info("renewal-refused", robot=connection.robot, reason=reason)
+            self._recorder.record_refused_renewal(before, reason)
+        connection.answer_renewal(token_s, now)
+
+    def _end_at(self, connection: RobotConnection, expires_s: float | None) -> None:
+        timer = self._timers.pop(connection, None)
+        if timer is not None:
+            timer.cancel()
+        if expires_s is not None:
+            left_s = max(0.0, expires_s - self._context.clocks.monotonic())
+            self._timers[connection] = self._context.loop.call_later(left_s, partial(self._end, connection))
+
+    def _stay(self, connection: RobotConnection, left_s: float) -> None:
+        """Report to the supervisor after *left_s* that a connection which was asked to move has not left."""
+        self._end_stay(connection)
+        self._stays[connection] = self._context.loop.call_later(
+            left_s, partial(self._report, "stays", connection)
+        )
+
+    def _end_stay(self, connection: RobotConnection) -> None:
+        timer = self._stays.pop(connection, None)
+        if timer is not None:
+            timer.cancel()
+
+    def _revoke(self, connection: RobotConnection, claims: Claims, problem: str) -> None:
+        if not connection.is_closing:
+            self._context.log.info("revoked", robot=connection.robot, reason=problem)
+            self._recorder.record_cut_off(claims, problem)
+            connection.close(CLOSE_REVOKED, "revoked")
+
+    def _end(self, connection: RobotConnection) -> None:
+        if not connection.is_closing:
+            connection.close(CLOSE_TOKEN_OVER, "token-over")
+
+    def _report(self, event: str, connection: RobotConnection) -> None:
+        claims = connection.claims
+        if claims is not None and (event == "left" or connection in self.connections):
+            self._tell(event=event, robot=claims.robot, number=connection.number)

@@ -1,0 +1,201 @@
+"""The process of one job: the worker starts it with `spawner`, it runs one command and ends.
+
+Over one socket it receives an order, sends progress and then one answer.  It runs at a lower priority than
+the workers, within its memory limit, and does not outlive its worker.  It reads its inputs and stores its
+reply itself, so that the worker can serve robots meanwhile.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import select
+import socket
+import time
+import traceback
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import msgspec
+
+from rse_pf.accounts import Accounts
+from rse_pf.aws.storage import open_data_store
+from rse_pf.child.start import Child, ChildPlan, start_child
+from rse_pf.config import PlatformSettings
+from rse_pf.errors import (
+    BadMessage,
+    Cancelled,
+    Crashed,
+    LimitExceeded,
+    RsePfError,
+    StoreError,
+    message_of,
+)
+from rse_pf.identity import RobotId
+from rse_pf.ipc import encode_message, receive
+from rse_pf.server.object_refs import named_in, resolve
+from rse_pf.server.robot_store import is_shared, store_within_quota
+from rse_pf.service import dispatch, failure_of
+from rse_pf.services.loading import load_services
+from rse_pf.wire import Command, Failure, Result
+from rse_pf.wire.arrays import binary_encode_hook
+
+__all__ = ["JobRequest", "inline_bytes", "retry_store", "run", "spawner", "store_reply"]
+
+_NICE = 10
+"""A job gets a tenth of a core that others want, and so ends on a machine that is always busy; commands of
+robots, which have a weight nine times as large, do not wait for it."""
+_REPORT_INTERVAL_S = 0.5
+_STORE_TRIES = 3
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class JobRequest:
+    """A job that a robot asked for.
+
+    ``quota_bytes`` limits all that the robot stores, results included; None for ``data.quota_bytes``.
+    """
+
+    service: str
+    payload: Any
+    robot: RobotId
+    key: str
+    quota_bytes: float | None
+    trace: str = ""
+    """Of the command that asked for it first."""
+
+
+def spawner(services: str, settings: PlatformSettings) -> Callable[[JobRequest], Child]:
+    """Return a function that starts the process of a job; *services* is ``module:function``."""
+    plan = ChildPlan(
+        target=f"{__name__}:run", name="rse-pf job", policy="batch", nice=_NICE, is_killed_first=True,
+        memory_bytes=settings.serving.max_job_memory_bytes,
+    )  # fmt: skip
+    order = {"services": services, "settings": settings.to_dict()}
+
+    def start(request: JobRequest) -> Child:
+        child = start_child(plan)
+        child.say({**order, "request": request})
+        return child
+
+    return start
+
+
+def inline_bytes(settings: PlatformSettings) -> int:
+    """Return the size above which a reply is answered with the name of its object."""
+    return settings.session.max_message_bytes // 2
+
+
+def retry_store(act: Callable[[], T]) -> T:
+    """Call *act* and return its result; a failure of the store repeats it, at most twice."""
+    for _ in range(_STORE_TRIES - 1):
+        with contextlib.suppress(StoreError):
+            return act()
+    return act()
+
+
+def run(worker: socket.socket) -> None:
+    """Run the one job that the *worker* orders."""
+    with worker:
+        order = receive(worker)
+        if order is None:
+            return
+        settings, request = PlatformSettings.from_dict(order["settings"]), _request(order["request"])
+        answer = _work(request, settings, order["services"], _Reporter(worker, time.monotonic))
+        with contextlib.suppress(OSError):  # the worker may have gone
+            worker.sendall(encode_message(store_reply(answer, request, settings)))
+
+
+def _request(plain: dict[str, Any]) -> JobRequest:
+    return JobRequest(**{**plain, "robot": RobotId(*plain["robot"])})
+
+
+class _Reporter:
+    """Sends progress to the worker; raises Cancelled when the worker has sent anything."""
+
+    def __init__(self, worker: socket.socket, clock: Callable[[], float]) -> None:
+        self._worker = worker
+        self._clock = clock
+        self._reported_s = float("-inf")
+
+    def __call__(self, done: float, what: str) -> None:
+        if select.select([self._worker], [], [], 0)[0]:
+            raise Cancelled("the robot cancelled the command")
+        now = self._clock()
+        if now - self._reported_s >= _REPORT_INTERVAL_S:
+            self._reported_s = now
+            self._worker.sendall(encode_message(["progress", float(done), str(what)[:200]]))
+
+
+def _work(
+    request: JobRequest, settings: PlatformSettings, services: str, report: Callable[[float, str], None]
+) -> list[Any]:
+    out_of_memory = False
+
+    def on_defect(_: Command, error: Exception) -> None:
+        nonlocal out_of_memory
+        out_of_memory = isinstance(error, MemoryError)
+        traceback.print_exception(error)
+
+    try:
+        registry = load_services(services, settings)
+        _check_quota(request, settings)
+        payload = _resolve_payload(request, registry.get(request.service).request_type, settings)
+        command = Command(id=0, service=request.service, payload=payload)
+        answer = dispatch(registry, command, time.monotonic, on_defect=on_defect, report=report)
+    except RsePfError as error:
+        answer = failure_of(error)
+    except MemoryError:
+        out_of_memory = True
+    if out_of_memory:
+        megabytes = settings.serving.max_job_memory_bytes / 1e6
+        answer = failure_of(
+            Crashed(f"the job needs more than {megabytes:.0f} MB of memory", hint="send less at once")
+        )
+    return _encode_answer(answer)
+
+
+def _resolve_payload(request: JobRequest, kind: type[Any], settings: PlatformSettings) -> Any:
+    """Return the payload with the robot's objects in place of their names."""
+    if not named_in(kind, request.payload):
+        return request.payload
+    store = open_data_store(settings)
+    return resolve(kind, request.payload, request.robot, store)
+
+
+def _check_quota(request: JobRequest, settings: PlatformSettings) -> None:
+    """Raise QuotaExceeded before the work if its result cannot be stored."""
+    if is_shared(settings):
+        store = open_data_store(settings)
+        with contextlib.suppress(StoreError):  # the store is tried again when there is a result
+            Accounts(store, settings.data).check_room(request.robot, 1, request.quota_bytes)
+
+
+def store_reply(answer: list[Any], request: JobRequest, settings: PlatformSettings) -> list[Any]:
+    """Store the reply from this process and answer with its name, and with the reply if it is small."""
+    if answer[0] != "done" or not is_shared(settings):
+        return answer
+    _, compute_ms, reply = answer
+    try:
+        if len(reply) > settings.data.max_object_bytes:
+            raise LimitExceeded(f"a reply of {len(reply)} bytes is too large", hint="ask for less")
+        store = open_data_store(settings)
+        accounts = Accounts(store, settings.data)
+        digest = retry_store(
+            lambda: store_within_quota(store, accounts, request.robot, reply, request.quota_bytes)
+        )
+    except RsePfError as error:
+        return _encode_answer(failure_of(error))
+    inline = reply if len(reply) <= inline_bytes(settings) else None
+    return ["stored", compute_ms, digest, len(reply), inline]
+
+
+def _encode_answer(answer: Result | Failure) -> list[Any]:
+    if isinstance(answer, Failure):
+        return ["failed", answer.code, answer.message, answer.hint]
+    try:
+        reply = msgspec.msgpack.encode(answer.reply, enc_hook=binary_encode_hook)
+    except (BadMessage, TypeError, ValueError, OverflowError) as error:
+        return ["failed", "internal", f"the reply cannot be encoded: {message_of(error)[:150]}", ""]
+    return ["done", answer.compute_ms, reply]

@@ -1,0 +1,348 @@
+"""One job, from the first read of its record to its outcome: follow it, run it, or return its result.
+
+Runs in a thread of the worker, because it only waits: for the store, for a slot, for the job's process.  A
+process that it started has ended when it returns.
+"""
+
+from __future__ import annotations
+
+import os
+import select
+import socket
+import threading
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+from rse_pf.accounts import Accounts
+from rse_pf.child.start import Child, how_ended
+from rse_pf.config import PlatformSettings
+from rse_pf.errors import (
+    Cancelled,
+    Crashed,
+    Expired,
+    LimitExceeded,
+    NotFound,
+    Poison,
+    QuotaExceeded,
+    RsePfError,
+    StoreError,
+    error_from_code,
+)
+from rse_pf.identity import object_name
+from rse_pf.ipc import FrameReader
+from rse_pf.linux import cpu_seconds
+from rse_pf.object_store import ObjectStore, digest_of
+from rse_pf.server.jobs.lease import MAX_TRIES, JobLease, JobRecord, record_name, renewal_s, verdict_on
+from rse_pf.server.jobs.process import JobRequest, inline_bytes, retry_store
+from rse_pf.server.jobs.slots import JobSlots
+from rse_pf.server.robot_store import store_within_quota
+
+__all__ = ["JobContext", "JobOutcome", "JobSignals", "run_job"]
+
+_POLL_SHARE = 0.5
+"""Share of the time between two renewals after which a follower reads the record again."""
+_KILL_AFTER_S = 0.6
+"""A cancelled job that does not end is killed after this."""
+_READ_BYTES = 1 << 18
+WAITING, STARTING = "waits for its turn", "starts"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class JobContext:
+    """What all jobs of one worker share."""
+
+    store: ObjectStore
+    slots: JobSlots
+    settings: PlatformSettings
+    server_id: str
+    start: Callable[[JobRequest], Child]
+    clock: Callable[[], float]
+    services: frozenset[str] = frozenset()
+    """Names of the long services, of which robots may ask."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class JobOutcome:
+    """How a job ended: a reply under its digest, an error, or neither: it was given up."""
+
+    object: str = ""
+    reply: bytes | None = None
+    """MessagePack; None if it is too large to be sent along."""
+    compute_ms: float = 0.0
+    error: RsePfError | None = None
+    cpu_s: float = 0.0
+    """Processor time of its process, if it ran here."""
+
+    @property
+    def is_given_up(self) -> bool:
+        """Whether another server should take the job."""
+        return not self.object and self.error is None
+
+
+class JobSignals:
+    """What the worker signals to the thread of a job; signals are never cleared."""
+
+    def __init__(self) -> None:
+        self.cancelled = False
+        self.giving_up = False
+        self._fd = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+        self._lock = threading.Lock()
+
+    def cancel(self) -> None:
+        """The robot cancelled the job."""
+        self.cancelled = True
+        self._wake()
+
+    def give_up(self) -> None:
+        """The server drains."""
+        self.giving_up = True
+        self._wake()
+
+    def wait(self, seconds: float, *others: socket.socket) -> bool:
+        """Wait for a signal or for bytes on *others*; return False if a signal was set."""
+        poller = select.poll()  # select() takes no descriptor above 1,023, and a worker has thousands
+        poller.register(self._fd, select.POLLIN)
+        for other in others:
+            poller.register(other, select.POLLIN)
+        if any(fd == self._fd for fd, _ in poller.poll(max(0.0, 1e3 * seconds))):
+            os.eventfd_read(self._fd)
+        return not (self.cancelled or self.giving_up)
+
+    def close(self) -> None:
+        """Free the descriptor; later signals are ignored."""
+        with self._lock:
+            os.close(self._fd)
+            self._fd = -1
+
+    def _wake(self) -> None:
+        with self._lock:
+            if self._fd >= 0:
+                os.eventfd_write(self._fd, 1)
+
+
+Tell = Callable[[float, str], None]
+
+
+def run_job(
+    request: JobRequest, context: JobContext, signals: JobSignals, tell: Tell, owner: str
+) -> JobOutcome:
+    """Run or follow the job and return its outcome; blocks until then.
+
+    Args:
+        request: The job.
+        context: Of the worker.
+        signals: Set by the event loop of the worker.
+        tell: Called in this thread with the share that is done, and what is being done.
+        owner: Name that is unique to this process, which runs a job once at a time.
+    """
+    name = record_name(request.robot, request.key)
+    lease = JobLease(context.store, name, owner, context.clock)
+    try:
+        return _follow_or_run(request, context, signals, tell, lease)
+    except RsePfError as error:
+        return JobOutcome(error=error)
+
+
+def _follow_or_run(
+    request: JobRequest, context: JobContext, signals: JobSignals, tell: Tell, lease: JobLease
+) -> JobOutcome:
+    serving = context.settings.serving
+    while True:
+        if signals.giving_up:
+            return JobOutcome()
+        record = lease.read()
+        if signals.cancelled:
+            lease.ask_to_cancel()
+            return JobOutcome(error=_cancelled_error())
+        verdict = verdict_on(
+            record, unchanged_s=lease.unchanged_s, lease_s=serving.job_lease_s,
+            is_watched=lease.is_watched, is_ours=lease.is_ours,
+        )  # fmt: skip
+        if verdict == "follow" and record is not None:
+            tell(record.share, record.what)
+            signals.wait(renewal_s(serving.job_lease_s) * _POLL_SHARE)
+            continue
+        if verdict == "failed" and record is not None:
+            return JobOutcome(error=error_from_code(record.code, record.message, hint=record.hint))
+        if verdict == "poison":
+            reason = f"{MAX_TRIES} workers ended, or did not reach the store, while they ran this job"
+            name = record_name(request.robot, request.key)
+            hint = f"send less at once; the operator can allow it again by deleting the object {name}"
+            return JobOutcome(error=Poison(reason, hint=hint))
+        if verdict == "done" and record is not None:
+            stored = _stored_outcome(request, context, record)
+            if stored is not None:
+                return stored
+        tell(0.0, WAITING)
+        if not context.slots.acquire(request.robot, signals.wait):
+            continue
+        try:
+            if lease.take():
+                outcome = _JobRun(request, context, signals, tell, lease).work()
+                if outcome is not None:
+                    return outcome
+        finally:
+            context.slots.release()
+
+
+def _stored_outcome(request: JobRequest, context: JobContext, record: JobRecord) -> JobOutcome | None:
+    """Return the result that *record* names; None if it was deleted and must be computed again."""
+    name = object_name(request.robot, record.reply)
+    try:
+        reply = None
+        if record.reply_bytes > inline_bytes(context.settings):
+            context.store.head(name)
+        else:
+            reply = context.store.get(name)
+    except NotFound:
+        return None
+    return JobOutcome(object=record.reply, reply=reply, compute_ms=record.compute_ms)
+
+
+class _JobRun:
+    """The run of a job whose lease this worker holds."""
+
+    def __init__(
+        self, request: JobRequest, context: JobContext, signals: JobSignals, tell: Tell, lease: JobLease
+    ) -> None:
+        self._request = request
+        self._context = context
+        self._signals = signals
+        self._tell = tell
+        self._lease = lease
+        self._done, self._what = 0.0, STARTING
+        self._frames = FrameReader(context.settings.data.max_object_bytes)
+        self._end: list[Any] | None = None
+        self._is_over = False
+
+    def work(self) -> JobOutcome | None:
+        """Return the outcome; None if another server took the job."""
+        self._tell(0.0, STARTING)
+        process = self._context.start(self._request)
+        try:
+            why = self._supervise(process)
+        finally:
+            cpu_s = cpu_seconds(process.pid)
+            exit_code = process.kill()  # all its messages have been read
+        outcome = self._outcome_of(why, exit_code)
+        return None if outcome is None else replace(outcome, cpu_s=cpu_s)
+
+    def _outcome_of(self, why: str, exit_code: int) -> JobOutcome | None:
+        if why == "lost":
+            return None
+        if why == "given-up":
+            self._end_lease(JobRecord(state="given-up", owner=""))
+            return JobOutcome()
+        if why == "cancelled":
+            return self._store_failure(_cancelled_error())
+        if why == "late":
+            max_s = self._context.settings.serving.max_job_s
+            return self._store_failure(
+                Expired(f"the job took longer than {max_s:g} s", hint="send less at once")
+            )
+        if self._end is None:
+            return self._store_failure(_crash_error(exit_code))
+        if self._end[0] == "stored":
+            return self._report_stored(*self._end[1:])
+        if self._end[0] == "done":
+            return self._store_reply(*self._end[1:])
+        return self._store_failure(
+            error_from_code(str(self._end[1]), str(self._end[2]), hint=str(self._end[3]))
+        )
+
+    def _supervise(self, process: Child) -> Literal["over", "lost", "given-up", "cancelled", "late"]:
+        """Read from the process and renew the lease until the run ends."""
+        serving, clock, signals = self._context.settings.serving, self._context.clock, self._signals
+        began = clock()
+        next_heartbeat, killed_s = began + renewal_s(serving.job_lease_s), float("inf")
+        while not self._is_over:
+            now = clock()
+            if signals.giving_up:
+                return "given-up"
+            if self._is_cancelled and killed_s == float("inf"):
+                process.say(["cancel"])
+                killed_s = now + _KILL_AFTER_S
+            if now >= killed_s:
+                return "cancelled"
+            if now - began >= serving.max_job_s:
+                return "late"
+            if now >= next_heartbeat:
+                next_heartbeat = now + renewal_s(serving.job_lease_s)
+                self._renew()
+                if not self._lease.is_ours:
+                    return "lost"
+            signals.wait(min(next_heartbeat, killed_s) - clock(), process.connection)
+            self._read(process)
+        return "cancelled" if self._is_cancelled and self._end is None else "over"
+
+    @property
+    def _is_cancelled(self) -> bool:
+        record = self._lease.record
+        return self._signals.cancelled or (record is not None and self._lease.is_ours and record.cancel)
+
+    def _renew(self) -> None:
+        """Renew the lease; while the store fails, the job runs on, unless another server takes it."""
+        with suppress(StoreError):
+            self._lease.renew(self._done, self._what)
+
+    def _read(self, process: Child) -> None:
+        try:
+            data = process.connection.recv(_READ_BYTES, socket.MSG_DONTWAIT)
+        except BlockingIOError:
+            return
+        except OSError:
+            data = b""
+        self._is_over = not data
+        try:
+            for message in self._frames.feed(data):
+                if message[0] == "progress":
+                    self._done, self._what = float(message[1]), str(message[2])
+                    self._tell(self._done, self._what)
+                else:
+                    self._end, self._is_over = message, True
+        except LimitExceeded as error:
+            self._end, self._is_over = ["failed", error.code, error.message, "ask for less"], True
+
+    def _store_reply(self, compute_ms: float, reply: bytes) -> JobOutcome:
+        """Store the reply before it is reported; used where the process has no access to the store."""
+        context, request, digest = self._context, self._request, digest_of(reply)
+        try:
+            accounts = Accounts(context.store, context.settings.data)
+            retry_store(
+                lambda: store_within_quota(context.store, accounts, request.robot, reply, request.quota_bytes)
+            )
+        except QuotaExceeded as error:
+            return self._store_failure(error)
+        inline = reply if len(reply) <= inline_bytes(context.settings) else None
+        return self._report_stored(compute_ms, digest, len(reply), inline)
+
+    def _report_stored(self, compute_ms: float, digest: str, size: int, reply: bytes | None) -> JobOutcome:
+        """Write to the record where the stored reply is; return it, too, if *reply* is small."""
+        self._end_lease(
+            JobRecord(
+                state="done", owner="", reply=digest, reply_bytes=size, compute_ms=compute_ms,
+                server=self._context.server_id,
+            )
+        )  # fmt: skip
+        return JobOutcome(object=digest, reply=reply, compute_ms=compute_ms)
+
+    def _store_failure(self, error: RsePfError) -> JobOutcome:
+        self._end_lease(
+            JobRecord(state="failed", owner="", code=error.code, message=error.message, hint=error.hint)
+        )
+        return JobOutcome(error=error)
+
+    def _end_lease(self, record: JobRecord) -> None:
+        retry_store(lambda: self._lease.end(record))
+
+
+def _cancelled_error() -> RsePfError:
+    return Cancelled("the robot cancelled the command")
+
+
+def _crash_error(code: int) -> RsePfError:
+    return Crashed(
+        f"the job's process ended: {how_ended(code)}", hint="the server's log has what it printed last"
+    )

@@ -1,0 +1,35 @@
+"""Read the access control store periodically, and send every worker what is new.
+
+What cannot be read stays as it was last known, and is logged once.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Sequence
+
+from rse_pf.auth.trust_store import REFRESH_S, TrustStore
+from rse_pf.server.ports import Log
+from rse_pf.server.supervisor.orders import TrustOrder
+from rse_pf.server.supervisor.worker_handle import WorkerProcess
+
+__all__ = ["poll_trust", "update_workers"]
+
+
+async def poll_trust(trust: TrustStore, workers: Sequence[WorkerProcess], log: Log) -> None:
+    """Call `update_workers` periodically until cancelled."""
+    while True:
+        await asyncio.sleep(REFRESH_S)
+        await update_workers(trust, workers, log)
+
+
+async def update_workers(trust: TrustStore, workers: Sequence[WorkerProcess], log: Log) -> None:
+    """Read the store in a thread, log a problem that is new, and send the workers what is new."""
+    known = trust.problem
+    is_new = await asyncio.to_thread(trust.refresh)
+    if trust.problem not in ("", known):
+        log.warning("access-control-unread", reason=trust.problem)
+    if is_new:
+        for worker in workers:
+            worker.order(TrustOrder(trust.snapshot))
+        log.info("access-control-read", bytes=len(trust.snapshot))

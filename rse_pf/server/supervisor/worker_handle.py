@@ -1,0 +1,266 @@
+"""A worker as its supervisor sees it: a process, its load, and two channels.
+
+Workers are forked after the supervisor's imports, which take most of the time of a start, and before its
+event loop and its threads.  A worker holds neither another worker's channels nor the listener.  No call
+here blocks the supervisor: a full channel is a refusal, a worker that does not answer a timeout.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import importlib
+import os
+import signal
+import socket
+import struct
+import sys
+import traceback
+from collections.abc import Callable, Sequence
+from typing import Any, NoReturn
+
+import msgspec
+
+from rse_pf.config import PlatformSettings
+from rse_pf.errors import MissingExtra
+from rse_pf.event_loop import event_loop_maker
+from rse_pf.server.supervisor.orders import (
+    BeginOrder,
+    BlocksOrder,
+    ReportOrder,
+    RobotsOrder,
+    UnblockOrder,
+    WorkerOrder,
+    encode_order,
+)
+from rse_pf.server.supervisor.worker import BEGIN_LENGTH, HANDOVER, WorkerPlan, run_worker
+from rse_pf.services.loading import load_services
+
+__all__ = ["BUILTIN", "RowsOrder", "WorkerProcess", "fork_workers", "warm_up"]
+
+RowsOrder = BlocksOrder | RobotsOrder | UnblockOrder
+"""Orders that a worker answers with rows."""
+BUILTIN = "rse_pf.services.builtin:builtin_services"
+"""The platform's own services."""
+_DESCRIPTOR = struct.Struct("@i")
+_MAX_LINE_BYTES = 1 << 20
+_READ_BYTES = 4096
+
+
+def warm_up(services: str = BUILTIN, settings: PlatformSettings | None = None) -> None:
+    """Import what every worker needs: most of the time of a server's start.
+
+    Raises:
+        ConfigurationError: There are no such services.
+        MissingExtra: The extra ``backend`` is not installed.
+    """
+    event_loop_maker()
+    try:
+        importlib.import_module("rse_pf.server.gateway.websocket")
+    except ModuleNotFoundError as error:
+        raise MissingExtra(error.name or "picows", "backend") from error
+    load_services(services, settings or PlatformSettings())
+
+
+def fork_workers(plans: Sequence[WorkerPlan], *, listener: socket.socket) -> list[WorkerProcess]:
+    """Import what every worker needs, then fork one for each plan; call this before any thread or loop.
+
+    Raises:
+        ConfigurationError: There are no such services.
+        MissingExtra: The extra ``backend`` is not installed.
+    """
+    warm_up(plans[0].services, plans[0].settings)
+    gc.collect()
+    gc.freeze()  # or the first collection of a worker would copy every page that it shares
+    workers: list[WorkerProcess] = []
+    try:
+        for plan in plans:
+            channels = [end for worker in workers for end in worker.channels]
+            workers.append(WorkerProcess(plan, unshared=[listener, *channels]))
+    except OSError:
+        for worker in workers:
+            worker.kill()
+        raise
+    return workers
+
+
+class WorkerProcess:
+    """One worker process, forked at once; `connect` waits until it is ready.
+
+    ``channels`` are the supervisor's ends of both channels, ``pid`` is the process id.
+    """
+
+    def __init__(self, plan: WorkerPlan, *, unshared: Sequence[socket.socket]) -> None:
+        """Fork.  The child closes *unshared*: the sockets of its parent that it must not hold."""
+        self.load = 0
+        self.is_ready = False
+        self.cpu_s = 0.0
+        """CPU time that it took, known when it has ended."""
+        self.crash = plan.crash
+        self.report: dict[str, Any] | None = None
+        self.empty = asyncio.Event()
+        self.gone = asyncio.Event()
+        self._data, data = socket.socketpair()
+        self._control, control = socket.socketpair()
+        self.channels = (self._data, self._control)
+        self._exit_code: int | None = None
+        with data, control:
+            self.pid = os.fork()
+            if self.pid == 0:
+                _be_worker(plan, data, control, [*unshared, *self.channels])
+        self._data.setblocking(False)
+        self._writer: asyncio.StreamWriter | None = None
+        self._reading: asyncio.Task[None] | None = None
+        self._reported: asyncio.Future[None] | None = None
+        self._told_rows: asyncio.Future[dict[str, Any]] | None = None
+        self._rows_number = 0
+
+    def exit_code(self, how: int = os.WNOHANG) -> int | None:
+        """Return how the process ended (negative: by which signal), None while it runs.
+
+        With 0 for *how* it waits for the end.
+        """
+        if self._exit_code is None:
+            try:
+                pid, status, used = os.wait4(self.pid, how)
+                self.cpu_s = used.ru_utime + used.ru_stime
+            except ChildProcessError:
+                pid, status = self.pid, 0  # somebody else reaped it
+            if pid:
+                self._exit_code = os.waitstatus_to_exitcode(status)
+        return self._exit_code
+
+    def begin(self, order: BeginOrder) -> bool:
+        """Let a process that waits take the place of a worker; return whether it lives, then `connect`."""
+        data = encode_order(order)
+        try:
+            self._control.sendall(BEGIN_LENGTH.pack(len(data)) + data)
+        except OSError:
+            return False
+        return True
+
+    async def connect(
+        self,
+        *,
+        on_lost: Callable[[WorkerProcess], None],
+        on_robot: Callable[[WorkerProcess, dict[str, Any]], None],
+    ) -> None:
+        """Wait until the worker takes sockets; *on_lost* is called if it ends, before that or later."""
+        self._on_lost, self._on_robot = on_lost, on_robot
+        reader, self._writer = await asyncio.open_unix_connection(sock=self._control, limit=_MAX_LINE_BYTES)
+        loop = asyncio.get_running_loop()
+        ready = asyncio.Event()
+        self._reading = loop.create_task(self._listen(reader, ready))
+        await ready.wait()
+        self.is_ready = True
+        loop.add_reader(self._data.fileno(), self._count_ended)
+
+    def give(self, fd: int, number: int, peer: str) -> bool:
+        """Send the worker the *number*-th accepted socket, which comes from the address *peer*.
+
+        Returns:
+            False if its channel is full or closed.  The descriptor *fd* stays open in both cases.
+        """
+        try:
+            self._data.sendmsg(
+                [HANDOVER.pack(number, peer.encode())],
+                [(socket.SOL_SOCKET, socket.SCM_RIGHTS, _DESCRIPTOR.pack(fd))],
+            )
+        except OSError:
+            return False
+        self.load += 1
+        return True
+
+    def order(self, order: WorkerOrder) -> None:
+        """Send *order*; one to a worker that is gone is lost."""
+        if self._writer is not None and not self._writer.is_closing():
+            self._writer.write(encode_order(order))
+
+    async def ask_report(self, timeout_s: float) -> None:
+        """Update `report`, or leave it as it is when the worker does not answer in time."""
+        self._reported = asyncio.get_running_loop().create_future()
+        self.order(ReportOrder())
+        await asyncio.wait([self._reported], timeout=timeout_s)
+
+    async def ask_rows(self, order: RowsOrder, timeout_s: float) -> dict[str, Any] | None:
+        """Return the worker's answer to *order*, None if there is none in time; one order at a time."""
+        self._told_rows = asyncio.get_running_loop().create_future()
+        self._rows_number = order.number
+        self.order(order)
+        await asyncio.wait([self._told_rows], timeout=timeout_s)
+        return self._told_rows.result() if self._told_rows.done() else None
+
+    def kill(self) -> None:
+        """Kill the process and close the channels; a second call does nothing."""
+        if self._data.fileno() < 0:
+            return
+        if self._reading is not None:
+            self._reading.cancel()
+            self._reading.get_loop().remove_reader(self._data.fileno())
+        if self.exit_code() is None:
+            os.kill(self.pid, signal.SIGKILL)
+            self.exit_code(0)
+        self.crash.close()
+        self._data.close()
+        if self._writer is not None:
+            self._writer.close()
+        else:
+            self._control.close()
+
+    async def _listen(self, reader: asyncio.StreamReader, ready: asyncio.Event) -> None:
+        try:
+            while line := await reader.readline():
+                self._on_message(msgspec.json.decode(line), ready)
+        except OSError:
+            pass  # a killed worker resets its channel: the same end as below
+        self.gone.set()
+        self.empty.set()
+        self._on_lost(self)
+
+    def _on_message(self, message: dict[str, Any], ready: asyncio.Event) -> None:
+        if message["event"] == "ready":
+            ready.set()
+        elif message["event"] == "empty":
+            self.empty.set()
+        elif message["event"] == "rows":
+            waiting = self._told_rows
+            if waiting is not None and not waiting.done() and message["number"] == self._rows_number:
+                waiting.set_result(message)
+        elif message["event"] == "robots":
+            for event in message["robots"]:
+                self._on_robot(self, event)
+        elif message["event"] != "report":
+            self._on_robot(self, message)
+        else:
+            self.report = message["report"]
+            if self._reported is not None and not self._reported.done():
+                self._reported.set_result(None)
+
+    def _count_ended(self) -> None:
+        try:
+            ended = self._data.recv(_READ_BYTES)
+        except OSError:
+            ended = b""
+        if ended:
+            self.load -= len(ended)
+        else:
+            asyncio.get_running_loop().remove_reader(self._data.fileno())
+
+
+def _be_worker(
+    plan: WorkerPlan, data: socket.socket, control: socket.socket, unshared: Sequence[socket.socket]
+) -> NoReturn:
+    """Run the child until it exits; it never returns into the supervisor's code."""
+    try:
+        for inherited in unshared:
+            inherited.close()
+        nothing = os.open(os.devnull, os.O_RDONLY)
+        os.dup2(nothing, 0)
+        os.close(nothing)
+        run_worker(plan, data, control)
+        os._exit(0)
+    except BaseException:  # noqa: BLE001  it must not go on as a second supervisor
+        traceback.print_exc()
+        sys.stderr.flush()
+    finally:
+        os._exit(1)

@@ -1,0 +1,179 @@
+"""A connection keeps the order of its messages, whichever of them the decoder thread gets."""
+
+from __future__ import annotations
+
+import json
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from fakes import FakeWire
+from msgspec import Raw
+from server.gateway.worker_parts import WorkerParts, worker_parts
+
+from rse_pf.config import PlatformSettings
+from rse_pf.identity import RobotId
+from rse_pf.server.log import JsonLog
+from rse_pf.wire import Command, Failure, Ping, Pong, Result, make_codec
+from rse_pf.wire.server_session import MAX_BAD_MESSAGES
+
+SETTINGS = PlatformSettings()
+CODEC = make_codec("zlib")
+BOMB = zlib.compress(bytes(3_000_000), 9)
+LONG = CODEC.encode(Command(id=7, service="echo", payload={"value": list(range(20_000))}))
+PAUSE_S = 0.1
+
+
+@pytest.fixture
+def worker() -> Iterator[WorkerParts]:
+    with worker_parts(codec="zlib") as parts:
+        yield parts
+
+
+def short(number: int) -> Command:
+    return Command(id=number, service="echo", payload={"value": 1.5})
+
+
+def answered(wire: FakeWire) -> list[int | None]:
+    return [message.id for message in wire.sent if isinstance(message, (Result, Failure))]
+
+
+def test_messages_behind_a_long_one_wait_for_it_and_the_socket_is_not_read_meanwhile(worker: WorkerParts):
+    connection, wire = worker.join()
+
+    for message in (LONG, short(8), LONG, Ping(sent_s=1.0)):
+        worker.say(connection, message)
+    assert (answered(wire), wire.holds) == ([], 1)
+    worker.loop.run_until(lambda: any(isinstance(message, Pong) for message in wire.sent))
+    worker.loop.run_until(lambda: len(answered(wire)) == 3)
+
+    assert answered(wire) == [7, 8, 7]
+    assert wire.holds == 0
+
+
+def test_a_short_command_is_decoded_at_once(worker: WorkerParts):
+    connection, wire = worker.join()
+
+    worker.say(connection, Command(id=1, service="echo", payload={"value": [1.5] * 1000}))
+
+    assert answered(wire) == [1]
+    assert wire.holds == 0
+
+
+def test_a_small_bomb_is_inflated_by_the_thread_and_its_robot_is_read_more_rarely(worker: WorkerParts):
+    connection, wire = worker.join()
+    assert len(BOMB) < worker.decoder.short_bytes
+
+    worker.say(connection, BOMB)
+    assert answered(wire) == []
+    worker.loop.run_until(lambda: answered(wire))
+
+    assert wire.sent[-1].code == "too-large"
+    assert wire.pauses == [PAUSE_S]
+
+
+def test_three_long_bombs_close_the_connection_and_ban_the_robot(worker: WorkerParts):
+    connection, wire = worker.join()
+    limits, rates = SETTINGS.session, worker.admission.rates
+    bomb = zlib.compress(bytes(300_000_000), 9)[: limits.max_message_bytes]
+    assert len(bomb) == limits.max_message_bytes
+
+    for number in range(3):
+        assert wire.closed is None
+        assert rates.banned_s(connection.robot, worker.loop.now) == 0
+        worker.say(connection, bomb)
+        worker.loop.run_until(lambda: len(answered(wire)) > number)  # noqa: B023  it is called at once
+
+    assert wire.closed == (4400, "too many bad messages")
+    assert wire.pauses == pytest.approx([5 * PAUSE_S, 10 * PAUSE_S])
+    assert rates.banned_s(connection.robot, worker.loop.now) == 5.0
+    assert rates.banned_s(RobotId("default", "r2"), worker.loop.now) == 0
+
+
+def test_a_long_command_of_a_robot_that_left_meanwhile_is_dropped(worker: WorkerParts):
+    connection, wire = worker.join()
+
+    worker.say(connection, LONG)
+    connection.on_socket_end()
+    worker.loop.run_until(lambda: wire.holds == 0)
+
+    assert answered(wire) == []
+    assert worker.metrics.requests == {}
+
+
+def test_a_long_message_that_finds_the_decoder_full_is_refused_with_its_id():
+    with worker_parts(codec="zlib", settings=SETTINGS) as worker:
+        connection, wire = worker.join()
+        worker.decoder.begin = lambda *_, **__: None  # type: ignore[method-assign]
+        worker.decoder.unread_bytes = 1 << 24
+        worker.say(connection, LONG)
+
+    (refusal,) = [message for message in wire.sent if isinstance(message, Failure)]
+    assert (refusal.id, refusal.code) == (7, "busy")
+    assert refusal.retry_after_ms > 0
+    assert worker.metrics.shed["unread"] == 1
+
+
+def test_an_answer_is_written_once_and_only_while_the_socket_exists(worker: WorkerParts):
+    connection, wire = worker.join()
+    answer: Any = worker.codec.encode(Result(id=1, reply=None))
+    assert connection.session is not None
+    connection.session.in_flight = 2
+
+    connection.answer(answer, 1)
+    connection.on_socket_end()
+    connection.answer(answer, 1)
+
+    assert answered(wire) == [1]
+    assert connection.session.in_flight == 1
+
+
+UNDECODABLE = CODEC.encode(Command(id=7, service="echo", payload=Raw(b"[1,NaN]")))
+
+
+def test_commands_that_cannot_be_decoded_are_answered_and_the_next_valid_one_works(worker: WorkerParts):
+    connection, wire = worker.join()
+    assert connection.session is not None
+
+    for _ in range(14):
+        worker.say(connection, UNDECODABLE)
+    worker.say(connection, short(8))
+
+    assert [(each.id, each.code) for each in wire.sent if isinstance(each, Failure)] == [
+        (7, "bad-message")
+    ] * 14
+    assert answered(wire)[-1] == 8
+    assert (wire.closed, connection.session.in_flight) == (None, 0)
+    assert wire.pauses == pytest.approx([0.1, 0.2, 0.3, 0.4] + [0.5] * 10)
+    assert worker.admission.rates.banned_s(connection.robot, worker.loop.now) == 0
+    assert worker.metrics.requests["unknown", "bad-message"] == 14
+
+
+def test_a_long_command_that_cannot_be_decoded_is_answered_with_its_id(worker: WorkerParts):
+    connection, wire = worker.join()
+    long = CODEC.encode(Command(id=9, service="echo", payload=Raw(b"[" + b"1," * 60_000 + b"1]")))
+
+    worker.say(connection, long)
+    worker.loop.run_until(lambda: answered(wire))
+
+    assert [(each.id, each.code) for each in wire.sent if isinstance(each, Failure)] == [(9, "too-large")]
+
+
+def test_the_log_names_why_a_message_was_refused_and_a_robot_cut_off(tmp_path: Path):
+    with (tmp_path / "log").open("wb") as file:
+        log = JsonLog(level="info", server="s-1", wall_clock=lambda: 0.0, fd=file.fileno()).start()
+        worker = WorkerParts(log, codec="zlib")
+        connection, _ = worker.join()
+        worker.say(connection, UNDECODABLE)
+        for _ in range(MAX_BAD_MESSAGES + 1):
+            worker.say(connection, b"no zlib stream")
+        worker.dispatcher.close_all()
+        log.close()
+    lines = [json.loads(line) for line in (tmp_path / "log").read_text(encoding="utf-8").splitlines()]
+
+    refused = [line for line in lines if line["event"] == "undecodable"]
+    assert [(each["id"], each["code"]) for each in refused[:2]] == [(7, "bad-message"), (None, "bad-message")]
+    assert refused[1]["reason"] == "not a zlib stream"
+    assert [line["reason"] for line in lines if line["event"] == "cut-off"] == ["bad-messages"]

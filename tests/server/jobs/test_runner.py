@@ -1,0 +1,339 @@
+"""One job from the first read of its record to its outcome, with a process that follows a script."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import os
+import socket
+import threading
+from collections.abc import Callable
+from typing import Any
+
+import msgspec
+import pytest
+
+from rse_pf.config import PlatformSettings
+from rse_pf.errors import Conflict, StoreError
+from rse_pf.identity import RobotId, object_name
+from rse_pf.ipc import encode_message
+from rse_pf.linux import raise_descriptor_limit
+from rse_pf.object_store import MemoryStore, digest_of
+from rse_pf.server.jobs.lease import JobLease, JobRecord, record_name
+from rse_pf.server.jobs.process import JobRequest
+from rse_pf.server.jobs.runner import JobContext, JobOutcome, JobSignals, run_job
+from rse_pf.server.jobs.slots import JobSlots, make_slot_file
+
+SETTINGS = PlatformSettings.from_dict(
+    {
+        "serving": {"job_lease_s": 0.25},
+        "session": {"max_message_bytes": 1024},
+        "data": {"max_object_bytes": 4096},
+    }
+)
+WANTED = JobRequest(
+    service="long", payload={}, robot=RobotId("default", "robot-1"), key="ab" * 32, quota_bytes=1e6
+)
+NAME = record_name(RobotId("default", "robot-1"), WANTED.key)
+REPLY = msgspec.msgpack.encode({"value": 1})
+DONE = ["done", 12.5, REPLY]
+
+
+class FakeProcess:
+    """Sends *script* at once; then ends with *code* if *ends*."""
+
+    pid = 0
+
+    def __init__(self, script: list[Any], *, ends: bool = True, code: int = 0) -> None:
+        self.connection, self.theirs = socket.socketpair()
+        self.killed = threading.Event()
+        self._code = code
+        for message in script:
+            self.theirs.sendall(encode_message(message))
+        if ends:
+            self.theirs.close()
+
+    def say(self, message: list[str]) -> None:
+        with contextlib.suppress(OSError):
+            self.connection.sendall(encode_message(message))
+
+    def kill(self) -> int:
+        self.killed.set()
+        self.theirs.close()
+        self.connection.close()
+        return self._code
+
+
+class Clock:
+    """Advances by a hundredth of a second with each reading, so that nothing waits for long."""
+
+    def __init__(self) -> None:
+        self._ticks = itertools.count()
+
+    def __call__(self) -> float:
+        return next(self._ticks) * 0.01
+
+
+class Bench:
+    def __init__(self) -> None:
+        self.store: MemoryStore = MemoryStore()
+        self.processes: list[FakeProcess] = []
+        self.scripts: list[Callable[[], FakeProcess]] = []
+        self.told: list[tuple[float, str]] = []
+        self.signals = JobSignals()
+        self.slots = JobSlots(make_slot_file(), 1)
+
+    def start(self, wanted: JobRequest) -> FakeProcess:
+        self.processes.append(self.scripts.pop(0)())
+        return self.processes[-1]
+
+    def run(self, *scripts: Callable[[], FakeProcess]) -> JobOutcome:
+        self.scripts += scripts
+        context = JobContext(
+            store=self.store, slots=self.slots, settings=SETTINGS, server_id="s",
+            start=self.start, clock=Clock(),
+        )  # fmt: skip
+
+        def tell(share: float, what: str) -> None:
+            self.told.append((share, what))
+            self.on_tell(share, what)
+
+        return run_job(WANTED, context, self.signals, tell, "us")
+
+    def on_tell(self, share: float, what: str) -> None: ...
+
+    @property
+    def record(self) -> JobRecord:
+        return msgspec.json.decode(self.store.get(NAME), type=JobRecord)
+
+
+@pytest.fixture
+def bench():
+    bench = Bench()
+    yield bench
+    bench.signals.close()
+    for process in bench.processes:
+        assert process.killed.is_set(), "a process outlived its job"
+
+
+def code(outcome: JobOutcome) -> str:
+    return "ok" if outcome.error is None else outcome.error.code
+
+
+def another(bench: Bench) -> JobLease:
+    lease = JobLease(bench.store, NAME, "another", Clock())
+    lease.read()
+    return lease
+
+
+class Ordered(MemoryStore):
+    """Fails if a job is done before its reply is stored."""
+
+    def compare_and_swap(self, name: str, expected: bytes | None, data: bytes) -> None:
+        if name.startswith("accounts/"):
+            super().compare_and_swap(name, expected, data)
+            return
+        record = msgspec.json.decode(data, type=JobRecord)
+        if record.state == "done":
+            self.get(object_name(RobotId("default", "robot-1"), record.reply))
+        super().compare_and_swap(name, expected, data)
+
+
+def test_a_result_is_stored_before_it_is_reported(bench):
+    bench.store = Ordered()
+
+    outcome = bench.run(lambda: FakeProcess([["progress", 0.5, "half"], DONE]))
+
+    assert outcome == JobOutcome(object=digest_of(REPLY), reply=REPLY, compute_ms=12.5)
+    assert bench.store.get(object_name(RobotId("default", "robot-1"), outcome.object)) == REPLY
+    assert (bench.record.state, bench.record.reply) == ("done", outcome.object)
+    assert [what for _, what in bench.told] == ["waits for its turn", "starts", "half"]
+
+
+@pytest.mark.parametrize("script", [[DONE], [], [["failed", "bad-request", "no", ""]]])
+def test_an_outcome_says_what_its_process_took_whatever_came_of_it(
+    bench, monkeypatch: pytest.MonkeyPatch, script: list[Any]
+):
+    monkeypatch.setattr("rse_pf.server.jobs.runner.cpu_seconds", lambda pid: 3.25)
+
+    assert bench.run(lambda: FakeProcess(script)).cpu_s == 3.25
+    if script == [DONE]:
+        assert bench.run().cpu_s == 0.0, "a stored result was not computed again"
+
+
+def test_a_job_runs_in_a_worker_with_more_than_1024_descriptors():
+    raise_descriptor_limit()
+    with contextlib.ExitStack() as opened, open(os.devnull) as file:
+        for _ in range(1100):
+            opened.callback(os.close, os.dup(file.fileno()))
+        bench = Bench()
+
+        assert code(bench.run(lambda: FakeProcess([DONE]))) == "ok"
+        bench.signals.close()
+
+
+def test_a_large_reply_is_reported_by_name_only(bench):
+    reply = msgspec.msgpack.encode({"value": "x" * 600})
+
+    first = bench.run(lambda: FakeProcess([["done", 12.5, reply]]))
+
+    assert (first.reply, first.object) == (None, digest_of(reply))
+    assert bench.run() == first
+
+
+def test_a_result_whose_object_was_deleted_is_computed_again(bench):
+    outcome = bench.run(lambda: FakeProcess([DONE]))
+    bench.store.delete(object_name(RobotId("default", "robot-1"), outcome.object))
+
+    assert bench.run(lambda: FakeProcess([DONE])) == outcome
+    assert len(bench.processes) == 2
+
+
+def test_a_failure_is_reported_unchanged_and_the_next_request_runs_again(bench):
+    outcome = bench.run(lambda: FakeProcess([["failed", "bad-request", "no maps", "send some"]]))
+
+    assert code(outcome) == "bad-request"
+    assert outcome.error is not None
+    assert (outcome.error.message, outcome.error.hint) == ("no maps", "send some")
+    assert code(bench.run(lambda: FakeProcess([DONE]))) == "ok"
+
+
+def test_a_reply_that_is_too_large_ends_the_job(bench):
+    outcome = bench.run(lambda: FakeProcess([["done", 1.0, b"x" * 5000]], ends=False))
+
+    assert code(outcome) == "too-large"
+
+
+def test_a_process_that_ignores_the_cancel_is_killed(bench):
+    bench.on_tell = lambda share, what: bench.signals.cancel() if what == "half" else None
+
+    outcome = bench.run(lambda: FakeProcess([["progress", 0.5, "half"]], ends=False))
+
+    assert code(outcome) == "cancelled"
+    assert (bench.record.state, bench.record.code) == ("failed", "cancelled")
+
+
+def test_a_result_that_arrives_before_the_cancel_is_processed_is_kept(bench):
+    bench.on_tell = lambda share, what: bench.signals.cancel() if what == "half" else None
+
+    assert code(bench.run(lambda: FakeProcess([["progress", 0.5, "half"], DONE]))) == "ok"
+
+
+def test_a_draining_server_gives_up_its_job_so_that_others_take_it_at_once(bench):
+    bench.on_tell = lambda share, what: bench.signals.give_up() if what == "half" else None
+
+    outcome = bench.run(lambda: FakeProcess([["progress", 0.5, "half"]], ends=False))
+
+    assert outcome.is_given_up
+    assert bench.record.state == "given-up"
+
+
+def test_a_job_that_runs_on_another_server_is_followed_to_its_end(bench):
+    owner = another(bench)
+    owner.take()
+    owner.renew(0.25, "quarter")
+
+    def end(share: float, what: str) -> None:
+        if owner.record is not None and owner.record.state == "running":
+            bench.store.put(object_name(RobotId("default", "robot-1"), digest_of(REPLY)), REPLY)
+            owner.end(JobRecord(state="done", owner="", reply=digest_of(REPLY), reply_bytes=len(REPLY)))
+
+    bench.on_tell = end
+
+    assert bench.run().object == digest_of(REPLY)
+    assert bench.told == [(0.25, "quarter")]
+    assert bench.processes == []
+
+
+def test_the_failure_of_a_followed_job_is_reported_and_not_retried(bench):
+    owner = another(bench)
+    owner.take()
+    failed = JobRecord(state="failed", owner="", code="crashed", message="it ended")
+    bench.on_tell = lambda share, what: owner.end(failed)
+
+    assert code(bench.run()) == "crashed"
+    assert bench.processes == []
+
+
+def test_a_server_that_lost_the_lease_kills_its_process_and_follows_the_new_owner(bench):
+    def overtake(share: float, what: str) -> None:
+        if what == "half" and bench.record.owner == "us":
+            other = another(bench)
+            other.take()
+            bench.store.put(object_name(RobotId("default", "robot-1"), digest_of(REPLY)), REPLY)
+            other.end(JobRecord(state="done", owner="", reply=digest_of(REPLY), reply_bytes=len(REPLY)))
+
+    bench.on_tell = overtake
+
+    outcome = bench.run(lambda: FakeProcess([["progress", 0.5, "half"]], ends=False))
+
+    assert outcome.object == digest_of(REPLY)
+    assert bench.record.owner == "another"
+
+
+class Faulty(MemoryStore):
+    """Fails for the first renewals of a running job, then calls *recovered*."""
+
+    def __init__(self, failures: int, recovered: Callable[[], None]) -> None:
+        super().__init__()
+        self.failures = failures
+        self._recovered = recovered
+
+    def compare_and_swap(self, name: str, expected: bytes | None, data: bytes) -> None:
+        if expected is not None and self.failures > 0:
+            self.failures -= 1
+            if self.failures == 0:
+                self._recovered()
+            raise StoreError("503")
+        super().compare_and_swap(name, expected, data)
+
+
+@pytest.mark.parametrize("failures", [2, 20], ids=["shorter than the lease", "longer than the lease"])
+def test_a_failure_of_the_store_does_not_end_a_job(bench, failures):
+    bench.store = Faulty(failures, lambda: bench.processes[0].theirs.sendall(encode_message(DONE)))
+
+    assert code(bench.run(lambda: FakeProcess([], ends=False))) == "ok"
+    assert bench.store.failures == 0
+    assert bench.record.tries == 1
+
+
+def test_a_store_that_fails_is_a_typed_failure(bench):
+    class Gone(MemoryStore):
+        def get(self, name: str) -> bytes:
+            raise StoreError("gone")
+
+    bench.store = Gone()
+
+    assert code(bench.run()) == "store"
+
+
+def test_the_outcome_is_written_again_after_a_conflict(bench):
+    class Racing(MemoryStore):
+        races = 1
+
+        def compare_and_swap(self, name: str, expected: bytes | None, data: bytes) -> None:
+            if b'"done"' in data and self.races:
+                self.races -= 1
+                raise Conflict("somebody asked to cancel")
+            super().compare_and_swap(name, expected, data)
+
+    bench.store = Racing()
+
+    assert code(bench.run(lambda: FakeProcess([DONE]))) == "ok"
+    assert bench.record.state == "done"
+
+
+def test_a_reply_that_the_process_stored_is_reported_by_its_name(bench):
+    outcome = bench.run(lambda: FakeProcess([["stored", 12.5, "ab" * 32, 10**6, None]]))
+
+    assert outcome == JobOutcome(object="ab" * 32, reply=None, compute_ms=12.5)
+    assert (bench.record.state, bench.record.reply, bench.record.reply_bytes) == ("done", "ab" * 32, 10**6)
+    assert [info.name for info in bench.store.list("objects/")] == []
+
+
+def test_a_reply_above_the_robots_quota_is_a_typed_failure_and_not_stored(bench):
+    bench.store.put(object_name(RobotId("default", "robot-1"), "full"), bytes(10**6 - 1))
+
+    assert code(bench.run(lambda: FakeProcess([DONE]))) == "quota"
+    assert bench.record.code == "quota"
+    assert len(list(bench.store.list("objects/"))) == 1

@@ -1,0 +1,195 @@
+"""A map for tests of its owner: it numbers keyframes, and its digest depends on every event in its order."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Collection
+from typing import Any, Literal
+
+import msgspec
+import numpy as np
+
+from rse_pf.errors import BadRequest
+from rse_pf.geometry import Camera
+from rse_pf.live_map.events import (
+    Event,
+    KeyframeAdded,
+    LinksMeasured,
+    MapStarted,
+    Optimised,
+    RobotForgotten,
+    encode_events,
+)
+from rse_pf.live_map.feature_parts import SnapshotParts
+from rse_pf.live_map.outcomes import Added, Alignment, Corrected, Outcome
+from rse_pf.live_map.versions import PointSource
+from rse_pf.maps.format import Keyframe, MapVersion
+from rse_pf.server.live_map.owner.state import MapKind
+from rse_pf.server.live_map.owner.whole_fit import WholeFit
+from rse_pf.slam.keyframe import Keyframe as SentKeyframe
+from rse_pf.slam.keyframe import UnknownBlock, encode_keyframe, make_features
+from rse_pf.wire.live_map import KeyframeRequest
+
+__all__ = ["FAKE_MAP", "FakeMap", "content_of", "keyframe_bytes", "keyframe_request"]
+
+_CAMERA = Camera(fx=500.0, fy=500.0, cx=320.0, cy=240.0, width=640, height=480)
+_CONTENT_KIND = 1000
+
+
+class FakeMap:
+    """Keyframes with the content ``bad`` are garbage, with ``defect`` they break the map's logic."""
+
+    def __init__(self) -> None:
+        self._state: dict[str, Any] = {"digest": "", "keyframes": [], "numbers": {}, "segments": {}}
+
+    @classmethod
+    def restore(cls, head: bytes, part: Callable[[str], bytes]) -> FakeMap:
+        restored = cls()
+        restored._state = msgspec.msgpack.decode(part(head.decode()))
+        return restored
+
+    def snapshot_parts(self, known: Collection[str] = ()) -> SnapshotParts:
+        data = msgspec.msgpack.encode(self._state)
+        name = hashlib.sha256(data).hexdigest()
+        return SnapshotParts(head=name.encode(), parts={name: None if name in known else data})
+
+    def digest(self) -> str:
+        return str(self._state["digest"])
+
+    def judge(self, event: KeyframeAdded) -> Literal["new", "known", "ahead"]:
+        expected = self.next_number(event.robot)
+        if event.number != expected:
+            return "known" if event.number < expected else "ahead"
+        if content_of(event) == b"bad":
+            raise BadRequest("garbage")
+        return "new"
+
+    def next_number(self, robot: str) -> int:
+        return int(self._state["numbers"].get(robot, 0))
+
+    def next_segment(self, robot: str) -> int:
+        return int(self._state["segments"].get(robot, -1)) + 1
+
+    def apply(self, event: Event) -> list[Outcome]:
+        if isinstance(event, KeyframeAdded) and content_of(event) == b"defect":
+            raise ZeroDivisionError
+        self._state["digest"] = hashlib.sha256(self.digest().encode() + encode_events([event])).hexdigest()
+        if isinstance(event, KeyframeAdded):
+            self._state["keyframes"].append([event.robot, event.number, event.keyframe.timestamp_s])
+            self._state["numbers"][event.robot] = event.number + 1
+            self._state["segments"][event.robot] = event.segment
+            return [Added(id=len(self._state["keyframes"]) - 1)]
+        if isinstance(event, LinksMeasured):
+            robot, number, _ = self._state["keyframes"][event.keyframe]
+            T = np.eye(4)
+            T[0, 3] = len(self._state["keyframes"])
+            return [
+                Corrected(robot=robot, segment=0, T_map_odom=T, covariance=np.eye(6), cause=(robot, number))
+            ]
+        if isinstance(event, MapStarted):
+            self._state["keyframes"] += [[each.robot, -1, 0.0] for each in event.keyframes]
+        if isinstance(event, RobotForgotten):
+            rows = self._state["keyframes"]
+            self._state["keyframes"] = [each for each in rows if each[0] != event.robot]
+            for table in ("numbers", "segments"):
+                self._state[table].pop(event.robot, None)
+        return []
+
+    def measuring(
+        self, keyframe: int, pieces: int = 1, candidates: int | None = None
+    ) -> list[Callable[[], LinksMeasured]]:
+        return [lambda: LinksMeasured(keyframe=keyframe)]
+
+    def optimising(self, solve: WholeFit | None = None) -> Callable[[], Optimised]:
+        return lambda: Optimised(up_to=0, ids=(), T_map_camera=b"")
+
+    def relocalising(self, view: SentKeyframe) -> Callable[[], Any]:
+        raise BadRequest("the fake map cannot relocalise")
+
+    def alignments(self) -> list[Alignment]:
+        T = np.eye(4)
+        T[0, 3] = len(self._state["keyframes"])
+        return [
+            Alignment(
+                robot=robot, segment=segment, aligned=True, reason="", T_map_odom=T, covariance=np.eye(6)
+            )
+            for robot, segment in self._state["segments"].items()
+        ]
+
+    def to_version(self) -> MapVersion:
+        camera = Camera(fx=500.0, fy=500.0, cx=320.0, cy=240.0, width=640, height=480)
+        keyframes = [
+            Keyframe(
+                id=row, robot=robot, timestamp_s=timestamp_s, T_world_camera=np.eye(4), camera=camera,
+                pixels=np.zeros((0, 2), np.float32), descriptors=np.zeros((0, 32), np.uint8),
+                points_camera=np.zeros((0, 3), np.float32),
+            )
+            for row, (robot, _, timestamp_s) in enumerate(self._state["keyframes"])
+        ]  # fmt: skip
+        return MapVersion(keyframes=tuple(keyframes), edges=(), points=np.zeros((0, 3), np.float32))
+
+    def point_sources(self, version: MapVersion) -> tuple[PointSource, ...]:
+        return ()
+
+    def image_references(self, version: MapVersion) -> dict[str, Any]:
+        return {}
+
+    def paths(self, most: int) -> list[tuple[str, int, Any]]:
+        return []
+
+    @property
+    def gone_objects(self) -> list[tuple[str, str]]:
+        return []
+
+    @property
+    def keyframes(self) -> int:
+        return len(self._state["keyframes"])
+
+    @property
+    def robots(self) -> tuple[str, ...]:
+        return tuple(self._state["numbers"])
+
+    @property
+    def contributors(self) -> tuple[str, ...]:
+        return tuple(self._state["numbers"])
+
+    @property
+    def links_believed(self) -> int:
+        return 0
+
+
+def _started(version: MapVersion, source: str) -> MapStarted:
+    from rse_pf.live_map.events import StartKeyframe
+
+    return MapStarted(
+        source=source,
+        keyframes=tuple(
+            StartKeyframe(robot=each.robot, data=keyframe_bytes(0.0, b"")) for each in version.keyframes
+        ),
+    )
+
+
+FAKE_MAP = MapKind(empty=FakeMap, restore=FakeMap.restore, started_from=_started)
+
+
+def keyframe_bytes(timestamp_s: float, content: bytes) -> bytes:
+    """Return a keyframe without features, which holds *content* in a block of its own."""
+    features = make_features(np.zeros((0, 2)), np.zeros(0), np.zeros((0, 32), np.uint8))
+    return encode_keyframe(
+        SentKeyframe(
+            timestamp_s=timestamp_s, T_odom_camera=np.eye(4), camera=_CAMERA, features=features,
+            others=(UnknownBlock(_CONTENT_KIND, content),),
+        )
+    )  # fmt: skip
+
+
+def content_of(event: KeyframeAdded) -> bytes:
+    """Return what `keyframe_bytes` was given."""
+    return event.keyframe.others[0].content
+
+
+def keyframe_request(number: int, content: bytes = b"good", segment: int = 0) -> KeyframeRequest:
+    """Return what a robot sends with keyframe *number*."""
+    return KeyframeRequest(
+        map="m", segment=segment, number=number, keyframe=keyframe_bytes(float(number), content)
+    )

@@ -1,0 +1,70 @@
+"""Entries of the log are bounded, and so is what waits for a store."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from typing import Any, cast
+
+import pytest
+
+from rse_pf.errors import Busy
+from rse_pf.live_map.events import Event, KeyframeAdded, RobotLeft
+from rse_pf.server.live_map.owner.log import EntryWriter, Submitted
+
+
+class Taker:
+    """Holds no map; notes how many events each entry had."""
+
+    def __init__(self) -> None:
+        self.sizes: list[int] = []
+
+    async def take_entry(self, position: int, batch: list[Submitted]) -> None:
+        self.sizes.append(len(batch))
+        for each in batch:
+            each.done.set_result([])
+
+
+class Store:
+    """Writes at once, as a thread and a log do."""
+
+    def store(self, act: Callable[[], int]) -> Awaitable[int]:
+        async def done() -> int:
+            return act()
+
+        return done()
+
+    def write(self, data: bytes) -> int:
+        return 1
+
+
+def keyframe(number: int) -> Event:
+    return KeyframeAdded(robot="r", number=number, segment=0, data=b"")
+
+
+def writer(taker: Taker) -> EntryWriter:
+    store = cast(Any, Store())
+    return EntryWriter(
+        store, take_entry=taker.take_entry, on_waiting=lambda is_waiting: None, on_lost=lambda reason: None,
+        threads=store, sleep=asyncio.sleep, json_log=cast(Any, None), name="m",
+    )  # fmt: skip
+
+
+async def test_an_entry_holds_no_more_than_four_mebibytes() -> None:
+    entries = writer(taker := Taker())
+    for number in range(5):
+        entries.submit(keyframe(number), 2 << 20)
+    running = asyncio.ensure_future(entries.run())
+    await entries.wait_empty()
+    running.cancel()
+    assert taker.sizes == [2, 2, 1]
+
+
+async def test_a_keyframe_too_many_is_refused_and_who_leaves_is_not() -> None:
+    entries = writer(Taker())
+    for number in range(1024):
+        entries.submit(keyframe(number))
+
+    with pytest.raises(Busy):
+        entries.submit(keyframe(1024))
+    entries.submit(RobotLeft(robot="r"))

@@ -1,0 +1,113 @@
+"""How an owner measures keyframes: less of each while many wait, and the whole graph apart."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from typing import TypeVar
+
+import numpy as np
+import pytest
+from fakes import FakeLog
+
+from rse_pf.geometry import Array, exp_se3, inverse
+from rse_pf.live_map.events import Event, LinksMeasured
+from rse_pf.server.live_map.owner.state import MapState, Measuring, candidates_of
+from rse_pf.server.live_map.owner.threads import Urgency
+from rse_pf.server.live_map.owner.whole_fit import fit_apart, fit_here
+from rse_pf.slam.optimise import OptimiseOptions
+from rse_pf.slam.pose_graph import PoseGraph
+from tests.server.live_map.fake_map import FakeMap
+from tests.server.live_map.owner_bench import settle
+
+_T = TypeVar("_T")
+
+
+class HeldThreads:
+    """Computes at once; what looks waits until the test lets it."""
+
+    def __init__(self) -> None:
+        self.looking: list[asyncio.Event] = []
+
+    async def compute(self, urgency: Urgency, act: Callable[[], _T]) -> _T:
+        return act()
+
+    def look(self, act: Callable[[], _T]) -> asyncio.Future[_T]:
+        held = asyncio.Event()
+        self.looking.append(held)
+        return asyncio.ensure_future(self._look(held, act))
+
+    async def _look(self, held: asyncio.Event, act: Callable[[], _T]) -> _T:
+        await held.wait()
+        return act()
+
+    store = lease = background = look
+
+
+class NotingMap(FakeMap):
+    """Notes how each keyframe was to be measured."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.asked: list[tuple[int, int, int | None]] = []
+
+    def measuring(
+        self, keyframe: int, pieces: int = 1, candidates: int | None = None
+    ) -> list[Callable[[], LinksMeasured]]:
+        self.asked.append((keyframe, pieces, candidates))
+        return [lambda: LinksMeasured(keyframe=keyframe)] * pieces
+
+
+def test_the_more_keyframes_wait_the_fewer_others_each_is_compared_with() -> None:
+    found = [candidates_of(waiting) for waiting in range(40)]
+    assert found[0] is None
+    rest = [each for each in found if each is not None]
+    assert found == [None] * (40 - len(rest)) + rest
+    assert rest == sorted(rest, reverse=True)
+    assert min(rest) >= 4
+
+
+async def test_waiting_keyframes_are_measured_two_at_a_time_and_one_alone_by_both_threads() -> None:
+    live_map, threads, taken = NotingMap(), HeldThreads(), list[Event]()
+    measuring = Measuring(
+        MapState(live_map, 0), threads, taken.append, fit=fit_here, name="warehouse",
+        json_log=FakeLog(),
+    )  # fmt: skip
+    working = asyncio.ensure_future(measuring.run())
+    measuring.measure(range(20))
+    await settle()
+    assert [each[:2] for each in live_map.asked] == [(0, 1), (1, 1)]
+    assert all(candidates is not None for _, _, candidates in live_map.asked)
+    while len(taken) < 20:
+        for held in threads.looking:
+            held.set()
+        await settle()
+    assert sorted(each.keyframe for each in taken) == list(range(20))  # type: ignore[union-attr]
+    live_map.asked.clear()
+    measuring.measure([20])
+    await settle()
+    assert live_map.asked == [(20, 2, None)]
+    working.cancel()
+    await asyncio.wait({working})
+
+
+@pytest.mark.slow  # starts a process
+def test_a_graph_that_is_fitted_apart_has_the_same_poses() -> None:
+    graph = _loop()
+    apart = fit_apart(graph, OptimiseOptions())
+    assert apart.tobytes() == fit_here(graph, OptimiseOptions()).tobytes()
+    assert not np.array_equal(apart, graph.T_world_pose)
+
+
+def _loop() -> PoseGraph:
+    """Return a loop whose edges are right and whose poses have drifted."""
+    n = 12
+    rng = np.random.default_rng(0)
+    true: Array = np.array([exp_se3(np.array([0.3 * i, 0.0, 0.0, 0.0, 0.0, 0.5 * i])) for i in range(n)])
+    a, b = np.arange(n), (np.arange(n) + 1) % n
+    drifted = np.array([each @ exp_se3(0.02 * i * rng.standard_normal(6)) for i, each in enumerate(true)])
+    return PoseGraph(
+        T_world_pose=drifted, a=a, b=b, robust=a == n - 1, ids=a,
+        T_a_b=np.array([inverse(true[i]) @ true[j] for i, j in zip(a, b, strict=True)]),
+        information=np.tile(1e4 * np.eye(6), (n, 1, 1)),
+    )  # fmt: skip

@@ -1,0 +1,205 @@
+"""When a live map is published: at most once in an interval, and never twice the same map."""
+
+from __future__ import annotations
+
+import asyncio
+
+import pytest
+
+from rse_pf.errors import Busy, NotFound, StoreError, StoreFull
+from rse_pf.maps.registry import MapRegistry
+from rse_pf.object_store import MemoryStore
+from tests.server.live_map.owner_bench import MAP, Bench, settle
+
+
+async def test_robots_that_leave_again_and_again_publish_one_version_in_an_interval_and_the_last_one_late():
+    bench = Bench()
+
+    owner = await bench.own("a")
+    owner.owner.users = 1
+    maps = MapRegistry(bench.store, "default")
+    for number in range(20):
+        await owner.keyframe(number)
+        await owner.ask("live-leave")
+        await settle()
+    assert [each.keyframes for each in maps.versions(MAP)] == [1]
+    await bench.clock.advance(9.0)
+    assert len(maps.versions(MAP)) == 1
+    await bench.clock.advance(2.0)
+    assert [each.keyframes for each in maps.versions(MAP)] == [1, 20]
+    for _ in range(5):
+        await owner.ask("live-leave")
+        await bench.clock.advance(11.0)
+    assert len(maps.versions(MAP)) == 2, "nothing has changed"
+
+
+async def test_who_asks_for_a_version_waits_for_the_interval_and_all_who_ask_get_the_same_one():
+    bench = Bench(publish_pause_s=5.0)
+
+    owner = await bench.own("a")
+    await owner.keyframe(0)
+    assert (await owner.ask("live-publish"))["number"] == 1
+    assert (await owner.ask("live-publish"))["number"] == 1
+    await owner.keyframe(1)
+    asked = [asyncio.ensure_future(owner.ask("live-publish")) for _ in range(3)]
+    await bench.clock.advance(4.0)
+    assert not any(each.done() for each in asked)
+    await bench.clock.advance(2.0)
+    assert [(await each)["number"] for each in asked] == [2, 2, 2]
+
+
+async def test_who_would_wait_for_long_is_told_when_to_ask_again_and_the_map_goes_on():
+    bench = Bench(publish_pause_s=60.0)
+
+    owner = await bench.own("a")
+    await owner.keyframe(0)
+    await owner.ask("live-publish")
+    await bench.clock.advance(5.0)
+    await owner.keyframe(1)
+    for operation in ("live-publish", "live-stop"):
+        with pytest.raises(Busy) as refused:
+            await owner.ask(operation)
+        assert refused.value.retry_after_ms == pytest.approx(55_000.0)
+    assert (await owner.keyframe(2))["number"] == 3
+
+
+async def test_the_interval_counts_over_owners_and_the_same_map_is_not_published_by_the_next_one():
+    bench = Bench()
+
+    first = await bench.own("a")
+    maps = MapRegistry(bench.store, "default")
+    await first.keyframe(0)
+    await first.ask("live-leave")
+    await settle()
+    await first.owner.release()
+    second = await bench.own("b")
+    second.owner.users = 1
+    asked = asyncio.ensure_future(second.ask("live-publish"))
+    await bench.clock.advance(9.0)
+    assert not asked.done()
+    await bench.clock.advance(2.0)
+    assert (await asked)["number"] == 1, "it is the same map"
+    await second.keyframe(1)
+    await second.ask("live-leave")
+    await bench.clock.advance(11.0)
+    assert maps.head(MAP).keyframes == 2
+
+
+async def test_a_drain_publishes_what_is_due_and_a_crash_leaves_it_to_the_next_owner():
+    bench = Bench(idle_s=3.0)
+
+    maps = MapRegistry(bench.store, "default")
+    drained = await bench.own("a")
+    await drained.keyframe(0)
+    await drained.ask("live-leave")
+    await drained.keyframe(1)
+    await drained.ask("live-leave")
+    await settle()
+    assert maps.head(MAP).keyframes == 1
+    await drained.owner.release()
+    assert maps.head(MAP).keyframes == 2
+    crashed = await bench.own("b")
+    crashed.owner.users = 1
+    await crashed.keyframe(2)
+    await crashed.ask("live-leave")
+    await settle()
+    crashed.owner.lose("it crashed")
+    assert maps.head(MAP).keyframes == 2
+    await bench.clock.advance(3.0)
+    following = await bench.own("c")
+    await bench.clock.advance(15.0)
+    assert await following.run == "released"
+    assert maps.head(MAP).keyframes == 3
+
+
+class FullRegistry(MemoryStore):
+    """Has no space for maps while it is full."""
+
+    is_full = False
+
+    def put(self, name: str, data: bytes) -> None:
+        if self.is_full and name.startswith("maps/"):
+            raise StoreFull("no space left", hint="free some space")
+        super().put(name, data)
+
+
+class UndeletableMaps(MemoryStore):
+    """Removes no record of a version while it is slow."""
+
+    is_slow = False
+
+    def delete(self, name: str) -> None:
+        if self.is_slow and "/versions/" in name:
+            raise StoreError("the store is slow", hint="wait")
+        super().delete(name)
+
+
+async def test_a_version_that_cannot_be_stored_stays_due_and_who_asks_is_told_why():
+    store = FullRegistry()
+    bench = Bench(store, publish_pause_s=1.0)
+
+    owner = await bench.own("a")
+    owner.owner.users = 1
+    await owner.keyframe(0)
+    store.is_full = True
+    with pytest.raises(StoreFull):
+        await owner.ask("live-publish")
+    await owner.ask("live-leave")
+    await bench.clock.advance(3.0)
+    with pytest.raises(NotFound):
+        MapRegistry(store, "default").head(MAP)
+    store.is_full = False
+    await bench.clock.advance(12.0)
+    assert MapRegistry(store, "default").head(MAP).keyframes == 1
+
+
+async def test_of_versions_that_nobody_asked_for_the_newest_stay_and_the_others_give_their_bytes_back():
+    bench = Bench(publish_pause_s=0.0, keep_versions=3)
+
+    owner = await bench.own("a")
+    owner.owner.users = 1
+    maps = MapRegistry(bench.store, "default")
+    numbers = []
+    for number in range(8):
+        await owner.keyframe(number)
+        if number == 1:
+            await owner.ask("live-publish")
+        await owner.ask("live-leave")
+        await bench.clock.advance(1.0)
+        numbers.append([each.number for each in maps.versions(MAP)])
+    assert numbers[2] == [1, 2, 3]
+    assert numbers[-1] == [2, 6, 7, 8], "number 2 was asked for"
+    assert [maps.data(MAP, each.id) for each in maps.versions(MAP)]
+    assert len(list(bench.store.list(f"maps/default/{MAP}/blobs/"))) == 4
+
+
+async def test_an_operator_may_keep_all_versions():
+    bench = Bench(publish_pause_s=0.0, keep_versions=0)
+
+    owner = await bench.own("a")
+    owner.owner.users = 1
+    for number in range(25):
+        await owner.keyframe(number)
+        await owner.ask("live-leave")
+        await bench.clock.advance(1.0)
+    assert len(MapRegistry(bench.store, "default").versions(MAP)) == 25
+
+
+async def test_a_version_that_cannot_be_removed_is_no_failure_of_the_one_that_was_published():
+    store = UndeletableMaps()
+    bench = Bench(store, publish_pause_s=0.0, keep_versions=1)
+
+    owner = await bench.own("a")
+    owner.owner.users = 1
+    maps = MapRegistry(store, "default")
+    store.is_slow = True
+    for number in range(3):
+        await owner.keyframe(number)
+        await owner.ask("live-leave")
+        await bench.clock.advance(1.0)
+    assert [each.number for each in maps.versions(MAP)] == [1, 2, 3]
+    store.is_slow = False
+    await owner.keyframe(3)
+    await owner.ask("live-leave")
+    await bench.clock.advance(1.0)
+    assert [each.number for each in maps.versions(MAP)] == [4]

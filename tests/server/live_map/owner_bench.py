@@ -1,0 +1,204 @@
+"""Owners of a live map without processes, sockets or time: a fake map, a store in memory, a clock by hand."""
+
+from __future__ import annotations
+
+import asyncio
+import random
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import msgspec
+from fakes import FakeLog
+
+from rse_pf.accounts import TenantAccount
+from rse_pf.config import PlatformSettings
+from rse_pf.errors import NotFound, StoreError
+from rse_pf.identity import RobotId
+from rse_pf.lease import read_record
+from rse_pf.maps.registry import MapRegistry
+from rse_pf.object_store import MemoryStore, ObjectStore
+from rse_pf.server.live_map.owner.context import OwnerContext
+from rse_pf.server.live_map.owner.keyframe_objects import KeyframeObjects
+from rse_pf.server.live_map.owner.lease import LeaseRecord, OwnerLease, decode_lease, lease_name, map_folder
+from rse_pf.server.live_map.owner.live_owner import LiveOwner
+from rse_pf.server.live_map.owner.log import LiveLog
+from rse_pf.server.live_map.owner.state import MapKind, MapState, take_over
+from rse_pf.server.live_map.owner.threads import Urgency
+from tests.server.live_map.fake_map import FAKE_MAP
+
+__all__ = ["MAP", "ROBOT", "Bench", "FailingStore", "HandClock", "InlineThreads", "OwnerBench", "settle"]
+
+MAP, TENANT = "warehouse", "default"
+ROBOT = RobotId("default", "robot-1")
+LEASE, FOLDER = lease_name(TENANT, MAP), map_folder(TENANT, MAP)
+_T = TypeVar("_T")
+
+
+class HandClock:
+    """Time that passes only when the test says so."""
+
+    def __init__(self) -> None:
+        self.now_s = 0.0
+        self._sleepers: list[tuple[float, asyncio.Future[None]]] = []
+
+    def __call__(self) -> float:
+        return self.now_s
+
+    async def sleep(self, seconds: float) -> None:
+        future = asyncio.get_running_loop().create_future()
+        self._sleepers.append((self.now_s + seconds, future))
+        await future
+
+    async def advance(self, seconds: float, step_s: float = 0.1) -> None:
+        """Let time pass in steps, and everything happen that is due."""
+        for _ in range(round(seconds / step_s)):
+            self.jump(step_s)
+            await settle()
+
+    def jump(self, seconds: float) -> None:
+        """Let time pass at once, as for a process that was paused."""
+        self.now_s += seconds
+        for due_s, future in self._sleepers:
+            if due_s <= self.now_s and not future.done():
+                future.set_result(None)
+        self._sleepers = [each for each in self._sleepers if not each[1].done()]
+
+
+class InlineThreads:
+    """Everything is computed where it is asked for."""
+
+    async def compute(self, urgency: Urgency, act: Callable[[], _T]) -> _T:
+        return act()
+
+    async def store(self, act: Callable[[], _T]) -> _T:
+        return act()
+
+    look = lease = background = store
+
+
+class FailingStore(MemoryStore):
+    """Fails with a probability, before a change or after it: then the change is made, but nobody is told."""
+
+    def __init__(self, share: float = 0.0, seed: int = 0) -> None:
+        super().__init__()
+        self.share = share
+        self.failures = 0
+        self._random = random.Random(seed)
+
+    def compare_and_swap(self, name: str, expected: bytes | None, data: bytes) -> None:
+        self._fail()
+        super().compare_and_swap(name, expected, data)
+        self._fail()
+
+    def get(self, name: str) -> bytes:
+        self._fail()
+        return super().get(name)
+
+    def put(self, name: str, data: bytes) -> None:
+        self._fail()
+        super().put(name, data)
+
+    def _fail(self) -> None:
+        if self._random.random() < self.share:
+            self.failures += 1
+            raise StoreError("the store fails", hint="wait")
+
+
+class OwnerBench:
+    """One owner on the bench."""
+
+    def __init__(self, bench: Bench, name: str) -> None:
+        self.told: list[dict[str, Any]] = []
+        self.beats: list[int] = []
+        self.used: list[bool] = []
+        self.lease = OwnerLease(bench.store, LEASE, owner=name, server=name, clock=bench.clock)
+        self.claimed = self.lease.claim(read_record(bench.store, LEASE))
+        record = self.lease.record
+        self.log = LiveLog(
+            bench.store, FOLDER, owner=name, epoch=record.epoch, base=record.base, keeps_all=bench.keeps_all
+        )
+        self.state: MapState = take_over(self.log, bench.kind, owner=name, epoch=record.epoch)
+        assert self.lease.serve("127.0.0.1", 1, "c")
+        account = TenantAccount(
+            bench.store, TENANT, bench.settings.data, wall_clock=lambda: 1e9 + bench.clock()
+        )
+        context = OwnerContext(
+            map_name=MAP, settings=bench.settings.live, kind=bench.kind, threads=bench.threads,
+            maps=MapRegistry(bench.store, TENANT), clock=bench.clock, wall_clock=lambda: 1000.0,
+            sleep=bench.clock.sleep,
+            account=account, objects=KeyframeObjects(bench.store, account),
+            log=bench.log, tell=self.told.append, on_beat=self.beats.append,
+            on_use=self.used.append,
+        )  # fmt: skip
+        self.owner = LiveOwner(context, self.state, self.log, self.lease)
+        self.run = asyncio.ensure_future(self.owner.run())
+
+    async def keyframe(
+        self, number: int, features: bytes = b"good", robot: RobotId = ROBOT
+    ) -> dict[str, Any]:
+        from tests.server.live_map.fake_map import keyframe_request
+
+        request = msgspec.msgpack.encode(keyframe_request(number, features))
+        return await self.owner.answer(robot, "live-keyframe", request)
+
+    async def ask(
+        self, operation: str, payload: dict[str, Any] | None = None, robot: RobotId = ROBOT
+    ) -> dict[str, Any]:
+        request = msgspec.msgpack.encode({"map": MAP, **(payload or {})})
+        return await self.owner.answer(robot, operation, request)
+
+    def newest(self, kind: str) -> dict[str, Any]:
+        return [payload for payload in self.told if payload["kind"] == kind][-1]
+
+
+class Bench:
+    """A store, a clock, and the owners that a test makes."""
+
+    def __init__(
+        self,
+        store: ObjectStore | None = None,
+        *,
+        keeps_all: bool = False,
+        data: dict[str, Any] | None = None,
+        kind: MapKind = FAKE_MAP,
+        **live: Any,
+    ) -> None:
+        self.kind = kind
+        self.store: ObjectStore = store or MemoryStore()
+        self.clock = HandClock()
+        self.settings = PlatformSettings.from_dict({"live": live, "data": data or {}})
+        self.keeps_all = keeps_all
+        self.threads = InlineThreads()
+        self.log: Any = FakeLog()
+
+    def lease_bytes(self) -> bytes | None:
+        try:
+            return self.store.get(LEASE)
+        except NotFound:
+            return None
+
+    def lease(self) -> LeaseRecord:
+        data = self.lease_bytes()
+        assert data is not None
+        return decode_lease(LEASE, data)
+
+    async def own(self, name: str) -> OwnerBench:
+        made = OwnerBench(self, name)
+        await settle()
+        return made
+
+    def replayed(self) -> MapState:
+        """Return the map that the entries of the log give, from the first one on."""
+        log = LiveLog(self.store, FOLDER, owner="replay", epoch=10**6)
+        state = MapState(self.kind.empty(), 0)
+        from rse_pf.live_map.events import decode_events
+
+        for entry in log.entries():
+            state.apply(log.position, decode_events(entry.events))
+        return state
+
+
+async def settle(rounds: int = 60) -> None:
+    """Let every coroutine that can go on do so."""
+    for _ in range(rounds):
+        await asyncio.sleep(0)

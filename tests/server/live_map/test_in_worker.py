@@ -1,0 +1,176 @@
+"""Subscriptions and commands to live maps on their way through a worker."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+from server.gateway.worker_parts import BINARY, WorkerParts, worker_parts
+from server.live_map.fake_owners import FakeOwners
+
+from rse_pf.server.gateway.answers import Answers
+from rse_pf.server.gateway.connection import RobotConnection
+from rse_pf.server.live_map.router import LiveMapRouter
+from rse_pf.server.ports import WorkerContext
+from rse_pf.wire import Command, Failure, Hello, Subscribe, Unsubscribe, Update
+from rse_pf.wire.server_session import MAX_SUBSCRIPTIONS
+
+HELLO = Hello(capabilities=("updates",))
+
+
+class Worker(WorkerParts):
+    """A worker with live maps, whose owners are fake."""
+
+    owners: FakeOwners
+
+    def __init__(self, *args: Any, **more: Any) -> None:
+        super().__init__(*args, live_maps=self._router, **more)
+
+    def _router(self, context: WorkerContext, answers: Answers) -> LiveMapRouter:
+        def owners(on_update: Any) -> FakeOwners:
+            self.owners = FakeOwners(on_update)
+            return self.owners
+
+        return LiveMapRouter(context, owners=owners, answer=answers.send_message)
+
+    def tell(self, keyframes: int) -> None:
+        self.owners.on_update("default", "m", {"kind": "map", "keyframes": keyframes})
+        self.loop.advance(0.1)
+
+    def subscriber(self, name: str = "r") -> tuple[RobotConnection, Any]:
+        connection, wire = self.join(name, hello=False)
+        self.say(connection, HELLO)
+        wire.sent.clear()
+        return connection, wire
+
+
+@pytest.fixture
+def worker(monkeypatch: pytest.MonkeyPatch) -> Iterator[Worker]:
+    monkeypatch.setattr("server.gateway.worker_parts.WorkerParts", Worker)
+    with worker_parts() as parts:
+        assert isinstance(parts, Worker)
+        yield parts
+
+
+def keyframes(wire: Any) -> list[int]:
+    return [each.payload["keyframes"] for each in wire.sent if isinstance(each, Update)]
+
+
+def test_a_subscriber_gets_the_present_state_and_then_each_newer_one(worker: Worker) -> None:
+    connection, wire = worker.subscriber()
+
+    worker.say(connection, Subscribe(id=4, topic="live/m"))
+    worker.tell(1)
+    worker.tell(2)
+
+    assert keyframes(wire) == [1, 2]
+    assert [each.seq for each in wire.sent] == [2, 3]
+    assert worker.dispatcher.snapshot()["gauges"]["subscriptions"] == 1.0
+
+
+def test_a_robot_without_the_capability_is_refused_and_sees_nothing_new(worker: Worker) -> None:
+    connection, wire = worker.join()
+    wire.sent.clear()
+
+    worker.say(connection, Subscribe(id=4, topic="live/m"))
+    worker.tell(1)
+
+    [failure] = wire.sent
+    assert (failure.id, failure.code) == (4, "bad-request")
+    assert worker.owners.watched == []
+
+
+def test_a_ninth_subscription_is_above_the_quota_until_one_ends(worker: Worker) -> None:
+    connection, wire = worker.subscriber()
+    for number in range(MAX_SUBSCRIPTIONS + 1):
+        worker.say(connection, Subscribe(id=number, topic=f"live/m{number}"))
+    assert [(each.id, each.code) for each in wire.sent if isinstance(each, Failure)] == [(8, "quota")]
+
+    worker.say(connection, Unsubscribe(id=0))
+    worker.say(connection, Subscribe(id=8, topic="live/m8"))
+
+    assert [name for _, name in worker.owners.watched] == [f"m{number}" for number in range(9)]
+    assert worker.owners.unwatched == [("default", "m0")]
+
+
+def test_a_subscription_of_a_live_id_begins_again(worker: Worker) -> None:
+    connection, wire = worker.subscriber()
+    worker.say(connection, Subscribe(id=4, topic="live/m"))
+    worker.tell(1)
+    wire.sent.clear()
+
+    worker.say(connection, Subscribe(id=4, topic="live/m"))
+    worker.loop.advance(0.1)
+
+    assert [(each.id, each.seq) for each in wire.sent] == [(4, 1)]
+    assert worker.dispatcher.snapshot()["gauges"]["subscriptions"] == 1.0
+
+
+def test_a_refused_subscription_leaves_its_place_to_another(worker: Worker) -> None:
+    connection, wire = worker.subscriber()
+    for _ in range(2 * MAX_SUBSCRIPTIONS):
+        worker.say(connection, Subscribe(id=4, topic="platform"))
+
+    assert [each.code for each in wire.sent] == ["bad-request"] * 2 * MAX_SUBSCRIPTIONS
+    assert connection.session is not None
+    assert connection.session.topics == {}
+
+
+def test_the_end_of_a_connection_ends_its_subscriptions(worker: Worker) -> None:
+    connection, _ = worker.subscriber()
+    worker.say(connection, Subscribe(id=4, topic="live/m"))
+
+    connection.on_socket_end()
+
+    assert worker.owners.unwatched == [("default", "m")]
+    worker.tell(1)
+
+
+def test_a_closing_connection_is_not_written_to(worker: Worker) -> None:
+    connection, wire = worker.subscriber()
+    worker.say(connection, Subscribe(id=4, topic="live/m"))
+
+    connection.close(1001, "leaving")
+    worker.tell(1)
+
+    assert keyframes(wire) == []
+
+
+def test_a_refused_command_is_answered_and_counted(worker: Worker) -> None:
+    connection, wire = worker.subscriber()
+
+    worker.say(connection, Command(id=9, service="live-keyframe", payload={"map": "m"}))
+
+    [failure] = wire.sent
+    assert (failure.id, failure.code) == (9, "bad-request")
+    assert connection.session is not None
+    assert connection.session.in_flight == 0
+    assert sum(worker.metrics.requests.values()) == 1
+
+
+def test_a_server_that_drains_gives_its_maps_up(worker: Worker) -> None:
+    worker.dispatcher.move_all("drain", 1000.0)
+
+    assert worker.owners.gave_up
+
+
+def test_without_live_maps_topics_and_services_are_unknown() -> None:
+    with worker_parts() as parts:
+        connection, wire = parts.join(hello=False)
+        parts.say(connection, HELLO)
+        wire.sent.clear()
+
+        parts.say(connection, Subscribe(id=4, topic="live/m"))
+        parts.say(connection, Command(id=5, service="live-keyframe", payload={}))
+
+        assert [(each.id, each.code) for each in wire.sent] == [(4, "not-found"), (5, "unknown-service")]
+
+
+def test_a_subscription_before_hello_closes_the_connection(worker: Worker) -> None:
+    connection, wire = worker.join(hello=False)
+
+    connection.receive_frame(BINARY, True, False, worker.codec.encode(Subscribe(id=1, topic="live/m")))
+
+    assert wire.closed is not None
+    assert wire.closed[0] == 4400

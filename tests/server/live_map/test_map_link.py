@@ -1,0 +1,235 @@
+"""How a worker finds, starts and replaces the owner of a map, with processes that are only played."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import socket
+import time
+from collections.abc import Callable
+from typing import Any
+
+from fakes import FakeLog
+
+from rse_pf.config import PlatformSettings
+from rse_pf.errors import Busy, NotFound
+from rse_pf.identity import RobotId
+from rse_pf.ipc import encode_message
+from rse_pf.object_store import MemoryStore
+from rse_pf.server.live_map.children import OwnerChild, OwnerChildren
+from rse_pf.server.live_map.map_link import LinkContext, MapLink, begins_a_map
+from rse_pf.server.live_map.owner.lease import LeaseRecord, OwnerLease, decode_lease, lease_name
+from rse_pf.server.live_map.owner.link_security import server_context
+from rse_pf.server.live_map.owner.process import OwnerOrder
+from rse_pf.wire.live_map import KeyframeRequest, LiveMapRequest, LiveStart
+from tests.server.live_map.fake_map import keyframe_request
+
+LEASE = lease_name("default", "warehouse")
+FIRST = KeyframeRequest(map="warehouse", segment=0, number=0, keyframe=b"")
+ROBOT = RobotId("default", "robot-1")
+
+
+class PlayedProcess:
+    """A process that says what the test says, and claims a map as a real one does."""
+
+    def __init__(self, store: MemoryStore) -> None:
+        self.connection, self._theirs = socket.socketpair()
+        self.pid = 1
+        self.claims = 0
+        self._store = store
+
+    def tell(self, *message: Any) -> None:
+        self._theirs.sendall(encode_message(list(message)))
+
+    def say(self, message: dict[str, Any]) -> None:
+        if "do" in message:
+            return
+        self.claims += 1
+        order = OwnerOrder(**message)
+        lease = OwnerLease(
+            self._store,
+            LEASE,
+            owner=f"owner-{id(self)}",
+            server=order.server,
+            clock=time.monotonic,
+        )
+        if lease.claim(order.known) and lease.serve("127.0.0.1", 1, "c"):
+            self.tell("serving", lease.record.epoch)
+        else:
+            self.tell("lost")
+
+    def kill(self) -> int:
+        self.connection.close()
+        self._theirs.close()
+        return 0
+
+
+class Worker:
+    """The link of one worker to one map."""
+
+    def __init__(self) -> None:
+        self.store = MemoryStore()
+        self.started: list[PlayedProcess] = []
+        self.told: list[dict[str, Any]] = []
+        self.children = OwnerChildren(self._spawn, max_owners=2, keeps_spare=False)
+        context = LinkContext(
+            store=self.store, settings=PlatformSettings().live, server_id="here", log=FakeLog(),
+            call=self._call, key=lambda: b"k" * 32, children=self.children,
+            clock=time.monotonic, wall_clock=time.time,
+        )  # fmt: skip
+        self.link = MapLink(
+            context, "default", "warehouse", on_update=self.told.append, on_end=lambda link: None
+        ).start()
+
+    def lease(self) -> LeaseRecord | None:
+        with contextlib.suppress(NotFound):
+            return decode_lease(LEASE, self.store.get(LEASE))
+        return None
+
+    async def __aenter__(self) -> Worker:
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        await self.link.close()
+        self.children.drop_spare()
+        for child in self.children.used:
+            child.kill()
+
+    def _spawn(self, calmly: bool) -> PlayedProcess:
+        self.started.append(PlayedProcess(self.store))
+        return self.started[-1]
+
+    async def _call(self, act: Callable[[], Any]) -> Any:
+        return act()
+
+
+async def until(is_so: Callable[[], Any]) -> None:
+    while not is_so():
+        await asyncio.sleep(0)
+
+
+async def test_a_process_is_started_as_soon_as_a_map_that_nobody_has_begun_is_watched() -> None:
+    async with Worker() as worker:
+        worker.link.set_watched(True)
+        await until(lambda: worker.started)
+        worker.started[0].tell("ready")
+        spare = worker.children.prepare()
+        assert isinstance(spare, OwnerChild)
+        await until(lambda: spare.is_ready)
+        assert worker.lease() is None  # the first keyframe begins the map
+
+        sent = asyncio.ensure_future(worker.link.request(ROBOT, "live-keyframe", FIRST, 5.0))
+        await until(lambda: (found := worker.lease()) is not None and found.state == "serving")
+        assert len(worker.started) == 1
+        sent.cancel()
+
+
+async def test_an_owner_elsewhere_is_used_before_the_own_process_is_ready() -> None:
+    """Else the robots of this server wait until its own process is started, for nothing."""
+
+    async with Worker() as worker:
+        sent = asyncio.ensure_future(worker.link.request(ROBOT, "live-keyframe", FIRST, 5.0))
+        await until(lambda: worker.started)  # it never gets ready
+        with socket.create_server(("127.0.0.1", 0)) as listener:
+            listener.setblocking(False)
+            elsewhere = OwnerLease(worker.store, LEASE, owner="b", server="there", clock=time.monotonic)
+            assert elsewhere.claim(None)
+            assert elsewhere.serve("127.0.0.1", listener.getsockname()[1], "c")
+            connection, _ = await asyncio.get_running_loop().sock_accept(listener)
+            connection.close()
+        assert worker.started[0].claims == 0
+        sent.cancel()
+
+
+def owner_on_a_closed_port(worker: Worker) -> None:
+    """Let another server have the lease, with a port where nobody listens."""
+    elsewhere = OwnerLease(worker.store, LEASE, owner="b", server="there", clock=time.monotonic)
+    assert elsewhere.claim(None)
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        port = listener.getsockname()[1]
+    assert elsewhere.serve("127.0.0.1", port, "c")
+
+
+async def test_an_owner_whose_port_is_closed_is_replaced_at_once_by_those_who_were_connected() -> None:
+    async with Worker() as worker:
+        owner_on_a_closed_port(worker)
+        worker.link._welcomed = "b"
+        began_s = time.monotonic()
+        sent = asyncio.ensure_future(worker.link.request(ROBOT, "live-keyframe", FIRST, 5.0))
+        await until(lambda: worker.started)
+        worker.started[0].tell("ready")
+        await until(lambda: (found := worker.lease()) is not None and found.epoch == 2)
+        assert time.monotonic() - began_s < PlatformSettings().live.lease_s
+        sent.cancel()
+
+
+async def test_a_link_that_ends_while_the_owner_has_not_welcomed_it_closes_its_connection() -> None:
+    async with Worker() as worker:
+        is_greeted, is_gone = asyncio.Event(), asyncio.Event()
+
+        async def owner(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+            await reader.read(1)
+            is_greeted.set()
+            while await reader.read(1024):
+                pass
+            is_gone.set()
+            writer.close()
+
+        context, certificate = server_context("127.0.0.1", now_s=time.time())
+        server = await asyncio.start_server(owner, "127.0.0.1", 0, ssl=context)
+        elsewhere = OwnerLease(worker.store, LEASE, owner="b", server="there", clock=time.monotonic)
+        assert elsewhere.claim(None)
+        assert elsewhere.serve("127.0.0.1", server.sockets[0].getsockname()[1], certificate)
+        worker.link.set_watched(True)
+        await asyncio.wait_for(is_greeted.wait(), 10.0)
+        await worker.link.close()
+        await asyncio.wait_for(is_gone.wait(), 10.0)
+        server.close()
+
+
+async def test_an_owner_whose_port_was_never_reached_keeps_its_lease() -> None:
+    """A firewall may refuse what the other servers can reach."""
+
+    async with Worker() as worker:
+        owner_on_a_closed_port(worker)
+        sent = asyncio.ensure_future(worker.link.request(ROBOT, "live-keyframe", FIRST, 0.3))
+        await until(lambda: worker.started)
+        worker.started[0].tell("ready")
+        await asyncio.wait({sent})
+        assert isinstance(sent.exception(), Busy)
+        assert decode_lease(LEASE, worker.store.get(LEASE)).epoch == 1
+
+
+async def test_who_may_only_watch_starts_no_process_and_is_told_that_the_map_is_idle() -> None:
+    async with Worker() as worker:
+        lease = OwnerLease(worker.store, LEASE, owner="b", server="there", clock=time.monotonic)
+        assert lease.claim(None)
+        assert lease.release()
+        worker.link.set_watched(True, may_start=False)
+        await until(lambda: worker.told)
+        assert worker.told[-1]["state"] == "idle"
+        assert not worker.link.is_in_use
+
+        worker.link.set_watched(True, may_start=True)
+        await until(lambda: worker.started)
+        worker.started[0].tell("ready")
+        await until(lambda: (found := worker.lease()) is not None and found.state == "serving")
+        assert worker.told[-1]["state"] == "moving"
+
+
+async def test_who_may_only_watch_a_map_that_is_driven_in_takes_no_part_in_a_takeover() -> None:
+    async with Worker() as worker:
+        owner_on_a_closed_port(worker)
+        worker.link._welcomed = "b"
+        worker.link.set_watched(True, may_start=False)
+        await until(lambda: worker.told and worker.told[-1]["state"] == "idle")
+        assert worker.started == []
+        assert decode_lease(LEASE, worker.store.get(LEASE)).epoch == 1
+
+
+def test_only_a_first_keyframe_or_an_operator_begins_a_map():
+    assert begins_a_map(keyframe_request(0))
+    assert begins_a_map(LiveStart(map="m"))
+    assert not begins_a_map(keyframe_request(1))
+    assert not begins_a_map(keyframe_request(0, segment=1))
+    assert not begins_a_map(LiveMapRequest(map="m"))

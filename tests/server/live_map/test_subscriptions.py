@@ -1,0 +1,230 @@
+"""Which robot gets which value of a live map, and what a slow one costs."""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+import numpy as np
+import pytest
+from fakes import FakeLog, FakeLoop
+from server.live_map.fake_owners import FakeReader
+
+from rse_pf.errors import Forbidden, RsePfError
+from rse_pf.server.live_map.subscriptions import Subscriptions
+from rse_pf.wire import CODECS, Failure, Update
+
+
+class Parts:
+    def __init__(self) -> None:
+        self.loop = FakeLoop()
+        self.log = FakeLog()
+        self.watched: list[tuple[str, str]] = []
+        self.all = Subscriptions(
+            loop=self.loop,  # type: ignore[arg-type]
+            log=self.log,
+            watch=lambda tenant, name, may_start: self.watched.append((tenant, name)),
+            unwatch=lambda *key: self.watched.remove(key),
+        )
+
+    def begin(self, reader: FakeReader, identity: int = 7, name: str = "m", **more: Any) -> None:
+        more.setdefault("may_go_on", lambda: None)
+        self.all.begin(reader, identity, reader.robot.tenant, name, **more)
+
+    def pose(self, robot: str, x: float, *, tenant: str = "default") -> None:
+        self.all.update(tenant, "m", f"pose/{robot}", {"kind": "pose", "robot": robot, "x": x})
+
+    def settle(self) -> None:
+        self.loop.advance(1.0)
+
+
+@pytest.fixture
+def parts() -> Parts:
+    return Parts()
+
+
+def told(reader: FakeReader) -> list[tuple[int, str]]:
+    return [(each.seq, each.key) for each in reader.written if isinstance(each, Update)]
+
+
+def poses(reader: FakeReader) -> list[float]:
+    return [each.payload["x"] for each in reader.written if each.key != "map"]
+
+
+def test_a_new_subscription_gets_the_present_value_of_every_key(parts: Parts) -> None:
+    early, late = FakeReader("a"), FakeReader("b")
+    parts.begin(early)
+    parts.pose("a", 1.0)
+    parts.pose("a", 2.0)
+    parts.settle()
+
+    parts.begin(late)
+    parts.settle()
+
+    assert told(late) == [(1, "map"), (2, "pose/a")]
+    assert poses(late) == [2.0]
+    assert parts.watched == [("default", "m")]
+
+
+@pytest.mark.parametrize("codec", CODECS)
+def test_every_codec_carries_the_same_value(parts: Parts, codec: str) -> None:
+    reader = FakeReader(codec=codec)
+    parts.begin(reader)
+    parts.all.update("default", "m", "alignment/r", {"T_map_odom": np.eye(4).ravel(), "cause": None})
+    parts.settle()
+
+    update = reader.written[-1]
+
+    assert (update.id, update.topic, update.key) == (7, "live/m", "alignment/r")
+    np.testing.assert_array_equal(update.payload["T_map_odom"], np.eye(4).ravel())
+
+
+def test_a_slow_reader_gets_the_newest_value_of_each_key_and_a_gap_in_the_numbers(parts: Parts) -> None:
+    slow, fast = FakeReader("slow"), FakeReader("fast")
+    parts.begin(slow)
+    parts.begin(fast)
+    parts.settle()
+    slow.unsent_bytes = 1 << 20
+
+    for step in range(100):
+        parts.pose("a", float(step))
+        parts.pose("b", float(-step))
+        parts.settle()
+    slow.unsent_bytes = 0
+    parts.settle()
+
+    assert told(slow)[1:] == [(101, "pose/a"), (201, "pose/b")]
+    assert poses(slow) == [99.0, -99.0]
+    assert len(poses(fast)) == 200
+    assert parts.all.replaced == 198
+
+
+def test_a_reader_that_never_reads_costs_the_names_of_the_keys_only(parts: Parts) -> None:
+    reader = FakeReader()
+    parts.begin(reader)
+    parts.settle()
+    reader.unsent_bytes = 1 << 20
+    [subscription] = parts.all._of_reader[reader].values()  # type: ignore[index]
+
+    for step in range(3000):
+        parts.pose(f"robot-{step % 1500}", float(step))
+    parts.settle()
+
+    assert told(reader) == [(1, "map")]
+    assert len(subscription.topic.values) == 1024
+    assert len(subscription.waiting) <= 1024
+    assert sys.getsizeof(subscription.waiting) < 100_000
+
+
+def test_values_that_come_together_replace_each_other_before_they_are_sent(parts: Parts) -> None:
+    reader = FakeReader()
+    parts.begin(reader)
+    parts.settle()
+
+    for step in range(5):
+        parts.pose("a", float(step))
+    parts.settle()
+
+    assert poses(reader) == [4.0]
+    assert told(reader)[-1][0] == 6
+
+
+def test_many_readers_are_served_in_several_rounds_of_the_event_loop(parts: Parts) -> None:
+    readers = [FakeReader(f"r{number}") for number in range(150)]
+    for reader in readers:
+        parts.begin(reader)
+    parts.settle()
+
+    parts.pose("a", 1.0)
+    parts.pose("b", 1.0)
+    parts.loop.now += 0.011
+    parts.loop.turn()
+    sent_at_once = sum(len(told(reader)) - 1 for reader in readers)
+    parts.settle()
+
+    assert sent_at_once == 200
+    assert all(len(told(reader)) == 3 for reader in readers)
+
+
+def test_another_tenants_map_of_the_same_name_is_another_map(parts: Parts) -> None:
+    here, there = FakeReader("r"), FakeReader("r", tenant="other")
+    parts.begin(here)
+    parts.begin(there)
+
+    parts.pose("a", 1.0, tenant="other")
+    parts.settle()
+
+    assert poses(here) == []
+    assert poses(there) == [1.0]
+
+
+def test_an_ended_subscription_gets_nothing_and_the_last_one_ends_the_watch(parts: Parts) -> None:
+    first, second = FakeReader("a"), FakeReader("b")
+    parts.begin(first)
+    parts.begin(second)
+    parts.settle()
+
+    parts.all.end(first, 7)
+    parts.pose("x", 1.0)
+    parts.settle()
+    assert (poses(first), poses(second)) == ([], [1.0])
+    assert parts.watched == [("default", "m")]
+
+    parts.all.left(second)
+    assert parts.watched == []
+    assert len(parts.all) == 0
+    parts.pose("x", 2.0)
+    parts.settle()
+
+
+def test_a_reader_that_is_slow_when_it_leaves_is_forgotten(parts: Parts) -> None:
+    reader = FakeReader()
+    parts.begin(reader)
+    parts.settle()
+    reader.unsent_bytes = 1 << 20
+    parts.pose("a", 1.0)
+    parts.settle()
+
+    parts.all.left(reader)
+    reader.unsent_bytes = 0
+    parts.settle()
+
+    assert poses(reader) == []
+
+
+def test_a_robot_whose_right_ends_is_told_and_gets_no_further_value(parts: Parts) -> None:
+    reader = FakeReader()
+    wrong: list[RsePfError] = []
+    parts.begin(reader, may_go_on=lambda: wrong[0] if wrong else None)
+    parts.settle()
+
+    wrong.append(Forbidden("no more"))
+    parts.pose("a", 1.0)
+    parts.settle()
+
+    assert isinstance(reader.written[-1], Failure)
+    assert (reader.written[-1].id, reader.written[-1].code) == (7, "forbidden")
+    assert told(reader) == [(1, "map")]
+    assert parts.watched == []
+
+
+@pytest.mark.parametrize("value", [object(), "x" * 70_000])
+def test_a_value_that_cannot_be_sent_is_logged_once_and_left_out(parts: Parts, value: object) -> None:
+    readers = [FakeReader("a"), FakeReader("b")]
+    for reader in readers:
+        parts.begin(reader)
+
+    parts.all.update("default", "m", "odd", {"value": value})
+    parts.pose("a", 1.0)
+    parts.settle()
+
+    assert [[key for _, key in told(reader)] for reader in readers] == [["map", "pose/a"]] * 2
+    assert [fields["key"] for level, _, fields in parts.log.events if level == "error"] == ["odd"]
+
+
+def test_the_kernel_is_told_to_hold_back_little_of_a_subscriber(parts: Parts) -> None:
+    reader = FakeReader()
+
+    parts.begin(reader)
+
+    assert reader.max_unsent == 16_384

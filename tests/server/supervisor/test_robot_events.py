@@ -1,0 +1,73 @@
+"""Workers tell their supervisor of robots in batches; nothing is lost, and the order is kept."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from fakes import FakeLoop
+
+from rse_pf.server.supervisor.robot_events import RobotEvents
+
+LINE_BYTES = 1 << 20
+"""The longest line that the supervisor reads of a worker's channel."""
+
+
+class Bench:
+    """Events on a loop whose clock the test moves; keeps the messages."""
+
+    def __init__(self) -> None:
+        self.loop = FakeLoop()
+        self.messages: list[list[dict[str, Any]]] = []
+        self.events = RobotEvents(self.loop, self.say)  # type: ignore[arg-type]
+
+    def say(self, *, event: str, robots: list[dict[str, Any]]) -> None:
+        assert event == "robots"
+        self.messages.append(robots)
+
+
+def test_events_of_ten_milliseconds_are_one_message() -> None:
+    bench = Bench()
+
+    for number in range(3):
+        bench.events.add(event="arrived", number=number)
+        bench.loop.advance(0.003)
+    assert bench.messages == []
+    bench.loop.advance(0.0011)
+
+    assert bench.messages == [[{"event": "arrived", "number": number} for number in range(3)]]
+
+
+def test_a_later_event_waits_for_its_own_ten_milliseconds() -> None:
+    bench = Bench()
+
+    bench.events.add(number=1)
+    bench.loop.advance(0.02)
+    bench.events.add(number=2)
+    bench.loop.advance(0.009)
+    assert bench.messages == [[{"number": 1}]]
+    bench.loop.advance(0.002)
+
+    assert bench.messages == [[{"number": 1}], [{"number": 2}]]
+
+
+def test_no_message_is_longer_than_the_line_that_the_supervisor_reads() -> None:
+    bench = Bench()
+    robot = ["t" * 64, "r" * 64, ""]
+
+    for number in range(1201):
+        bench.events.add(event="arrived", robot=robot, number=number)
+    bench.loop.advance(0.02)
+
+    assert [len(message) for message in bench.messages] == [500, 500, 201]
+    assert [event["number"] for message in bench.messages for event in message] == list(range(1201))
+    assert all(len(repr(message)) < LINE_BYTES for message in bench.messages)
+
+
+def test_what_is_held_is_sent_before_the_worker_ends() -> None:
+    bench = Bench()
+
+    bench.events.add(event="left", number=1)
+    bench.events.flush()
+    bench.loop.advance(1.0)
+
+    assert bench.messages == [[{"event": "left", "number": 1}]], "once, although its timer was set"
