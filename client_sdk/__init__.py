@@ -12,23 +12,23 @@ from typing import TYPE_CHECKING, Any
 from rse_pf.errors import RsePfError
 
 if TYPE_CHECKING:
-    from client_sdk.answers import Answer, PoseAnswer, decode_reply
-    from client_sdk.blocking import BlockingRobot, connect_blocking
+    from client_sdk.blocking_robot import BlockingRobot, connect_blocking
+    from client_sdk.commands.answer_types import Answer, PoseAnswer, decode_reply
+    from client_sdk.commands.subscriptions import BlockingUpdates, Updates
+    from client_sdk.commands.traffic_stats import Stats
     from client_sdk.datasets import Dataset, open_dataset
     from client_sdk.frontend import Frame, FrontEndOptions, PoseQuery, TrackedFrame
     from client_sdk.live import BlockingLiveMapper, Correction, LiveMapper, LiveOptions, OtherRobot
+    from client_sdk.map_merge import merge_maps
     from client_sdk.mapper import BlockingMapper, Mapper
     from client_sdk.mapping import MapOptions, PointMap, Trajectory
     from client_sdk.monocular.scale import MarkerScale, OdometryScale
-    from client_sdk.offloading.offload import CloudFirst
+    from client_sdk.offloading.offload_policy import CloudFirst
     from client_sdk.robot import Robot, connect
-    from client_sdk.stats import Stats
     from client_sdk.tracking.monocular_tracker import MonocularOptions
     from client_sdk.tracking.tracker import Tracker
     from client_sdk.transfer.background_upload import BackgroundUploader
     from client_sdk.transfer.data_client import DataClient, DataOptions
-    from client_sdk.transfer.map_merge import merge_maps
-    from client_sdk.updates import BlockingUpdates, Updates
 
 __all__ = [
     "Answer",
@@ -70,13 +70,13 @@ __all__ = [
 ]
 
 _HOMES = {
-    "Answer": "answers",
+    "Answer": "commands.answer_types",
     "BackgroundUploader": "transfer.background_upload",
     "BlockingLiveMapper": "live",
     "BlockingMapper": "mapper",
-    "BlockingRobot": "blocking",
-    "BlockingUpdates": "updates",
-    "CloudFirst": "offloading.offload",
+    "BlockingRobot": "blocking_robot",
+    "BlockingUpdates": "commands.subscriptions",
+    "CloudFirst": "offloading.offload_policy",
     "Correction": "live",
     "DataClient": "transfer.data_client",
     "DataOptions": "transfer.data_client",
@@ -92,18 +92,18 @@ _HOMES = {
     "OdometryScale": "monocular.scale",
     "OtherRobot": "live",
     "PointMap": "mapping",
-    "PoseAnswer": "answers",
+    "PoseAnswer": "commands.answer_types",
     "PoseQuery": "frontend",
     "Robot": "robot",
-    "Stats": "stats",
+    "Stats": "commands.traffic_stats",
     "TrackedFrame": "frontend",
     "Tracker": "tracking.tracker",
     "Trajectory": "mapping",
-    "Updates": "updates",
+    "Updates": "commands.subscriptions",
     "connect": "robot",
-    "connect_blocking": "blocking",
-    "decode_reply": "answers",
-    "merge_maps": "transfer.map_merge",
+    "connect_blocking": "blocking_robot",
+    "decode_reply": "commands.answer_types",
+    "merge_maps": "map_merge",
     "open_dataset": "datasets",
 }
 

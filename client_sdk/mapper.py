@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from client_sdk.answers import PoseAnswer
+from client_sdk.commands.answer_types import PoseAnswer
 from client_sdk.frontend import Features, Frame, FrontEndOptions, PoseQuery, TrackedFrame
 from client_sdk.imu.inertial import ImuScale, Inertial, upright
 from client_sdk.imu.samples import ImuSamples

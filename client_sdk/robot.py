@@ -15,23 +15,23 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
-from client_sdk.answers import Answer, PoseAnswer
-from client_sdk.callbacks import Callbacks
+from client_sdk.commands.answer_types import Answer, PoseAnswer
+from client_sdk.commands.subscriptions import RobotSubscriptions, Updates
+from client_sdk.commands.traffic_stats import Stats, StatsKeeper
+from client_sdk.concurrency.event_loop_thread import not_connected_here
+from client_sdk.concurrency.user_callbacks import Callbacks
 from client_sdk.enrolment import read_enrolment
-from client_sdk.local_services import LocalServices
-from client_sdk.loop_thread import not_connected_here
+from client_sdk.network.connect_timings import ConnectTimings
 from client_sdk.network.connection import Connection, ForRobot, OnChange
-from client_sdk.network.dialling import DialError
+from client_sdk.network.dial_errors import DialError
 from client_sdk.network.handshake import Token
-from client_sdk.network.timings import ConnectTimings
-from client_sdk.offloading.asking import Asking, Call, OnProgress
-from client_sdk.offloading.burst import Burst
-from client_sdk.offloading.burst_rules import check_burst_url
-from client_sdk.offloading.offload import CloudFirst
+from client_sdk.offloading.burst_client import Burst
+from client_sdk.offloading.burst_policy import check_burst_url
+from client_sdk.offloading.command_router import Asking, Call, OnProgress
+from client_sdk.offloading.local_services import LocalServices
+from client_sdk.offloading.offload_policy import CloudFirst
 from client_sdk.recording import make_recorder, sdk_version
-from client_sdk.robot_objects import RobotObjects
-from client_sdk.stats import Stats, StatsKeeper
-from client_sdk.updates import RobotSubscriptions, Updates
+from client_sdk.transfer.small_objects import RobotObjects
 from rse_pf.config import SessionSettings
 from rse_pf.errors import Disconnected, RsePfError, UsageError, error_from_code
 from rse_pf.wire import CODECS, Failure, Welcome, as_type, make_codec

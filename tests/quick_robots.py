@@ -6,7 +6,7 @@ import asyncio
 import random
 
 import client_sdk
-from client_sdk.network.timings import ConnectTimings
+from client_sdk.network.connect_timings import ConnectTimings
 from rse_pf.config import SessionSettings
 from rse_pf.errors import Conflict, Unauthorized
 

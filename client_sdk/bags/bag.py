@@ -17,6 +17,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
+from client_sdk.auto_close import Closing
 from client_sdk.bags.bag_file import BagFile, BrokenMessage, RawMessage, Topic, open_bag_file
 from client_sdk.bags.choose import (
     ChosenTopics,
@@ -42,7 +43,6 @@ from client_sdk.bags.realsense_recording import stated_depth_unit_m, stated_T_co
 from client_sdk.bags.registration import register_depth
 from client_sdk.bags.stereo import pair_of
 from client_sdk.bags.stream import ImageStream
-from client_sdk.closing import Closing
 from client_sdk.frontend import Frame, load_opencv
 from client_sdk.mapping import Trajectory
 from client_sdk.rigs.imu_track import ImuTrack, with_imu

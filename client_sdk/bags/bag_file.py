@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from client_sdk.auto_close import Closing
 from client_sdk.bags.decompression import Allowance, bound_reader, charge
 from client_sdk.bags.message_types import load_types
-from client_sdk.closing import Closing
 from rse_pf.errors import MissingExtra, UsageError
 
 __all__ = ["BagFile", "BrokenMessage", "RawMessage", "Topic", "is_bag", "open_bag_file"]

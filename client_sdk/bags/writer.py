@@ -13,9 +13,9 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
+from client_sdk.auto_close import Closing
 from client_sdk.bags.message_maker import MessageMaker
 from client_sdk.bags.message_types import PATH, POINT_CLOUD, POSE, TF
-from client_sdk.closing import Closing
 from client_sdk.mapping import Trajectory
 from rse_pf.errors import MissingExtra, UsageError
 

@@ -16,7 +16,7 @@ from typing import Any, Protocol, TypeVar, runtime_checkable
 import numpy as np
 import numpy.typing as npt
 
-from client_sdk.closing import Closing
+from client_sdk.auto_close import Closing
 from client_sdk.datasets.thinning import Thinning
 from client_sdk.frontend import Frame, load_opencv
 from client_sdk.rigs.checks import PairLook, check_pairs, fault_of_looks, measure_pair

@@ -14,7 +14,7 @@ from client_sdk.frontend import Features, Frame, load_opencv
 from client_sdk.live.keyframe_points import points_of
 from client_sdk.live.object_sender import ObjectSender, StoreObject
 from client_sdk.live.options import LiveOptions
-from client_sdk.network.data_requests import MAX_SINGLE_PUT_BYTES
+from client_sdk.transfer.data_connection import MAX_SINGLE_PUT_BYTES
 from rse_pf.slam.keyframe_points import ObjectReference
 from rse_pf.token_bucket import TokenBucket
 

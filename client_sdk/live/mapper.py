@@ -28,7 +28,7 @@ from typing import Any
 
 import numpy as np
 
-from client_sdk.answers import PoseAnswer
+from client_sdk.commands.answer_types import PoseAnswer
 from client_sdk.frontend import Features, Frame, FrontEndOptions, PoseQuery, TrackedFrame
 from client_sdk.live.alignments import Alignments, Correction, OtherRobot
 from client_sdk.live.attachments import Attached, Attachments

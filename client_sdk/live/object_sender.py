@@ -11,7 +11,7 @@ import contextlib
 from collections import deque
 from collections.abc import Awaitable, Callable
 
-from client_sdk.callbacks import Callbacks
+from client_sdk.concurrency.user_callbacks import Callbacks
 from rse_pf.errors import (
     BadRequest,
     Forbidden,

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from client_sdk.answers import Answer
+from client_sdk.commands.answer_types import Answer
 from client_sdk.live.waiting_keyframes import Base, WaitingKeyframe, WaitingKeyframes, rebase
 from rse_pf.errors import (
     BadMessage,

@@ -1,5 +1,5 @@
-"""A robot's connection: which platform, when to dial, the handshake, and the WebSocket.
+"""Connections of a robot: which platform it dials, when it dials, the handshake, and the WebSocket.
 
-What is said on it belongs to `client_sdk.answers` and `client_sdk.updates`, who computes to
-`client_sdk.offloading`.
+What commands and subscriptions return is defined in `client_sdk.commands`; `client_sdk.offloading` decides
+whether a server, the burst function or the robot computes a command.
 """

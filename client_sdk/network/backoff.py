@@ -12,7 +12,7 @@ from __future__ import annotations
 from enum import Enum
 from random import Random
 
-from client_sdk.network.timings import ConnectTimings
+from client_sdk.network.connect_timings import ConnectTimings
 from rse_pf.config.front_door import DIAL_BURST, DIALS_PER_MINUTE
 from rse_pf.token_bucket import TokenBucket
 

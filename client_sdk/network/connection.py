@@ -1,8 +1,9 @@
 """The sockets of a robot: connect, read, write, ping, reconnect, move; `ClientSession` holds the rules.
 
 There is one current socket, a second one during a move, and one that stands by for each further address.
-Reconnects are delayed (`client_sdk.network.pauses`).  Commands survive the loss of a socket.  Nothing is
-final once the robot was connected: while its servers refuse it, commands end with the reason, and it goes on
+Reconnects are delayed (`client_sdk.network.reconnect_wait`).  Commands survive the loss of a socket.
+Nothing is final once the robot was connected: while its servers refuse it, commands end with the reason, and
+it goes on
 trying.
 """
 
@@ -17,14 +18,14 @@ from typing import TYPE_CHECKING, Any
 
 from websockets.exceptions import ConnectionClosed
 
-from client_sdk.callbacks import Callbacks
+from client_sdk.concurrency.user_callbacks import Callbacks
 from client_sdk.network.backoff import Backoff
-from client_sdk.network.dialling import CHECK_ADDRESS, CHECK_RUNNING, ISSUE, DialError
+from client_sdk.network.connect_timings import ConnectTimings
+from client_sdk.network.dial_errors import CHECK_ADDRESS, CHECK_RUNNING, ISSUE, DialError
 from client_sdk.network.handshake import Dialler, Token
-from client_sdk.network.pauses import Pauses
+from client_sdk.network.reconnect_wait import Pauses
+from client_sdk.network.region_choice import MAX_REGIONS, RegionChoice
 from client_sdk.network.region_sockets import Region, RegionSocket, cancel_all, either
-from client_sdk.network.regions import MAX_REGIONS, RegionChoice
-from client_sdk.network.timings import ConnectTimings
 from rse_pf.errors import (
     Conflict,
     ConnectError,

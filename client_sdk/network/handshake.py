@@ -18,8 +18,10 @@ from websockets.asyncio.client import connect as websocket_connect
 from websockets.exceptions import InvalidStatus, WebSocketException
 from websockets.typing import Subprotocol
 
-from client_sdk.callbacks import Callbacks
-from client_sdk.network.dialling import (
+from client_sdk.concurrency.user_callbacks import Callbacks
+from client_sdk.network.bearer_token import strip_token
+from client_sdk.network.connect_timings import ConnectTimings
+from client_sdk.network.dial_errors import (
     CHECK_ADDRESS,
     DialError,
     dial_error_of,
@@ -28,12 +30,10 @@ from client_sdk.network.dialling import (
     unreachable,
     untrusted_error,
 )
-from client_sdk.network.foreign_answers import explain_proxy
-from client_sdk.network.probe import Probed, port_of, probe
-from client_sdk.network.proxies import Proxy, TunnelRefused, check_tunnel, is_complete_head, proxy_of
+from client_sdk.network.http_proxy import Proxy, TunnelRefused, check_tunnel, is_complete_head, proxy_of
+from client_sdk.network.peer_diagnosis import explain_proxy
+from client_sdk.network.peer_probe import Probed, port_of, probe
 from client_sdk.network.tcp import TcpDialler
-from client_sdk.network.timings import ConnectTimings
-from client_sdk.token_text import strip_token
 from rse_pf.config import SessionSettings
 from rse_pf.errors import ConnectError, Unauthorized, UnsupportedProtocol, UsageError
 from rse_pf.wire import SUBPROTOCOLS

@@ -9,7 +9,7 @@ from typing import Any
 from websockets.asyncio.client import ClientConnection
 
 from client_sdk.network.backoff import Backoff
-from client_sdk.network.dialling import DialError, hide_password
+from client_sdk.network.dial_errors import DialError, hide_password
 from rse_pf.wire.client_session import ConnectionState
 
 __all__ = ["Region", "RegionSocket", "cancel_all", "either"]

@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from client_sdk.callbacks import Callbacks
+from client_sdk.concurrency.user_callbacks import Callbacks
 from client_sdk.transfer.data_client import DataClient
 from rse_pf.errors import BadRequest, LimitExceeded, RsePfError, UsageError
 from rse_pf.files import replace_file

@@ -26,9 +26,10 @@ from urllib.parse import quote, urlencode, urlsplit
 
 import msgspec
 
-from client_sdk.callbacks import Callbacks
+from client_sdk.concurrency.user_callbacks import Callbacks
 from client_sdk.enrolment import read_enrolment
-from client_sdk.network.data_requests import (
+from client_sdk.network.http_proxy import TunnelRefused
+from client_sdk.transfer.data_connection import (
     MAX_SINGLE_PUT_BYTES,
     NO_UPSTREAM,
     DataRequests,
@@ -36,7 +37,6 @@ from client_sdk.network.data_requests import (
     StoredReply,
     open_connection,
 )
-from client_sdk.network.proxies import TunnelRefused
 from rse_pf.config.front_door import LOCALISE_PATH
 from rse_pf.errors import (
     Conflict,

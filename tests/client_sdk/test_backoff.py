@@ -9,7 +9,7 @@ from random import Random
 import pytest
 
 from client_sdk.network.backoff import Backoff, Last
-from client_sdk.network.timings import ConnectTimings
+from client_sdk.network.connect_timings import ConnectTimings
 from rse_pf.config import PlatformSettings
 from rse_pf.config.front_door import DIAL_BURST, DIALS_PER_MINUTE
 from tests.played_firewall import PlayedFirewall, rules_of_settings

@@ -11,7 +11,7 @@ import pytest
 from fake_platform import FakePlatform
 
 import client_sdk
-from client_sdk.network.dialling import untrusted_error
+from client_sdk.network.dial_errors import untrusted_error
 from rse_pf.auth.tokens import SigningKey
 from rse_pf.enrolment import Enrolment
 from rse_pf.errors import ConnectError, UsageError

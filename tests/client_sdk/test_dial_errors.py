@@ -8,8 +8,8 @@ import socket
 import pytest
 
 import client_sdk
-from client_sdk.network.dialling import dial_error_of, hide_password, unconnected_error, unreachable
-from client_sdk.network.probe import Probed
+from client_sdk.network.dial_errors import dial_error_of, hide_password, unconnected_error, unreachable
+from client_sdk.network.peer_probe import Probed
 from client_sdk.transfer.data_client import DataClient
 from rse_pf.auth.tokens import KeySet
 from rse_pf.config import PlatformSettings

@@ -12,8 +12,8 @@ import pytest
 from fake_platform import FakePlatform
 
 import client_sdk
-from client_sdk.network.timings import ConnectTimings
-from client_sdk.token_text import strip_token
+from client_sdk.network.bearer_token import strip_token
+from client_sdk.network.connect_timings import ConnectTimings
 from client_sdk.transfer.data_client import DataClient
 from rse_pf.errors import ConnectError, Unauthorized
 from rse_pf.pnp.problems import make_problem

@@ -12,7 +12,7 @@ import server_sessions
 from fakes import FakeRobot, FakeServer, answer_at_once, answer_nothing
 
 import client_sdk
-from client_sdk.network.timings import ConnectTimings
+from client_sdk.network.connect_timings import ConnectTimings
 from rse_pf.config import PnpSettings, SessionSettings
 from rse_pf.errors import (
     Disconnected,

@@ -10,8 +10,8 @@ import pytest
 from fake_platform import FakePlatform, echo_services
 
 import client_sdk
-from client_sdk.network.timings import ConnectTimings
-from client_sdk.stats import StatsKeeper
+from client_sdk.commands.traffic_stats import StatsKeeper
+from client_sdk.network.connect_timings import ConnectTimings
 from rse_pf import native
 from rse_pf.config import PlatformSettings, SessionSettings
 from rse_pf.errors import (

@@ -10,7 +10,7 @@ import pytest
 from fakes import FakeRobot, FakeServer, answer_at_once, answer_nothing
 
 import client_sdk
-from client_sdk.network.timings import ConnectTimings
+from client_sdk.network.connect_timings import ConnectTimings
 from rse_pf.config import SessionSettings
 from rse_pf.errors import Disconnected
 from rse_pf.wire import Command, Failure, Result, make_codec

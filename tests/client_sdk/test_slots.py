@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from client_sdk.answers import PoseAnswer
+from client_sdk.commands.answer_types import PoseAnswer
 from client_sdk.frontend import FrontEndOptions, PoseQuery, TrackedFrame, describe
 from client_sdk.mapper import Mapper
 from client_sdk.monocular.bundle import Bundle, adjust

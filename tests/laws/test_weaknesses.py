@@ -41,16 +41,16 @@ HARMLESS: Mapping[tuple[str, str], str] = {
 
 NO_SECRETS: Mapping[tuple[str, str], str] = {
     (
-        "client_sdk/network/foreign_answers.py",
+        "client_sdk/network/peer_diagnosis.py",
         "Basic Auth Credentials",
     ): "the words USER and PASSWORD of a hint",
     ("docs/local.md", "Basic Auth Credentials"): "the words USER and PASSWORD",
     ("docs/howto/own_certificates.md", "Secret Keyword"): "the name of a file",
     (
-        "tests/client_sdk/test_foreign_answers.py",
+        "tests/client_sdk/test_peer_diagnosis.py",
         "Basic Auth Credentials",
     ): "made up, for a proxy of the test",
-    ("tests/client_sdk/test_proxies.py", "Basic Auth Credentials"): "the same",
+    ("tests/client_sdk/test_http_proxy.py", "Basic Auth Credentials"): "the same",
     ("tests/hostile/test_floods.py", "Hex High Entropy String"): "digits of a long number",
     ("docs/protocol.md", "JSON Web Token"): "the page's example; its signature says 'signature'",
     ("docs/protocol.md", "Base64 High Entropy String"): "the same",
@@ -82,7 +82,7 @@ NO_SECRETS: Mapping[tuple[str, str], str] = {
     ("tests/aws/canary/test_handler.py", "Hex High Entropy String"): "the example of W3C's Trace Context",
     ("rse_pf/aws/lifecycle/proof.py", "Secret Keyword"): "the name of a service",
     ("tests/emulated_aws.py", "Secret Keyword"): "made for emulators",
-    ("tests/client_sdk/test_burst_rules.py", "Basic Auth Credentials"): "made up, to be left out",
+    ("tests/client_sdk/test_burst_policy.py", "Basic Auth Credentials"): "made up, to be left out",
     ("tests/stacks/test_first_boot.py", "Secret Keyword"): "made for moto",
     ("tests/system/boot/imds.py", "Secret Keyword"): "made for moto",
     ("tests/recording/test_redact.py", "JSON Web Token"): "made up, to be kept out of a recording",

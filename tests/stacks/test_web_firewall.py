@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from client_sdk.network.dialling import dial_error_of
+from client_sdk.network.dial_errors import dial_error_of
 from rse_pf.config.front_door import DIAL_BURST, DIALS_PER_MINUTE
 from rse_pf.config.resource_names import ROSBRIDGE_PATH
 from tests.played_firewall import PlayedFirewall, rules_of_settings, rules_of_template

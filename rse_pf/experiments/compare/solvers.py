@@ -11,7 +11,7 @@ from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Protocol
 
-from client_sdk.answers import PoseAnswer
+from client_sdk.commands.answer_types import PoseAnswer
 from client_sdk.frontend import PoseQuery
 from client_sdk.mapper import ask_robot
 from client_sdk.robot import Robot

@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from client_sdk.answers import Answer, decode_reply
+from client_sdk.commands.answer_types import Answer, decode_reply
 from client_sdk.mapping import Trajectory, write_ply, write_trajectory
 from client_sdk.transfer.data_client import DataClient
 from rse_pf.config import SessionSettings

@@ -18,14 +18,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from client_sdk.answers import PoseAnswer
 from client_sdk.check.drive_check import DriveCheck
 from client_sdk.check.motion import MotionReference
+from client_sdk.commands.answer_types import PoseAnswer
 from client_sdk.frontend import Frame, FrontEndOptions, PoseQuery, TrackedFrame
 from client_sdk.live import LiveMapper, LiveOptions
 from client_sdk.mapper import Mapper, ask_robot
 from client_sdk.mapping import Trajectory, write_ply, write_trajectory
-from client_sdk.offloading.offload import CloudFirst
+from client_sdk.offloading.offload_policy import CloudFirst
 from client_sdk.robot import Robot
 from client_sdk.slots import load_features
 from client_sdk.source_facts import DoubtLog, unresolved

@@ -9,7 +9,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from client_sdk.answers import Answer, PoseAnswer
+from client_sdk.commands.answer_types import Answer, PoseAnswer
 from client_sdk.frontend import PoseQuery
 from rse_pf.errors import Conflict, Expired, NotFound, RsePfError
 from rse_pf.geometry import Array

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from client_sdk import connect
-from client_sdk.answers import PoseAnswer
+from client_sdk.commands.answer_types import PoseAnswer
 from client_sdk.frontend import Frame, FrontEndOptions, PoseQuery, TrackedFrame, extract
 from client_sdk.live import BlockingLiveMapper, Correction, LiveMapper, LiveOptions
 from client_sdk.live.sender import keyframe_request

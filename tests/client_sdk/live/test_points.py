@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from client_sdk.answers import PoseAnswer
+from client_sdk.commands.answer_types import PoseAnswer
 from client_sdk.frontend import Frame, FrontEndOptions, PoseQuery, extract
 from client_sdk.live import LiveMapper, LiveOptions
 from client_sdk.live.keyframe_points import points_of

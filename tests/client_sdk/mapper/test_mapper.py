@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from client_sdk.answers import PoseAnswer
+from client_sdk.commands.answer_types import PoseAnswer
 from client_sdk.datasets import open_dataset
 from client_sdk.frontend import Frame, FrontEndOptions, PoseQuery, TrackedFrame
 from client_sdk.mapper import BlockingMapper, Mapper

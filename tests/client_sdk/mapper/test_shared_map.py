@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import client_sdk
-from client_sdk.answers import Answer
+from client_sdk.commands.answer_types import Answer
 from client_sdk.mapper import Mapper
 from rse_pf.errors import UsageError
 from rse_pf.maps.format import decode_map

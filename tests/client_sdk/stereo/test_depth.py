@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from client_sdk.answers import PoseAnswer
+from client_sdk.commands.answer_types import PoseAnswer
 from client_sdk.frontend import Frame, FrontEndOptions, PoseQuery, extract, load_opencv, points_at
 from client_sdk.mapper import Mapper
 from client_sdk.simulator import SIMULATED_CAMERA, make_world, render_pairs, true_trajectory

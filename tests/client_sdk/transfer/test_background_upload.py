@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from client_sdk.transfer import BackgroundUploader
+from client_sdk.transfer.background_upload import BackgroundUploader
 from rse_pf.errors import BadRequest
 from rse_pf.token_bucket import TokenBucket
 

@@ -16,7 +16,7 @@ import pytest
 from fake_platform import FakePlatform
 
 import client_sdk
-from client_sdk.network.timings import ConnectTimings
+from client_sdk.network.connect_timings import ConnectTimings
 from rse_pf.config import SessionSettings
 from rse_pf.errors import ConnectError, RsePfError
 

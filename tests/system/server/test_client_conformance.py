@@ -15,8 +15,8 @@ from typing import Any
 import pytest
 import websockets
 
+from client_sdk.network.connect_timings import ConnectTimings
 from client_sdk.network.handshake import websocket_options
-from client_sdk.network.timings import ConnectTimings
 from rse_pf.config import SessionSettings
 
 pytestmark = [pytest.mark.system, pytest.mark.slow]

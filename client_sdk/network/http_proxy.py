@@ -12,7 +12,7 @@ import urllib.request
 from dataclasses import dataclass, field
 from urllib.parse import unquote, urlsplit
 
-from client_sdk.network.foreign_answers import explain_proxy, parse_answer
+from client_sdk.network.peer_diagnosis import explain_proxy, parse_answer
 from rse_pf.config.placement import is_loopback
 from rse_pf.errors import ConnectError, UsageError
 

@@ -10,11 +10,11 @@ import functools
 from collections.abc import Callable, Coroutine
 from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, TypeVar
 
-from client_sdk.closing import Closing
-from client_sdk.loop_thread import LoopThread
+from client_sdk.auto_close import Closing
+from client_sdk.commands.subscriptions import BlockingUpdates, Updates
+from client_sdk.commands.traffic_stats import Stats
+from client_sdk.concurrency.event_loop_thread import LoopThread
 from client_sdk.robot import MAX_DEADLINE_S, Robot, connect
-from client_sdk.stats import Stats
-from client_sdk.updates import BlockingUpdates, Updates
 from rse_pf.errors import Disconnected, RsePfError, UsageError
 from rse_pf.wire import Welcome
 

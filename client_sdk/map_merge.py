@@ -9,7 +9,7 @@ import asyncio
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from client_sdk.answers import decode_reply
+from client_sdk.commands.answer_types import decode_reply
 from client_sdk.transfer.data_client import DataClient
 from rse_pf.services.mapping.merge import MergeReply
 from rse_pf.slam.map_merge import MergeOptions

@@ -7,7 +7,7 @@ from itertools import pairwise
 
 import pytest
 
-from client_sdk.network.regions import RegionChoice
+from client_sdk.network.region_choice import RegionChoice
 
 NEAR, FAR = 0, 1
 HOLD_S = 60.0

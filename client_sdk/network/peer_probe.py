@@ -13,8 +13,8 @@ import time
 from dataclasses import dataclass
 from urllib.parse import SplitResult
 
-from client_sdk.network.foreign_answers import explain_proxy
-from client_sdk.network.proxies import TunnelRefused, check_tunnel, is_complete_head, proxy_of
+from client_sdk.network.http_proxy import TunnelRefused, check_tunnel, is_complete_head, proxy_of
+from client_sdk.network.peer_diagnosis import explain_proxy
 from rse_pf.errors import RsePfError
 
 __all__ = ["Probed", "dial", "port_of", "probe"]

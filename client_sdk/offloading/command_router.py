@@ -12,13 +12,13 @@ from collections.abc import Callable, Coroutine
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from client_sdk.answers import Answer
-from client_sdk.callbacks import Callbacks
-from client_sdk.local_services import LocalServices
+from client_sdk.commands.answer_types import Answer
+from client_sdk.commands.traffic_stats import StatsKeeper
+from client_sdk.concurrency.user_callbacks import Callbacks
 from client_sdk.network.region_sockets import cancel_all
-from client_sdk.offloading.burst import Burst
-from client_sdk.offloading.offload import CloudFirst, Plan
-from client_sdk.stats import StatsKeeper
+from client_sdk.offloading.burst_client import Burst
+from client_sdk.offloading.local_services import LocalServices
+from client_sdk.offloading.offload_policy import CloudFirst, Plan
 from client_sdk.tracing import current_trace
 from rse_pf.wire import Command, Failure, Result
 from rse_pf.wire.client_session import Answered, ClientSession, Progressed

@@ -7,7 +7,7 @@ import hashlib
 import ssl
 from collections.abc import Awaitable, Callable
 
-from client_sdk.network.data_requests import MAX_SINGLE_PUT_BYTES, DataRequests, StoredReply
+from client_sdk.transfer.data_connection import MAX_SINGLE_PUT_BYTES, DataRequests, StoredReply
 from rse_pf.errors import LimitExceeded, Unauthorized
 
 __all__ = ["RobotObjects"]

@@ -14,8 +14,8 @@ import pytest
 from fake_peers import after_request, at_once, http, peer, read_head, silent, tls_context, with_tls
 
 import client_sdk
-from client_sdk.network.probe import probe
-from client_sdk.network.timings import ConnectTimings
+from client_sdk.network.connect_timings import ConnectTimings
+from client_sdk.network.peer_probe import probe
 from client_sdk.transfer.data_client import DataClient, DataOptions
 from rse_pf.auth import certificates
 from rse_pf.auth.certificates import AUTHORITY_S, CertificateWithKey, make_authority

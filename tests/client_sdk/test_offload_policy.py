@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from client_sdk.offloading.offload import CloudFirst
+from client_sdk.offloading.offload_policy import CloudFirst
 from rse_pf.errors import CommandFailed, ConnectError, Disconnected, PnpError
 
 seconds = st.floats(1e-4, 10)

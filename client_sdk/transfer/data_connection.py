@@ -11,17 +11,17 @@ from urllib.parse import SplitResult
 
 import msgspec
 
-from client_sdk.network.dialling import explain_unconnected, show_wrong_url, split_address
-from client_sdk.network.foreign_answers import (
+from client_sdk.network.bearer_token import strip_token
+from client_sdk.network.dial_errors import explain_unconnected, show_wrong_url, split_address
+from client_sdk.network.http_proxy import TunnelRefused
+from client_sdk.network.peer_diagnosis import (
     HttpAnswer,
     explain_answer,
     explain_certificate,
     explain_silence,
     is_of_tls_server,
 )
-from client_sdk.network.probe import dial, port_of, probe
-from client_sdk.network.proxies import TunnelRefused
-from client_sdk.token_text import strip_token
+from client_sdk.network.peer_probe import dial, port_of, probe
 from rse_pf.errors import (
     ConnectError,
     RsePfError,

@@ -1,7 +1,7 @@
 """When a robot may send a command to the burst function, and to which address.
 
 Decisions only: a budget for each day, a circuit breaker, and the expected time of an answer.  Time is an
-argument; `client_sdk.offloading.burst` sends.
+argument; `client_sdk.offloading.burst_client` sends.
 """
 
 from __future__ import annotations

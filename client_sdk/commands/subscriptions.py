@@ -12,7 +12,7 @@ from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
 from types import TracebackType
 from typing import Any
 
-from client_sdk.closing import Closing
+from client_sdk.auto_close import Closing
 from rse_pf.errors import Disconnected, RsePfError, error_from_code
 from rse_pf.wire.client_session import ClientSession
 from rse_pf.wire.client_subscriptions import SubscriptionEnded, Updated

@@ -11,8 +11,8 @@ from fake_peers import after_request, http, peer, proxy_to, silent
 from fake_platform import FakePlatform
 
 import client_sdk
-from client_sdk.network.proxies import proxy_of
-from client_sdk.network.timings import ConnectTimings
+from client_sdk.network.connect_timings import ConnectTimings
+from client_sdk.network.http_proxy import proxy_of
 from client_sdk.transfer.data_client import DataClient, DataOptions
 from rse_pf.errors import RsePfError, UsageError
 

@@ -2,7 +2,7 @@
 
 The paper's rule (Sect. 6.2): "the saved time should be more than transmission delay so that real-time
 performance gains from cloud computing".  This module only decides;
-`client_sdk.offloading.asking` carries the plan out.
+`client_sdk.offloading.command_router` carries the plan out.
 """
 
 from __future__ import annotations

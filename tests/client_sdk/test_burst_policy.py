@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from client_sdk.offloading.burst_rules import BurstRules, burst_address, check_burst_url
+from client_sdk.offloading.burst_policy import BurstRules, burst_address, check_burst_url
 from rse_pf.errors import UsageError
 
 DAY_S = 86400.0

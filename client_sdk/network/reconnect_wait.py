@@ -10,7 +10,7 @@ import asyncio
 from collections.abc import Callable
 
 from client_sdk.network.backoff import Backoff, Last
-from client_sdk.network.dialling import DialError
+from client_sdk.network.dial_errors import DialError
 from client_sdk.network.network_changes import NetworkChanges
 from client_sdk.network.region_sockets import either
 

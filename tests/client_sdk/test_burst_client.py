@@ -15,7 +15,7 @@ from fake_peers import peer, proxy_to
 from fake_platform import FakePlatform
 
 import client_sdk
-from client_sdk.network.timings import ConnectTimings
+from client_sdk.network.connect_timings import ConnectTimings
 from rse_pf.config import BurstSettings, PlatformSettings, SessionSettings
 from rse_pf.errors import Busy, Expired, NoConsensus, UsageError
 from rse_pf.pnp import solve_pnp

@@ -14,7 +14,7 @@ import ssl
 from collections.abc import Mapping
 from urllib.parse import SplitResult, urlsplit
 
-from client_sdk.network.foreign_answers import (
+from client_sdk.network.peer_diagnosis import (
     HttpAnswer,
     explain_answer,
     explain_bytes,
@@ -23,7 +23,7 @@ from client_sdk.network.foreign_answers import (
     is_of_tls_server,
     parse_answer,
 )
-from client_sdk.network.probe import Probed
+from client_sdk.network.peer_probe import Probed
 from rse_pf.errors import ConnectError, Forbidden, RsePfError, Unauthorized, UsageError
 from rse_pf.wire.refusal import CUT_OFF, RefusedHandshake, refusal_in
 

@@ -13,11 +13,11 @@ from dataclasses import dataclass
 from random import Random
 from urllib.parse import SplitResult, urlsplit
 
-from client_sdk.answers import Answer
-from client_sdk.network.probe import dial, port_of
-from client_sdk.network.proxies import TunnelRefused, proxy_of
+from client_sdk.commands.answer_types import Answer
+from client_sdk.network.http_proxy import TunnelRefused, proxy_of
+from client_sdk.network.peer_probe import dial, port_of
 from client_sdk.network.region_sockets import cancel_all
-from client_sdk.offloading.burst_rules import BurstRules, burst_address
+from client_sdk.offloading.burst_policy import BurstRules, burst_address
 from rse_pf.config import BurstSettings
 from rse_pf.errors import RsePfError
 from rse_pf.wire import SUBPROTOCOLS, Codec, Command, Failure, Result, Welcome
