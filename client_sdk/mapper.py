@@ -39,7 +39,7 @@ from rse_pf.errors import ConfigurationError, RsePfError, UsageError
 from rse_pf.geometry import Array, Camera
 from rse_pf.maps.format import UP, UP_FIELD, Keyframe, MapVersion, encode_map
 from rse_pf.pnp import DepthNoise, PnpOptions
-from rse_pf.slam.inertial import KeyframeImu, upright_turn
+from rse_pf.slam.inertial import KeyframeImu, upright_rotation
 
 if TYPE_CHECKING:  # only robots that record need what it imports
     from rse_pf.recording.robot_recorder import RobotRecorder
@@ -514,7 +514,7 @@ class Mapper:
         gravity = None if self._inertial is None else self._inertial.gravity
         if gravity is None or self._holds_world:
             return False
-        turned = upright_turn(gravity)
+        turned = upright_rotation(gravity)
         tracker.turn(turned)
         if isinstance(tracker, Tracker):
             self._records.turn(turned)
@@ -569,7 +569,7 @@ class Mapper:
         self._align(tracker)
         if self._is_upright or inertial.gravity is None:
             return done
-        T = upright_turn(inertial.gravity)
+        T = upright_rotation(inertial.gravity)
         if not self._make_upright(tracker):
             return done
         return replace(done, T_world_camera=T @ pose, corrected=True, T_new_old=T)

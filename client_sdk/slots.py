@@ -154,7 +154,7 @@ class FeaturesSlot:
         if not n:
             none = np.empty(0)
             return CheckedFeatures(
-                pixels=np.empty((0, 2)), scores=none, descriptors=self.kind.none(), turns=np.empty((0, 2)),
+                pixels=np.empty((0, 2)), scores=none, descriptors=self.kind.empty(), turns=np.empty((0, 2)),
                 sizes=none,
             )  # fmt: skip
         scores = self._numbers("scores", found.scores, (n,))

@@ -15,7 +15,7 @@ from client_sdk.imu.preintegration import Preintegration, preintegrate
 from client_sdk.imu.samples import ImuModel, ImuSamples
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Array, Camera, exp_so3, log_so3
-from rse_pf.slam.inertial import InertialMotion, KeyframeImu, upright_turn
+from rse_pf.slam.inertial import InertialMotion, KeyframeImu, upright_rotation
 
 __all__ = ["ImuScale", "Inertial", "upright"]
 
@@ -257,7 +257,7 @@ def upright(gravity_camera: Array) -> Array:
     """
     made = np.eye(4)
     made[:3, :3] = _LEVEL
-    turned: Array = upright_turn(_LEVEL @ gravity_camera) @ made
+    turned: Array = upright_rotation(_LEVEL @ gravity_camera) @ made
     return turned
 
 

@@ -67,7 +67,7 @@ from rse_pf.live_map.versions import (
     version_of,
     whole_graph,
 )
-from rse_pf.maps.descriptors import DescriptorKind, check_alike
+from rse_pf.maps.descriptors import DescriptorKind, check_same_kind
 from rse_pf.maps.format import MapVersion
 from rse_pf.slam.keyframe import Keyframe, check_sent, decode_keyframe
 from rse_pf.slam.localise import LocalisationOptions, Localised, localise, spread_candidates
@@ -229,7 +229,7 @@ class LiveMap:
             raise BadRequest(error.message, hint=error.hint) from error
         kind = self.kind
         if kind is not None:
-            check_alike(kind, event.keyframe.features.kind, "the live map")
+            check_same_kind(kind, event.keyframe.features.kind, "the live map")
         return "new"
 
     def apply(self, event: Event) -> list[Outcome]:
@@ -312,7 +312,7 @@ class LiveMap:
         """
         graph, kind = self._graph, self.kind
         if kind is not None:
-            check_alike(kind, view.features.kind, "the live map")
+            check_same_kind(kind, view.features.kind, "the live map")
         aligned = np.flatnonzero(graph.held & self._aligned_mask())
         most = self.options.candidates
         # More are looked at, so that a second place that looks alike is compared, too.

@@ -19,7 +19,7 @@ from rse_pf.live_map.graph import Graph, Segment
 from rse_pf.live_map.options import LiveMapOptions
 from rse_pf.live_map.smoothing import edges_of, link_information
 from rse_pf.maps.format import UP, UP_FIELD, Edge, EdgeKind, Keyframe, MapVersion
-from rse_pf.slam.inertial import agreed_gravity, upright_turn
+from rse_pf.slam.inertial import agreed_gravity, upright_rotation
 from rse_pf.slam.keyframe import Keyframe as SentKeyframe
 from rse_pf.slam.keyframe import decode_keyframe, encode_keyframe, make_features
 from rse_pf.slam.keyframe_points import ObjectReference
@@ -132,7 +132,7 @@ def _version_of(graph: Graph, options: LiveMapOptions) -> MapVersion:
     # A map that started from a version keeps the axes of that.
     down = None if graph.source else agreed_gravity([np.array(each) for each in downs.values()])
     if down is not None:
-        turn = upright_turn(down)
+        turn = upright_rotation(down)
         keyframes = [
             replace(keyframe, T_world_camera=turn @ keyframe.T_world_camera) for keyframe in keyframes
         ]

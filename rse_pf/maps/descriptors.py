@@ -1,4 +1,4 @@
-"""What kind the descriptors of features are, so that those of two kinds are never compared."""
+"""Describe the kinds of feature descriptors, so that descriptors of different kinds are never compared."""
 
 from __future__ import annotations
 
@@ -17,32 +17,34 @@ __all__ = [
     "ORB",
     "DescriptorKind",
     "Descriptors",
-    "check_alike",
-    "descriptors_of",
-    "one_kind",
+    "check_same_kind",
+    "common_kind",
+    "decode_descriptors",
 ]
 
 Descriptors = npt.NDArray[Any]
-"""``(n, d)``, uint8 for binary ones, int8 for vectors."""
+"""Descriptors of n features, ``(n, d)``: uint8 if they are binary (d bytes), int8 if they are vectors."""
 
 MAX_DESCRIPTOR_SIZE = 512
-"""Bytes of a descriptor, or dimensions: squared distances of so many stay below 2**24, exact in float32."""
-_MIN_SIZE = 4
-_NAME = re.compile(r"[a-z0-9][a-z0-9._-]{0,31}")
+"""Largest size of a descriptor, in bytes if it is binary, else in dimensions: squared distances of int8
+vectors of this length stay below 2**24, where float32 is exact."""
+_MIN_DESCRIPTOR_SIZE = 4  # smallest size of a descriptor, in bytes if it is binary, else in dimensions
+_KIND_NAME = re.compile(r"[a-z0-9][a-z0-9._-]{0,31}")
 
 
 @dataclass(frozen=True, slots=True)
 class DescriptorKind:
-    """What descriptors are: those of two kinds are never compared.
+    """A kind of descriptors; descriptors are compared only with descriptors of an equal kind.
 
     Attributes:
-        name: Of the features, such as ``orb``: small letters, digits, dots, hyphens and underscores, 32 at
-            most.
-        dtype: ``uint8`` for binary ones, ``int8`` for vectors.
-        size: Bytes of a binary one, dimensions of a vector; 4 to 512.
+        name: Name of the feature, such as ``orb``: up to 32 lower-case letters, digits, dots, hyphens and
+            underscores.
+        dtype: ``uint8`` for binary descriptors, which are compared by their Hamming distance; ``int8`` for
+            vectors, which are compared by their Euclidean distance.
+        size: Bytes of a binary descriptor, or dimensions of a vector; 4 to 512.
 
     Raises:
-        BadRequest: A part is out of its range.
+        BadRequest: An attribute is out of its range.
     """
 
     name: str
@@ -50,66 +52,73 @@ class DescriptorKind:
     size: int
 
     def __post_init__(self) -> None:
-        if not _NAME.fullmatch(self.name):
+        if not _KIND_NAME.fullmatch(self.name):
             raise BadRequest(
                 f"{self.name[:40]!r} is no name of features",
                 hint="use up to 32 small letters, digits, dots, hyphens and underscores",
             )
-        if self.dtype not in ("uint8", "int8") or not _MIN_SIZE <= self.size <= MAX_DESCRIPTOR_SIZE:
+        if (
+            self.dtype not in ("uint8", "int8")
+            or not _MIN_DESCRIPTOR_SIZE <= self.size <= MAX_DESCRIPTOR_SIZE
+        ):
             raise BadRequest(
                 f"descriptors of {self.size} numbers of {str(self.dtype)[:20]} are not known",
-                hint=f"use {_MIN_SIZE} to {MAX_DESCRIPTOR_SIZE} of uint8 (binary) or int8 (a vector)",
+                hint=f"use {_MIN_DESCRIPTOR_SIZE} to {MAX_DESCRIPTOR_SIZE} numbers of uint8 (binary) or int8 "
+                "(a vector)",
             )
 
     def __str__(self) -> str:
         unit = "bytes" if self.dtype == "uint8" else "dimensions"
         return f"{self.name} ({self.size} {unit})"
 
-    def describes(self, descriptors: npt.NDArray[Any]) -> bool:
-        """Return whether an array holds ``(n, size)`` descriptors of this kind."""
+    def is_kind_of(self, descriptors: npt.NDArray[Any]) -> bool:
+        """Return whether an array has the shape ``(n, size)`` and the dtype of this kind."""
         return descriptors.dtype == self.dtype and descriptors.shape[1:] == (self.size,)
 
-    def none(self) -> Descriptors:
-        """Return an array of no descriptors."""
+    def empty(self) -> Descriptors:
+        """Return descriptors of no features, shape ``(0, size)``."""
         return np.empty((0, self.size), dtype=self.dtype)
 
 
 ORB = DescriptorKind("orb", "uint8", 32)
-"""The default, and all that the native core matches; numpy matches the others."""
+"""The default kind of descriptors, which the native core matches; other kinds are matched by numpy."""
 
 
-def one_kind(kinds: Iterable[DescriptorKind], what: str) -> DescriptorKind:
-    """Return the kind that all are of, ORB if there are none.
+def common_kind(kinds: Iterable[DescriptorKind], subject: str) -> DescriptorKind:
+    """Return the kind that all of *kinds* are equal to, or ORB if there are none.
 
     Raises:
-        BadRequest: There are two kinds.
+        BadRequest: *kinds* differ; the message begins with *subject*, such as "the map".
     """
-    found = dict.fromkeys(kinds)
-    if len(found) > 1:
-        first, second, *_ = found
-        raise _two_kinds(first, second, what)
-    return next(iter(found), ORB)
+    distinct = dict.fromkeys(kinds)
+    if len(distinct) > 1:
+        first, second, *_ = distinct
+        raise _different_kinds(first, second, subject)
+    return next(iter(distinct), ORB)
 
 
-def check_alike(kind: DescriptorKind, other: DescriptorKind, what: str) -> None:
-    """Raise BadRequest if *other* is not the *kind* that *what* holds."""
-    if other != kind:
-        raise _two_kinds(kind, other, what)
+def check_same_kind(expected: DescriptorKind, actual: DescriptorKind, subject: str) -> None:
+    """Raise BadRequest if *actual* is not the *expected* kind of *subject*, such as "the map"."""
+    if actual != expected:
+        raise _different_kinds(expected, actual, subject)
 
 
-def _two_kinds(first: DescriptorKind, second: DescriptorKind, what: str) -> BadRequest:
-    """Return the refusal of features of another kind."""
+def _different_kinds(expected: DescriptorKind, actual: DescriptorKind, subject: str) -> BadRequest:
     return BadRequest(
-        f"{what} has features of kind {first}, and cannot take {second}",
+        f"{subject} has features of kind {expected}, and cannot take {actual}",
         hint="use one kind of features for a map, or another map",
     )
 
 
-def descriptors_of(data: bytes, rows: int, kind: DescriptorKind = ORB) -> Descriptors:
-    """Return raw bytes as ``(rows, size)`` descriptors; raises BadRequest."""
-    if len(data) != kind.size * rows:
+def decode_descriptors(data: bytes, count: int, kind: DescriptorKind = ORB) -> Descriptors:
+    """Return raw bytes as an array of descriptors, shape ``(count, kind.size)``, that shares their memory.
+
+    Raises:
+        BadRequest: *data* has another length than *count* descriptors.
+    """
+    if len(data) != kind.size * count:
         raise BadRequest(
-            f"{len(data)} bytes are not {rows} descriptors of {kind.size} bytes",
-            hint="send one for each pixel",
+            f"{len(data)} bytes are not {count} descriptors of {kind.size} bytes",
+            hint="send one descriptor for each pixel",
         )
-    return np.frombuffer(data, dtype=kind.dtype).reshape(rows, kind.size)
+    return np.frombuffer(data, dtype=kind.dtype).reshape(count, kind.size)

@@ -1,14 +1,16 @@
-"""Maps as values (keyframes, edges, a point cloud) and their encoding as bytes.
+"""Represent maps as values (keyframes, edges, a point cloud), and encode them as bytes.
 
-`decode_map` returns complete and validated maps only and executes nothing it reads.  Sizes and counts are
-judged on the bytes, before any object is made.  The same map always gives the same bytes.
+A map file is the 8 bytes ``RSEMAP1\n`` and one MessagePack map, which is compressed by zlib; its arrays are
+raw little-endian bytes.  Equal maps give equal bytes.
 
-Format: ``RSEMAP1\\n``, then one MessagePack map, zlib-compressed; arrays are raw little-endian bytes.
+`decode_map` returns complete and valid maps only.  Sizes and counts are checked on the bytes before an object
+is made from them, so that a malformed or hostile file costs little memory; nothing in a file is executed.
 """
 
 from __future__ import annotations
 
 import functools
+import re
 import zlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -30,9 +32,10 @@ from rse_pf.budget import (
 )
 from rse_pf.errors import BadMessage, BadRequest, LimitExceeded, RsePfError, message_of
 from rse_pf.geometry import Array, Camera, rigid
-from rse_pf.maps.descriptors import ORB, DescriptorKind, Descriptors, one_kind
+from rse_pf.maps.descriptors import ORB, DescriptorKind, Descriptors, common_kind
 
 __all__ = [
+    "IMAGES_FOLDER",
     "UP",
     "UP_FIELD",
     "Edge",
@@ -45,27 +48,51 @@ __all__ = [
 ]
 
 EdgeKind = Literal["odometry", "loop", "merge"]
+"""What an edge measures: the motion to the next keyframe of a robot, a loop closure within one map, or a loop
+closure between two maps that were merged."""
 
+IMAGES_FOLDER = "images"
+"""Name of the folder that holds the image files of keyframes, beside an exported map or a drive's results."""
 UP_FIELD = "up"
-"""Field of the provenance of a map whose gravity is known: the direction against it, in the world."""
+"""Name of the field of a map's provenance that holds the unit vector against gravity in the map's world."""
 UP = (0.0, 0.0, 1.0)
-"""That of maps that were turned, so that their z points up."""
+"""Value of the provenance field ``up`` in a map whose world was rotated so that its z axis points up."""
 
-_MAGIC = b"RSEMAP1\n"
-_MAX_BYTES = 1 << 30
-_MAX_RATIO, _FREE_BYTES = 50.0, 1 << 20
-"""Features and clouds deflate to half their size; only empty or hostile maps deflate to a fiftieth."""
-_MAX_ID = 2**63 - 1
-_MAX_NAME = 64
-_MAX_NUMBER, _MAX_TIME_S, _MAX_PIXEL, _MAX_INFORMATION = 1e9, 1e12, 1e5, 1e18
-"""Metres or pixels, and seconds: larger numbers overflow in what computes with them."""
+_MAGIC = b"RSEMAP1\n"  # the first bytes of a map file, with the version of the format
+_MAX_BYTES = 1 << 30  # size of a decompressed map: 1 GiB
+_MAX_COMPRESSION_RATIO = 50.0
+"""Decompressed size of a map over its compressed size; features and point clouds only compress to half their
+size, so that a larger ratio means an empty or a hostile map."""
+_UNCHECKED_BYTES = 1 << 20  # decompressed size up to which the compression ratio is not limited
+_MAX_ID = 2**63 - 1  # the largest id of a keyframe: an int64
+_MAX_NAME_LENGTH = 64  # characters of the name of a keyframe's robot
+_MAX_COORDINATE_M = (
+    1e9  # largest coordinate of a map's points in metres; larger ones overflow in later computations
+)
+_MAX_TIME_S = (
+    1e12  # largest time of a keyframe, seconds from 1970; larger ones overflow in later computations
+)
+_MAX_PIXEL = 1e5  # largest coordinate of a feature in pixels: no camera has wider images
+_MAX_INFORMATION = (
+    1e18  # largest number of an edge's information matrix: standard deviations of 1 nm and 1 nrad
+)
+_ITEM_VALUES = {"keyframes": 100, "edges": 40}
+"""MessagePack values that one keyframe or one edge may have: more than today, so that fields can be added."""
+_OTHER_FIELD_VALUES = (
+    1000  # MessagePack values in any other field of a map file, such as one of a later release
+)
+_UNSAFE_IN_FILE_NAMES = re.compile(r"[^A-Za-z0-9._-]+")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MapLimits:
-    """How much a map may hold; one with more is refused before it is decoded.
+    """The numbers of items that a map may hold; a larger map is rejected before it is decoded.
 
-    ``keyframe_features`` is the limit of one keyframe, ``features`` that of all together.
+    Attributes:
+        keyframes: Keyframes of the map.
+        keyframe_features: Features of one keyframe.
+        features: Features of all keyframes together.
+        edges: Edges of the pose graph.
     """
 
     keyframes: int = 20_000
@@ -76,18 +103,26 @@ class MapLimits:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Keyframe:
-    """One image of a map, as features.
+    """A keyframe of a map: the features of one image, with the pose of its camera in the world of the map.
+
+    This class is the keyframe of everything that works with whole maps: versions, merging, localisation and
+    exports.  What a robot sends before a map has given it an id and a pose is
+    `rse_pf.slam.keyframe.SentKeyframe`, which converts into this class.
 
     Attributes:
-        id: Unique in its map.
-        T_world_camera: ``(4, 4)`` float64, metres.
+        id: Unique in its map, 0..2**63-1.
+        robot: Name of the robot that took the image, at most 64 characters.
+        timestamp_s: When the image was taken, Unix seconds.
+        T_world_camera: ``(4, 4)`` float64, metres; maps points from the camera's frame to the map's world.
+        camera: The pinhole camera whose undistorted pixels these are.
         pixels: ``(n, 2)`` float32, undistorted.
-        descriptors: ``(n, d)`` uint8 or int8, of one kind in a map.
-        points_camera: ``(n, 3)`` float32 metres, camera frame; NaN rows where there is no depth.
-        kind: Of the descriptors.
+        descriptors: ``(n, d)`` uint8 or int8, of the same kind in the whole map.
+        points_camera: ``(n, 3)`` float32, the 3-D point of each feature in the camera's frame, metres; NaN
+            where the depth is unknown.
+        kind: The kind of the descriptors.
 
     Raises:
-        BadRequest: Shapes do not fit, or a number is not finite where it must be.
+        BadRequest: The shapes do not fit, or a number is not finite or out of its range.
     """
 
     id: int
@@ -105,29 +140,50 @@ class Keyframe:
         if not (
             self.pixels.shape == (n, 2)
             and len(self.descriptors) == n
-            and self.kind.describes(self.descriptors)
+            and self.kind.is_kind_of(self.descriptors)
             and self.points_camera.shape == (n, 3)
         ):
-            raise BadRequest(f"the arrays of keyframe {self.id} do not fit", hint="one row for each feature")
-        if not (0 <= self.id <= _MAX_ID and len(self.robot) <= _MAX_NAME):
             raise BadRequest(
-                f"the id {self.id} is not within 0..2**63-1, or the robot's name longer than {_MAX_NAME}",
-                hint="number keyframes from 0",
+                f"the arrays of keyframe {self.id} do not fit: pixels {self.pixels.shape}, descriptors "
+                f"{self.descriptors.shape}, points_camera {self.points_camera.shape}",
+                hint="send one row for each feature in each array",
+            )
+        if not (0 <= self.id <= _MAX_ID and len(self.robot) <= _MAX_NAME_LENGTH):
+            raise BadRequest(
+                f"the id {self.id} is not within 0..2**63-1, or the robot's name longer than "
+                f"{_MAX_NAME_LENGTH}",
+                hint="number keyframes from 0, and shorten the name of the robot",
             )
         if not (abs(self.timestamp_s) <= _MAX_TIME_S and _is_bounded(self.pixels, _MAX_PIXEL)):
             raise BadRequest(
-                f"keyframe {self.id} holds a number that is not finite, or absurd", hint="leave it out"
+                f"the time of keyframe {self.id} is not within +-{_MAX_TIME_S:g} s, or a pixel not within "
+                f"+-{_MAX_PIXEL:g}",
+                hint="leave this keyframe out",
             )
-        # Frozen from here on.
-        object.__setattr__(self, "T_world_camera", _checked_pose(f"keyframe {self.id}", self.T_world_camera))
+        pose = _checked_pose(f"keyframe {self.id}", self.T_world_camera)
+        object.__setattr__(self, "T_world_camera", pose)  # This class is frozen.
+
+    @property
+    def image_name(self) -> str:
+        """The name of the file of the keyframe's image: unique in its map, of plain letters and digits."""
+        robot = _UNSAFE_IN_FILE_NAMES.sub("-", self.robot).strip(".-") or "camera"
+        return f"{robot}-{self.id:06d}.jpg"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Edge:
-    """A measured relative pose ``T_a_b`` between the keyframes with ids *a* and *b*.
+    """A relative pose between two keyframes of a map that was measured: an edge of the pose graph.
 
-    ``information`` is the ``(6, 6)`` inverse covariance of the twist (rho metres, phi radians) in
-    ``log(inverse(T_a_b) @ inverse(T_world_a) @ T_world_b)``.
+    Attributes:
+        a: Id of the first keyframe.
+        b: Id of the second keyframe.
+        T_a_b: ``(4, 4)``, the pose of the camera of *b* in the frame of the camera of *a*, metres.
+        information: ``(6, 6)``, the inverse covariance of the twist (translation in metres, rotation in
+            radians) ``log(inverse(T_a_b) @ inverse(T_world_a) @ T_world_b)``.
+        kind: What the edge measures.
+
+    Raises:
+        BadRequest: The pose is not rigid, or the information is not a ``(6, 6)`` matrix of finite numbers.
     """
 
     a: int
@@ -139,18 +195,27 @@ class Edge:
     def __post_init__(self) -> None:
         object.__setattr__(self, "T_a_b", _checked_pose(f"edge {self.a}-{self.b}", self.T_a_b))
         if self.information.shape != (6, 6) or not (np.abs(self.information) <= _MAX_INFORMATION).all():
-            raise BadRequest(f"edge {self.a}-{self.b} has no (6, 6) information", hint="invert a covariance")
+            raise BadRequest(
+                f"edge {self.a}-{self.b} has no (6, 6) information matrix with numbers up to "
+                f"{_MAX_INFORMATION:g}",
+                hint="send the inverse of the covariance of the relative pose",
+            )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class MapVersion:
-    """A complete map: immutable, a change makes a new version.
+    """A complete map.  It never changes: a change of the map makes a new version.
 
-    ``points`` ``(m, 3)`` float32 metres, world frame; ``colours`` ``(m, 3)`` uint8.
+    Attributes:
+        keyframes: The keyframes, with unique ids.
+        edges: The edges of the pose graph between them.
+        points: ``(m, 3)`` float32, the point cloud in the world of the map, metres.
+        colours: ``(m, 3)`` uint8, red, green and blue of each point.
+        provenance: Where the map comes from: free fields that its maker wrote, and the field ``up``.
 
     Raises:
-        BadRequest: Two keyframes have one id or features of two kinds, an edge leads nowhere, or points and
-            colours do not fit.
+        BadRequest: Two keyframes have the same id or different kinds of descriptors, an edge refers to a
+            missing keyframe, or the shapes of points and colours do not fit.
     """
 
     keyframes: tuple[Keyframe, ...]
@@ -161,16 +226,16 @@ class MapVersion:
 
     @property
     def kind(self) -> DescriptorKind:
-        """Of the descriptors of all keyframes; ORB without any."""
+        """The kind of the descriptors of all keyframes; ORB if there are no keyframes."""
         return self.keyframes[0].kind if self.keyframes else ORB
 
     @property
     def up(self) -> Array | None:
-        """The ``(3,)`` unit vector against gravity, in the world; None where gravity is not known."""
-        told = self.provenance.get(UP_FIELD)
-        if not isinstance(told, list) or len(told) != 3 or not all(type(each) is float for each in told):
+        """The unit vector ``(3,)`` against gravity in the world of the map; None if gravity is unknown."""
+        stated = self.provenance.get(UP_FIELD)
+        if not isinstance(stated, list) or len(stated) != 3 or not all(type(x) is float for x in stated):
             return None
-        up = np.array(told)
+        up = np.array(stated)
         length = float(np.linalg.norm(up))
         return up / length if 0.99 <= length <= 1.01 else None
 
@@ -178,7 +243,7 @@ class MapVersion:
         ids = {keyframe.id for keyframe in self.keyframes}
         if len(ids) != len(self.keyframes):
             raise BadRequest("two keyframes of a map have one id", hint="assign unique ids")
-        one_kind((keyframe.kind for keyframe in self.keyframes), "the map")
+        common_kind((keyframe.kind for keyframe in self.keyframes), "the map")
         dangling = next((edge for edge in self.edges if edge.a not in ids or edge.b not in ids), None)
         if dangling is not None:
             raise BadRequest(
@@ -186,10 +251,14 @@ class MapVersion:
             )
         m = len(self.points)
         if self.points.shape != (m, 3) or self.colours.shape != (m, 3) or not _is_bounded(self.points):
-            raise BadRequest("points and colours of a map do not fit", hint="send (m, 3) of both")
+            raise BadRequest(
+                f"points {self.points.shape} and colours {self.colours.shape} of a map are not both (m, 3), "
+                f"or a coordinate is not within +-{_MAX_COORDINATE_M:g} m",
+                hint="send (m, 3) of both, without NaN",
+            )
 
 
-class _Keyframe(msgspec.Struct, frozen=True, kw_only=True):
+class _EncodedKeyframe(msgspec.Struct, frozen=True, kw_only=True):
     id: int
     robot: str
     timestamp_s: float
@@ -200,7 +269,7 @@ class _Keyframe(msgspec.Struct, frozen=True, kw_only=True):
     points: memoryview
 
 
-class _Edge(msgspec.Struct, frozen=True, kw_only=True):
+class _EncodedEdge(msgspec.Struct, frozen=True, kw_only=True):
     a: int
     b: int
     step: bytes
@@ -208,96 +277,118 @@ class _Edge(msgspec.Struct, frozen=True, kw_only=True):
     kind: EdgeKind
 
 
-class _Kind(msgspec.Struct, frozen=True, array_like=True):
+class _EncodedKind(msgspec.Struct, frozen=True, array_like=True):
     name: str
     dtype: str
     size: int
 
 
-class _Map(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
-    keyframes: list[_Keyframe]
-    edges: list[_Edge]
+class _EncodedMap(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
+    keyframes: list[_EncodedKeyframe]
+    edges: list[_EncodedEdge]
     points: memoryview
     colours: memoryview
     provenance: msgspec.Raw
-    features: _Kind | None = None
-    """None for ORB."""
+    features: _EncodedKind | None = None
+    """The kind of the descriptors; None means ORB."""
 
 
 def encode_map(version: MapVersion) -> bytes:
-    """Return *version* as bytes; the same map gives the same bytes."""
+    """Return *version* as the bytes of a map file; equal maps give equal bytes."""
     kind = version.kind
-    packed = _Map(
+    encoded = _EncodedMap(
         keyframes=[
-            _Keyframe(
-                id=k.id, robot=k.robot, timestamp_s=k.timestamp_s, pose=_raw(k.T_world_camera, "<f8"),
-                camera=k.camera, pixels=_view(k.pixels, "<f4"), descriptors=_view(k.descriptors, kind.dtype),
-                points=_view(k.points_camera, "<f4"),
+            _EncodedKeyframe(
+                id=keyframe.id,
+                robot=keyframe.robot,
+                timestamp_s=keyframe.timestamp_s,
+                pose=_array_bytes(keyframe.T_world_camera, "<f8"),
+                camera=keyframe.camera,
+                pixels=_array_view(keyframe.pixels, "<f4"),
+                descriptors=_array_view(keyframe.descriptors, kind.dtype),
+                points=_array_view(keyframe.points_camera, "<f4"),
             )
-            for k in version.keyframes
+            for keyframe in version.keyframes
         ],
         edges=[
-            _Edge(
-                a=e.a, b=e.b, step=_raw(e.T_a_b, "<f8"), information=_raw(e.information, "<f8"), kind=e.kind
+            _EncodedEdge(
+                a=edge.a,
+                b=edge.b,
+                step=_array_bytes(edge.T_a_b, "<f8"),
+                information=_array_bytes(edge.information, "<f8"),
+                kind=edge.kind,
             )
-            for e in version.edges
+            for edge in version.edges
         ],
-        points=_view(version.points, "<f4"),
-        colours=_view(version.colours, "u1"),
+        points=_array_view(version.points, "<f4"),
+        colours=_array_view(version.colours, "u1"),
         provenance=msgspec.Raw(msgspec.msgpack.encode(dict(version.provenance), order="deterministic")),
-        features=None if kind == ORB else _Kind(kind.name, kind.dtype, kind.size),
-    )  # fmt: skip
-    return _MAGIC + zlib.compress(msgspec.msgpack.encode(packed, order="deterministic"), 1)
+        features=None if kind == ORB else _EncodedKind(kind.name, kind.dtype, kind.size),
+    )
+    return _MAGIC + zlib.compress(msgspec.msgpack.encode(encoded, order="deterministic"), 1)
 
 
 def decode_map(data: bytes, max_bytes: int = _MAX_BYTES, limits: MapLimits | None = None) -> MapVersion:
-    """Return the map of *data*, whose arrays share the memory of the inflated bytes.
+    """Return the map of the bytes of a map file; its arrays are read-only views of the decompressed bytes.
 
-    The provenance is decoded when it is first asked for, and raises BadRequest then if it is damaged.
+    The provenance is decoded when it is first read, and raises BadRequest then if it is damaged.
 
     Args:
-        data: What `encode_map` returned, or a stranger's bytes.
-        max_bytes: Size of the inflated map.
-        limits: Counts that it may hold; None means the defaults.
+        data: The bytes that `encode_map` returned; they may come from an untrusted robot.
+        max_bytes: The largest size of the decompressed map.
+        limits: The largest numbers of keyframes, features and edges; None means the defaults.
 
     Raises:
-        BadRequest: The bytes are not a map, are damaged, or hold more than *max_bytes*.
+        BadRequest: The bytes are not a map, are damaged, or decompress to more than *max_bytes*.
         LimitExceeded: The map holds more than *limits* allow.
     """
     limits = limits or MapLimits()
-    text = _inflated(data, max_bytes)
+    # 1. Decompress, with a limit of the size.
+    content = _decompress(data, max_bytes)
     try:
-        _check_sections(text, limits)
-        packed = msgspec.msgpack.decode(memoryview(text).toreadonly(), type=_Map)
-        named = packed.features
-        kind = ORB if named is None else DescriptorKind(named.name, named.dtype, named.size)
-        _check_features(packed.keyframes, limits, kind.size)
+        # 2. Count keyframes, edges and features on the bytes.
+        _check_fields(content, limits)
+        encoded = msgspec.msgpack.decode(memoryview(content).toreadonly(), type=_EncodedMap)
+        features = encoded.features
+        kind = ORB if features is None else DescriptorKind(features.name, features.dtype, features.size)
+        _check_feature_counts(encoded.keyframes, limits, kind.size)
+        # 3. Make the values, which check themselves.
         return MapVersion(
-            keyframes=tuple(_keyframe(each, kind) for each in packed.keyframes),
+            keyframes=tuple(_decode_keyframe(keyframe, kind) for keyframe in encoded.keyframes),
             edges=tuple(
                 Edge(
-                    a=e.a, b=e.b, T_a_b=_array(e.step, "<f8", (4, 4)),
-                    information=_array(e.information, "<f8", (6, 6)), kind=e.kind,
+                    a=edge.a,
+                    b=edge.b,
+                    T_a_b=_array(edge.step, "<f8", (4, 4)),
+                    information=_array(edge.information, "<f8", (6, 6)),
+                    kind=edge.kind,
                 )
-                for e in packed.edges
+                for edge in encoded.edges
             ),
-            points=_array(packed.points, "<f4", (-1, 3)),
-            colours=_array(packed.colours, "u1", (-1, 3)),
-            provenance=_Provenance(bytes(packed.provenance)),
-        )  # fmt: skip
+            points=_array(encoded.points, "<f4", (-1, 3)),
+            colours=_array(encoded.colours, "u1", (-1, 3)),
+            provenance=_LazyProvenance(bytes(encoded.provenance)),
+        )
     except (msgspec.MsgspecError, ValueError, RecursionError, BadMessage) as error:
         if isinstance(error, RsePfError) and not isinstance(error, BadMessage):
             raise
         raise BadRequest(f"the map is damaged: {message_of(error)}", hint="fetch it again") from error
 
 
-def _inflated(data: bytes, max_bytes: int) -> bytes | bytearray:
+def _decompress(data: bytes, max_bytes: int) -> bytes | bytearray:
     if data[: len(_MAGIC)] != _MAGIC:
         raise BadRequest("these bytes are not a map", hint="send what encode_map returned")
     budget = Budget(
-        wire_bytes=max_bytes, inflated_bytes=max_bytes, inflate_ratio=_MAX_RATIO, free_bytes=_FREE_BYTES,
-        depth=0, containers=0, values=0, mixed_values=0, memory_bytes=max_bytes,
-    )  # fmt: skip
+        wire_bytes=max_bytes,
+        inflated_bytes=max_bytes,
+        inflate_ratio=_MAX_COMPRESSION_RATIO,
+        free_bytes=_UNCHECKED_BYTES,
+        depth=0,
+        containers=0,
+        values=0,
+        mixed_values=0,
+        memory_bytes=max_bytes,
+    )
     try:
         return inflate_within(data[len(_MAGIC) :], budget)
     except LimitExceeded as error:
@@ -306,123 +397,151 @@ def _inflated(data: bytes, max_bytes: int) -> bytes | bytearray:
         raise BadRequest(f"the map is truncated or damaged: {error.message}", hint="send it again") from error
 
 
-def _check_sections(text: bytes | bytearray, limits: MapLimits) -> None:
-    """Check the counts of each field of an encoded map, which is one MessagePack map."""
-    count, at, names = announced_values(text, 0), 1, set()
-    if not 0x80 <= text[0] <= 0x8F:
+def _check_fields(content: bytes | bytearray, limits: MapLimits) -> None:
+    """Check the size of each field of a decompressed map file before the fields are decoded.
+
+    Raises:
+        BadMessage: The bytes are malformed, or a field occurs twice.
+        LimitExceeded: The map has too many keyframes or edges, or its provenance is too long.
+    """
+    count, offset, names = announced_values(content, 0), 1, set()
+    if not 0x80 <= content[0] <= 0x8F:
         raise BadMessage("it is not a map of fields")
     for _ in range(count // 2):
-        name, at = small_text(text, at)
+        name, offset = small_text(content, offset)
         if name in names:
             raise BadMessage(f"the field {name!r} is there twice")
         names.add(name)
-        items = announced_values(text, at)
+        items = announced_values(content, offset)
         if name in _ITEM_VALUES and items > getattr(limits, name):
             raise LimitExceeded(
                 f"a map of {items} {name} is above {getattr(limits, name)}", hint="split the map"
             )
-        if name == "provenance" and not (0x80 <= text[at] < 0x90 or text[at] in (0xDE, 0xDF)):
+        if name == "provenance" and not (0x80 <= content[offset] < 0x90 or content[offset] in (0xDE, 0xDF)):
             raise BadMessage("its provenance is not a map")
-        begin, at = at, measure_msgpack(text, at, _budget_of(name, items))
-        if name == "provenance" and at - begin > PROVENANCE.wire_bytes:
+        begin, offset = offset, measure_msgpack(content, offset, _field_budget(name, items))
+        if name == "provenance" and offset - begin > PROVENANCE.wire_bytes:
             raise LimitExceeded(
-                f"a provenance of {at - begin} bytes is above {PROVENANCE.wire_bytes}", hint="leave it out"
+                f"a provenance of {offset - begin} bytes is above {PROVENANCE.wire_bytes}",
+                hint="leave it out",
             )
 
 
-_ITEM_VALUES = {"keyframes": 100, "edges": 40}
-"""Values of one item of a list, beyond what the format has today, so that fields may be added."""
-_OTHER_FIELD = 1000
-
-
-def _budget_of(name: str, items: int) -> Budget:
-    """Return the budget of a field whose value announces *items* items."""
+def _field_budget(name: str, items: int) -> Budget:
+    """Return the decoding budget of the field *name* of a map file, whose value states *items* items."""
     if name == "provenance":
         return PROVENANCE
-    values = LIST_VALUES + items * _ITEM_VALUES[name] if name in _ITEM_VALUES else _OTHER_FIELD
+    values = LIST_VALUES + items * _ITEM_VALUES[name] if name in _ITEM_VALUES else _OTHER_FIELD_VALUES
     containers = 1 + values // MAP_VALUES
     return Budget(
-        wire_bytes=_MAX_BYTES, inflated_bytes=_MAX_BYTES, inflate_ratio=_MAX_RATIO, free_bytes=_FREE_BYTES,
-        depth=4, containers=containers, values=values, mixed_values=values, memory_bytes=_MAX_BYTES,
-    )  # fmt: skip
+        wire_bytes=_MAX_BYTES,
+        inflated_bytes=_MAX_BYTES,
+        inflate_ratio=_MAX_COMPRESSION_RATIO,
+        free_bytes=_UNCHECKED_BYTES,
+        depth=4,
+        containers=containers,
+        values=values,
+        mixed_values=values,
+        memory_bytes=_MAX_BYTES,
+    )
 
 
-def _check_features(keyframes: list[_Keyframe], limits: MapLimits, descriptor_bytes: int) -> None:
+def _check_feature_counts(
+    keyframes: list[_EncodedKeyframe], limits: MapLimits, descriptor_bytes: int
+) -> None:
+    """Raise LimitExceeded if one keyframe, or the map in total, has more features than *limits* allow."""
     total = 0
-    for each in keyframes:
-        count = max(len(each.pixels) // 8, len(each.descriptors) // descriptor_bytes, len(each.points) // 12)
+    for keyframe in keyframes:
+        count = max(
+            len(keyframe.pixels) // 8,
+            len(keyframe.descriptors) // descriptor_bytes,
+            len(keyframe.points) // 12,
+        )
         total += count
-        if count > limits.keyframe_features or total > limits.features:
+        if count > limits.keyframe_features:
             raise LimitExceeded(
-                f"keyframe {each.id} has {count} features, which is above {limits.keyframe_features}, or the "
-                f"map more than {limits.features}",
+                f"keyframe {keyframe.id} has {count} features, which is above {limits.keyframe_features}",
                 hint="keep the strongest features of each image",
+            )
+        if total > limits.features:
+            raise LimitExceeded(
+                f"the keyframes of the map have more than {limits.features} features",
+                hint="keep the strongest features of each image, or split the map",
             )
 
 
-class _Provenance(Mapping[str, Any]):
-    """What a map says about its origin, decoded when it is first asked for."""
+class _LazyProvenance(Mapping[str, Any]):
+    """The provenance of a map, which is decoded when a field of it is first read."""
 
-    def __init__(self, raw: bytes) -> None:
-        self._raw = raw
+    def __init__(self, encoded: bytes) -> None:
+        self._encoded = encoded
 
     def __getitem__(self, name: str) -> Any:
-        return self._decoded[name]
+        return self._fields[name]
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self._decoded)
+        return iter(self._fields)
 
     def __len__(self) -> int:
-        return len(self._decoded)
+        return len(self._fields)
 
     @functools.cached_property
-    def _decoded(self) -> dict[str, Any]:
+    def _fields(self) -> dict[str, Any]:
         try:
-            return msgspec.msgpack.decode(self._raw, type=dict[str, Any], ext_hook=_no_extension)
+            return msgspec.msgpack.decode(self._encoded, type=dict[str, Any], ext_hook=_reject_extension)
         except (msgspec.MsgspecError, ValueError, RecursionError) as error:
             raise BadRequest(
                 f"the provenance of the map is damaged: {message_of(error)}", hint="fetch it again"
             ) from error
 
 
-def _no_extension(kind: int, _: memoryview) -> Any:
-    raise ValueError(f"it holds the extension {kind}")
+def _reject_extension(code: int, _: memoryview) -> Any:
+    raise ValueError(f"it holds a MessagePack extension of type {code}")
 
 
-def _keyframe(k: _Keyframe, kind: DescriptorKind) -> Keyframe:
+def _decode_keyframe(encoded: _EncodedKeyframe, kind: DescriptorKind) -> Keyframe:
     return Keyframe(
-        id=k.id, robot=k.robot, timestamp_s=k.timestamp_s, T_world_camera=_array(k.pose, "<f8", (4, 4)),
-        camera=k.camera, pixels=_array(k.pixels, "<f4", (-1, 2)),
-        descriptors=_array(k.descriptors, kind.dtype, (-1, kind.size)),
-        points_camera=_array(k.points, "<f4", (-1, 3)), kind=kind,
-    )  # fmt: skip
+        id=encoded.id,
+        robot=encoded.robot,
+        timestamp_s=encoded.timestamp_s,
+        T_world_camera=_array(encoded.pose, "<f8", (4, 4)),
+        camera=encoded.camera,
+        pixels=_array(encoded.pixels, "<f4", (-1, 2)),
+        descriptors=_array(encoded.descriptors, kind.dtype, (-1, kind.size)),
+        points_camera=_array(encoded.points, "<f4", (-1, 3)),
+        kind=kind,
+    )
 
 
-def _raw(array: npt.NDArray[Any], kind: str) -> bytes:
-    return np.ascontiguousarray(array, dtype=np.dtype(kind)).tobytes()
+def _array_bytes(array: npt.NDArray[Any], dtype: str) -> bytes:
+    return np.ascontiguousarray(array, dtype=np.dtype(dtype)).tobytes()
 
 
-def _view(array: npt.NDArray[Any], kind: str) -> memoryview:
-    return memoryview(_raw(array, kind))
+def _array_view(array: npt.NDArray[Any], dtype: str) -> memoryview:
+    return memoryview(_array_bytes(array, dtype))
 
 
-def _array(raw: bytes | memoryview, kind: str, shape: tuple[int, ...]) -> npt.NDArray[Any]:
-    return np.frombuffer(raw, dtype=np.dtype(kind)).reshape(shape)
+def _array(data: bytes | memoryview, dtype: str, shape: tuple[int, ...]) -> npt.NDArray[Any]:
+    return np.frombuffer(data, dtype=np.dtype(dtype)).reshape(shape)
 
 
-def _is_bounded(values: npt.NDArray[np.float32], most: float = _MAX_NUMBER) -> bool:
-    """Return whether all *values* are finite and not absurd; a NaN makes both comparisons false."""
+def _is_bounded(values: npt.NDArray[np.float32], bound: float = _MAX_COORDINATE_M) -> bool:
+    """Return whether all *values* are within ``-bound..bound``; a NaN makes both comparisons false."""
     if not values.size:
         return True
-    return bool(values.min() >= -most and values.max() <= most)
+    return bool(values.min() >= -bound and values.max() <= bound)
 
 
-def _checked_pose(what: str, T: Array) -> Array:
-    """Return a pose with a rotation; raises BadRequest."""
-    made = rigid(T)
-    if made is None:
+def _checked_pose(name: str, T: Array) -> Array:
+    """Return *T* with an exactly orthonormal rotation; *name* stands in the error.
+
+    Raises:
+        BadRequest: The matrix is not ``(4, 4)``, not finite, or its upper left part is not a rotation.
+    """
+    pose = rigid(T)
+    if pose is None:
         raise BadRequest(
-            f"{what} has no rigid pose, or a matrix that is not a rotation",
+            f"{name} has no rigid pose, or a matrix that is not a rotation",
             hint="send (4, 4) matrices of a rotation with at least three decimals and a finite translation",
         )
-    return made
+    return pose

@@ -98,7 +98,7 @@ def best_matches(reference: Descriptors, view: Descriptors, ratio: float) -> tup
     none: Rows = np.empty(0, dtype=np.int64)
     if len(reference) == 0 or len(view) < 2:
         return none, none
-    if ORB.describes(reference):
+    if ORB.is_kind_of(reference):
         return match_orb(reference, view, ratio)
     step = max(1, _BLOCK // len(view))
     blocks = [_two_nearest(reference[row : row + step], view) for row in range(0, len(reference), step)]

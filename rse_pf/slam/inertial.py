@@ -1,14 +1,17 @@
-"""What an IMU tells of a keyframe: where down is, and the motion since the previous keyframe of the segment.
+"""Encode what an IMU measured for a keyframe: the direction of gravity, and the motion since the last one.
 
-Raw samples stay on the robot.  The content of the block, little-endian, 40 or 284 bytes::
+The motion is relative to the previous keyframe of the same segment of the robot's odometry.  Raw samples stay
+on the robot.  The content of the IMU block of a keyframe is little-endian, 40 bytes or with a motion 284::
 
-    gravity   unit vector down in the frame of the camera (3 float32), deviation in rad (float32)
-    mount     T_imu_camera: rotation vector, translation in metres (6 float32)
-    motion    optional: duration in s, rotation vector, velocity, position (10 float32), biases of gyroscope
-              and accelerometer that were subtracted (6 float32), and the upper triangle, row by row, of the
-              covariance of rotation, velocity, position (45 float32): preintegrated, in the axes of the IMU
+    gravity   unit vector down in the camera's frame (3 float32), its standard deviation in rad (float32)
+    mount     T_imu_camera: rotation vector in rad, translation in metres (6 float32)
+    motion    optional: duration in s, rotation vector in rad, velocity in m/s, position in m (10 float32),
+              biases of gyroscope (rad/s) and accelerometer (m/s^2) that were subtracted (6 float32), and the
+              upper triangle, row by row, of the 9x9 covariance of rotation, velocity and position
+              (45 float32): the preintegrated measurement, in the axes of the IMU
 
-Every number is judged: false gravity of one robot is judged again by what others say.
+The decoder checks that each number is physically possible.  A plausible but false gravity is outvoted by the
+other robots of a map, see `agreed_gravity`.
 """
 
 from __future__ import annotations
@@ -22,22 +25,46 @@ import numpy as np
 from rse_pf.errors import BadRequest
 from rse_pf.geometry import Array, exp_se3, log_se3
 
-__all__ = ["InertialMotion", "KeyframeImu", "agreed_gravity", "decode_imu", "encode_imu", "upright_turn"]
+__all__ = [
+    "InertialMotion",
+    "KeyframeImu",
+    "agreed_gravity",
+    "decode_imu",
+    "encode_imu",
+    "upright_rotation",
+]
 
-_GRAVITY, _MOUNT, _MOTION = struct.Struct("<4f"), struct.Struct("<6f"), struct.Struct("<61f")
+_GRAVITY_STRUCT = struct.Struct("<4f")
+_MOUNT_STRUCT = struct.Struct("<6f")
+_MOTION_STRUCT = struct.Struct("<61f")
 _TRIANGLE = np.triu_indices(9)
-_LEAST_RAD, _MOST_RAD = 1e-4, 0.35
-_MOST_S, _MOST_M_S, _MOST_M, _MOST_ARM_M = 60.0, 1e3, 1e4, 10.0
-_MOST_BIAS = 10.0
-_MOST_DEVIATION = 1e3
-_AGREE_DEG = 5.0
+_MIN_GRAVITY_DEVIATION_RAD = 1e-4  # standard deviation of a gravity direction: no IMU is more accurate
+_MAX_GRAVITY_DEVIATION_RAD = (
+    0.35  # standard deviation of a gravity direction: beyond 20 degrees it is useless
+)
+_MAX_ROTATION_RAD = 3.2  # length of a rotation vector: pi, and some room for rounding
+_MAX_DURATION_S = 60.0  # of a preintegrated motion: an IMU drifts too far in a longer time
+_MAX_VELOCITY_M_S = 1e3  # largest coordinate of the velocity of a preintegrated motion
+_MAX_POSITION_M = 1e4  # largest coordinate of the position of a preintegrated motion
+_MAX_LEVER_ARM_M = 10.0  # distance of the IMU from the camera on one robot
+_MAX_BIAS = 10.0  # largest bias of a gyroscope in rad/s, or of an accelerometer in m/s^2
+_MAX_MOTION_DEVIATION = 1e3  # largest standard deviation of a rotation (rad), velocity (m/s) or position (m)
+_MAX_GRAVITY_DIFFERENCE_DEG = 5.0  # two robots agree on the direction of gravity up to this angle
+_MAX_DIRECTIONS = 200  # directions among which a median is looked for; bounds a matrix of n x n angles
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class InertialMotion:
-    """A preintegrated motion in the axes of the IMU, as `client_sdk.imu.preintegration` defines it.
+    """Hold a preintegrated motion in the axes of the IMU, as `client_sdk.imu.preintegration` defines it.
 
-    ``rotation`` ``(3,)`` is a rotation vector; ``covariance`` ``(9, 9)`` is of rotation, velocity, position.
+    Attributes:
+        duration_s: Time between the two keyframes.
+        rotation: ``(3,)`` rotation vector, rad.
+        velocity: ``(3,)`` change of velocity without gravity, m/s.
+        position: ``(3,)`` displacement without gravity and initial velocity, m.
+        bias_gyro: ``(3,)`` bias that was subtracted from angular rates, rad/s.
+        bias_accel: ``(3,)`` bias that was subtracted from accelerations, m/s^2.
+        covariance: ``(9, 9)``, of rotation, velocity and position, in this order.
     """
 
     duration_s: float
@@ -51,7 +78,14 @@ class InertialMotion:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class KeyframeImu:
-    """``down_camera`` ``(3,)`` is a unit vector in the frame of the camera, with its deviation in rad."""
+    """Hold the IMU measurements of one keyframe.
+
+    Attributes:
+        down_camera: ``(3,)`` unit vector in the direction of gravity, in the frame of the camera.
+        deviation_rad: Standard deviation of this direction.
+        T_imu_camera: ``(4, 4)``, where the camera is mounted, metres.
+        motion: The motion since the previous keyframe of the segment, None if it was not measured.
+    """
 
     down_camera: Array
     deviation_rad: float
@@ -60,110 +94,143 @@ class KeyframeImu:
 
 
 def encode_imu(imu: KeyframeImu) -> bytes:
-    """Return the content of a block."""
+    """Return *imu* as the content of the IMU block of a keyframe: 40 bytes, or 284 with a motion."""
     mount = log_se3(imu.T_imu_camera[None])[0]
-    data = _GRAVITY.pack(*imu.down_camera, imu.deviation_rad)
-    data += _MOUNT.pack(*mount[3:], *imu.T_imu_camera[:3, 3])
+    data = _GRAVITY_STRUCT.pack(*imu.down_camera, imu.deviation_rad)
+    data += _MOUNT_STRUCT.pack(*mount[3:], *imu.T_imu_camera[:3, 3])
     if imu.motion is not None:
         motion = imu.motion
-        data += _MOTION.pack(
-            motion.duration_s, *motion.rotation, *motion.velocity, *motion.position, *motion.bias_gyro,
-            *motion.bias_accel, *motion.covariance[_TRIANGLE],
-        )  # fmt: skip
+        data += _MOTION_STRUCT.pack(
+            motion.duration_s,
+            *motion.rotation,
+            *motion.velocity,
+            *motion.position,
+            *motion.bias_gyro,
+            *motion.bias_accel,
+            *motion.covariance[_TRIANGLE],
+        )
     return data
 
 
 def decode_imu(data: bytes) -> KeyframeImu:
-    """Return what `encode_imu` encoded.
+    """Return the IMU measurements that `encode_imu` encoded.
 
     Raises:
-        BadRequest: The size is another one, or a number is not finite or absurd.
+        BadRequest: *data* has another size, a number is not finite, or a value is physically impossible.
     """
-    least = _GRAVITY.size + _MOUNT.size
-    if len(data) not in (least, least + _MOTION.size):
-        raise _refusal(f"{len(data)} bytes are neither {least} nor {least + _MOTION.size}")
+    size = _GRAVITY_STRUCT.size + _MOUNT_STRUCT.size
+    if len(data) not in (size, size + _MOTION_STRUCT.size):
+        raise _bad_block(f"{len(data)} bytes are neither {size} nor {size + _MOTION_STRUCT.size}")
     numbers = np.frombuffer(data, dtype="<f4").astype(np.float64)
     if not np.isfinite(numbers).all():
-        raise _refusal("a number is not finite")
+        raise _bad_block("a number is not finite")
     down, deviation_rad = numbers[:3], float(numbers[3])
     length = float(np.linalg.norm(down))
     if not 0.99 <= length <= 1.01:
-        raise _refusal(f"gravity has the length {length:.3g}, not 1")
-    if not _LEAST_RAD <= deviation_rad <= _MOST_RAD:
-        raise _refusal(f"a gravity with a deviation of {deviation_rad:g} rad tells nothing")
-    turned, arm = numbers[4:7], numbers[7:10]
-    if not (np.linalg.norm(turned) <= 3.2 and np.linalg.norm(arm) <= _MOST_ARM_M):
-        raise _refusal("T_imu_camera is absurd")
-    T_imu_camera = exp_se3(np.concatenate([np.zeros(3), turned]))
-    T_imu_camera[:3, 3] = arm
+        raise _bad_block(f"the direction of gravity has the length {length:.3g}, not 1")
+    if not _MIN_GRAVITY_DEVIATION_RAD <= deviation_rad <= _MAX_GRAVITY_DEVIATION_RAD:
+        raise _bad_block(
+            f"the standard deviation of gravity, {deviation_rad:g} rad, is not within "
+            f"{_MIN_GRAVITY_DEVIATION_RAD:g}..{_MAX_GRAVITY_DEVIATION_RAD:g} rad"
+        )
+    mount_rotation, lever_arm = numbers[4:7], numbers[7:10]
+    if not (
+        np.linalg.norm(mount_rotation) <= _MAX_ROTATION_RAD and np.linalg.norm(lever_arm) <= _MAX_LEVER_ARM_M
+    ):
+        raise _bad_block(
+            f"T_imu_camera rotates by more than {_MAX_ROTATION_RAD:g} rad, or the camera is more than "
+            f"{_MAX_LEVER_ARM_M:g} m from the IMU"
+        )
+    T_imu_camera = exp_se3(np.concatenate([np.zeros(3), mount_rotation]))
+    T_imu_camera[:3, 3] = lever_arm
     return KeyframeImu(
-        down_camera=down / length, deviation_rad=deviation_rad, T_imu_camera=T_imu_camera,
-        motion=_motion(numbers[10:]) if len(numbers) > 10 else None,
-    )  # fmt: skip
+        down_camera=down / length,
+        deviation_rad=deviation_rad,
+        T_imu_camera=T_imu_camera,
+        motion=_decode_motion(numbers[10:]) if len(numbers) > 10 else None,
+    )
 
 
 def agreed_gravity(downs: Sequence[Array]) -> Array | None:
-    """Return the ``(3,)`` direction on which more than half of the robots agree; None if there is none.
+    """Return the direction of gravity ``(3,)`` on which more than half of the robots agree, else None.
+
+    Each robot has one vote, the median of its own directions, so that a robot with many keyframes does not
+    outvote others.  Two votes agree if they differ by at most 5 degrees.
 
     Args:
-        downs: For each robot unit vectors ``(n, 3)``, n >= 1, in one world.  A robot has one vote, the
-            direction in the middle of its own, so that none outweighs others by many keyframes.
+        downs: For each robot the directions of gravity at its keyframes, unit vectors ``(n, 3)`` with n >= 1,
+            all in the same world frame.
     """
-    votes = np.array([_middle(each) for each in downs]).reshape(-1, 3)
+    votes = np.array([_median_direction(directions) for directions in downs]).reshape(-1, 3)
     if not len(votes):
         return None
-    agree = votes @ votes.T >= np.cos(np.radians(_AGREE_DEG))
-    best = int(np.argmax(agree.sum(axis=1)))
-    if 2 * int(agree[best].sum()) <= len(votes):
+    agrees = votes @ votes.T >= np.cos(np.radians(_MAX_GRAVITY_DIFFERENCE_DEG))
+    best = int(np.argmax(agrees.sum(axis=1)))
+    if 2 * int(agrees[best].sum()) <= len(votes):
         return None
-    return _middle(votes[agree[best]])
+    return _median_direction(votes[agrees[best]])
 
 
-def upright_turn(down: Array) -> Array:
-    """Return the smallest rotation ``(4, 4)`` of a world after which *down* ``(3,)`` points along -z."""
+def upright_rotation(down: Array) -> Array:
+    """Return the smallest rotation, as ``(4, 4)``, that moves the direction *down* ``(3,)`` to -z."""
     down = down / np.linalg.norm(down)
     axis = np.cross(down, [0.0, 0.0, -1.0])
     sine, cosine = float(np.linalg.norm(axis)), -float(down[2])
-    if sine < 1e-12:  # nothing to turn, or half a turn about any level axis
+    if (
+        sine < 1e-12
+    ):  # Parallel to z: no rotation, or half a turn about x, which is as good as any level axis.
         return np.diag([1.0, 1.0, 1.0, 1.0] if cosine > 0.0 else [1.0, -1.0, -1.0, 1.0])
     return exp_se3(np.concatenate([np.zeros(3), axis / sine * np.arctan2(sine, cosine)]))
 
 
-def _middle(directions: Array) -> Array:
-    """Return the one of unit vectors ``(n, 3)`` that is nearest to all: half of them cannot move it far."""
-    if len(directions) > 200:
-        directions = directions[np.linspace(0, len(directions) - 1, 200).astype(np.int64)]
+def _median_direction(directions: Array) -> Array:
+    """Return that of unit vectors ``(n, 3)`` with the smallest sum of angles to the others.
+
+    This medoid is robust: fewer than half of the vectors cannot move it far.
+    """
+    if len(directions) > _MAX_DIRECTIONS:
+        rows = np.linspace(0, len(directions) - 1, _MAX_DIRECTIONS).astype(np.int64)
+        directions = directions[rows]
     angles = np.arccos(np.clip(directions @ directions.T, -1.0, 1.0))
-    middle: Array = directions[int(np.argmin(angles.sum(axis=1)))]
-    return middle
+    median: Array = directions[int(np.argmin(angles.sum(axis=1)))]
+    return median
 
 
-def _motion(numbers: Array) -> InertialMotion:
-    duration_s, rotation, velocity, position = float(numbers[0]), numbers[1:4], numbers[4:7], numbers[7:10]
+def _decode_motion(numbers: Array) -> InertialMotion:
+    """Return the motion of the 61 numbers of its encoding; raises BadRequest."""
+    duration_s = float(numbers[0])
+    rotation, velocity, position = numbers[1:4], numbers[4:7], numbers[7:10]
     biases = numbers[10:16]
-    if not 0.0 < duration_s <= _MOST_S:
-        raise _refusal(f"a motion of {duration_s:g} s is not within 0..{_MOST_S:g} s")
+    if not 0.0 < duration_s <= _MAX_DURATION_S:
+        raise _bad_block(
+            f"the duration of its motion, {duration_s:g} s, is not within 0..{_MAX_DURATION_S:g} s"
+        )
     if (
-        np.linalg.norm(rotation) > 3.2
-        or np.abs(velocity).max() > _MOST_M_S
-        or np.abs(position).max() > _MOST_M
-        or np.abs(biases).max() > _MOST_BIAS
+        np.linalg.norm(rotation) > _MAX_ROTATION_RAD
+        or np.abs(velocity).max() > _MAX_VELOCITY_M_S
+        or np.abs(position).max() > _MAX_POSITION_M
+        or np.abs(biases).max() > _MAX_BIAS
     ):
-        raise _refusal("its motion is absurd")
+        raise _bad_block("a rotation, velocity, position or bias of its motion is larger than any robot's")
     covariance = np.zeros((9, 9))
     covariance[_TRIANGLE] = numbers[16:]
     covariance = covariance + np.triu(covariance, 1).T
     diagonal = np.diag(covariance)
-    if not (diagonal > 0.0).all() or diagonal.max() > _MOST_DEVIATION**2:
-        raise _refusal("its covariance is not positive, or absurd")
-    scaled = covariance / np.sqrt(np.outer(diagonal, diagonal))
-    if np.linalg.eigvalsh(scaled)[0] < -1e-4:
-        raise _refusal("its covariance is not positive")
+    if not (diagonal > 0.0).all() or diagonal.max() > _MAX_MOTION_DEVIATION**2:
+        raise _bad_block(f"a variance of its motion is not within 0..{_MAX_MOTION_DEVIATION**2:g}")
+    correlation = covariance / np.sqrt(np.outer(diagonal, diagonal))
+    if np.linalg.eigvalsh(correlation)[0] < -1e-4:
+        raise _bad_block("the covariance of its motion is not positive semidefinite")
     return InertialMotion(
-        duration_s=duration_s, rotation=rotation, velocity=velocity, position=position,
-        bias_gyro=biases[:3], bias_accel=biases[3:], covariance=covariance,
-    )  # fmt: skip
+        duration_s=duration_s,
+        rotation=rotation,
+        velocity=velocity,
+        position=position,
+        bias_gyro=biases[:3],
+        bias_accel=biases[3:],
+        covariance=covariance,
+    )
 
 
-def _refusal(why: str) -> BadRequest:
-    return BadRequest(f"the block of the IMU is refused: {why}", hint="send what encode_imu returned")
+def _bad_block(reason: str) -> BadRequest:
+    return BadRequest(f"the block of the IMU is refused: {reason}", hint="send what encode_imu returned")

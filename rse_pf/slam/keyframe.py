@@ -275,7 +275,7 @@ def _check_shapes(
 ) -> None:
     n = len(depths)
     fits = pixels.shape == (n, 2) and depths.shape == (n,) and len(descriptors) == n
-    if not (fits and kind.describes(descriptors)):
+    if not (fits and kind.is_kind_of(descriptors)):
         raise BadRequest(
             f"pixels {pixels.shape}, depths_m {depths.shape}, descriptors {descriptors.shape} of "
             f"{descriptors.dtype} do not fit features of {kind}",

@@ -1,4 +1,4 @@
-"""Where up is in a cloud whose gravity nobody measured: across the floors, tables and ceilings in it."""
+"""Estimate the direction against gravity ("up") of a map without IMU from its floors, tables and ceilings."""
 
 from __future__ import annotations
 
@@ -11,125 +11,161 @@ import numpy.typing as npt
 from rse_pf.geometry import Array
 from rse_pf.maps.format import MapVersion
 
-__all__ = ["UpSource", "up_of_floor", "up_of_map", "up_of_surfaces"]
+__all__ = ["UpSource", "estimate_up", "floor_normal", "level_surface_normal"]
 
 UpSource = Literal["the map", "--up", "the floor", "the level surfaces", "the cameras"]
-_LEAST_UP = 0.5
-"""Length of the mean of the cameras' unit vectors, below which they do not agree on where up is."""
+"""What the direction against gravity was taken from; ``--up`` is the option of the command line."""
 
-_VOXEL_M = 0.15
-_MAX_POINTS = 500_000
-_LEAST_POINTS, _LEAST_VOXELS = 12, 20
-_FLAT = 0.02
-"""A voxel is flat if its points spread at most this share of their variance along its surface across it."""
-_LEVEL_DEG, _ALIKE_DEG = 30.0, 5.0
-_MOST_TRIED = 500
-_CELL_M, _LEAST_OF_CELL, _LEAST_CELLS = 0.25, 10, 40
-_FLOOR_M = (0.4, 0.4, 0.2, 0.2, 0.1, 0.1, 0.05, 0.05, 0.05)
-"""Heights beside the plane from which a cell does not count, from one fit to the next."""
-_LEAST_SHARE, _LEAST_WIDTH_M, _MOST_OFF_DEG = 0.5, 1.0, 5.0
+_MIN_CAMERA_AGREEMENT = 0.5
+"""Length of the mean of the cameras' upward unit vectors below which the cameras do not agree on where up is;
+the length is 1 if all cameras are held alike, and about 0 if they are held in all directions."""
+
+# --- Limits of `level_surface_normal`, which finds horizontal surfaces by the normals of small voxels ---
+_VOXEL_M = 0.15  # edge in metres of the voxels in which surface normals are estimated
+_MAX_POINTS = 500_000  # points of a cloud that are used; a larger cloud is thinned evenly, to bound the time
+_MIN_VOXEL_POINTS = 12  # points that a voxel needs for an estimate of its surface normal
+_MIN_VOXELS = 20  # voxels with a similar normal that are accepted as level surfaces
+_MAX_FLATNESS_RATIO = 0.02
+"""A voxel is flat if the variance of its points along the normal is at most this share of the second smallest
+variance."""
+_MAX_LEVEL_TILT_DEG = 30.0  # angle between a surface normal and the rough direction up: walls are beyond it
+_MAX_NORMAL_DIFFERENCE_DEG = 5.0  # angle up to which two surface normals are counted as the same direction
+_MAX_HYPOTHESES = 500  # normals that are tried as the common direction; bounds the time
+
+# --- Limits of `floor_normal`, which fits a plane to the lowest points ---
+_CELL_M = 0.25  # edge in metres of the horizontal cells, of each of which one low point is taken
+_MIN_CELL_POINTS = 10  # points that a cell needs, so that its low point is not an outlier
+_MIN_CELLS = 40  # cells that must lie on the plane of the floor
+_TUKEY_LIMITS_M = (0.4, 0.4, 0.2, 0.2, 0.1, 0.1, 0.05, 0.05, 0.05)
+"""Distances in metres from the plane of the floor at which the weight of a cell becomes 0, for the successive
+iterations of its robust fit."""
+_MIN_INLIER_RATIO = 0.5  # share of the cells that must lie within 5 cm of the plane of the floor
+_MIN_WIDTH_M = 1.0  # width of the floor across its longer side: in a narrower strip its tilt is uncertain
+_MAX_FLOOR_TILT_DEG = 5.0  # angle between the floor's normal and the rough direction up; ramps are beyond it
 
 
-def up_of_map(version: MapVersion) -> tuple[Array, UpSource] | None:
-    """Return the unit vector of where up is in a map that has keyframes, and what tells it.
+def estimate_up(version: MapVersion) -> tuple[Array, UpSource] | None:
+    """Return the unit vector ``(3,)`` against gravity in the world of a map, and what it was taken from.
 
-    It is what the map says, else the normal of its floor, else that of its level surfaces, else the mean of
-    what is up in its cameras; None if these do not agree.
+    The first of these that is known is returned: the direction that the map states; the normal of its floor;
+    the common normal of its level surfaces; the mean of the cameras' upward directions.
+
+    Args:
+        version: A map with at least one keyframe.
+
+    Returns:
+        None if the map does not state the direction and its cameras do not agree on one.
     """
-    told = version.up
-    if told is not None:
-        return told, "the map"
-    # y of a camera points down in its image.
+    # 1. Use what the map states, which was measured by an IMU.
+    stated_up = version.up
+    if stated_up is not None:
+        return stated_up, "the map"
+    # 2. Take the mean of the cameras' upward directions; the y axis of a camera points down in its image.
     mean = -np.mean([keyframe.T_world_camera[:3, 1] for keyframe in version.keyframes], axis=0)
     length = float(np.linalg.norm(mean))
-    if length < _LEAST_UP:
+    if length < _MIN_CAMERA_AGREEMENT:
         return None
-    level = up_of_surfaces(version.points, mean / length)
-    rough: tuple[Array, UpSource] = (mean / length, "the cameras")
+    estimate: tuple[Array, UpSource] = (mean / length, "the cameras")
+    # 3. Refine this direction by level surfaces of the cloud.
+    level = level_surface_normal(version.points, mean / length)
     if level is not None:
-        rough = level, "the level surfaces"
-    places = np.array([keyframe.T_world_camera[:3, 3] for keyframe in version.keyframes])
-    floor = up_of_floor(version.points, rough[0], places)
-    return rough if floor is None else (floor, "the floor")
+        estimate = level, "the level surfaces"
+    # 4. Refine the result by the plane of the floor.
+    camera_positions = np.array([keyframe.T_world_camera[:3, 3] for keyframe in version.keyframes])
+    floor = floor_normal(version.points, estimate[0], camera_positions)
+    return estimate if floor is None else (floor, "the floor")
 
 
-def up_of_surfaces(points: npt.NDArray[np.float32], up: Array) -> Array | None:
-    """Return the unit vector across the level surfaces of a cloud; None if it shows too few.
+def level_surface_normal(points: npt.NDArray[np.float32], up: Array) -> Array | None:
+    """Return the common unit normal ``(3,)`` of the level surfaces of a cloud; None if it has too few.
 
     Args:
         points: ``(n, 3)`` metres.
-        up: ``(3,)``, about where up is: the direction within 30 degrees of it that most surfaces share is it.
+        up: ``(3,)`` rough direction against gravity; the result is the direction within 30 degrees of *up*
+            that most surface normals share.
     """
-    chosen = points[:: max(1, len(points) // _MAX_POINTS)].astype(np.float64)
+    # 1. Divide the points into voxels, and compute the covariance of the points of each voxel.
+    thinned = points[:: max(1, len(points) // _MAX_POINTS)].astype(np.float64)
     _, voxel, count = np.unique(
-        np.floor(chosen / _VOXEL_M).astype(np.int64), axis=0, return_inverse=True, return_counts=True
+        np.floor(thinned / _VOXEL_M).astype(np.int64), axis=0, return_inverse=True, return_counts=True
     )
     voxel = voxel.reshape(-1)
     total = len(count)
     mean = (
-        np.stack([np.bincount(voxel, chosen[:, axis], total) for axis in range(3)], axis=1) / count[:, None]
+        np.stack([np.bincount(voxel, thinned[:, axis], total) for axis in range(3)], axis=1) / count[:, None]
     )
-    apart = chosen - mean[voxel]
-    spread = np.empty((total, 3, 3))
+    offset = thinned - mean[voxel]
+    covariance = np.empty((total, 3, 3))
     for i in range(3):
         for j in range(3):
-            spread[:, i, j] = np.bincount(voxel, apart[:, i] * apart[:, j], total) / count
-    lengths, axes = np.linalg.eigh(spread[count >= _LEAST_POINTS])
-    normals = axes[lengths[:, 0] <= _FLAT * lengths[:, 1], :, 0]
+            covariance[:, i, j] = np.bincount(voxel, offset[:, i] * offset[:, j], total) / count
+    # 2. Take the normals of flat voxels, oriented upwards, and leave out those of walls.
+    variances, axes = np.linalg.eigh(covariance[count >= _MIN_VOXEL_POINTS])
+    normals = axes[variances[:, 0] <= _MAX_FLATNESS_RATIO * variances[:, 1], :, 0]
     normals = normals * np.sign(normals @ up)[:, None]
-    normals = normals[normals @ up >= math.cos(math.radians(_LEVEL_DEG))]
+    normals = normals[normals @ up >= math.cos(math.radians(_MAX_LEVEL_TILT_DEG))]
     if not len(normals):
         return None
-    least = math.cos(math.radians(_ALIKE_DEG))
-    tried = normals[:: max(1, len(normals) // _MOST_TRIED)]
-    found: Array = tried[int(np.argmax(np.count_nonzero(tried @ normals.T >= least, axis=1)))]
+    # 3. Choose the normal that most others are similar to.
+    min_cosine = math.cos(math.radians(_MAX_NORMAL_DIFFERENCE_DEG))
+    hypotheses = normals[:: max(1, len(normals) // _MAX_HYPOTHESES)]
+    supporters = np.count_nonzero(hypotheses @ normals.T >= min_cosine, axis=1)
+    direction: Array = hypotheses[int(np.argmax(supporters))]
+    # 4. Replace it twice by the mean of the normals similar to it.
     for _ in range(2):
-        alike = normals[normals @ found >= least]
-        if len(alike) < _LEAST_VOXELS:
+        similar = normals[normals @ direction >= min_cosine]
+        if len(similar) < _MIN_VOXELS:
             return None
-        found = alike.mean(axis=0)
-        found = found / np.linalg.norm(found)
-    return found
+        direction = similar.mean(axis=0)
+        direction = direction / np.linalg.norm(direction)
+    return direction
 
 
-def up_of_floor(points: npt.NDArray[np.float32], up: Array, places: Array) -> Array | None:
-    """Return the normal of the floor: over many metres it is known better than the normals of its parts.
+def floor_normal(points: npt.NDArray[np.float32], up: Array, camera_positions: Array) -> Array | None:
+    """Return the unit normal ``(3,)`` of the floor, fitted by iteratively reweighted least squares.
 
-    The lowest points of each cell below the cameras are fitted by a plane with Tukey's weights.  None where
-    fewer than half of the cells lie on it, where they are too few or in a line, or where it is tilted by more
-    than 5 degrees: stairs, ramps and several storeys.
+    The plane of a floor of many metres is known more accurately than the normals of small surfaces.  The
+    weights are those of Tukey's biweight, before they are squared by the least squares.
 
     Args:
         points: ``(n, 3)`` metres.
-        up: ``(3,)``, within some degrees of where up is.
-        places: ``(k, 3)`` of the cameras.
+        up: ``(3,)`` unit vector against gravity, accurate to some degrees.
+        camera_positions: ``(k, 3)`` metres.
+
+    Returns:
+        None if fewer than half of the cells lie on one plane, as with stairs and several storeys, if they are
+        fewer than 40 or a strip narrower than 1 m, or if the plane is tilted by more than 5 degrees.
     """
-    across = np.cross(up, np.eye(3)[int(np.argmin(np.abs(up)))])
-    across /= np.linalg.norm(across)
-    axes = np.stack([across, np.cross(up, across), up])
+    # 1. Express the points in axes whose third one is *up*, and keep those below the median camera.
+    level_axis = np.cross(up, np.eye(3)[int(np.argmin(np.abs(up)))])
+    level_axis /= np.linalg.norm(level_axis)
+    axes = np.stack([level_axis, np.cross(up, level_axis), up])
     below = points.astype(np.float64) @ axes.T
-    below = below[below[:, 2] < np.median(places @ up)]
+    below = below[below[:, 2] < np.median(camera_positions @ up)]
     if not len(below):
         return None
+    # 2. Take of each horizontal cell the point at the 5th percentile of the heights.
     _, cell = np.unique(np.floor(below[:, :2] / _CELL_M).astype(np.int64), axis=0, return_inverse=True)
     cell = cell.reshape(-1)
     order = np.lexsort((below[:, 2], cell))
     count = np.bincount(cell)
     first = np.cumsum(count) - count
-    low = below[order][(first + count // 20)[count >= _LEAST_OF_CELL]]
-    if len(low) < _LEAST_CELLS:
+    low = below[order][(first + count // 20)[count >= _MIN_CELL_POINTS]]
+    if len(low) < _MIN_CELLS:
         return None
+    # 3. Fit the plane z = a x + b y + c from a level start, with a decreasing limit of the weights.
     plane = np.array([0.0, 0.0, float(np.percentile(low[:, 2], 20))])
     rows = np.column_stack([low[:, :2], np.ones(len(low))])
-    for limit_m in _FLOOR_M:
+    for limit_m in _TUKEY_LIMITS_M:
         weights = np.clip(1.0 - ((low[:, 2] - rows @ plane) / limit_m) ** 2, 0.0, None)
         plane = np.linalg.lstsq(rows * weights[:, None], low[:, 2] * weights, rcond=None)[0]
-    on_it = low[np.abs(low[:, 2] - rows @ plane) < _FLOOR_M[-1]]
-    if len(on_it) < max(_LEAST_CELLS, _LEAST_SHARE * len(low)):
+    # 4. Accept the plane if enough cells lie on it, in an area that is wide enough.
+    inliers = low[np.abs(low[:, 2] - rows @ plane) < _TUKEY_LIMITS_M[-1]]
+    if len(inliers) < max(_MIN_CELLS, _MIN_INLIER_RATIO * len(low)):
         return None
-    width_m = math.sqrt(12.0 * float(np.linalg.eigvalsh(np.cov(on_it[:, :2].T))[0]))
+    width_m = math.sqrt(12.0 * float(np.linalg.eigvalsh(np.cov(inliers[:, :2].T))[0]))
     normal = np.array([-plane[0], -plane[1], 1.0]) / math.hypot(plane[0], plane[1], 1.0)
-    if width_m < _LEAST_WIDTH_M or normal[2] < math.cos(math.radians(_MOST_OFF_DEG)):
+    if width_m < _MIN_WIDTH_M or normal[2] < math.cos(math.radians(_MAX_FLOOR_TILT_DEG)):
         return None
-    found: Array = normal @ axes
-    return found
+    normal_world: Array = normal @ axes
+    return normal_world

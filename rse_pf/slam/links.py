@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from rse_pf.errors import BadRequest, LimitExceeded
 from rse_pf.geometry import Array, inverse
-from rse_pf.maps.descriptors import one_kind
+from rse_pf.maps.descriptors import common_kind
 from rse_pf.maps.format import Keyframe, MapVersion
 from rse_pf.service import Report
 from rse_pf.slam.consistency import LinkEnds, LoopClosure, OdometryNoise, consistent, fits_prediction
@@ -98,7 +98,7 @@ class Atlas:
         Raises:
             BadRequest: They have features of two kinds.
         """
-        one_kind((version.kind for version in versions if version.keyframes), "the first map")
+        common_kind((version.kind for version in versions if version.keyframes), "the first map")
         rows = [
             (which, keyframe)
             for which, version in enumerate(versions)

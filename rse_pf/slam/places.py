@@ -48,7 +48,7 @@ def place_vector(descriptors: Descriptors) -> PlaceVector:
         and Zisserman, CVPR 2013.
     """
     numbers = as_vectors(descriptors)
-    is_orb = ORB.describes(descriptors)
+    is_orb = ORB.is_kind_of(descriptors)
     words, directions, squares = _vocabulary() if is_orb else _random_vocabulary(numbers.shape[1])
     if not is_orb and len(numbers):
         # Vectors that are never negative lie all in one direction.

@@ -250,7 +250,7 @@ def distinct_distances(
             f"{len(pixels)} features with descriptors of shape {descriptors.shape}, {descriptors.dtype}",
             hint="give a descriptor and two pixel coordinates for each feature",
         )
-    if ORB.describes(descriptors):
+    if ORB.is_kind_of(descriptors):
         descriptors, pixels = aligned(descriptors), aligned(pixels, np.float64)
         nearest = np.full(len(pixels), _NO_ORB_DISTANCE, dtype=np.int32)
         _function("distinct")(
@@ -292,7 +292,7 @@ def match_near(sought: SoughtFeatures, image: ImageFeatures, limits: NearLimits)
         )
     if not 0.0 <= limits.radius_px <= _MAX_ABS:
         raise BadRequest(f"a radius of {limits.radius_px:g} px", hint="give 0 to 1e9 px")
-    if not ORB.describes(image.descriptors):
+    if not ORB.is_kind_of(image.descriptors):
         return _match_near_by_numpy(sought, image, limits)
     arrays = _aligned(sought.pixels, sought.turns, sought.sizes, descriptors=sought.descriptors)
     request, _held = _near_request(image, limits, arrays, m)
@@ -353,7 +353,7 @@ def seek_near(
         limits: When a feature is the expected one.
         margin_px: Landmarks are expected so far around the image, too.
     """
-    if not ORB.describes(image.descriptors):
+    if not ORB.is_kind_of(image.descriptors):
         expected = expect(looks, numbers, T_camera_world, camera, margin_px)
         rows, features = match_near(expected.features, image, limits)
         return expected.rows[rows], features

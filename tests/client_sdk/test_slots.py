@@ -322,7 +322,7 @@ def test_the_place_of_an_image_is_computed_once() -> None:
         calls.append(len(rgb))
         return np.ones(16)
 
-    place = place_of(ORB.none(), IMAGE, LoopsSlot(loops))
+    place = place_of(ORB.empty(), IMAGE, LoopsSlot(loops))
 
     assert calls == []
     assert np.array_equal(place.vector(), place.vector())

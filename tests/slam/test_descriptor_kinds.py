@@ -20,7 +20,7 @@ from rse_pf.geometry import Camera, exp_se3
 from rse_pf.live_map.events import KeyframeAdded, RobotForgotten
 from rse_pf.live_map.live_map import LiveMap
 from rse_pf.live_map.versions import started_from
-from rse_pf.maps.descriptors import ORB, DescriptorKind, one_kind
+from rse_pf.maps.descriptors import ORB, DescriptorKind, common_kind
 from rse_pf.maps.format import Keyframe as MapKeyframe
 from rse_pf.maps.format import MapVersion, decode_map, encode_map
 from rse_pf.service import dispatch
@@ -123,9 +123,9 @@ def test_descriptors_of_two_kinds_are_not_compared() -> None:
         best_matches(random_descriptors(SIFT, 5), random_descriptors(XFEAT, 5), 0.8)
     with pytest.raises(BadRequest, match="cannot be compared"):
         best_matches(random_descriptors(ORB, 5).view(np.int8), random_descriptors(ORB, 5), 0.8)
-    assert one_kind([], "x") == ORB
+    assert common_kind([], "x") == ORB
     with pytest.raises(BadRequest, match=r"the map has features of kind sift \(128 dimensions\)"):
-        one_kind([SIFT, SIFT, XFEAT], "the map")
+        common_kind([SIFT, SIFT, XFEAT], "the map")
 
 
 @pytest.mark.parametrize("kind", [SIFT, AKAZE], ids=str)

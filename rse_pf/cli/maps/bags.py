@@ -23,11 +23,9 @@ if TYPE_CHECKING:
     from client_sdk.mapping import Trajectory
     from rse_pf.maps.format import MapVersion
 
-__all__ = ["BAG_ACTIONS", "BAG_FORMAT", "add_bag_actions", "export_bag", "run_bags"]
+__all__ = ["BAG_ACTIONS", "add_bag_actions", "export_bag", "run_bags"]
 
 BAG_ACTIONS = ("from-bag", "to-bag")
-BAG_FORMAT = "mcap"
-"""The format of ``map export`` that ROS 2 and Foxglove read."""
 _ENDINGS: dict[str, BagKind] = {".bag": "ros1", ".db3": "sqlite3", ".mcap": "mcap"}
 
 

@@ -12,12 +12,10 @@ import numpy as np
 from client_sdk.frontend import TrackedFrame, load_opencv
 from rse_pf.errors import UsageError
 from rse_pf.files import replace_file
-from rse_pf.maps.format import MapVersion
-from rse_pf.slam.colmap import image_name
+from rse_pf.maps.format import IMAGES_FOLDER, MapVersion
 
-__all__ = ["IMAGES_FOLDER", "KeyframeImages"]
+__all__ = ["KeyframeImages"]
 
-IMAGES_FOLDER = "images"
 _QUALITY = 95
 
 
@@ -51,7 +49,7 @@ class KeyframeImages:
 
     def finish(self, version: MapVersion | None) -> int:
         """Name the images of the keyframes of *version* and remove the others; return how many stay."""
-        named = {} if version is None else {each.timestamp_s: image_name(each) for each in version.keyframes}
+        named = {} if version is None else {k.timestamp_s: k.image_name for k in version.keyframes}
         for timestamp_s, file in self._files.items():
             if timestamp_s in named:
                 file.replace(self._folder / named[timestamp_s])

@@ -16,7 +16,7 @@ import numpy as np
 from rse_pf.errors import UsageError
 from rse_pf.files import read_regular_file
 from rse_pf.geometry import Camera, rotation_angle_deg, to_quaternion
-from rse_pf.maps.descriptors import check_alike
+from rse_pf.maps.descriptors import check_same_kind
 from rse_pf.maps.format import MapVersion
 from rse_pf.maps.photos import Lens, PhotoLocation
 from rse_pf.maps.registry import MapRegistry
@@ -257,7 +257,7 @@ def _view_of(named: _NamedFrame, version: MapVersion, camera: str | None, slot: 
         nothing = np.zeros((height, width), dtype=np.float32)
         frame = Frame(timestamp_s=0.0, rgb=rgb, depth_m=nothing, camera=lens)
     features = extract(frame, FrontEndOptions(), slot)
-    check_alike(version.kind, features.kind, "the map")
+    check_same_kind(version.kind, features.kind, "the map")
     return View(camera=frame.camera, pixels=features.pixels, descriptors=features.descriptors)
 
 

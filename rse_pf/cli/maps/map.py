@@ -29,6 +29,7 @@ import argparse
 import functools
 import time
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -36,8 +37,7 @@ import msgspec
 import numpy as np
 
 from rse_pf.cli.maps.backup import add_backup_arguments, add_restore_arguments, run_backup, run_restore
-from rse_pf.cli.maps.bags import BAG_ACTIONS, add_bag_actions, run_bags
-from rse_pf.cli.maps.export import add_export_arguments, run_export
+from rse_pf.cli.maps.bags import BAG_ACTIONS, add_bag_actions, export_bag, run_bags
 from rse_pf.cli.maps.from_camera import add_from_camera_arguments, run_from_camera
 from rse_pf.cli.maps.live import add_live_arguments, run_live, run_publish
 from rse_pf.cli.maps.localise import add_localise_arguments, is_remote, localise_frames, localise_photos
@@ -45,6 +45,7 @@ from rse_pf.cli.maps.map_store import open_maps, with_store
 from rse_pf.cli.maps.merge_output import commit_merge, merge_progress
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import NotFound, UsageError
+from rse_pf.map_export.command import add_export_arguments, run_export
 from rse_pf.maps.registry import MapOrigin, MapRecord, MapRegistry, difference
 from rse_pf.maps.removal import freed_bytes, superseded
 from rse_pf.terminal import at_work, counted, format_time, show, show_json
@@ -171,7 +172,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     if args.action in ("backup", "restore"):
         return (run_backup if args.action == "backup" else run_restore)(args, chosen)
     maps = open_maps(chosen, args.tenant)
-    actions = {
+    actions: dict[str, Callable[[argparse.Namespace, MapRegistry], int | None]] = {
         "list": _list,
         "show": _show,
         "view": _view,
@@ -180,7 +181,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
         "diff": _diff,
         "rollback": _rollback,
         "prune": _prune,
-        "export": run_export,
+        "export": functools.partial(run_export, write_bag=export_bag),
     }
     return actions[args.action](args, maps) or 0
 

@@ -14,12 +14,12 @@ import numpy.typing as npt
 from rse_pf.errors import BadRequest
 from rse_pf.geometry import Array, Camera
 from rse_pf.images import decode_photo, load_opencv, photo_size
-from rse_pf.maps.descriptors import ORB, check_alike
+from rse_pf.maps.descriptors import ORB, check_same_kind
 from rse_pf.maps.format import MapVersion
 from rse_pf.maps.photos import Lens, MapOutline, PhotoLocation
 from rse_pf.services.mapping.localise import LocaliseOptions, LocaliseReply, locate
 from rse_pf.services.mapping.place import MapIndex, check_comparisons
-from rse_pf.slam.level_surfaces import up_of_map
+from rse_pf.slam.level_surfaces import estimate_up
 from rse_pf.slam.orb import describe_orb
 from rse_pf.slam.relative_pose import View
 
@@ -53,7 +53,7 @@ def localise_photo(data: bytes, lens: Lens, index: MapIndex) -> LocaliseReply:
         InvalidCamera: An intrinsic is impossible.
         MissingExtra: OpenCV or the native core is not installed.
     """
-    check_alike(index.kind, ORB, "the map")
+    check_same_kind(index.kind, ORB, "the map")
     whole = _camera_of(lens, *photo_size(data))
     camera = _searched(whole, [keyframe.camera for keyframe in index.keyframes])
     rgb = decode_photo(data)
@@ -92,7 +92,7 @@ def outline_of(map_version: MapVersion, version: str) -> MapOutline:
     Up is that of its floor plan: what the map says, or what its floor and its cameras tell.
     """
     poses = np.array([keyframe.T_world_camera for keyframe in map_version.keyframes])
-    up = up_of_map(map_version)
+    up = estimate_up(map_version)
     axes = _top_view(np.array([0.0, 0.0, 1.0]) if up is None else up[0])
     points = np.asarray(map_version.points, dtype=np.float64).reshape(-1, 3)
     return MapOutline(

@@ -14,7 +14,14 @@ import numpy.typing as npt
 
 from rse_pf.errors import BadRequest, LimitExceeded
 from rse_pf.geometry import Camera
-from rse_pf.maps.descriptors import ORB, DescriptorKind, Descriptors, check_alike, descriptors_of, one_kind
+from rse_pf.maps.descriptors import (
+    ORB,
+    DescriptorKind,
+    Descriptors,
+    check_same_kind,
+    common_kind,
+    decode_descriptors,
+)
 from rse_pf.maps.format import Keyframe, MapLimits, MapVersion, decode_map
 from rse_pf.service import Registry
 from rse_pf.slam.places import PlaceIndex, place_vector
@@ -111,7 +118,7 @@ class MapIndex:
 
     def __init__(self, keyframes: Sequence[Keyframe]) -> None:
         self.keyframes = tuple(keyframes)
-        self.kind = one_kind((keyframe.kind for keyframe in self.keyframes), "the map")
+        self.kind = common_kind((keyframe.kind for keyframe in self.keyframes), "the map")
         self.T_map_keyframe = np.array([keyframe.T_world_camera for keyframe in self.keyframes])
         self._places = PlaceIndex.of(place_vector(keyframe.descriptors) for keyframe in self.keyframes)
 
@@ -161,13 +168,13 @@ def view_of(
         LimitExceeded: It has too many features.
     """
     kind = ORB if features is None else DescriptorKind(features.name, features.dtype, features.size)
-    check_alike(index.kind, kind, "the map")
+    check_same_kind(index.kind, kind, "the map")
     rows = reshaped("pixels", pixels, 2)
     if len(rows) > MAX_VIEW_FEATURES:
         raise LimitExceeded(
             f"a view of {len(rows)} features is above {MAX_VIEW_FEATURES}", hint="send the strongest ones"
         )
-    return View(camera=camera, pixels=rows, descriptors=descriptors_of(descriptors, len(rows), kind))
+    return View(camera=camera, pixels=rows, descriptors=decode_descriptors(descriptors, len(rows), kind))
 
 
 def check_comparisons(index: MapIndex, view: View, candidates: int) -> None:

@@ -11,14 +11,13 @@ import msgspec
 import numpy as np
 import pytest
 from hostile.hostile_maps import DECODABLE, hostile_maps
-from slam.exact_maps import points_map
+from map_export.exact_maps import points_map
 
 from rse_pf.cli.main import main
 from rse_pf.maps.describe import MapSummary
 from rse_pf.maps.format import MapVersion, encode_map
 from rse_pf.maps.registry import MapContent, MapOrigin, MapRegistry
 from rse_pf.object_store import DirectoryStore, digest_of
-from rse_pf.slam.colmap import image_name
 
 FORMATS = ("colmap", "nerfstudio", "occupancy", "ply", "pcd", "tum", "g2o")
 WRITTEN = {
@@ -41,6 +40,7 @@ def hall() -> MapVersion:
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The working folder with the maps "hall", "bare" without points, and "void" without anything."""
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     maps = MapRegistry(DirectoryStore(tmp_path / "store"))
     whole = hall()
     for name, version in (
@@ -85,7 +85,7 @@ def test_the_images_that_robots_stored_for_a_live_map_are_taken_along(
 
     (written,) = Path("out", "images").iterdir()
     assert written.read_bytes() == image
-    assert written.name == image_name(version.keyframes[0])
+    assert written.name == version.keyframes[0].image_name
     missing = len(version.keyframes) - 1
     assert f"note: the store has no image of {missing} keyframe" in capsys.readouterr().out
 

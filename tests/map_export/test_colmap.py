@@ -8,13 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from slam.exact_maps import OTHER_CAMERA, points_map, world_map
+from map_export.exact_maps import OTHER_CAMERA, points_map, world_map
 
 from rse_pf.errors import UsageError
 from rse_pf.geometry import from_quaternion, inverse
+from rse_pf.map_export.colmap import encode_colmap
+from rse_pf.map_export.tracks import find_tracks
 from rse_pf.maps.format import Edge, MapVersion
-from rse_pf.slam.colmap import colmap_files
-from rse_pf.slam.tracks import find_tracks
 
 NO_PYCOLMAP = "pycolmap is not installed, and in no lock: its wheel has 38 MB (pip install pycolmap==4.2.1)"
 
@@ -26,7 +26,7 @@ def rows_of(files: Mapping[str, bytes], name: str) -> list[list[str]]:
 def test_poses_lead_from_the_world_to_the_camera_with_w_first() -> None:
     version, _ = points_map()
 
-    images = rows_of(colmap_files(version), "images.txt")[::2]
+    images = rows_of(encode_colmap(version), "images.txt")[::2]
 
     for keyframe, row in zip(version.keyframes, images, strict=True):
         w, x, y, z, *t = map(float, row[1:8])
@@ -39,7 +39,7 @@ def test_poses_lead_from_the_world_to_the_camera_with_w_first() -> None:
 def test_cameras_and_pixels_count_from_the_corner_of_the_image() -> None:
     version, _ = points_map(cameras=(points_map()[0].keyframes[0].camera, OTHER_CAMERA))
 
-    files = colmap_files(version)
+    files = encode_colmap(version)
 
     assert rows_of(files, "cameras.txt") == [
         ["1", "PINHOLE", "640", "480", "500", "510", "320.5", "238.5"],
@@ -54,7 +54,7 @@ def test_cameras_and_pixels_count_from_the_corner_of_the_image() -> None:
 def test_each_point_has_the_features_that_see_it_and_they_name_it() -> None:
     version, world = points_map()
 
-    files = colmap_files(version)
+    files = encode_colmap(version)
 
     images = [np.array(row).reshape(-1, 3) for row in rows_of(files, "images.txt")[1::2]]
     points = rows_of(files, "points3D.txt")
@@ -104,7 +104,7 @@ def test_keyframes_far_apart_in_time_are_matched_where_an_edge_links_them() -> N
 def test_names_of_images_are_plain_and_unique_whatever_a_robot_is_called(robot: str) -> None:
     version, _ = points_map(robot=robot)
 
-    rows = rows_of(colmap_files(version), "images.txt")
+    rows = rows_of(encode_colmap(version), "images.txt")
 
     names = [row[9] for row in rows[::2]]
     assert {len(row) for row in rows[::2]} == {10}
@@ -140,10 +140,10 @@ def test_absurd_points_and_poses_cost_only_their_own_features() -> None:
 
 def test_maps_without_keyframes_or_matches_say_so_or_are_empty_models() -> None:
     with pytest.raises(UsageError, match="no COLMAP model"):
-        colmap_files(MapVersion(keyframes=()))
+        encode_colmap(MapVersion(keyframes=()))
     version, _ = points_map(keyframes=1)
 
-    files = colmap_files(version)
+    files = encode_colmap(version)
 
     assert rows_of(files, "points3D.txt") == []
     assert len(rows_of(files, "images.txt")) == 2
@@ -157,7 +157,7 @@ def test_pycolmap_reads_the_model_of_a_rendered_world(tmp_path: Path) -> None:
 
 def compare_with_pycolmap(version: MapVersion, folder: Path) -> None:
     pycolmap = pytest.importorskip("pycolmap", reason=NO_PYCOLMAP)
-    for name, data in colmap_files(version).items():
+    for name, data in encode_colmap(version).items():
         (folder / name).write_bytes(data)
 
     model = pycolmap.Reconstruction(str(folder))

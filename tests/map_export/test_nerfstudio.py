@@ -7,12 +7,12 @@ from typing import Annotated, Literal
 import msgspec
 import numpy as np
 import pytest
-from slam.exact_maps import OTHER_CAMERA, points_map
+from map_export.exact_maps import OTHER_CAMERA, points_map
 
 from rse_pf.errors import UsageError
 from rse_pf.geometry import inverse, transform
+from rse_pf.map_export.nerfstudio import encode_nerfstudio
 from rse_pf.maps.format import MapVersion
-from rse_pf.slam.nerfstudio import nerfstudio_files
 from rse_pf.slam.ply import decode_ply
 
 Row = Annotated[list[float], msgspec.Meta(min_length=4, max_length=4)]
@@ -68,7 +68,7 @@ def valid(files: dict[str, bytes]) -> TransformsSchema:
 
 def test_the_file_fits_the_documented_schema() -> None:
     version, _ = points_map()
-    files = nerfstudio_files(version)
+    files = encode_nerfstudio(version)
 
     found = valid(files)
 
@@ -85,7 +85,7 @@ def test_the_file_fits_the_documented_schema() -> None:
 def test_a_frame_looks_along_minus_z_with_y_up() -> None:
     version, world = points_map()
 
-    frame = valid(nerfstudio_files(version)).frames[2]
+    frame = valid(encode_nerfstudio(version)).frames[2]
 
     seen = transform(inverse(np.array(frame.transform_matrix)), world)
     camera = version.keyframes[2].camera
@@ -99,7 +99,7 @@ def test_a_frame_looks_along_minus_z_with_y_up() -> None:
 def test_several_cameras_stand_in_their_frames() -> None:
     version, _ = points_map(cameras=(points_map()[0].keyframes[0].camera, OTHER_CAMERA))
 
-    found = valid(nerfstudio_files(version))
+    found = valid(encode_nerfstudio(version))
 
     assert found.fl_x is msgspec.UNSET
     assert [frame.w for frame in found.frames] == [640, 600, 640, 600, 640]
@@ -107,7 +107,7 @@ def test_several_cameras_stand_in_their_frames() -> None:
 
 def test_a_map_that_knows_gravity_is_turned_so_that_z_points_up() -> None:
     version, _ = points_map(up=[0.0, -1.0, 0.0])  # y of the world points down, as in a first camera
-    files = nerfstudio_files(version)
+    files = encode_nerfstudio(version)
 
     found = valid(files)
 
@@ -118,7 +118,7 @@ def test_a_map_that_knows_gravity_is_turned_so_that_z_points_up() -> None:
         np.testing.assert_allclose(kept, keyframe.T_world_camera, atol=1e-9)
     points, _ = decode_ply(files["points.ply"])
     np.testing.assert_allclose(points, transform(turn, version.points.astype(float)), atol=1e-5)
-    assert valid(nerfstudio_files(points_map(up=[0.0, 0.0, 1.0])[0])).applied_transform is msgspec.UNSET
+    assert valid(encode_nerfstudio(points_map(up=[0.0, 0.0, 1.0])[0])).applied_transform is msgspec.UNSET
 
 
 @pytest.mark.parametrize(
@@ -128,15 +128,15 @@ def test_a_wrong_gravity_in_a_map_is_no_gravity(up: object) -> None:
     version, _ = points_map(up=up)  # type: ignore[arg-type]
 
     assert version.up is None
-    assert valid(nerfstudio_files(version)).applied_transform is msgspec.UNSET
+    assert valid(encode_nerfstudio(version)).applied_transform is msgspec.UNSET
 
 
 def test_a_map_without_points_has_no_cloud_and_one_without_keyframes_is_refused() -> None:
     version, _ = points_map()
 
-    files = nerfstudio_files(MapVersion(keyframes=version.keyframes))
+    files = encode_nerfstudio(MapVersion(keyframes=version.keyframes))
 
     assert list(files) == ["transforms.json"]
     assert valid(files).ply_file_path is msgspec.UNSET
     with pytest.raises(UsageError, match="without keyframes"):
-        nerfstudio_files(MapVersion(keyframes=()))
+        encode_nerfstudio(MapVersion(keyframes=()))

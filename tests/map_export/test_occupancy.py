@@ -6,21 +6,21 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from slam.exact_maps import CAMERA, shares_right, world_map
+from map_export.exact_maps import CAMERA, shares_right, world_map
 
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Array, exp_se3, from_quaternion, transform
-from rse_pf.maps.format import Keyframe, MapVersion
-from rse_pf.slam.level_surfaces import up_of_floor, up_of_surfaces
-from rse_pf.slam.occupancy import (
+from rse_pf.map_export.occupancy import (
     FREE,
     OCCUPIED,
     UNKNOWN,
     GridOptions,
     OccupancyGrid,
-    occupancy_files,
-    occupancy_grid,
+    encode_occupancy,
+    make_occupancy_grid,
 )
+from rse_pf.maps.format import Keyframe, MapVersion
+from rse_pf.slam.level_surfaces import floor_normal, level_surface_normal
 
 UP = GridOptions(up=(0.0, 0.0, 1.0))
 
@@ -63,7 +63,7 @@ def room(*, looks: Array | None = None, T: Array | None = None) -> MapVersion:
 def test_at_least_95_percent_of_seen_cells_of_a_rendered_world_are_right() -> None:
     pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
 
-    grid = occupancy_grid(world_map(), UP)
+    grid = make_occupancy_grid(world_map(), UP)
 
     right, right_free, right_occupied = shares_right(grid, 0.1, 1.5)
     assert abs(grid.floor_m) < 0.02
@@ -86,10 +86,10 @@ def test_without_gravity_up_is_found_across_the_floors_that_are_seen() -> None:
         points=transform(tilted, version.points.astype(np.float64)).astype(np.float32),
     )
 
-    grid = occupancy_grid(moved)
+    grid = make_occupancy_grid(moved)
 
     up = grid.T_grid_world[:3, :3] @ tilted[:3, :3] @ [0.0, 0.0, 1.0]
-    assert grid.up_by == "the floor"
+    assert grid.up_source == "the floor"
     assert np.degrees(np.arccos(up[2])) < 0.15
 
 
@@ -101,11 +101,11 @@ def test_ramps_and_walls_do_not_tilt_what_is_level() -> None:
     points = np.concatenate([floor, ramp, wall]).astype(np.float32)
     rough = np.array([np.sin(np.radians(8.0)), 0.0, np.cos(np.radians(8.0))])
 
-    up = up_of_surfaces(points, rough)
+    up = level_surface_normal(points, rough)
 
     assert up is not None
     assert np.degrees(np.arccos(up[2])) < 0.1
-    assert up_of_surfaces(wall.astype(np.float32), rough) is None
+    assert level_surface_normal(wall.astype(np.float32), rough) is None
 
 
 def long_floor(tilt_deg: float, *, width_m: float = 4.0, step_m: float = 0.0) -> tuple[Array, Array]:
@@ -124,7 +124,7 @@ def long_floor(tilt_deg: float, *, width_m: float = 4.0, step_m: float = 0.0) ->
 def test_a_long_floor_tells_up_better_than_its_parts(tilt_deg: float) -> None:
     points, places = long_floor(tilt_deg)
 
-    up = up_of_floor(points.astype(np.float32), np.array([0.0, 0.0, 1.0]), places)
+    up = floor_normal(points.astype(np.float32), np.array([0.0, 0.0, 1.0]), places)
 
     assert up is not None
     wanted = exp_se3(np.array([0, 0, 0, 0.0, np.radians(tilt_deg), 0.0]))[:3, 2]
@@ -138,11 +138,11 @@ def test_a_long_floor_tells_up_better_than_its_parts(tilt_deg: float) -> None:
 def test_a_floor_that_tells_no_up_is_not_asked(floor: tuple[Array, Array]) -> None:
     points, places = floor
 
-    assert up_of_floor(points.astype(np.float32), np.array([0.0, 0.0, 1.0]), places) is None
+    assert floor_normal(points.astype(np.float32), np.array([0.0, 0.0, 1.0]), places) is None
 
 
 def test_floor_is_free_obstacles_are_occupied_and_the_rest_is_unknown() -> None:
-    grid = occupancy_grid(room(), UP)
+    grid = make_occupancy_grid(room(), UP)
 
     assert at(grid, 0.8, 0.8) == FREE
     assert at(grid, 1.2, 3.2) == OCCUPIED
@@ -152,8 +152,8 @@ def test_floor_is_free_obstacles_are_occupied_and_the_rest_is_unknown() -> None:
 
 
 def test_a_look_frees_what_it_passes_at_the_height_of_the_robot_alone() -> None:
-    grid = occupancy_grid(room(looks=np.array([[0.0, 0.0, 3.0]])), UP)
-    above = occupancy_grid(room(looks=np.array([[0.0, -1.4, 2.2]])), UP)
+    grid = make_occupancy_grid(room(looks=np.array([[0.0, 0.0, 3.0]])), UP)
+    above = make_occupancy_grid(room(looks=np.array([[0.0, -1.4, 2.2]])), UP)
 
     assert at(grid, 2.8, 2.0) == FREE
     assert at(grid, 3.52, 2.0) == OCCUPIED
@@ -165,20 +165,22 @@ def test_a_map_that_knows_gravity_is_turned_and_the_file_says_how() -> None:
     down[:3, :3] = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])  # z of the room becomes -y
     version = replace(room(T=down), provenance={"up": [0.0, -1.0, 0.0]})
 
-    grid = occupancy_grid(version)
+    grid = make_occupancy_grid(version)
 
-    assert grid.up_by == "the map"
+    assert grid.up_source == "the map"
     np.testing.assert_allclose(grid.T_grid_world @ down, np.eye(4), atol=1e-9)
     assert at(grid, 1.2, 3.2) == OCCUPIED
-    assert b"# T_grid_world" in occupancy_files(grid)["map.yaml"]
+    assert b"# T_grid_world" in encode_occupancy(grid)["map.yaml"]
 
 
 def test_the_file_names_the_static_transform_of_ros() -> None:
     T_grid_world = exp_se3([0.3, -1.2, 0.7, 0.4, -1.1, 2.0])
-    grid = replace(occupancy_grid(room(), UP), T_grid_world=T_grid_world)
+    grid = replace(make_occupancy_grid(room(), UP), T_grid_world=T_grid_world)
 
     (command,) = (
-        line for line in occupancy_files(grid)["map.yaml"].decode().splitlines() if "static_transform" in line
+        line
+        for line in encode_occupancy(grid)["map.yaml"].decode().splitlines()
+        if "static_transform" in line
     )
 
     words = command.split()
@@ -193,9 +195,9 @@ def test_the_file_names_the_static_transform_of_ros() -> None:
 
 def test_the_files_are_those_of_map_server() -> None:
     yaml = pytest.importorskip("yaml", reason="pip install 'rse-pf[vision]'")
-    grid = occupancy_grid(room(), UP)
+    grid = make_occupancy_grid(room(), UP)
 
-    files = occupancy_files(grid)
+    files = encode_occupancy(grid)
 
     about = yaml.safe_load(files["map.yaml"])
     head, size, most, data = files["map.pgm"].split(b"\n", 3)
@@ -222,10 +224,10 @@ def test_points_far_from_all_poses_are_left_out_and_counted() -> None:
         colours=np.concatenate([version.colours, np.zeros((3, 3), np.uint8)]),
     )  # fmt: skip
 
-    grid = occupancy_grid(more, UP)
+    grid = make_occupancy_grid(more, UP)
 
     assert grid.points_left_out == 3
-    np.testing.assert_array_equal(grid.cells, occupancy_grid(version, UP).cells)
+    np.testing.assert_array_equal(grid.cells, make_occupancy_grid(version, UP).cells)
 
 
 @pytest.mark.parametrize("far_m", [3e4, 9e8])
@@ -235,7 +237,7 @@ def test_poses_far_apart_make_no_huge_grid(far_m: float) -> None:
     far[:2, 3] = far_m
 
     with pytest.raises(UsageError, match=r"cells, above 16777216") as refused:
-        occupancy_grid(
+        make_occupancy_grid(
             replace(
                 version,
                 keyframes=(*version.keyframes, replace(version.keyframes[0], id=1, T_world_camera=far)),
@@ -266,12 +268,12 @@ def test_options_out_of_range_are_refused(words: dict[str, float], why: str) -> 
 def test_maps_without_points_keyframes_or_up_are_refused_in_one_line() -> None:
     version = room()
     with pytest.raises(UsageError, match="no points"):
-        occupancy_grid(MapVersion(keyframes=version.keyframes), UP)
+        make_occupancy_grid(MapVersion(keyframes=version.keyframes), UP)
     with pytest.raises(UsageError, match="without keyframes"):
-        occupancy_grid(replace(version, keyframes=()), UP)
+        make_occupancy_grid(replace(version, keyframes=()), UP)
     first = version.keyframes[0]
     other = first.T_world_camera @ np.diag([-1.0, -1.0, 1.0, 1.0])
     with pytest.raises(UsageError, match="where up is"):
-        occupancy_grid(replace(version, keyframes=(first, replace(first, id=1, T_world_camera=other))))
+        make_occupancy_grid(replace(version, keyframes=(first, replace(first, id=1, T_world_camera=other))))
     with pytest.raises(UsageError, match="within 30 m of a pose"):
-        occupancy_grid(replace(version, points=version.points + np.float32(1000.0)), UP)
+        make_occupancy_grid(replace(version, points=version.points + np.float32(1000.0)), UP)

@@ -1,0 +1,348 @@
+"""Make the floor plan of a map: a 2-D occupancy grid, and its files in the format of the ROS map_server.
+
+A cell is occupied if the point cloud has at least two points in it between the floor and the height of the
+robot.  A cell is free if it is not occupied and the cloud shows the floor there, or the line of sight from a
+keyframe to one of its features passes through it between these heights.  All other cells are unknown.
+
+Source:
+    ROS map_server and nav2_map_server: image, resolution, origin, negate, occupied_thresh, free_thresh.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from rse_pf.errors import UsageError
+from rse_pf.geometry import Array, to_quaternion, transform
+from rse_pf.maps.format import MapVersion
+from rse_pf.slam.inertial import upright_rotation
+from rse_pf.slam.level_surfaces import UpSource, estimate_up
+
+__all__ = [
+    "FREE",
+    "OCCUPIED",
+    "UNKNOWN",
+    "GridOptions",
+    "OccupancyGrid",
+    "encode_occupancy",
+    "make_occupancy_grid",
+]
+
+OCCUPIED = 0  # grey level of a cell with an obstacle: black
+UNKNOWN = 205  # grey level of a cell that no camera has observed, as map_saver of ROS writes it
+FREE = 254  # grey level of a cell without an obstacle: white, as map_saver of ROS writes it
+
+_MAX_CELLS = 1 << 24  # an occupancy grid has at most this number of cells: 16 MiB of memory
+_MAX_DISTANCE_M = 30.0
+"""Points of a map that are farther than this outside the box around all camera positions are left out of its
+floor plan: no camera has seen them."""
+_MAX_RAY_M = 10.0
+"""A feature with a coordinate in the camera's frame above this many metres does not mark cells as free, since
+its depth is inaccurate."""
+_MAX_RAYS = 400_000  # lines of sight of the whole map that mark free cells; bounds the time of an export
+_RAYS_AT_ONCE = 20_000  # lines of sight that are rasterised in one array operation; bounds its memory
+_MIN_POINTS = 2  # points of the cloud that make a cell occupied; a single point may be an outlier
+_LAYER_M = 0.05  # height in metres of the horizontal layers among which the floor is looked for
+_AREA_CELL_M = 0.1  # edge in metres of the squares that measure the area of a horizontal layer
+_FLOOR_SHARE = 0.3
+"""The floor is the lowest layer whose area is at least this share of the area of the largest layer."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GridOptions:
+    """Say which points of a map are floor and which are obstacles.
+
+    Attributes:
+        resolution_m: Length of a cell's edge.
+        robot_height_m: Points higher than this above the floor are no obstacles.
+        step_m: Points lower than this above the floor are part of the floor.
+        floor_m: Height of the floor in the world whose z axis points up; None means the lowest large
+            horizontal surface.
+        up: ``(3,)`` direction against gravity in the world of the map, of any length; None means the
+            direction that `rse_pf.slam.level_surfaces.estimate_up` returns.
+
+    Raises:
+        UsageError: A number is out of its range, or the step is not below the height of the robot.
+    """
+
+    resolution_m: float = 0.05
+    robot_height_m: float = 1.5
+    step_m: float = 0.1
+    floor_m: float | None = None
+    up: tuple[float, float, float] | None = None
+
+    def __post_init__(self) -> None:
+        for name, value, low, high in (
+            ("--resolution", self.resolution_m, 0.01, 10.0),
+            ("--robot-height", self.robot_height_m, 0.05, 100.0),
+            ("--step", self.step_m, 0.005, 10.0),
+            ("--floor", self.floor_m or 0.0, -1e5, 1e5),
+        ):
+            if not low <= value <= high:
+                raise UsageError(
+                    f"{name} = {value:g} is not within {low:g}..{high:g} m",
+                    hint="leave it out for the default",
+                )
+        if self.step_m >= self.robot_height_m:
+            raise UsageError(
+                f"--step = {self.step_m:g} m is not below --robot-height = {self.robot_height_m:g} m",
+                hint="an obstacle is higher than the step, and lower than the robot",
+            )
+        length = math.hypot(*(self.up or (1.0, 0.0, 0.0)))
+        if not 1e-3 <= length <= 1e3:
+            raise UsageError("--up is no direction", hint="name it in the world of the map, such as 0,0,1")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class OccupancyGrid:
+    """Hold the floor plan of a map.
+
+    Attributes:
+        cells: ``(h, w)`` uint8, `OCCUPIED`, `UNKNOWN` or `FREE`; row 0 has the lowest y, column 0 the
+            lowest x.
+        origin_m: x and y of the outer corner of ``cells[0, 0]``, in the frame of the grid.
+        resolution_m: Length of a cell's edge.
+        floor_m: Height of the floor in the frame of the grid.
+        T_grid_world: ``(4, 4)``, maps the world of the map to the frame of the grid, whose z axis points up.
+        up_source: How the direction against gravity was found.
+        points_left_out: The number of points that lie too far from all camera positions.
+    """
+
+    cells: npt.NDArray[np.uint8]
+    origin_m: tuple[float, float]
+    resolution_m: float
+    floor_m: float
+    T_grid_world: Array
+    up_source: UpSource
+    points_left_out: int = 0
+
+
+_DEFAULT = GridOptions()
+
+
+def make_occupancy_grid(version: MapVersion, options: GridOptions = _DEFAULT) -> OccupancyGrid:
+    """Return the floor plan of a map; the same map and options always give the same grid.
+
+    Raises:
+        UsageError: The map has no points or no keyframes, the direction against gravity is unknown, or the
+            grid would have more than 2**24 cells.
+    """
+    if not version.keyframes:
+        raise UsageError("a map without keyframes has no floor plan", hint="export its cloud as ply")
+    if not len(version.points):
+        raise UsageError("this map has no points, so it has no floor plan", hint="export it as tum or g2o")
+    # 1. Rotate the map so that its z axis points up.
+    up, up_source = _find_up(version, options)
+    T_grid_world = upright_rotation(-up)
+    T_grid_camera = np.array([T_grid_world @ keyframe.T_world_camera for keyframe in version.keyframes])
+    # 2. Leave out points that no camera can have seen.
+    low = T_grid_camera[:, :3, 3].min(axis=0)
+    high = T_grid_camera[:, :3, 3].max(axis=0)
+    _check_cell_count(high - low, options)
+    points = transform(T_grid_world, version.points.astype(np.float64))
+    is_near = ((points >= low - _MAX_DISTANCE_M) & (points <= high + _MAX_DISTANCE_M)).all(axis=1)
+    points_left_out = len(points) - int(is_near.sum())
+    points = points[is_near]
+    if not len(points):
+        raise UsageError(
+            f"no point of this map is within {_MAX_DISTANCE_M:g} m of a pose", hint="check its poses"
+        )
+    # 3. Find the floor, and divide the points into floor and obstacles.
+    floor_m = _find_floor(points, T_grid_camera, options) if options.floor_m is None else options.floor_m
+    height_m = points[:, 2] - floor_m
+    obstacles = points[(height_m > options.step_m) & (height_m <= options.robot_height_m)]
+    floor_points = points[np.abs(height_m) <= options.step_m]
+    # 4. Mark the floor and the lines of sight as free, then the obstacles as occupied.
+    start, end = _lines_of_sight(version, T_grid_camera, floor_m, options)
+    raster = _Raster.covering([obstacles, floor_points, start, end], options)
+    raster.mark_free(raster.cell_numbers(floor_points))
+    raster.mark_lines_free(start, end)
+    raster.mark_occupied(raster.cell_numbers(obstacles))
+    return OccupancyGrid(
+        cells=raster.cells,
+        origin_m=(float(raster.low[0]), float(raster.low[1])),
+        resolution_m=options.resolution_m,
+        floor_m=floor_m,
+        T_grid_world=T_grid_world,
+        up_source=up_source,
+        points_left_out=points_left_out,
+    )
+
+
+def encode_occupancy(grid: OccupancyGrid) -> dict[str, bytes]:
+    """Return the image ``map.pgm`` and its description ``map.yaml`` for ROS's map_server, by their names.
+
+    Comments in ``map.yaml`` state the height of the floor and ``T_grid_world``.
+    """
+    height, width = grid.cells.shape
+    image = f"P5\n{width} {height}\n255\n".encode("ascii") + grid.cells[::-1].tobytes()
+    x, y = grid.origin_m
+    rows = [", ".join(f"{number:.9g}" for number in row) for row in grid.T_grid_world]
+    lines = [
+        f"# The floor is at z = {grid.floor_m:.3f} m; up is by {grid.up_source}.",
+        "# T_grid_world, from the world of the map to that of this grid:",
+        *(f"#   [{row}]" for row in rows),
+        "# The same for ROS 2, with the frame `map` of the bridge below the frame `plan` of this grid:",
+        f"#   {_ros2_static_transform(grid.T_grid_world)}",
+        "image: map.pgm",
+        "mode: trinary",
+        f"resolution: {grid.resolution_m:.6g}",
+        f"origin: [{x:.6f}, {y:.6f}, 0.0]",
+        "negate: 0",
+        "occupied_thresh: 0.65",
+        "free_thresh: 0.196",
+    ]
+    return {"map.pgm": image, "map.yaml": ("\n".join(lines) + "\n").encode("ascii")}
+
+
+def _ros2_static_transform(T_grid_world: Array) -> str:
+    """Return the ROS 2 command that publishes ``T_grid_world`` from frame ``map`` to frame ``plan``."""
+    x, y, z = T_grid_world[:3, 3]
+    qx, qy, qz, qw = to_quaternion(T_grid_world[:3, :3])
+    return (
+        f"ros2 run tf2_ros static_transform_publisher --x {x:.6f} --y {y:.6f} --z {z:.6f} "
+        f"--qx {qx:.9f} --qy {qy:.9f} --qz {qz:.9f} --qw {qw:.9f} --frame-id plan --child-frame-id map"
+    )
+
+
+def _find_up(version: MapVersion, options: GridOptions) -> tuple[Array, UpSource]:
+    if options.up is not None:
+        up = np.array(options.up)
+        return up / np.linalg.norm(up), "--up"
+    estimate = estimate_up(version)
+    if estimate is None:
+        raise UsageError(
+            "this map does not say where up is, and its cameras do not agree", hint="name it: --up 0,0,1"
+        )
+    return estimate
+
+
+def _check_cell_count(extent_m: Array, options: GridOptions) -> None:
+    """Raise UsageError if a grid over *extent_m* (x and y, metres) has more than 2**24 cells."""
+    sides = np.ceil(extent_m[:2] / options.resolution_m) + 1.0
+    cells = float(sides[0] * sides[1])
+    if cells > _MAX_CELLS:
+        min_resolution_m = options.resolution_m * math.sqrt(cells / _MAX_CELLS) * 1.1
+        hint = (
+            f"raise --resolution to {min_resolution_m:.2g} m"
+            if min_resolution_m < 10.0
+            else "check the poses of the map"
+        )
+        raise UsageError(
+            f"a grid over {extent_m[0]:.4g} x {extent_m[1]:.4g} m has {cells:.3g} cells, above {_MAX_CELLS}",
+            hint=hint,
+        )
+
+
+def _find_floor(points: Array, T_grid_camera: Array, options: GridOptions) -> float:
+    """Return the height in metres of the lowest large horizontal surface below the cameras.
+
+    Points below the median camera height are divided into layers of 5 cm.  The area of a layer is the number
+    of its 10 cm squares with a point; a layer is large if it has 30 % of the area of the largest layer.
+    Without points below the cameras, return the height of the lowest point.
+    """
+    below = points[points[:, 2] < float(np.median(T_grid_camera[:, 2, 3]))]
+    if not len(below):
+        return float(points[:, 2].min())
+    lowest_m = float(below[:, 2].min())
+    layer_cells = np.column_stack(
+        [np.floor((below[:, 2] - lowest_m) / _LAYER_M), np.floor(below[:, :2] / _AREA_CELL_M)]
+    ).astype(np.int64)
+    area = np.bincount(np.unique(layer_cells, axis=0)[:, 0])
+    layer = int(np.flatnonzero(area >= _FLOOR_SHARE * area.max())[0])
+    middle_m = lowest_m + (layer + 0.5) * _LAYER_M
+    near = below[np.abs(below[:, 2] - middle_m) <= _LAYER_M, 2]
+    return float(np.median(near)) if len(near) else middle_m
+
+
+def _lines_of_sight(
+    version: MapVersion, T_grid_camera: Array, floor_m: float, options: GridOptions
+) -> tuple[Array, Array]:
+    """Return starts and ends ``(n, 3)`` of the lines from cameras to features, in the frame of the grid.
+
+    Lines are cut to the heights between the floor and the robot, and end one cell before the feature, because
+    the cell of the feature itself is not free.
+    """
+    starts, ends = [np.empty((0, 3))], [np.empty((0, 3))]
+    max_per_keyframe = max(1, _MAX_RAYS // len(T_grid_camera))
+    # 1. Take the features of each keyframe whose point is near enough, evenly thinned.
+    for keyframe, T in zip(version.keyframes, T_grid_camera, strict=True):
+        points = keyframe.points_camera.astype(np.float64)
+        points = points[(np.abs(points) <= _MAX_RAY_M).all(axis=1) & (points[:, 2] > 0.0)]
+        points = points[:: max(1, math.ceil(len(points) / max_per_keyframe))]
+        ends.append(transform(T, points))
+        starts.append(np.broadcast_to(T[:3, 3], points.shape))
+    start, end = np.concatenate(starts), np.concatenate(ends)
+    direction = end - start
+    length_m = np.maximum(np.linalg.norm(direction, axis=1), 1e-9)
+    # 2. Find the shares of each line at which it crosses the lowest and the highest permitted height.
+    low = floor_m - options.step_m
+    high = floor_m + options.robot_height_m
+    with np.errstate(divide="ignore", invalid="ignore"):
+        crossing = (np.array([low, high]) - start[:, 2:]) / direction[:, 2:]
+    is_level = np.abs(direction[:, 2]) < 1e-9
+    is_within = (start[:, 2] >= low) & (start[:, 2] <= high)
+    crossing[is_level] = np.where(is_within[is_level, None], [0.0, 1.0], [1.0, 0.0])
+    crossing[~is_level] = np.sort(crossing[~is_level], axis=1)
+    # 3. Cut each line there, and one cell before its feature; drop lines of which nothing is left.
+    first = np.maximum(crossing[:, 0], 0.0)
+    last = np.minimum(crossing[:, 1], 1.0 - options.resolution_m / length_m)
+    is_left = first < last
+    direction, origin = direction[is_left], start[is_left]
+    return origin + first[is_left, None] * direction, origin + last[is_left, None] * direction
+
+
+@dataclass(slots=True, kw_only=True, eq=False)
+class _Raster:
+    """The cells of a grid while they are marked; ``low`` ``(2,)`` is the corner of cell (0, 0), metres."""
+
+    low: Array
+    resolution_m: float
+    cells: npt.NDArray[np.uint8] = field(repr=False)
+
+    @staticmethod
+    def covering(point_sets: list[Array], options: GridOptions) -> _Raster:
+        """Return a raster of unknown cells around all points, with a margin of one cell."""
+        xy = np.concatenate([points[:, :2] for points in point_sets])
+        if not len(xy):
+            raise UsageError(
+                "this map shows nothing between the floor and the height of the robot",
+                hint="name the height of the floor: --floor",
+            )
+        low, high = xy.min(axis=0), xy.max(axis=0)
+        _check_cell_count(high - low, options)
+        low = (np.floor(low / options.resolution_m) - 1.0) * options.resolution_m
+        width, height = (np.ceil((high - low) / options.resolution_m) + 1.0).astype(np.int64)
+        cells = np.full((int(height), int(width)), UNKNOWN, dtype=np.uint8)
+        return _Raster(low=low, resolution_m=options.resolution_m, cells=cells)
+
+    def cell_numbers(self, points: Array) -> npt.NDArray[np.int64]:
+        """Return the number of the cell that holds each point, counted row by row."""
+        column, row = np.floor((points[:, :2] - self.low) / self.resolution_m).astype(np.int64).T
+        numbers: npt.NDArray[np.int64] = row * self.cells.shape[1] + column
+        return numbers
+
+    def mark_free(self, cell_numbers: npt.NDArray[np.int64]) -> None:
+        self.cells.reshape(-1)[cell_numbers] = FREE
+
+    def mark_occupied(self, cell_numbers: npt.NDArray[np.int64]) -> None:
+        """Mark the cells whose number occurs at least twice, once for each point."""
+        distinct, count = np.unique(cell_numbers, return_counts=True)
+        self.cells.reshape(-1)[distinct[count >= _MIN_POINTS]] = OCCUPIED
+
+    def mark_lines_free(self, start: Array, end: Array) -> None:
+        """Mark the cells under lines from *start* to *end* ``(n, 3)``, sampled at half the cell's edge."""
+        for first in range(0, len(start), _RAYS_AT_ONCE):
+            rows = slice(first, first + _RAYS_AT_ONCE)
+            origin, direction = start[rows, :2], end[rows, :2] - start[rows, :2]
+            samples = (
+                np.ceil(2.0 * np.linalg.norm(direction, axis=1) / self.resolution_m).astype(np.int64) + 1
+            )
+            line = np.repeat(np.arange(len(samples)), samples)
+            sample = np.arange(len(line)) - np.repeat(np.cumsum(samples) - samples, samples)
+            share = sample / np.maximum(samples[line] - 1, 1)
+            self.mark_free(np.unique(self.cell_numbers(origin[line] + share[:, None] * direction[line])))
