@@ -8,7 +8,6 @@ advice until the user accepts the doubt by its name.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
@@ -19,7 +18,7 @@ import numpy.typing as npt
 
 from rse_pf.config.validation import did_you_mean
 from rse_pf.errors import RsePfError, UsageError
-from rse_pf.geometry import Array, Camera
+from rse_pf.geometry import Array, Lens
 
 __all__ = [
     "CameraFacts", "DepthFacts", "Doubt", "DoubtLog", "DoubtName", "LossFacts", "SourceFacts", "TimeFacts",
@@ -28,8 +27,6 @@ __all__ = [
     "unresolved",
 ]  # fmt: skip
 
-MIN_FIELD_OF_VIEW_DEG = 20.0  # a longer lens is not used for SLAM; a mistake in the unit gives less
-MAX_FIELD_OF_VIEW_DEG = 140.0  # a wider lens is not a pinhole camera
 MIN_MEDIAN_DEPTH_M = 0.05  # nearer than any depth camera measures
 MAX_MEDIAN_DEPTH_M = 30.0  # farther than any depth camera measures
 MIN_ASSUMED_MEDIAN_DEPTH_M = 0.2  # of a depth unit that nobody stated
@@ -87,8 +84,7 @@ class CameraFacts:
     """A camera as its source states it (*stated_by* is a file or topic), and the images that it delivers."""
 
     stated_by: str
-    camera: Camera
-    is_fisheye: bool = False
+    lens: Lens
     image_size_px: tuple[int, int] | None = None
 
 
@@ -360,7 +356,7 @@ def some_names(names: Sequence[str]) -> str:
 
 def _check_cameras(facts: SourceFacts) -> Iterable[Doubt]:
     for each in facts.cameras:
-        camera = each.camera
+        camera = each.lens.camera
         size = (camera.width, camera.height)
         if each.image_size_px is not None and each.image_size_px != size:
             raise UsageError(
@@ -374,14 +370,12 @@ def _check_cameras(facts: SourceFacts) -> Iterable[Doubt]:
                 f"image of {size[0]}x{size[1]} px",
                 hint="give the intrinsics of this size: scale fx fy cx cy with the image",
             )
-        seen_deg = math.degrees(
-            2.0 * math.atan(max(camera.width / camera.fx, camera.height / camera.fy) / 2.0)
-        )
-        if not each.is_fisheye and not MIN_FIELD_OF_VIEW_DEG <= seen_deg <= MAX_FIELD_OF_VIEW_DEG:
+        smallest_deg, largest_deg = each.lens.plausible_field_of_view_deg
+        if not smallest_deg <= each.lens.field_of_view_deg <= largest_deg:
             raise UsageError(
                 f"{each.stated_by}: fx {camera.fx:g} fy {camera.fy:g} at {size[0]}x{size[1]} px is a "
-                f"field of view of {seen_deg:.0f} degrees, not within {MIN_FIELD_OF_VIEW_DEG:g}.."
-                f"{MAX_FIELD_OF_VIEW_DEG:g}",
+                f"field of view of {each.lens.field_of_view_deg:.0f} degrees, not within "
+                f"{smallest_deg:g}..{largest_deg:g}",
                 hint="give fx and fy in pixels of this image size; a wide lens has model fisheye",
             )
     return ()

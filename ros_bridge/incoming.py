@@ -16,17 +16,18 @@ import numpy as np
 
 from client_sdk.bags.bag_file import BrokenMessage
 from client_sdk.bags.images import ImageFormat, check_image, decode_colour, decode_depth, format_of
-from client_sdk.bags.lens import Lens, Rectifier, lens_of
+from client_sdk.bags.lens import lens_of
 from client_sdk.bags.message_maker import MessageMaker
 from client_sdk.bags.message_types import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, IMU
 from client_sdk.cameras.source import no_depth
 from client_sdk.frontend import Frame, load_opencv
+from client_sdk.image_map import ImageMap, map_to_pinhole
 from client_sdk.source_facts import MAX_MEDIAN_DEPTH_M, MIN_MEDIAN_DEPTH_M, median_depth_m
 from ros_bridge.input_check import InputCheck
 from ros_bridge.options import BridgeOptions
 from ros_bridge.rig_topics import RigTopics
 from rse_pf.errors import RsePfError
-from rse_pf.geometry import Camera
+from rse_pf.geometry import Camera, Lens
 
 __all__ = ["IncomingFrames", "PairedImages", "Role", "kind_of"]
 
@@ -72,7 +73,7 @@ class _StatedCamera:
     stamp_ns: int
     lens: Lens
     rectified: Camera
-    rectifier: Rectifier
+    rectifier: ImageMap
     change: str
 
 
@@ -82,7 +83,7 @@ def _change_of(topic: str, first: Lens, lens: Lens) -> str:
         name: (getattr(first.camera, name), getattr(lens.camera, name))
         for name in ("width", "height", "fx", "fy", "cx", "cy")
     }
-    pairs |= {name: (getattr(first, name), getattr(lens, name)) for name in ("distortion", "is_fisheye")}
+    pairs |= {name: (getattr(first, name), getattr(lens, name)) for name in ("distortion", "model")}
     changed = ", ".join(f"{name} {old} to {new}" for name, (old, new) in pairs.items() if old != new)
     line = f"{topic} has changed: {changed}"
     if "width" in changed or "height" in changed:
@@ -328,7 +329,7 @@ class IncomingFrames:
         if change and is_pair and not self._options.rig:
             raise BrokenMessage(f"{change}; a pair is rectified once: start the bridge again")
         if role == "info" and (not self._cameras or (self._cameras[-1].lens != lens and not is_pair)):
-            rectifier = Rectifier(lens, first.camera)
+            rectifier = map_to_pinhole(lens, first.camera)
             self._cameras.append(_StatedCamera(_stamp_ns(message), lens, first.camera, rectifier, change))
 
     def _check(self, role: Role, message: Any) -> None:

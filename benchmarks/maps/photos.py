@@ -40,7 +40,7 @@ from client_sdk.transfer.data_client import DataClient
 from rse_pf.geometry import Array, Camera, exp_se3, pose_difference
 from rse_pf.images import load_opencv
 from rse_pf.maps.format import Keyframe, MapVersion, encode_map
-from rse_pf.maps.photos import Lens
+from rse_pf.maps.photos import PhotoLens
 from rse_pf.slam.keyframe import most_features
 
 ROBOT = "robot-1"
@@ -174,8 +174,8 @@ def jpeg_of(rgb: npt.NDArray[np.uint8]) -> bytes:
     return bytes(data)
 
 
-def lens_of(camera: Camera) -> Lens:
-    return Lens(fx=camera.fx, fy=camera.fy, cx=camera.cx, cy=camera.cy)
+def lens_of(camera: Camera) -> PhotoLens:
+    return PhotoLens(fx=camera.fx, fy=camera.fy, cx=camera.cx, cy=camera.cy)
 
 
 def _localised(client: DataClient, name: str, photos: Sequence[Photo]) -> dict[str, Any]:

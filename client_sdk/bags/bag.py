@@ -36,7 +36,7 @@ from client_sdk.bags.index import (
     pair_stamps,
     read_index,
 )
-from client_sdk.bags.lens import Lens, Rectifier, lens_of
+from client_sdk.bags.lens import lens_of
 from client_sdk.bags.lens_change import mismatch_px
 from client_sdk.bags.message_types import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, POSE
 from client_sdk.bags.realsense_recording import stated_depth_unit_m, stated_T_colour_depth
@@ -44,6 +44,7 @@ from client_sdk.bags.registration import register_depth
 from client_sdk.bags.stereo import pair_of
 from client_sdk.bags.stream import ImageStream
 from client_sdk.frontend import Frame, load_opencv
+from client_sdk.image_map import ImageMap, map_to_pinhole
 from client_sdk.mapping import Trajectory
 from client_sdk.rigs.imu_track import ImuTrack, with_imu
 from client_sdk.rigs.rectification import Rectification
@@ -61,7 +62,7 @@ from client_sdk.source_facts import (
     median_depth_m,
 )
 from rse_pf.errors import UsageError
-from rse_pf.geometry import Array, Camera, inverse
+from rse_pf.geometry import Array, Camera, Lens, inverse
 
 __all__ = ["Bag", "BagOptions", "open_bag"]
 
@@ -285,7 +286,7 @@ def _open(file: BagFile, options: BagOptions) -> Bag:
         _file=file,
         _stream=stream,
         _pairs=tuple(pairs),
-        _colour_way=_Way(times, [Rectifier(each, lens.camera) for each in lenses]),
+        _colour_way=_Way(times, [map_to_pinhole(each, lens.camera) for each in lenses]),
         _depth_way=depth_way,
         _depth_scale=depth_scale,
         _is_float_depth=is_float,
@@ -295,10 +296,7 @@ def _open(file: BagFile, options: BagOptions) -> Bag:
     )
     facts = SourceFacts(
         name=name,
-        cameras=[
-            CameraFacts(stated_by=_stated_by(chosen, options), camera=each.camera, is_fisheye=each.is_fisheye)
-            for each in lenses
-        ],
+        cameras=[CameraFacts(stated_by=_stated_by(chosen, options), lens=each) for each in lenses],
         depth=_depth_facts(
             bag, is_unit_stated=is_float or unit_m is not None or options.depth_scale is not None
         ),
@@ -321,9 +319,9 @@ class _Way:
     """How images of a topic become those of the camera, whose lens may change in the drive."""
 
     times: CameraTimes
-    rectifiers: Sequence[Rectifier]
+    rectifiers: Sequence[ImageMap]
 
-    def of(self, image: tuple[str, int, int]) -> Rectifier:
+    def of(self, image: tuple[str, int, int]) -> ImageMap:
         """Return what rectifies an image."""
         _, stamp_ns, log_ns = image
         return self.rectifiers[self.times.row_at(stamp_ns, log_ns) if len(self.rectifiers) > 1 else 0]
@@ -449,7 +447,7 @@ def _lenses_of_colour(
     """Return the lenses of the colours, and when each of them is valid; nearly always there is one."""
     info = chosen.colour_info
     if options.lens is not None or options.rig is not None:
-        lens = options.lens if options.rig is None else Lens.of(options.rig.left.lens)
+        lens = options.lens if options.rig is None else options.rig.left.lens
         assert lens is not None
         _check_size(chosen.colour.name, formats, "the file of intrinsics", lens.camera)
         return [lens], CameraTimes()
@@ -585,7 +583,7 @@ def _depth_way(
     """Return how depth images become those of the colour camera: rectified, registered, and doubts."""
     camera, depth = lens.camera, chosen.depth
     if depth is None:
-        return _Way(times, [Rectifier(Lens(camera=camera), camera)]), None, ()
+        return _Way(times, [ImageMap(None)]), None, ()
     info, image, colours = chosen.depth_info, formats[depth.name], formats[chosen.colour.name]
     own_times = CameraTimes() if info is None else index.cameras[info.name]
     own = [
@@ -595,7 +593,7 @@ def _depth_way(
     ]
     if any(image.size not in (None, (each.camera.width, each.camera.height)) for each in own):
         own = []
-    like_colours = _Way(times, [Rectifier(each, camera) for each in lenses])
+    like_colours = _Way(times, [map_to_pinhole(each, camera) for each in lenses])
     T_colour_depth = stated_T_colour_depth(file, chosen.colour.name, depth.name)
     if T_colour_depth is None and is_registered(depth):
         T_colour_depth = np.eye(4)
@@ -605,10 +603,11 @@ def _depth_way(
         T_colour_depth = np.eye(4)
     is_same_size = image.size in (None, (camera.width, camera.height))
     if T_colour_depth is not None and is_same_size and np.allclose(T_colour_depth, np.eye(4), atol=1e-6):
-        return _Way(own_times, [Rectifier(each, camera) for each in own]) if own else like_colours, None, ()
+        own_way = _Way(own_times, [map_to_pinhole(each, camera) for each in own])
+        return own_way if own else like_colours, None, ()
     if T_colour_depth is not None and own:
         return (
-            _Way(own_times, [Rectifier(each, own[0].camera) for each in own]),
+            _Way(own_times, [map_to_pinhole(each, own[0].camera) for each in own]),
             (own[0].camera, T_colour_depth),
             (),
         )
@@ -627,7 +626,7 @@ def _depth_way(
         hint="record the registered (aligned) depth topic of your driver, or /tf_static",
     )
     if own:
-        return _Way(own_times, [Rectifier(each, camera) for each in own]), None, (doubt,)
+        return _Way(own_times, [map_to_pinhole(each, camera) for each in own]), None, (doubt,)
     return like_colours, None, (doubt,)
 
 
@@ -668,7 +667,7 @@ def _notes(
 ) -> tuple[str, ...]:
     camera = lens.camera
     where = _stated_by(chosen, options)
-    distorted = "distorted, so images are undistorted" if lens.distortion else "no distortion"
+    distorted = "distorted, so images are undistorted" if not lens.is_pinhole else "no distortion"
     first = "colour" if chosen.right is None else "left"
     taken = [(first, chosen.colour), ("right", chosen.right), ("depth", chosen.depth)]
     return (

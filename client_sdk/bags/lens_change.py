@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from client_sdk.bags.lens import Lens
 from client_sdk.frontend import describe
 from client_sdk.rigs.checks import match_features
-from rse_pf.geometry import Array
+from rse_pf.geometry import Array, Lens
 
 __all__ = ["mismatch_px"]
 
@@ -35,7 +34,7 @@ def mismatch_px(before: _Image, after: _Image, lens: Lens, other: Lens) -> tuple
         return None
     seen, again = first.pixels[rows], second.pixels[others]
     changed, *unchanged = (
-        _residual(one.rays(seen), two.rays(again)) * two.camera.fx
+        _residual(one.unit_rays(seen), two.unit_rays(again)) * two.camera.fx
         for one, two in ((lens, other), (lens, lens), (other, other))
     )
     return changed, min(unchanged)

@@ -6,13 +6,13 @@ from typing import Any
 
 import numpy as np
 
-from client_sdk.bags.lens import Lens, lens_of, numbers_of
+from client_sdk.bags.lens import lens_of, numbers_of
 from client_sdk.rigs.intrinsics import Intrinsics
 from client_sdk.rigs.rig import RigCamera
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Array, inverse, rigid
 
-__all__ = ["CameraMessage", "intrinsics_of_lens", "pair_of"]
+__all__ = ["CameraMessage", "pair_of"]
 
 _HINT = "give both cameras yourself: --intrinsics rig.json; or take one: --no-depth"
 _MOST_NUMBERS = 5
@@ -96,13 +96,4 @@ def _intrinsics(name: str, message: Any, is_rectified: bool) -> Intrinsics:
             f"{name} has a lens of {len(lens.distortion)} distortion numbers, a pair takes {_MOST_NUMBERS}",
             hint=_HINT,
         )
-    return intrinsics_of_lens(lens)
-
-
-def intrinsics_of_lens(lens: Lens) -> Intrinsics:
-    """Return a lens as that of a rig."""
-    return Intrinsics(
-        camera=lens.camera,
-        distortion=lens.distortion[:_MOST_NUMBERS],
-        model="fisheye" if lens.is_fisheye else "radial-tangential",
-    )
+    return Intrinsics(camera=lens.camera, distortion=lens.distortion[:_MOST_NUMBERS], model=lens.model)

@@ -86,8 +86,7 @@ class FolderImages:
             if not depth.is_unit_stated:
                 assumed += (f"{stated_by} states no depth_scale: {units_per_m:g} units a metre are assumed",)
         camera = CameraFacts(
-            stated_by=stated_by, camera=lens.camera, is_fisheye=lens.model == "fisheye",
-            image_size_px=self.size_px,
+            stated_by=stated_by, lens=lens, image_size_px=self.size_px,
         )  # fmt: skip
         return SourceFacts(
             name=self.name, cameras=(camera,), depth=depth, doubts=self.doubts, assumed=assumed,

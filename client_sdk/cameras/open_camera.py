@@ -171,7 +171,7 @@ def _single(
 
 def _facts_of_lens(name: str, lens: Intrinsics, stated_by: str) -> SourceFacts:
     """Return what is known of a camera whose images were not looked at; their sizes are compared later."""
-    camera = CameraFacts(stated_by=stated_by, camera=lens.camera, is_fisheye=lens.model == "fisheye")
+    camera = CameraFacts(stated_by=stated_by, lens=lens)
     return SourceFacts(name=name, cameras=(camera,))
 
 

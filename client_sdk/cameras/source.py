@@ -19,8 +19,9 @@ import numpy.typing as npt
 from client_sdk.auto_close import Closing
 from client_sdk.datasets.thinning import Thinning
 from client_sdk.frontend import Frame, load_opencv
+from client_sdk.image_map import map_to_pinhole
 from client_sdk.rigs.checks import PairLook, check_pairs, fault_of_looks, measure_pair
-from client_sdk.rigs.intrinsics import Intrinsics, Undistortion
+from client_sdk.rigs.intrinsics import Intrinsics
 from client_sdk.rigs.rectification import Rectification
 from client_sdk.rigs.rig import Rig
 from client_sdk.source_facts import Doubt, DoubtLog, DoubtName
@@ -179,7 +180,7 @@ class RawSource(FrameStream):
             UsageError: The rate is not above 0.
         """
         super().__init__(about, raw, self._frame, rate_hz=rate_hz, close=close)
-        self._undistortion = Undistortion(intrinsics)
+        self._undistortion = map_to_pinhole(intrinsics)
         self._no_depth = no_depth(self.camera)
 
     def _frame(self, raw: RawFrame) -> Frame:

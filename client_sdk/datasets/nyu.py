@@ -17,13 +17,13 @@ import numpy.typing as npt
 
 from rse_pf.errors import MissingExtra, UsageError
 from rse_pf.files import read_regular_file
-from rse_pf.geometry import Array, Camera, transform
+from rse_pf.geometry import Array, Camera, Lens, transform
 
 __all__ = [
     "COLOUR_CAMERA",
-    "COLOUR_DISTORTION",
+    "COLOUR_LENS",
     "DEPTH_CAMERA",
-    "DEPTH_DISTORTION",
+    "DEPTH_LENS",
     "LabelledFile",
     "RawFile",
     "depth_from_raw",
@@ -41,7 +41,7 @@ COLOUR_CAMERA = Camera(
     width=640,
     height=480,
 )
-COLOUR_DISTORTION = (
+_COLOUR_DISTORTION = (
     0.20796615318809061,
     -0.58613825163911781,
     7.2231363135888329e-04,
@@ -56,13 +56,15 @@ DEPTH_CAMERA = Camera(
     width=640,
     height=480,
 )
-DEPTH_DISTORTION = (
+_DEPTH_DISTORTION = (
     -0.099897236553084481,
     0.39065324602765344,
     1.9290592870229277e-03,
     -1.9422022475975055e-03,
     -0.51031725053400578,
 )
+COLOUR_LENS = Lens(camera=COLOUR_CAMERA, distortion=_COLOUR_DISTORTION)
+DEPTH_LENS = Lens(camera=DEPTH_CAMERA, distortion=_DEPTH_DISTORTION)
 _MAX_DEPTH_M = 10.0
 _MAX_PNM_BYTES = 16 << 20
 _PNM_HEAD = re.compile(rb"(P[56])\s+(?:#[^\n]*\n\s*)*(\d{1,5})\s+(\d{1,5})\s+(\d{1,5})\s")

@@ -23,8 +23,9 @@ from client_sdk.datasets.dataset import Dataset
 from client_sdk.datasets.images import check_size, probe, read_colour, read_depth
 from client_sdk.datasets.rig_recordings import CameraChoice, is_euroc, is_kitti, open_euroc, open_kitti
 from client_sdk.frontend import Frame
+from client_sdk.image_map import map_to_pinhole
 from client_sdk.mapping import Trajectory, read_trajectory
-from client_sdk.rigs.intrinsics import Intrinsics, Undistortion
+from client_sdk.rigs.intrinsics import Intrinsics
 from client_sdk.rigs.rig import Rig
 from client_sdk.rigs.rig_file import read_calibration
 from client_sdk.rigs.stated_camera import stated_camera
@@ -43,7 +44,7 @@ from client_sdk.source_facts import (
 )
 from rse_pf.errors import UsageError
 from rse_pf.files import check_exists, read_regular_file
-from rse_pf.geometry import Camera
+from rse_pf.geometry import Camera, Lens
 
 __all__ = ["associate_stamps", "dataset_of_bag", "is_listed", "open_dataset"]
 
@@ -208,7 +209,7 @@ def _open_tum(folder: Path, of_camera: Path) -> Dataset:
         f"{_MAX_STAMP_DIFFERENCE_S:g} s and are left out",
         lost=lost, total=total, is_usual=True,
     )  # fmt: skip
-    camera, undistort = intrinsics.camera, Undistortion(intrinsics)
+    camera, undistort = intrinsics.camera, map_to_pinhole(intrinsics)
     units_per_m = intrinsics.depth_units_per_m
     no_depth: npt.NDArray[np.float32] = np.zeros((camera.height, camera.width), dtype=np.float32)
 
@@ -233,7 +234,6 @@ def _open_tum(folder: Path, of_camera: Path) -> Dataset:
 
     truth, truth_kind, of_truth = _read_truth(folder)
     stated_by = str(of_camera if of_camera.exists() else folder)
-    is_fisheye = intrinsics.model == "fisheye"
     probed = probe(range(len(pairs)), depth_of)
     depth = DepthFacts(
         median_m=median_depth_m(probed), units_per_m=units_per_m, is_unit_stated=is_unit_stated,
@@ -242,7 +242,7 @@ def _open_tum(folder: Path, of_camera: Path) -> Dataset:
     lists = (colours,) if depths is None else (colours, depths)
     facts = SourceFacts(
         name=str(folder),
-        cameras=(CameraFacts(stated_by=stated_by, camera=camera, is_fisheye=is_fisheye),),
+        cameras=(CameraFacts(stated_by=stated_by, lens=intrinsics),),
         depth=None if depths is None else depth,
         times=tuple(each.times for each in lists),
         references=() if truth is None else (TimeFacts(stated_by=of_truth[0], stamps_s=truth.timestamps_s),),
@@ -394,8 +394,8 @@ def _open_raw(folder: Path) -> Dataset:
             f"no depth image of {folder} has a colour image within {_MAX_RAW_STAMP_DIFFERENCE_S:g} s",
             hint="unpack the whole scene: r-*.ppm and d-*.pgm",
         )
-    colour = Undistortion(Intrinsics(camera=nyu.COLOUR_CAMERA, distortion=nyu.COLOUR_DISTORTION))
-    depth = Undistortion(Intrinsics(camera=nyu.DEPTH_CAMERA, distortion=nyu.DEPTH_DISTORTION))
+    colour = map_to_pinhole(nyu.COLOUR_LENS)
+    depth = map_to_pinhole(nyu.DEPTH_LENS)
 
     def read(row: int) -> Frame:
         depth_row, colour_row = pairs[row]
@@ -452,7 +452,7 @@ def _nyu_dataset(
     )
     facts = SourceFacts(
         name=name,
-        cameras=(CameraFacts(stated_by="the toolbox of NYU Depth V2", camera=camera),),
+        cameras=(CameraFacts(stated_by="the toolbox of NYU Depth V2", lens=Lens(camera=camera)),),
         depth=DepthFacts(
             median_m=median_depth_m(depths_m), units_per_m=1.0, is_unit_stated=True, is_registered=True
         ),

@@ -17,6 +17,7 @@ from client_sdk.bags.index import pair_stamps
 from client_sdk.datasets.dataset import Dataset
 from client_sdk.datasets.images import check_size, image_files, probe, read_colour
 from client_sdk.frontend import Frame, load_opencv
+from client_sdk.image_map import map_to_pinhole
 from client_sdk.mapping import Trajectory
 from client_sdk.rigs.benchmark_files import (
     read_euroc_camera,
@@ -26,7 +27,6 @@ from client_sdk.rigs.benchmark_files import (
     read_text,
 )
 from client_sdk.rigs.imu_track import ImuTrack
-from client_sdk.rigs.intrinsics import Undistortion
 from client_sdk.rigs.rectification import Rectification
 from client_sdk.rigs.rig import Rig
 from client_sdk.source_facts import (
@@ -249,7 +249,7 @@ def _dataset(name: str, rig: Rig, files: _Files, bodies: Trajectory | None, samp
         raise UsageError(f"{name} has no images", hint="unpack the recording again")
     left, right = rig.left, rig.right
     rectify = None if rights is None or right is None else Rectification(left, right)
-    undistort = Undistortion(left.lens)
+    undistort = map_to_pinhole(left.lens)
     right_camera = (left if right is None else right).lens.camera
     camera = left.lens.camera if rectify is None else rectify.camera
     T_body_camera = left.T_body_camera if rectify is None else rectify.T_body_camera
@@ -286,7 +286,7 @@ def _dataset(name: str, rig: Rig, files: _Files, bodies: Trajectory | None, samp
     stated = [
         CameraFacts(
             stated_by=files.stated_by[0] if each is left else f"the right camera of {name}",
-            camera=each.lens.camera, is_fisheye=each.lens.model == "fisheye",
+            lens=each.lens,
         )
         for each in rig.cameras
     ]  # fmt: skip

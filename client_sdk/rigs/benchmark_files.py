@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from client_sdk.rigs.intrinsics import Intrinsics, lens_model
+from client_sdk.rigs.intrinsics import Intrinsics, parse_lens_model
 from client_sdk.rigs.rig import Rig, RigCamera, RigImu
 from rse_pf.errors import InvalidCamera, UsageError
 from rse_pf.files import read_regular_file
@@ -43,9 +43,9 @@ def read_euroc_camera(path: Path, name: str) -> RigCamera:
     (fx, fy, cx, cy), (width, height) = found["intrinsics"], found["resolution"]
     try:
         camera = Camera(fx=fx, fy=fy, cx=cx, cy=cy, width=int(width), height=int(height))
-        lens_model(_word_after(text, "camera_model"))  # refuses projections such as omni
+        parse_lens_model(_word_after(text, "camera_model"))  # refuses projections such as omni
         lens = Intrinsics(
-            camera=camera, model=lens_model(_word_after(text, "distortion_model")),
+            camera=camera, model=parse_lens_model(_word_after(text, "distortion_model")),
             distortion=tuple(found["distortion_coefficients"]),
         )  # fmt: skip
         return RigCamera(name=name, lens=lens, T_body_camera=np.array(pose).reshape(4, 4))

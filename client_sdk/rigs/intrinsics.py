@@ -1,4 +1,5 @@
-"""``intrinsics.json``: a camera with its lens, as calibration writes it and every source reads it.
+"""``intrinsics.json``: the camera, the lens and the depth unit that calibration writes and every source
+reads.
 
 ::
 
@@ -6,11 +7,11 @@
      "model": "radial-tangential", "distortion": [k1, k2, p1, p2, k3],
      "depth_scale": 1000, "rms_px": 0.31, "views": 24}
 
-Lengths are pixels.  ``distortion`` (OpenCV's order), ``depth_scale`` (units of a 16-bit depth image in a
-metre), ``rate_hz`` (of images that state no time), ``rms_px`` and ``views`` (of the calibration) may be left
-out, and ``model`` for all lenses but ``fisheye`` (Kannala and Brandt), whose ``distortion`` is
-``[k1, k2, k3, k4]``.  The names that other programs give to these fields are read as well; an unknown field
-is refused, since it may state what would be missed.
+Lengths are pixels.  These fields may be left out:  ``distortion`` (coefficients in OpenCV's order), ``model``
+(``radial-tangential`` by default, or ``fisheye`` with ``[k1, k2, k3, k4]``), ``depth_scale`` (units of a
+16-bit depth image in a metre), ``rate_hz`` (of images that have no time stamps), ``rms_px`` (reprojection
+error of the calibration) and ``views`` (number of its images).  Fields that other programs name differently
+are read too.  A field that is not known is refused, because the camera may differ by what the field states.
 """
 
 from __future__ import annotations
@@ -20,46 +21,43 @@ import json
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, TypeVar, get_args
+from typing import Any, TypeVar
 
 import numpy as np
 
-from client_sdk.frontend import load_opencv
-from client_sdk.image_map import ImageMap
 from rse_pf.config.validation import did_you_mean
 from rse_pf.errors import InvalidCamera, UsageError
 from rse_pf.files import read_document
-from rse_pf.geometry import Array, Camera
+from rse_pf.geometry import LENS_MODELS, Camera, Lens, find_lens_model
 from rse_pf.images import MAX_IMAGE_PIXELS
 
 __all__ = [
-    "INTRINSICS_HINT", "TYPICAL_HINT", "Intrinsics", "LensModel", "Undistortion", "intrinsics_of",
-    "lens_maps", "lens_model", "read_intrinsics", "read_json", "told_with", "values_of", "write_intrinsics",
+    "INTRINSICS_HINT",
+    "TYPICAL_HINT",
+    "Intrinsics",
+    "intrinsics_to_json",
+    "name_file_in_errors",
+    "parse_intrinsics",
+    "parse_lens_model",
+    "read_intrinsics",
+    "read_json",
+    "write_intrinsics",
     "write_json",
-]  # fmt: skip
-
-LensModel = Literal["radial-tangential", "fisheye"]
+]
 
 _T = TypeVar("_T")
-_MAX_FILE_BYTES = 1 << 20
-_MAX_DISTORTION = 1e3
-_MIN_DEPTH_SCALE, _MAX_DEPTH_SCALE = 1e-2, 1e7
-_MIN_RATE_HZ, _MAX_RATE_HZ = 1e-3, 1e4
-_DEFAULT_DEPTH_SCALE = 1000.0  # millimetres, as most depth cameras write them
-_LENS_MODELS: dict[str, LensModel] = {
-    **dict.fromkeys(
-        (
-            "radial-tangential", "radtan", "plumb_bob", "brown_conrady", "pinhole", "opencv", "none",
-            "simple_pinhole", "perspective", "",
-        ),
-        "radial-tangential",
-    ),
-    **dict.fromkeys(
-        ("fisheye", "equidistant", "kannala_brandt4", "kannalabrandt8", "opencv_fisheye"), "fisheye"
-    ),
-}  # fmt: skip
-"""Names of lens models, in lower case, in files of EuRoC, Kalibr, ROS, COLMAP, ORB-SLAM3 and nerfstudio."""
-_OTHER_NAMES = {
+_MAX_FILE_BYTES = 1 << 20  # size of intrinsics.json or rig.json: a real file has a few hundred bytes
+_MIN_DEPTH_SCALE = 1e-2  # units of a depth image in a metre: a unit of 100 m measures no room
+_MAX_DEPTH_SCALE = 1e7  # units of a depth image in a metre: 65,535 units of 0.1 um end after 7 mm
+_MIN_RATE_HZ = 1e-3  # images in a second: slower ones show no motion that could be tracked
+_MAX_RATE_HZ = 1e4  # images in a second: no camera is faster
+_DEFAULT_DEPTH_SCALE = 1000.0  # units in a metre where nobody stated them: most depth cameras write mm
+_PERSPECTIVE_NAMES = {"pinhole", "perspective", "simple_pinhole", "none", ""}
+"""Values of a field for the lens model that name a perspective projection, in lower case: the distortion is
+then radial-tangential, as in files of COLMAP, Kalibr and EuRoC."""
+_PROJECTION_ONLY_NAMES = {"pinhole", "perspective", ""}
+"""Values of ``camera_model`` that say nothing of the distortion, which another field may state."""
+_FIELD_ALIASES = {
     **dict.fromkeys(("w", "image_width"), "width"),
     **dict.fromkeys(("h", "image_height"), "height"),
     **dict.fromkeys(("fl_x", "f_x", "fu"), "fx"),
@@ -74,16 +72,31 @@ _OTHER_NAMES = {
     **dict.fromkeys(("camera_matrix", "intrinsic_matrix", "matrix", "K"), "matrix"),
     **dict.fromkeys(("depth_map_factor", "png_depth_scale", "depth_factor"), "depth_scale"),
     **dict.fromkeys(("fps", "frame_rate", "Camera.fps"), "rate_hz"),
-}  # fmt: skip
-"""Fields as OpenCV, ROS, COLMAP, Open3D, librealsense and nerfstudio call them, and as this file does."""
-_NUMBERED = ("k1", "k2", "p1", "p2", "k3"), ("k1", "k2", "k3", "k4")
-"""Coefficients that have fields of their own, of a radial-tangential lens and of a fisheye."""
+}
+"""Field names of OpenCV, ROS, COLMAP, Open3D, librealsense and nerfstudio, each with the name that
+``intrinsics.json`` gives to the same field."""
+_COEFFICIENT_NAMES = {name for model in LENS_MODELS.values() for name in model.coefficient_names}
+"""Distortion coefficients that a file may state in fields of their own, such as ``k1``, of any lens model."""
 _FIELDS = {
-    "fx", "fy", "cx", "cy", "width", "height", "matrix", "distortion", "model", "depth_scale", "rate_hz",
-    "depth_registered_to_color", "rms_px", "views", *_NUMBERED[0], *_NUMBERED[1],
-}  # fmt: skip
+    "fx",
+    "fy",
+    "cx",
+    "cy",
+    "width",
+    "height",
+    "matrix",
+    "distortion",
+    "model",
+    "depth_scale",
+    "rate_hz",
+    "depth_registered_to_color",
+    "rms_px",
+    "views",
+    *_COEFFICIENT_NAMES,
+}
+"""Fields of ``intrinsics.json`` that are read, after `_FIELD_ALIASES` has replaced other names."""
 _REMARKS = {"name", "comment", "description", "source", "serial", "camera_name", "depth_unit"}
-"""Fields for people."""
+"""Fields of ``intrinsics.json`` that are for people, and are accepted without being read."""
 INTRINSICS_HINT = (
     "write fx fy cx cy width height, and distortion [k1 k2 p1 p2 k3] and depth_scale if they are known, as "
     "JSON into intrinsics.json; files of OpenCV, ROS, ORB-SLAM and COLMAP hold them (docs/cameras.md)"
@@ -96,53 +109,38 @@ TYPICAL_HINT = (
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Intrinsics:
-    """A camera, the distortion of its lens (0, 4 or 5 numbers) and the unit of its 16-bit depth images.
+class Intrinsics(Lens):
+    """A calibrated lens, the unit of its 16-bit depth images, and how good the calibration is.
 
-    ``model`` says what the numbers of ``distortion`` are: k1 k2 p1 p2 k3 of a ``radial-tangential`` lens, or
-    k1 k2 k3 k4 of a ``fisheye`` (Kannala and Brandt, PAMI 2006, as OpenCV's fisheye module has it).
-    ``depth_scale`` is None if nobody stated it.  ``rate_hz`` is that of images without a time.
-    ``is_depth_registered`` False says that depth images show another camera's view.  ``rms_px`` and ``views``
-    tell how the camera was calibrated.  All of these are None if unknown.
+    Attributes:
+        depth_scale: Units of a depth image in a metre; None if nobody stated them.
+        rms_px: Root mean square reprojection error of the calibration; None if unknown.
+        views: Number of images of the calibration board that were used; None if unknown.
+        rate_hz: Images in a second, for images that have no time stamps; None if unknown.
+        is_depth_registered: Whether depth images show the view of the colour camera; None if unknown.
 
     Raises:
-        UsageError: A number is impossible.
+        UsageError: The lens model is not known, the coefficients do not fit the model, or a number is not in
+            its range.
     """
 
-    camera: Camera
-    distortion: tuple[float, ...] = ()
     depth_scale: float | None = None
     rms_px: float | None = None
     views: int | None = None
-    model: LensModel = "radial-tangential"
     rate_hz: float | None = None
     is_depth_registered: bool | None = None
 
-    @property
-    def depth_units_per_m(self) -> float:
-        """The ``depth_scale``, or the one that is assumed."""
-        return _DEFAULT_DEPTH_SCALE if self.depth_scale is None else self.depth_scale
-
     def __post_init__(self) -> None:
-        if self.model not in get_args(LensModel):
-            raise UsageError(
-                f"no lens model {self.model!r}", hint=f"write one of {', '.join(get_args(LensModel))}"
-            )
-        if self.model == "fisheye" and len(self.distortion) not in (0, 4):
-            raise UsageError(
-                f"{len(self.distortion)} distortion numbers of a fisheye", hint="give k1 k2 k3 k4"
-            )
-        if len(self.distortion) not in (0, 4, 5) or not all(
-            abs(coefficient) <= _MAX_DISTORTION for coefficient in self.distortion
-        ):
-            raise UsageError(
-                f"{len(self.distortion)} distortion numbers, or one that is not within {_MAX_DISTORTION:g}",
-                hint=INTRINSICS_HINT,
-            )
+        try:
+            Lens.__post_init__(self)
+            LENS_MODELS[self.model].check_stated(self.distortion)
+        except InvalidCamera as error:
+            raise UsageError(error.message, hint=error.hint) from error
         if not _MIN_DEPTH_SCALE <= self.depth_units_per_m <= _MAX_DEPTH_SCALE:
             raise UsageError(
-                f"depth_scale {self.depth_scale:g} is not within {_MIN_DEPTH_SCALE:g}..{_MAX_DEPTH_SCALE:g}",
-                hint="1000 for mm, 5000 for TUM",
+                f"depth_scale {self.depth_scale:g} is not within {_MIN_DEPTH_SCALE:g}..{_MAX_DEPTH_SCALE:g} "
+                "units a metre",
+                hint="write 1000 for depth images in mm, or 5000 for those of TUM",
             )
         if self.rate_hz is not None and not _MIN_RATE_HZ <= self.rate_hz <= _MAX_RATE_HZ:
             raise UsageError(
@@ -156,29 +154,43 @@ class Intrinsics:
                 hint="make the images smaller, and scale fx fy cx cy with them",
             )
 
+    @property
+    def depth_units_per_m(self) -> float:
+        """Units of a depth image in a metre: ``depth_scale``, or 1000 (millimetres) if nobody stated it."""
+        return _DEFAULT_DEPTH_SCALE if self.depth_scale is None else self.depth_scale
+
 
 def read_intrinsics(path: Path | str) -> Intrinsics:
-    """Return the intrinsics of a file.
+    """Return the intrinsics of ``intrinsics.json``, or of a JSON file of another program.
 
     Raises:
         UsageError: The file is missing, lacks a number, has an unknown field, or a number is impossible.
     """
     path = Path(path)
     values = read_json(path, INTRINSICS_HINT)
-    with told_with(path, INTRINSICS_HINT):
-        return intrinsics_of(values)
+    with name_file_in_errors(path, INTRINSICS_HINT):
+        return parse_intrinsics(values)
 
 
 def read_json(path: Path, hint: str) -> Any:
-    """Return what a small file of JSON holds; raises UsageError."""
+    """Return the content of a JSON file of intrinsics of at most 1 MiB.
+
+    Raises:
+        UsageError: The file is missing, too large, or no JSON; *hint* then says what the file should hold.
+    """
     if not path.exists():
         raise UsageError(f"there is no {path}, and the intrinsics are not known", hint=TYPICAL_HINT)
     return read_document(path, "a file of intrinsics", hint=hint, max_bytes=_MAX_FILE_BYTES)
 
 
 @contextlib.contextmanager
-def told_with(path: Path, hint: str) -> Iterator[None]:
-    """Turn what a wrong number raises into one line with the path."""
+def name_file_in_errors(path: Path, hint: str) -> Iterator[None]:
+    """Turn errors of the block that parses the file *path* into a UsageError that names the file.
+
+    Raises:
+        UsageError: The block raised InvalidCamera or UsageError (their hint stays), or an error of Python for
+            a field that is missing or has another type (then with *hint*).
+    """
     try:
         yield
     except (InvalidCamera, UsageError) as error:
@@ -189,10 +201,18 @@ def told_with(path: Path, hint: str) -> Iterator[None]:
         raise UsageError(f"{path} is not a file of intrinsics", hint=hint) from error
 
 
-def intrinsics_of(values: Any) -> Intrinsics:
-    """Return the intrinsics of a JSON object; what is wrong with it raises as it comes, see `told_with`."""
-    values = _with_our_names(values)
-    model = lens_model(values.get("model"))
+def parse_intrinsics(values: Any) -> Intrinsics:
+    """Return the intrinsics that a decoded JSON object states; call it within `name_file_in_errors`.
+
+    Raises:
+        UsageError: A field is unknown or stated twice, or a number is impossible.
+        InvalidCamera: The numbers of the pinhole camera are impossible.
+        KeyError, ValueError, TypeError, AttributeError: A field is missing, or has another type.
+    """
+    # 1. Fields by the names of intrinsics.json.
+    values = _replace_field_aliases(values)
+    model = parse_lens_model(values.get("model"))
+    # 2. The camera matrix, where it is stated instead of fx fy cx cy.
     if "matrix" in values:
         K = np.array(values["matrix"], dtype=np.float64).reshape(3, 3)
         K = K.T if K[2, 0] or K[2, 1] else K  # Open3D writes column after column
@@ -202,118 +222,114 @@ def intrinsics_of(values: Any) -> Intrinsics:
         width=int(values["width"]),
         height=int(values["height"]),
     )
+    # 3. Everything that may be left out.
     return Intrinsics(
         camera=camera,
-        distortion=_distortion(values, model),
-        depth_scale=_optional(values.get("depth_scale"), float),
-        rms_px=_optional(values.get("rms_px"), float),
-        views=_optional(values.get("views"), int),
+        distortion=_parse_distortion(values, model),
+        depth_scale=_convert_optional(values.get("depth_scale"), float),
+        rms_px=_convert_optional(values.get("rms_px"), float),
+        views=_convert_optional(values.get("views"), int),
         model=model,
-        rate_hz=_optional(values.get("rate_hz"), float),
-        is_depth_registered=_optional(values.get("depth_registered_to_color"), bool),
+        rate_hz=_convert_optional(values.get("rate_hz"), float),
+        is_depth_registered=_convert_optional(values.get("depth_registered_to_color"), bool),
     )
 
 
-def lens_model(name: Any) -> LensModel:
-    """Return the model of a lens by one of its names, None for none; raises UsageError."""
-    model = _LENS_MODELS.get("radtan" if name is None else str(name).lower())
+def parse_lens_model(stated: Any) -> str:
+    """Return the name in `LENS_MODELS` of the lens model that a file states; radial-tangential for None.
+
+    Raises:
+        UsageError: No lens model has this name, and the name is not that of a perspective projection.
+    """
+    name = "pinhole" if stated is None else str(stated)
+    if name.lower() in _PERSPECTIVE_NAMES:
+        return "radial-tangential"
+    model = find_lens_model(name)
     if model is None:
         raise UsageError(
             f"the lens model {name!r} is not known",
-            hint=f"calibrate with one of {', '.join(get_args(LensModel))}, or name the model of the numbers",
+            hint=f"calibrate with one of {', '.join(LENS_MODELS)}, or name the model of the numbers",
         )
-    return model
+    return model.name
 
 
-def _with_our_names(values: Any) -> dict[str, Any]:
-    """Return the fields of a file by the names of this module; raises UsageError for one that is unknown."""
-    ours: dict[str, Any] = {}
-    for name, value in values.items():
-        field = _OTHER_NAMES.get(name, name)
-        if field not in _FIELDS and name not in _REMARKS:
+def _replace_field_aliases(values: Any) -> dict[str, Any]:
+    """Return the fields of a file by the names of ``intrinsics.json``.
+
+    Raises:
+        UsageError: A field is not known, or two aliases of one field state different values.
+    """
+    fields: dict[str, Any] = {}
+    for alias, value in values.items():
+        name = _FIELD_ALIASES.get(alias, alias)
+        if name not in _FIELDS and alias not in _REMARKS:
             raise UsageError(
-                f"the field {name!r} is not known", hint=did_you_mean(name, sorted(_FIELDS), INTRINSICS_HINT)
+                f"the field {alias!r} is not known",
+                hint=did_you_mean(alias, sorted(_FIELDS), INTRINSICS_HINT),
             )
-        if field in ours and ours[field] != value and field != "model":
-            raise UsageError(f"{field} is {ours[field]} and, as {name}, {value}", hint="give the field once")
-        if field != "model" or str(value).lower() not in ("pinhole", "perspective", ""):
-            ours[field] = value  # "pinhole" names the projection, not the distortion
-    return ours
+        if name in fields and fields[name] != value and name != "model":
+            raise UsageError(
+                f"{name} is {fields[name]} and, as {alias}, {value}", hint=f"give {name} once, as {name}"
+            )
+        if name != "model" or str(value).lower() not in _PROJECTION_ONLY_NAMES:
+            fields[name] = value
+    return fields
 
 
-def _distortion(values: dict[str, Any], model: LensModel) -> tuple[float, ...]:
-    """Return the coefficients, from one field or from fields of their own; raises UsageError."""
-    names = _NUMBERED[model == "fisheye"]
-    own = [name for name in {*_NUMBERED[0], *_NUMBERED[1]} if float(values.get(name, 0.0))]
+def _parse_distortion(values: dict[str, Any], model: str) -> tuple[float, ...]:
+    """Return the distortion coefficients of a file, which states them as a list or as ``k1``, ``k2``, ...
+
+    Raises:
+        UsageError: Both are stated, or a coefficient is not 0 that the lens model does not have.
+    """
+    names = LENS_MODELS[model].coefficient_names
+    nonzero = {name for name in _COEFFICIENT_NAMES if float(values.get(name, 0.0))}
     if "distortion" not in values:
-        if not set(own) <= set(names):
+        if not nonzero <= set(names):
             raise UsageError(
-                f"a lens of model {model} has no {min(set(own) - set(names))}", hint=INTRINSICS_HINT
+                f"a lens of model {model} has no {min(nonzero - set(names))}", hint=INTRINSICS_HINT
             )
-        return tuple(float(values.get(name, 0.0)) for name in names) if own else ()
-    if own:
+        return tuple(float(values.get(name, 0.0)) for name in names) if nonzero else ()
+    if nonzero:
         raise UsageError("distortion is given twice, as a list and by names", hint="give the list")
     return tuple(float(value) for value in np.ravel(values["distortion"]))
 
 
-def _optional(value: Any, kind: Callable[[Any], _T]) -> _T | None:
-    return None if value is None else kind(value)
+def _convert_optional(value: Any, convert: Callable[[Any], _T]) -> _T | None:
+    return None if value is None else convert(value)
 
 
 def write_intrinsics(path: Path | str, intrinsics: Intrinsics) -> None:
     """Write the file that `read_intrinsics` reads; raises UsageError where it cannot be written."""
-    write_json(path, values_of(intrinsics))
+    write_json(path, intrinsics_to_json(intrinsics))
 
 
 def write_json(path: Path | str, values: Any) -> None:
-    """Write a small file of JSON; raises UsageError where it cannot be written."""
+    """Write *values* as indented JSON; raises UsageError where the file cannot be written."""
     try:
         Path(path).write_text(json.dumps(values, indent=2) + "\n", encoding="utf-8")
     except OSError as error:
         raise UsageError(f"cannot write {path}: {error.strerror}", hint="name another file") from error
 
 
-def values_of(intrinsics: Intrinsics) -> dict[str, Any]:
-    """Return the JSON object of `intrinsics_of`."""
+def intrinsics_to_json(intrinsics: Intrinsics) -> dict[str, Any]:
+    """Return the JSON object that `parse_intrinsics` reads, without what is unknown or the default."""
     camera = intrinsics.camera
     values: dict[str, Any] = {
-        "fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy,
-        "width": camera.width, "height": camera.height,
+        "fx": camera.fx,
+        "fy": camera.fy,
+        "cx": camera.cx,
+        "cy": camera.cy,
+        "width": camera.width,
+        "height": camera.height,
         "distortion": list(intrinsics.distortion),
-    }  # fmt: skip
-    if intrinsics.depth_scale is not None:
-        values["depth_scale"] = intrinsics.depth_scale
-    if intrinsics.rate_hz is not None:
-        values["rate_hz"] = intrinsics.rate_hz
-    if intrinsics.is_depth_registered is not None:
-        values["depth_registered_to_color"] = intrinsics.is_depth_registered
-    if intrinsics.model != "radial-tangential":
-        values["model"] = intrinsics.model
-    if intrinsics.rms_px is not None:
-        values["rms_px"] = round(intrinsics.rms_px, 4)
-    if intrinsics.views is not None:
-        values["views"] = intrinsics.views
-    return values
-
-
-class Undistortion(ImageMap):
-    """Map images of a distorted lens to the pinhole camera of the same intrinsics."""
-
-    def __init__(self, intrinsics: Intrinsics) -> None:
-        distorts = intrinsics.model == "fisheye" or any(intrinsics.distortion)
-        super().__init__(lens_maps(intrinsics, np.eye(3), intrinsics.camera) if distorts else None)
-
-
-def lens_maps(lens: Intrinsics, rotation: Array, camera: Camera) -> tuple[Any, Any]:
-    """Return where pixels of a pinhole *camera*, turned by ``(3, 3)`` *rotation*, lie in images of *lens*.
-
-    Raises:
-        MissingExtra: OpenCV is not installed.
-    """
-    cv2 = load_opencv()
-    make = cv2.fisheye.initUndistortRectifyMap if lens.model == "fisheye" else cv2.initUndistortRectifyMap
-    maps: tuple[Any, Any] = make(
-        lens.camera.matrix, np.array(lens.distortion or (0.0,) * 4), rotation, camera.matrix,
-        (camera.width, camera.height), cv2.CV_32FC1,
-    )  # fmt: skip
-    return maps
+    }
+    optional = {
+        "depth_scale": intrinsics.depth_scale,
+        "rate_hz": intrinsics.rate_hz,
+        "depth_registered_to_color": intrinsics.is_depth_registered,
+        "model": None if intrinsics.model == "radial-tangential" else intrinsics.model,
+        "rms_px": None if intrinsics.rms_px is None else round(intrinsics.rms_px, 4),
+        "views": intrinsics.views,
+    }
+    return values | {name: value for name, value in optional.items() if value is not None}

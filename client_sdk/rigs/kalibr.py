@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from client_sdk.rigs.intrinsics import INTRINSICS_HINT, Intrinsics, lens_model, told_with
+from client_sdk.rigs.intrinsics import INTRINSICS_HINT, Intrinsics, name_file_in_errors, parse_lens_model
 from client_sdk.rigs.rig import Rig, RigCamera, RigImu
 from rse_pf.errors import MissingExtra, UsageError
 from rse_pf.files import read_document
@@ -21,6 +21,7 @@ __all__ = ["read_kalibr"]
 
 _MAX_BYTES = 1 << 18
 _HINT = "name the camchain that kalibr_calibrate_cameras or kalibr_calibrate_imu_camera wrote"
+_IMU_HINT = "it needs the noise densities and random walks of the IMU, and update_rate"
 _MODELS = ("radtan", "none", "equidistant")
 _NAMES = ("left", "right")
 _IMU_FILES = ("imu.yaml", "imu0.yaml")
@@ -34,7 +35,7 @@ def read_kalibr(path: Path) -> Rig:
         MissingExtra: PyYAML is not installed.
     """
     values = _read_yaml(path)
-    with told_with(path, _HINT):
+    with name_file_in_errors(path, _HINT):
         names = sorted(name for name in values if str(name).startswith("cam"))
         if not names or names[0] != "cam0":
             raise UsageError("there is no camera cam0", hint=INTRINSICS_HINT)
@@ -70,7 +71,7 @@ def _lens(values: Any) -> Intrinsics:
     return Intrinsics(
         camera=Camera(fx=fx, fy=fy, cx=cx, cy=cy, width=int(width), height=int(height)),
         distortion=tuple(float(value) for value in values.get("distortion_coeffs", ())),
-        model=lens_model(distortion),
+        model=parse_lens_model(distortion),
     )
 
 
@@ -82,7 +83,7 @@ def _imu_beside(path: Path) -> RigImu | None:
     if file is None:
         return None
     values = _read_yaml(file)
-    with told_with(file, "it needs the noise densities and random walks of the IMU, and update_rate"):
+    with name_file_in_errors(file, _IMU_HINT):
         values = values.get("imu0", values)
         return RigImu(
             T_body_imu=np.eye(4),

@@ -1,52 +1,49 @@
-"""Rectify a stereo pair: both images as of two equal pinhole cameras side by side.
+"""Rectify a stereo pair: resample both images as seen by two equal pinhole cameras, one right of the other.
 
-What is matched in them belongs to `client_sdk.stereo`.
+After that, a point of the scene lies in the same row of both images.  `client_sdk.stereo` matches those rows.
 """
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import numpy.typing as npt
 
-from client_sdk.frontend import load_opencv
 from client_sdk.image_map import ImageMap
-from client_sdk.rigs.intrinsics import Intrinsics, lens_maps
+from client_sdk.rigs.intrinsics import Intrinsics
 from client_sdk.rigs.rig import RigCamera
 from client_sdk.stereo.view import StereoView
 from rse_pf.errors import InvalidCamera, UsageError
-from rse_pf.geometry import Array, Camera, inverse
+from rse_pf.geometry import Array, Camera, inverse, rectify_stereo_pair
 
 __all__ = ["Rectification"]
 
-_LEAST_BASELINE_M = 0.001
-_RECTIFIED = 1e-9
+_MIN_BASELINE_M = 0.001  # between the cameras of a pair: a shorter one is no stereo rig, but a missing pose
+_MIN_SIDEWAYS_SHARE = 0.7  # of the baseline along x of the left camera: less means one camera above the other
+_RECTIFIED_TOLERANCE = 1e-9  # of each number of T_right_left: cameras within it are rectified already
 
 
 class Rectification:
-    """The rectified cameras of a pair, and the maps of its images.
+    """The rectified cameras of a stereo pair, and the maps that rectify its images.
 
     Attributes:
         camera: The pinhole camera of both rectified images.
-        baseline_m: From the left camera to the right one.
-        T_body_camera: ``(4, 4)``, pose of the rectified left camera in the body: it is turned against the
-            left camera, and sits where that sits.
+        baseline_m: Distance from the left camera to the right one.
+        T_body_camera: ``(4, 4)``, metres, pose of the rectified left camera in the body.  It has the position
+            of the left camera and is rotated against it.
 
     Source:
-        Bouguet's method, as OpenCV's ``stereoRectify`` (alpha 0) and ``fisheye.stereoRectify`` (balance 0)
-        implement it.
+        Bouguet's method, see `rse_pf.geometry.rectify_stereo_pair`.
     """
 
     def __init__(self, left: RigCamera, right: RigCamera) -> None:
-        """Compute both maps.
+        """Compute the rectified cameras and the maps of both images.
 
         Raises:
-            UsageError: The cameras do not make a pair: another size or model, the right one on the left, one
-                above the other, or at one place.
+            UsageError: The cameras are no stereo pair: they differ in size or lens model, the right one is on
+                the left, one is above the other, or both are at one position.
             MissingExtra: OpenCV is not installed.
         """
-        self._sizes = [(each.lens.camera.height, each.lens.camera.width) for each in (left, right)]
+        self._sizes = [(camera.lens.camera.height, camera.lens.camera.width) for camera in (left, right)]
         T_right_left = inverse(right.T_body_camera) @ left.T_body_camera
         _check_pair(left, right, inverse(T_right_left)[:3, 3])
         if _is_rectified(left.lens, right.lens, T_right_left):
@@ -55,98 +52,100 @@ class Rectification:
             self.T_body_camera = left.T_body_camera
             self._maps = (ImageMap(None), ImageMap(None))
             return
-        cv2 = load_opencv()
-        rotations, projections = _rectified(cv2, left.lens, right.lens, T_right_left)
-        self.camera = _pinhole(projections[0], left.lens.camera)
+        rotations, projections = rectify_stereo_pair(left.lens, right.lens, T_right_left)
+        self.camera = _pinhole_camera(projections[0], left.lens.camera)
         self.baseline_m = float(-projections[1][0, 3] / projections[1][0, 0])
         T_left_rectified = np.eye(4)
         T_left_rectified[:3, :3] = rotations[0].T
         self.T_body_camera = left.T_body_camera @ T_left_rectified
         self._maps = (
-            ImageMap(lens_maps(left.lens, rotations[0], self.camera)),
-            ImageMap(lens_maps(right.lens, rotations[1], self.camera)),
+            ImageMap(left.lens.undistortion_maps(self.camera, rotations[0])),
+            ImageMap(right.lens.undistortion_maps(self.camera, rotations[1])),
         )
 
     def left(self, rgb: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
-        """Return the rectified left image, ``(h, w, 3)``; raises UsageError for another size."""
+        """Return the rectified image of a left colour image ``(h, w, 3)``.
+
+        Raises:
+            UsageError: The image has not the size that the left camera was calibrated with.
+        """
         self._check_size(0, rgb)
         return self._maps[0].colour(rgb)
 
     def right(self, gray: npt.NDArray[np.uint8]) -> StereoView:
-        """Return the rectified right image of a grey one, ``(h, w)``; raises UsageError for another size."""
+        """Return the rectified image of a right grey image ``(h, w)``, together with the baseline.
+
+        Raises:
+            UsageError: The image has not the size that the right camera was calibrated with.
+        """
         self._check_size(1, gray)
         return StereoView(self._maps[1].colour(gray), self.baseline_m)
 
-    def _check_size(self, which: int, image: npt.NDArray[np.uint8]) -> None:
-        if image.shape[:2] != self._sizes[which]:
-            height, width = self._sizes[which]
+    def _check_size(self, side: int, image: npt.NDArray[np.uint8]) -> None:
+        if image.shape[:2] != self._sizes[side]:
+            height, width = self._sizes[side]
             raise UsageError(
-                f"the {('left', 'right')[which]} image is {image.shape[1]}x{image.shape[0]} px, its camera "
+                f"the {('left', 'right')[side]} image is {image.shape[1]}x{image.shape[0]} px, its camera "
                 f"{width}x{height} px",
                 hint="use the size that the rig was calibrated with",
             )
 
 
-def _check_pair(left: RigCamera, right: RigCamera, right_in_left: Array) -> None:
-    sizes = [(each.lens.camera.width, each.lens.camera.height) for each in (left, right)]
+def _check_pair(left: RigCamera, right: RigCamera, right_in_left_m: Array) -> None:
+    """Refuse two cameras that are no stereo pair; *right_in_left_m* ``(3,)`` is the right camera's position.
+
+    Raises:
+        UsageError: See `Rectification.__init__`.
+    """
+    sizes = [(camera.lens.camera.width, camera.lens.camera.height) for camera in (left, right)]
     if sizes[0] != sizes[1] or left.lens.model != right.lens.model:
         raise UsageError(
             f"the left camera is {left.lens.model}, {sizes[0][0]}x{sizes[0][1]} px, the right one "
             f"{right.lens.model}, {sizes[1][0]}x{sizes[1][1]} px",
             hint="a stereo pair needs two cameras of one size and model",
         )
-    across, distance = float(right_in_left[0]), float(np.linalg.norm(right_in_left))
-    if distance < _LEAST_BASELINE_M:
+    sideways_m, distance_m = float(right_in_left_m[0]), float(np.linalg.norm(right_in_left_m))
+    if distance_m < _MIN_BASELINE_M:
         raise UsageError(
-            f"{right.name} sits {1e3 * distance:.2g} mm from {left.name}: that is no stereo pair",
+            f"{right.name} sits {1e3 * distance_m:.2g} mm from {left.name}: that is no stereo pair",
             hint="check T_body_camera of both, in metres",
         )
-    if abs(across) < 0.7 * distance:
+    if abs(sideways_m) < _MIN_SIDEWAYS_SHARE * distance_m:
         raise UsageError(
-            f"{right.name} is not beside {left.name}, but {right_in_left.round(3).tolist()} m from it",
+            f"{right.name} is not beside {left.name}, but {right_in_left_m.round(3).tolist()} m from it",
             hint="check T_body_camera of both: x of a camera points to the right",
         )
-    if across < 0.0:
+    if sideways_m < 0.0:
         raise UsageError(
-            f"{right.name} sits {-across:.3g} m to the left of {left.name}: the cameras are swapped",
-            hint="name the left camera first, or turn T_body_camera around (inverted?)",
+            f"{right.name} sits {-sideways_m:.3g} m to the left of {left.name}: the cameras are swapped",
+            hint="name the left camera first, or invert T_body_camera if it maps the body into the camera",
         )
 
 
 def _is_rectified(left: Intrinsics, right: Intrinsics, T_right_left: Array) -> bool:
-    aside = T_right_left - np.eye(4)
-    aside[0, 3] = 0.0
-    same = left.camera == right.camera and not any(left.distortion) and not any(right.distortion)
-    return same and left.model == "radial-tangential" and bool((np.abs(aside) < _RECTIFIED).all())
+    """Whether both cameras are one pinhole camera, and differ by a translation along x only."""
+    deviation = T_right_left - np.eye(4)
+    deviation[0, 3] = 0.0
+    are_equal_pinholes = left.camera == right.camera and left.is_pinhole and right.is_pinhole
+    return are_equal_pinholes and bool((np.abs(deviation) < _RECTIFIED_TOLERANCE).all())
 
 
-def _rectified(
-    cv2: Any, left: Intrinsics, right: Intrinsics, T_right_left: Array
-) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-    """Return rotations ``(3, 3)`` from each camera to its rectified one, and both ``(3, 4)`` projections."""
-    lenses = (
-        left.camera.matrix, _coefficients(left), right.camera.matrix, _coefficients(right),
-        (left.camera.width, left.camera.height), T_right_left[:3, :3], T_right_left[:3, 3],
-    )  # fmt: skip
-    if left.model == "fisheye":
-        R1, R2, P1, P2, _ = cv2.fisheye.stereoRectify(*lenses, flags=cv2.CALIB_ZERO_DISPARITY, balance=0.0)
-    else:
-        R1, R2, P1, P2, _, _, _ = cv2.stereoRectify(*lenses, flags=cv2.CALIB_ZERO_DISPARITY, alpha=0.0)
-    return (R1, R2), (P1, P2)
+def _pinhole_camera(projection: Array, camera: Camera) -> Camera:
+    """Return the pinhole camera of a ``(3, 4)`` rectified projection, with the image size of *camera*.
 
-
-def _pinhole(projection: Array, camera: Camera) -> Camera:
+    Raises:
+        UsageError: The rectified intrinsics are those of no camera: distortion or poses are far off.
+    """
     try:
         return Camera(
-            fx=float(projection[0, 0]), fy=float(projection[1, 1]),
-            cx=float(projection[0, 2]), cy=float(projection[1, 2]),
-            width=camera.width, height=camera.height,
-        )  # fmt: skip
+            fx=float(projection[0, 0]),
+            fy=float(projection[1, 1]),
+            cx=float(projection[0, 2]),
+            cy=float(projection[1, 2]),
+            width=camera.width,
+            height=camera.height,
+        )
     except InvalidCamera as error:
         raise UsageError(
             f"the pair cannot be rectified: {error.message}", hint="check the distortion and T_body_camera"
         ) from error
-
-
-def _coefficients(lens: Intrinsics) -> Array:
-    return np.array(lens.distortion or (0.0, 0.0, 0.0, 0.0))

@@ -21,10 +21,10 @@ import numpy as np
 from client_sdk.rigs.intrinsics import (
     INTRINSICS_HINT,
     Intrinsics,
-    intrinsics_of,
+    intrinsics_to_json,
+    name_file_in_errors,
+    parse_intrinsics,
     read_json,
-    told_with,
-    values_of,
     write_json,
 )
 from client_sdk.rigs.kalibr import read_kalibr
@@ -66,9 +66,9 @@ def read_calibration(path: Path | str) -> Intrinsics | Rig:
         return read_kalibr(path)
     values = read_json(path, INTRINSICS_HINT)
     if isinstance(values, dict) and "cameras" not in values:
-        with told_with(path, INTRINSICS_HINT):
-            return intrinsics_of(values)
-    with told_with(path, _HINT):
+        with name_file_in_errors(path, INTRINSICS_HINT):
+            return parse_intrinsics(values)
+    with name_file_in_errors(path, _HINT):
         return Rig(
             cameras=tuple(_camera(each) for each in values["cameras"]),
             imu=None if values.get("imu") is None else _imu(values["imu"]),
@@ -81,7 +81,7 @@ def write_rig(path: Path | str, rig: Rig) -> None:
         "cameras": [
             {
                 "name": each.name,
-                **values_of(each.lens),
+                **intrinsics_to_json(each.lens),
                 "T_body_camera": each.T_body_camera.tolist(),
                 "time_offset_s": each.time_offset_s,
             }
@@ -101,7 +101,7 @@ def write_rig(path: Path | str, rig: Rig) -> None:
 def _camera(values: Any) -> RigCamera:
     lens = {name: value for name, value in values.items() if name not in _OF_RIG}
     return RigCamera(
-        name=str(values["name"]), lens=intrinsics_of(lens), T_body_camera=_pose(values["T_body_camera"]),
+        name=str(values["name"]), lens=parse_intrinsics(lens), T_body_camera=_pose(values["T_body_camera"]),
         time_offset_s=float(values.get("time_offset_s", 0.0)),
     )  # fmt: skip
 

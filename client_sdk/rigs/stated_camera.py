@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from client_sdk.rigs.benchmark_files import read_numbers, read_text
-from client_sdk.rigs.intrinsics import INTRINSICS_HINT, Intrinsics, read_intrinsics, told_with
+from client_sdk.rigs.intrinsics import INTRINSICS_HINT, Intrinsics, name_file_in_errors, read_intrinsics
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Camera
 
@@ -43,7 +43,7 @@ def stated_camera(folder: Path, size_px: Callable[[], tuple[int, int]]) -> tuple
             K = np.array(values).reshape(side, side)
             fx, fy, cx, cy = values if side == 2 else (K[0, 0], K[1, 1], K[0, 2], K[1, 2])
             width, height = size_px()
-            with told_with(file, INTRINSICS_HINT):
+            with name_file_in_errors(file, INTRINSICS_HINT):
                 camera = Camera(
                     fx=float(fx), fy=float(fy), cx=float(cx), cy=float(cy), width=width, height=height
                 )

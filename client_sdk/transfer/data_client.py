@@ -48,7 +48,7 @@ from rse_pf.errors import (
     Unauthorized,
     UsageError,
 )
-from rse_pf.maps.photos import Lens, MapOutline, PhotoLocation
+from rse_pf.maps.photos import MapOutline, PhotoLens, PhotoLocation
 from rse_pf.maps.record import MapRecord
 
 __all__ = ["DataClient", "DataOptions", "OnBytes", "is_allowed"]
@@ -238,7 +238,7 @@ class DataClient:
             parent = None
         return self.commit_map(name, data, parent=parent, note=note)
 
-    def localise(self, name: str, photo: bytes, lens: Lens) -> PhotoLocation:
+    def localise(self, name: str, photo: bytes, lens: PhotoLens) -> PhotoLocation:
         """Return where a photo was taken in the head of a map.
 
         Args:

@@ -53,7 +53,7 @@ from rse_pf.errors import BadRequest, Conflict, NotFound
 from rse_pf.identity import RobotId
 from rse_pf.maps.charges import charge_name
 from rse_pf.maps.describe import MapSummary
-from rse_pf.maps.photos import Lens
+from rse_pf.maps.photos import PhotoLens
 from rse_pf.maps.registry import MapContent, MapOrigin, MapRecord, MapRegistry
 from rse_pf.maps.removal import freed_bytes, superseded
 from rse_pf.object_store import DirectoryStore, ObjectStore, PresigningStore
@@ -75,7 +75,7 @@ _BEGINNING = re.compile(r"[0-9a-f]{0,64}")
 _MAP_THREADS = 1
 """They wait for the process that reads maps, so that slow maps delay only other maps."""
 _PROBE = "ready/probe"
-_LENS = frozenset(Lens.__struct_fields__)
+_LENS = frozenset(PhotoLens.__struct_fields__)
 _COUNT = re.compile(r"[0-9]{1,6}")
 
 
@@ -448,12 +448,12 @@ def _version(status: int, record: MapRecord) -> HttpReply:
     return json_reply(status, MapVersionInfo(id=record.id, record=record))
 
 
-def _lens(query: Mapping[str, str]) -> Lens:
+def _lens(query: Mapping[str, str]) -> PhotoLens:
     """Return the lens that a query describes; raises BadRequest."""
     values: dict[str, Any] = {name: text for name, text in query.items() if name in _LENS}
     values["distortion"] = [each for each in values.get("distortion", "").split(",") if each]
     try:
-        return msgspec.convert(values, Lens, strict=False)
+        return msgspec.convert(values, PhotoLens, strict=False)
     except msgspec.ValidationError as error:
         raise BadRequest(
             f"the query is not a lens: {error}", hint="write ?fx=525&fy=525&cx=319.5&cy=239.5, pixels"

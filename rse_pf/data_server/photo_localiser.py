@@ -19,7 +19,7 @@ from rse_pf.config import PlatformSettings
 from rse_pf.data_server.robot_processes import RobotProcesses, max_map_bytes, shared_store
 from rse_pf.errors import MissingExtra
 from rse_pf.identity import RobotId
-from rse_pf.maps.photos import Lens, MapOutline, PhotoLocation
+from rse_pf.maps.photos import MapOutline, PhotoLens, PhotoLocation
 from rse_pf.maps.registry import MapRegistry
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ class _Request(msgspec.Struct, frozen=True, kw_only=True):
     tenant: str
     name: str
     photo: bytes | None = None
-    lens: Lens | None = None
+    lens: PhotoLens | None = None
     version: str = ""
     data: bytes = b""
 
@@ -57,7 +57,7 @@ class PhotoLocaliser:
         self._processes = processes
 
     def localise(
-        self, robot: RobotId, name: str, photo: bytes, lens: Lens, charge: Callable[[float], None]
+        self, robot: RobotId, name: str, photo: bytes, lens: PhotoLens, charge: Callable[[float], None]
     ) -> PhotoLocation:
         """Return where *photo*, which *robot* sent, was taken in the head of the map *name*; blocks.
 

@@ -17,6 +17,7 @@ import msgspec
 
 from rse_pf.config.front_door import LOCALISE_PATH
 from rse_pf.data_server.http import HttpFailure
+from rse_pf.geometry import LENS_MODELS
 from rse_pf.maps.photos import MapOutline, PhotoLocation
 from rse_pf.maps.registry import MapRecord
 
@@ -210,7 +211,7 @@ _LENS = (
     Field(name="distortion", place="query", doc="k1,k2,p1,p2[,k3], or k1,k2,k3,k4 of a fisheye"),
     Field(
         name="model", place="query", doc="of the lens",
-        schema={"type": "string", "enum": ["radial-tangential", "fisheye"]},
+        schema={"type": "string", "enum": list(LENS_MODELS)},
     ),
 )  # fmt: skip
 

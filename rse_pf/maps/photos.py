@@ -1,25 +1,29 @@
-"""What is said by HTTP about photos and maps: a lens, where a photo was taken, and a map seen from above."""
+"""What clients and the data server exchange about photos and maps by HTTP.
+
+A photo is localised in a map: the request states the lens, the reply the pose of the camera.  An outline
+shows a map from above.
+"""
 
 from __future__ import annotations
 
-from typing import Literal
-
 import msgspec
 
-from rse_pf.errors import BadRequest
+from rse_pf.errors import BadRequest, InvalidCamera
+from rse_pf.geometry import LENS_MODELS
 
-__all__ = ["Lens", "MapOutline", "PhotoLocation"]
-
-_MAX_DISTORTION = 1e3
+__all__ = ["MapOutline", "PhotoLens", "PhotoLocation"]
 
 
-class Lens(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """Intrinsics of a photo, px, for an image of *width* by *height*; 0 is the photo's own size.
+class PhotoLens(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """The camera and lens that took a photo, as the query of a request states them.
 
-    *distortion* has 0, 4 or 5 numbers in OpenCV's order, and of a fisheye 0 or 4.
+    ``fx``, ``fy``, ``cx`` and ``cy`` are pixels of an image of ``width`` by ``height``; 0 for both means the
+    size of the photo itself.  ``model`` is a name of `rse_pf.geometry.LENS_MODELS`, and ``distortion`` holds
+    the coefficients of this model in OpenCV's order, or nothing.
 
     Raises:
-        BadRequest: Numbers are too many or too large, or only one of width and height is given.
+        BadRequest: The model is not known, the coefficients do not fit the model, or only one of width and
+            height is given.
     """
 
     fx: float
@@ -29,17 +33,18 @@ class Lens(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     width: int = 0
     height: int = 0
     distortion: tuple[float, ...] = ()
-    model: Literal["radial-tangential", "fisheye"] = "radial-tangential"
+    model: str = "radial-tangential"
 
     def __post_init__(self) -> None:
-        counts = (0, 4) if self.model == "fisheye" else (0, 4, 5)
-        if len(self.distortion) not in counts or not all(
-            abs(each) <= _MAX_DISTORTION for each in self.distortion
-        ):
+        model = LENS_MODELS.get(self.model)
+        if model is None:
             raise BadRequest(
-                f"{len(self.distortion)} distortion numbers, or one that is not within {_MAX_DISTORTION:g}",
-                hint="send k1,k2,p1,p2,k3, or k1,k2,k3,k4 of a fisheye",
+                f"no lens model {self.model!r}", hint=f"send model={' or model='.join(LENS_MODELS)}"
             )
+        try:
+            model.check_stated(self.distortion)
+        except InvalidCamera as error:
+            raise BadRequest(error.message, hint=error.hint) from error
         if (self.width > 0) != (self.height > 0) or min(self.width, self.height) < 0:
             raise BadRequest(
                 f"intrinsics of an image of {self.width}x{self.height} px",
@@ -48,13 +53,14 @@ class Lens(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
 
 
 class PhotoLocation(msgspec.Struct, frozen=True, kw_only=True):
-    """Where a photo was taken in version *version* of a map.
+    """Where a photo was taken, in the frame of version ``version`` of a map.
 
-    ``verdict`` is ok; weak, with a *reason*; or lost, with a reason and without a pose.  ``T_map_camera`` is
-    4x4, metres, and ``covariance`` 6x6 that of the twist (metres, radians) on the left of it.  From it come
-    *position_sigma_m* and *turn_sigma_deg*, the standard deviations of the camera's place and direction in
-    space.  *inliers* and
-    *rmse_px* are those of the best keyframe; *keyframes* are the ids of those that agree, best first.
+    ``verdict`` is ``ok``, ``weak`` with a ``reason``, or ``lost`` with a reason and without a pose.
+    ``T_map_camera`` is the 4x4 pose of the camera, metres.  ``covariance`` is the 6x6 covariance of the twist
+    (metres, then radians) that perturbs the pose on its left.  ``position_sigma_m`` and ``turn_sigma_deg``
+    are standard deviations of the position and of the orientation of the camera, each over all three axes.
+    ``inliers`` and ``rmse_px`` belong to the best keyframe.  ``keyframes`` are the ids of the keyframes that
+    agree on the pose, best first.
     """
 
     version: str
@@ -70,9 +76,10 @@ class PhotoLocation(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class MapOutline(msgspec.Struct, frozen=True, kw_only=True):
-    """Version *version* of a map from above: places of its keyframes and of some of its points, metres.
+    """Version ``version`` of a map, seen from above, metres.
 
-    A position of the map is at ``top_view`` (2x3) times the position.
+    ``top_view`` is the 2x3 matrix that projects a position of the map into the plane seen from above.
+    ``keyframes`` and ``points`` hold such 2D positions of some keyframes and of some map points.
     """
 
     version: str

@@ -20,13 +20,16 @@ from client_sdk.source_facts import (
     unresolved,
 )
 from rse_pf.errors import UsageError
-from rse_pf.geometry import Camera
+from rse_pf.geometry import Camera, Lens
 
 
 def camera(size: tuple[int, int] = (640, 480), **facts: Any) -> dict[str, Any]:
     numbers = {name: facts.pop(name, value) for name, value in {"fx": 525.0, "cx": 319.5}.items()}
-    stated = Camera(fy=numbers["fx"], cy=239.5, width=size[0], height=size[1], **numbers)
-    return {"cameras": (CameraFacts(stated_by="intrinsics.json", camera=stated, **facts),)}
+    lens = Lens(
+        camera=Camera(fy=numbers["fx"], cy=239.5, width=size[0], height=size[1], **numbers),
+        model=facts.pop("model", "radial-tangential"),
+    )
+    return {"cameras": (CameraFacts(stated_by="intrinsics.json", lens=lens, **facts),)}
 
 
 def depth(median_m: float | None, *, is_unit_stated: bool = True) -> dict[str, Any]:
@@ -96,7 +99,7 @@ def test_unlikely_facts_are_named_until_they_are_accepted(
     [
         {},
         camera(image_size_px=(640, 480)),
-        camera(fx=100.0, is_fisheye=True),
+        camera(fx=100.0, model="fisheye"),
         depth(None),
         depth(12.0),
         {"times": (times(0, 1, 2.5),), "references": (times(-5, 1, 9),)},

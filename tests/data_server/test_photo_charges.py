@@ -11,7 +11,7 @@ from fake_data_service import Service, small_settings
 from rse_pf.data_server.photo_localiser import PhotoLocaliser
 from rse_pf.errors import BadRequest
 from rse_pf.identity import RobotId
-from rse_pf.maps.photos import Lens, PhotoLocation
+from rse_pf.maps.photos import PhotoLens, PhotoLocation
 from rse_pf.object_store import MemoryStore
 
 ROBOT = RobotId("acme", "robot-1")
@@ -26,7 +26,7 @@ class Localiser:
         self.cpu_s, self.calls = 0.0, 0
 
     def localise(
-        self, robot: RobotId, name: str, photo: bytes, lens: Lens, charge: Callable[[float], None]
+        self, robot: RobotId, name: str, photo: bytes, lens: PhotoLens, charge: Callable[[float], None]
     ) -> PhotoLocation:
         self.calls += 1
         charge(self.cpu_s)

@@ -18,7 +18,7 @@ from rse_pf.files import read_regular_file
 from rse_pf.geometry import Camera, rotation_angle_deg, to_quaternion
 from rse_pf.maps.descriptors import check_same_kind
 from rse_pf.maps.format import MapVersion
-from rse_pf.maps.photos import Lens, PhotoLocation
+from rse_pf.maps.photos import PhotoLens, PhotoLocation
 from rse_pf.maps.registry import MapRegistry
 from rse_pf.terminal import at_work, show, show_json
 
@@ -124,7 +124,7 @@ def localise_photos(args: argparse.Namespace) -> int:
     return _finish(args, found)
 
 
-def _lens_of(args: argparse.Namespace) -> Lens:
+def _lens_of(args: argparse.Namespace) -> PhotoLens:
     if (args.intrinsics is None) == (args.camera is None):
         raise UsageError(
             "a platform needs --intrinsics FILE, or --camera FX,FY,CX,CY, and not both",
@@ -132,12 +132,12 @@ def _lens_of(args: argparse.Namespace) -> Lens:
         )
     if args.camera is not None:
         fx, fy, cx, cy = _four_numbers(args.camera)
-        return Lens(fx=fx, fy=fy, cx=cx, cy=cy)
+        return PhotoLens(fx=fx, fy=fy, cx=cx, cy=cy)
     from client_sdk.rigs.intrinsics import read_intrinsics
 
     read = read_intrinsics(args.intrinsics)
     camera = read.camera
-    return Lens(
+    return PhotoLens(
         fx=camera.fx, fy=camera.fy, cx=camera.cx, cy=camera.cy, width=camera.width, height=camera.height,
         distortion=read.distortion, model=read.model,
     )  # fmt: skip

@@ -1,6 +1,7 @@
 """Localise a photo: from a JPEG or PNG and the lens that took it to the pose of the camera in a map.
 
-The photo gets the features that keyframes have, and `rse_pf.services.mapping.localise` decides.
+The photo gets the same ORB features as keyframes, and `rse_pf.services.mapping.localise` computes the pose.
+This module also draws the outline of a map, on which clients show the result.
 """
 
 from __future__ import annotations
@@ -12,11 +13,11 @@ import numpy as np
 import numpy.typing as npt
 
 from rse_pf.errors import BadRequest
-from rse_pf.geometry import Array, Camera
+from rse_pf.geometry import Array, Camera, Lens
 from rse_pf.images import decode_photo, load_opencv, photo_size
 from rse_pf.maps.descriptors import ORB, check_same_kind
 from rse_pf.maps.format import MapVersion
-from rse_pf.maps.photos import Lens, MapOutline, PhotoLocation
+from rse_pf.maps.photos import MapOutline, PhotoLens, PhotoLocation
 from rse_pf.services.mapping.localise import LocaliseOptions, LocaliseReply, locate
 from rse_pf.services.mapping.place import MapIndex, check_comparisons
 from rse_pf.slam.level_surfaces import estimate_up
@@ -25,153 +26,181 @@ from rse_pf.slam.relative_pose import View
 
 __all__ = ["localise_photo", "location_of", "outline_of"]
 
-_FEATURES = 1000
-"""As many as a robot finds in a frame of its own."""
-_LEVEL = 1.2
-"""A photo whose focal length is longer than the map's by more than one level of the pyramid is made
-smaller."""
-_MOST_PIXELS = 4
-"""Times the pixels of the map's largest image: features are sought in no more."""
-_ASPECT = 0.01
-"""Intrinsics of another size of the same image may differ so much in its aspect ratio."""
-_UNDISTORTED_PX = 0.5
-"""A pixel that its lens does not bring back to where it was is not used."""
-_MOST_KEYFRAMES, _MOST_POINTS = 2000, 4000
-"""Of an outline."""
+_MAX_FEATURES = 1000  # ORB features of a photo: as many as a robot finds in one of its frames
+_MAX_FOCAL_RATIO = 1.2
+"""Focal length of a photo over that of the map's images, in pixels: a photo with a longer one is made
+smaller, because beyond one level of ORB's image pyramid (1.2) the same corners get other descriptors."""
+_MAX_PIXEL_RATIO = (
+    4  # pixels of a photo over those of the map's largest image: a larger photo is made smaller
+)
+_MAX_ASPECT_DIFFERENCE = 0.01
+"""Relative difference of aspect ratio between a photo and its intrinsics: rounding of a resized photo stays
+below 1 %, and a cropped or rotated photo differs by more."""
+_MAX_ROUND_TRIP_PX = 0.5
+"""Distance between a pixel and the same pixel undistorted and distorted again: beyond it, the iterative
+inverse of the distortion has failed, and the feature at the pixel is not used."""
+_MAX_OUTLINE_KEYFRAMES = 2000  # positions of keyframes in an outline, so that it stays below 100 kB
+_MAX_OUTLINE_POINTS = 4000  # map points in an outline, so that it stays below 100 kB
 
 
-def localise_photo(data: bytes, lens: Lens, index: MapIndex) -> LocaliseReply:
-    """Return where a photo was taken among the keyframes of *index*.
+def localise_photo(data: bytes, photo_lens: PhotoLens, index: MapIndex) -> LocaliseReply:
+    """Return the pose of the camera that took a photo, relative to the keyframes of *index*.
 
     Args:
-        data: A JPEG or PNG.
-        lens: What took it.
-        index: Of a map with ORB features.
+        data: A JPEG or PNG file.
+        photo_lens: The intrinsics and the distortion of the photo.
+        index: The index of a map with ORB features.
 
     Raises:
         BadRequest, LimitExceeded: The photo or its intrinsics cannot be used, or the map has other features.
-        InvalidCamera: An intrinsic is impossible.
+        InvalidCamera: The intrinsics describe no camera.
         MissingExtra: OpenCV or the native core is not installed.
     """
+    # 1. The camera of the photo, and of the smaller image in which features are sought.
     check_same_kind(index.kind, ORB, "the map")
-    whole = _camera_of(lens, *photo_size(data))
-    camera = _searched(whole, [keyframe.camera for keyframe in index.keyframes])
+    camera_of_photo = _camera_of_photo(photo_lens, *photo_size(data))
+    camera = _camera_for_features(camera_of_photo, [keyframe.camera for keyframe in index.keyframes])
+    # 2. ORB features of this image.
     rgb = decode_photo(data)
-    if camera != whole:
+    if camera != camera_of_photo:
         cv2 = load_opencv()
         rgb = cv2.resize(rgb, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
-    found = describe_orb(rgb, _FEATURES)
-    pixels, is_used = _undistorted(found.pixels, camera, lens)
-    view = View(camera=camera, pixels=pixels[is_used], descriptors=found.descriptors[is_used])
+    features = describe_orb(rgb, _MAX_FEATURES)
+    # 3. Their pixels without the distortion of the lens.
+    lens = Lens(camera=camera, distortion=photo_lens.distortion, model=photo_lens.model)
+    pixels, is_valid = _undistort_features(features.pixels, lens)
+    # 4. Place recognition and relative pose.
+    view = View(camera=camera, pixels=pixels[is_valid], descriptors=features.descriptors[is_valid])
     check_comparisons(index, view, LocaliseOptions().candidates)
     return locate(index, view)
 
 
-def location_of(found: LocaliseReply, version: str) -> PhotoLocation:
-    """Return a reply of `localise_photo` as it is sent."""
-    pose, covariance = found.T_map_camera, found.covariance
-    said = PhotoLocation(
-        version=version, verdict=found.verdict, reason=found.reason, inliers=found.inliers,
-        rmse_px=round(found.rmse_px, 3), keyframes=found.keyframes,
-    )  # fmt: skip
-    if pose is None or covariance is None:
-        return said
-    x, y, z = pose[:3, 3]
-    # The twist moves the camera's place by its own metres, and by its turn around the origin of the map.
-    moved = np.hstack([np.eye(3), [[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]]])
-    return msgspec.structs.replace(
-        said, T_map_camera=pose.tolist(), covariance=covariance.tolist(),
-        position_sigma_m=_sigma(moved @ covariance @ moved.T),
-        turn_sigma_deg=math.degrees(_sigma(covariance[3:, 3:])),
-    )  # fmt: skip
+def location_of(reply: LocaliseReply, version: str) -> PhotoLocation:
+    """Return the result of `localise_photo` as the HTTP reply, with standard deviations for people.
 
-
-def outline_of(map_version: MapVersion, version: str) -> MapOutline:
-    """Return a map, which has keyframes, as it is seen from above.
-
-    Up is that of its floor plan: what the map says, or what its floor and its cameras tell.
+    ``position_sigma_m`` is the root of the trace of the covariance of the camera's position, and
+    ``turn_sigma_deg`` that of its rotation.  *version* is the id of the map version that was searched.
     """
-    poses = np.array([keyframe.T_world_camera for keyframe in map_version.keyframes])
-    up = estimate_up(map_version)
-    axes = _top_view(np.array([0.0, 0.0, 1.0]) if up is None else up[0])
-    points = np.asarray(map_version.points, dtype=np.float64).reshape(-1, 3)
-    return MapOutline(
+    pose, covariance = reply.T_map_camera, reply.covariance
+    location = PhotoLocation(
         version=version,
-        top_view=axes.tolist(),
-        keyframes=np.round(_thinned(poses[:, :3, 3], _MOST_KEYFRAMES) @ axes.T, 3).tolist(),
-        points=np.round(_thinned(points, _MOST_POINTS) @ axes.T, 3).tolist(),
+        verdict=reply.verdict,
+        reason=reply.reason,
+        inliers=reply.inliers,
+        rmse_px=round(reply.rmse_px, 3),
+        keyframes=reply.keyframes,
+    )
+    if pose is None or covariance is None:
+        return location
+    x, y, z = pose[:3, 3]
+    # A twist (rho, phi) left of the pose moves the camera's position t by rho + phi x t: J = [I, -skew(t)].
+    J = np.hstack([np.eye(3), [[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]]])
+    return msgspec.structs.replace(
+        location,
+        T_map_camera=pose.tolist(),
+        covariance=covariance.tolist(),
+        position_sigma_m=_total_deviation(J @ covariance @ J.T),
+        turn_sigma_deg=math.degrees(_total_deviation(covariance[3:, 3:])),
     )
 
 
-def _camera_of(lens: Lens, width: int, height: int) -> Camera:
-    """Return the camera of a photo of this size.
+def outline_of(map_version: MapVersion, version: str) -> MapOutline:
+    """Return a map seen from above: positions of some keyframes and points, projected along the vertical.
+
+    The vertical is what the map states, or what its floor and its cameras show; without either, the z axis of
+    the map.  The map must have a keyframe.  *version* is the id of the map version.
+    """
+    poses = np.array([keyframe.T_world_camera for keyframe in map_version.keyframes])
+    up = estimate_up(map_version)
+    axes = _top_view_axes(np.array([0.0, 0.0, 1.0]) if up is None else up[0])
+    points = np.asarray(map_version.points, dtype=np.float64).reshape(-1, 3)
+    keyframes_2d = _take_evenly(poses[:, :3, 3], _MAX_OUTLINE_KEYFRAMES) @ axes.T
+    points_2d = _take_evenly(points, _MAX_OUTLINE_POINTS) @ axes.T
+    return MapOutline(
+        version=version,
+        top_view=axes.tolist(),
+        keyframes=np.round(keyframes_2d, 3).tolist(),
+        points=np.round(points_2d, 3).tolist(),
+    )
+
+
+def _camera_of_photo(photo_lens: PhotoLens, width: int, height: int) -> Camera:
+    """Return the camera of a photo of *width* by *height* pixels, whose intrinsics may be of another size.
 
     Raises:
-        BadRequest: The intrinsics are for an image of another shape.
-        InvalidCamera: A number is impossible.
+        BadRequest: The intrinsics are for an image of another aspect ratio.
+        InvalidCamera: The intrinsics describe no camera.
     """
-    given = lens.width or width, lens.height or height
-    if abs((width / given[0]) / (height / given[1]) - 1.0) > _ASPECT:
+    stated = photo_lens.width or width, photo_lens.height or height
+    if abs((width / stated[0]) / (height / stated[1]) - 1.0) > _MAX_ASPECT_DIFFERENCE:
         raise BadRequest(
-            f"the intrinsics are for {given[0]}x{given[1]} px, the photo has {width}x{height}",
+            f"the intrinsics are for {stated[0]}x{stated[1]} px, the photo has {width}x{height}",
             hint="send those of this camera, without cropping or turning the photo",
         )
-    whole = Camera(fx=lens.fx, fy=lens.fy, cx=lens.cx, cy=lens.cy, width=given[0], height=given[1])
-    return _resized(whole, width, height)
+    camera = Camera(
+        fx=photo_lens.fx,
+        fy=photo_lens.fy,
+        cx=photo_lens.cx,
+        cy=photo_lens.cy,
+        width=stated[0],
+        height=stated[1],
+    )
+    return _resize_camera(camera, width, height)
 
 
-def _sigma(covariance: Array) -> float:
+def _total_deviation(covariance: Array) -> float:
+    """Return the standard deviation over all axes: the root of the trace."""
     return math.sqrt(float(np.trace(covariance)))
 
 
-def _top_view(up: Array) -> Array:
-    """Return the ``(2, 3)`` axes of a plane that is seen from above, of the unit vector *up*."""
+def _top_view_axes(up: Array) -> Array:
+    """Return two orthogonal unit vectors ``(2, 3)`` that span the plane orthogonal to *up* ``(3,)``."""
     right = np.eye(3)[int(np.argmin(np.abs(up)))]
     right = right - (right @ up) * up
     right /= np.linalg.norm(right)
     return np.stack([right, np.cross(up, right)])
 
 
-def _thinned(points: Array, most: int) -> Array:
-    return points[:: max(1, math.ceil(len(points) / most))]
+def _take_evenly(points: Array, max_count: int) -> Array:
+    return points[:: max(1, math.ceil(len(points) / max_count))]
 
 
-def _searched(camera: Camera, of_map: list[Camera]) -> Camera:
-    """Return the camera of the photo as features are sought in it: as finely as the map's images show."""
-    focal = float(np.median([each.fx for each in of_map]))
-    scale = focal / camera.fx if camera.fx > _LEVEL * focal else 1.0
-    most = _MOST_PIXELS * max(each.width * each.height for each in of_map)
-    scale = min(scale, math.sqrt(most / (camera.width * camera.height)))
+def _camera_for_features(camera: Camera, map_cameras: list[Camera]) -> Camera:
+    """Return the camera of the photo, made smaller until it shows as much detail as the images of the map.
+
+    Limits are `_MAX_FOCAL_RATIO` and `_MAX_PIXEL_RATIO`; a photo within both keeps its size.
+    """
+    map_focal_px = float(np.median([map_camera.fx for map_camera in map_cameras]))
+    scale = map_focal_px / camera.fx if camera.fx > _MAX_FOCAL_RATIO * map_focal_px else 1.0
+    max_pixels = _MAX_PIXEL_RATIO * max(map_camera.width * map_camera.height for map_camera in map_cameras)
+    scale = min(scale, math.sqrt(max_pixels / (camera.width * camera.height)))
     if scale >= 1.0:
         return camera
-    return _resized(camera, max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
+    return _resize_camera(camera, max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
 
 
-def _resized(camera: Camera, width: int, height: int) -> Camera:
-    """Return the camera of the same image in another size; centres of pixels are whole numbers."""
-    across, down = width / camera.width, height / camera.height
+def _resize_camera(camera: Camera, width: int, height: int) -> Camera:
+    """Return the camera of the same image, resampled to *width* by *height* pixels."""
+    scale_x, scale_y = width / camera.width, height / camera.height
+    # The first pixel's centre is (0, 0), so that the corner of the image, which stays, is (-0.5, -0.5).
     return Camera(
-        fx=camera.fx * across, fy=camera.fy * down, cx=(camera.cx + 0.5) * across - 0.5,
-        cy=(camera.cy + 0.5) * down - 0.5, width=width, height=height,
-    )  # fmt: skip
+        fx=camera.fx * scale_x,
+        fy=camera.fy * scale_y,
+        cx=(camera.cx + 0.5) * scale_x - 0.5,
+        cy=(camera.cy + 0.5) * scale_y - 0.5,
+        width=width,
+        height=height,
+    )
 
 
-def _undistorted(pixels: Array, camera: Camera, lens: Lens) -> tuple[Array, npt.NDArray[np.bool_]]:
-    """Return ``(n, 2)`` pixels without the distortion of *lens*, and which of them can be used."""
-    if not len(pixels) or not any(lens.distortion):
+def _undistort_features(pixels: Array, lens: Lens) -> tuple[Array, npt.NDArray[np.bool_]]:
+    """Return ``(n, 2)`` pixels without distortion, and whether each of them is valid, ``(n,)``.
+
+    A pixel is invalid where the inverse of the distortion did not converge, see `_MAX_ROUND_TRIP_PX`.
+    """
+    if not len(pixels) or lens.is_pinhole:
         return pixels, np.ones(len(pixels), dtype=bool)
-    cv2 = load_opencv()
-    matrix, numbers = camera.matrix, np.array(lens.distortion)
-    seen = np.ascontiguousarray(pixels).reshape(-1, 1, 2)
     with np.errstate(all="ignore"):
-        if lens.model == "fisheye":
-            straight = cv2.fisheye.undistortPoints(seen, matrix, numbers, None, None, matrix)
-            rays = (straight.reshape(-1, 2) - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
-            again = cv2.fisheye.distortPoints(rays.reshape(-1, 1, 2), matrix, numbers)
-        else:
-            straight = cv2.undistortPoints(seen, matrix, numbers, None, None, matrix)
-            rays = (straight.reshape(-1, 2) - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
-            points = np.column_stack([rays, np.ones(len(rays))])
-            again, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, numbers)
-        off_px = np.abs(again.reshape(-1, 2) - pixels).max(axis=1)
-    return straight.reshape(-1, 2), np.isfinite(off_px) & (off_px <= _UNDISTORTED_PX)
+        undistorted = lens.undistort_pixels(pixels)
+        round_trip_px = np.abs(lens.distort_pixels(undistorted) - pixels).max(axis=1)
+    return undistorted, np.isfinite(round_trip_px) & (round_trip_px <= _MAX_ROUND_TRIP_PX)

@@ -13,7 +13,7 @@ from fake_data_service import HttpServer, Service, small_settings
 from rse_pf.cli.main import main
 from rse_pf.errors import NotFound
 from rse_pf.identity import RobotId
-from rse_pf.maps.photos import Lens, MapOutline, PhotoLocation
+from rse_pf.maps.photos import MapOutline, PhotoLens, PhotoLocation
 from rse_pf.object_store import MemoryStore
 
 POSE = [[1.0, 0.0, 0.0, 1.5], [0.0, 1.0, 0.0, -2.0], [0.0, 0.0, 1.0, 0.25], [0.0, 0.0, 0.0, 1.0]]
@@ -30,9 +30,11 @@ class Localiser:
     count = 1
 
     def __init__(self) -> None:
-        self.asked: list[tuple[str, bytes, Lens]] = []
+        self.asked: list[tuple[str, bytes, PhotoLens]] = []
 
-    def localise(self, robot: RobotId, name: str, photo: bytes, lens: Lens, charge: Any) -> PhotoLocation:
+    def localise(
+        self, robot: RobotId, name: str, photo: bytes, lens: PhotoLens, charge: Any
+    ) -> PhotoLocation:
         self.asked.append((name, photo, lens))
         if name != "kitchen":
             raise NotFound(f"there is no map {name!r}", hint="see rse-pf map list")
@@ -85,7 +87,7 @@ def test_photos_are_sent_with_the_lens_and_each_has_a_line(
     assert lines[2] == "1 of 2 found"
     name, photo, lens = platform.localiser.asked[0]
     assert (name, photo) == ("kitchen", b"k")
-    assert lens == Lens(**CALIBRATED, distortion=(0.1, -0.2, 0.0, 1e-5, 0.3))
+    assert lens == PhotoLens(**CALIBRATED, distortion=(0.1, -0.2, 0.0, 1e-5, 0.3))
 
 
 def test_json_has_the_pose_with_its_quality(platform: Platform, capsys: pytest.CaptureFixture[str]) -> None:
@@ -94,7 +96,7 @@ def test_json_has_the_pose_with_its_quality(platform: Platform, capsys: pytest.C
     (found,) = json.loads(capsys.readouterr().out)
     assert found["T_map_camera"] == POSE
     assert (found["position_sigma_m"], found["turn_sigma_deg"], found["version"]) == (0.01, 0.2, "ab")
-    assert platform.localiser.asked[0][2] == Lens(fx=500.0, fy=500.0, cx=320.0, cy=240.0)
+    assert platform.localiser.asked[0][2] == PhotoLens(fx=500.0, fy=500.0, cx=320.0, cy=240.0)
 
 
 def test_the_exit_code_is_1_if_no_photo_is_found(platform: Platform) -> None:

@@ -14,7 +14,7 @@ import pytest
 
 from client_sdk.transfer.data_client import DataClient, DataOptions
 from rse_pf.errors import ConnectError, NotFound, QuotaExceeded, StoreError, Unauthorized, UsageError
-from rse_pf.maps.photos import Lens
+from rse_pf.maps.photos import PhotoLens
 
 DATA = random.Random(1).randbytes(700_000)
 DIGEST = hashlib.sha256(DATA).hexdigest()
@@ -225,7 +225,7 @@ def test_only_the_data_service_can_report_that_an_object_is_stored(
     assert service.objects[robot.client.upload(data)] == data
 
 
-LENS = Lens(fx=500.0, fy=500.0, cx=320.0, cy=240.0)
+LENS = PhotoLens(fx=500.0, fy=500.0, cx=320.0, cy=240.0)
 
 
 @pytest.mark.parametrize("body", [b"", b"{}", b"[1]", b'{"id":7}'])

@@ -1,0 +1,319 @@
+"""The lens model: a camera with the distortion of its lens, and the table of all models.
+
+This module alone calls the distortion functions of OpenCV, and alone knows which of them belong to a model.
+All other code holds a `Lens` and asks it.  To add a camera model, add an entry to `LENS_MODELS`.  OpenCV is
+imported when a function needs it, so that a robot without OpenCV can still hold a `Lens`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from rse_pf.errors import InvalidCamera
+from rse_pf.geometry.camera import Camera
+from rse_pf.geometry.transforms import Array
+from rse_pf.images import load_opencv
+
+__all__ = ["LENS_MODELS", "Lens", "LensModel", "find_lens_model", "rectify_stereo_pair"]
+
+MAX_STATED_COEFFICIENT = 1e3
+"""Largest absolute value of a distortion coefficient in a file or a request: those of real lenses are far
+below, so that a larger one is another number in the place of a coefficient."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LensModel:
+    """A lens model: its names, its coefficients, and the functions that compute with them.
+
+    All functions take the module ``cv2`` first.  ``K`` is a ``(3, 3)`` camera matrix in pixels, and
+    ``coefficients`` ``(m,)`` are in OpenCV's order.
+
+    Attributes:
+        name: As files and requests of this platform state the model.
+        aliases: Names that ROS, Kalibr, EuRoC, COLMAP, ORB-SLAM3 and nerfstudio give to the same model, in
+            lower case with ``_`` for spaces.
+        coefficient_names: Coefficients that files and requests can state, in OpenCV's order.
+        coefficient_counts: Numbers of coefficients that OpenCV takes; 0 is valid for every model.
+        is_perspective: Whether the model without coefficients is a pinhole camera.
+        plausible_field_of_view_deg: Smallest and largest field of view of a lens that SLAM can use.
+        field_of_view_rad: Field of view along an image side that is this many focal lengths long.
+        undistort_points: ``(cv2, pixels (n, 1, 2), K, coefficients, K_new or None)`` to ``(n, 1, 2)``: pixels
+            of a pinhole camera with the matrix K_new, or coordinates in the plane z = 1 for None.
+        distort_points: ``(cv2, rays (n, 2), K, coefficients)`` to ``(n, 2)`` pixels of points ``(x, y, 1)``.
+        undistortion_maps: ``(cv2, K, coefficients, rotation (3, 3), K_new, (width, height))`` to the two
+            float32 maps that ``cv2.remap`` takes.
+        rectify: ``(cv2, K_left, coefficients_left, K_right, coefficients_right, (width, height), R, t)`` to
+            the rotations R1 and R2 and the projections P1 and P2 of Bouguet's rectification.
+    """
+
+    name: str
+    aliases: frozenset[str]
+    coefficient_names: tuple[str, ...]
+    coefficient_counts: tuple[int, ...]
+    is_perspective: bool
+    plausible_field_of_view_deg: tuple[float, float]
+    field_of_view_rad: Callable[[float], float]
+    undistort_points: Callable[..., Any]
+    distort_points: Callable[..., Array]
+    undistortion_maps: Callable[..., tuple[Any, Any]]
+    rectify: Callable[..., tuple[Array, Array, Array, Array]]
+
+    def check(self, coefficients: tuple[float, ...]) -> None:
+        """Refuse coefficients that OpenCV's functions do not take.
+
+        Raises:
+            InvalidCamera: Their number is not one of ``coefficient_counts`` or 0, or one is not finite.
+        """
+        counts = (0, *self.coefficient_counts)
+        if len(coefficients) not in counts or not all(map(math.isfinite, coefficients)):
+            raise InvalidCamera(
+                f"{len(coefficients)} distortion numbers do not fit the lens model {self.name}, which takes "
+                f"{', '.join(map(str, counts))} finite numbers",
+                hint=f"give {' '.join(self.coefficient_names)}",
+            )
+
+    def check_stated(self, coefficients: tuple[float, ...]) -> None:
+        """Refuse coefficients that a file or a request may not state, although OpenCV would take them.
+
+        Raises:
+            InvalidCamera: There are more than ``coefficient_names``, one is above `MAX_STATED_COEFFICIENT`,
+                or `check` refuses them.
+        """
+        self.check(coefficients)
+        largest = max(map(abs, coefficients), default=0.0)
+        if len(coefficients) > len(self.coefficient_names) or largest > MAX_STATED_COEFFICIENT:
+            raise InvalidCamera(
+                f"{len(coefficients)} distortion numbers of up to {largest:g} are more than the "
+                f"{len(self.coefficient_names)} of the lens model {self.name}, or above "
+                f"{MAX_STATED_COEFFICIENT:g}",
+                hint=f"give {' '.join(self.coefficient_names)}",
+            )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Lens:
+    """A camera, the model of its lens, and the distortion coefficients in OpenCV's order.
+
+    ``model`` is a name of `LENS_MODELS`: ``radial-tangential`` with k1 k2 p1 p2 [k3 ...], or ``fisheye`` with
+    k1 k2 k3 k4.  Without coefficients, a radial-tangential lens is a pinhole, and a fisheye has the exact
+    equidistant projection.
+
+    Raises:
+        InvalidCamera: The model is not known, or the coefficients do not fit the model.
+    """
+
+    camera: Camera
+    distortion: tuple[float, ...] = ()
+    model: str = "radial-tangential"
+
+    def __post_init__(self) -> None:
+        if self.model not in LENS_MODELS:
+            raise InvalidCamera(
+                f"no lens model {self.model!r}", hint=f"write one of {', '.join(LENS_MODELS)}"
+            )
+        LENS_MODELS[self.model].check(self.distortion)
+
+    @property
+    def is_pinhole(self) -> bool:
+        """Whether images of this lens have no distortion, so that nothing needs to be undistorted."""
+        return LENS_MODELS[self.model].is_perspective and not any(self.distortion)
+
+    @property
+    def field_of_view_deg(self) -> float:
+        """The larger one of the horizontal and the vertical field of view, without distortion, degrees."""
+        camera = self.camera
+        side_per_focal_length = max(camera.width / camera.fx, camera.height / camera.fy)
+        return math.degrees(LENS_MODELS[self.model].field_of_view_rad(side_per_focal_length))
+
+    @property
+    def plausible_field_of_view_deg(self) -> tuple[float, float]:
+        """The smallest and the largest field of view of a lens of this model that SLAM can use, degrees."""
+        return LENS_MODELS[self.model].plausible_field_of_view_deg
+
+    @property
+    def coefficients(self) -> Array:
+        """The distortion coefficients ``(m,)`` in OpenCV's order; four zeros where there is no distortion."""
+        return np.array(self.distortion or (0.0, 0.0, 0.0, 0.0))
+
+    def undistort_pixels(self, pixels: Array) -> Array:
+        """Return ``(n, 2)`` distorted pixels as pixels of the pinhole camera with the same intrinsics.
+
+        The inverse of the distortion is iterative and may fail far from the centre: compare the result with
+        `distort_pixels`.
+
+        Raises:
+            MissingExtra: OpenCV is not installed.
+        """
+        return self._undistort(pixels, self.camera.matrix)
+
+    def distort_pixels(self, pixels: Array) -> Array:
+        """Return ``(n, 2)`` pixels of the pinhole camera with the same intrinsics as distorted pixels.
+
+        Raises:
+            MissingExtra: OpenCV is not installed.
+        """
+        camera = self.camera
+        rays = (pixels - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
+        return (
+            LENS_MODELS[self.model]
+            .distort_points(load_opencv(), rays, camera.matrix, self.coefficients)
+            .reshape(-1, 2)
+        )
+
+    def unit_rays(self, pixels: Array) -> Array:
+        """Return the ``(n, 3)`` directions, of length 1 in the camera frame, of ``(n, 2)`` distorted pixels.
+
+        Raises:
+            MissingExtra: OpenCV is not installed.
+        """
+        points = self._undistort(pixels, None)
+        rays = np.column_stack((points, np.ones(len(points))))
+        directions: Array = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+        return directions
+
+    def undistortion_maps(self, camera: Camera, rotation: Array | None = None) -> tuple[Any, Any]:
+        """Return the two maps with which ``cv2.remap`` gives the images of a pinhole *camera*.
+
+        Args:
+            camera: The pinhole camera of the new images.
+            rotation: ``(3, 3)``, from this camera's frame to that of the new camera; None if both agree.
+
+        Raises:
+            MissingExtra: OpenCV is not installed.
+        """
+        return LENS_MODELS[self.model].undistortion_maps(
+            load_opencv(), self.camera.matrix, self.coefficients, np.eye(3) if rotation is None else rotation,
+            camera.matrix, (camera.width, camera.height),
+        )  # fmt: skip
+
+    def _undistort(self, pixels: Array, K_new: Array | None) -> Array:
+        contiguous = np.ascontiguousarray(pixels).reshape(-1, 1, 2)
+        points: Array = (
+            LENS_MODELS[self.model]
+            .undistort_points(load_opencv(), contiguous, self.camera.matrix, self.coefficients, K_new)
+            .reshape(-1, 2)
+        )
+        return points
+
+
+def find_lens_model(name: str) -> LensModel | None:
+    """Return the model with this name or alias, whatever its case; None if no model has it."""
+    name = name.lower().replace(" ", "_")
+    return next((model for model in LENS_MODELS.values() if name in {model.name, *model.aliases}), None)
+
+
+def rectify_stereo_pair(
+    left: Lens, right: Lens, T_right_left: Array
+) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+    """Return the rotations and projections that rectify a stereo pair of two lenses of one model and size.
+
+    Args:
+        left: The left lens.
+        right: The right lens.
+        T_right_left: ``(4, 4)``, metres, maps points of the left camera's frame into the right one's.
+
+    Returns:
+        The ``(3, 3)`` rotations from the left and the right camera to the rectified ones, and the ``(3, 4)``
+        projections of both rectified cameras; ``P[0, 3]`` of the right one is minus fx times the baseline.
+
+    Raises:
+        MissingExtra: OpenCV is not installed.
+
+    Source:
+        Bouguet's method, as ``cv2.stereoRectify`` and ``cv2.fisheye.stereoRectify`` implement it.
+    """
+    R1, R2, P1, P2 = LENS_MODELS[left.model].rectify(
+        load_opencv(), left.camera.matrix, left.coefficients, right.camera.matrix, right.coefficients,
+        (left.camera.width, left.camera.height), T_right_left[:3, :3], T_right_left[:3, 3],
+    )  # fmt: skip
+    return (R1, R2), (P1, P2)
+
+
+# --- Functions of the radial-tangential model (Brown 1966), as the module cv2 implements it ---
+
+
+def _undistort_radial_tangential(cv2: Any, pixels: Array, K: Array, coefficients: Array, K_new: Any) -> Any:
+    return cv2.undistortPoints(pixels, K, coefficients, None, None, K_new)
+
+
+def _distort_radial_tangential(cv2: Any, rays: Array, K: Array, coefficients: Array) -> Any:
+    points = np.column_stack([rays, np.ones(len(rays))])
+    return cv2.projectPoints(points, np.zeros(3), np.zeros(3), K, coefficients)[0]
+
+
+def _radial_tangential_maps(cv2: Any, *arguments: Any) -> Any:
+    return cv2.initUndistortRectifyMap(*arguments, cv2.CV_32FC1)
+
+
+def _rectify_radial_tangential(cv2: Any, *pair: Any) -> Any:
+    # alpha 0: every pixel of the rectified images is seen by the camera.
+    return cv2.stereoRectify(*pair, flags=cv2.CALIB_ZERO_DISPARITY, alpha=0.0)[:4]
+
+
+# --- Functions of the equidistant fisheye (Kannala and Brandt 2006), as cv2.fisheye implements it ---
+
+
+def _undistort_fisheye(cv2: Any, pixels: Array, K: Array, coefficients: Array, K_new: Any) -> Any:
+    return cv2.fisheye.undistortPoints(pixels, K, coefficients, None, None, K_new)
+
+
+def _distort_fisheye(cv2: Any, rays: Array, K: Array, coefficients: Array) -> Any:
+    return cv2.fisheye.distortPoints(rays.reshape(-1, 1, 2), K, coefficients)
+
+
+def _fisheye_maps(cv2: Any, *arguments: Any) -> Any:
+    return cv2.fisheye.initUndistortRectifyMap(*arguments, cv2.CV_32FC1)
+
+
+def _rectify_fisheye(cv2: Any, *pair: Any) -> Any:
+    # balance 0: every pixel of the rectified images is seen by the camera.
+    return cv2.fisheye.stereoRectify(*pair, flags=cv2.CALIB_ZERO_DISPARITY, balance=0.0)[:4]
+
+
+_MODELS = (
+    LensModel(
+        name="radial-tangential",
+        aliases=frozenset(
+            (
+                "radtan",
+                "plumb_bob",
+                "brown_conrady",
+                "opencv",
+                "rational_polynomial",
+                "rational_polynomial_thin_prism",
+            )
+        ),
+        coefficient_names=("k1", "k2", "p1", "p2", "k3"),
+        coefficient_counts=(4, 5, 8, 12, 14),
+        is_perspective=True,
+        # Below 20 degrees is a mistake in the unit of fx, or a lens too long for SLAM; above 140 degrees is
+        # no pinhole camera.
+        plausible_field_of_view_deg=(20.0, 140.0),
+        field_of_view_rad=lambda side_per_focal_length: 2.0 * math.atan(side_per_focal_length / 2.0),
+        undistort_points=_undistort_radial_tangential,
+        distort_points=_distort_radial_tangential,
+        undistortion_maps=_radial_tangential_maps,
+        rectify=_rectify_radial_tangential,
+    ),
+    LensModel(
+        name="fisheye",
+        aliases=frozenset(("equidistant", "kannala_brandt4", "kannalabrandt8", "opencv_fisheye")),
+        coefficient_names=("k1", "k2", "k3", "k4"),
+        coefficient_counts=(4,),
+        is_perspective=False,
+        plausible_field_of_view_deg=(0.0, math.inf),  # a fisheye's image circle may be cropped, or all around
+        field_of_view_rad=lambda side_per_focal_length: side_per_focal_length,
+        undistort_points=_undistort_fisheye,
+        distort_points=_distort_fisheye,
+        undistortion_maps=_fisheye_maps,
+        rectify=_rectify_fisheye,
+    ),
+)
+
+LENS_MODELS: Mapping[str, LensModel] = {model.name: model for model in _MODELS}
+"""All lens models by their names: the one place where a model is defined."""
