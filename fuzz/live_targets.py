@@ -14,7 +14,7 @@ from fuzz.meter import Meter
 from rse_pf.errors import BadRequest, InvalidCamera
 from rse_pf.geometry import Camera
 from rse_pf.live_map.events import matrix_of
-from rse_pf.live_map.measure import measure_links, reference_of_features, view_of_features
+from rse_pf.live_map.measure import measure_loop_closures, reference_of_features, view_of_features
 from rse_pf.slam.keyframe import (
     MAX_FEATURES,
     MAX_KEYFRAME_BYTES,
@@ -60,7 +60,7 @@ def live(data: bytes, meter: Meter) -> None:
     expect(bool(np.isfinite(vector).all()), "a vector that is not finite")
     view, known = (0, features, camera), (1, _KNOWN, _CAMERA)
     for measured, other in ((view, known), (known, view), (view, view)):
-        links = measure_links(measured, [other]).links
+        links = measure_loop_closures(measured, [other]).links
         for link in links:
             expect(bool(np.isfinite(matrix_of(link.T_keyframe_other, 4, 4)).all()), "a pose not finite")
             information = matrix_of(link.information, 6, 6)

@@ -27,19 +27,19 @@ from client_sdk.datasets import Dataset, open_dataset
 from client_sdk.frontend import FrontEndOptions
 from rse_pf.experiments.results.trajectory_error import ate_m
 from rse_pf.geometry import Array, exp_se3, inverse
-from rse_pf.live_map.events import Event, KeyframeAdded, LinksMeasured, MapStarted
+from rse_pf.live_map.events import Event, KeyframeAdded, LoopClosuresMeasured, MapStarted
 from rse_pf.live_map.live_map import LiveMap
 from rse_pf.live_map.outcomes import (
     Added,
     Ambiguous,
     Corrected,
     Joined,
-    LinkRemoved,
+    LoopClosureRejected,
     OptimiseWanted,
     Outcome,
     Unaligned,
 )
-from rse_pf.live_map.versions import encode_stored
+from rse_pf.live_map.versions import encode_version_keyframe
 from tests.live_map.generated_drives import (
     STEP_M,
     GeneratedDrive,
@@ -124,7 +124,7 @@ def _send(played: Played, name: str, run: Run, number: int, tick: int) -> list[t
     """Send a keyframe, measure it, and return what robots learn of it, and when."""
     keyframe = run.version.keyframes[number]
     event = KeyframeAdded(
-        robot=name, segment=0, number=number, data=encode_stored(keyframe)
+        robot=name, segment=0, number=number, data=encode_version_keyframe(keyframe)
     )  # fmt: skip
     outcomes = played.live_map.apply(event)
     added = next(outcome for outcome in outcomes if isinstance(outcome, Added))
@@ -151,7 +151,7 @@ def _random_links(runs: int, inliers: int) -> tuple[int, int]:
         drives = [world.drive(name, circle(2.0, 1.0, phase)) for name, phase in (("a", 0.0), ("b", 2.0))]
         for event in world.play(drives, wrong=0.4):
             live_map.apply(event)
-        for a, b, T_a_b in live_map.believed():
+        for a, b, T_a_b in live_map.accepted_loop_closures():
             off = inverse(T_a_b) @ inverse(world.seen[a]) @ world.seen[b]
             believed += float(np.linalg.norm(off[:3, 3])) > 0.3
         sent += world.wrong_sent
@@ -171,12 +171,12 @@ def _plant(seed: int) -> int:
     off = world.seen[0] @ exp_se3(np.r_[rng.uniform(0.5, 2.0, 3), 0.0, 0.4, 0.0]) @ inverse(world.seen[0])
     for k in range(20, 24):
         planted = make_link(k - 20, inverse(world.seen[k]) @ off @ world.seen[k - 20])
-        live_map.apply(LinksMeasured(keyframe=k, links=(planted,)))
+        live_map.apply(LoopClosuresMeasured(keyframe=k, links=(planted,)))
     for later in range(16):
         k = 24 + later
         links = tuple(world.true_link(k, k - 20 - near) for near in (0, 1))
-        outcomes = live_map.apply(LinksMeasured(keyframe=k, links=links))
-        if any(isinstance(outcome, LinkRemoved) for outcome in outcomes):
+        outcomes = live_map.apply(LoopClosuresMeasured(keyframe=k, links=links))
+        if any(isinstance(outcome, LoopClosureRejected) for outcome in outcomes):
             return later + 1
     return 99
 
@@ -262,7 +262,7 @@ def foreign(recordings: Path, runs: int) -> dict[str, Any]:
         starts = {name: int(rng.integers(0, 40)) for name in rng.permutation(list(drives)).tolist()}
         played = play({name: drives[name] for name in starts}, starts)
         wrong += sum(isinstance(outcome, Joined) for outcome in played.outcomes) - 1
-        links += played.live_map.links_open
+        links += played.live_map.pending_loop_closure_count
     keyframes = {name: len(run.version.keyframes) for name, run in drives.items()}
     return {"n": runs, "keyframes": keyframes, "wrong_joins": wrong, "open_links": links}
 

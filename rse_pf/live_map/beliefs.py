@@ -22,10 +22,10 @@ from rse_pf.live_map.agreement import (
     weight_of,
     with_metres,
 )
-from rse_pf.live_map.events import MeasuredLink, matrix_of
+from rse_pf.live_map.events import MeasuredLoopClosure, matrix_of
 from rse_pf.live_map.graph import Graph, Segment
 from rse_pf.live_map.options import LiveMapOptions
-from rse_pf.live_map.outcomes import Ambiguous, LinkBelieved, LinkRemoved, Outcome
+from rse_pf.live_map.outcomes import Ambiguous, LoopClosureAccepted, LoopClosureRejected, Outcome
 from rse_pf.live_map.smoothing import SmoothedWindows, odometry_step, smooth_around
 
 __all__ = [
@@ -104,7 +104,7 @@ def judge_again(graph: Graph, options: LiveMapOptions) -> Iterator[Changes]:
 
 
 def has_other_metres(
-    graph: Graph, keyframe: int, links: Iterable[MeasuredLink], options: LiveMapOptions
+    graph: Graph, keyframe: int, links: Iterable[MeasuredLoopClosure], options: LiveMapOptions
 ) -> bool:
     """Return whether the metres of *keyframe* are not those of all other robots that it is compared with.
 
@@ -120,7 +120,9 @@ def has_other_metres(
     return len(signs) > 1 and len(set().union(*signs.values())) == 1 and {0.0} not in signs.values()
 
 
-def has_jumped(graph: Graph, keyframe: int, links: Iterable[MeasuredLink], options: LiveMapOptions) -> bool:
+def has_jumped(
+    graph: Graph, keyframe: int, links: Iterable[MeasuredLoopClosure], options: LiveMapOptions
+) -> bool:
     """Return whether the odometry of *keyframe* is far from where all of its latest neighbours see it.
 
     They saw the same place just before, so these are no two places that look the same.
@@ -153,7 +155,7 @@ def disbelieve_contradicting(
         return False
     is_contrary = has_other_metres or (
         changes.verdicts == {"contrary"}
-        and not any(isinstance(each, LinkBelieved) for each in changes.outcomes)
+        and not any(isinstance(each, LoopClosureAccepted) for each in changes.outcomes)
     )
     # What two robots measure tells more than what the map predicts.
     noted = 2 if has_other_metres else 1
@@ -503,7 +505,7 @@ def _believe(graph: Graph, numbers: list[int], changes: Changes) -> None:
         link = graph.links[number]
         if link.state == "open":
             graph.believe(number)
-            changes.outcomes.append(LinkBelieved(a=link.a, b=link.b))
+            changes.outcomes.append(LoopClosureAccepted(a=link.a, b=link.b))
             changes.touch(link.a, link.b)
 
 
@@ -512,7 +514,7 @@ def _remove(graph: Graph, numbers: list[int], reason: str, changes: Changes) -> 
     for number in numbers:
         link = graph.links[number]
         graph.remove_link(number)
-        changes.outcomes.append(LinkRemoved(a=link.a, b=link.b, reason=reason))
+        changes.outcomes.append(LoopClosureRejected(a=link.a, b=link.b, reason=reason))
         changes.touch(link.a, link.b)
         crossed |= bool(graph.of_segment[link.a] != graph.of_segment[link.b])
     if crossed:

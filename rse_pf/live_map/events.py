@@ -19,15 +19,15 @@ from rse_pf.slam.keyframe import Keyframe, decode_keyframe
 __all__ = [
     "Event",
     "KeyframeAdded",
-    "LinksMeasured",
+    "LoopClosuresMeasured",
+    "MapServerChanged",
     "MapStarted",
-    "MeasuredLink",
+    "MeasuredLoopClosure",
     "Optimised",
-    "OwnerChanged",
     "RobotForgotten",
     "RobotLeft",
+    "StartEdge",
     "StartKeyframe",
-    "StartLink",
     "decode_events",
     "encode_events",
     "matrix_bytes",
@@ -54,7 +54,7 @@ class KeyframeAdded(msgspec.Struct, frozen=True, kw_only=True, dict=True, tag="k
         return decode_keyframe(self.data)
 
 
-class MeasuredLink(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
+class MeasuredLoopClosure(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     """A measured relative pose to keyframe ``other``, with its ``(6, 6)`` information.
 
     ``scale`` is the logarithm, with its variance, of how long the unit of the other keyframe is in that of
@@ -72,11 +72,11 @@ class MeasuredLink(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True
     off_scale: float | None = None
 
 
-class LinksMeasured(msgspec.Struct, frozen=True, kw_only=True, tag="links"):
+class LoopClosuresMeasured(msgspec.Struct, frozen=True, kw_only=True, tag="links"):
     """The links that `measure` found for a keyframe, and the number of candidates that failed, by reason."""
 
     keyframe: int
-    links: tuple[MeasuredLink, ...] = ()
+    links: tuple[MeasuredLoopClosure, ...] = ()
     failed: dict[str, int] = {}
 
 
@@ -107,7 +107,7 @@ class StartKeyframe(msgspec.Struct, frozen=True, kw_only=True):
     data: bytes
 
 
-class StartLink(msgspec.Struct, frozen=True, kw_only=True):
+class StartEdge(msgspec.Struct, frozen=True, kw_only=True):
     """An edge of the version that a live map starts from; ``a`` and ``b`` are row numbers."""
 
     a: int
@@ -125,18 +125,26 @@ class MapStarted(msgspec.Struct, frozen=True, kw_only=True, tag="started-2"):
 
     source: str
     keyframes: tuple[StartKeyframe, ...]
-    links: tuple[StartLink, ...] = ()
+    links: tuple[StartEdge, ...] = ()
     equal_rooms_m: float = 0.0
 
 
-class OwnerChanged(msgspec.Struct, frozen=True, kw_only=True, tag="owner"):
+class MapServerChanged(msgspec.Struct, frozen=True, kw_only=True, tag="owner"):
     """Another process owns the map from here on."""
 
     owner: str
     epoch: int
 
 
-Event = KeyframeAdded | LinksMeasured | Optimised | RobotForgotten | RobotLeft | MapStarted | OwnerChanged
+Event = (
+    KeyframeAdded
+    | LoopClosuresMeasured
+    | Optimised
+    | RobotForgotten
+    | RobotLeft
+    | MapStarted
+    | MapServerChanged
+)
 
 
 _ENCODER = msgspec.msgpack.Encoder(order="deterministic")

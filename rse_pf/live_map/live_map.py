@@ -29,7 +29,7 @@ from rse_pf.live_map.beliefs import (
 from rse_pf.live_map.events import (
     Event,
     KeyframeAdded,
-    LinksMeasured,
+    LoopClosuresMeasured,
     MapStarted,
     Optimised,
     RobotForgotten,
@@ -41,9 +41,9 @@ from rse_pf.live_map.feature_parts import FeatureParts, SnapshotParts
 from rse_pf.live_map.graph import Graph, LiveKeyframe, LiveLink, Segment, variances_of
 from rse_pf.live_map.measure import (
     StoredView,
-    measure_stored,
+    assumed_scale,
+    measure_stored_keyframes,
     placed_keyframe,
-    sought_per_unit,
     view_of_features,
 )
 from rse_pf.live_map.options import LiveMapOptions
@@ -149,16 +149,16 @@ class LiveMap:
         return tuple(dict.fromkeys(each.robot for each in segments if each.keyframes and not each.version))
 
     @property
-    def links_believed(self) -> int:
+    def loop_closure_count(self) -> int:
         """The number of measured links that hold poses together."""
         return len(self._graph.links) - len(self._graph.open)
 
     @property
-    def links_open(self) -> int:
+    def pending_loop_closure_count(self) -> int:
         """The number of measured links that are not believed, the newest of them."""
         return len(self._graph.open)
 
-    def believed(self) -> list[tuple[int, int, Array]]:
+    def accepted_loop_closures(self) -> list[tuple[int, int, Array]]:
         """Return the believed links as keyframes a, b and the measured ``T_a_b``."""
         links = self._graph.links.values()
         return [(link.a, link.b, link.T_a_b) for link in links if link.state == "believed"]
@@ -199,7 +199,7 @@ class LiveMap:
         row = int(self._graph.of_segment[keyframe])
         return row >= 0 and self._is_aligned(row)
 
-    def judge(self, event: KeyframeAdded) -> Literal["new", "known", "ahead"]:
+    def check_keyframe(self, event: KeyframeAdded) -> Literal["new", "known", "ahead"]:
         """Say whether a keyframe is the robot's next one; the map does not change.
 
         Raises:
@@ -222,7 +222,7 @@ class LiveMap:
                 hint="begin a new segment where depths begin or end",
             )
         features = event.keyframe.features
-        scale = sought_per_unit(features) if known is None else known.scale
+        scale = assumed_scale(features) if known is None else known.scale
         try:
             check_sent(event.keyframe, 1.0 if features.is_metric else scale)
         except InvalidCamera as error:
@@ -241,7 +241,7 @@ class LiveMap:
         match event:
             case KeyframeAdded():
                 return self._add(event)
-            case LinksMeasured():
+            case LoopClosuresMeasured():
                 return self._take_links(event)
             case Optimised():
                 return self._take_poses(event)
@@ -253,26 +253,26 @@ class LiveMap:
                 return self._start(event)
         return []
 
-    def measure(self, keyframe: int) -> LinksMeasured:
+    def measure(self, keyframe: int) -> LoopClosuresMeasured:
         """Compare a keyframe with others that may show the same place; changes nothing."""
-        return self.measuring(keyframe)[0]()
+        return self.prepare_measurement(keyframe)[0]()
 
-    def measuring(
+    def prepare_measurement(
         self, keyframe: int, pieces: int = 1, candidates: int | None = None
-    ) -> list[Callable[[], LinksMeasured]]:
+    ) -> list[Callable[[], LoopClosuresMeasured]]:
         """Return functions that together do the work of `measure`, in any thread, while the map changes.
 
-        The results of the pieces, one for each share of the candidates, are joined by `joined_links`.  Less
-        *candidates* than those of the options are for an owner that is behind.
+        The results of the pieces, one for each share of the candidates, are joined by `merge_measurements`.
+        Less *candidates* than those of the options are for an owner that is behind.
         """
         stored = self._stored(keyframe)
         if stored is None or self._is_ignored(keyframe):
-            return [lambda: LinksMeasured(keyframe=keyframe)]
+            return [lambda: LoopClosuresMeasured(keyframe=keyframe)]
         found = [self._stored(i) for i in self._candidates(keyframe, candidates)]
         others = [each for each in found if each is not None]
         size = max(1, -(-len(others) // pieces))
         shares = [others[begin : begin + size] for begin in range(0, max(1, len(others)), size)]
-        return [partial(measure_stored, stored, share, self.options.measured) for share in shares]
+        return [partial(measure_stored_keyframes, stored, share, self.options.measured) for share in shares]
 
     def optimise(self) -> Optimised:
         """Fit the whole graph to all links; changes nothing.
@@ -280,9 +280,9 @@ class LiveMap:
         Raises:
             MissingExtra: gtsam is not installed.
         """
-        return self.optimising()()
+        return self.prepare_optimisation()()
 
-    def optimising(
+    def prepare_optimisation(
         self, solve: Callable[[PoseGraph, OptimiseOptions], Array] | None = None
     ) -> Callable[[], Optimised]:
         """Return a function that does the work of `optimise`, in any thread, while the map changes.
@@ -302,9 +302,9 @@ class LiveMap:
 
     def relocalise(self, view: Keyframe) -> Localised:
         """Find the place of a view in the map, whatever its pose; changes nothing."""
-        return self.relocalising(view)()
+        return self.prepare_relocalisation(view)()
 
-    def relocalising(self, view: Keyframe) -> Callable[[], Localised]:
+    def prepare_relocalisation(self, view: Keyframe) -> Callable[[], Localised]:
         """Return what does the work of `relocalise`; another thread may call it while the map changes.
 
         Raises:
@@ -323,7 +323,7 @@ class LiveMap:
         ]
         views = [(stored, T, scale) for stored, T, scale in chosen if stored is not None]
         options = LocalisationOptions(has_equal_rooms=graph.equal_rooms_m > 0.0)
-        image, sought = view_of_features(view.features, view.camera), sought_per_unit(view.features)
+        image, sought = view_of_features(view.features, view.camera), assumed_scale(view.features)
 
         def find() -> Localised:
             placed = [placed_keyframe(stored, T, scale) for stored, T, scale in views]
@@ -363,7 +363,7 @@ class LiveMap:
         return [(row.robot, digest) for row in rows for digest in row.objects]
 
     @property
-    def gone_objects(self) -> list[tuple[str, str]]:
+    def deletable_objects(self) -> list[tuple[str, str]]:
         """Robot and digest of the newest objects whose robot was forgotten, which nobody may read again."""
         return list(self._graph.gone_objects)
 
@@ -380,7 +380,7 @@ class LiveMap:
             segment.is_metric = keyframe.features.is_metric
             if not segment.is_metric:
                 # Lengths begin as if the median depth were that of a room, so that noise fits.
-                segment.scale = sought_per_unit(keyframe.features)
+                segment.scale = assumed_scale(keyframe.features)
                 segment.reason = UP_TO_SCALE
                 T = scaled(T_odom, segment.scale)
         else:
@@ -406,7 +406,7 @@ class LiveMap:
         is_told = segment.told is not None or not self._is_aligned(row)
         return [Added(id=i), *(() if is_told else self._tell((event.robot, event.number)))]
 
-    def _take_links(self, event: LinksMeasured) -> list[Outcome]:
+    def _take_links(self, event: LoopClosuresMeasured) -> list[Outcome]:
         graph, k = self._graph, event.keyframe
         if not self._exists(k):
             return []

@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from rse_pf.geometry import Array, Camera
-from rse_pf.live_map.events import LinksMeasured, MeasuredLink, matrix_bytes
+from rse_pf.live_map.events import LoopClosuresMeasured, MeasuredLoopClosure, matrix_bytes
 from rse_pf.slam.keyframe import KeyframeFeatures, decode_keyframe
 from rse_pf.slam.localise import PlacedKeyframe
 from rse_pf.slam.relative_pose import (
@@ -25,13 +25,13 @@ from rse_pf.slam.relative_pose import (
 
 __all__ = [
     "StoredView",
+    "assumed_scale",
     "decoded_view",
-    "joined_links",
-    "measure_links",
-    "measure_stored",
+    "measure_loop_closures",
+    "measure_stored_keyframes",
+    "merge_measurements",
     "placed_keyframe",
     "reference_of_features",
-    "sought_per_unit",
     "view_of_features",
 ]
 
@@ -44,11 +44,11 @@ StoredView = tuple[int, bytes]
 """Id and bytes of a keyframe."""
 
 
-def measure_links(
+def measure_loop_closures(
     keyframe: tuple[int, KeyframeFeatures, Camera],
     others: Sequence[tuple[int, KeyframeFeatures, Camera]],
     options: RelativePoseOptions = _DEFAULT,
-) -> LinksMeasured:
+) -> LoopClosuresMeasured:
     """Measure the pose of each of *others* relative to *keyframe*; deterministic.
 
     Args:
@@ -61,7 +61,7 @@ def measure_links(
     """
     number, features, camera = keyframe
     reference = reference_of_features(features, camera)
-    links: list[MeasuredLink] = []
+    links: list[MeasuredLoopClosure] = []
     failed: Counter[str] = Counter()
     for other, other_features, other_camera in others:
         if other_features.is_metric and not features.is_metric:
@@ -75,7 +75,7 @@ def measure_links(
             continue
         measured = _in_units(measured, features, other_features)
         links.append(
-            MeasuredLink(
+            MeasuredLoopClosure(
                 other=other, T_keyframe_other=matrix_bytes(measured.T_a_b),
                 information=matrix_bytes(measured.information),
                 inliers=measured.inliers, matches=measured.matches,
@@ -83,14 +83,14 @@ def measure_links(
                 off_scale=_off_scale(measured),
             )
         )  # fmt: skip
-    return LinksMeasured(keyframe=number, links=tuple(links), failed=dict(sorted(failed.items())))
+    return LoopClosuresMeasured(keyframe=number, links=tuple(links), failed=dict(sorted(failed.items())))
 
 
-def measure_stored(
+def measure_stored_keyframes(
     keyframe: StoredView, others: Sequence[StoredView], options: RelativePoseOptions = _DEFAULT
-) -> LinksMeasured:
-    """Decode stored keyframes and measure their links as `measure_links` does; raises BadRequest."""
-    return measure_links(decoded_view(keyframe), [decoded_view(other) for other in others], options)
+) -> LoopClosuresMeasured:
+    """Decode stored keyframes and measure their links as `measure_loop_closures` does; raises BadRequest."""
+    return measure_loop_closures(decoded_view(keyframe), [decoded_view(other) for other in others], options)
 
 
 def decoded_view(stored: StoredView) -> tuple[int, KeyframeFeatures, Camera]:
@@ -101,12 +101,12 @@ def decoded_view(stored: StoredView) -> tuple[int, KeyframeFeatures, Camera]:
 
 
 def reference_of_features(features: KeyframeFeatures, camera: Camera) -> Reference:
-    """Return the points of a keyframe that are sought in other images, by `sought_per_unit` without scale."""
+    """Return the points of a keyframe that are sought in other images, by `assumed_scale` without scale."""
     if features.is_metric:
         return Reference(points_camera=features.points_camera(camera), descriptors=features.descriptors)
     rows = np.flatnonzero(features.depths_m > 0.0)
     return Reference(
-        points_camera=sought_per_unit(features) * features.points_camera(camera)[rows],
+        points_camera=assumed_scale(features) * features.points_camera(camera)[rows],
         descriptors=features.descriptors[rows],
     )
 
@@ -116,12 +116,12 @@ def view_of_features(features: KeyframeFeatures, camera: Camera) -> View:
     depths = features.depths_m.astype(np.float64)
     return View(
         camera=camera, pixels=features.pixels.astype(np.float64), descriptors=features.descriptors,
-        depths_m=depths if features.is_metric else sought_per_unit(features) * depths, noise=features.noise,
+        depths_m=depths if features.is_metric else assumed_scale(features) * depths, noise=features.noise,
         is_metric=features.is_metric,
     )  # fmt: skip
 
 
-def sought_per_unit(features: KeyframeFeatures) -> float:
+def assumed_scale(features: KeyframeFeatures) -> float:
     """Return by what lengths without scale are multiplied, so that points are as far as those in a room.
 
     Noise and rounding are those of metres.
@@ -139,10 +139,10 @@ def _off_scale(measured: RelativePose) -> float | None:
 
 
 def _in_units(measured: RelativePose, features: KeyframeFeatures, other: KeyframeFeatures) -> RelativePose:
-    """Return a link whose lengths were multiplied by `sought_per_unit` as a `MeasuredLink` has it."""
+    """Return a link whose lengths were multiplied by `assumed_scale` as a `MeasuredLoopClosure` has it."""
     if measured.scale is None:
         return measured
-    here, there = sought_per_unit(features), sought_per_unit(other)
+    here, there = assumed_scale(features), assumed_scale(other)
     T_a_b, information = measured.T_a_b, measured.information
     if not other.is_metric and not features.is_metric:
         T_a_b = T_a_b.copy()
@@ -161,16 +161,16 @@ def placed_keyframe(stored: StoredView, T_map_keyframe: Array, scale: float = 1.
     number, features, camera = decoded_view(stored)
     reference = reference_of_features(features, camera)
     if not features.is_metric:
-        points = scale / sought_per_unit(features) * reference.points_camera
+        points = scale / assumed_scale(features) * reference.points_camera
         reference = replace(reference, points_camera=points)
     return PlacedKeyframe(id=number, reference=reference, T_map_keyframe=T_map_keyframe)
 
 
-def joined_links(keyframe: int, measured: Iterable[LinksMeasured]) -> LinksMeasured:
-    """Return the links and failures of several calls of `measure_links` for one keyframe, in their order."""
-    links: list[MeasuredLink] = []
+def merge_measurements(keyframe: int, measured: Iterable[LoopClosuresMeasured]) -> LoopClosuresMeasured:
+    """Return the loop closures and failures of several measurements of *keyframe* as one event."""
+    links: list[MeasuredLoopClosure] = []
     failed: Counter[str] = Counter()
     for part in measured:
         links += part.links
         failed.update(part.failed)
-    return LinksMeasured(keyframe=keyframe, links=tuple(links), failed=dict(sorted(failed.items())))
+    return LoopClosuresMeasured(keyframe=keyframe, links=tuple(links), failed=dict(sorted(failed.items())))

@@ -13,8 +13,8 @@ __all__ = [
     "Corrected",
     "Culled",
     "Joined",
-    "LinkBelieved",
-    "LinkRemoved",
+    "LoopClosureAccepted",
+    "LoopClosureRejected",
     "OptimiseWanted",
     "Outcome",
     "Unaligned",
@@ -64,7 +64,7 @@ class Unaligned:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class LinkBelieved:
+class LoopClosureAccepted:
     """A link between keyframes ``a`` and ``b`` holds poses together from here on."""
 
     a: int
@@ -72,7 +72,7 @@ class LinkBelieved:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class LinkRemoved:
+class LoopClosureRejected:
     """A link that was believed is no longer."""
 
     a: int
@@ -120,5 +120,13 @@ class Alignment:
 
 
 Outcome = (
-    Added | Joined | Corrected | Unaligned | LinkBelieved | LinkRemoved | OptimiseWanted | Ambiguous | Culled
+    Added
+    | Joined
+    | Corrected
+    | Unaligned
+    | LoopClosureAccepted
+    | LoopClosureRejected
+    | OptimiseWanted
+    | Ambiguous
+    | Culled
 )

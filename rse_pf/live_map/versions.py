@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from rse_pf.errors import BadMessage, BadRequest, InternalError, LimitExceeded
 from rse_pf.geometry import Array, Camera, inverse
-from rse_pf.live_map.events import MapStarted, StartKeyframe, StartLink, matrix_bytes
+from rse_pf.live_map.events import MapStarted, StartEdge, StartKeyframe, matrix_bytes
 from rse_pf.live_map.graph import Graph, Segment
 from rse_pf.live_map.options import LiveMapOptions
 from rse_pf.live_map.smoothing import edges_of, link_information
@@ -27,8 +27,8 @@ from rse_pf.slam.pose_graph import PoseGraph, is_positive_definite
 
 __all__ = [
     "PointSource",
-    "encode_stored",
-    "errors_of_maps",
+    "as_internal_error",
+    "encode_version_keyframe",
     "image_references",
     "paths_of",
     "point_sources",
@@ -55,7 +55,7 @@ class PointSource:
 
 
 @contextlib.contextmanager
-def errors_of_maps(what: str) -> Iterator[None]:
+def as_internal_error(what: str) -> Iterator[None]:
     """Raise what is wrong with a map that is kept as InternalError: who asks for it has not caused it.
 
     Args:
@@ -85,11 +85,11 @@ def started_from(version: MapVersion, source: str) -> MapStarted:
     return MapStarted(
         source=source,
         keyframes=tuple(
-            StartKeyframe(robot=keyframe.robot, data=encode_stored(keyframe))
+            StartKeyframe(robot=keyframe.robot, data=encode_version_keyframe(keyframe))
             for keyframe in version.keyframes
         ),
         links=tuple(
-            StartLink(
+            StartEdge(
                 a=row[each.a], b=row[each.b], T_a_b=matrix_bytes(each.T_a_b),
                 information=matrix_bytes(each.information),
             )
@@ -107,7 +107,7 @@ def version_of(graph: Graph, options: LiveMapOptions) -> MapVersion:
     Raises:
         InternalError: Something that the map holds does not fit into a version.
     """
-    with errors_of_maps("the live map cannot be published"):
+    with as_internal_error("the live map cannot be published"):
         return _version_of(graph, options)
 
 
@@ -257,7 +257,7 @@ def _odometry(graph: Graph, ids: list[int], options: LiveMapOptions) -> list[Edg
     return edges
 
 
-def encode_stored(keyframe: Keyframe) -> bytes:
+def encode_version_keyframe(keyframe: Keyframe) -> bytes:
     """Return a keyframe of a version as a robot would have sent it, its pose that in the version."""
     features = make_features(
         keyframe.pixels, keyframe.points_camera[:, 2], keyframe.descriptors, kind=keyframe.kind

@@ -15,7 +15,13 @@ import msgspec
 import numpy as np
 
 from rse_pf.geometry import Array, Camera, exp_se3, inverse, scaled
-from rse_pf.live_map.events import KeyframeAdded, LinksMeasured, MeasuredLink, matrix_bytes, matrix_of
+from rse_pf.live_map.events import (
+    KeyframeAdded,
+    LoopClosuresMeasured,
+    MeasuredLoopClosure,
+    matrix_bytes,
+    matrix_of,
+)
 from rse_pf.slam.keyframe import Keyframe, encode_keyframe, make_features, make_scaleless_features
 
 __all__ = ["GeneratedDrive", "GeneratedWorld", "circle", "make_link", "straight"]
@@ -101,7 +107,7 @@ class GeneratedWorld:
             robot=drive.robot, segment=drive.segment, number=first + number, data=encode_keyframe(keyframe)
         )
 
-    def links_of(self, keyframe: int, wrong: float = 0.0) -> LinksMeasured:
+    def links_of(self, keyframe: int, wrong: float = 0.0) -> LoopClosuresMeasured:
         """Return the links of the newest keyframe to those that it truly overlaps; some may be wrong.
 
         *wrong* is the share of links, measured in addition, that are random.
@@ -123,7 +129,7 @@ class GeneratedWorld:
                 off = exp_se3(np.r_[self.rng.uniform(-3, 3, 3), self.rng.uniform(-1.5, 1.5, 3)])
                 made = make_link(other, self.step(keyframe, other) @ off, self.wrong_inliers)
                 links.append(self.in_units(keyframe, made))
-        return LinksMeasured(keyframe=keyframe, links=tuple(links))
+        return LoopClosuresMeasured(keyframe=keyframe, links=tuple(links))
 
     def _poses(self, count: int) -> Array:
         """Return the first poses of ``seen`` as an array, which grows with it."""
@@ -140,7 +146,7 @@ class GeneratedWorld:
         self._stacked = self.seen, known
         return self._stack[:count]
 
-    def _links_to_twin(self, keyframe: int, poses: Array, shift: float) -> list[MeasuredLink]:
+    def _links_to_twin(self, keyframe: int, poses: Array, shift: float) -> list[MeasuredLoopClosure]:
         """Return links to keyframes of the place that looks like that of *keyframe*."""
         shifted = self.seen[keyframe].copy()
         shifted[0, 3] += shift
@@ -158,13 +164,13 @@ class GeneratedWorld:
         step: Array = inverse(self.seen[keyframe]) @ self.seen[other]
         return step
 
-    def true_link(self, keyframe: int, other: int) -> MeasuredLink:
+    def true_link(self, keyframe: int, other: int) -> MeasuredLoopClosure:
         """Return a link as PnP measures it."""
         sigma = np.array([LINK_SIGMA_M] * 3 + [math.radians(LINK_SIGMA_DEG)] * 3)
         link = make_link(other, self.step(keyframe, other) @ exp_se3(sigma * self.rng.normal(size=6)))
         return self.in_units(keyframe, link)
 
-    def in_units(self, keyframe: int, link: MeasuredLink, ratio: float = 1.0) -> MeasuredLink:
+    def in_units(self, keyframe: int, link: MeasuredLoopClosure, ratio: float = 1.0) -> MeasuredLoopClosure:
         """Return a link in metres as it is between keyframes whose units differ, its scale *ratio* wrong."""
         here, there = self.units_m[keyframe], self.units_m[link.other]
         if here is None and there is None:
@@ -181,7 +187,7 @@ class GeneratedWorld:
 
     def play(
         self, drives: list[GeneratedDrive], wrong: float = 0.0
-    ) -> Iterator[KeyframeAdded | LinksMeasured]:
+    ) -> Iterator[KeyframeAdded | LoopClosuresMeasured]:
         """Yield the events of robots that drive at the same time."""
         for number in range(max(len(drive.T_world_camera) for drive in drives)):
             for drive in drives:
@@ -190,9 +196,9 @@ class GeneratedWorld:
                     yield self.links_of(len(self.seen) - 1, wrong)
 
 
-def make_link(other: int, T_keyframe_other: Array, inliers: int = 100) -> MeasuredLink:
+def make_link(other: int, T_keyframe_other: Array, inliers: int = 100) -> MeasuredLoopClosure:
     """Return a link with the noise that the map expects, and two thirds of its matches as inliers."""
-    return MeasuredLink(
+    return MeasuredLoopClosure(
         other=other, T_keyframe_other=matrix_bytes(T_keyframe_other), information=matrix_bytes(INFORMATION),
         inliers=inliers, matches=3 * inliers // 2,
     )  # fmt: skip

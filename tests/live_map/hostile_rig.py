@@ -13,7 +13,7 @@ from rse_pf.geometry import Array
 from rse_pf.live_map.events import KeyframeAdded
 from rse_pf.live_map.live_map import LiveMap
 from rse_pf.live_map.outcomes import Added, OptimiseWanted
-from rse_pf.live_map.versions import encode_stored
+from rse_pf.live_map.versions import encode_version_keyframe
 from rse_pf.slam.inertial import InertialMotion, KeyframeImu
 from rse_pf.slam.keyframe import Keyframe, UnknownBlock, decode_keyframe, encode_keyframe, make_features
 from tests.synthetic_maps import make_world
@@ -47,7 +47,7 @@ def generated_drives(seed: int, keyframes: int = 16) -> Drives:
     for row, name in enumerate(("a", "b", "c", HOSTILE)):
         turns = 0.27 * (row if name != HOSTILE else 0.5) + np.linspace(0.0, 0.35, keyframes)
         version, _ = world.walk(name, turns, seed=10 * seed + row)
-        drives[name] = tuple(encode_stored(keyframe) for keyframe in version.keyframes)
+        drives[name] = tuple(encode_version_keyframe(keyframe) for keyframe in version.keyframes)
     return drives
 
 
@@ -65,7 +65,7 @@ def play(drives: Drives, attack: Attack | None) -> Outcome:
             next_number = live_map.next_number(name) if is_hostile else number
             event = KeyframeAdded(robot=name, segment=0, number=next_number, data=data)
             try:
-                live_map.judge(event)
+                live_map.check_keyframe(event)
             except RsePfError as error:
                 played.refused += 1
                 played.why = error.message

@@ -11,7 +11,7 @@ import numpy as np
 
 from rse_pf.experiments.results.trajectory_error import ate_m
 from rse_pf.geometry import Array, exp_se3
-from rse_pf.live_map.events import Event, KeyframeAdded, LinksMeasured
+from rse_pf.live_map.events import Event, KeyframeAdded, LoopClosuresMeasured
 from rse_pf.live_map.live_map import LiveMap
 from rse_pf.slam.keyframe import encode_keyframe
 from tests.live_map.generated_drives import GeneratedDrive, GeneratedWorld, circle
@@ -78,12 +78,12 @@ def without(events: Sequence[Event], robot: str) -> list[Event]:
                 number_of[count] = len(number_of)
                 others.append(event)
             count += 1
-        elif isinstance(event, LinksMeasured) and event.keyframe in number_of:
+        elif isinstance(event, LoopClosuresMeasured) and event.keyframe in number_of:
             links = tuple(
                 msgspec.structs.replace(link, other=number_of[link.other])
                 for link in event.links if link.other in number_of
             )  # fmt: skip
-            others.append(LinksMeasured(keyframe=number_of[event.keyframe], links=links))
+            others.append(LoopClosuresMeasured(keyframe=number_of[event.keyframe], links=links))
     return others
 
 

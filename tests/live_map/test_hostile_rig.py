@@ -8,7 +8,7 @@ import pytest
 from rse_pf.geometry import Array, exp_se3, inverse
 from rse_pf.live_map import beliefs
 from rse_pf.live_map.beliefs import has_jumped
-from rse_pf.live_map.events import KeyframeAdded, LinksMeasured, MeasuredLink, matrix_bytes
+from rse_pf.live_map.events import KeyframeAdded, LoopClosuresMeasured, MeasuredLoopClosure, matrix_bytes
 from rse_pf.live_map.graph import Graph, LiveKeyframe, LiveLink
 from rse_pf.live_map.live_map import LiveMap
 from rse_pf.live_map.options import LiveMapOptions
@@ -73,8 +73,8 @@ def test_false_blocks_move_nobody(name: str, drives: Drives, truthful: Outcome) 
     assert same(attacked, truthful)
 
 
-def link(other: int, step: Array, inliers: int = 100) -> MeasuredLink:
-    return MeasuredLink(
+def link(other: int, step: Array, inliers: int = 100) -> MeasuredLoopClosure:
+    return MeasuredLoopClosure(
         other=other, T_keyframe_other=matrix_bytes(step), information=matrix_bytes(np.eye(6)),
         inliers=inliers, matches=inliers,
     )  # fmt: skip
@@ -112,7 +112,7 @@ JUMPED = [0.0, 0.2, 0.4, 0.6, 0.8, 4.0]
     ],
 )
 def test_a_keyframe_is_off_its_path_where_those_just_before_see_it_elsewhere(
-    metres: list[float], links: list[MeasuredLink], is_off: bool
+    metres: list[float], links: list[MeasuredLoopClosure], is_off: bool
 ) -> None:
     assert has_jumped(path(metres), 5, links, LiveMapOptions()) is is_off
     assert not has_jumped(path(metres, is_metric=False), 5, links, LiveMapOptions())
@@ -126,7 +126,7 @@ def test_a_keyframe_off_its_path_is_compared_with_nothing_and_counts_as_a_contra
         sent = jump(number, decode_keyframe(data))
         live_map.apply(KeyframeAdded(robot=HOSTILE, segment=0, number=number, data=sent))
     true = [decode_keyframe(each).T_odom_camera for each in drives[HOSTILE][3:5]]
-    measured = LinksMeasured(keyframe=4, links=(link(3, inverse(true[1]) @ true[0]),), failed={})
+    measured = LoopClosuresMeasured(keyframe=4, links=(link(3, inverse(true[1]) @ true[0]),), failed={})
 
     outcomes = live_map.apply(measured)
 

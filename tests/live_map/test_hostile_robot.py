@@ -14,7 +14,7 @@ from rse_pf.live_map.events import RobotForgotten
 from rse_pf.live_map.graph import Graph
 from rse_pf.live_map.live_map import LiveMap
 from rse_pf.live_map.options import LiveMapOptions
-from rse_pf.live_map.outcomes import Ambiguous, LinkRemoved, Unaligned
+from rse_pf.live_map.outcomes import Ambiguous, LoopClosureRejected, Unaligned
 from tests.live_map.generated_drives import GeneratedWorld, circle
 from tests.live_map.hostile_robot import HOSTILE, error_cm, joins, play, scenario, without
 
@@ -43,7 +43,7 @@ def test_a_robot_whose_odometry_is_random_is_disbelieved_and_told() -> None:
     live_map = LiveMap()
     outcomes = [each for event in events for each in live_map.apply(event)]
     [lying] = [each for each in live_map.alignments() if each.robot == HOSTILE]
-    measured_links = [len(each().links) for each in live_map.measuring(len(live_map._graph) - 1)]
+    measured_links = [len(each().links) for each in live_map.prepare_measurement(len(live_map._graph) - 1)]
 
     assert joins(live_map) == JOINED
     assert not lying.aligned
@@ -118,5 +118,7 @@ def test_a_snapshot_of_an_earlier_release_is_read() -> None:
     restored = LiveMap.restore(msgspec.msgpack.encode(packed))
 
     assert np.array_equal(restored._graph.T, live_map._graph.T)
-    assert restored.links_believed == live_map.links_believed
-    assert not any(isinstance(each, LinkRemoved) for each in restored.apply(RobotForgotten(robot=HOSTILE)))
+    assert restored.loop_closure_count == live_map.loop_closure_count
+    assert not any(
+        isinstance(each, LoopClosureRejected) for each in restored.apply(RobotForgotten(robot=HOSTILE))
+    )

@@ -14,7 +14,7 @@ from rse_pf.errors import BadRequest
 from rse_pf.geometry import Array, exp_se3, inverse, pose_difference
 from rse_pf.live_map.events import (
     Event,
-    LinksMeasured,
+    LoopClosuresMeasured,
     MapStarted,
     Optimised,
     RobotForgotten,
@@ -25,7 +25,15 @@ from rse_pf.live_map.events import (
 )
 from rse_pf.live_map.live_map import LiveMap
 from rse_pf.live_map.options import LiveMapOptions
-from rse_pf.live_map.outcomes import Added, Ambiguous, Corrected, Joined, LinkRemoved, Outcome, Unaligned
+from rse_pf.live_map.outcomes import (
+    Added,
+    Ambiguous,
+    Corrected,
+    Joined,
+    LoopClosureRejected,
+    Outcome,
+    Unaligned,
+)
 from rse_pf.live_map.versions import started_from
 from rse_pf.slam.keyframe import encode_keyframe
 from tests.live_map.generated_drives import GeneratedDrive, GeneratedWorld, circle, make_link, straight
@@ -207,7 +215,7 @@ def test_links_that_do_not_agree_join_nothing() -> None:
     rng = np.random.default_rng(3)
     for k in range(12, 18):
         off = exp_se3(np.r_[rng.uniform(-2, 2, 3), rng.uniform(-1, 1, 3)])
-        run.apply(LinksMeasured(keyframe=k, links=(make_link(k - 12, world.step(k, k - 12) @ off),)))
+        run.apply(LoopClosuresMeasured(keyframe=k, links=(make_link(k - 12, world.step(k, k - 12) @ off),)))
 
     assert [each.robot for each in run.of(Joined)] == ["a"]
 
@@ -215,7 +223,7 @@ def test_links_that_do_not_agree_join_nothing() -> None:
 def test_links_from_one_keyframe_join_nothing() -> None:
     run, world = _two_apart()
     links = tuple(world.true_link(12, other) for other in (0, 1, 2, 3))
-    run.apply(LinksMeasured(keyframe=12, links=links))
+    run.apply(LoopClosuresMeasured(keyframe=12, links=links))
 
     assert run.of(Ambiguous) == []
     assert [each.robot for each in run.of(Joined)] == ["a"]
@@ -231,12 +239,12 @@ def test_robots_that_are_joined_already_need_one_link_only() -> None:
             run.apply(world.keyframe(drive, number))
     for k, others in ((12, range(4)), (24, range(12, 16))):
         for step, other in enumerate(others):
-            run.apply(LinksMeasured(keyframe=k + step, links=(world.true_link(k + step, other),)))
-    believed = run.map.links_believed
-    run.apply(LinksMeasured(keyframe=27, links=(world.true_link(27, 3),)))
+            run.apply(LoopClosuresMeasured(keyframe=k + step, links=(world.true_link(k + step, other),)))
+    believed = run.map.loop_closure_count
+    run.apply(LoopClosuresMeasured(keyframe=27, links=(world.true_link(27, 3),)))
 
     assert len(run.of(Joined)) == 3
-    assert run.map.links_believed == believed + 1
+    assert run.map.loop_closure_count == believed + 1
 
 
 def test_planted_links_are_removed_soon_after_contrary_evidence() -> None:
@@ -244,17 +252,17 @@ def test_planted_links_are_removed_soon_after_contrary_evidence() -> None:
     wrong = exp_se3([1.5, 0.3, 0.0, 0.0, 0.4, 0.0])
     for k in range(12, 16):
         planted = inverse(world.seen[k]) @ _moved(world, wrong) @ world.seen[k - 12]
-        run.apply(LinksMeasured(keyframe=k, links=(make_link(k - 12, planted),)))
+        run.apply(LoopClosuresMeasured(keyframe=k, links=(make_link(k - 12, planted),)))
     assert [each.robot for each in run.of(Joined)] == ["a", "b"]
     later = 0
-    while not run.of(LinkRemoved) and later < 20:
+    while not run.of(LoopClosureRejected) and later < 20:
         k = 16 + later
         links = tuple(world.true_link(k, k - 12 + near) for near in (0, 1))
-        run.apply(LinksMeasured(keyframe=k, links=links))
+        run.apply(LoopClosuresMeasured(keyframe=k, links=links))
         later += 1
 
     assert later <= 20
-    assert len(run.of(LinkRemoved)) == 4
+    assert len(run.of(LoopClosureRejected)) == 4
     assert run.worst_error(range(len(world.seen)))[0] < 0.1
 
 
@@ -294,11 +302,11 @@ def test_a_robot_that_meets_in_the_second_of_equal_rooms_whom_it_met_in_the_firs
         k = first_b + near % steps
         other = (near % steps + near // steps) % steps
         link = make_link(other, inverse(world.seen[k]) @ inverse(shift) @ world.seen[other])
-        live_map.apply(LinksMeasured(keyframe=k, links=(link,)))
+        live_map.apply(LoopClosuresMeasured(keyframe=k, links=(link,)))
     assert live_map.alignment_of("b", 0).aligned  # type: ignore[union-attr]
     for number in range(steps):
         link = world.true_link(in_second + number, first_b + number)
-        outcomes += live_map.apply(LinksMeasured(keyframe=in_second + number, links=(link,)))
+        outcomes += live_map.apply(LoopClosuresMeasured(keyframe=in_second + number, links=(link,)))
 
     found = live_map.alignment_of("b", 0)
     assert found is not None
@@ -327,7 +335,7 @@ def test_an_owner_that_is_behind_compares_a_keyframe_with_few_and_none_of_just_b
     live_map, drive = LiveMap(LiveMapOptions(candidates=1000)), world.drive("a", straight(0.0, 9.0))
     for number in range(60):
         live_map.apply(world.keyframe(drive, number))
-    assert len(live_map.measuring(59, 100, 4)) == 4
+    assert len(live_map.prepare_measurement(59, 100, 4)) == 4
     assert max(live_map._candidates(59)) > 50 > max(live_map._candidates(59, 1000))
 
 
@@ -337,9 +345,9 @@ def test_a_keyframe_is_new_known_or_ahead() -> None:
     live = LiveMap()
     first, second = world.keyframe(drive, 0), world.keyframe(drive, 1)
 
-    assert (live.judge(first), live.judge(second)) == ("new", "ahead")
+    assert (live.check_keyframe(first), live.check_keyframe(second)) == ("new", "ahead")
     live.apply(first)
-    assert (live.judge(first), live.judge(second)) == ("known", "new")
+    assert (live.check_keyframe(first), live.check_keyframe(second)) == ("known", "new")
     assert live.next_number("a") == 1
 
 
@@ -366,22 +374,24 @@ def test_garbage_is_refused_before_it_is_logged(change: dict[str, Any]) -> None:
     event = msgspec.structs.replace(good, **{"data": data, **in_event})
 
     with pytest.raises(BadRequest):
-        live.judge(event)
+        live.check_keyframe(event)
     assert live.digest() == before
 
 
 def test_links_to_keyframes_that_were_forgotten_change_nothing(joined: Run) -> None:
     run = copy_of(joined)
     newest = len(run.world.seen) - 1
-    late = LinksMeasured(keyframe=newest, links=tuple(run.world.true_link(newest, i) for i in (0, 2, 4)))
+    late = LoopClosuresMeasured(
+        keyframe=newest, links=tuple(run.world.true_link(newest, i) for i in (0, 2, 4))
+    )
     run.apply(RobotForgotten(robot="b"))
-    believed = run.map.links_believed
+    believed = run.map.loop_closure_count
 
     measured = len(run.map._graph.links)
     assert run.apply(late) == []
     assert len(run.map._graph.links) == measured
-    assert run.apply(LinksMeasured(keyframe=10_000)) == []
-    assert run.map.links_believed == believed
+    assert run.apply(LoopClosuresMeasured(keyframe=10_000)) == []
+    assert run.map.loop_closure_count == believed
 
 
 def test_a_forgotten_robot_that_drives_on_is_a_new_trajectory(joined: Run) -> None:
@@ -435,7 +445,7 @@ def test_a_map_goes_on_from_the_version_that_it_became(joined: Run) -> None:
         here = world.seen[offset + number]
         rows = sorted(range(newest), key=lambda row: _apart(world.seen[held[row]], here))[:3]
         links = tuple(make_link(row, inverse(here) @ world.seen[held[row]]) for row in rows)
-        again.apply(LinksMeasured(keyframe=newest + number, links=links))
+        again.apply(LoopClosuresMeasured(keyframe=newest + number, links=links))
 
     assert [each.robot for each in again.of(Joined)] == ["c"]
     assert started.alignment_of("c", 0).aligned

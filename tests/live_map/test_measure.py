@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from rse_pf.geometry import Array, exp_se3, inverse, pose_difference, transform
-from rse_pf.live_map.events import LinksMeasured, matrix_of
-from rse_pf.live_map.measure import joined_links, measure_links, measure_stored
+from rse_pf.live_map.events import LoopClosuresMeasured, matrix_of
+from rse_pf.live_map.measure import measure_loop_closures, measure_stored_keyframes, merge_measurements
 from rse_pf.maps.format import Keyframe
 from rse_pf.pnp import DepthNoise
 from rse_pf.pnp.problems import KINECT
@@ -31,7 +31,7 @@ def numbered(number: int):
 
 
 def test_a_link_is_the_pose_of_the_other_in_the_frame_of_the_keyframe():
-    found = measure_links(numbered(0), [numbered(1), numbered(2)])
+    found = measure_loop_closures(numbered(0), [numbered(1), numbered(2)])
 
     assert [link.other for link in found.links] == [1, 2]
     for link in found.links:
@@ -44,7 +44,7 @@ def test_a_link_is_the_pose_of_the_other_in_the_frame_of_the_keyframe():
 
 def test_the_information_is_that_of_an_edge_with_the_floor():
     options = RelativePoseOptions()
-    (link,) = measure_links(numbered(0), [numbered(1)], options).links
+    (link,) = measure_loop_closures(numbered(0), [numbered(1)], options).links
 
     covariance = np.linalg.inv(matrix_of(link.information, 6, 6))
 
@@ -55,7 +55,7 @@ def test_the_information_is_that_of_an_edge_with_the_floor():
 
 
 def test_places_that_have_nothing_in_common_fail_with_their_reason():
-    found = measure_links(numbered(0), [numbered(3), numbered(1)])
+    found = measure_loop_closures(numbered(0), [numbered(3), numbered(1)])
 
     assert [link.other for link in found.links] == [1]
     assert found.failed == {"no-matches": 1}
@@ -63,17 +63,17 @@ def test_places_that_have_nothing_in_common_fail_with_their_reason():
 
 def test_candidates_that_are_measured_in_two_pieces_give_the_same_links_and_failures():
     others = [numbered(3), numbered(1), numbered(2)]
-    whole = measure_links(numbered(0), others)
+    whole = measure_loop_closures(numbered(0), others)
 
-    pieces = [measure_links(numbered(0), others[:2]), measure_links(numbered(0), others[2:])]
+    pieces = [measure_loop_closures(numbered(0), others[:2]), measure_loop_closures(numbered(0), others[2:])]
 
-    assert joined_links(0, pieces) == whole
+    assert merge_measurements(0, pieces) == whole
     assert len(whole.links) == 2
-    assert joined_links(0, [LinksMeasured(keyframe=0, failed={"a": 1})] * 2).failed == {"a": 2}
+    assert merge_measurements(0, [LoopClosuresMeasured(keyframe=0, failed={"a": 1})] * 2).failed == {"a": 2}
 
 
 def test_too_few_inliers_are_no_link():
-    found = measure_links(numbered(0), [numbered(1)], RelativePoseOptions(min_inliers=700))
+    found = measure_loop_closures(numbered(0), [numbered(1)], RelativePoseOptions(min_inliers=700))
 
     assert found.links == ()
     assert sum(found.failed.values()) == 1
@@ -86,7 +86,7 @@ def test_a_pose_that_the_evidence_calls_weak_is_no_link():
         descriptors=FEATURES[0].descriptors[near],
     )  # fmt: skip
 
-    found = measure_links((0, narrow, CAMERA), [numbered(1)], RelativePoseOptions(min_inliers=8))
+    found = measure_loop_closures((0, narrow, CAMERA), [numbered(1)], RelativePoseOptions(min_inliers=8))
 
     assert found.links == ()
     assert found.failed == {"nearly-collinear": 1}
@@ -98,8 +98,8 @@ def test_a_view_of_fewer_than_two_features_gives_no_link():
         descriptors=FEATURES[0].descriptors[:1],
     )  # fmt: skip
 
-    assert measure_links((0, one, CAMERA), [numbered(1)]).failed == {"no-matches": 1}
-    assert measure_links(numbered(1), [(0, one, CAMERA)]).failed == {"no-matches": 1}
+    assert measure_loop_closures((0, one, CAMERA), [numbered(1)]).failed == {"no-matches": 1}
+    assert measure_loop_closures(numbered(1), [(0, one, CAMERA)]).failed == {"no-matches": 1}
 
 
 NOISY = DepthNoise(base_m=4 * DepthNoise().base_m, growth_per_m=4 * DepthNoise().growth_per_m)
@@ -132,7 +132,7 @@ def test_links_of_stored_keyframes_weigh_their_depths_by_the_noise_that_they_car
         errors = []
         for seed in range(40):
             one, other, T_a_b = noisy_pair(seed, noise)
-            (link,) = measure_stored((0, one), [(1, other)]).links
+            (link,) = measure_stored_keyframes((0, one), [(1, other)]).links
             errors.append(pose_difference(matrix_of(link.T_keyframe_other, 4, 4), T_a_b)[0])
         return float(np.median(errors))
 

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from rse_pf.live_map.beliefs import Changes, disbelieve_contradicting, has_other_metres
-from rse_pf.live_map.events import KeyframeAdded, LinksMeasured, MeasuredLink, matrix_bytes
+from rse_pf.live_map.events import KeyframeAdded, LoopClosuresMeasured, MeasuredLoopClosure, matrix_bytes
 from rse_pf.live_map.graph import Graph, LiveKeyframe
 from rse_pf.live_map.live_map import LiveMap
-from rse_pf.live_map.measure import measure_links
+from rse_pf.live_map.measure import measure_loop_closures
 from rse_pf.live_map.options import LiveMapOptions
 from rse_pf.live_map.outcomes import Outcome, Unaligned
 from rse_pf.slam.keyframe import decode_keyframe, make_features
@@ -32,8 +32,8 @@ def graph_of(*robots: str) -> Graph:
     return graph
 
 
-def link(other: int, off_scale: float, inliers: int = 100) -> MeasuredLink:
-    return MeasuredLink(
+def link(other: int, off_scale: float, inliers: int = 100) -> MeasuredLoopClosure:
+    return MeasuredLoopClosure(
         other=other, T_keyframe_other=matrix_bytes(np.eye(4)), information=matrix_bytes(np.eye(6)),
         inliers=inliers, matches=inliers, off_scale=off_scale,
     )  # fmt: skip
@@ -53,7 +53,7 @@ def link(other: int, off_scale: float, inliers: int = 100) -> MeasuredLink:
         ([], False),
     ],
 )
-def test_metres_are_others_where_two_robots_say_so(links: list[MeasuredLink], is_other: bool) -> None:
+def test_metres_are_others_where_two_robots_say_so(links: list[MeasuredLoopClosure], is_other: bool) -> None:
     graph = graph_of("x", "a", "b", "c")
 
     assert has_other_metres(graph, 0, links, OPTIONS) is is_other
@@ -84,7 +84,7 @@ def test_depths_of_both_keyframes_tell_the_ratio_of_their_metres(factor: float, 
     seen = other.features
     false = make_features(seen.pixels, factor * seen.depths_m, seen.descriptors, seen.noise, seen.kind, 0.0)
 
-    (measured,) = measure_links((0, one.features, one.camera), [(1, false, other.camera)]).links
+    (measured,) = measure_loop_closures((0, one.features, one.camera), [(1, false, other.camera)]).links
 
     # A metre of the second one is shorter if it reads too many.
     off_scale = measured.off_scale or 0.0
@@ -103,7 +103,7 @@ def test_a_map_lets_go_a_robot_whose_links_say_that_its_metres_are_others(
     for event in world.play(drives):
         if isinstance(event, KeyframeAdded):
             robots.append(event.robot)
-        if isinstance(event, LinksMeasured) and robots[event.keyframe] == "x":
+        if isinstance(event, LoopClosuresMeasured) and robots[event.keyframe] == "x":
             links = tuple(msgspec.structs.replace(each, off_scale=off_scale) for each in event.links)
             event = msgspec.structs.replace(event, links=links)
         outcomes += live.apply(event)

@@ -10,7 +10,7 @@ import pytest
 
 from rse_pf.errors import BadRequest, InternalError
 from rse_pf.geometry import Array, exp_se3, inverse, rigid, rigid_many
-from rse_pf.live_map.events import KeyframeAdded, LinksMeasured
+from rse_pf.live_map.events import KeyframeAdded, LoopClosuresMeasured
 from rse_pf.live_map.live_map import LiveMap
 from rse_pf.live_map.versions import started_from
 from rse_pf.maps.format import decode_map, encode_map
@@ -61,16 +61,16 @@ def test_a_rounded_pose_that_is_accepted_is_published_optimised_and_started_from
 
     for number, T in enumerate(poses):
         event = sent(T, good, number)
-        assert live_map.judge(event) == "new"
+        assert live_map.check_keyframe(event) == "new"
         live_map.apply(event)
     T_exact = np.array([live_map.pose(i) for i in range(500)])
     for k in range(20, 500, 20):
         step = inverse(T_exact[k]) @ T_exact[k - 5]
-        live_map.apply(LinksMeasured(keyframe=k, links=(make_link(k - 5, step),)))
+        live_map.apply(LoopClosuresMeasured(keyframe=k, links=(make_link(k - 5, step),)))
     version = live_map.to_version()
     data = encode_map(version)
     again = decode_map(data)
-    live_map.apply(live_map.optimising(as_first_graph)())
+    live_map.apply(live_map.prepare_optimisation(as_first_graph)())
 
     assert encode_map(again) == data
     assert len(version.keyframes) == 500
@@ -109,7 +109,7 @@ def test_absurd_poses_are_refused_where_they_arrive(wrong: float, place: tuple[i
     with pytest.raises(BadRequest, match=r"T_odom_camera|not finite"):
         sent(T, good, 0)
     with pytest.raises(BadRequest, match="T_odom_camera"):
-        LiveMap().judge(with_pose(good, T))
+        LiveMap().check_keyframe(with_pose(good, T))
 
 
 def test_a_log_of_an_earlier_release_with_scaled_rotations_is_replayed_and_published() -> None:

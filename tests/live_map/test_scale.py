@@ -15,16 +15,16 @@ from rse_pf.geometry import Array, exp_se3, inverse, pose_difference, scaled
 from rse_pf.live_map.agreement import scale_into, step_into
 from rse_pf.live_map.events import (
     Event,
-    LinksMeasured,
+    LoopClosuresMeasured,
     MapStarted,
-    MeasuredLink,
+    MeasuredLoopClosure,
     decode_events,
     encode_events,
     matrix_bytes,
     matrix_of,
 )
 from rse_pf.live_map.live_map import UP_TO_SCALE, LiveMap
-from rse_pf.live_map.measure import measure_links
+from rse_pf.live_map.measure import measure_loop_closures
 from rse_pf.live_map.outcomes import Corrected, Joined
 from rse_pf.slam.consistency import LinkEnds, OdometryNoise, round_trips_close
 from rse_pf.slam.keyframe import KeyframeFeatures, make_features, make_scaleless_features
@@ -35,7 +35,7 @@ from tests.synthetic_maps import make_world
 
 HOSTILE = "x"
 WAY = 1.0, 1.1
-Tamper = Callable[[GeneratedWorld, int, MeasuredLink], MeasuredLink]
+Tamper = Callable[[GeneratedWorld, int, MeasuredLoopClosure], MeasuredLoopClosure]
 
 
 class Run:
@@ -53,7 +53,7 @@ class Run:
 
     def play(self, drives: list[GeneratedDrive] | None = None, tamper: Tamper | None = None) -> Run:
         for event in self.world.play(self.drives if drives is None else drives, self.wrong):
-            if tamper is not None and isinstance(event, LinksMeasured):
+            if tamper is not None and isinstance(event, LoopClosuresMeasured):
                 links = tuple(tamper(self.world, event.keyframe, link) for link in event.links)
                 event = msgspec.structs.replace(event, links=links)
             self.log.append(event)
@@ -146,7 +146,7 @@ def test_a_version_has_the_segments_without_metres_in_metres() -> None:
 def test_links_whose_scales_contradict_each_other_join_nothing() -> None:
     rng = np.random.default_rng(0)
 
-    def tamper(world: GeneratedWorld, keyframe: int, link: MeasuredLink) -> MeasuredLink:
+    def tamper(world: GeneratedWorld, keyframe: int, link: MeasuredLoopClosure) -> MeasuredLoopClosure:
         if link.scale is None:
             return link
         return world.in_units(keyframe, _in_metres(world, keyframe, link), math.exp(rng.uniform(-2.0, 2.0)))
@@ -167,9 +167,9 @@ def test_links_within_the_map_whose_scale_is_wrong_are_not_believed() -> None:
     believed = []
     for link in links:
         copy = LiveMap.restore(run.map.snapshot())
-        before = copy.links_believed
-        copy.apply(LinksMeasured(keyframe=newest, links=(link,)))
-        believed.append(copy.links_believed - before)
+        before = copy.loop_closure_count
+        copy.apply(LoopClosuresMeasured(keyframe=newest, links=(link,)))
+        believed.append(copy.loop_closure_count - before)
 
     assert believed == [1, 0]
 
@@ -180,7 +180,7 @@ def test_links_within_the_map_whose_scale_is_wrong_are_not_believed() -> None:
 def test_a_false_scale_moves_no_other_robot(lie: float) -> None:
     """The hostile robot's depths are *lie* times as deep as its odometry says."""
 
-    def tamper(world: GeneratedWorld, keyframe: int, link: MeasuredLink) -> MeasuredLink:
+    def tamper(world: GeneratedWorld, keyframe: int, link: MeasuredLoopClosure) -> MeasuredLoopClosure:
         if link.scale is None:
             return link
         off = math.log(lie) if world.owners[link.other][0] == HOSTILE else -math.log(lie)
@@ -207,7 +207,7 @@ def test_a_segment_does_not_change_whether_it_has_metres() -> None:
     wrong = msgspec.structs.replace(run.world.keyframe(metric, 1), robot="b")
 
     with pytest.raises(BadRequest, match="with and without metres"):
-        run.map.judge(wrong)
+        run.map.check_keyframe(wrong)
 
 
 def test_a_pose_that_is_far_in_a_small_unit_is_refused() -> None:
@@ -217,9 +217,9 @@ def test_a_pose_that_is_far_in_a_small_unit_is_refused() -> None:
     near = run.world.keyframe(run.drives[0], 0)
     event = run.world.keyframe(replace(run.drives[0], T_odom_camera=far), 0)
 
-    assert run.map.judge(near) == "new"
+    assert run.map.check_keyframe(near) == "new"
     with pytest.raises(BadRequest, match="from the start"):
-        run.map.judge(event)
+        run.map.check_keyframe(event)
 
 
 def test_rooms_of_a_stated_size_are_measured_in_metres() -> None:
@@ -244,8 +244,12 @@ def test_a_link_says_one_place_whichever_of_its_ends_was_measured(
     for name, phase, unit_m in zip("ab", (0.0, 0.3), units_m, strict=True):
         live_map.apply(world.keyframe(world.drive(name, circle(1.0, 0.5, phase), unit_m=unit_m), 3))
     graph = live_map._graph
-    live_map.apply(LinksMeasured(keyframe=1, links=(world.in_units(1, make_link(0, world.step(1, 0))),)))
-    live_map.apply(LinksMeasured(keyframe=0, links=(world.in_units(0, make_link(1, world.step(0, 1))),)))
+    live_map.apply(
+        LoopClosuresMeasured(keyframe=1, links=(world.in_units(1, make_link(0, world.step(1, 0))),))
+    )
+    live_map.apply(
+        LoopClosuresMeasured(keyframe=0, links=(world.in_units(0, make_link(1, world.step(0, 1))),))
+    )
 
     for stay in (0, 1) if None not in units_m else (units_m.index(None),):
         moving, unit_m = 1 - stay, units_m[stay] or 1.0
@@ -293,7 +297,9 @@ def features(number: int, unit_m: float | None) -> KeyframeFeatures:
 
 @pytest.mark.parametrize("units_m", [(None, 0.01), (0.3, None), (5.0, 0.2), (1e-3, 1e3)])
 def test_a_link_measures_pose_and_scale(units_m: tuple[float | None, float | None]) -> None:
-    [link] = measure_links((0, features(0, units_m[0]), CAMERA), [(1, features(1, units_m[1]), CAMERA)]).links
+    [link] = measure_loop_closures(
+        (0, features(0, units_m[0]), CAMERA), [(1, features(1, units_m[1]), CAMERA)]
+    ).links
     here, there = units_m[0] or 1.0, units_m[1] or 1.0
     length = 1.0 if None in units_m else here
     T = scaled(matrix_of(link.T_keyframe_other, 4, 4), length)
@@ -310,7 +316,7 @@ def test_a_link_measures_pose_and_scale(units_m: tuple[float | None, float | Non
 
 
 def test_links_in_metres_have_no_scale_and_the_bytes_that_they_had() -> None:
-    found = measure_links((0, features(0, None), CAMERA), [(1, features(1, None), CAMERA)])
+    found = measure_loop_closures((0, features(0, None), CAMERA), [(1, features(1, None), CAMERA)])
 
     assert found.links[0].scale is None
     assert b"scale" not in encode_events([found])
@@ -349,7 +355,7 @@ def test_a_scale_is_fitted_with_the_poses_of_a_chain() -> None:
     assert found.covariances.shape == (1, 6, 6)
 
 
-def _in_metres(world: GeneratedWorld, keyframe: int, link: MeasuredLink) -> MeasuredLink:
+def _in_metres(world: GeneratedWorld, keyframe: int, link: MeasuredLoopClosure) -> MeasuredLoopClosure:
     """Return a link as `GeneratedWorld.in_units` got it."""
     here, there = world.units_m[keyframe], world.units_m[link.other]
     length: float = here if here is not None and there is not None else 1.0

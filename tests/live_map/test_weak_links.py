@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from rse_pf.geometry import exp_se3, inverse
-from rse_pf.live_map.events import LinksMeasured, MeasuredLink
+from rse_pf.live_map.events import LoopClosuresMeasured, MeasuredLoopClosure
 from rse_pf.live_map.live_map import LiveMap
 from rse_pf.live_map.options import LiveMapOptions
 from rse_pf.live_map.smoothing import edges_of
@@ -34,7 +34,7 @@ def test_three_weak_links_that_agree_join_nothing_and_five_do() -> None:
     joined = [add(live_map, 12 + k, weak(world.true_link(12 + k, k))) for k in range(5)]
 
     assert joined == [False, False, False, False, True]
-    assert live_map.links_believed == 5
+    assert live_map.loop_closure_count == 5
 
 
 def test_weak_links_add_to_strong_ones() -> None:
@@ -57,18 +57,18 @@ def test_strong_links_join_although_more_weak_ones_agree_on_another_place() -> N
     joined = [add(live_map, 16 + k, world.true_link(16 + k, 4 + k)) for k in range(3)]
 
     assert joined == [False, False, True]
-    assert {(a, b) for a, b, _ in live_map.believed()} == {(16, 4), (17, 5), (18, 6)}
+    assert {(a, b) for a, b, _ in live_map.accepted_loop_closures()} == {(16, 4), (17, 5), (18, 6)}
 
 
 def test_a_weak_link_is_believed_where_no_strong_one_ties_its_keyframe() -> None:
     live_map, world = joined_robots()
-    before = live_map.links_believed
+    before = live_map.loop_closure_count
 
     add(live_map, 15, weak(world.true_link(15, 4)))  # a strong link ties 15 to the other robot
-    tied = live_map.links_believed
+    tied = live_map.loop_closure_count
     add(live_map, 17, weak(world.true_link(17, 5)))
 
-    assert (tied, live_map.links_believed) == (before, before + 1)
+    assert (tied, live_map.loop_closure_count) == (before, before + 1)
 
 
 def test_weak_links_that_contradict_the_map_do_not_disbelieve_their_robot() -> None:
@@ -81,7 +81,7 @@ def test_weak_links_that_contradict_the_map_do_not_disbelieve_their_robot() -> N
 
     assert [each.aligned for each in live_map.alignments()] == [True, True]
     assert not any(segment.disbelieved for segment in live_map._graph.segments)
-    assert live_map.links_believed == 4
+    assert live_map.loop_closure_count == 4
 
 
 def test_a_weak_link_is_taken_for_less_exact() -> None:
@@ -105,18 +105,18 @@ def test_random_wrong_links_with_few_inliers_are_not_believed() -> None:
         live_map.apply(event)
 
     assert world.wrong_sent > 20
-    for a, b, T_a_b in live_map.believed():
+    for a, b, T_a_b in live_map.accepted_loop_closures():
         off = inverse(T_a_b) @ inverse(world.seen[a]) @ world.seen[b]
         assert float(np.linalg.norm(off[:3, 3])) < 0.2
 
 
-def weak(link: MeasuredLink, inliers: int = WEAK_INLIERS) -> MeasuredLink:
+def weak(link: MeasuredLoopClosure, inliers: int = WEAK_INLIERS) -> MeasuredLoopClosure:
     return msgspec.structs.replace(link, inliers=inliers, matches=3 * inliers // 2)
 
 
-def add(live_map: LiveMap, keyframe: int, link: MeasuredLink) -> bool:
+def add(live_map: LiveMap, keyframe: int, link: MeasuredLoopClosure) -> bool:
     """Give a link to the map; return whether both robots are in it now."""
-    live_map.apply(LinksMeasured(keyframe=keyframe, links=(link,)))
+    live_map.apply(LoopClosuresMeasured(keyframe=keyframe, links=(link,)))
     return all(each.aligned for each in live_map.alignments())
 
 
@@ -137,5 +137,5 @@ def joined_robots() -> tuple[LiveMap, GeneratedWorld]:
     live_map, world = two_apart()
     for k in range(12, 16):
         add(live_map, k, world.true_link(k, k - 12))
-    assert live_map.links_believed == 4
+    assert live_map.loop_closure_count == 4
     return live_map, world

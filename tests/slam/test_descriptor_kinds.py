@@ -385,15 +385,15 @@ def test_a_live_map_takes_one_kind_until_all_of_it_is_forgotten() -> None:
     live = LiveMap()
     assert live.kind is None
     for number in range(2):
-        assert live.judge(added("a", number, SIFT)) == "new"
+        assert live.check_keyframe(added("a", number, SIFT)) == "new"
         live.apply(added("a", number, SIFT))
 
     for other in (ORB, XFEAT, DescriptorKind("other", "int8", 128)):
         with pytest.raises(BadRequest, match=r"the live map has features of kind sift"):
-            live.judge(added("b", 0, other))
+            live.check_keyframe(added("b", 0, other))
         with pytest.raises(BadRequest, match=r"the live map has features of kind sift"):
             live.relocalise(keyframe(other, 40))
-    assert live.judge(added("b", 0, SIFT)) == "new"
+    assert live.check_keyframe(added("b", 0, SIFT)) == "new"
     assert live.relocalise(keyframe(SIFT, 40)).verdict in ("ok", "weak", "none")
 
     restored = LiveMap.restore(live.snapshot())
@@ -401,7 +401,7 @@ def test_a_live_map_takes_one_kind_until_all_of_it_is_forgotten() -> None:
     for each in (live, restored):
         each.apply(RobotForgotten(robot="a"))
         assert each.kind is None
-        assert each.judge(added("b", 0, XFEAT)) == "new"
+        assert each.check_keyframe(added("b", 0, XFEAT)) == "new"
 
 
 def test_a_version_of_a_live_map_keeps_its_kind_and_starts_another_one() -> None:

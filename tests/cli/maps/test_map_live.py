@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from rse_pf.cli.main import main
-from rse_pf.live_map.events import OwnerChanged, encode_events
+from rse_pf.live_map.events import MapServerChanged, encode_events
 from rse_pf.object_store import DirectoryStore
 from rse_pf.server.live_map.owner.lease import OwnerLease, lease_name, map_folder
 from rse_pf.server.live_map.owner.log import LiveLog
@@ -28,7 +28,7 @@ def store(tmp_path: Path) -> Path:
         )
         lease.claim(None)
         LiveLog(objects, map_folder("default", name), owner="a-1", epoch=1).write(
-            encode_events([OwnerChanged(owner="a-1", epoch=1)])
+            encode_events([MapServerChanged(owner="a-1", epoch=1)])
         )
         assert lease.release() if name == "hall" else lease.stop(1)
     return tmp_path / "store"

@@ -18,7 +18,7 @@ from rse_pf.experiments.results.log_replay import read_log
 from rse_pf.experiments.results.records import CommandRecord, Records
 from rse_pf.geometry import Camera, exp_se3
 from rse_pf.identity import DEFAULT_TENANT
-from rse_pf.live_map.events import KeyframeAdded, OwnerChanged, encode_events
+from rse_pf.live_map.events import KeyframeAdded, MapServerChanged, encode_events
 from rse_pf.object_store import DirectoryStore
 from rse_pf.server.live_map.owner.lease import map_folder
 from rse_pf.server.live_map.owner.log import LiveLog
@@ -45,12 +45,12 @@ def write_run(folder: Path, keyframes: list[KeyframeAdded], *, fault: str = "kil
     store = DirectoryStore(folder / "platform" / "objects")
     where = map_folder(DEFAULT_TENANT, "demo")
     log = LiveLog(store, where, owner="one", epoch=1)
-    log.write(encode_events([OwnerChanged(owner="one", epoch=1)]))
+    log.write(encode_events([MapServerChanged(owner="one", epoch=1)]))
     for each in keyframes[:2]:
         log.write(encode_events([each]))
     second = LiveLog(store, where, owner="two", epoch=2)
     second.position = log.position
-    position = second.write(encode_events([OwnerChanged(owner="two", epoch=2)]))
+    position = second.write(encode_events([MapServerChanged(owner="two", epoch=2)]))
     for each in keyframes[2:]:
         position = second.write(encode_events([each]))
     (folder / "robot-1").mkdir()

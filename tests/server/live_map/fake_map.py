@@ -14,7 +14,7 @@ from rse_pf.geometry import Camera
 from rse_pf.live_map.events import (
     Event,
     KeyframeAdded,
-    LinksMeasured,
+    LoopClosuresMeasured,
     MapStarted,
     Optimised,
     RobotForgotten,
@@ -56,7 +56,7 @@ class FakeMap:
     def digest(self) -> str:
         return str(self._state["digest"])
 
-    def judge(self, event: KeyframeAdded) -> Literal["new", "known", "ahead"]:
+    def check_keyframe(self, event: KeyframeAdded) -> Literal["new", "known", "ahead"]:
         expected = self.next_number(event.robot)
         if event.number != expected:
             return "known" if event.number < expected else "ahead"
@@ -79,7 +79,7 @@ class FakeMap:
             self._state["numbers"][event.robot] = event.number + 1
             self._state["segments"][event.robot] = event.segment
             return [Added(id=len(self._state["keyframes"]) - 1)]
-        if isinstance(event, LinksMeasured):
+        if isinstance(event, LoopClosuresMeasured):
             robot, number, _ = self._state["keyframes"][event.keyframe]
             T = np.eye(4)
             T[0, 3] = len(self._state["keyframes"])
@@ -95,15 +95,15 @@ class FakeMap:
                 self._state[table].pop(event.robot, None)
         return []
 
-    def measuring(
+    def prepare_measurement(
         self, keyframe: int, pieces: int = 1, candidates: int | None = None
-    ) -> list[Callable[[], LinksMeasured]]:
-        return [lambda: LinksMeasured(keyframe=keyframe)]
+    ) -> list[Callable[[], LoopClosuresMeasured]]:
+        return [lambda: LoopClosuresMeasured(keyframe=keyframe)]
 
-    def optimising(self, solve: WholeFit | None = None) -> Callable[[], Optimised]:
+    def prepare_optimisation(self, solve: WholeFit | None = None) -> Callable[[], Optimised]:
         return lambda: Optimised(up_to=0, ids=(), T_map_camera=b"")
 
-    def relocalising(self, view: SentKeyframe) -> Callable[[], Any]:
+    def prepare_relocalisation(self, view: SentKeyframe) -> Callable[[], Any]:
         raise BadRequest("the fake map cannot relocalise")
 
     def alignments(self) -> list[Alignment]:
@@ -138,7 +138,7 @@ class FakeMap:
         return []
 
     @property
-    def gone_objects(self) -> list[tuple[str, str]]:
+    def deletable_objects(self) -> list[tuple[str, str]]:
         return []
 
     @property
@@ -154,7 +154,7 @@ class FakeMap:
         return tuple(self._state["numbers"])
 
     @property
-    def links_believed(self) -> int:
+    def loop_closure_count(self) -> int:
         return 0
 
 

@@ -36,7 +36,7 @@ from rse_pf.live_map.outcomes import (
     Corrected,
     Culled,
     Joined,
-    LinkRemoved,
+    LoopClosureRejected,
     OptimiseWanted,
     Outcome,
     Unaligned,
@@ -84,7 +84,7 @@ _EVENT_BYTES = 512
 """Size of a keyframe's event in the log, without the keyframe."""
 _WAITING = "waiting for the store"
 _ALL_LEFT, _CHANGED, _UNUSED = AUTOMATIC_NOTES
-_ALIGNING = (Joined, Corrected, Unaligned, Ambiguous, LinkRemoved)
+_ALIGNING = (Joined, Corrected, Unaligned, Ambiguous, LoopClosureRejected)
 
 
 class MapMoves(Busy):
@@ -231,7 +231,7 @@ class LiveOwner:
         """Return when a keyframe is durable; those before it that are on their way come first."""
         compute, live_map = self._context.threads.compute, self._state.live_map
         while True:
-            verdict = await compute(Urgency.JUDGE, functools.partial(live_map.judge, event))
+            verdict = await compute(Urgency.JUDGE, functools.partial(live_map.check_keyframe, event))
             if verdict == "known":
                 return
             if verdict == "new":
@@ -272,7 +272,7 @@ class LiveOwner:
     async def _relocalise(self, request: LiveRelocalise) -> dict[str, Any]:
         view = decode_keyframe(request.keyframe)
         threads, live_map = self._context.threads, self._state.live_map
-        look = await threads.compute(Urgency.ANSWER, functools.partial(live_map.relocalising, view))
+        look = await threads.compute(Urgency.ANSWER, functools.partial(live_map.prepare_relocalisation, view))
         position = self._state.position
         return relocalise_reply(await threads.look(look), position)
 
@@ -304,7 +304,9 @@ class LiveOwner:
 
     async def _delete_gone(self) -> None:
         """Delete what forgotten robots stored beside their keyframes; raises StoreError."""
-        gone = await self._context.threads.compute(Urgency.ANSWER, lambda: self._state.live_map.gone_objects)
+        gone = await self._context.threads.compute(
+            Urgency.ANSWER, lambda: self._state.live_map.deletable_objects
+        )
         if gone:
             await self._context.threads.background(functools.partial(self._context.objects.delete_gone, gone))
 

@@ -23,7 +23,7 @@ from rse_pf.errors import (
     RsePfError,
     StoreError,
 )
-from rse_pf.live_map.versions import PointSource, errors_of_maps
+from rse_pf.live_map.versions import PointSource, as_internal_error
 from rse_pf.maps.format import UP_FIELD, MapVersion, encode_map
 from rse_pf.maps.registry import MapOrigin, MapRecord, MapRegistry
 from rse_pf.maps.removal import superseded
@@ -171,7 +171,7 @@ class Publisher:
             if self._context.settings.images:
                 provenance = {**version.provenance, **live_map.image_references(version)}
                 version = dataclasses.replace(version, provenance=provenance)
-            return version, live_map.point_sources(version), live_map.gone_objects
+            return version, live_map.point_sources(version), live_map.deletable_objects
 
         while True:
             version, sources, gone = await compute(Urgency.BACKGROUND, make)
@@ -179,7 +179,7 @@ class Publisher:
             if not sources:
                 return version
             cloud = await self._threads.background(functools.partial(objects.cloud, sources))
-            if await compute(Urgency.BACKGROUND, lambda: live_map.gone_objects) == gone:
+            if await compute(Urgency.BACKGROUND, lambda: live_map.deletable_objects) == gone:
                 break
         self._json_log.info(
             "live-cloud", map=self._name, points=len(cloud.points), keyframes=cloud.keyframes,
@@ -256,7 +256,7 @@ def _publish_version(
         InternalError: The registry takes no such map.
         StoreError: The store fails.
     """
-    with errors_of_maps("the live map cannot be published"):
+    with as_internal_error("the live map cannot be published"):
         data = encode_map(version)
         digest = digest_of(data)
         for tries_left in reversed(range(_TRIES)):
@@ -284,5 +284,5 @@ def version_to_start_from(maps: MapRegistry, request: LiveStart) -> tuple[MapVer
     """
     name, version = request.source_version()
     record = maps.record(name, version)
-    with errors_of_maps(f"{name}@{record.id} cannot be read"):
+    with as_internal_error(f"{name}@{record.id} cannot be read"):
         return maps.load(name, record.id), f"{name}@{record.id}"

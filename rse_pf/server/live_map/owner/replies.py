@@ -84,7 +84,7 @@ def show_reply(
         "server": lease.server,
         "epoch": lease.epoch,
         "version": state.position,
-        "links": state.live_map.links_believed,
+        "links": state.live_map.loop_closure_count,
         "state": told_state,
         "digest": state.digest(),
         "you": {

@@ -23,17 +23,17 @@ from rse_pf.geometry import Array, scaled
 from rse_pf.live_map.events import (
     Event,
     KeyframeAdded,
-    LinksMeasured,
+    LoopClosuresMeasured,
+    MapServerChanged,
     MapStarted,
     Optimised,
-    OwnerChanged,
     RobotLeft,
     decode_events,
     encode_events,
     matrix_bytes,
 )
 from rse_pf.live_map.live_map import LiveMap
-from rse_pf.live_map.measure import joined_links
+from rse_pf.live_map.measure import merge_measurements
 from rse_pf.live_map.outcomes import Added, Alignment, Corrected, Outcome
 from rse_pf.live_map.versions import started_from
 from rse_pf.maps.format import MapVersion
@@ -60,7 +60,7 @@ Payload = dict[str, Any]
 _UPPER = np.triu_indices(6)
 _NEVER = ("cause", "version")
 """A payload that differs in these only is not told again."""
-_UNCHANGING = (OwnerChanged, RobotLeft)
+_UNCHANGING = (MapServerChanged, RobotLeft)
 _AT_ONCE = 2
 """OwnerThreads that measure: both share one keyframe, or take one each where more wait."""
 _FEW_WAIT, _FEWER, _FEWEST = 4, 6, 4
@@ -120,21 +120,21 @@ class MapState:
 
     def measuring(
         self, keyframe: int, pieces: int, candidates: int | None = None
-    ) -> list[Callable[[], LinksMeasured]]:
+    ) -> list[Callable[[], LoopClosuresMeasured]]:
         """Return what measures the links of a keyframe, in any thread, while the map changes.
 
-        It is compared with *candidates*, None for as many as the map likes.  `joined_links` joins what the
-        pieces find.  After a defect there are none, with the reason ``defect``.
+        It is compared with *candidates*, None for as many as the map likes.  `merge_measurements` joins what
+        the pieces find.  After a defect there are none, with the reason ``defect``.
         """
-        defect = LinksMeasured(keyframe=keyframe, failed={"defect": 1})
-        found = _guarded(lambda: self.live_map.measuring(keyframe, pieces, candidates))
+        defect = LoopClosuresMeasured(keyframe=keyframe, failed={"defect": 1})
+        found = _guarded(lambda: self.live_map.prepare_measurement(keyframe, pieces, candidates))
         if found is None:
             return [lambda: defect]
         return [functools.partial(_links, measure, defect) for measure in found]
 
     def optimising(self, solve: WholeFit) -> Callable[[], Optimised | None]:
         """Return what fits the whole graph, in any thread, while the map changes; None if that fails."""
-        fit = _guarded(lambda: self.live_map.optimising(solve))
+        fit = _guarded(lambda: self.live_map.prepare_optimisation(solve))
         return lambda: None if fit is None else _guarded(fit)
 
     @property
@@ -163,7 +163,7 @@ class MapState:
             return [], error
         if isinstance(event, KeyframeAdded):
             self.unmeasured |= dict.fromkeys(each.id for each in outcomes if isinstance(each, Added))
-        elif isinstance(event, LinksMeasured):
+        elif isinstance(event, LoopClosuresMeasured):
             self.unmeasured.pop(event.keyframe, None)
         self.changes += not isinstance(event, _UNCHANGING)
         return outcomes, None
@@ -179,7 +179,9 @@ def _guarded(act: Callable[[], _T]) -> _T | None:
         return None
 
 
-def _links(measure: Callable[[], LinksMeasured], otherwise: LinksMeasured) -> LinksMeasured:
+def _links(
+    measure: Callable[[], LoopClosuresMeasured], otherwise: LoopClosuresMeasured
+) -> LoopClosuresMeasured:
     found = _guarded(measure)
     return otherwise if found is None else found
 
@@ -202,7 +204,7 @@ def take_over(log: LiveLog, kind: MapKind, *, owner: str, epoch: int) -> MapStat
         StoreError: The store fails, or the log is damaged.
     """
     state = _from_snapshot(log, kind)
-    change = [OwnerChanged(owner=owner, epoch=epoch)]
+    change = [MapServerChanged(owner=owner, epoch=epoch)]
     data = encode_events(change)
     while True:
         for entry in log.entries():
@@ -303,7 +305,7 @@ class Measuring:
         )
         pieces = await threads.compute(Urgency.MEASURE, look)
         begun = [threads.look(measure) for measure in pieces]
-        self._submit(joined_links(keyframe, [await each for each in begun]))
+        self._submit(merge_measurements(keyframe, [await each for each in begun]))
         self._has_measured = True
 
     async def _optimise(self) -> None:

@@ -282,7 +282,7 @@ def test_a_snapshot_knows_whose_objects_are_to_be_deleted() -> None:
 
     restored = LiveMap.restore_parts(parts.head, lambda name: parts.parts[name] or b"")
 
-    assert [robot for robot, _ in restored.gone_objects] == [ONE.folder]
+    assert [robot for robot, _ in restored.deletable_objects] == [ONE.folder]
     assert restored.objects_of([1]) == live_map.objects_of([1]) != []
     assert restored.digest() == live_map.digest()
 

@@ -10,7 +10,7 @@ import pytest
 
 from rse_pf.errors import BadRequest, StoreError, Unauthorized
 from rse_pf.lease import Lease, read_record
-from rse_pf.live_map.events import OwnerChanged, encode_events
+from rse_pf.live_map.events import MapServerChanged, encode_events
 from rse_pf.object_store import MemoryStore
 from rse_pf.server.live_map.owner.lease import LeaseRecord, OwnerLease, decode_lease, map_folder, verdict_on
 from rse_pf.server.live_map.owner.link_security import (
@@ -202,7 +202,7 @@ def test_an_old_owner_that_wakes_up_deletes_no_part_of_a_snapshot_that_the_new_o
 def test_a_snapshot_whose_part_is_missing_is_passed_over():
     store = MemoryStore()
     log, state = log_of(store, keeps_all=True), MapState(FAKE_MAP.empty(), 0)
-    change = [OwnerChanged(owner="a", epoch=1)]
+    change = [MapServerChanged(owner="a", epoch=1)]
     newest = ""
     for _ in range(2):
         state.apply(log.write(encode_events(change)), change)
@@ -222,7 +222,7 @@ def test_a_snapshot_that_this_version_cannot_read_costs_time_and_no_map():
     store = MemoryStore()
     log = log_of(store, keeps_all=True)
     for number in range(1, 5):
-        log.write(encode_events([OwnerChanged(owner="a", epoch=number)]))
+        log.write(encode_events([MapServerChanged(owner="a", epoch=number)]))
     log.write_snapshot(MapSnapshot(position=4, unmeasured=(), head=b"of another version"))
 
     def refuse(head: bytes, part: Callable[[str], bytes]) -> FakeMap:

@@ -143,7 +143,7 @@ async def test_an_optimisation_that_fails_is_no_defect_of_the_owner():
     bench = Bench()
 
     owner = await bench.own("a")
-    owner.state.live_map.optimising = lambda solve: [].index(0)  # type: ignore[attr-defined]
+    owner.state.live_map.prepare_optimisation = lambda solve: [].index(0)  # type: ignore[attr-defined]
     owner.owner._measuring.optimise()
     await settle()
     assert not owner.run.done()

@@ -11,7 +11,7 @@ import pytest
 from fakes import FakeLog
 
 from rse_pf.geometry import Array, exp_se3, inverse
-from rse_pf.live_map.events import Event, LinksMeasured
+from rse_pf.live_map.events import Event, LoopClosuresMeasured
 from rse_pf.server.live_map.owner.state import MapState, Measuring, candidates_of
 from rse_pf.server.live_map.owner.threads import Urgency
 from rse_pf.server.live_map.owner.whole_fit import fit_apart, fit_here
@@ -51,11 +51,11 @@ class NotingMap(FakeMap):
         super().__init__()
         self.asked: list[tuple[int, int, int | None]] = []
 
-    def measuring(
+    def prepare_measurement(
         self, keyframe: int, pieces: int = 1, candidates: int | None = None
-    ) -> list[Callable[[], LinksMeasured]]:
+    ) -> list[Callable[[], LoopClosuresMeasured]]:
         self.asked.append((keyframe, pieces, candidates))
-        return [lambda: LinksMeasured(keyframe=keyframe)] * pieces
+        return [lambda: LoopClosuresMeasured(keyframe=keyframe)] * pieces
 
 
 def test_the_more_keyframes_wait_the_fewer_others_each_is_compared_with() -> None:
