@@ -14,16 +14,16 @@ from fuzz.meter import Meter
 from rse_pf.errors import BadRequest, InvalidCamera
 from rse_pf.geometry import Camera
 from rse_pf.live_map.events import matrix_of
-from rse_pf.live_map.measure import measure_loop_closures, reference_of_features, view_of_features
+from rse_pf.live_map.measure import landmarks_of_features, measure_loop_closures, view_of_features
 from rse_pf.slam.keyframe import (
     MAX_FEATURES,
     MAX_KEYFRAME_BYTES,
-    Keyframe,
+    SentKeyframe,
     decode_keyframe,
     encode_keyframe,
     make_features,
 )
-from rse_pf.slam.localise import PlacedKeyframe, localise
+from rse_pf.slam.localise import LocalisationCandidate, localise
 from rse_pf.slam.places import place_vector
 from tests.synthetic_maps import make_world
 
@@ -66,8 +66,12 @@ def live(data: bytes, meter: Meter) -> None:
             information = matrix_of(link.information, 6, 6)
             expect(bool((np.linalg.eigvalsh(information) > 0.0).all()), "information that is not positive")
     candidates = [
-        PlacedKeyframe(id=0, reference=reference_of_features(features, camera), T_map_keyframe=np.eye(4)),
-        PlacedKeyframe(id=1, reference=reference_of_features(_KNOWN, _CAMERA), T_map_keyframe=np.eye(4)),
+        LocalisationCandidate(
+            id=0, landmarks=landmarks_of_features(features, camera), T_map_keyframe=np.eye(4)
+        ),
+        LocalisationCandidate(
+            id=1, landmarks=landmarks_of_features(_KNOWN, _CAMERA), T_map_keyframe=np.eye(4)
+        ),
     ]
     found = localise(candidates, view_of_features(features, camera))
     expect((found.verdict == "none") == (found.T_map_camera is None), "a pose without a verdict")
@@ -77,7 +81,7 @@ def live(data: bytes, meter: Meter) -> None:
         expect(bool(np.isfinite(found.covariance).all()), "a covariance that is not finite")
 
 
-def _decode(data: bytes) -> Keyframe:
+def _decode(data: bytes) -> SentKeyframe:
     try:
         return decode_keyframe(data)
     except InvalidCamera as error:
@@ -90,7 +94,7 @@ def _with_heads(body: bytes, fraction: int) -> bytes:
     units_end, end = _UNITS_BYTES * count, _FEATURE_BYTES * count
     empty = make_features(np.zeros((0, 2)), np.zeros(0), np.zeros((0, 32), np.uint8))
     begin = encode_keyframe(
-        Keyframe(timestamp_s=0.0, T_odom_camera=np.eye(4), camera=_CAMERA, features=empty)
+        SentKeyframe(timestamp_s=0.0, T_odom_camera=np.eye(4), camera=_CAMERA, features=empty)
     )[: -8 - 8 - 4 - 8]
     return b"".join(
         (
@@ -101,7 +105,7 @@ def _with_heads(body: bytes, fraction: int) -> bytes:
     )  # fmt: skip
 
 
-def _check_keyframe(keyframe: Keyframe) -> None:
+def _check_keyframe(keyframe: SentKeyframe) -> None:
     features, camera = keyframe.features, keyframe.camera
     expect(len(features) <= MAX_FEATURES, "too many features")
     numbers = (features.pixels, features.depths_m, keyframe.T_odom_camera, features.points_camera(camera))

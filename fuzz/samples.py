@@ -17,10 +17,10 @@ import msgspec
 import numpy as np
 
 from rse_pf.ipc import encode_message
-from rse_pf.live_map.versions import encode_version_keyframe
 from rse_pf.maps.format import Edge, MapVersion, decode_map, encode_map
 from rse_pf.pnp.problems import DEGENERATE, KINECT, make_degenerate, make_problem, make_two_views
 from rse_pf.services.pnp import make_request
+from rse_pf.slam.keyframe import SentKeyframe, encode_keyframe
 from rse_pf.slam.pose_graph import write_g2o
 from rse_pf.wire import Cancel, Command, Failure, Hello, Ping, Result, make_codec
 from tests.synthetic_maps import make_room, make_sphere, make_world
@@ -276,7 +276,7 @@ def _pairs() -> list[bytes]:
 
 def _live_keyframes() -> list[bytes]:
     version, _ = make_world(7, points=1500).walk("robot-1", np.linspace(0.0, 0.05, 2), seed=2)
-    coded = [encode_version_keyframe(keyframe) for keyframe in version.keyframes]
+    coded = [encode_keyframe(SentKeyframe.from_map(keyframe)) for keyframe in version.keyframes]
     return [head + data[skipped:] for data in coded for head, skipped in ((b"\x00", 0), (b"\x05", 162))]
 
 

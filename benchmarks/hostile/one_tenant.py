@@ -58,7 +58,7 @@ from rse_pf.maps.format import MapVersion, encode_map
 from rse_pf.object_store import DirectoryStore, digest_of
 from rse_pf.pnp.problems import make_problem
 from rse_pf.services.pnp import make_request
-from rse_pf.slam.keyframe import Keyframe, encode_keyframe, make_features
+from rse_pf.slam.keyframe import SentKeyframe, encode_keyframe, make_features
 from rse_pf.wire.live_map import live_topic
 
 __all__ = ["ATTACKS", "measure"]
@@ -80,7 +80,7 @@ _GRAPH = "VERTEX_SE3:QUAT 0 0 0 0 0 0 0 1\nVERTEX_SE3:QUAT 1 1 0 0 0 0 0 1\n" + 
 def keyframe(name: str, number: int, features: int = 600) -> dict[str, Any]:
     """Return the request with keyframe *number* of a robot that drives straight on; all features differ."""
     rng = np.random.default_rng(number)
-    made = Keyframe(
+    made = SentKeyframe(
         timestamp_s=number / KEYFRAME_HZ, T_odom_camera=exp_se3([0.1 * number, 0, 0, 0, 0, 0]),
         camera=Camera(**_CAMERA),
         features=make_features(

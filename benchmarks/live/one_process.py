@@ -39,7 +39,7 @@ from rse_pf.live_map.outcomes import (
     Outcome,
     Unaligned,
 )
-from rse_pf.live_map.versions import encode_version_keyframe
+from rse_pf.slam.keyframe import SentKeyframe, encode_keyframe
 from tests.live_map.generated_drives import (
     STEP_M,
     GeneratedDrive,
@@ -124,7 +124,7 @@ def _send(played: Played, name: str, run: Run, number: int, tick: int) -> list[t
     """Send a keyframe, measure it, and return what robots learn of it, and when."""
     keyframe = run.version.keyframes[number]
     event = KeyframeAdded(
-        robot=name, segment=0, number=number, data=encode_version_keyframe(keyframe)
+        robot=name, segment=0, number=number, data=encode_keyframe(SentKeyframe.from_map(keyframe))
     )  # fmt: skip
     outcomes = played.live_map.apply(event)
     added = next(outcome for outcome in outcomes if isinstance(outcome, Added))

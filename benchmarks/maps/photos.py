@@ -41,7 +41,7 @@ from rse_pf.geometry import Array, Camera, exp_se3, pose_difference
 from rse_pf.images import load_opencv
 from rse_pf.maps.format import Keyframe, MapVersion, encode_map
 from rse_pf.maps.photos import PhotoLens
-from rse_pf.slam.keyframe import most_features
+from rse_pf.slam.keyframe import max_features
 
 ROBOT = "robot-1"
 RIGHT_M, RIGHT_DEG, QUALITY = 0.05, 2.0, 85
@@ -105,7 +105,7 @@ def run_benchmark(
 def keyframe_of(number: int, frame: Frame, T_map_camera: Array) -> Keyframe:
     """Return the keyframe that a robot would send of a frame at a pose."""
     features = extract(frame, FrontEndOptions())
-    kept = slice(most_features(features.kind))
+    kept = slice(max_features(features.kind))
     return Keyframe(
         id=number, robot="r", timestamp_s=frame.timestamp_s, camera=frame.camera, kind=features.kind,
         T_world_camera=T_map_camera, pixels=features.pixels[kept].astype(np.float32),

@@ -47,11 +47,11 @@ from rse_pf.geometry import Array, Camera, pose_difference
 from rse_pf.maps.descriptors import DescriptorKind
 from rse_pf.slam.keyframe import (
     MAX_FEATURES,
-    Keyframe,
+    SentKeyframe,
     encode_keyframe,
     make_features,
     make_scaleless_features,
-    most_features,
+    max_features,
 )
 from rse_pf.wire.live_map import LiveRelocalise, RelocaliseReply, live_topic
 
@@ -537,7 +537,7 @@ class LiveMapper:
         attached = self._attachments.make(frame, features)
         depths_m = features.points_camera[:, 2]
         rows = np.flatnonzero(np.isfinite(depths_m))[: self._most(features.kind)]
-        keyframe = Keyframe(
+        keyframe = SentKeyframe(
             timestamp_s=frame.timestamp_s, T_odom_camera=T_odom_camera, camera=frame.camera,
             features=make_features(
                 features.pixels[rows], depths_m[rows], features.descriptors[rows], self._mapper.depth_noise,
@@ -552,7 +552,7 @@ class LiveMapper:
         """Return a keyframe without scale: its features with a landmark first, then those without."""
         assert self._mapper.camera is not None
         image, rows = seen.image, np.argsort(np.isnan(seen.depths), kind="stable")[: self._most(seen.kind)]
-        keyframe = Keyframe(
+        keyframe = SentKeyframe(
             timestamp_s=seen.timestamp_s, T_odom_camera=T_odom_camera, camera=self._mapper.camera,
             features=make_scaleless_features(
                 image.pixels[rows], seen.depths[rows], image.descriptors[rows], seen.kind
@@ -563,7 +563,7 @@ class LiveMapper:
 
     def _most(self, kind: DescriptorKind) -> int:
         """Return how many features of a kind are sent."""
-        return self.options.features * most_features(kind) // MAX_FEATURES
+        return self.options.features * max_features(kind) // MAX_FEATURES
 
     def _relocalise(self, keyframe: WaitingKeyframe, pose: Array) -> None:
         """Ask where in the map a keyframe is, if its segment is not aligned and the map has others."""

@@ -50,7 +50,7 @@ def align_tiles(
         return links, refused
     moved = transform(T_one_other, source)
     options = IcpOptions()
-    information = np.linalg.inv(RelativePoseOptions().floor()).astype(np.float64)
+    information = np.linalg.inv(RelativePoseOptions().min_covariance()).astype(np.float64)
     rows = [np.flatnonzero(atlas.of_map == which) for which in (0, 1)]
     for low in _tiles(target, moved):
         near = _within(target, low - options.reach_m, TILE_M + 2.0 * options.reach_m)

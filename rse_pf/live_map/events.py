@@ -14,7 +14,7 @@ import numpy as np
 
 from rse_pf.errors import BadRequest, message_of
 from rse_pf.geometry import Array
-from rse_pf.slam.keyframe import Keyframe, decode_keyframe
+from rse_pf.slam.keyframe import SentKeyframe, decode_keyframe
 
 __all__ = [
     "Event",
@@ -49,7 +49,7 @@ class KeyframeAdded(msgspec.Struct, frozen=True, kw_only=True, dict=True, tag="k
     data: bytes
 
     @cached_property
-    def keyframe(self) -> Keyframe:
+    def keyframe(self) -> SentKeyframe:
         """The keyframe, decoded once; raises BadRequest or InvalidCamera."""
         return decode_keyframe(self.data)
 

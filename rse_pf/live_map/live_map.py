@@ -69,7 +69,7 @@ from rse_pf.live_map.versions import (
 )
 from rse_pf.maps.descriptors import DescriptorKind, check_same_kind
 from rse_pf.maps.format import MapVersion
-from rse_pf.slam.keyframe import Keyframe, check_sent, decode_keyframe
+from rse_pf.slam.keyframe import SentKeyframe, check_odometry_range, decode_keyframe
 from rse_pf.slam.localise import LocalisationOptions, Localised, localise, spread_candidates
 from rse_pf.slam.optimise import OptimiseOptions, optimise_graph
 from rse_pf.slam.places import PlaceIndex
@@ -224,7 +224,7 @@ class LiveMap:
         features = event.keyframe.features
         scale = assumed_scale(features) if known is None else known.scale
         try:
-            check_sent(event.keyframe, 1.0 if features.is_metric else scale)
+            check_odometry_range(event.keyframe, 1.0 if features.is_metric else scale)
         except InvalidCamera as error:
             raise BadRequest(error.message, hint=error.hint) from error
         kind = self.kind
@@ -300,11 +300,11 @@ class LiveMap:
 
         return fit
 
-    def relocalise(self, view: Keyframe) -> Localised:
+    def relocalise(self, view: SentKeyframe) -> Localised:
         """Find the place of a view in the map, whatever its pose; changes nothing."""
         return self.prepare_relocalisation(view)()
 
-    def prepare_relocalisation(self, view: Keyframe) -> Callable[[], Localised]:
+    def prepare_relocalisation(self, view: SentKeyframe) -> Callable[[], Localised]:
         """Return what does the work of `relocalise`; another thread may call it while the map changes.
 
         Raises:
@@ -680,7 +680,7 @@ class LiveMap:
         )  # fmt: skip
 
 
-def _objects_of(keyframe: Keyframe) -> tuple[str, ...]:
+def _objects_of(keyframe: SentKeyframe) -> tuple[str, ...]:
     return tuple(each.digest for each in (keyframe.points, keyframe.image) if each is not None)
 
 

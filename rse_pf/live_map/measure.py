@@ -12,26 +12,26 @@ import numpy as np
 from rse_pf.geometry import Array, Camera
 from rse_pf.live_map.events import LoopClosuresMeasured, MeasuredLoopClosure, matrix_bytes
 from rse_pf.slam.keyframe import KeyframeFeatures, decode_keyframe
-from rse_pf.slam.localise import PlacedKeyframe
+from rse_pf.slam.localise import LocalisationCandidate
 from rse_pf.slam.relative_pose import (
-    MeasuredScale,
-    Reference,
+    Landmarks,
     RelativePose,
     RelativePoseOptions,
+    ScaleRatio,
     View,
-    measure_inverse_link,
-    measure_link,
+    measure_inverse_relative_pose,
+    measure_relative_pose,
 )
 
 __all__ = [
     "StoredView",
     "assumed_scale",
     "decoded_view",
+    "landmarks_of_features",
     "measure_loop_closures",
     "measure_stored_keyframes",
     "merge_measurements",
     "placed_keyframe",
-    "reference_of_features",
     "view_of_features",
 ]
 
@@ -57,19 +57,22 @@ def measure_loop_closures(
         options: What a link needs.
 
     Returns:
-        The links in the order of *others*, and the number of failures by the reasons of `measure_link`.
+        The links in the order of *others*, and the number of failures by the reasons of
+        `measure_relative_pose`.
     """
     number, features, camera = keyframe
-    reference = reference_of_features(features, camera)
+    reference = landmarks_of_features(features, camera)
     links: list[MeasuredLoopClosure] = []
     failed: Counter[str] = Counter()
     for other, other_features, other_camera in others:
         if other_features.is_metric and not features.is_metric:
             # So that the pose is in metres.
-            sought = reference_of_features(other_features, other_camera)
-            measured = measure_inverse_link(sought, view_of_features(features, camera), options)
+            sought = landmarks_of_features(other_features, other_camera)
+            measured = measure_inverse_relative_pose(sought, view_of_features(features, camera), options)
         else:
-            measured = measure_link(reference, view_of_features(other_features, other_camera), options)
+            measured = measure_relative_pose(
+                reference, view_of_features(other_features, other_camera), options
+            )
         if isinstance(measured, str):
             failed[measured] += 1
             continue
@@ -100,19 +103,19 @@ def decoded_view(stored: StoredView) -> tuple[int, KeyframeFeatures, Camera]:
     return number, keyframe.features, keyframe.camera
 
 
-def reference_of_features(features: KeyframeFeatures, camera: Camera) -> Reference:
+def landmarks_of_features(features: KeyframeFeatures, camera: Camera) -> Landmarks:
     """Return the points of a keyframe that are sought in other images, by `assumed_scale` without scale."""
     if features.is_metric:
-        return Reference(points_camera=features.points_camera(camera), descriptors=features.descriptors)
+        return Landmarks(points_camera=features.points_camera(camera), descriptors=features.descriptors)
     rows = np.flatnonzero(features.depths_m > 0.0)
-    return Reference(
+    return Landmarks(
         points_camera=assumed_scale(features) * features.points_camera(camera)[rows],
         descriptors=features.descriptors[rows],
     )
 
 
 def view_of_features(features: KeyframeFeatures, camera: Camera) -> View:
-    """Return the image of a keyframe in which the points of others are sought, as `reference_of_features`."""
+    """Return the image of a keyframe in which the points of others are sought, as `landmarks_of_features`."""
     depths = features.depths_m.astype(np.float64)
     return View(
         camera=camera, pixels=features.pixels.astype(np.float64), descriptors=features.descriptors,
@@ -149,21 +152,21 @@ def _in_units(measured: RelativePose, features: KeyframeFeatures, other: Keyfram
         T_a_b[:3, 3] /= here
         stretch = np.array([here] * 3 + [1.0] * 3)
         information = stretch[:, None] * information * stretch
-    scale = MeasuredScale(measured.scale.log_ratio + math.log(there / here), measured.scale.variance)
+    scale = ScaleRatio(measured.scale.log_ratio + math.log(there / here), measured.scale.variance)
     return replace(measured, T_a_b=T_a_b, information=information, scale=scale)
 
 
-def placed_keyframe(stored: StoredView, T_map_keyframe: Array, scale: float = 1.0) -> PlacedKeyframe:
+def placed_keyframe(stored: StoredView, T_map_keyframe: Array, scale: float = 1.0) -> LocalisationCandidate:
     """Return a stored keyframe with its ``(4, 4)`` pose, to find a view near it; raises BadRequest.
 
     *scale* is how many metres its unit is, if it is not in metres.
     """
     number, features, camera = decoded_view(stored)
-    reference = reference_of_features(features, camera)
+    reference = landmarks_of_features(features, camera)
     if not features.is_metric:
         points = scale / assumed_scale(features) * reference.points_camera
         reference = replace(reference, points_camera=points)
-    return PlacedKeyframe(id=number, reference=reference, T_map_keyframe=T_map_keyframe)
+    return LocalisationCandidate(id=number, landmarks=reference, T_map_keyframe=T_map_keyframe)
 
 
 def merge_measurements(keyframe: int, measured: Iterable[LoopClosuresMeasured]) -> LoopClosuresMeasured:

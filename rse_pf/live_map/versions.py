@@ -10,7 +10,6 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from rse_pf.errors import BadMessage, BadRequest, InternalError, LimitExceeded
 from rse_pf.geometry import Array, Camera, inverse
@@ -20,15 +19,13 @@ from rse_pf.live_map.options import LiveMapOptions
 from rse_pf.live_map.smoothing import edges_of, link_information
 from rse_pf.maps.format import UP, UP_FIELD, Edge, EdgeKind, Keyframe, MapVersion
 from rse_pf.slam.inertial import agreed_gravity, upright_rotation
-from rse_pf.slam.keyframe import Keyframe as SentKeyframe
-from rse_pf.slam.keyframe import decode_keyframe, encode_keyframe, make_features
+from rse_pf.slam.keyframe import SentKeyframe, decode_keyframe, encode_keyframe
 from rse_pf.slam.keyframe_points import ObjectReference
 from rse_pf.slam.pose_graph import PoseGraph, is_positive_definite
 
 __all__ = [
     "PointSource",
     "as_internal_error",
-    "encode_version_keyframe",
     "image_references",
     "paths_of",
     "point_sources",
@@ -85,7 +82,7 @@ def started_from(version: MapVersion, source: str) -> MapStarted:
     return MapStarted(
         source=source,
         keyframes=tuple(
-            StartKeyframe(robot=keyframe.robot, data=encode_version_keyframe(keyframe))
+            StartKeyframe(robot=keyframe.robot, data=encode_keyframe(SentKeyframe.from_map(keyframe)))
             for keyframe in version.keyframes
         ),
         links=tuple(
@@ -122,13 +119,13 @@ def _version_of(graph: Graph, options: LiveMapOptions) -> MapVersion:
         if seen.imu is not None:
             downs.setdefault(row.robot, []).append(graph.T[i, :3, :3] @ seen.imu.down_camera)
         keyframes.append(
-            Keyframe(
-                id=i, robot=_short_name(row.robot), timestamp_s=row.timestamp_s,
-                T_world_camera=graph.T[i].copy(), camera=seen.camera, pixels=seen.features.pixels,
-                descriptors=seen.features.descriptors, kind=seen.features.kind,
-                points_camera=_points_m(seen, graph.segment_of(i)),
+            seen.in_map(
+                id=i,
+                robot=_short_name(row.robot),
+                T_world_camera=graph.T[i].copy(),
+                metres_per_unit=graph.segment_of(i).scale,
             )
-        )  # fmt: skip
+        )
     # A map that started from a version keeps the axes of that.
     down = None if graph.source else agreed_gravity([np.array(each) for each in downs.values()])
     if down is not None:
@@ -223,14 +220,6 @@ def whole_graph(graph: Graph, options: LiveMapOptions) -> tuple[PoseGraph, list[
     return pose_graph, ids
 
 
-def _points_m(seen: SentKeyframe, segment: Segment) -> npt.NDArray[np.float32]:
-    """Return the points of a keyframe in metres, not a number where it has no depth."""
-    points = seen.features.points_camera(seen.camera)
-    if not segment.is_metric:
-        points = np.where(seen.features.depths_m[:, None] > 0.0, segment.scale * points, np.nan)
-    return points.astype(np.float32)
-
-
 def _aligned_segments(graph: Graph) -> list[Segment]:
     if graph.root < 0:
         return []
@@ -255,19 +244,6 @@ def _odometry(graph: Graph, ids: list[int], options: LiveMapOptions) -> list[Edg
         walked = float(graph.way[b] - graph.way[a])
         edges.append(Edge(a=a, b=b, T_a_b=inverse(from_a) @ to_b, information=np.diag(spread / walked)))
     return edges
-
-
-def encode_version_keyframe(keyframe: Keyframe) -> bytes:
-    """Return a keyframe of a version as a robot would have sent it, its pose that in the version."""
-    features = make_features(
-        keyframe.pixels, keyframe.points_camera[:, 2], keyframe.descriptors, kind=keyframe.kind
-    )
-    return encode_keyframe(
-        SentKeyframe(
-            timestamp_s=keyframe.timestamp_s, T_odom_camera=keyframe.T_world_camera, camera=keyframe.camera,
-            features=features,
-        )
-    )  # fmt: skip
 
 
 def _short_name(folder: str) -> str:

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from rse_pf.geometry import Array, inverse, transform
 from rse_pf.maps.format import Keyframe, MapVersion
 from rse_pf.pnp import DepthNoise
-from rse_pf.slam.relative_pose import RelativePoseOptions, match_rows
+from rse_pf.slam.relative_pose import RelativePoseOptions, match_descriptors
 
 __all__ = ["Tracks", "find_tracks"]
 
@@ -122,7 +122,7 @@ def _agreeing(reference: Keyframe, view: Keyframe) -> tuple[Rows, Rows]:
     """Return the rows of two keyframes that match, where the point of one is at the pixel of the other."""
     known = _has_point(reference)
     options = RelativePoseOptions(max_matches=max(1, len(view.pixels)))
-    rows, columns = match_rows(reference.descriptors[known], view.descriptors, options)
+    rows, columns = match_descriptors(reference.descriptors[known], view.descriptors, options)
     rows = known[rows]
     T_view_reference = inverse(view.T_world_camera) @ reference.T_world_camera
     points = transform(T_view_reference, reference.points_camera[rows].astype(np.float64))

@@ -22,7 +22,12 @@ from rse_pf.service import Report
 from rse_pf.slam.consistency import LinkEnds, LoopClosure, OdometryNoise, consistent, fits_prediction
 from rse_pf.slam.optimise import ignore_progress
 from rse_pf.slam.places import PlaceIndex, place_vector
-from rse_pf.slam.relative_pose import RelativePoseOptions, measure_link, reference_of, view_of_keyframe
+from rse_pf.slam.relative_pose import (
+    RelativePoseOptions,
+    landmarks_of_keyframe,
+    measure_relative_pose,
+    view_of_keyframe,
+)
 
 __all__ = [
     "Atlas",
@@ -193,8 +198,8 @@ def measure_pairs(
     for done, (a, b) in enumerate(pairs):
         if done % 16 == 0:
             report(done / len(pairs), f"{done} of {len(pairs)} keyframe pairs")
-        measured = measure_link(
-            reference_of(atlas.keyframes[a]), view_of_keyframe(atlas.keyframes[b]), pose_options
+        measured = measure_relative_pose(
+            landmarks_of_keyframe(atlas.keyframes[a]), view_of_keyframe(atlas.keyframes[b]), pose_options
         )  # fmt: skip
         if isinstance(measured, str):
             one, other = maps_of(atlas, a, b)

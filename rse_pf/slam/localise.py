@@ -1,7 +1,8 @@
-"""Find the place of one view among placed keyframes: a pose with its verdict and reason.
+"""Localise a camera among keyframes of a map: return its pose with a verdict and a reason.
 
-Each candidate proposes a placement by PnP and depth; placements that agree support each other, and one that
-contradicts them makes the place ambiguous.  Which keyframes are candidates is decided elsewhere.
+The candidates come from place recognition, which only proposes.  Each candidate estimates a pose by PnP and,
+if the view has depths, by depth.  Estimates that agree confirm each other; an estimate elsewhere with many
+inliers makes the result ambiguous, because two parts of the world then look alike (perceptual aliasing).
 """
 
 from __future__ import annotations
@@ -18,69 +19,82 @@ from rse_pf.geometry import Array, adjoint, exp_se3, inverse, log_se3, pose_diff
 from rse_pf.pnp import PnpOptions, PnpSolution, solve_pnp
 from rse_pf.slam.camera_fit import CameraFit, fit_camera
 from rse_pf.slam.relative_pose import (
+    Landmarks,
     MeasuredPose,
-    Reference,
     RelativePoseOptions,
     View,
     measure_pose,
-    scale_between,
+    measure_scale_ratio,
 )
 
-__all__ = ["LocalisationOptions", "Localised", "PlacedKeyframe", "localise", "spread_candidates"]
+__all__ = ["LocalisationCandidate", "LocalisationOptions", "Localised", "localise", "spread_candidates"]
 
-_MAX_LOG_FOCAL = 0.07  # logarithm of an adjusted focal length over the given one; good photos: up to 0.06
-_MAX_CAMERA_STEP_M = 0.12  # between the poses of the given and the adjusted camera; good photos: up to 0.1
-_MAX_CAMERA_TURN_DEG = 6.0  # between both; good photos with a rolling shutter: up to 5.1
-_MAX_M = 1e6
-"""A keyframe farther from the origin of its map than any robot drives is no rival for a place."""
+_MAX_LOG_FOCAL = 0.07
+"""Largest logarithm of the fitted over the stated focal length at which the stated camera is accepted; photos
+with a right camera stay below 0.06."""
+_MAX_CAMERA_STEP_M = 0.12
+"""Largest distance between the poses of the fitted and of the stated camera at which the stated camera is
+accepted; photos with a right camera stay below 0.1 m."""
+_MAX_CAMERA_ROTATION_DEG = 6.0
+"""Largest rotation between the poses of the fitted and of the stated camera at which the stated camera is
+accepted; photos with a right camera and a rolling shutter stay below 5.1 degrees."""
+_MAX_MAP_COORDINATE_M = 1e6
+"""A candidate farther than this from the origin of the map is ignored: no robot drives 1,000 km, and a false
+pose must not make a true one ambiguous."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LocalisationOptions:
-    """When a placement counts, and when it is ok.
+    """Conditions under which the pose of a view is accepted.
 
     Attributes:
-        measured: Of matches; a pose is ok from its ``min_inliers`` and ``min_inlier_ratio`` on.
-        least_inliers: A candidate with fewer proposes nothing.
-        agree_m: Placements closer than this,
-        agree_deg: and turned less than this, support each other.
-        alone_inliers: One keyframe alone is enough from so many inliers on.
-        rival: A contradicting placement with this share of the inliers makes a place ambiguous: where a room
-            is unique, none was ever found.
-        place_m: Candidates closer than this,
-        place_deg: and turned less than this, are of one place,
-        of_place: of which so many are compared.
-        has_equal_rooms: Whether rooms may look the same; then a view, which shows less than a room, is never
-            enough.
-        fits_camera: Whether the camera of a view without depths may be wrong, as that of a photo.  Its pose
-            then counts only if it agrees with the one that the best fitting camera has, and what lies between
-            both is part of the covariance.
+        measured: Limits of matches; a pose needs its ``min_inliers`` and ``min_inlier_ratio`` to be ok.
+        min_candidate_inliers: The estimate of a candidate with fewer inliers is dropped.
+        agree_m: Two estimates agree if their distance is at most this,
+        agree_deg: and the rotation between them is at most this.
+        min_single_inliers: Inliers from which the estimate of one keyframe alone is enough.
+        rival_ratio: An estimate that disagrees with the best one makes the pose ambiguous if it has at least
+            this share of the inliers; in environments without repetition no such estimate was ever measured.
+        region_m: Candidates show the same region if their distance is at most this,
+        region_deg: and the rotation between them is at most this.
+        max_per_region: Number of candidates of one region that are compared.
+        has_equal_rooms: Whether the map may have rooms that look alike; a view shows less than a room, so
+            that its pose is then always ambiguous.
+        fits_camera: Whether the intrinsics of a view without depths may be wrong, as those of a photo.  Its
+            pose is then ok only if a camera that is fitted to the matches has nearly the same pose, and the
+            covariance includes the difference of both poses.
     """
 
     measured: RelativePoseOptions = field(default_factory=lambda: RelativePoseOptions(min_inliers=30))
-    least_inliers: int = 15
+    min_candidate_inliers: int = 15
     agree_m: float = 0.2
     agree_deg: float = 6.0
-    alone_inliers: int = 80
-    rival: float = 0.1
-    place_m: float = 1.5
-    place_deg: float = 45.0
-    of_place: int = 4
+    min_single_inliers: int = 80
+    rival_ratio: float = 0.1
+    region_m: float = 1.5
+    region_deg: float = 45.0
+    max_per_region: int = 4
     has_equal_rooms: bool = False
     fits_camera: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Localised:
-    """Where a camera is in the map.
+    """The pose of a camera in a map, with its quality.
 
-    ``verdict`` is ``ok``; ``weak`` with a reason ("ambiguous", "few-inliers", "low-inlier-ratio",
-    "one-keyframe", "wrong-intrinsics", or one of PnP); or ``none`` with a reason ("no-candidates", "no-pose")
-    and without a pose.
-    ``covariance`` ``(6, 6)`` is of the twist (metres, radians) on the left of ``T_map_camera``.  ``inliers``,
-    ``matches`` and ``rmse_px`` are those of the best keyframe; ``keyframes`` are the ids of those that agree,
-    best first.  ``scale`` is how many metres the unit of the view's depths is, None if that is a metre;
-    without it such a view is ``weak`` with the reason "no-scale".
+    Attributes:
+        verdict: ``ok``; ``weak``, a pose that must not be trusted; or ``none``, no pose.
+        reason: Why the verdict is not ``ok``.  For ``weak``: "ambiguous", "few-inliers", "low-inlier-ratio",
+            "one-keyframe", "wrong-intrinsics", "no-scale", or a reason of PnP.  For ``none``: "no-candidates"
+            or "no-pose".
+        T_map_camera: ``(4, 4)``, metres.
+        covariance: ``(6, 6)`` of the twist (metres, radians) on the left of ``T_map_camera``.
+        inliers: Inliers of the best keyframe.
+        matches: Matches of the best keyframe.
+        rmse_px: Root mean square reprojection error of the inliers of the best keyframe.
+        keyframes: Ids of the keyframes whose estimates agree, the one with most inliers first.
+        scale: Length in metres of the unit of the view's depths; None if the depths are metric, or if the
+            scale is unknown (verdict ``weak``, reason "no-scale").
     """
 
     verdict: Literal["ok", "weak", "none"]
@@ -95,171 +109,212 @@ class Localised:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class PlacedKeyframe:
-    """A keyframe of a map that may show the view: its id, its points, and its ``(4, 4)`` pose in the map."""
+class LocalisationCandidate:
+    """The landmarks of a keyframe that may show the same place as the view, with its id and pose in the map.
+
+    Attributes:
+        id: Id of the keyframe in the map.
+        landmarks: The landmarks of the keyframe, in the frame of its camera.
+        T_map_keyframe: ``(4, 4)``, metres.
+    """
 
     id: int
-    reference: Reference
+    landmarks: Landmarks
     T_map_keyframe: Array
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Placement:
-    """The pose of the view that one keyframe proposes, with its covariance on the right."""
+class _Estimate:
+    """The pose of the view that one keyframe estimates; the covariance is of the twist on its right."""
 
     keyframe: int
     T_map_keyframe: Array
     T_map_camera: Array
     covariance: Array
-    found: MeasuredPose
+    measured: MeasuredPose
 
 
 _DEFAULT = LocalisationOptions()
 
 
 def localise(
-    candidates: Sequence[PlacedKeyframe], view: View, options: LocalisationOptions = _DEFAULT
+    candidates: Sequence[LocalisationCandidate], view: View, options: LocalisationOptions = _DEFAULT
 ) -> Localised:
-    """Return the place of *view* among *candidates*; deterministic.
+    """Return the pose of *view* in the map of *candidates*; deterministic.
 
     Args:
-        candidates: Keyframes that look alike.  Those of one place say nothing against another one: give some
-            of each place that looks alike.
-        view: The image whose place is sought.
-        options: When a placement is ok.
+        candidates: Keyframes that place recognition proposes.  They should show all regions that look like
+            the view, see `spread_candidates`: candidates of one region cannot reveal another one that looks
+            alike.
+        view: The image whose pose is estimated.
+        options: Conditions under which the pose is ok.
 
     Raises:
-        MissingExtra: There is no matcher or no solver.
+        MissingExtra: The native core is not installed.
     """
     if not candidates:
         return Localised(verdict="none", reason="no-candidates")
-    placements = []
-    for candidate in candidates:
-        if not (np.abs(candidate.T_map_keyframe[:3, 3]) <= _MAX_M).all():
-            continue
-        measured = measure_pose(candidate.reference, view, options.measured)
-        if isinstance(measured, str) or measured.inliers < options.least_inliers:
-            continue
-        placements.append(
-            _Placement(
-                keyframe=candidate.id,
-                T_map_keyframe=candidate.T_map_keyframe,
-                T_map_camera=candidate.T_map_keyframe @ inverse(measured.solution.T_camera_world),
-                covariance=measured.solution.covariance + options.measured.floor(),
-                found=measured,
-            )
-        )
-    if not placements:
+    # 1. Estimate the pose of the view with each candidate.
+    estimates = _estimate_poses(candidates, view, options)
+    if not estimates:
         return Localised(verdict="none", reason="no-pose")
-    placements.sort(key=lambda each: (-each.found.inliers, each.keyframe))
-    best = placements[0]
-    agreeing = [each for each in placements if _agree(each, best, options)]
-    others = [each for each in placements if not _agree(each, best, options)]
-    solution = best.found.solution
-    T_map_camera, covariance = _fused(agreeing)
+    # 2. Divide the estimates into those that agree with the best one and those that contradict it.
+    best = estimates[0]
+    agreeing = [estimate for estimate in estimates if _do_agree(estimate, best, options)]
+    contradicting = [estimate for estimate in estimates if not _do_agree(estimate, best, options)]
+    # 3. Combine the agreeing estimates: by their inliers if pixels alone give the pose, else by their mean.
+    solution = best.measured.solution
+    T_map_camera, covariance = _fuse_estimates(agreeing)
     if (view.depths_m is None or not view.is_metric) and len(agreeing) > 1:
-        solution = _solved_together(agreeing, view, options)
+        solution = _solve_jointly(agreeing, view, options)
         T_map_camera = best.T_map_keyframe @ inverse(solution.T_camera_world)
-    reason = _weakness(agreeing, others, solution, options)
+    # 4. Find a reason not to trust the pose.
+    reason = _weakness(agreeing, contradicting, solution, options)
     if options.fits_camera and view.depths_m is None:
-        fit = fit_camera(*_matches_of(agreeing), T_map_camera, view.camera)
-        covariance = covariance + _uncertainty_of_camera(fit, T_map_camera)
+        fit = fit_camera(*_collect_matches(agreeing), T_map_camera, view.camera)
+        covariance = covariance + _camera_covariance(fit, T_map_camera)
         reason = reason or _camera_weakness(fit, T_map_camera)
-    scale = None if view.is_metric else _scale_of(agreeing, options)
+    scale = None if view.is_metric else _estimate_scale(agreeing, options)
     if scale is None and not view.is_metric:
         reason = reason or "no-scale"
     return Localised(
-        verdict="weak" if reason else "ok", reason=reason, T_map_camera=T_map_camera, covariance=covariance,
-        inliers=best.found.inliers, matches=best.found.matches, rmse_px=best.found.solution.rmse_px,
-        keyframes=tuple(each.keyframe for each in agreeing), scale=scale,
-    )  # fmt: skip
+        verdict="weak" if reason else "ok",
+        reason=reason,
+        T_map_camera=T_map_camera,
+        covariance=covariance,
+        inliers=best.measured.inliers,
+        matches=best.measured.matches,
+        rmse_px=best.measured.solution.rmse_px,
+        keyframes=tuple(estimate.keyframe for estimate in agreeing),
+        scale=scale,
+    )
 
 
 def spread_candidates(
-    found: Sequence[tuple[int, float]],
+    similar: Sequence[tuple[int, float]],
     T_map_camera: Array,
     count: int,
     options: LocalisationOptions = _DEFAULT,
 ) -> list[int]:
-    """Return up to *count* ids of *found* (best first), only a few of each place.
+    """Return the ids of up to *count* similar keyframes, with a limited number from each region of the map.
 
-    So a second place that looks alike is compared, too, though the first one has more keyframes.
+    A second region that looks like the first one is then compared as well, though the first region may have
+    more keyframes.
 
     Args:
-        found: Ids and similarities, of about six times *count* keyframes.
-        T_map_camera: ``(n, 4, 4)``, by id.
-        count: How many to compare.
-        options: What is one place.
+        similar: Ids and similarities from place recognition, the most similar first; about six times *count*.
+        T_map_camera: ``(n, 4, 4)``, the poses of all keyframes, indexed by their ids.
+        count: The largest number of candidates.
+        options: The size of a region, and the number of candidates from each.
     """
-    chosen: list[int] = []
-    least_trace = 1.0 + 2.0 * math.cos(math.radians(options.place_deg))
-    for number, _ in found:
-        here, others = T_map_camera[number], T_map_camera[chosen]
-        near = np.linalg.norm(others[:, :3, 3] - here[:3, 3], axis=1) <= options.place_m
-        near &= np.einsum("kij,ij->k", others[:, :3, :3], here[:3, :3]) >= least_trace
-        if np.count_nonzero(near) < options.of_place:
-            chosen.append(number)
-        if len(chosen) == count:
+    candidates: list[int] = []
+    # The trace of a rotation matrix is 1 + 2 cos(angle).
+    min_trace = 1.0 + 2.0 * math.cos(math.radians(options.region_deg))
+    for number, _ in similar:
+        pose, others = T_map_camera[number], T_map_camera[candidates]
+        is_near = np.linalg.norm(others[:, :3, 3] - pose[:3, 3], axis=1) <= options.region_m
+        is_near &= np.einsum("kij,ij->k", others[:, :3, :3], pose[:3, :3]) >= min_trace
+        if np.count_nonzero(is_near) < options.max_per_region:
+            candidates.append(number)
+        if len(candidates) == count:
             break
-    return chosen
+    return candidates
 
 
-def _scale_of(placements: Sequence[_Placement], options: LocalisationOptions) -> float | None:
-    """Return how long the unit of the view is in that of placements that agree, None if none tells."""
-    measured = [scale_between(each.found, options.measured) for each in placements]
-    known = [each for each in measured if each is not None]
+def _estimate_poses(
+    candidates: Sequence[LocalisationCandidate], view: View, options: LocalisationOptions
+) -> list[_Estimate]:
+    """Return the estimates of all candidates with enough inliers, the one with most inliers first."""
+    estimates = []
+    for candidate in candidates:
+        if not (np.abs(candidate.T_map_keyframe[:3, 3]) <= _MAX_MAP_COORDINATE_M).all():
+            continue
+        measured = measure_pose(candidate.landmarks, view, options.measured)
+        if isinstance(measured, str) or measured.inliers < options.min_candidate_inliers:
+            continue
+        estimates.append(
+            _Estimate(
+                keyframe=candidate.id,
+                T_map_keyframe=candidate.T_map_keyframe,
+                T_map_camera=candidate.T_map_keyframe @ inverse(measured.solution.T_camera_world),
+                covariance=measured.solution.covariance + options.measured.min_covariance(),
+                measured=measured,
+            )
+        )
+    return sorted(estimates, key=lambda estimate: (-estimate.measured.inliers, estimate.keyframe))
+
+
+def _estimate_scale(estimates: Sequence[_Estimate], options: LocalisationOptions) -> float | None:
+    """Return the metres in the unit of the view's depths; None if no estimate gives it.
+
+    The logarithms of the estimates' scales are averaged, weighted by their inverse variances.
+    """
+    ratios = [measure_scale_ratio(estimate.measured, options.measured) for estimate in estimates]
+    known = [ratio for ratio in ratios if ratio is not None]
     if not known:
         return None
-    weights = np.array([1.0 / each.variance for each in known])
-    return math.exp(float(weights @ [each.log_ratio for each in known] / weights.sum()))
+    weights = np.array([1.0 / ratio.variance for ratio in known])
+    return math.exp(float(weights @ [ratio.log_ratio for ratio in known] / weights.sum()))
 
 
-def _matches_of(placements: Sequence[_Placement]) -> tuple[Array, Array, Array]:
-    """Return all matches, agreeing or not: points of the map, the places of their keyframes, and pixels."""
-    points = [transform(each.T_map_keyframe, each.found.points_reference) for each in placements]
-    origins = [np.tile(each.T_map_keyframe[:3, 3], (each.found.matches, 1)) for each in placements]
-    pixels = [each.found.pixels for each in placements]
+def _collect_matches(estimates: Sequence[_Estimate]) -> tuple[Array, Array, Array]:
+    """Return all matches, inliers and outliers.
+
+    Returns:
+        Landmarks ``(k, 3)`` in the map, the positions ``(k, 3)`` of the cameras of their keyframes in the
+        map, and pixels ``(k, 2)`` in the view.
+    """
+    points = [transform(e.T_map_keyframe, e.measured.points_keyframe) for e in estimates]
+    origins = [np.tile(e.T_map_keyframe[:3, 3], (e.measured.matches, 1)) for e in estimates]
+    pixels = [e.measured.pixels for e in estimates]
     return np.concatenate(points), np.concatenate(origins), np.concatenate(pixels)
 
 
-def _uncertainty_of_camera(fit: CameraFit, T_map_camera: Array) -> Array:
-    """Return the ``(6, 6)`` covariance that an unknown error of the camera adds to the pose."""
-    moved = log_se3((fit.T_map_camera @ inverse(T_map_camera))[None])[0]
-    covariance: Array = np.outer(moved, moved) + fit.covariance
+def _camera_covariance(fit: CameraFit, T_map_camera: Array) -> Array:
+    """Return the ``(6, 6)`` covariance that an unknown error of the intrinsics adds to that of the pose."""
+    difference = log_se3((fit.T_map_camera @ inverse(T_map_camera))[None])[0]
+    covariance: Array = np.outer(difference, difference) + fit.covariance
     return covariance
 
 
 def _camera_weakness(fit: CameraFit, T_map_camera: Array) -> str:
-    """Return "wrong-intrinsics" if the matches contradict the camera of the view, else "".
+    """Return "wrong-intrinsics" if the matches contradict the intrinsics of the view, else "".
 
-    What the matches leave undetermined, such as the focal length before a flat wall, contradicts nothing.
+    What the matches do not determine, such as the focal length in front of a flat wall, contradicts nothing.
     """
-    moved_m, turned_deg = pose_difference(fit.T_map_camera, T_map_camera)
+    moved_m, rotated_deg = pose_difference(fit.T_map_camera, T_map_camera)
     is_contradicted = (
         abs(fit.log_focal) > _MAX_LOG_FOCAL + fit.log_focal_deviation
         or moved_m > _MAX_CAMERA_STEP_M + fit.position_deviation_m
-        or turned_deg > _MAX_CAMERA_TURN_DEG + fit.turn_deviation_deg
+        or rotated_deg > _MAX_CAMERA_ROTATION_DEG + fit.turn_deviation_deg
     )
     return "wrong-intrinsics" if is_contradicted else ""
 
 
-def _agree(one: _Placement, other: _Placement, options: LocalisationOptions) -> bool:
-    metres, degrees = pose_difference(one.T_map_camera, other.T_map_camera)
+def _do_agree(a: _Estimate, b: _Estimate, options: LocalisationOptions) -> bool:
+    metres, degrees = pose_difference(a.T_map_camera, b.T_map_camera)
     return metres <= options.agree_m and degrees <= options.agree_deg
 
 
 def _weakness(
-    agreeing: Sequence[_Placement],
-    others: Sequence[_Placement],
+    agreeing: Sequence[_Estimate],
+    contradicting: Sequence[_Estimate],
     solution: PnpSolution,
     options: LocalisationOptions,
 ) -> str:
-    """Return why the placement of *agreeing* (best first), solved as *solution*, is not ok, "" if it is."""
-    best = agreeing[0].found
+    """Return the reason why a pose must not be trusted, "" if it can be.
+
+    Args:
+        agreeing: The best estimate and those that agree with it, the best first.
+        contradicting: The other estimates.
+        solution: The PnP solution of the pose.
+        options: Conditions under which the pose is ok.
+    """
+    best = agreeing[0].measured
     if options.has_equal_rooms:
         return "ambiguous"
-    rival = max((each.found.inliers for each in others if not each.found.solution.reason), default=0)
-    if rival and rival >= options.rival * best.inliers:
+    rivals = [e.measured.inliers for e in contradicting if not e.measured.solution.reason]
+    if rivals and max(rivals) >= options.rival_ratio * best.inliers:
         return "ambiguous"
     if best.inliers < options.measured.min_inliers:
         return "few-inliers"
@@ -267,47 +322,52 @@ def _weakness(
         return "low-inlier-ratio"
     if solution.reason:
         return solution.reason
-    if len(agreeing) < 2 and best.inliers < options.alone_inliers:
+    if len(agreeing) < 2 and best.inliers < options.min_single_inliers:
         return "one-keyframe"
     return ""
 
 
-def _solved_together(
-    placements: Sequence[_Placement], view: View, options: LocalisationOptions
-) -> PnpSolution:
-    """Return the solution that fits the inliers of all *placements*, or that of the first one.
+def _solve_jointly(estimates: Sequence[_Estimate], view: View, options: LocalisationOptions) -> PnpSolution:
+    """Solve PnP with the inliers of all *estimates*, in the frame of the keyframe of the first one.
 
-    It is relative to the first keyframe.  Without depths a pose of one keyframe is no more exact than its few
-    pixels; each has its own.
+    Without depths this is more accurate than the pose of one keyframe, since each has inliers of its own.
+
+    Returns:
+        The solution of the first estimate if the joint problem has none.
     """
-    best = placements[0]
+    best = estimates[0]
     T_best_map = inverse(best.T_map_keyframe)
     points, pixels = [], []
-    for placement in placements:
-        inliers = placement.found.solution.inliers
-        T_best_keyframe = T_best_map @ placement.T_map_keyframe
-        points.append(transform(T_best_keyframe, placement.found.points_reference[inliers]))
-        pixels.append(placement.found.pixels[inliers])
+    for estimate in estimates:
+        inliers = estimate.measured.solution.inliers
+        T_best_keyframe = T_best_map @ estimate.T_map_keyframe
+        points.append(transform(T_best_keyframe, estimate.measured.points_keyframe[inliers]))
+        pixels.append(estimate.measured.pixels[inliers])
     try:
         return solve_pnp(
-            np.concatenate(points), np.concatenate(pixels), view.camera,
+            np.concatenate(points),
+            np.concatenate(pixels),
+            view.camera,
             PnpOptions(inlier_px=options.measured.inlier_px),
-        )  # fmt: skip
+        )
     except PnpError:
-        return best.found.solution
+        return best.measured.solution
 
 
-def _fused(placements: Sequence[_Placement]) -> tuple[Array, Array]:
-    """Return the mean of placements that agree, weighted by their information, and its covariance.
+def _fuse_estimates(estimates: Sequence[_Estimate]) -> tuple[Array, Array]:
+    """Return the mean pose of agreeing estimates, weighted by their information, and its covariance.
 
-    Keyframes that lie together share the errors of the map, so the covariance is that of the best one.
+    The covariance is that of the best estimate, not a smaller one: neighbouring keyframes have the errors of
+    the map in common.  It is of the twist on the left of the pose.
     """
-    best = placements[0]
-    back = inverse(best.T_map_camera)
-    twists = log_se3(np.array([back @ each.T_map_camera for each in placements]))
-    information = np.array([np.linalg.inv(each.covariance) for each in placements])
+    best = estimates[0]
+    # 1. Average the twists from the best estimate to all estimates.
+    T_camera_map = inverse(best.T_map_camera)
+    twists = log_se3(np.array([T_camera_map @ estimate.T_map_camera for estimate in estimates]))
+    information = np.array([np.linalg.inv(estimate.covariance) for estimate in estimates])
     twist = np.linalg.solve(information.sum(axis=0), np.einsum("kij,kj->i", information, twists))
     T_map_camera: Array = best.T_map_camera @ exp_se3(twist)
-    to_map = adjoint(T_map_camera)
-    covariance: Array = to_map @ best.covariance @ to_map.T
+    # 2. Move the covariance from the right of the pose to its left.
+    to_left = adjoint(T_map_camera)
+    covariance: Array = to_left @ best.covariance @ to_left.T
     return T_map_camera, 0.5 * (covariance + covariance.T)

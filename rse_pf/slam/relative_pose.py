@@ -1,6 +1,9 @@
-"""The relative pose of two views: matches, PnP, depth, and whether the result is a link.
+"""Measure the relative pose of two images: match features, solve PnP, and refine the pose with depths.
 
-Which views to compare, and which links to believe, is decided elsewhere.
+The landmarks of one image are found in the other one.  `measure_pose` returns any pose that was found;
+`measure_relative_pose` accepts it as a constraint between two keyframes only if enough matches are inliers.
+Which images are compared, and which constraints are outliers, is decided by `rse_pf.slam.links`,
+`rse_pf.slam.localise` and `rse_pf.live_map`.
 """
 
 from __future__ import annotations
@@ -20,98 +23,137 @@ from rse_pf.pnp import DepthNoise, PnpOptions, PnpSolution, refine_with_depth, s
 from rse_pf.slam.descriptors import best_matches
 
 __all__ = [
+    "Landmarks",
     "MeasuredPose",
-    "MeasuredScale",
-    "Reference",
     "RelativePose",
     "RelativePoseOptions",
+    "ScaleRatio",
     "View",
-    "match_points",
-    "match_rows",
-    "measure_inverse_link",
-    "measure_link",
+    "landmarks_of_keyframe",
+    "match_descriptors",
+    "match_landmarks",
+    "measure_inverse_relative_pose",
     "measure_pose",
-    "reference_of",
-    "scale_between",
+    "measure_relative_pose",
+    "measure_scale_ratio",
     "view_of_keyframe",
 ]
 
-_KINECT = DepthNoise()
-_MAX_POINT_M = 1e5
-"""No point of a keyframe is further away; PnP refuses all matches for one that is."""
-_NEAREST_M, _FARTHEST_M = 0.01, 100.0
-"""Depths that a depth camera may measure; the depth of anything else is left out."""
-_MIN_RATIOS = 12
-"""Points with a depth in both keyframes from which on they tell a scale."""
-_MAX_RATIO_SPREAD = 0.15
-"""Deviation of the logarithms of the depths' ratios beyond which they tell none."""
-_SCALE_FLOOR = 0.01
-"""Smallest deviation of the logarithm of a scale: errors of landmarks of one keyframe are correlated."""
+_KINECT_NOISE = DepthNoise()
+_MAX_LANDMARK_M = 1e5
+"""Largest coordinate in metres of a landmark in its camera's frame; PnP would reject all matches because of
+one landmark beyond it."""
+_MIN_DEPTH_M = 0.01  # smallest depth in metres that is used as the measurement of a depth camera
+_MAX_DEPTH_M = 100.0  # largest depth in metres that is used as the measurement of a depth camera
+_MIN_SCALE_RATIOS = 12  # inliers with a depth in both images that are needed to estimate a ratio of scales
+_MAX_SCALE_SPREAD = 0.15
+"""Largest standard deviation of the logarithms of depth ratios at which their median is a ratio of scales."""
+_MIN_SCALE_DEVIATION = 0.01
+"""Smallest standard deviation of the logarithm of a ratio of scales: the errors of the landmarks of one
+keyframe are correlated, so that more landmarks do not make it more accurate."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RelativePoseOptions:
-    """Limits of matches and inliers; the defaults were measured on the red-kitchen recording."""
+    """Limits for matches and inliers; the defaults were measured on the red-kitchen recording of 7-Scenes.
+
+    Attributes:
+        ratio: Largest distance of the best match over that of the second best one (Lowe's ratio test).
+        inlier_px: Largest reprojection error of an inlier.
+        max_matches: Number of best matches that are used.
+        min_matches: Fewer matches give no pose; None means half of ``min_inliers``.
+        min_inliers: Fewer inliers give no constraint.
+        min_inlier_ratio: A smaller share of inliers among the matches gives no constraint.
+        floor_m: Smallest standard deviation of the translation along each axis, because errors of depth and
+            calibration are correlated.
+        floor_deg: Smallest standard deviation of the rotation about each axis, for the same reason.
+        weak_variance: Factor by which the covariance of a pose is multiplied that PnP calls weak, before it
+            becomes a constraint; 0 means that a weak pose gives no constraint.
+    """
 
     ratio: float = 0.75
     inlier_px: float = 3.0
     max_matches: int = 700
     min_matches: int | None = None
-    """Fewer matches are not solved; None: half of ``min_inliers``."""
     min_inliers: int = 40
     min_inlier_ratio: float = 0.5
     floor_m: float = 0.02
     floor_deg: float = 0.7
-    """Smallest standard deviations for each axis: errors of depth and calibration are correlated."""
     weak_variance: float = 0.0
-    """A pose that its evidence calls weak is a link with so many times its covariance; 0: it is none."""
 
-    def floor(self) -> Array:
-        """Return the ``(6, 6)`` covariance that every measured pose has at least."""
+    def min_covariance(self) -> Array:
+        """Return the ``(6, 6)`` covariance (metres, radians) that is added to that of each measured pose."""
         return np.diag([self.floor_m**2] * 3 + [math.radians(self.floor_deg) ** 2] * 3)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class View:
-    """A camera image: ``(n, 2)`` undistorted pixels with their ``(n, d)`` descriptors of any kind.
+    """The features of one camera image, in which the landmarks of other images are looked for.
 
-    ``depths_m``, if there are any, are the ``(n,)`` depths at the pixels with their ``noise``, 0 where there
-    is none.  They are in another unit than those of other views unless the view ``is_metric``.
+    Attributes:
+        camera: The pinhole camera.
+        pixels: ``(n, 2)``, undistorted.
+        descriptors: ``(n, d)``.
+        depths_m: ``(n,)`` along the optical axis, 0 where the depth is unknown; None without depths.
+        noise: Noise of the depths.
+        is_metric: Whether the depths are in metres; else their unit of length is unknown.
     """
 
     camera: Camera
     pixels: Array
     descriptors: Descriptors
     depths_m: Array | None = None
-    noise: DepthNoise = _KINECT
+    noise: DepthNoise = _KINECT_NOISE
     is_metric: bool = True
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Reference:
-    """Points of a keyframe that are sought in other images: ``(n, 3)`` metres, camera frame, finite.
+class Landmarks:
+    """3-D points of a keyframe with descriptors, which are looked for in other images.
 
-    ``descriptors`` ``(n, d)`` has one row for each point.
+    Attributes:
+        points_camera: ``(n, 3)`` metres in the frame of the keyframe's camera, finite.
+        descriptors: ``(n, d)``, one row for each point.
     """
 
     points_camera: Array
     descriptors: Descriptors
 
 
+@dataclass(frozen=True, slots=True)
+class ScaleRatio:
+    """The logarithm of the ratio of two units of length, and its variance.
+
+    ``exp(log_ratio)`` is the length of the first unit, expressed in the second one.
+    """
+
+    log_ratio: float
+    variance: float
+
+    @property
+    def inverse(self) -> ScaleRatio:
+        """The length of the second unit, expressed in the first one."""
+        return ScaleRatio(-self.log_ratio, self.variance)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class MeasuredPose:
-    """``T_view_reference`` by PnP and depth, and the matches it was found among.
+    """The pose of a view relative to a keyframe, and the matches from which it was computed.
 
-    ``points_reference`` ``(k, 3)`` are metres, in the frame of the reference; ``pixels`` ``(k, 2)`` and
-    ``depths_view`` ``(k,)``, 0 where there is none, are those of the view.  ``depth_ratio`` is how long a
-    metre of the view is in those of the reference, by the pose that pixels alone give.
+    Attributes:
+        solution: The PnP solution; its ``T_camera_world`` maps the keyframe's frame to the view's frame.
+        points_keyframe: ``(k, 3)``, the matched landmarks in the frame of the keyframe, metres.
+        pixels: ``(k, 2)``, the matched pixels in the view.
+        depths_view: ``(k,)``, the depths of the matched features in the view, 0 where unknown.
+        depth_ratio: For a metric view with depths: the metre of the view in metres of the keyframe, which
+            differs from 1 if one of both has a wrong scale.
     """
 
     solution: PnpSolution
-    points_reference: Array
+    points_keyframe: Array
     pixels: Array
     depths_view: Array
-    depth_ratio: MeasuredScale | None = None
+    depth_ratio: ScaleRatio | None = None
 
     @property
     def matches(self) -> int:
@@ -120,92 +162,88 @@ class MeasuredPose:
 
     @property
     def inliers(self) -> int:
-        """The number of matches that agree."""
+        """The number of inliers among the matches."""
         return len(self.solution.inliers)
-
-
-@dataclass(frozen=True, slots=True)
-class MeasuredScale:
-    """The logarithm of how long the unit of one keyframe is in that of another, and its variance."""
-
-    log_ratio: float
-    variance: float
-
-    @property
-    def inverse(self) -> MeasuredScale:
-        """How long the unit of the other keyframe is in that of the one."""
-        return MeasuredScale(-self.log_ratio, self.variance)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class RelativePose:
-    """``T_a_b`` between two keyframes, its ``(6, 6)`` information, and the number of inliers and matches.
+    """A constraint between two keyframes *a* and *b*.
 
-    The information is the inverse covariance of the twist (metres, radians) in
-    ``log(inverse(T_a_b) @ T_a_b_true)``.  ``scale``, where the keyframes have different units, is that of the
-    unit of *b* in the unit of *a*; ``depth_ratio`` how long a metre of one is in those of the other, where
-    both claim metres.
+    Attributes:
+        T_a_b: ``(4, 4)``, maps the frame of the camera of *b* to that of *a*.
+        information: ``(6, 6)`` inverse covariance of the twist (metres, radians) in
+            ``log(inverse(T_a_b) @ true_T_a_b)``.
+        inliers: The number of inliers.
+        matches: The number of matches.
+        scale: The unit of *b* in the unit of *a*, if *b* is not metric; else None.
+        depth_ratio: The metre of *b* in metres of *a*, where both have metric depths and it was measured.
     """
 
     T_a_b: Array
     information: Array
     inliers: int
     matches: int
-    scale: MeasuredScale | None = None
-    depth_ratio: MeasuredScale | None = None
+    scale: ScaleRatio | None = None
+    depth_ratio: ScaleRatio | None = None
 
 
 _DEFAULT = RelativePoseOptions()
 
 
-def reference_of(keyframe: Keyframe) -> Reference:
-    """Return the features of *keyframe* that have a usable point: one absurd row must not cost the others."""
-    # Not a number is "no depth".
-    usable = np.flatnonzero((np.abs(keyframe.points_camera) <= _MAX_POINT_M).all(axis=1))
-    return Reference(
-        points_camera=keyframe.points_camera[usable].astype(np.float64),
-        descriptors=keyframe.descriptors[usable],
+def landmarks_of_keyframe(keyframe: Keyframe) -> Landmarks:
+    """Return the features of *keyframe* whose 3-D point is known and within 100 km of its camera."""
+    # A comparison with NaN, which means an unknown depth, is false.
+    rows = np.flatnonzero((np.abs(keyframe.points_camera) <= _MAX_LANDMARK_M).all(axis=1))
+    return Landmarks(
+        points_camera=keyframe.points_camera[rows].astype(np.float64),
+        descriptors=keyframe.descriptors[rows],
     )
 
 
 def view_of_keyframe(keyframe: Keyframe) -> View:
-    """Return the image of *keyframe*, with the depths that a depth camera could have measured."""
+    """Return the image of *keyframe* as a view; depths outside 0.01..100 m are unknown."""
     depths_m = keyframe.points_camera[:, 2].astype(np.float64)
-    usable = (depths_m >= _NEAREST_M) & (depths_m <= _FARTHEST_M)
+    is_usable = (depths_m >= _MIN_DEPTH_M) & (depths_m <= _MAX_DEPTH_M)
     return View(
         camera=keyframe.camera,
         pixels=keyframe.pixels.astype(np.float64),
         descriptors=keyframe.descriptors,
-        depths_m=np.where(usable, depths_m, 0.0),
+        depths_m=np.where(is_usable, depths_m, 0.0),
     )
 
 
-def measure_link(
-    reference: Reference, view: View, options: RelativePoseOptions = _DEFAULT
+def measure_relative_pose(
+    landmarks: Landmarks, view: View, options: RelativePoseOptions = _DEFAULT
 ) -> RelativePose | str:
-    """Return the pose of *view* (b) relative to *reference* (a) as a link; deterministic.
+    """Return the pose of *view* (b) relative to the keyframe of *landmarks* (a); deterministic.
 
     Returns:
-        The relative pose, or the reason why there is none: "no-matches", "no-pose", "few-inliers",
-        "low-inlier-ratio", "no-scale" where the view is not metric and the depths of both do not tell a
-        ratio, or the reason why the pose is weak, unless weak poses are links.
+        The relative pose, or the reason why there is none: "no-matches"; "no-pose"; "few-inliers";
+        "low-inlier-ratio"; "no-scale" where the view is not metric and depths do not give its scale; or the
+        reason why PnP calls the pose weak, unless ``weak_variance`` accepts weak poses.
+
+    Raises:
+        BadRequest: The descriptors of both are of different kinds.
+        MissingExtra: They are ORB descriptors, and the native core is not installed.
     """
-    measured = measure_pose(reference, view, options)
+    measured = measure_pose(landmarks, view, options)
     if isinstance(measured, str):
         return measured
     if measured.inliers < options.min_inliers:
         return "few-inliers"
     if measured.inliers < options.min_inlier_ratio * measured.matches:
         return "low-inlier-ratio"
-    weak = measured.solution.reason
-    if weak and not options.weak_variance:
-        return weak
-    scale = None if view.is_metric else scale_between(measured, options)
+    weakness = measured.solution.reason
+    if weakness and not options.weak_variance:
+        return weakness
+    scale = None if view.is_metric else measure_scale_ratio(measured, options)
     if scale is None and not view.is_metric:
         return "no-scale"
-    variance = options.weak_variance if weak else 1.0
-    # T_b_a true = exp(xi) T_b_a, and its inverse has exp(-xi) on its right: the same covariance.
-    information = np.linalg.inv(variance * measured.solution.covariance + options.floor())
+    factor = options.weak_variance if weakness else 1.0
+    # The error is on the left of T_b_a: true_T_b_a = exp(xi) T_b_a.  The inverse of this equation has
+    # exp(-xi) on the right of T_a_b, so that the covariance of both is the same.
+    information = np.linalg.inv(factor * measured.solution.covariance + options.min_covariance())
     return RelativePose(
         T_a_b=inverse(measured.solution.T_camera_world),
         information=0.5 * (information + information.T),
@@ -216,106 +254,138 @@ def measure_link(
     )
 
 
-def measure_inverse_link(
-    reference: Reference, view: View, options: RelativePoseOptions = _DEFAULT
+def measure_inverse_relative_pose(
+    landmarks: Landmarks, view: View, options: RelativePoseOptions = _DEFAULT
 ) -> RelativePose | str:
-    """Return the pose of *reference* (b) relative to *view* (a), as `measure_link` does of the view."""
-    found = measure_link(reference, view, options)
-    if isinstance(found, str):
-        return found
+    """Return the pose of the keyframe of *landmarks* (b) relative to *view* (a).
+
+    The result is the inverse of that of `measure_relative_pose`, without ``depth_ratio``; the reasons why
+    there is no pose are the same.
+    """
+    measured = measure_relative_pose(landmarks, view, options)
+    if isinstance(measured, str):
+        return measured
     # inverse(T exp(xi)) = inverse(T) exp(-Ad(T) xi).
-    back = adjoint(inverse(found.T_a_b))
-    information = back.T @ found.information @ back
+    J = adjoint(inverse(measured.T_a_b))
+    information = J.T @ measured.information @ J
     return RelativePose(
-        T_a_b=inverse(found.T_a_b), information=0.5 * (information + information.T), inliers=found.inliers,
-        matches=found.matches, scale=None if found.scale is None else found.scale.inverse,
-    )  # fmt: skip
+        T_a_b=inverse(measured.T_a_b),
+        information=0.5 * (information + information.T),
+        inliers=measured.inliers,
+        matches=measured.matches,
+        scale=None if measured.scale is None else measured.scale.inverse,
+    )
 
 
-def scale_between(measured: MeasuredPose, options: RelativePoseOptions = _DEFAULT) -> MeasuredScale | None:
-    """Return how long the unit of the view's depths is in that of the reference's points.
+def measure_scale_ratio(measured: MeasuredPose, options: RelativePoseOptions = _DEFAULT) -> ScaleRatio | None:
+    """Return the unit of the view's depths in the unit of the keyframe's landmarks.
 
-    It is the median of the ratios of depths among the inliers; None if too few of them have a depth, or they
-    do not agree.  What the pose may be wrong by along the axis of the view counts, too.
+    The estimate is the median of the depth ratios of the inliers.  Its variance is the sum of those of the
+    median, of the correlated errors of landmarks, and of the pose along the optical axis.
+
+    Returns:
+        None if fewer than 12 inliers have a depth in both images, or their ratios spread by more than 15 %.
     """
     rows = measured.solution.inliers[measured.depths_view[measured.solution.inliers] > 0.0]
-    expected = transform(measured.solution.T_camera_world, measured.points_reference[rows])[:, 2]
-    known = measured.depths_view[rows]
-    is_before = expected > 0.0
-    if np.count_nonzero(is_before) < _MIN_RATIOS:
+    expected_depths = transform(measured.solution.T_camera_world, measured.points_keyframe[rows])[:, 2]
+    view_depths = measured.depths_view[rows]
+    is_in_front = expected_depths > 0.0
+    if np.count_nonzero(is_in_front) < _MIN_SCALE_RATIOS:
         return None
-    ratios = np.log(expected[is_before] / known[is_before])
-    log_ratio = float(np.median(ratios))
-    spread = 1.4826 * float(np.median(np.abs(ratios - log_ratio)))
-    if spread > _MAX_RATIO_SPREAD:
+    log_ratios = np.log(expected_depths[is_in_front] / view_depths[is_in_front])
+    log_ratio = float(np.median(log_ratios))
+    # 1.4826 times the median absolute deviation is the standard deviation of a normal distribution.
+    spread = 1.4826 * float(np.median(np.abs(log_ratios - log_ratio)))
+    if spread > _MAX_SCALE_SPREAD:
         return None
-    along = math.sqrt(float(measured.solution.covariance[2, 2])) + options.floor_m
+    axial_deviation_m = math.sqrt(float(measured.solution.covariance[2, 2])) + options.floor_m
     variance = (
-        0.5 * math.pi * spread**2 / len(ratios)
-        + _SCALE_FLOOR**2
-        + (along / float(np.median(expected[is_before]))) ** 2
+        0.5 * math.pi * spread**2 / len(log_ratios)  # the variance of a median is pi / 2 that of a mean
+        + _MIN_SCALE_DEVIATION**2
+        + (axial_deviation_m / float(np.median(expected_depths[is_in_front]))) ** 2
     )
-    return MeasuredScale(log_ratio, variance)
+    return ScaleRatio(log_ratio, variance)
 
 
 def measure_pose(
-    reference: Reference, view: View, options: RelativePoseOptions = _DEFAULT
+    landmarks: Landmarks, view: View, options: RelativePoseOptions = _DEFAULT
 ) -> MeasuredPose | str:
-    """Return ``T_view_reference``, or the reason why there is none: "no-matches" or "no-pose".
+    """Return the pose of *view* relative to the keyframe of *landmarks*, however few matches are inliers.
 
-    The pose is refined with the depths of *view*, if it has any, is metric, and all matched points lie before
-    the camera.
+    The pose is refined with the depths of *view* if the view is metric and has depths, and all matched
+    landmarks lie in front of the keyframe's camera.
 
     Args:
-        reference: Whose points are sought.
-        view: The image in which they are sought; the depth noise is taken for that of both cameras.
-        options: Of matches and inliers; the number of inliers is not judged here.
+        landmarks: The landmarks of the keyframe.
+        view: The image in which they are looked for; its depth noise is taken as that of both cameras.
+        options: Limits of the matches and of the reprojection error.
+
+    Returns:
+        The pose, or the reason why there is none: "no-matches" or "no-pose".
+
+    Raises:
+        BadRequest: The descriptors of both are of different kinds.
+        MissingExtra: They are ORB descriptors, and the native core is not installed.
     """
-    points, pixels, depths_m = match_points(reference, view, options)
-    least = options.min_inliers // 2 if options.min_matches is None else options.min_matches
-    if len(points) < max(4, least):
+    # 1. Match the features.
+    points, pixels, depths_m = match_landmarks(landmarks, view, options)
+    min_matches = options.min_inliers // 2 if options.min_matches is None else options.min_matches
+    if len(points) < max(4, min_matches):
         return "no-matches"
+    # 2. Solve PnP.
     try:
         solution = solve_pnp(points, pixels, view.camera, _pnp_options(options.inlier_px))
     except PnpError:
         return "no-pose"
-    measured = MeasuredPose(solution=solution, points_reference=points, pixels=pixels, depths_view=depths_m)
-    if view.depths_m is None or not view.is_metric or points[:, 2].min() < _NEAREST_M:
+    measured = MeasuredPose(solution=solution, points_keyframe=points, pixels=pixels, depths_view=depths_m)
+    # 3. Refine the pose with the depths of both images.
+    if view.depths_m is None or not view.is_metric or points[:, 2].min() < _MIN_DEPTH_M:
         return measured
     refined = refine_with_depth(solution, points, pixels, depths_m, view.camera, view.noise)
-    return replace(measured, solution=refined, depth_ratio=scale_between(measured, options))
+    # 4. Compare the metric scales by the unrefined pose, which the depths of the view did not affect.
+    return replace(measured, solution=refined, depth_ratio=measure_scale_ratio(measured, options))
 
 
-def match_points(
-    reference: Reference, view: View, options: RelativePoseOptions = _DEFAULT
+def match_landmarks(
+    landmarks: Landmarks, view: View, options: RelativePoseOptions = _DEFAULT
 ) -> tuple[Array, Array, Array]:
-    """Return the points of *reference* that *view* shows, ``(k, 3)``, with its pixels and depths there.
+    """Match landmarks with the features of a view.
 
-    They are sorted from left to right, and rounded to 0.1 mm, 0.01 px and 1 mm.
+    Returns:
+        The matched landmarks ``(k, 3)`` in the keyframe's frame, and the pixels ``(k, 2)`` and depths
+        ``(k,)`` of the matched features in *view* (0 where unknown), sorted by the column of the pixel and
+        rounded to 0.1 mm, 0.01 px and 1 mm.
 
     Raises:
-        BadRequest: The descriptors are of two kinds.
+        BadRequest: The descriptors of both are of different kinds.
         MissingExtra: They are ORB descriptors, and the native core is not installed.
     """
-    rows, columns = best_matches(reference.descriptors, view.descriptors, options.ratio)
-    rows, columns = rows[: options.max_matches], columns[: options.max_matches]
-    leftmost = np.argsort(view.pixels[columns, 0], kind="stable")
-    rows, columns = rows[leftmost], columns[leftmost]
-    depths_m = np.zeros(len(columns)) if view.depths_m is None else view.depths_m[columns]
-    return reference.points_camera[rows].round(4), view.pixels[columns].round(2), depths_m.round(3)
+    landmark_rows, view_rows = best_matches(landmarks.descriptors, view.descriptors, options.ratio)
+    landmark_rows, view_rows = landmark_rows[: options.max_matches], view_rows[: options.max_matches]
+    order = np.argsort(view.pixels[view_rows, 0], kind="stable")
+    landmark_rows, view_rows = landmark_rows[order], view_rows[order]
+    depths_m = np.zeros(len(view_rows)) if view.depths_m is None else view.depths_m[view_rows]
+    return (
+        landmarks.points_camera[landmark_rows].round(4),
+        view.pixels[view_rows].round(2),
+        depths_m.round(3),
+    )
 
 
-def match_rows(
-    reference: Descriptors, view: Descriptors, options: RelativePoseOptions = _DEFAULT
+def match_descriptors(
+    first: Descriptors, second: Descriptors, options: RelativePoseOptions = _DEFAULT
 ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    """Return rows of *reference* and of *view* that match, the best ``max_matches``, by rows of *view*.
+    """Return the rows of *first* and of *second* that match, the best ``max_matches`` of them.
+
+    The matches are sorted by their row of *second*.
 
     Raises:
-        As `match_points`.
+        BadRequest: The descriptors of both are of different kinds.
+        MissingExtra: They are ORB descriptors, and the native core is not installed.
     """
-    rows, columns = best_matches(reference, view, options.ratio)
-    order = np.argsort(columns[: options.max_matches])
-    return rows[order], columns[order]
+    first_rows, second_rows = best_matches(first, second, options.ratio)
+    order = np.argsort(second_rows[: options.max_matches])
+    return first_rows[order], second_rows[order]
 
 
 @lru_cache(maxsize=16)

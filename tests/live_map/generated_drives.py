@@ -22,7 +22,7 @@ from rse_pf.live_map.events import (
     matrix_bytes,
     matrix_of,
 )
-from rse_pf.slam.keyframe import Keyframe, encode_keyframe, make_features, make_scaleless_features
+from rse_pf.slam.keyframe import SentKeyframe, encode_keyframe, make_features, make_scaleless_features
 
 __all__ = ["GeneratedDrive", "GeneratedWorld", "circle", "make_link", "straight"]
 
@@ -98,7 +98,7 @@ class GeneratedWorld:
         self.units_m.append(drive.unit_m)
         pixels = self.rng.uniform(0, 470, (self.features, 2))
         depths_m = self.rng.uniform(1, 4, self.features)
-        keyframe = Keyframe(
+        keyframe = SentKeyframe(
             timestamp_s=0.2 * number, T_odom_camera=drive.T_odom_camera[number], camera=CAMERA,
             features=make_features(pixels, depths_m, self._descriptors) if drive.unit_m is None
             else make_scaleless_features(pixels, depths_m / drive.unit_m, self._descriptors),

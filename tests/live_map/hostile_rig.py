@@ -13,9 +13,8 @@ from rse_pf.geometry import Array
 from rse_pf.live_map.events import KeyframeAdded
 from rse_pf.live_map.live_map import LiveMap
 from rse_pf.live_map.outcomes import Added, OptimiseWanted
-from rse_pf.live_map.versions import encode_version_keyframe
 from rse_pf.slam.inertial import InertialMotion, KeyframeImu
-from rse_pf.slam.keyframe import Keyframe, UnknownBlock, decode_keyframe, encode_keyframe, make_features
+from rse_pf.slam.keyframe import SentKeyframe, UnknownBlock, decode_keyframe, encode_keyframe, make_features
 from tests.synthetic_maps import make_world
 
 HOSTILE = "x"
@@ -26,7 +25,7 @@ _F_BASELINE = 50.0
 
 Drives = Mapping[str, tuple[bytes, ...]]
 """The keyframes of each robot."""
-Attack = Callable[[int, Keyframe], bytes]
+Attack = Callable[[int, SentKeyframe], bytes]
 """Returns the bytes that the robot sends for keyframe *number*."""
 
 
@@ -47,7 +46,9 @@ def generated_drives(seed: int, keyframes: int = 16) -> Drives:
     for row, name in enumerate(("a", "b", "c", HOSTILE)):
         turns = 0.27 * (row if name != HOSTILE else 0.5) + np.linspace(0.0, 0.35, keyframes)
         version, _ = world.walk(name, turns, seed=10 * seed + row)
-        drives[name] = tuple(encode_version_keyframe(keyframe) for keyframe in version.keyframes)
+        drives[name] = tuple(
+            encode_keyframe(SentKeyframe.from_map(keyframe)) for keyframe in version.keyframes
+        )
     return drives
 
 
@@ -85,11 +86,11 @@ def play(drives: Drives, attack: Attack | None) -> Outcome:
     return played
 
 
-def tell_truth(number: int, keyframe: Keyframe) -> bytes:
+def tell_truth(number: int, keyframe: SentKeyframe) -> bytes:
     return encode_keyframe(keyframe)
 
 
-def _with_block(keyframe: Keyframe, kind: int, content: bytes, flags: int = 0) -> bytes:
+def _with_block(keyframe: SentKeyframe, kind: int, content: bytes, flags: int = 0) -> bytes:
     """Return a keyframe with one more block behind its own, whatever the block holds."""
     data = bytearray(encode_keyframe(keyframe))
     data[_BLOCKS_AT] += 1
@@ -116,18 +117,18 @@ _FALSE_MOTION = InertialMotion(
 )  # fmt: skip
 
 
-def _moved(keyframe: Keyframe, T_odom_camera: Array) -> bytes:
+def _moved(keyframe: SentKeyframe, T_odom_camera: Array) -> bytes:
     return encode_keyframe(replace(keyframe, T_odom_camera=T_odom_camera))
 
 
-def _with_baseline(keyframe: Keyframe, f_baseline: float) -> bytes:
+def _with_baseline(keyframe: SentKeyframe, f_baseline: float) -> bytes:
     """Return a keyframe with the depths of a stereo pair."""
     seen = keyframe.features
     features = make_features(seen.pixels, seen.depths_m, seen.descriptors, seen.noise, seen.kind, f_baseline)
     return encode_keyframe(replace(keyframe, features=features))
 
 
-def jump(number: int, keyframe: Keyframe) -> bytes:
+def jump(number: int, keyframe: SentKeyframe) -> bytes:
     """Send each fifth keyframe 3 m aside."""
     T = keyframe.T_odom_camera.copy()
     T[:3, 3] += (3.0 if number % 5 == 4 else 0.0) * T[:3, 0]
@@ -151,7 +152,7 @@ REFUSED: dict[str, Attack] = {
 """Every keyframe of these is refused."""
 ACCEPTED: dict[str, Attack] = {
     "unknown-optional": lambda number, keyframe: encode_keyframe(
-        replace(keyframe, others=(UnknownBlock(_UNKNOWN_KIND, bytes(1000)),))
+        replace(keyframe, unknown_blocks=(UnknownBlock(_UNKNOWN_KIND, bytes(1000)),))
     ),
     "false-gravity": _imu([1.0, 0.0, 0.0]),
     "false-motion": _imu([0.0, 1.0, 0.0], arm_m=9.9, motion=_FALSE_MOTION),

@@ -10,8 +10,7 @@ from rse_pf.live_map.measure import measure_loop_closures, measure_stored_keyfra
 from rse_pf.maps.format import Keyframe
 from rse_pf.pnp import DepthNoise
 from rse_pf.pnp.problems import KINECT
-from rse_pf.slam.keyframe import Keyframe as SentKeyframe
-from rse_pf.slam.keyframe import KeyframeFeatures, encode_keyframe, make_features
+from rse_pf.slam.keyframe import KeyframeFeatures, SentKeyframe, encode_keyframe, make_features
 from rse_pf.slam.relative_pose import RelativePoseOptions
 from tests.synthetic_maps import make_world
 

@@ -21,18 +21,17 @@ from rse_pf.live_map.events import KeyframeAdded, RobotForgotten
 from rse_pf.live_map.live_map import LiveMap
 from rse_pf.live_map.versions import started_from
 from rse_pf.maps.descriptors import ORB, DescriptorKind, common_kind
-from rse_pf.maps.format import Keyframe as MapKeyframe
-from rse_pf.maps.format import MapVersion, decode_map, encode_map
+from rse_pf.maps.format import Keyframe, MapVersion, decode_map, encode_map
 from rse_pf.service import dispatch
 from rse_pf.services.builtin import builtin_services
 from rse_pf.slam.descriptors import best_matches, distance_matrix, distances_of_pairs, no_distance
 from rse_pf.slam.keyframe import (
     MAX_KEYFRAME_BYTES,
-    Keyframe,
+    SentKeyframe,
     decode_keyframe,
     encode_keyframe,
     make_features,
-    most_features,
+    max_features,
 )
 from rse_pf.slam.links import Atlas
 from rse_pf.slam.places import place_vector
@@ -56,21 +55,21 @@ def random_descriptors(kind: DescriptorKind, n: int, seed: int = 1) -> npt.NDArr
     return np.random.default_rng(seed).integers(low, high, (n, kind.size)).astype(kind.dtype)
 
 
-def keyframe(kind: DescriptorKind, n: int = 20, seed: int = 1) -> Keyframe:
+def keyframe(kind: DescriptorKind, n: int = 20, seed: int = 1) -> SentKeyframe:
     rng = np.random.default_rng(seed)
     features = make_features(
         rng.uniform(0, [640, 480], (n, 2)), rng.uniform(0.3, 6.0, n), random_descriptors(kind, n, seed),
         kind=kind,
     )  # fmt: skip
-    return Keyframe(
+    return SentKeyframe(
         timestamp_s=1.8e9, T_odom_camera=exp_se3([1.0, -2.0, 3.0, 0.1, 0.2, 0.3]), camera=CAMERA,
         features=features,
     )  # fmt: skip
 
 
-def map_keyframe(kind: DescriptorKind, number: int = 0, n: int = 20) -> MapKeyframe:
+def map_keyframe(kind: DescriptorKind, number: int = 0, n: int = 20) -> Keyframe:
     rng = np.random.default_rng(number)
-    return MapKeyframe(
+    return Keyframe(
         id=number, robot="r", timestamp_s=float(number), T_world_camera=np.eye(4), camera=CAMERA,
         pixels=rng.uniform(0, 480, (n, 2)).astype(np.float32),
         descriptors=random_descriptors(kind, n, number),
@@ -177,7 +176,7 @@ def test_a_keyframe_of_any_kind_comes_back_as_it_was(kind: DescriptorKind) -> No
 
     found = decode_keyframe(data)
 
-    assert len(made.features) == most_features(kind) == {32: 894, 61: 507, 64: 485, 128: 253}[kind.size]
+    assert len(made.features) == max_features(kind) == {32: 894, 61: 507, 64: 485, 128: 253}[kind.size]
     assert len(data) <= MAX_KEYFRAME_BYTES - 1800
     assert found.features.kind == kind
     assert found.features.descriptors.dtype == kind.dtype

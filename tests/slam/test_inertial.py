@@ -18,7 +18,7 @@ from rse_pf.slam.inertial import (
     decode_imu,
     encode_imu,
 )
-from rse_pf.slam.keyframe import Keyframe, decode_keyframe, encode_keyframe, make_features
+from rse_pf.slam.keyframe import SentKeyframe, decode_keyframe, encode_keyframe, make_features
 
 RNG = np.random.default_rng(4)
 ROOT = RNG.normal(size=(9, 9))
@@ -85,8 +85,8 @@ def test_hostile_blocks_are_refused(data, line):
     assert "\n" not in caught.value.message
 
 
-def keyframe(imu: KeyframeImu | None) -> Keyframe:
-    return Keyframe(
+def keyframe(imu: KeyframeImu | None) -> SentKeyframe:
+    return SentKeyframe(
         timestamp_s=1.0, T_odom_camera=np.eye(4),
         camera=Camera(fx=500.0, fy=500.0, cx=319.5, cy=239.5, width=640, height=480),
         features=make_features(np.full((3, 2), 5.0), np.ones(3), np.zeros((3, ORB.size), dtype=np.uint8)),

@@ -19,9 +19,9 @@ from rse_pf.slam.keyframe import (
     MAX_BLOCKS,
     MAX_FEATURES,
     MAX_KEYFRAME_BYTES,
-    Keyframe,
+    SentKeyframe,
     UnknownBlock,
-    check_sent,
+    check_odometry_range,
     decode_keyframe,
     encode_keyframe,
     make_features,
@@ -44,13 +44,17 @@ def random_features(n: int, seed: int = 1, width: int = 640, height: int = 480):
     )
 
 
-def keyframe(n: int = 20, camera: Camera = CAMERA) -> Keyframe:
+def keyframe(n: int = 20, camera: Camera = CAMERA) -> SentKeyframe:
     features = make_features(*random_features(n, width=camera.width, height=camera.height))
-    return Keyframe(timestamp_s=1.8e9 + 0.25, T_odom_camera=POSE, camera=camera, features=features)
+    return SentKeyframe(timestamp_s=1.8e9 + 0.25, T_odom_camera=POSE, camera=camera, features=features)
 
 
-def assert_equal(one: Keyframe, other: Keyframe) -> None:
-    assert (one.timestamp_s, one.camera, one.others) == (other.timestamp_s, other.camera, other.others)
+def assert_equal(one: SentKeyframe, other: SentKeyframe) -> None:
+    assert (one.timestamp_s, one.camera, one.unknown_blocks) == (
+        other.timestamp_s,
+        other.camera,
+        other.unknown_blocks,
+    )
     assert np.array_equal(one.T_odom_camera, other.T_odom_camera)
     for name in ("pixels", "depths_m", "descriptors"):
         first, second = getattr(one.features, name), getattr(other.features, name)
@@ -131,13 +135,14 @@ def test_shapes_that_do_not_fit_are_refused() -> None:
 
 def test_optional_blocks_that_are_not_known_are_kept_byte_for_byte() -> None:
     made = replace(
-        keyframe(), others=(UnknownBlock(10, b"new"), UnknownBlock(10, b""), UnknownBlock(65_535, bytes(200)))
+        keyframe(),
+        unknown_blocks=(UnknownBlock(10, b"new"), UnknownBlock(10, b""), UnknownBlock(65_535, bytes(200))),
     )
     data = encode_keyframe(made)
 
     found = decode_keyframe(data)
 
-    assert found.others == made.others
+    assert found.unknown_blocks == made.unknown_blocks
     assert encode_keyframe(found) == data
 
 
@@ -151,7 +156,7 @@ def noisy(*numbers: float) -> bytes:
 
 def test_the_noise_of_the_depths_is_kept_among_blocks_that_are_not_known() -> None:
     noise = DepthNoise(base_m=0.0024, growth_per_m=0.0038)
-    first = replace(keyframe(), others=(UnknownBlock(4, b"rig"), UnknownBlock(10, b"")))
+    first = replace(keyframe(), unknown_blocks=(UnknownBlock(4, b"rig"), UnknownBlock(10, b"")))
     first = replace(first, features=replace(first.features, noise=noise))
 
     assert_equal(decode_keyframe(encode_keyframe(first)), first)
@@ -200,9 +205,9 @@ def test_a_robot_that_is_farther_than_any_way_is_refused_and_a_map_of_a_survey_i
     far = exp_se3([5.6e6, 0.0, 0.0, 0.0, 0.0, 0.0])
     found = decode_keyframe(encode_keyframe(replace(keyframe(), T_odom_camera=far)))
 
-    check_sent(keyframe())
+    check_odometry_range(keyframe())
     with pytest.raises(BadRequest, match="more than 1000000 m from the start"):
-        check_sent(found)
+        check_odometry_range(found)
 
 
 GOOD = encode_keyframe(keyframe())
@@ -226,13 +231,13 @@ F_BASELINE = 380.0
 """Of KITTI: 707 px times 0.54 m."""
 
 
-def stereo_keyframe(n: int = 20) -> Keyframe:
+def stereo_keyframe(n: int = 20) -> SentKeyframe:
     """Return a keyframe of a stereo pair whose points are 1.5 to 300 m away."""
     pixels, _, descriptors = random_features(n)
     depths_m = 1.5 * 200.0 ** np.linspace(0.0, 1.0, n)
     noise = DepthNoise(base_m=1e-5, growth_per_m=0.2 / F_BASELINE, from_m=0.0)
     features = make_features(pixels, depths_m, descriptors, noise, f_baseline=F_BASELINE)
-    return Keyframe(timestamp_s=1.8e9, T_odom_camera=POSE, camera=CAMERA, features=features)
+    return SentKeyframe(timestamp_s=1.8e9, T_odom_camera=POSE, camera=CAMERA, features=features)
 
 
 @pytest.mark.parametrize("n", [0, 1, 300, MAX_FEATURES])
@@ -293,8 +298,8 @@ DISPARITIES_AT = FEATURES_AT + 8 + 20 * 36 + BLOCK + 4
         (changed(3, "<B", 4), "ends within the head of a block"),
         (changed(3, "<B", 255), "255 blocks are more than 16"),
         (with_blocks(MAX_BLOCKS - 2), "17 blocks are more than 16"),
-        (changed(4, "<d", math.nan), "its time is absurd"),
-        (changed(4, "<d", 1e13), "its time is absurd"),
+        (changed(4, "<d", math.nan), "its time .* is not within"),
+        (changed(4, "<d", 1e13), "its time .* is not within"),
         (changed(12, "<d", math.nan), "no rigid motion"),
         (changed(12 + 3 * 8, "<d", math.inf), "no rigid motion"),
         (changed(12, "<d", 2.0), "no rigid motion"),
@@ -311,7 +316,7 @@ DISPARITIES_AT = FEATURES_AT + 8 + 20 * 36 + BLOCK + 4
         (changed(FEATURES_AT + 1, "<B", 2), "detector 1, metric 2, with 32 bytes are not known"),
         (changed(FEATURES_AT + 2, "<H", 64), "descriptors of 64"),
         (changed(FEATURES_AT + 4, "<H", 65_535), "bytes are not 65535 features"),
-        (changed(FEATURES_AT + 6, "<B", 200), r"2\*\*-200 are not known"),
+        (changed(FEATURES_AT + 6, "<B", 200), r"2\*\*-200 px are not known"),
         (changed(FEATURES_AT + 7, "<B", 1), "bytes are not 20 features"),
         (changed(FEATURES_AT + 8, "<H", 65_535), "outside the image of 640x480"),
         (changed(GEOMETRY_AT, "<B", 7), "geometry of kind 7 is not known"),

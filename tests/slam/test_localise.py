@@ -8,9 +8,15 @@ import numpy as np
 import pytest
 
 from rse_pf.geometry import exp_se3, inverse, pose_difference
-from rse_pf.live_map.measure import reference_of_features, view_of_features
+from rse_pf.live_map.measure import landmarks_of_features, view_of_features
 from rse_pf.slam.keyframe import KeyframeFeatures, make_features
-from rse_pf.slam.localise import LocalisationOptions, Localised, PlacedKeyframe, localise, spread_candidates
+from rse_pf.slam.localise import (
+    LocalisationCandidate,
+    LocalisationOptions,
+    Localised,
+    localise,
+    spread_candidates,
+)
 from rse_pf.slam.relative_pose import RelativePoseOptions
 from tests.synthetic_maps import make_world
 
@@ -40,7 +46,7 @@ TURNED = T_VIEW @ exp_se3([0.0, 0.0, 0.0, 0.0, 1.0, 0.0]) @ inverse(T_VIEW)
 def place_of(candidates, view: KeyframeFeatures, camera, *options: LocalisationOptions) -> Localised:
     """Return the place of *view* among candidates of ids, features, cameras and poses."""
     placed = [
-        PlacedKeyframe(id=number, reference=reference_of_features(features, of), T_map_keyframe=T)
+        LocalisationCandidate(id=number, landmarks=landmarks_of_features(features, of), T_map_keyframe=T)
         for number, features, of, T in candidates
     ]
     return localise(placed, view_of_features(view, camera), *options)
@@ -113,8 +119,8 @@ def test_a_place_that_looks_alike_only_in_part_does_not_make_it_ambiguous():
 @pytest.mark.parametrize(
     ("options", "reason"),
     [
-        ({"alone_inliers": 1000}, "one-keyframe"),
-        ({"alone_inliers": 10}, ""),
+        ({"min_single_inliers": 1000}, "one-keyframe"),
+        ({"min_single_inliers": 10}, ""),
     ],
 )
 def test_one_keyframe_alone_needs_more_inliers(options, reason):
@@ -158,24 +164,24 @@ def test_candidates_that_look_another_way_are_of_another_place():
 
     found = [(number, 0.5) for number in range(8)]
 
-    assert spread_candidates(found, poses, 6, LocalisationOptions(of_place=2)) == [0, 1, 4, 5]
+    assert spread_candidates(found, poses, 6, LocalisationOptions(max_per_region=2)) == [0, 1, 4, 5]
 
 
-def strip(number: int, left: float, right: float) -> PlacedKeyframe:
+def strip(number: int, left: float, right: float) -> LocalisationCandidate:
     """Return a keyframe of `MAP` that has only the features between two columns."""
     _, features, camera, T_map_keyframe = MAP[number]
     rows = np.flatnonzero((features.pixels[:, 0] >= left) & (features.pixels[:, 0] < right))
     part = KeyframeFeatures(
         pixels=features.pixels[rows], depths_m=features.depths_m[rows], descriptors=features.descriptors[rows]
     )
-    return PlacedKeyframe(
-        id=number, reference=reference_of_features(part, camera), T_map_keyframe=T_map_keyframe
+    return LocalisationCandidate(
+        id=number, landmarks=landmarks_of_features(part, camera), T_map_keyframe=T_map_keyframe
     )
 
 
 def test_keyframes_that_are_weak_alone_place_a_view_without_depths_together():
     view = replace(view_of_features(VIEW, CAMERA), depths_m=None)
-    options = LocalisationOptions(alone_inliers=10, measured=RelativePoseOptions(min_inliers=12))
+    options = LocalisationOptions(min_single_inliers=10, measured=RelativePoseOptions(min_inliers=12))
     strips = [strip(1, 60.0, 100.0), strip(2, 360.0, 400.0)]
 
     alone, together = localise(strips[:1], view, options), localise(strips, view, options)

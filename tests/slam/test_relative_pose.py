@@ -12,10 +12,10 @@ from rse_pf.pnp.problems import KINECT
 from rse_pf.slam.relative_pose import (
     RelativePose,
     RelativePoseOptions,
-    match_points,
-    measure_link,
+    landmarks_of_keyframe,
+    match_landmarks,
     measure_pose,
-    reference_of,
+    measure_relative_pose,
     view_of_keyframe,
 )
 
@@ -57,7 +57,7 @@ def with_depths(b: Keyframe, depth_m: Array | float) -> Keyframe:
 
 
 def measured(a: Keyframe, b: Keyframe) -> RelativePose:
-    found = measure_link(reference_of(a), view_of_keyframe(b))
+    found = measure_relative_pose(landmarks_of_keyframe(a), view_of_keyframe(b))
     assert isinstance(found, RelativePose), found
     return found
 
@@ -94,16 +94,16 @@ def test_a_reference_with_points_behind_its_camera_is_measured_by_pixels() -> No
 
 def test_a_weak_pose_is_no_link_unless_its_covariance_is_given_a_factor() -> None:
     a, b, _ = pair(4, top=385.0)
-    sought, view = reference_of(a), view_of_keyframe(b)
+    sought, view = landmarks_of_keyframe(a), view_of_keyframe(b)
     options = RelativePoseOptions(weak_variance=4.0)
     pose = measure_pose(sought, view)
 
-    refused, link = measure_link(sought, view), measure_link(sought, view, options)
+    refused, link = measure_relative_pose(sought, view), measure_relative_pose(sought, view, options)
 
     assert not isinstance(pose, str)
     assert refused == pose.solution.reason != ""
     assert isinstance(link, RelativePose)
-    covariance = 4.0 * pose.solution.covariance + options.floor()
+    covariance = 4.0 * pose.solution.covariance + options.min_covariance()
     np.testing.assert_allclose(np.linalg.inv(link.information), covariance, rtol=1e-6)
 
 
@@ -111,7 +111,9 @@ def test_a_pose_that_is_not_weak_is_the_same_link_with_every_factor() -> None:
     a, b, _ = pair(5)
 
     links = [
-        measure_link(reference_of(a), view_of_keyframe(b), RelativePoseOptions(weak_variance=factor))
+        measure_relative_pose(
+            landmarks_of_keyframe(a), view_of_keyframe(b), RelativePoseOptions(weak_variance=factor)
+        )
         for factor in (0.0, 4.0)
     ]
 
@@ -122,11 +124,11 @@ def test_a_pose_that_is_not_weak_is_the_same_link_with_every_factor() -> None:
 
 def test_fewer_matches_than_the_least_are_not_solved() -> None:
     a, b, _ = pair(6)
-    sought, view = reference_of(a), view_of_keyframe(b)
-    matches = len(match_points(sought, view)[0])
+    sought, view = landmarks_of_keyframe(a), view_of_keyframe(b)
+    matches = len(match_landmarks(sought, view)[0])
 
-    few = measure_link(sought, view, RelativePoseOptions(min_inliers=15, min_matches=matches + 1))
-    enough = measure_link(sought, view, RelativePoseOptions(min_inliers=15, min_matches=matches))
+    few = measure_relative_pose(sought, view, RelativePoseOptions(min_inliers=15, min_matches=matches + 1))
+    enough = measure_relative_pose(sought, view, RelativePoseOptions(min_inliers=15, min_matches=matches))
 
     assert few == "no-matches"
     assert isinstance(enough, RelativePose)

@@ -12,7 +12,7 @@ from rse_pf.geometry import Array, exp_se3
 from rse_pf.slam.keyframe import (
     MAX_FEATURES,
     MAX_KEYFRAME_BYTES,
-    Keyframe,
+    SentKeyframe,
     decode_keyframe,
     encode_keyframe,
     make_scaleless_features,
@@ -20,12 +20,12 @@ from rse_pf.slam.keyframe import (
 from tests.slam.test_keyframe import CAMERA, changed
 
 
-def keyframe(depths: Array, seed: int = 0) -> Keyframe:
+def keyframe(depths: Array, seed: int = 0) -> SentKeyframe:
     rng = np.random.default_rng(seed)
     n = len(depths)
     pixels = rng.uniform(0, [640, 480], (n, 2))
     descriptors = rng.integers(0, 256, (n, 32), dtype=np.uint8)
-    return Keyframe(
+    return SentKeyframe(
         timestamp_s=1.8e9, T_odom_camera=exp_se3([0.1, 0.2, -0.3, 0.1, 0.0, 0.2]), camera=CAMERA,
         features=make_scaleless_features(pixels, depths, descriptors),
     )  # fmt: skip

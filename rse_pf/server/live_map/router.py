@@ -34,7 +34,7 @@ from rse_pf.server.ports import Subscriber, WorkerContext
 from rse_pf.server.scheduling.command_queue import CommandQueue, QueueReport
 from rse_pf.server.scheduling.scheduler import QueueBacklog, QueuedCommand
 from rse_pf.service import failure_of
-from rse_pf.slam.keyframe import MAX_KEYFRAME_BYTES, check_sent, decode_keyframe
+from rse_pf.slam.keyframe import MAX_KEYFRAME_BYTES, check_odometry_range, decode_keyframe
 from rse_pf.wire import Failure, Result, as_type
 from rse_pf.wire.live_map import (
     FORGET,
@@ -338,7 +338,7 @@ def _check_size(value: Any, what: str, most: int) -> None:
 def _check_keyframe(request: LiveRequest) -> None:
     """Raise RsePfError for a keyframe that is garbage: the owner, which others share, decodes none."""
     if isinstance(request, KeyframeRequest):
-        check_sent(decode_keyframe(request.keyframe))
+        check_odometry_range(decode_keyframe(request.keyframe))
     elif isinstance(request, LiveRelocalise):
         decode_keyframe(request.keyframe)
 

@@ -18,8 +18,8 @@ from rse_pf.services.mapping.place import (
     open_map,
     view_of,
 )
-from rse_pf.slam.localise import LocalisationOptions, PlacedKeyframe, localise, spread_candidates
-from rse_pf.slam.relative_pose import RelativePoseOptions, View, reference_of
+from rse_pf.slam.localise import LocalisationCandidate, LocalisationOptions, localise, spread_candidates
+from rse_pf.slam.relative_pose import RelativePoseOptions, View, landmarks_of_keyframe
 from rse_pf.wire.arrays import Array
 
 __all__ = ["LocaliseOptions", "LocaliseReply", "LocaliseRequest", "locate", "register"]
@@ -112,16 +112,17 @@ def locate(
             min_inliers=options.min_inliers, min_inlier_ratio=options.min_inlier_ratio,
             inlier_px=options.inlier_px,
         ),
-        least_inliers=options.min_inliers // 2,
+        min_candidate_inliers=options.min_inliers // 2,
         agree_m=options.agree_m,
         agree_deg=options.agree_deg,
-        of_place=max(1, 3 * options.candidates // 4),
+        max_per_region=max(1, 3 * options.candidates // 4),
         fits_camera=True,
     )  # fmt: skip
     rows = spread_candidates(similar, index.T_map_keyframe, options.candidates, limits)
     keyframes = [index.keyframes[row] for row in rows]
     candidates = [
-        PlacedKeyframe(id=k.id, reference=reference_of(k), T_map_keyframe=k.T_world_camera) for k in keyframes
+        LocalisationCandidate(id=k.id, landmarks=landmarks_of_keyframe(k), T_map_keyframe=k.T_world_camera)
+        for k in keyframes
     ]
     located = localise(candidates, view, limits)
     return LocaliseReply(

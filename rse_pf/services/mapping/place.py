@@ -25,7 +25,7 @@ from rse_pf.maps.descriptors import (
 from rse_pf.maps.format import Keyframe, MapLimits, MapVersion, decode_map
 from rse_pf.service import Registry
 from rse_pf.slam.places import PlaceIndex, place_vector
-from rse_pf.slam.relative_pose import View, measure_pose, reference_of
+from rse_pf.slam.relative_pose import View, landmarks_of_keyframe, measure_pose
 from rse_pf.wire.arrays import Array, reshaped
 
 __all__ = [
@@ -213,6 +213,6 @@ def register(registry: Registry) -> None:
 def _candidate(keyframe: Keyframe, score: float, view: View, check: bool) -> Candidate:
     inliers = None
     if check:
-        measured = measure_pose(reference_of(keyframe), view)
+        measured = measure_pose(landmarks_of_keyframe(keyframe), view)
         inliers = 0 if isinstance(measured, str) else measured.inliers
     return Candidate(keyframe=keyframe.id, robot=keyframe.robot, score=score, inliers=inliers)

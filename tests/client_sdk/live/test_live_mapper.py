@@ -21,7 +21,7 @@ from client_sdk.live.waiting_keyframes import Base, WaitingKeyframe, WaitingKeyf
 from rse_pf.config import SessionSettings
 from rse_pf.errors import BadRequest, Busy, Forbidden, MissingExtra, UsageError
 from rse_pf.geometry import exp_se3
-from rse_pf.slam.keyframe import Keyframe, decode_keyframe, encode_keyframe, make_features
+from rse_pf.slam.keyframe import SentKeyframe, decode_keyframe, encode_keyframe, make_features
 from rse_pf.wire import Command, make_codec
 from tests.client_sdk.live.fake_live_map import FakeLiveRobot, alignment, failing, solve
 from tests.client_sdk.mapper.flat_world import CAMERA, STEP_M, covered, foreign, frame_at
@@ -106,7 +106,7 @@ def test_the_largest_keyframe_takes_at_most_34_kb_in_every_codec(codec: str) -> 
         rng.uniform([0, 0], [640, 480], (count, 2)), rng.uniform(0.3, 8.0, count),
         rng.integers(0, 256, (count, 32), dtype=np.uint8),
     )  # fmt: skip
-    keyframe = Keyframe(
+    keyframe = SentKeyframe(
         timestamp_s=1.8e9 + 0.123456789, T_odom_camera=exp_se3(rng.uniform(-3.0, 3.0, 6)), camera=CAMERA,
         features=features,
     )  # fmt: skip

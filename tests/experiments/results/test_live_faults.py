@@ -22,7 +22,7 @@ from rse_pf.live_map.events import KeyframeAdded, MapServerChanged, encode_event
 from rse_pf.object_store import DirectoryStore
 from rse_pf.server.live_map.owner.lease import map_folder
 from rse_pf.server.live_map.owner.log import LiveLog
-from rse_pf.slam.keyframe import Keyframe, encode_keyframe, make_features
+from rse_pf.slam.keyframe import SentKeyframe, encode_keyframe, make_features
 
 NUMBERS = range(4)
 FAULT_S, RELEASED_S, SERVING_S = 12.0, 12.5, 14.25
@@ -31,7 +31,7 @@ FAULT_S, RELEASED_S, SERVING_S = 12.0, 12.5, 14.25
 def keyframe(number: int, *, stamp: float | None = None) -> KeyframeAdded:
     rng = np.random.default_rng(number)
     pixels, descriptors = rng.uniform(10, 200, (40, 2)), rng.integers(0, 256, (40, 32), dtype=np.uint8)
-    made = Keyframe(
+    made = SentKeyframe(
         timestamp_s=number / 5 if stamp is None else stamp,
         T_odom_camera=exp_se3([0.1 * number, 0, 0, 0, 0, 0]),
         camera=Camera(fx=500.0, fy=500.0, cx=159.5, cy=119.5, width=320, height=240),

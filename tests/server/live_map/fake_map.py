@@ -26,8 +26,7 @@ from rse_pf.live_map.versions import PointSource
 from rse_pf.maps.format import Keyframe, MapVersion
 from rse_pf.server.live_map.owner.state import MapKind
 from rse_pf.server.live_map.owner.whole_fit import WholeFit
-from rse_pf.slam.keyframe import Keyframe as SentKeyframe
-from rse_pf.slam.keyframe import UnknownBlock, encode_keyframe, make_features
+from rse_pf.slam.keyframe import SentKeyframe, UnknownBlock, encode_keyframe, make_features
 from rse_pf.wire.live_map import KeyframeRequest
 
 __all__ = ["FAKE_MAP", "FakeMap", "content_of", "keyframe_bytes", "keyframe_request"]
@@ -178,14 +177,14 @@ def keyframe_bytes(timestamp_s: float, content: bytes) -> bytes:
     return encode_keyframe(
         SentKeyframe(
             timestamp_s=timestamp_s, T_odom_camera=np.eye(4), camera=_CAMERA, features=features,
-            others=(UnknownBlock(_CONTENT_KIND, content),),
+            unknown_blocks=(UnknownBlock(_CONTENT_KIND, content),),
         )
     )  # fmt: skip
 
 
 def content_of(event: KeyframeAdded) -> bytes:
     """Return what `keyframe_bytes` was given."""
-    return event.keyframe.others[0].content
+    return event.keyframe.unknown_blocks[0].content
 
 
 def keyframe_request(number: int, content: bytes = b"good", segment: int = 0) -> KeyframeRequest:

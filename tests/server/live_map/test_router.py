@@ -32,7 +32,7 @@ from rse_pf.identity import RobotId
 from rse_pf.server.live_map.router import LIVE_SERVICES, LiveMapRouter
 from rse_pf.server.ports import Clocks, WorkerContext
 from rse_pf.server.scheduling.scheduler import QueuedCommand
-from rse_pf.slam.keyframe import MAX_KEYFRAME_BYTES, Keyframe, encode_keyframe, make_features
+from rse_pf.slam.keyframe import MAX_KEYFRAME_BYTES, SentKeyframe, encode_keyframe, make_features
 from rse_pf.wire import Command, Failure, Result, Update
 from rse_pf.wire.live_map import KeyframeRequest
 
@@ -42,7 +42,7 @@ POSE = [1, 0, 0, 0.5, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
 
 SEEN = np.full((300, 2), 7.5), np.full(300, 2.0), np.arange(9600, dtype=np.uint8).reshape(300, 32)
 KEYFRAME = encode_keyframe(
-    Keyframe(
+    SentKeyframe(
         timestamp_s=1.5, T_odom_camera=np.array(POSE, dtype=float).reshape(4, 4), camera=Camera(**CAMERA),
         features=make_features(*SEEN),
     )

@@ -22,7 +22,7 @@ from rse_pf.errors import Forbidden
 from rse_pf.geometry import Camera
 from rse_pf.server.live_map.router import LIVE_SERVICES
 from rse_pf.services.builtin import builtin_services
-from rse_pf.slam.keyframe import Keyframe, encode_keyframe, make_features
+from rse_pf.slam.keyframe import SentKeyframe, encode_keyframe, make_features
 from rse_pf.wire import SUBPROTOCOLS, make_codec, messages
 from rse_pf.wire.server_session import CLOSE_PROTOCOL, UPDATES
 
@@ -37,7 +37,7 @@ def keyframe(number: int) -> dict[str, Any]:
     seen = (
         noise.uniform(10, 400, (300, 2)), np.full(300, 2.0), noise.integers(0, 255, (300, 32), dtype=np.uint8)
     )  # fmt: skip
-    made = Keyframe(
+    made = SentKeyframe(
         timestamp_s=float(number), T_odom_camera=np.eye(4), camera=Camera(**CAMERA),
         features=make_features(*seen),
     )  # fmt: skip

@@ -20,7 +20,7 @@ from rse_pf.object_store import MemoryStore
 from rse_pf.server.live_map.owner.keyframe_objects import KeyframeObjects
 from rse_pf.server.live_map.owner.state import LIVE_MAP
 from rse_pf.slam.cloud_deform import joined_cloud
-from rse_pf.slam.keyframe import Keyframe, encode_keyframe, make_features
+from rse_pf.slam.keyframe import SentKeyframe, encode_keyframe, make_features
 from rse_pf.slam.keyframe_points import ObjectReference, encode_points
 from rse_pf.wire.live_map import KeyframeRequest
 from tests.server.live_map.owner_bench import MAP, Bench, settle
@@ -67,7 +67,7 @@ def keyframe_request(
 ) -> bytes:
     noise = np.random.default_rng(number)
     seen = noise.uniform(10, 400, (50, 2)), np.full(50, 2.0), noise.integers(0, 255, (50, 32), dtype=np.uint8)
-    made = Keyframe(
+    made = SentKeyframe(
         timestamp_s=float(number), T_odom_camera=exp_se3([0.2 * number, 0, 0, 0, 0, 0]), camera=CAMERA,
         features=make_features(*seen), points=reference, image=image,
     )  # fmt: skip
