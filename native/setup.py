@@ -16,14 +16,14 @@ from setuptools.command.build_py import build_py
 
 NATIVE = Path(__file__).resolve().parent
 MACHINE = sysconfig.get_platform().removeprefix("linux-")
-"""That of this Python, or of the variable ``_PYTHON_HOST_PLATFORM`` where another one is compiled for."""
+"""The machine to compile for: that of this Python, or the one that ``_PYTHON_HOST_PLATFORM`` names."""
 
 
 class BuildLibrary(build_py):
-    """Put the compiled library beside the module by which it is found."""
+    """Build the wheel with the compiled library next to the module `rse_pf_native`."""
 
     def run(self) -> None:
-        """Compile what has changed, and copy the library; a checkout is only made known to pip."""
+        """Compile with the Makefile and copy the library; an editable installation compiles nothing."""
         super().run()
         if self.editable_mode:
             return
@@ -38,20 +38,20 @@ class BuildLibrary(build_py):
         shutil.copy(out / "librse_pf_native.so", Path(self.build_lib) / "rse_pf_native")
 
 
-class OfOneMachine(Distribution):
-    """A package that is not for every machine."""
+class PlatformDistribution(Distribution):
+    """A distribution with compiled code, whose wheel is for one platform."""
 
     def has_ext_modules(self) -> bool:
-        """Return True, so that the wheel is for one platform."""
+        """Return True, which makes the wheel specific to a platform."""
         return True
 
 
-class OfEveryPython(bdist_wheel):
-    """A wheel whose library uses nothing of Python."""
+class AnyPythonWheel(bdist_wheel):
+    """A wheel for every version of Python 3: its library does not use Python's C interface."""
 
     def get_tag(self) -> tuple[str, str, str]:
-        """Return the tag of every Python 3 on this platform."""
+        """Return the wheel's tag: any Python 3, no Python ABI, this platform."""
         return "py3", "none", super().get_tag()[2]
 
 
-setup(distclass=OfOneMachine, cmdclass={"build_py": BuildLibrary, "bdist_wheel": OfEveryPython})
+setup(distclass=PlatformDistribution, cmdclass={"build_py": BuildLibrary, "bdist_wheel": AnyPythonWheel})

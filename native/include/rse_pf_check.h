@@ -1,4 +1,4 @@
-/* The C ABI of the check of a drive: how sharp edges are, and depths around features.
+/* C interface of the measurements that `rse-pf check` takes of recorded images: edge sharpness, and depths at features.
  *
  * Every function may be called from any thread, on memory of its own.  Nothing is allocated, and equal arguments give
  * equal bytes on every processor. */
@@ -10,26 +10,33 @@
 extern "C" {
 #endif
 
+/* Version of this header. */
 #define RSE_PF_CHECK_ABI 2
 
-/* Return RSE_PF_CHECK_ABI of the library, to compare with the header's. */
+/* Return the RSE_PF_CHECK_ABI with which the library was compiled. */
 uint32_t rse_pf_check_abi(void);
 
-/* Find the strongest edges along lines of an image, and write for each the steepest difference over 2 pixels as a share
- * of the step over 16.  Return how many there are, all of them in the order of lines, at most `most` of them, evenly
- * chosen; -1 if a size does not fit.
+/* Measure the sharpness of the strongest edges along the lines of an image, which tells blur from sharp images.
  *
- * gray: lines x length; strong: how many steps over 16 pixels are strong, by which the least one is found that counts,
- * which is least_step at least. */
-int64_t rse_pf_edges(const uint8_t *gray, int64_t lines, int64_t length, int64_t strong, int64_t least_step,
-                     int64_t most, double *sharpness);
+ * The contrast at a pixel is the absolute difference of grey levels over 16 pixels along the line.  The threshold is
+ * the highest contrast that at least `wanted_edges` pixels reach, but not below `min_contrast`.  For each edge, which
+ * is a pixel at or above the threshold, the sharpness is the largest difference over 2 pixels within these 16, divided
+ * by the contrast: near 1 for a step, near 1/8 for a ramp.
+ *
+ * gray: lines x length grey levels.  sharpness: memory for max_edges numbers; of more edges every n-th is written, in
+ * the order of the lines.  Returns the number of all edges, -1 if a size is not valid. */
+int64_t rse_pf_edges(const uint8_t *gray, int64_t lines, int64_t length, int64_t wanted_edges, int64_t min_contrast,
+                     int64_t max_edges, double *sharpness);
 
-/* Write the median of the depths at each pixel and two pixels above, below, left and right of it, NaN where one is
- * missing or they differ by more than a share of it; return 0, -1 if a size does not fit.
+/* Write the depth at each pixel: the median of the depths at the pixel and two pixels above, below, left and right.
  *
- * depth_m: height x width, whose strides are in readings; pixels: rows x 2. */
+ * The depth is NaN where one of the five is missing, or where they differ by more than max_difference times the median.
+ *
+ * depth_m: height x width, metres, addressed by strides in numbers, so that it may be a rotated view; pixels: rows x 2
+ * (column, row); depths_m: memory for `rows` numbers.  Returns 0, or -1 if a size is not valid. */
 int32_t rse_pf_depths_at(const float *depth_m, int64_t height, int64_t width, int64_t row_stride,
-                         int64_t column_stride, const double *pixels, int64_t rows, double share, double *depths_m);
+                         int64_t column_stride, const double *pixels, int64_t rows, double max_difference,
+                         double *depths_m);
 
 #ifdef __cplusplus
 }

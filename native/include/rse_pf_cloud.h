@@ -1,7 +1,7 @@
-/* The C ABI of a cloud of voxels: each holds the mean place and colour of the readings that fell into it.
+/* C interface of the voxel grid that thins a point cloud: each voxel holds the mean position and colour of its points.
  *
- * It may be called from any thread, on memory of its own.  Nothing is allocated, and equal arguments give equal bytes
- * on every processor. */
+ * Every function may be called from any thread, on memory of its own.  Nothing is allocated, and equal arguments give
+ * equal bytes on every processor. */
 #pragma once
 
 #include <stdint.h>
@@ -10,50 +10,58 @@
 extern "C" {
 #endif
 
+/* Version of this header; a request that carries another version is refused. */
 #define RSE_PF_CLOUD_ABI 1
 
-/* Return RSE_PF_CLOUD_ABI of the library, to compare with the header's. */
+/* Return the RSE_PF_CLOUD_ABI with which the library was compiled. */
 uint32_t rse_pf_cloud_abi(void);
 
+/* The voxel grid, in memory of the caller, and the points that rse_pf_cloud_add adds. */
 typedef struct rse_pf_cloud_request {
     uint32_t abi;
     uint32_t flags;          /* 0 */
-    int64_t rows;            /* of the readings */
-    const double *points;    /* rows x 3, metres, world */
+    int64_t rows;            /* points to add */
+    const double *points;    /* rows x 3, metres, world frame */
     const float *colours;    /* rows x 3 */
-    const int32_t *readings; /* rows: how many readings a row stands for, above 0 */
-    double voxel_m;
-    int64_t reach;           /* voxels on either side of the origin; beyond, rows are left out */
-    int64_t slots;           /* of the hash table, a power of two */
-    int64_t *slot_keys;      /* slots: key of a voxel, -1 in an empty slot */
-    int32_t *slot_rows;      /* slots: row of the voxel */
-    int64_t size, room;      /* voxels that there are, and that there is room for; below slots */
-    int64_t *keys;           /* room */
-    float *means;            /* room x 6: metres, then colours */
-    int32_t *counts;         /* room: readings */
-    int64_t used, probes;    /* written: readings that were added, and slots that were read */
+    const int32_t *weights;  /* rows: number of measurements that a point is the mean of, above 0 */
+    double voxel_m;          /* edge length of a voxel, metres */
+    int64_t reach;           /* the grid ends this many voxels from the origin; points beyond are left out */
+    int64_t slots;           /* size of the hash table, a power of two above max_voxels */
+    int64_t *slot_keys;      /* slots: key of the voxel in a slot, -1 in an empty slot */
+    int32_t *slot_rows;      /* slots: row of that voxel in keys, means and counts */
+    int64_t voxels, max_voxels; /* voxels in the grid; rows of the three arrays below */
+    int64_t *keys;           /* max_voxels */
+    float *means;            /* max_voxels x 6: mean position (metres), mean colour */
+    int32_t *counts;         /* max_voxels: measurements in a voxel */
+    int64_t used, probes;    /* written: measurements added, and slots of the hash table that were read */
 } rse_pf_cloud_request;
 
+/* One image of a depth camera with its pose. */
 typedef struct rse_pf_cloud_frame {
-    int64_t width, height, every_px; /* each row and column that every_px divides is taken */
-    const float *depth_m;            /* height x width */
+    int64_t width, height, every_px; /* pixels whose row and column are multiples of every_px are added */
+    const float *depth_m;            /* height x width, metres along the optical axis */
     const uint8_t *rgb;              /* height x width x 3 */
-    double fx, fy, cx, cy;
-    float min_depth_m, max_depth_m;
-    float edge_share;                /* a neighbour differs by at most this share of the right or lower depth */
-    float zero;
-    double T_world_camera[16];       /* row-major */
+    double fx, fy, cx, cy;           /* pinhole intrinsics, pixels */
+    float min_depth_m, max_depth_m;  /* depths outside are left out */
+    float edge_share;                /* a pixel whose depth differs from a neighbour's by more than this share of the
+                                        right or lower depth of the two lies on a depth edge and is left out */
+    float zero;                      /* 0 */
+    double T_world_camera[16];       /* 4 x 4, row-major, maps camera to world */
 } rse_pf_cloud_frame;
 
-/* Add readings to voxels, in their order, and update size, used and probes; return 0, -1 if a size does not fit.  Voxels
- * for which there is no room are left out. */
+/* Add the points of the request to the grid, in their order, and update voxels, used and probes.
+ *
+ * Once max_voxels is reached, points that need a new voxel are left out.  Returns 0, -1 if a size is not valid. */
 int32_t rse_pf_cloud_add(rse_pf_cloud_request *request);
 
-/* Do that for what a depth camera shows; points, colours and readings of the request are not read. */
+/* Add the pixels of a depth image to the grid, as rse_pf_cloud_add does with points.
+ *
+ * points, colours and weights of the request are not read.  Returns 0, -1 if a size is not valid. */
 int32_t rse_pf_cloud_add_frame(rse_pf_cloud_request *request, const rse_pf_cloud_frame *frame);
 
-/* Fill the hash table with the voxels that there are, such as after it grew; return 0, -1 if a size does not fit.  Rows
- * are not read. */
+/* Build the hash table anew from `keys`, which is needed after the caller has enlarged it.
+ *
+ * points, colours and weights of the request are not read.  Returns 0, -1 if a size is not valid. */
 int32_t rse_pf_cloud_index(rse_pf_cloud_request *request);
 
 #ifdef __cplusplus

@@ -1,7 +1,8 @@
-/* The C ABI of the refinement of a pose with the depths that two cameras measured.
+/* C interface of the pose refinement with depths: the errors-in-variables least squares behind
+ * rse_pf/pnp/depth_refinement.py.
  *
- * It does what rse_pf/pnp/depth_refinement.py does.  It may be called from any thread, on memory of its own.
- * Nothing is allocated, and equal requests give equal bytes on every processor. */
+ * It may be called from any thread, on memory of its own.  It allocates nothing, and equal requests give equal bytes on
+ * every processor. */
 #pragma once
 
 #include <stdint.h>
@@ -10,47 +11,49 @@
 extern "C" {
 #endif
 
+/* Version of this header; a request that carries another version is refused with RSE_PF_DEPTH_BAD_REQUEST. */
 #define RSE_PF_DEPTH_ABI 1
 
-/* Use no AVX2, for tests: the bytes of the result are the same. */
+/* Request flag: compute without AVX2.  Tests use it to show that the bytes of the result are the same. */
 #define RSE_PF_DEPTH_PORTABLE 1u
 
 enum {
-    RSE_PF_DEPTH_REFINED = 0,
-    RSE_PF_DEPTH_KEPT = 1, /* No row has a depth, or depths and pixels contradict each other. */
-    RSE_PF_DEPTH_BAD_REQUEST = 2,
-    RSE_PF_DEPTH_BAD_DEPTHS = 3, /* One is not within 0..1000 m. */
-    RSE_PF_DEPTH_BAD_POINTS = 4, /* One is not before the reference camera, or beyond 1e6 m. */
-    RSE_PF_DEPTH_BAD_PIXELS = 5  /* One is not finite, or beyond 1e6. */
+    RSE_PF_DEPTH_REFINED = 0,     /* The result holds the refined pose. */
+    RSE_PF_DEPTH_KEPT = 1,        /* The input pose stays: no inlier has a depth, or depths and pixels disagree. */
+    RSE_PF_DEPTH_BAD_REQUEST = 2, /* A size, an option or the ABI version is not valid. */
+    RSE_PF_DEPTH_BAD_DEPTHS = 3,  /* A depth is not within 0..1000 m. */
+    RSE_PF_DEPTH_BAD_POINTS = 4,  /* A point is not in front of the reference camera, or farther than 1e6 m. */
+    RSE_PF_DEPTH_BAD_PIXELS = 5   /* A pixel is not finite, or beyond 1e6 px. */
 };
 
 typedef struct rse_pf_depth_request {
     uint32_t abi;
-    uint32_t flags;
-    int64_t rows;
-    int64_t inlier_rows;
-    const double *points_reference; /* rows x 3, metres, in the frame of the camera that measured them */
-    const double *pixels;           /* rows x 2, in the second image */
-    const double *depths_m;         /* rows, at these pixels; 0 where there is none */
+    uint32_t flags;                 /* 0, or RSE_PF_DEPTH_PORTABLE */
+    int64_t rows;                   /* number of correspondences */
+    int64_t inlier_rows;            /* number of inliers among them */
+    const double *points_reference; /* rows x 3, metres, in the frame of the reference camera, which measured them */
+    const double *pixels;           /* rows x 2, undistorted pixels of the second image */
+    const double *depths_m;         /* rows: depth in the second image at these pixels, metres; 0 where there is none */
     const int64_t *inliers;         /* inlier_rows row numbers */
-    double fx, fy, cx, cy;
-    double base_m, growth_per_m, from_m; /* deviation of depth z: base + growth * max(0, z - from)^2 */
-    double rmse_px;                      /* that the pixels left */
-    double T_camera_reference[16];       /* row-major */
+    double fx, fy, cx, cy;          /* pinhole intrinsics of both images, pixels */
+    double base_m, growth_per_m, from_m; /* standard deviation of depth z: base + growth * max(0, z - from)^2 metres */
+    double rmse_px;                      /* root mean square reprojection error of the inliers at the input pose */
+    double T_camera_reference[16];       /* 4 x 4, row-major: the input pose, which maps reference to second camera */
 } rse_pf_depth_request;
 
 typedef struct rse_pf_depth_result {
     int64_t status;
-    double rmse_px;
-    double T_camera_reference[16];
-    double covariance[36]; /* of the twist (metres, then radians) left of the pose */
+    double rmse_px;                /* root mean square reprojection error of the inliers at the refined pose */
+    double T_camera_reference[16]; /* 4 x 4, row-major: the refined pose */
+    double covariance[36];         /* 6 x 6, of the twist (3 metres, 3 radians) that multiplies the pose on the left */
 } rse_pf_depth_result;
 
-/* Return RSE_PF_DEPTH_ABI of the library, to compare with the header's. */
+/* Return the RSE_PF_DEPTH_ABI with which the library was compiled. */
 uint32_t rse_pf_depth_abi(void);
 
-/* Refine the pose; the result holds numbers only where its status is RSE_PF_DEPTH_REFINED.  workspace has room for
- * 11 * (inlier_rows + 4) numbers. */
+/* Refine the pose.  Only with the status RSE_PF_DEPTH_REFINED do the other fields of the result hold values.
+ *
+ * workspace: memory for 11 * (inlier_rows + 4) numbers. */
 void rse_pf_depth_refine(const rse_pf_depth_request *request, double *workspace, rse_pf_depth_result *result);
 
 #ifdef __cplusplus

@@ -1,7 +1,7 @@
-/* The C ABI of features: keypoints, descriptors, points at keypoints, and matches of descriptors of 256 bits.
+/* C interface of a robot's front end: ORB keypoints and descriptors, depths at keypoints, and brute-force matching.
  *
- * Every function may be called from any thread, on arrays of its own.  Nothing is allocated, and equal
- * arguments give equal bytes on every processor. */
+ * Every function may be called from any thread, on arrays of its own.  Nothing is allocated, and equal arguments give
+ * equal bytes on every processor. */
 #pragma once
 
 #include <stdint.h>
@@ -10,60 +10,68 @@
 extern "C" {
 #endif
 
+/* Version of this header. */
 #define RSE_PF_MATCH_ABI 4
 
-/* Use no AVX2 and AVX-512, or no AVX-512, for tests: the bytes of the result are the same. */
+/* Flag of rse_pf_match: compute without AVX2 and AVX-512.  The bytes of the result are the same. */
 #define RSE_PF_MATCH_PORTABLE 1u
+/* Flag of rse_pf_match: compute without AVX-512; AVX2 stays allowed.  The bytes of the result are the same. */
 #define RSE_PF_MATCH_AVX2 2u
 
-/* Return RSE_PF_MATCH_ABI of the library, to compare with the header's. */
+/* Return the RSE_PF_MATCH_ABI with which the library was compiled. */
 uint32_t rse_pf_match_abi(void);
 
-/* Write the rows x 3 points of the camera frame that are seen at rows x 2 pixels, and return 0; -1 if a size
- * does not fit.
+/* Back-project pixels of a depth image to points of the camera frame.
  *
- * The depth of a pixel is the median of its 3x3 patch; it is NaN where fewer than five readings are finite and
- * above 0, where they differ by more than spread * median, or where the median is out of range.
- * depth_m: height x width, row-major, metres along the optical axis. */
+ * The depth of a pixel is the median of its 3x3 patch.  The point is NaN where fewer than five depths of the patch are
+ * finite and above 0, where they differ by more than `spread` times the median, or where the median is not within
+ * min_depth_m..max_depth_m.
+ *
+ * depth_m: height x width, row-major, metres along the optical axis; pixels: rows x 2 (column, row); fx, fy, cx, cy:
+ * pinhole intrinsics, pixels; points_camera: memory for rows x 3 numbers, metres.  Returns 0, -1 if a size is not
+ * valid. */
 int32_t rse_pf_points_at(const float *depth_m, int64_t width, int64_t height, const double *pixels, int64_t rows,
                          double fx, double fy, double cx, double cy, double min_depth_m, double max_depth_m,
                          double spread, double *points_camera);
 
-/* Match the descriptors of a reference view to those of a frame; return the number of matches, -1 if a size does not
- * fit.
+/* Match the 256-bit descriptors of a reference image to those of a frame, one to one.
  *
- * Descriptors have 256 bits.  A reference row takes the frame row at the least Hamming distance, the first one of
- * equals, if that distance is less than ratio times the second least.  Of the reference rows that take one frame row
- * the nearest stays, the first one of equals.  Matches are written by ascending distance, equals by reference row.
- * rows and columns have room for min(reference_rows, frame_rows) numbers; workspace has room for reference_rows +
- * 5 * frame_rows + 64. */
+ * A reference descriptor is matched to the frame descriptor with the smallest Hamming distance if that distance is
+ * below `ratio` times the second smallest (Lowe's ratio test).  Of several reference descriptors that choose the same
+ * frame descriptor, the one with the smallest distance stays.  Ties go to the lower row number.
+ *
+ * reference: reference_rows x 32 bytes; frame: frame_rows x 32 bytes; flags: 0 or one of the flags above; workspace:
+ * memory for reference_rows + 5 * frame_rows + 64 numbers; rows and columns: memory for min(reference_rows, frame_rows)
+ * row numbers of the reference and of the frame, written by ascending distance, then by reference row.  Returns the
+ * number of matches, -1 if a size is not valid. */
 int64_t rse_pf_match(const uint8_t *reference, int64_t reference_rows, const uint8_t *frame, int64_t frame_rows,
                      double ratio, uint32_t flags, uint64_t *workspace, int64_t *rows, int64_t *columns);
 
-/* An image of height x width, row-major; the scale of each level, 1 and more, and how many keypoints it gives;
- * FAST's threshold; for how many keypoints there is room; width * height / 2 + 8 * width + height + 64 numbers. */
 typedef struct rse_pf_detect_request {
-    const uint8_t *gray;
-    int64_t width, height;
-    const float *scales;
-    const int64_t *wanted;
-    int32_t levels, threshold;
-    int64_t room;
-    uint64_t *workspace;
+    const uint8_t *gray;         /* height x width grey levels, row-major */
+    int64_t width, height;       /* pixels */
+    const float *scales;         /* levels: how many times smaller than the image each pyramid level is, from 1 on */
+    const int64_t *wanted;       /* levels: keypoints wanted of each pyramid level */
+    int32_t levels, threshold;   /* pyramid levels; FAST threshold in grey levels */
+    int64_t room;                /* keypoints that the output arrays have room for */
+    uint64_t *workspace;         /* memory for width * height / 2 + 8 * width + height + 64 numbers */
 } rse_pf_detect_request;
 
-/* Write ORB's keypoints in OpenCV's order, bit by bit its own, and return their number; -1 if a size does not fit, if
- * there is no room, or if the processor lacks AVX2.
+/* Detect ORB keypoints, equal to those of OpenCV bit by bit and in the same order.
  *
- * pixels: rows x 2, of the whole image; the Harris measure, the orientation and the octave (level) of each. */
+ * Written for each keypoint: pixels (rows x 2, in the whole image), Harris response, orientation in degrees, and octave
+ * (pyramid level).  Returns the number of keypoints, or -1 if a size is not valid, if `room` is too small, or if the
+ * processor lacks AVX2; the caller then uses OpenCV. */
 int64_t rse_pf_detect(const rse_pf_detect_request *request, float *pixels, float *responses, float *angles_deg,
                       int32_t *octaves);
 
-/* Write ORB's descriptors (rows x 32) of keypoints, bit by bit those of OpenCV, and return 0; -1 if a size does not
- * fit, if a keypoint is nearer than 22 px to the edge of its level, or if the processor lacks AVX2 or FMA.
+/* Compute the ORB descriptors of keypoints, equal to those of OpenCV bit by bit.
  *
- * gray: height x width, row-major.  scales: of each level, 1 and more.  pixels: rows x 2, of the whole image; the
- * cosine, sine and octave (level) of each keypoint.  workspace: 3 * width * height / 8 + 7 * width + 64 numbers. */
+ * gray: height x width grey levels, row-major; scales: as in rse_pf_detect_request; pixels: rows x 2, in the whole
+ * image; cosines, sines: of the keypoints' orientations; octaves: their pyramid levels; workspace: memory for
+ * 3 * width * height / 8 + 7 * width + 64 numbers; descriptors: memory for rows x 32 bytes.  Returns 0, or -1 if a size
+ * is not valid, if a keypoint lies within 22 px of the border of its level, or if the processor lacks AVX2 or FMA; the
+ * caller then uses OpenCV. */
 int32_t rse_pf_describe(const uint8_t *gray, int64_t width, int64_t height, const float *scales, int32_t levels,
                         const float *pixels, const float *cosines, const float *sines, const int32_t *octaves,
                         int64_t rows, uint64_t *workspace, uint8_t *descriptors);

@@ -1,7 +1,7 @@
-/* The C ABI of the native core: one call from matches, or from a pose and matches, to a pose with its evidence.
+/* C interface of the PnP solver: from correspondences of 3-D points and pixels to one camera pose with its evidence.
  *
- * Every function may be called from any thread at any time.  Equal requests give equal bytes on every
- * processor, whatever was solved before.  A request is never written to. */
+ * Every function may be called from any thread at any time.  Equal requests give equal bytes on every processor,
+ * independent of earlier requests.  No function writes to its request. */
 #pragma once
 
 #include <stdint.h>
@@ -10,29 +10,32 @@
 extern "C" {
 #endif
 
+/* Version of this header; a request that carries another version is refused with RSE_PF_PNP_BAD_REQUEST. */
 #define RSE_PF_NATIVE_ABI 5
 
-/* Flags of a request. */
-#define RSE_PF_PNP_PORTABLE 1u /* Use no AVX, for tests: the bytes of the result are the same. */
-#define RSE_PF_PNP_AVX2 4u     /* Use no AVX-512, for tests as well. */
+/* Request flag: compute without AVX2 and AVX-512.  Tests use it to show that the bytes of the result are the same. */
+#define RSE_PF_PNP_PORTABLE 1u
+/* Request flag: compute without AVX-512; AVX2 stays allowed.  The bytes of the result are the same. */
+#define RSE_PF_PNP_AVX2 4u
 
-/* What became of a request; all but the first refuse the pose. */
+/* Outcome of a request.  Every status but RSE_PF_PNP_SOLVED refuses the pose; the comments name the fields of the
+ * result that hold the measured values of the refusal. */
 enum rse_pf_pnp_status {
     RSE_PF_PNP_SOLVED = 0,
-    RSE_PF_PNP_BAD_REQUEST = 1,   /* A size, an option or the ABI does not fit. */
-    RSE_PF_PNP_BAD_POINTS = 2,    /* A coordinate is not finite or is beyond 1e6. */
-    RSE_PF_PNP_BAD_PIXELS = 3,
-    RSE_PF_PNP_NO_CONSENSUS = 4,  /* No more rows agree than chance would give: count. */
-    RSE_PF_PNP_COLLINEAR = 5,     /* thinness */
-    RSE_PF_PNP_COPIES = 6,        /* count, independent */
-    RSE_PF_PNP_ONE_PLACE = 7,     /* radius_px */
-    RSE_PF_PNP_UNCONSTRAINED = 8,
-    RSE_PF_PNP_TWO_POSES = 9,     /* rmse_px, other_rmse_px */
-    RSE_PF_PNP_MIRRORED = 10,     /* count, other_count */
+    RSE_PF_PNP_BAD_REQUEST = 1,     /* A size, an option or the ABI version is not valid. */
+    RSE_PF_PNP_BAD_POINTS = 2,      /* A coordinate of a point is not finite or is larger than 1e6 m. */
+    RSE_PF_PNP_BAD_PIXELS = 3,      /* A coordinate of a pixel is not finite or is larger than 1e6 px. */
+    RSE_PF_PNP_NO_CONSENSUS = 4,    /* A random pose would have as many inliers: inlier_count. */
+    RSE_PF_PNP_COLLINEAR = 5,       /* The points or the pixels lie on one line: width_to_length. */
+    RSE_PF_PNP_DUPLICATES = 6,      /* Inliers may be copies of a few: inlier_count, independent_inliers. */
+    RSE_PF_PNP_ONE_SPOT = 7,        /* All inliers lie in one small spot of the image: radius_px. */
+    RSE_PF_PNP_UNCONSTRAINED = 8,   /* Some motion of the camera changes no pixel. */
+    RSE_PF_PNP_TWO_POSES = 9,       /* A second pose fits as well: rmse_px, second_pose_rmse_px. */
+    RSE_PF_PNP_MIRRORED = 10,       /* The reflected points fit far better: inlier_count, mirrored_inliers. */
     RSE_PF_PNP_OUT_OF_MEMORY = 11
 };
 
-/* Why a pose is weak; 0 for a pose that is ok. */
+/* Why a solved pose is weak.  RSE_PF_PNP_OK means that the pose is not weak. */
 enum rse_pf_pnp_reason {
     RSE_PF_PNP_OK = 0,
     RSE_PF_PNP_FEW_INLIERS = 1,
@@ -45,56 +48,70 @@ enum rse_pf_pnp_reason {
 
 typedef struct rse_pf_pnp_request {
     uint32_t abi;   /* RSE_PF_NATIVE_ABI */
-    uint32_t flags;
-    int64_t rows;   /* 4 and more */
-    const double *points_world; /* rows x 3, metres, world frame, row-major */
-    const double *pixels;       /* rows x 2, undistorted pixels, row-major */
-    const double *T_camera_world; /* row-major, the pose to judge; null: find one */
-    double fx, fy, cx, cy;      /* pixels */
-    int32_t width, height;      /* pixels */
-    double inlier_px;
-    double confidence;
-    int32_t max_iterations, min_iterations;
-    double weak_inliers, weak_inlier_ratio, weak_translation_m, weak_rotation_rad;
+    uint32_t flags; /* 0, RSE_PF_PNP_PORTABLE or RSE_PF_PNP_AVX2 */
+    int64_t rows;   /* number of correspondences, at least 4 */
+    const double *points_world;   /* rows x 3, metres, world frame, row-major */
+    const double *pixels;         /* rows x 2, undistorted pixels, row-major; row i observes point i */
+    const double *T_camera_world; /* 4 x 4, row-major: the pose whose evidence is wanted; null: estimate a pose */
+    double fx, fy, cx, cy;        /* pinhole intrinsics, pixels */
+    int32_t width, height;        /* image size, pixels */
+    double inlier_px;             /* largest reprojection error of an inlier, pixels */
+    double confidence;            /* RANSAC stops when it has drawn an all-inlier sample with this probability */
+    int32_t max_iterations, min_iterations;       /* bounds of the number of RANSAC samples */
+    double weak_inliers, weak_inlier_ratio;       /* a pose with fewer inliers, or a smaller ratio, is weak */
+    double weak_translation_m, weak_rotation_rad; /* a pose with a larger standard deviation is weak */
 } rse_pf_pnp_request;
 
 typedef struct rse_pf_pnp_result {
-    int32_t status;
-    int32_t reason;
-    int64_t count, independent, other_count;
-    double rmse_px, other_rmse_px, thinness, radius_px; /* other_rmse_px: 0 without a second pose */
-    double inlier_thinness, log10_false_alarms;
-    double T_camera_world[16]; /* row-major; zeros where there is none */
-    double covariance[36];     /* of the twist (rho metres, phi radians) left of the pose */
-    float upper_triangle[22];  /* of the covariance, row after row; the last one is 0 */
+    int32_t status;              /* enum rse_pf_pnp_status */
+    int32_t reason;              /* enum rse_pf_pnp_reason */
+    int64_t inlier_count;        /* inliers of the pose, or of the best pose that was refused */
+    int64_t independent_inliers; /* inliers of which neighbours in the image count once */
+    int64_t mirrored_inliers;    /* inliers of the best pose of the reflected points; 0 where that was not tested */
+    double rmse_px;              /* root mean square reprojection error of the inliers, pixels */
+    double second_pose_rmse_px;  /* the same of the second pose of a planar scene; 0 where there is no second pose */
+    double width_to_length;      /* smallest width over length (0: a line) that led to the refusal */
+    double radius_px;            /* root mean square distance of the inlier pixels from their centroid */
+    double inlier_width_to_length; /* width over length of the inlier pixels in the image */
+    double log10_false_alarms;   /* log10 of the expected number of random poses that fit as well */
+    double T_camera_world[16];   /* 4 x 4, row-major, maps world to camera; zeros where there is no pose */
+    double covariance[36];       /* 6 x 6, of the twist (3 metres, 3 radians) that multiplies the pose on the left */
+    float upper_triangle[22];    /* the 21 values of the covariance's upper triangle by rows, then one 0 */
 } rse_pf_pnp_result;
 
-/* Return RSE_PF_NATIVE_ABI of the library, to compare with the header's. */
+/* Return the RSE_PF_NATIVE_ABI with which the library was compiled. */
 uint32_t rse_pf_native_abi(void);
 
-/* Return "avx512", "avx2" or "portable": the instructions that this processor gets. */
+/* Return the widest vector instructions that the library uses on this processor: "avx512", "avx2" or "portable". */
 const char *rse_pf_native_lanes(void);
 
-/* Estimate or judge the camera pose.  inliers has room for as many numbers as the request has rows; the first
- * `count` of them become the sorted row numbers that agree, also where the pose is refused. */
+/* Estimate a camera pose, or measure the evidence of the pose in the request, and fill in the result.
+ *
+ * inliers: memory for `rows` numbers.  The first inlier_count of them become the ascending row numbers of the inliers,
+ * also where the pose is refused. */
 void rse_pf_pnp_solve(const rse_pf_pnp_request *request, uint32_t *inliers, rse_pf_pnp_result *result);
 
+/* Most lists of numbers in one JSON text; a `pnp` command has three: points, pixels and depths. */
 #define RSE_PF_MAX_LISTS 3
+/* Most bytes of a JSON text without its lists; the other fields of a `pnp` command take some 400 bytes. */
 #define RSE_PF_MAX_REST 1024
 
 typedef struct rse_pf_lists {
-    double *numbers; /* of all lists, one behind the other; `room` of them */
+    double *numbers; /* memory for `room` numbers: those of all lists, one list after the other */
     int64_t room;
-    int64_t count;                  /* lists that were found */
-    int64_t ends[RSE_PF_MAX_LISTS]; /* of each list in `numbers` */
-    char rest[RSE_PF_MAX_REST];
+    int64_t count;                  /* lists in the text */
+    int64_t ends[RSE_PF_MAX_LISTS]; /* for each list the index in `numbers` behind its last number */
+    char rest[RSE_PF_MAX_REST];     /* the text without its lists */
 } rse_pf_lists;
 
-/* Cut the lists of numbers out of a JSON text: `rest` becomes the text with the string "\u000K" in the place of
- * list K, which the text itself cannot hold, since one with a backslash is not read.
+/* Move the lists of numbers out of a JSON text, so that a JSON parser need not make an object of each number.
  *
- * Returns the size of the rest; -1 if it is too long, if there are other lists or too many of them, and for a number
- * with an exponent or more than 15 digits, which this function could not round as IEEE 754 does. */
+ * In `rest` the JSON string "\u000K" stands in the place of list K.  The text cannot hold such a string itself, since
+ * a text with a backslash is refused.
+ *
+ * Returns the size of the rest in bytes, or -1 where the text must be parsed as usual: the rest is too long, there are
+ * more than RSE_PF_MAX_LISTS lists or a list of something else, or a number has an exponent or more than 15 digits,
+ * which this function could not round as IEEE 754 requires. */
 int64_t rse_pf_cut_lists(const char *text, int64_t bytes, rse_pf_lists *lists);
 
 #ifdef __cplusplus

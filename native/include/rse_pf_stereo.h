@@ -1,7 +1,7 @@
-/* The C ABI of the matcher of a rectified stereo pair.
+/* C interface of the sparse stereo matcher: disparities of features of a rectified stereo pair.
  *
- * It does what rse_pf/slam/stereo.py does.  It may be called from any thread, on memory of its own.  Nothing is
- * allocated, and equal arguments give equal bytes on every processor. */
+ * rse_pf/slam/stereo.py calls it.  It may be called from any thread, on memory of its own.  It allocates nothing, and
+ * equal arguments give equal bytes on every processor. */
 #pragma once
 
 #include <stdint.h>
@@ -10,33 +10,36 @@
 extern "C" {
 #endif
 
+/* Version of this header; a request that carries another version is refused. */
 #define RSE_PF_STEREO_ABI 1
 
-/* The largest disparity that may be sought. */
-#define RSE_PF_STEREO_MOST 1024
+/* Largest max_disparity_px of a request, pixels: the matcher keeps a search line of this length on the stack. */
+#define RSE_PF_STEREO_MAX_DISPARITY_PX 1024
 
-/* Use no instructions beyond those that every processor has. */
+/* Request flag: compute without AVX2.  The bytes of the result are the same. */
 #define RSE_PF_STEREO_PORTABLE 1u
 
-/* Return RSE_PF_STEREO_ABI of the library, to compare with the header's. */
+/* Return the RSE_PF_STEREO_ABI with which the library was compiled. */
 uint32_t rse_pf_stereo_abi(void);
 
 typedef struct rse_pf_stereo_request {
     uint32_t abi;
     uint32_t flags;            /* 0, or RSE_PF_STEREO_PORTABLE */
-    int64_t width, height;     /* 1..65536 */
-    const uint8_t *left;       /* height x width, row-major */
-    const uint8_t *right;      /* height x width */
-    int64_t rows;
-    const double *pixels;      /* rows x 2, in the left image */
-    double min_disparity_px;   /* smaller ones are not believed */
-    double min_likeness;       /* least squared correlation of two patches, 0..1 */
-    double uniqueness;         /* what the best lacks of 1 is less than this share of what the second lacks */
-    int64_t max_disparity_px;  /* 1..RSE_PF_STEREO_MOST */
-    int64_t left_right_px;     /* tolerance from the right image back to the left one; below 0: not checked */
+    int64_t width, height;     /* of both images: 1..65536 pixels */
+    const uint8_t *left;       /* height x width grey levels, row-major */
+    const uint8_t *right;      /* height x width grey levels, row-major */
+    int64_t rows;              /* number of features */
+    const double *pixels;      /* rows x 2: (column, row) of each feature in the left image */
+    double min_disparity_px;   /* smaller disparities become NaN: their depth is nearly unknown */
+    double min_correlation2;   /* smallest squared normalised cross-correlation of a match, 0..1 */
+    double uniqueness;         /* largest ratio of (1 - correlation^2) of the best and the second best match */
+    int64_t max_disparity_px;  /* 1..RSE_PF_STEREO_MAX_DISPARITY_PX */
+    int64_t left_right_px;     /* largest difference of left-to-right and right-to-left disparity; below 0: no check */
 } rse_pf_stereo_request;
 
-/* Write the disparity of each pixel, NaN where none is believed, and return 0; -1 if a size does not fit. */
+/* Write the disparity of each feature in pixels, NaN where no match passes the limits of the request.
+ *
+ * disparities: memory for `rows` numbers.  Returns 0, or -1 if a value of the request is not valid. */
 int32_t rse_pf_disparities(const rse_pf_stereo_request *request, double *disparities);
 
 #ifdef __cplusplus

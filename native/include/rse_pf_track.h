@@ -1,7 +1,7 @@
-/* The C ABI of a tracker: matches near predicted pixels, and the pose that fits landmarks.
+/* C interface of the tracker's inner loops: matching near predicted pixels, and fitting a pose to landmarks.
  *
- * Every function may be called from any thread, on arrays of its own.  Nothing is allocated, and equal
- * arguments give equal bytes on every processor. */
+ * rse_pf/slam/tracking.py calls it.  Every function may be called from any thread, on arrays of its own.  Nothing is
+ * allocated, and equal arguments give equal bytes on every processor. */
 #pragma once
 
 #include <stdint.h>
@@ -10,103 +10,123 @@
 extern "C" {
 #endif
 
+/* Version of this header; a request that carries another version is refused. */
 #define RSE_PF_TRACK_ABI 2
 
-/* Return RSE_PF_TRACK_ABI of the library, to compare with the header's. */
+/* Return the RSE_PF_TRACK_ABI with which the library was compiled. */
 uint32_t rse_pf_track_abi(void);
 
-/* For each feature of an image write the least Hamming distance to another feature that is at least apart_px away
- * in a row or a column, 256 without one, and return 0; -1 if a size does not fit.
+/* Measure how distinctive the features of one image are, so that repeated texture is not matched.
  *
- * descriptors: rows x 32; pixels: rows x 2. */
+ * Writes for each feature the smallest Hamming distance to another feature of the image that is at least apart_px away
+ * in column or row; 256 where there is none.
+ *
+ * descriptors: rows x 32 bytes; pixels: rows x 2; distances: memory for `rows` numbers.  Returns 0, -1 if a size is not
+ * valid. */
 int32_t rse_pf_distinct(const uint8_t *descriptors, const double *pixels, int64_t rows, double apart_px,
-                        int32_t *distinct);
+                        int32_t *distances);
 
+/* Predicted features, the features of an image, and when a pair of them matches. */
 typedef struct rse_pf_near_request {
     uint32_t abi;
-    uint32_t flags;                 /* 0 */
-    int64_t sought_rows, rows;      /* of the sought features; of the image's */
-    const double *predicted;        /* sought_rows x 2: where they are expected */
-    const double *sought_turns;     /* sought_rows x 2: their expected orientation, unit vectors or shorter */
-    const double *sought_sizes;     /* sought_rows: their expected size, above 0 */
-    const uint8_t *sought;          /* sought_rows x 32 */
-    const double *pixels;           /* rows x 2 */
-    const double *turns;            /* rows x 2, unit vectors */
-    const double *sizes;            /* rows, above 0 */
-    const uint8_t *descriptors;     /* rows x 32 */
-    const int32_t *distinct;        /* rows, of rse_pf_distinct */
-    double radius_px;               /* of the search */
-    double ratio;                   /* the nearest must be this much nearer than the second within the radius */
-    double distinct_ratio;          /* and this much nearer than its own image's most similar feature */
-    double min_cosine;              /* between the expected orientation and that of the feature */
-    double max_size_ratio;          /* between the sizes, either way */
-    int64_t max_distance;           /* Hamming */
+    uint32_t flags;                      /* 0 */
+    int64_t predicted_rows, rows;        /* number of predicted features, and of features of the image */
+    const double *predicted_pixels;      /* predicted_rows x 2 */
+    const double *predicted_directions;  /* predicted_rows x 2: cosine and sine of the orientation, or shorter vectors */
+    const double *predicted_sizes;       /* predicted_rows: diameter in pixels, above 0 */
+    const uint8_t *predicted_descriptors; /* predicted_rows x 32 bytes */
+    const double *pixels;                /* rows x 2 */
+    const double *directions;            /* rows x 2: cosine and sine of the orientation */
+    const double *sizes;                 /* rows: diameter in pixels, above 0 */
+    const uint8_t *descriptors;          /* rows x 32 bytes */
+    const int32_t *distinct;             /* rows: distances that rse_pf_distinct wrote */
+    double radius_px;                    /* radius of the search around a predicted pixel */
+    double ratio;                        /* the best distance is below this share of the second best in the radius */
+    double distinct_ratio;               /* and below this share of the feature's own distance in `distinct` */
+    double min_cosine;                   /* smallest cosine of the angle between predicted and measured orientation */
+    double max_size_ratio;               /* largest ratio of predicted and measured size, either way */
+    int64_t max_distance;                /* largest Hamming distance of a match, bits */
 } rse_pf_near_request;
 
-/* Numbers of 8 bytes that rse_pf_match_near works in. */
-#define RSE_PF_NEAR_WORKSPACE(sought_rows, rows) ((sought_rows) + 12 * (rows) + 16400)
+/* 8-byte numbers of the workspace of rse_pf_match_near. */
+#define RSE_PF_NEAR_WORKSPACE(predicted_rows, rows) ((predicted_rows) + 12 * (rows) + 16400)
 
-/* Match sought features to features of an image near predicted pixels; return the number of matches, -1 if a size
- * does not fit.  The first of equals is taken; of the sought features that take one feature the nearest stays, the
- * first of equals.  Writes the row of both for each match, by the rows of the sought features; there is room for
- * min(sought_rows, rows). */
-int64_t rse_pf_match_near(const rse_pf_near_request *request, uint64_t *workspace, int64_t *sought_matched,
+/* Match predicted features to features of an image within a radius, one to one.
+ *
+ * Of several predicted features that choose the same feature, the one with the smallest Hamming distance stays.  Ties
+ * go to the lower row number.  predicted_matched and matched get the row numbers of both sides of each match, by
+ * ascending predicted row; they have room for min(predicted_rows, rows).  Returns the number of matches, -1 if a size
+ * is not valid. */
+int64_t rse_pf_match_near(const rse_pf_near_request *request, uint64_t *workspace, int64_t *predicted_matched,
                           int64_t *matched);
 
+/* Landmarks, a predicted camera pose, and when a landmark is expected to be visible. */
 typedef struct rse_pf_seek_request {
     uint32_t abi;
     uint32_t flags;             /* 0 */
-    int64_t rows, landmarks;    /* of the sought numbers; of the arrays of landmarks */
-    const int64_t *numbers;     /* rows: landmarks that are sought; none is beyond the arrays */
-    const double *points;       /* landmarks x 3, metres, world */
-    const double *rays;         /* landmarks x 3: from the camera that saw a landmark last to it, metres, world */
-    const double *turns;        /* landmarks x 3: its orientation in that image, world */
-    const double *sizes;        /* landmarks: its size in that image, above 0 */
-    const uint8_t *descriptors; /* landmarks x 32 */
-    double fx, fy, cx, cy, width, height;
-    double margin_px;           /* around the image */
-    double nearest_m;           /* along the optical axis */
-    double min_cosine;          /* between the rays of now and of then */
-    double max_nearer, max_farther; /* ratio of the distances of then and now, and of now and then */
-    double T_camera_world[16];  /* row-major */
+    int64_t rows, landmarks;    /* number of landmarks to look for, and of landmarks in the arrays below */
+    const int64_t *numbers;     /* rows: the landmarks to look for; numbers outside of the arrays are ignored */
+    const double *points;       /* landmarks x 3, metres, world frame */
+    const double *rays;         /* landmarks x 3: from the camera that saw a landmark last to the landmark, metres,
+                                   world frame */
+    const double *directions;   /* landmarks x 3: orientation of the feature in that image, as a vector of the world */
+    const double *sizes;        /* landmarks: diameter of the feature in that image, pixels, above 0 */
+    const uint8_t *descriptors; /* landmarks x 32 bytes */
+    double fx, fy, cx, cy, width, height; /* pinhole intrinsics and image size, pixels */
+    double margin_px;           /* landmarks may project this far outside of the image */
+    double min_depth_m;         /* landmarks nearer along the optical axis are not visible */
+    double min_cosine;          /* smallest cosine of the angle between the present and the last viewing ray */
+    double max_nearer, max_farther; /* largest ratio of last to present distance, and of present to last distance */
+    double T_camera_world[16];  /* 4 x 4, row-major: the predicted pose */
 } rse_pf_seek_request;
 
-/* Find landmarks in an image as a pose expects them there, and match them as rse_pf_match_near does; what image says
- * of sought features is not read.  Writes the row of the numbers and that of the image for each match.  workspace has
- * room for 10 * rows + RSE_PF_NEAR_WORKSPACE(rows, image->rows) numbers. */
+/* Project landmarks into an image by a predicted pose and match the visible ones as rse_pf_match_near does.
+ *
+ * The fields predicted_... of `image` are not read.  predicted_matched gets rows of `numbers`, matched gets rows of the
+ * image's features.  workspace: memory for 10 * rows + RSE_PF_NEAR_WORKSPACE(rows, image->rows) numbers.  Returns the
+ * number of matches, -1 if a size is not valid. */
 int64_t rse_pf_seek(const rse_pf_seek_request *request, const rse_pf_near_request *image, uint64_t *workspace,
-                    int64_t *sought_matched, int64_t *matched);
+                    int64_t *predicted_matched, int64_t *matched);
 
+/* Landmarks, their measurements in one image, and the pose from which a fit starts. */
 typedef struct rse_pf_fit_request {
     uint32_t abi;
-    uint32_t flags;           /* 0 */
-    int64_t rows;
-    const double *points;     /* rows x 3, metres, world */
-    const double *spreads;    /* rows x 6: upper triangle of the covariance of the point, square metres, world */
-    const double *pixels;     /* rows x 2 */
-    const double *pixels_px;  /* rows: deviation of the pixel */
-    const double *depths_m;   /* rows: depth along the optical axis, 0 where there is none */
-    const double *depths_dev; /* rows: deviation of that depth, metres; not read where there is none */
-    double fx, fy, cx, cy;
-    double cauchy2;           /* squared distance (in deviations) at which a row weighs half */
-    double gate2;             /* squared distance beyond which a row is no inlier */
-    double T_camera_world[16]; /* row-major: where the fit begins */
+    uint32_t flags;                  /* 0 */
+    int64_t rows;                    /* number of measurements */
+    const double *points;            /* rows x 3: landmark, metres, world frame */
+    const double *point_covariances; /* rows x 6: upper triangle of the landmark's covariance, m^2, world frame */
+    const double *pixels;            /* rows x 2: measured pixel */
+    const double *pixel_sigmas_px;   /* rows: standard deviation of the pixel */
+    const double *depths_m;          /* rows: measured depth along the optical axis, 0 where there is none */
+    const double *depth_sigmas_m;    /* rows: standard deviation of the depth; not read where there is none */
+    double fx, fy, cx, cy;           /* pinhole intrinsics, pixels */
+    double cauchy2;                  /* squared Mahalanobis distance at which the Cauchy weight of a row is one half */
+    double gate2;                    /* squared Mahalanobis distance from which on a row is an outlier */
+    double T_camera_world[16];       /* 4 x 4, row-major: the pose from which the fit starts */
 } rse_pf_fit_request;
 
 typedef struct rse_pf_fit_result {
-    int64_t inliers;
-    double T_camera_world[16];
-    double information[36]; /* of the twist (metres, then radians) left of the pose, by the inliers */
+    int64_t inliers;           /* number of inliers */
+    double T_camera_world[16]; /* 4 x 4, row-major */
+    double information[36];    /* 6 x 6, J^T W J of the inliers, for the twist (metres, radians) left of the pose */
 } rse_pf_fit_result;
 
-/* Fit the pose to pixels and depths by the noise of both and of the points, robustly, and write which rows are
- * inliers (rows bytes, 0 or 1); return 0, 1 if some motion is free, -1 if a size or a number does not fit. */
+/* Fit the camera pose to landmarks by robust Gauss-Newton, weighted by the noise of pixels, depths and landmarks.
+ *
+ * is_inlier: memory for `rows` bytes, set to 1 for inliers and 0 for outliers.  Returns 0; 1 if the measurements leave
+ * some motion of the camera free; -1 if a size or a number is not valid. */
 int32_t rse_pf_fit_pose(const rse_pf_fit_request *request, uint8_t *is_inlier, rse_pf_fit_result *result);
 
-/* Write by how much motions of the points (rows x 3, in the camera's frame) explain what is left of the errors at the
- * pose, solved together with the pose by one step, and the information of that number; both 0 where a motion of the
- * camera explains the same.  Return 0, -1 if a size or a number does not fit.  gate2 is not read. */
-int32_t rse_pf_fit_sway(const rse_pf_fit_request *request, const double *sways, double *more, double *information);
+/* Estimate the scalar s for which the landmarks, displaced by s * displacements, explain the residuals at the pose.
+ *
+ * The tracker uses it for the displacement by a rolling shutter.  s and a correction of the pose are solved together by
+ * one robust Gauss-Newton step, and the correction is discarded.
+ *
+ * displacements: rows x 3, metres, camera frame, for s = 1; scalar and information: written, both 0 where a motion of
+ * the camera explains the same residuals.  gate2 of the request is not read.  Returns 0, -1 if a size or a number is
+ * not valid. */
+int32_t rse_pf_fit_sway(const rse_pf_fit_request *request, const double *displacements, double *scalar,
+                        double *information);
 
 #ifdef __cplusplus
 }

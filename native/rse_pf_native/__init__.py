@@ -1,1 +1,1 @@
-"""The native core of RSE-PF; `rse_pf.native` loads the library beside this file."""
+"""The shared library of the native core; `rse_pf.native` finds the library in the folder of this module."""

@@ -1,4 +1,4 @@
-// The same solver with wider vectors; the build compiles this file for AVX2.
+// The solver, compiled for AVX2: the Makefile compiles this file with -mavx2.
 #if defined(__x86_64__)
 #define RSE_PF_ISA rse_pf_avx2
 #include "solve.hpp"

@@ -1,14 +1,16 @@
-// The best of many, in the order in which libstdc++ leaves them, which OpenCV's keypoints have.
+// Selection of the best keypoints, in the very order in which std::nth_element and std::partition of libstdc++ leave
+// them, because OpenCV's keypoints have that order.
 //
-// Musser, Introspective sorting and selection algorithms, 1997: parts are split at the median of three until the last
-// of the best is in its place.  Which of equals comes first follows from the order of the exchanges alone, so that
-// order is part of what is computed here.
+// The method is introselect (Musser, Introspective sorting and selection algorithms, 1997): ranges are split at the
+// median of three until the last wanted element is in its place.  The order of equal elements depends on the sequence
+// of exchanges, so every exchange below is part of the result.
 #pragma once
 
 #include <cstdint>
 
 namespace rse_pf {
 
+// A candidate keypoint: its response (larger is better) and the index of its pixel in the level.
 struct Ranked {
     float rank;
     int32_t index;
@@ -20,14 +22,15 @@ inline void exchange(Ranked& a, Ranked& b) {
     b = held;
 }
 
-// Exchange *first* and the median of three by rank; of equals the one that libstdc++ takes.
-inline void take_median(Ranked* first, Ranked* a, Ranked* b, Ranked* c) {
+// Exchange *first* with the median of *a, *b and *c by rank; of equal ranks, with the one that libstdc++ takes.
+inline void move_median_to_first(Ranked* first, Ranked* a, Ranked* b, Ranked* c) {
     Ranked *const high = a->rank > b->rank ? a : b, *const low = high == a ? b : a;
     exchange(*first, low->rank > c->rank ? *low : high->rank > c->rank ? *c : *high);
 }
 
-// Split from *begin* to before *end* at *pivot*, which ends both searches; return where the lower part begins.
-inline Ranked* split(Ranked* begin, Ranked* end, const Ranked* pivot) {
+// Partition [begin, end) into ranks above and below that of the pivot; return where the lower part begins.  The range
+// must hold a rank on either side of the pivot's, because the two searches do not test for its ends.
+inline Ranked* partition(Ranked* begin, Ranked* end, const Ranked* pivot) {
     for (;;) {
         while (begin->rank > pivot->rank) ++begin;
         --end;
@@ -38,30 +41,34 @@ inline Ranked* split(Ranked* begin, Ranked* end, const Ranked* pivot) {
     }
 }
 
-// Put the best *wanted* of *count* and all that equal the last of them to the front; return how many those are, -1 if
-// the parts are so unequal that the order would be another one.
+// Move the `wanted` best of `count` candidates, and all that equal the last of them, to the front, and return their
+// number. Return -1 if the ranges become so unequal that libstdc++ would change to heap selection, whose order is not
+// known here.
 inline int64_t keep_best(Ranked* values, int64_t count, int64_t wanted) {
     if (count <= wanted || wanted <= 0) return count <= wanted ? count : 0;
+    // 1. Narrow the range around the last wanted element until at most three elements are left.
     Ranked *begin = values, *end = values + count, *const last = values + wanted - 1;
     int64_t splits = 2 * (63 - __builtin_clzll(static_cast<uint64_t>(count)));
     while (end - begin > 3) {
         if (splits-- == 0) return -1;
-        take_median(begin, begin + 1, begin + (end - begin) / 2, end - 1);
-        Ranked* const lower = split(begin + 1, end, begin);
+        move_median_to_first(begin, begin + 1, begin + (end - begin) / 2, end - 1);
+        Ranked* const lower = partition(begin + 1, end, begin);
         if (lower <= last)
             begin = lower;
         else
             end = lower;
     }
-    for (Ranked* each = begin + 1; each < end; ++each)
-        for (Ranked* at = each; at > begin && at->rank > (at - 1)->rank; --at) exchange(*at, *(at - 1));
-    const float least = last->rank;
+    // 2. Sort the rest by insertion.
+    for (Ranked* next = begin + 1; next < end; ++next)
+        for (Ranked* at = next; at > begin && at->rank > (at - 1)->rank; --at) exchange(*at, *(at - 1));
+    // 3. Move all candidates that equal the last wanted one behind it, as std::partition does.
+    const float min_rank = last->rank;
     Ranked *front = values + wanted, *back = values + count;
     for (;;) {
-        while (front != back && front->rank >= least) ++front;
+        while (front != back && front->rank >= min_rank) ++front;
         if (front == back) break;
         --back;
-        while (front != back && !(back->rank >= least)) --back;
+        while (front != back && !(back->rank >= min_rank)) --back;
         if (front == back) break;
         exchange(*front, *back);
         ++front;

@@ -1,5 +1,5 @@
-// Refine a pose with the depths that both cameras measured: iterated least squares with a Cauchy weight, on
-// residuals weighed by the noise of both images.  rse_pf/pnp/depth_refinement.py says why.
+// Refinement of a pose with the depths of both images: Gauss-Newton on an errors-in-variables model with Cauchy
+// weights. rse_pf/pnp/depth_refinement.py describes the model.
 #include "rse_pf_depth.h"
 
 #include <cstring>
@@ -23,31 +23,44 @@ namespace {
 
 using namespace rse_pf_depth_detail;
 
+// Most correspondences of a request.
 constexpr int64_t kMaxRows = int64_t{1} << 24;
+// Most Gauss-Newton iterations: the input pose is near the minimum.
 constexpr int kMaxIterations = 6;
-constexpr double kConverged = 1e-5;
-constexpr double kMaxAbs = 1e6, kMaxDepthM = 1e3;
-constexpr double kMinPixelPx = 0.05, kMinScale = 0.01;
-// Growth of the pixel errors above which depths and pixels contradict each other.
-constexpr double kMaxGrowth = 1.5, kLeastRmsePx = 0.2;
+// Step (largest component, metres and radians) below which the iteration has converged.
+constexpr double kConvergedStep = 1e-5;
+// Largest coordinate of a point (m) or pixel (px).
+constexpr double kMaxAbs = 1e6;
+// Largest depth in the second image, metres.
+constexpr double kMaxDepthM = 1e3;
+// Smallest standard deviation of a pixel (px): the reprojection errors of few matches may be small by chance.
+constexpr double kMinPixelPx = 0.05;
+// Smallest factor of the covariance that the residuals may give: they may be small by chance.
+constexpr double kMinScale = 0.01;
+// Largest ratio of the reprojection errors after and before: a larger one shows that depths and pixels disagree.
+constexpr double kMaxRmseGrowth = 1.5;
+// Smallest reprojection error before the refinement (px) for that ratio: smaller errors may grow more by chance.
+constexpr double kMinRmsePx = 0.2;
 
-bool within(double value, double low, double high) { return value >= low && value <= high; }
+bool is_within(double value, double low, double high) { return value >= low && value <= high; }
 
+// Sum the rows without AVX2; add_rows_with_avx2 gives the same bytes.
 template <bool kIsLast>
-void add_portably(const Rows& rows, const Pose& pose, const Sensor& sensor, Sums& sums) {
+void add_rows_portably(const Rows& rows, const Pose& pose, const Sensor& sensor, Sums& sums) {
     const double t[3] = {pose.t.x, pose.t.y, pose.t.z};
     add_rows<kIsLast>(rows, pose.R, t, sensor, sums);
 }
 
 template <bool kIsLast>
-RSE_PF_DEPTH_AVX2 void add_by_avx2(const Rows& rows, const Pose& pose, const Sensor& sensor, Sums& sums) {
+RSE_PF_DEPTH_AVX2 void add_rows_with_avx2(const Rows& rows, const Pose& pose, const Sensor& sensor, Sums& sums) {
     const double t[3] = {pose.t.x, pose.t.y, pose.t.z};
     add_rows<kIsLast>(rows, pose.R, t, sensor, sums);
 }
 
 template <bool kIsLast>
-void add(const Rows& rows, const Pose& pose, const Sensor& sensor, bool has_avx2, Sums& sums) {
-    has_avx2 ? add_by_avx2<kIsLast>(rows, pose, sensor, sums) : add_portably<kIsLast>(rows, pose, sensor, sums);
+void add_all_rows(const Rows& rows, const Pose& pose, const Sensor& sensor, bool has_avx2, Sums& sums) {
+    has_avx2 ? add_rows_with_avx2<kIsLast>(rows, pose, sensor, sums)
+             : add_rows_portably<kIsLast>(rows, pose, sensor, sums);
 }
 
 bool may_use_avx2(uint32_t flags) {
@@ -59,40 +72,42 @@ bool may_use_avx2(uint32_t flags) {
 #endif
 }
 
-int64_t checked(const rse_pf_depth_request& request, const double* workspace) {
-    const bool is_whole =
+// Return RSE_PF_DEPTH_REFINED for a valid request, else the status that names its first fault.
+int64_t validate(const rse_pf_depth_request& request, const double* workspace) {
+    const bool is_valid =
         request.abi == RSE_PF_DEPTH_ABI && request.rows >= 0 && request.rows <= kMaxRows && request.inlier_rows >= 0 &&
         request.inlier_rows <= request.rows && request.points_reference != nullptr && request.pixels != nullptr &&
         request.depths_m != nullptr && request.inliers != nullptr && workspace != nullptr &&
-        within(request.fx, 1e-9, 1e9) && within(request.fy, 1e-9, 1e9) && within(request.cx, -1e9, 1e9) &&
-        within(request.cy, -1e9, 1e9) && within(request.base_m, 1e-5, 1.0) && within(request.growth_per_m, 0.0, 1.0) &&
-        within(request.from_m, 0.0, 100.0) && within(request.rmse_px, 0.0, kMaxAbs);
-    if (!is_whole) return RSE_PF_DEPTH_BAD_REQUEST;
-    for (const double each : request.T_camera_reference)
-        if (!within(each, -1e9, 1e9)) return RSE_PF_DEPTH_BAD_REQUEST;
+        is_within(request.fx, 1e-9, 1e9) && is_within(request.fy, 1e-9, 1e9) && is_within(request.cx, -1e9, 1e9) &&
+        is_within(request.cy, -1e9, 1e9) && is_within(request.base_m, 1e-5, 1.0) && is_within(request.growth_per_m, 0.0, 1.0) &&
+        is_within(request.from_m, 0.0, 100.0) && is_within(request.rmse_px, 0.0, kMaxAbs);
+    if (!is_valid) return RSE_PF_DEPTH_BAD_REQUEST;
+    for (const double element : request.T_camera_reference)
+        if (!is_within(element, -1e9, 1e9)) return RSE_PF_DEPTH_BAD_REQUEST;
     for (int64_t i = 0; i < request.inlier_rows; ++i)
         if (request.inliers[i] < 0 || request.inliers[i] >= request.rows) return RSE_PF_DEPTH_BAD_REQUEST;
     for (int64_t i = 0; i < request.rows; ++i)
-        if (!within(request.depths_m[i], 0.0, kMaxDepthM)) return RSE_PF_DEPTH_BAD_DEPTHS;
+        if (!is_within(request.depths_m[i], 0.0, kMaxDepthM)) return RSE_PF_DEPTH_BAD_DEPTHS;
     for (int64_t i = 0; i < request.rows; ++i) {
         const double* const point = request.points_reference + 3 * i;
-        if (!(within(point[0], -kMaxAbs, kMaxAbs) && within(point[1], -kMaxAbs, kMaxAbs) &&
-              within(point[2], kNearM, kMaxAbs)))
+        if (!(is_within(point[0], -kMaxAbs, kMaxAbs) && is_within(point[1], -kMaxAbs, kMaxAbs) &&
+              is_within(point[2], kMinDepthM, kMaxAbs)))
             return RSE_PF_DEPTH_BAD_POINTS;
     }
     for (int64_t i = 0; i < 2 * request.rows; ++i)
-        if (!within(request.pixels[i], -kMaxAbs, kMaxAbs)) return RSE_PF_DEPTH_BAD_PIXELS;
+        if (!is_within(request.pixels[i], -kMaxAbs, kMaxAbs)) return RSE_PF_DEPTH_BAD_PIXELS;
     return RSE_PF_DEPTH_REFINED;
 }
 
-// Copy the inliers to columns, and fill up the last four rows with the first one; say whether any has a depth.
-bool gathered(const rse_pf_depth_request& request, const Sensor& sensor, double* workspace, Rows& rows) {
+// Copy the inliers to columns, and pad the last vector with copies of the first inlier.  Return whether any inlier has
+// a depth in the second image.
+bool gather_inliers(const rse_pf_depth_request& request, const Sensor& sensor, double* workspace, Rows& rows) {
     rows.count = (request.inlier_rows + kFour - 1) / kFour * kFour;
     double** const columns[] = {&rows.x, &rows.y, &rows.z,     &rows.z_inverse, &rows.depth_variance, &rows.z2,
                                 &rows.u, &rows.v, &rows.depth, &rows.has_depth, &rows.is_real};
     static_assert(sizeof columns / sizeof columns[0] == kColumns);
     for (int i = 0; i < kColumns; ++i) *columns[i] = workspace + i * rows.count;
-    bool has_any = false;
+    bool has_any_depth = false;
     for (int64_t i = 0; i < rows.count; ++i) {
         const bool is_real = i < request.inlier_rows;
         const int64_t row = request.inliers[is_real ? i : 0];
@@ -111,12 +126,12 @@ bool gathered(const rse_pf_depth_request& request, const Sensor& sensor, double*
         rows.depth[i] = depth;
         rows.has_depth[i] = depth > 0.0 ? 1.0 : 0.0;
         rows.is_real[i] = is_real ? 1.0 : 0.0;
-        has_any = has_any || depth > 0.0;
+        has_any_depth = has_any_depth || depth > 0.0;
     }
-    return has_any;
+    return has_any_depth;
 }
 
-Normal normal_of(const Sums& sums) {
+Normal assemble_normal_equations(const Sums& sums) {
     Normal normal;
     for (int i = 0, k = 0; i < 3; ++i)
         for (int j = i; j < 3; ++j, ++k) {
@@ -129,57 +144,65 @@ Normal normal_of(const Sums& sums) {
     return normal;
 }
 
-// Write the covariance of the twist; false where some motion is free or the weights leave no slope.
-bool covariance_of(const Sums& sums, double (&covariance)[36]) {
-    const double mean_slope = sums.slope / sums.numbers;
+// Write the covariance of the twist: that of an M-estimator, Huber, Robust Statistics (1981), Sect. 7.6.  Return false
+// where some motion of the camera is unconstrained, or where most residuals are outliers (a mean slope of 0 or less).
+bool compute_covariance(const Sums& sums, double (&covariance)[36]) {
+    // 1. Compute the factor by which the residuals exceed their assumed noise.
+    const double mean_slope = sums.slope / sums.residuals;
     if (!(mean_slope > 0.0)) return false;
-    const double freedom = sums.numbers - 6.0 > 1.0 ? sums.numbers - 6.0 : 1.0;
-    double scale = sums.weight2_distance2 / freedom / (mean_slope * mean_slope);
+    const double degrees_of_freedom = sums.residuals - 6.0 > 1.0 ? sums.residuals - 6.0 : 1.0;
+    double scale = sums.weight2_distance2 / degrees_of_freedom / (mean_slope * mean_slope);
     scale = scale > kMinScale ? scale : kMinScale;
-    Normal normal = normal_of(sums);
+    // 2. Invert A column by column, and multiply its symmetric part by the factor.
+    Normal normal = assemble_normal_equations(sums);
     double columns[6][6];
     for (int i = 0; i < 6; ++i) {
         for (int j = 0; j < 6; ++j) normal.b[j] = i == j ? 1.0 : 0.0;
-        if (!solved(normal, 0.0, columns[i])) return false;
+        if (!solve_normal_equations(normal, 0.0, columns[i])) return false;
     }
-    double size = 0.0;
+    double total = 0.0;
     for (int i = 0; i < 6; ++i)
         for (int j = 0; j < 6; ++j) {
             covariance[6 * i + j] = 0.5 * (columns[i][j] + columns[j][i]) * scale;
-            size += covariance[6 * i + j];
+            total += covariance[6 * i + j];
         }
+    // 3. Refuse a covariance that is not finite or has a variance that is not positive.
     for (int i = 0; i < 6; ++i)
         if (!(covariance[7 * i] > 0.0)) return false;
-    return size - size == 0.0;
+    return total - total == 0.0;
 }
 
-int64_t refined(const rse_pf_depth_request& request, double* workspace, rse_pf_depth_result& result) {
+// Refine the pose of a valid request, and return RSE_PF_DEPTH_REFINED, or RSE_PF_DEPTH_KEPT where that fails.
+int64_t refine(const rse_pf_depth_request& request, double* workspace, rse_pf_depth_result& result) {
+    // 1. Derive the pixel noise from the reprojection error: half of it is due to each image.
     const double pixel_px = 0.5 * request.rmse_px > kMinPixelPx ? 0.5 * request.rmse_px : kMinPixelPx;
     const Sensor sensor = {request.fx,     request.fy,           request.cx,     request.cy,
                            request.base_m, request.growth_per_m, request.from_m, pixel_px * pixel_px};
     Rows rows;
-    if (request.inlier_rows == 0 || !gathered(request, sensor, workspace, rows)) return RSE_PF_DEPTH_KEPT;
+    if (request.inlier_rows == 0 || !gather_inliers(request, sensor, workspace, rows)) return RSE_PF_DEPTH_KEPT;
+    // 2. Iterate Gauss-Newton steps.
     const bool has_avx2 = may_use_avx2(request.flags);
     const double* const T = request.T_camera_reference;
     Pose pose = {{{T[0], T[1], T[2]}, {T[4], T[5], T[6]}, {T[8], T[9], T[10]}}, {T[3], T[7], T[11]}};
     Sums sums;
     for (int i = 0; i < kMaxIterations; ++i) {
-        add<false>(rows, pose, sensor, has_avx2, sums);
+        add_all_rows<false>(rows, pose, sensor, has_avx2, sums);
         double twist[6], largest = 0.0;
-        if (!solved(normal_of(sums), 0.0, twist)) return RSE_PF_DEPTH_KEPT;
-        for (const double each : twist) {
-            if (!within(each, -kMaxAbs, kMaxAbs)) return RSE_PF_DEPTH_KEPT;
-            largest = absolute(each) > largest ? absolute(each) : largest;
+        if (!solve_normal_equations(assemble_normal_equations(sums), 0.0, twist)) return RSE_PF_DEPTH_KEPT;
+        for (const double component : twist) {
+            if (!is_within(component, -kMaxAbs, kMaxAbs)) return RSE_PF_DEPTH_KEPT;
+            largest = absolute(component) > largest ? absolute(component) : largest;
         }
-        pose = moved_along(twist, pose);
-        if (largest < kConverged) break;
+        pose = apply_twist(twist, pose);
+        if (largest < kConvergedStep) break;
     }
-    add<true>(rows, pose, sensor, has_avx2, sums);
+    // 3. Keep the input pose if the reprojection error has grown or the pose is not finite.
+    add_all_rows<true>(rows, pose, sensor, has_avx2, sums);
     result.rmse_px = square_root(sums.error2 / static_cast<double>(request.inlier_rows));
-    const double before_px = request.rmse_px > kLeastRmsePx ? request.rmse_px : kLeastRmsePx;
-    // Also refuses what is not finite.
-    if (!(is_finite(pose) && result.rmse_px <= kMaxGrowth * before_px)) return RSE_PF_DEPTH_KEPT;
-    if (!covariance_of(sums, result.covariance)) return RSE_PF_DEPTH_KEPT;
+    const double before_px = request.rmse_px > kMinRmsePx ? request.rmse_px : kMinRmsePx;
+    if (!(is_finite(pose) && result.rmse_px <= kMaxRmseGrowth * before_px)) return RSE_PF_DEPTH_KEPT;
+    // 4. Write the covariance and the pose.
+    if (!compute_covariance(sums, result.covariance)) return RSE_PF_DEPTH_KEPT;
     const double out[16] = {pose.R[0][0], pose.R[0][1], pose.R[0][2], pose.t.x, pose.R[1][0], pose.R[1][1],
                             pose.R[1][2], pose.t.y,     pose.R[2][0], pose.R[2][1], pose.R[2][2], pose.t.z,
                             0.0,          0.0,          0.0,          1.0};
@@ -195,7 +218,7 @@ __attribute__((visibility("default"))) uint32_t rse_pf_depth_abi(void) { return 
 
 __attribute__((visibility("default"))) void rse_pf_depth_refine(const rse_pf_depth_request* request,
                                                                 double* workspace, rse_pf_depth_result* result) {
-    result->status = checked(*request, workspace);
-    if (result->status == RSE_PF_DEPTH_REFINED) result->status = refined(*request, workspace, *result);
+    result->status = validate(*request, workspace);
+    if (result->status == RSE_PF_DEPTH_REFINED) result->status = refine(*request, workspace, *result);
 }
 }

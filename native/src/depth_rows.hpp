@@ -1,7 +1,7 @@
-// The rows of a refinement with depth: residuals, their noise and the sums of the normal equations.
+// The inner loop of the pose refinement with depths: residuals, their covariances, and the normal equations.
 //
-// Four rows at a time; a vector of four doubles is one AVX register or two narrower ones, with the same bytes,
-// because each operation is a single IEEE operation and lanes are added in one order.
+// The loop takes four correspondences at a time.  A vector of four doubles is one AVX register or two narrower ones,
+// and gives the same bytes, because each operation is a single IEEE 754 operation and lanes are added in one order.
 #pragma once
 
 #include <cstdint>
@@ -10,29 +10,43 @@ namespace rse_pf_depth_detail {
 
 typedef double Four __attribute__((vector_size(32)));
 
+// Correspondences in a vector.
 constexpr int64_t kFour = 4;
+// Arrays of a Rows, each with a number for every correspondence.
 constexpr int kColumns = 11;
-constexpr double kNearM = 1e-3;
-// Mahalanobis distance, squared, at which a row weighs half.
+// Smallest depth (metres) of a point in front of a camera; a smaller depth is replaced by it.
+constexpr double kMinDepthM = 1e-3;
+// Squared Mahalanobis distance of a residual at which its Cauchy weight is one half: 2.5 standard deviations.
 constexpr double kCauchy2 = 6.25;
 
-// One inlier: its point, 1/z and variances in the reference image; pixel and depth in the second image; whether
-// there is a depth, and 1, or 0 for rows that fill up the last four.
+// Inliers as a structure of arrays; `count` is a multiple of four, and the last vector is padded.
 struct Rows {
-    int64_t count;  // a multiple of four
-    double *x, *y, *z, *z_inverse, *depth_variance, *z2, *u, *v, *depth, *has_depth, *is_real;
+    int64_t count;
+    double *x, *y, *z;        // point in the reference camera, metres
+    double *z_inverse;        // 1 / z
+    double *depth_variance;   // variance of z by the depth noise, square metres
+    double *z2;               // z^2
+    double *u, *v, *depth;    // pixel and depth (metres, 0: none) in the second image
+    double *has_depth;        // 1 where there is a depth in the second image, else 0
+    double *is_real;          // 1, or 0 for padding
 };
 
 struct Sensor {
-    double fx, fy, cx, cy;
-    double base_m, growth_per_m, from_m;
-    double pixel_px2;
+    double fx, fy, cx, cy;               // pinhole intrinsics, pixels
+    double base_m, growth_per_m, from_m; // standard deviation of depth z: base + growth * max(0, z - from)^2
+    double pixel_px2;                    // variance of a pixel coordinate, px^2
 };
 
-// P, M and D are the blocks of A = J^T W J: translation, mixed, rotation; upper triangles of P and D.
+// The sums of one pass over the rows.
 struct Sums {
+    // Blocks of A = J^T W J (upper triangles of translation P and rotation D, all of the mixed block M), and b = J^T W
+    // r.
     double P[6], M[9], D[6], b[6];
-    double weight2_distance2, slope, numbers, error2;
+    // For the covariance of an M-estimator: the squared weighted distances, the sum of the derivatives of the influence
+    // function, and the number of residuals.
+    double weight2_distance2, slope, residuals;
+    // Sum of the squared reprojection errors, px^2.
+    double error2;
 };
 
 #define RSE_PF_ROWS_INLINE static inline __attribute__((always_inline))
@@ -41,37 +55,40 @@ RSE_PF_ROWS_INLINE Four all(double value) { return Four{value, value, value, val
 RSE_PF_ROWS_INLINE void load(const double* from, Four& lanes) { __builtin_memcpy(&lanes, from, sizeof lanes); }
 RSE_PF_ROWS_INLINE double total(const Four& lanes) { return (lanes[0] + lanes[1]) + (lanes[2] + lanes[3]); }
 
-// The last pass leaves the robust weights out of A, and has what the covariance and the rmse need instead of b.
+// Sum the rows at the pose (R, t), which maps the reference camera to the second camera.  The last pass, at the final
+// pose, leaves the robust weights out of A, and sums what covariance and rmse need instead of b.
 template <bool kIsLast>
 RSE_PF_ROWS_INLINE void add_rows(const Rows& rows, const double (&R)[3][3], const double (&t)[3],
                                  const Sensor& sensor, Sums& sums) {
-    const Four zero = all(0.0), one = all(1.0), near = all(kNearM), pixel = all(sensor.pixel_px2);
+    const Four zero = all(0.0), one = all(1.0), near = all(kMinDepthM), pixel = all(sensor.pixel_px2);
     const Four fx = all(sensor.fx), fy = all(sensor.fy), cx = all(sensor.cx), cy = all(sensor.cy);
     const Four by_fx2 = all(sensor.pixel_px2 / (sensor.fx * sensor.fx));
     const Four by_fy2 = all(sensor.pixel_px2 / (sensor.fy * sensor.fy));
-    Four P[6], M[9], D[6], b[6], squares = zero, slopes = zero, numbers = zero, errors = zero;
-    for (Four& each : P) each = zero;
-    for (Four& each : M) each = zero;
-    for (Four& each : D) each = zero;
-    for (Four& each : b) each = zero;
+    Four P[6], M[9], D[6], b[6], squares = zero, slopes = zero, residuals = zero, errors = zero;
+    for (Four& lanes : P) lanes = zero;
+    for (Four& lanes : M) lanes = zero;
+    for (Four& lanes : D) lanes = zero;
+    for (Four& lanes : b) lanes = zero;
     for (int64_t i = 0; i < rows.count; i += kFour) {
         Four X, Y, Z, z_inverse, depth_variance, z2, u, v, depth, has, real;
         load(rows.x + i, X), load(rows.y + i, Y), load(rows.z + i, Z), load(rows.z_inverse + i, z_inverse);
         load(rows.depth_variance + i, depth_variance), load(rows.z2 + i, z2);
         load(rows.u + i, u), load(rows.v + i, v), load(rows.depth + i, depth);
         load(rows.has_depth + i, has), load(rows.is_real + i, real);
-        // The point without t first: divided by its old depth it is the ray that its depth noise lies along.
+        // 1. Rotate the point.  Before t is added, the point divided by its depth in the reference camera is the ray
+        // along which its depth noise lies.
         Four x = R[0][0] * X + R[0][1] * Y + R[0][2] * Z;
         Four y = R[1][0] * X + R[1][1] * Y + R[1][2] * Z;
         Four z = R[2][0] * X + R[2][1] * Y + R[2][2] * Z;
         const Four rx = x * z_inverse, ry = y * z_inverse, rz = z * z_inverse;
+        // 2. Translate the point, and compute the residuals of pixel and depth.
         x += all(t[0]);
         y += all(t[1]);
         z += all(t[2]);
         z = z > near ? z : near;
         const Four inverse = one / z, a = x * inverse, c = y * inverse;
         const Four r0 = u - (fx * a + cx), r1 = v - (fy * c + cy), r2 = has * (depth - z);
-        // Covariance G of the point in this camera's frame, from the reference image.
+        // 3. Compute the covariance G of the point in the second camera's frame, from the noise of the reference image.
         const Four gx = by_fx2 * z2, gy = by_fy2 * z2;
         const Four dx = depth_variance * rx, dy = depth_variance * ry, dz = depth_variance * rz;
         const Four g00 = dx * rx + gx * (R[0][0] * R[0][0]) + gy * (R[0][1] * R[0][1]);
@@ -80,7 +97,8 @@ RSE_PF_ROWS_INLINE void add_rows(const Rows& rows, const double (&R)[3][3], cons
         const Four g11 = dy * ry + gx * (R[1][0] * R[1][0]) + gy * (R[1][1] * R[1][1]);
         const Four g12 = dy * rz + gx * (R[1][0] * R[2][0]) + gy * (R[1][1] * R[2][1]);
         const Four g22 = dz * rz + gx * (R[2][0] * R[2][0]) + gy * (R[2][1] * R[2][1]);
-        // Slopes of (u, v, z) by the point: [h0 0 k0; 0 h1 k1; 0 0 has].
+        // 4. Compute the covariance S of the residuals: G through the Jacobian [h0 0 k0; 0 h1 k1; 0 0 has] of (u, v, z)
+        // by the point, plus the noise of the second image.
         const Four h0 = fx * inverse, h1 = fy * inverse, k0 = -(h0 * a), k1 = -(h1 * c);
         const Four e0 = h0 * g02 + k0 * g22, e1 = h1 * g12 + k1 * g22;
         Four beyond = z - all(sensor.from_m);
@@ -91,7 +109,7 @@ RSE_PF_ROWS_INLINE void add_rows(const Rows& rows, const double (&R)[3][3], cons
         const Four s11 = h1 * (h1 * g11 + k1 * g12) + k1 * e1 + pixel;
         const Four s02 = has * e0, s12 = has * e1;
         const Four s22 = has * (g22 + deviation * deviation) + (one - has);
-        // Its inverse W.
+        // 5. Invert S to W.
         const Four m00 = s11 * s22 - s12 * s12, m01 = s02 * s12 - s01 * s22, m02 = s01 * s12 - s02 * s11;
         const Four scale = one / (s00 * m00 + s01 * m01 + s02 * m02);
         const Four w00 = m00 * scale, w01 = m01 * scale, w02 = m02 * scale;
@@ -99,10 +117,12 @@ RSE_PF_ROWS_INLINE void add_rows(const Rows& rows, const double (&R)[3][3], cons
         const Four w22 = (s00 * s11 - s01 * s01) * scale;
         const Four q0 = w00 * r0 + w01 * r1 + w02 * r2, q1 = w01 * r0 + w11 * r1 + w12 * r2;
         const Four q2 = w02 * r0 + w12 * r1 + w22 * r2;
+        // 6. Compute the squared Mahalanobis distance and the Cauchy weight.
         const Four distance2 = r0 * q0 + r1 * q1 + r2 * q2;
         const Four weight = one / (one + distance2 * (1.0 / kCauchy2));
         const Four share = real * (kIsLast ? one : weight);
-        // Information of the point, then of the twist: the point moves by rho + phi x point.
+        // 7. Add the information of the point, and from it that of the twist (rho, phi), which moves the point by
+        // rho + phi x point.
         const Four f0 = w00 * k0 + w01 * k1 + w02 * has, f1 = w01 * k0 + w11 * k1 + w12 * has;
         const Four f2 = w02 * k0 + w12 * k1 + w22 * has;
         const Four p00 = share * (h0 * h0 * w00), p01 = share * (h0 * h1 * w01), p02 = share * (h0 * f0);
@@ -117,10 +137,10 @@ RSE_PF_ROWS_INLINE void add_rows(const Rows& rows, const double (&R)[3][3], cons
         D[0] += y * n20 - z * n10, D[1] += y * n21 - z * n11, D[2] += y * n22 - z * n12;
         D[3] += z * n01 - x * n21, D[4] += z * n02 - x * n22, D[5] += x * n12 - y * n02;
         if (kIsLast) {
-            const Four count = real * (all(2.0) + has), pulled = weight * weight * distance2;
-            squares += real * pulled;
-            slopes += count * weight - real * (all(2.0 / kCauchy2) * pulled);
-            numbers += count;
+            const Four count = real * (all(2.0) + has), weighted2 = weight * weight * distance2;
+            squares += real * weighted2;
+            slopes += count * weight - real * (all(2.0 / kCauchy2) * weighted2);
+            residuals += count;
             errors += real * (r0 * r0 + r1 * r1);
         } else {
             const Four b0 = share * (h0 * q0), b1 = share * (h1 * q1);
@@ -133,7 +153,7 @@ RSE_PF_ROWS_INLINE void add_rows(const Rows& rows, const double (&R)[3][3], cons
     for (int i = 0; i < 9; ++i) sums.M[i] = total(M[i]);
     sums.weight2_distance2 = total(squares);
     sums.slope = total(slopes);
-    sums.numbers = total(numbers);
+    sums.residuals = total(residuals);
     sums.error2 = total(errors);
 }
 

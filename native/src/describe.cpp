@@ -1,9 +1,9 @@
-// ORB's descriptors of keypoints that were found elsewhere, bit by bit those of OpenCV.
+// ORB descriptors of given keypoints, equal to those of OpenCV bit by bit (Rublee et al., ORB: an efficient alternative
+// to SIFT or SURF, ICCV 2011, Sect. 4).
 //
-// Rublee et al., ORB: an efficient alternative to SIFT or SURF, ICCV 2011, sect. 4: each bit compares the smoothed
-// image at two places that turn with the keypoint.  The levels of the pyramid are integers; the smoothing adds
-// floats in OpenCV's order, each product and sum rounded once.  So only processors that can do so (AVX2, FMA) have
-// these descriptors, and all others leave them to OpenCV.
+// Each of the 256 bits compares the grey levels of two pixels of the smoothed image, whose positions are rotated by the
+// orientation of the keypoint.  The smoothing adds floats in OpenCV's order with fused multiply-add, so processors
+// without AVX2 or FMA have no implementation here; the caller uses OpenCV.
 #include <cstdint>
 
 #include "orb_pattern.hpp"
@@ -18,37 +18,46 @@
 
 namespace {
 
-using rse_pf::Image, rse_pf::kMaxLevels, rse_pf::kMaxRows, rse_pf::kMaxSide, rse_pf::Pyramid, rse_pf::rounded;
+using rse_pf::Image, rse_pf::kMaxLevels, rse_pf::kMaxRows, rse_pf::kMaxSide, rse_pf::Pyramid, rse_pf::round_to_integer;
 
-constexpr int64_t kPairs = 256, kBytes = 32;
-// The farthest place, turned by any angle, and the smoothing around it.
-constexpr int64_t kTurned = 19, kBlur = 3, kReach = kTurned + kBlur;
+// Pairs of pixels that are compared: bits of a descriptor.
+constexpr int64_t kPairs = 256;
+// Bytes of a descriptor.
+constexpr int64_t kBytes = 32;
+// Largest distance (px, per axis) of a compared pixel from the keypoint at any orientation.
+constexpr int64_t kPatternReach = 19;
+// Pixels on each side that the smoothing reads.
+constexpr int64_t kBlurRadius = 3;
+// Smallest distance (px) of a keypoint from the border of its level.
+constexpr int64_t kReach = kPatternReach + kBlurRadius;
+// Weights of the smoothing along an axis.
 constexpr int64_t kTaps = 7;
-// A Gaussian of 2 px, as OpenCV computes it.
+// A Gaussian with a standard deviation of 2 px, in the rounding of OpenCV.
 constexpr float kGauss[kTaps] = {0x1.1f5f62p-4f, 0x1.0c70fcp-3f, 0x1.869472p-3f, 0x1.ba95cp-3f,
                                  0x1.869472p-3f, 0x1.0c70fcp-3f, 0x1.1f5f62p-4f};
 
 struct Workspace {
     Pyramid pyramid;
-    float* lines;  // kTaps + 1
-    uint8_t* smooth;
+    float* lines;      // kTaps rows after horizontal smoothing, and one row of pixels as floats
+    uint8_t* smoothed; // the smoothed level
 };
 
-// Part of an image: from the first row and column to before the last ones.
+// A part of an image: columns [left, right) and rows [top, bottom).
 struct Box {
     int64_t left, top, right, bottom;
 };
 
-// Smooth a box that leaves three pixels on each side: along each row from the left, then down from the middle tap.
+// Smooth the box of an image, which has at least kBlurRadius pixels around it: horizontally from the first tap, then
+// vertically from the middle tap outwards.
 RSE_PF_INLINE void smooth(const Image& image, const Box& box, uint8_t* to, const Workspace& work) {
-    const int64_t w = image.width, inner = box.right - box.left;
-    float* __restrict const plain = work.lines + kTaps * w;
-    for (int64_t y = box.top - kBlur; y < box.bottom + kBlur; ++y) {
-        const uint8_t* const pixels = image.pixels + y * w + box.left - kBlur;
-        for (int64_t x = 0; x < inner + 2 * kBlur; ++x) plain[x] = static_cast<float>(pixels[x]);
+    const int64_t w = image.width, box_width = box.right - box.left;
+    float* __restrict const pixel_line = work.lines + kTaps * w;
+    for (int64_t y = box.top - kBlurRadius; y < box.bottom + kBlurRadius; ++y) {
+        const uint8_t* const pixels = image.pixels + y * w + box.left - kBlurRadius;
+        for (int64_t x = 0; x < box_width + 2 * kBlurRadius; ++x) pixel_line[x] = static_cast<float>(pixels[x]);
         float* __restrict const line = work.lines + y % kTaps * w;
-        for (int64_t x = 0; x < inner; ++x) {
-            const float* const at = plain + x;
+        for (int64_t x = 0; x < box_width; ++x) {
+            const float* const at = pixel_line + x;
             float sum = kGauss[0] * at[0];
             sum = __builtin_fmaf(kGauss[1], at[1], sum);
             sum = __builtin_fmaf(kGauss[2], at[2], sum);
@@ -57,11 +66,11 @@ RSE_PF_INLINE void smooth(const Image& image, const Box& box, uint8_t* to, const
             sum = __builtin_fmaf(kGauss[5], at[5], sum);
             line[x] = __builtin_fmaf(kGauss[6], at[6], sum);
         }
-        if (y < box.top + kBlur) continue;
+        if (y < box.top + kBlurRadius) continue;
         const float* tap[kTaps];
         for (int64_t k = 0; k < kTaps; ++k) tap[k] = work.lines + (y + 1 + k) % kTaps * w;
-        uint8_t* __restrict const out = to + (y - kBlur) * w + box.left;
-        for (int64_t x = 0; x < inner; ++x) {
+        uint8_t* __restrict const out = to + (y - kBlurRadius) * w + box.left;
+        for (int64_t x = 0; x < box_width; ++x) {
             float sum = kGauss[3] * tap[3][x];
             sum = __builtin_fmaf(kGauss[4], tap[4][x] + tap[2][x], sum);
             sum = __builtin_fmaf(kGauss[5], tap[5][x] + tap[1][x], sum);
@@ -71,20 +80,23 @@ RSE_PF_INLINE void smooth(const Image& image, const Box& box, uint8_t* to, const
     }
 }
 
-// Compare the pairs around a place of a smoothed image.
-RSE_PF_INLINE void compare(const uint8_t* centre, int64_t width, float cosine, float sine, uint8_t* descriptor) {
-    int32_t places[2 * kPairs];
-    const float step = static_cast<float>(width);
+// Write the descriptor of a keypoint at a pixel of a smoothed image.
+RSE_PF_INLINE void write_descriptor(const uint8_t* centre, int64_t width, float cosine, float sine,
+                                    uint8_t* descriptor) {
+    // 1. Rotate the pattern.
+    int32_t offsets[2 * kPairs];
+    const float row_step = static_cast<float>(width);
     for (int64_t k = 0; k < 2 * kPairs; ++k) {
         const float x = __builtin_rintf(kPatternX[k] * cosine - kPatternY[k] * sine);
         const float y = __builtin_rintf(kPatternX[k] * sine + kPatternY[k] * cosine);
-        places[k] = static_cast<int32_t>(y * step + x);  // exact: below 2^24
+        offsets[k] = static_cast<int32_t>(y * row_step + x);  // exact, since it is below 2^24
     }
+    // 2. Compare the pairs.
     for (int64_t byte = 0; byte < kBytes; ++byte) {
         uint32_t bits = 0;
         for (int64_t bit = 0; bit < 8; ++bit) {
             const int64_t k = 8 * byte + bit;
-            bits |= static_cast<uint32_t>(centre[places[k]] < centre[places[k + kPairs]]) << bit;
+            bits |= static_cast<uint32_t>(centre[offsets[k]] < centre[offsets[k + kPairs]]) << bit;
         }
         descriptor[byte] = static_cast<uint8_t>(bits);
     }
@@ -96,39 +108,43 @@ struct Keypoints {
     int64_t rows;
 };
 
-// Return the index of a keypoint's pixel in its level, -1 if that is too near to the edge.
-RSE_PF_INLINE int64_t place_of(const Image& image, const float* pixel, float inverse) {
+// Return the index of a keypoint's pixel in its level, -1 if it is within kReach of the border.  `pixel` is that of the
+// whole image, `inverse` the inverse scale of the level.
+RSE_PF_INLINE int64_t index_in_level(const Image& image, const float* pixel, float inverse) {
     const float x = pixel[0] * inverse, y = pixel[1] * inverse;
-    constexpr float kMost = static_cast<float>(kMaxSide);
-    if (!(x >= 0.0f && y >= 0.0f && x <= kMost && y <= kMost)) return -1;
-    const int64_t column = rounded(x), row = rounded(y);
+    constexpr float kMaxCoordinate = static_cast<float>(kMaxSide);
+    if (!(x >= 0.0f && y >= 0.0f && x <= kMaxCoordinate && y <= kMaxCoordinate)) return -1;
+    const int64_t column = round_to_integer(x), row = round_to_integer(y);
     const bool is_inside =
         column >= kReach && row >= kReach && column < image.width - kReach && row < image.height - kReach;
     return is_inside ? row * image.width + column : -1;
 }
 
-// Describe the keypoints of one level; say whether all of them lie far enough inside.
-RSE_PF_INLINE bool describe(const Image& image, const Keypoints& keypoints, int32_t octave, float scale,
+// Write the descriptors of the keypoints of one level.  Return false if one of them lies within kReach of the border,
+// or has a cosine and sine that are not those of an angle.
+RSE_PF_INLINE bool describe_level(const Image& image, const Keypoints& keypoints, int32_t octave, float scale,
                             const Workspace& work, uint8_t* descriptors) {
     const float inverse = 1.0f / scale;
+    // 1. Find the part of the level that the keypoints read.
     Box box = {image.width, image.height, 0, 0};
     for (int64_t i = 0; i < keypoints.rows; ++i) {
         if (keypoints.octaves[i] != octave) continue;
-        const int64_t place = place_of(image, keypoints.pixels + 2 * i, inverse);
+        const int64_t index = index_in_level(image, keypoints.pixels + 2 * i, inverse);
         const float cosine = keypoints.cosines[i], sine = keypoints.sines[i];
-        if (place < 0 || !(cosine * cosine + sine * sine < 1.001f)) return false;
-        const int64_t column = place % image.width, row = place / image.width;
-        box.left = column - kTurned < box.left ? column - kTurned : box.left;
-        box.top = row - kTurned < box.top ? row - kTurned : box.top;
-        box.right = column + kTurned >= box.right ? column + kTurned + 1 : box.right;
-        box.bottom = row + kTurned >= box.bottom ? row + kTurned + 1 : box.bottom;
+        if (index < 0 || !(cosine * cosine + sine * sine < 1.001f)) return false;
+        const int64_t column = index % image.width, row = index / image.width;
+        box.left = column - kPatternReach < box.left ? column - kPatternReach : box.left;
+        box.top = row - kPatternReach < box.top ? row - kPatternReach : box.top;
+        box.right = column + kPatternReach >= box.right ? column + kPatternReach + 1 : box.right;
+        box.bottom = row + kPatternReach >= box.bottom ? row + kPatternReach + 1 : box.bottom;
     }
     if (box.right == 0) return true;
-    smooth(image, box, work.smooth, work);
+    // 2. Smooth it, and write the descriptors.
+    smooth(image, box, work.smoothed, work);
     for (int64_t i = 0; i < keypoints.rows; ++i) {
         if (keypoints.octaves[i] != octave) continue;
-        compare(work.smooth + place_of(image, keypoints.pixels + 2 * i, inverse), image.width, keypoints.cosines[i],
-                keypoints.sines[i], descriptors + kBytes * i);
+        write_descriptor(work.smoothed + index_in_level(image, keypoints.pixels + 2 * i, inverse), image.width,
+                         keypoints.cosines[i], keypoints.sines[i], descriptors + kBytes * i);
     }
     return true;
 }
@@ -145,14 +161,14 @@ RSE_PF_FUSED int32_t describe_all(Image image, const float* scales, int32_t leve
     for (int32_t level = 0; level <= last; ++level) {
         if (!(scales[level] >= 1.0f && scales[level] < 1e4f)) return -1;
         if (level > 0 && !work.pyramid.shrink(image, whole, scales[level])) return -1;
-        if (!describe(image, keypoints, level, scales[level], work, descriptors)) return -1;
+        if (!describe_level(image, keypoints, level, scales[level], work, descriptors)) return -1;
     }
     return 0;
 }
 
 }  // namespace
 #else
-#pragma GCC diagnostic ignored "-Wunused-parameter"  // not written for other processors: the caller uses OpenCV
+#pragma GCC diagnostic ignored "-Wunused-parameter"  // Other processors have no implementation: the caller uses OpenCV.
 #endif
 
 extern "C" __attribute__((visibility("default"))) int32_t rse_pf_describe(
@@ -166,9 +182,9 @@ extern "C" __attribute__((visibility("default"))) int32_t rse_pf_describe(
         !rse_pf::processor().avx2 || !rse_pf::processor().fma)
         return -1;
     Workspace work;
-    uint8_t* const rest = work.pyramid.lend(workspace, width, height);
+    uint8_t* const rest = work.pyramid.divide_workspace(workspace, width, height);
     work.lines = reinterpret_cast<float*>(rest);
-    work.smooth = rest + (kTaps + 1) * width * static_cast<int64_t>(sizeof(float));
+    work.smoothed = rest + (kTaps + 1) * width * static_cast<int64_t>(sizeof(float));
     return describe_all({gray, width, height}, scales, levels, {pixels, cosines, sines, octaves, rows}, work,
                         descriptors);
 #else

@@ -1,21 +1,32 @@
-// Evidence for and against a proposed pose: probability of chance, geometry, covariance.
+// The evidence of a pose: the expected number of equally good random poses, the shape of the inliers, the covariance.
 #pragma once
 
 #include "kernels.hpp"
 
 namespace RSE_PF_ISA {
 
-constexpr double kMinError2 = 0.01;  // px^2: messages are rounded, and four points may fit by luck
-constexpr double kKeptShare = 0.8;
+// Smallest squared error (px^2) of the false alarm test: messages are rounded, and four points may fit by luck.
+constexpr double kMinError2 = 0.01;
+// Quantile of the distances from and along the main axis that gives width and length of a point set: the farthest fifth
+// may be outliers.
+constexpr double kShapeQuantile = 0.8;
+// Number of inliers at the farthest possible distance that are subtracted before inliers count as wide without a
+// quantile.
 constexpr double kOutlierFactor = 4.0;
+// Width over length above which that bound replaces the exact quantile, which needs a selection over all inliers.
 constexpr double kClearlyWide = 0.15;
+// Cells across the width of the image: inliers in one cell or in adjacent cells count as one independent inlier.
 constexpr double kCellsAcross = 40.0;
+// Occupied cells from which on all inliers count as independent: copies of a few features do not occupy as many.
 constexpr int kManyCells = 24;
+// Largest log10 of the expected number of random poses that fit as well as an accepted pose: one in 100,000 requests.
 constexpr double kMaxLog10FalseAlarms = -5.0;
+// log10(e), which converts natural to decimal logarithms.
 constexpr double kLog10E = 0.43429448190325183;
 
-// Return log10 of the expected number of random poses that `inliers` of n rows fit within largest_error2 (px^2).
-// Source: Moisan and Stival, IJCV 2004; for PnP: Moulon et al., ACCV 2012.
+// Return log10 of the expected number of random poses (number of false alarms, NFA) for which at least `inliers` of n
+// rows have a squared error of at most largest_error2 (px^2) in an image of area_px2; infinity for up to 3 inliers.
+// Sources: a-contrario RANSAC, Moisan and Stival, IJCV 2004; for PnP, Moulon et al., ACCV 2012.
 static double log10_false_alarms(int64_t n, int64_t inliers, double largest_error2, double area_px2) {
     if (inliers <= 3) return kInfinity;
     const double disc = kPi * (largest_error2 > kMinError2 ? largest_error2 : kMinError2) / area_px2;
@@ -25,24 +36,26 @@ static double log10_false_alarms(int64_t n, int64_t inliers, double largest_erro
     return log * kLog10E;
 }
 
-// Return how many of the inliers count as independent: those in the same or in adjacent cells of the image
-// count once, unless very many cells are occupied.
-static int64_t independent_inliers(const double* u, const double* v, int64_t count, double cx, double cy,
-                                   double width) {
+// Count the independent inliers: inliers in the same cell or in adjacent cells of the image count once.  Where
+// kManyCells cells are occupied, return the number of all inliers.  u, v: pixels relative to the principal point (cx,
+// cy).
+static int64_t count_independent_inliers(const double* u, const double* v, int64_t count, double cx, double cy,
+                                         double width) {
+    // 1. List the occupied cells.
     const double scale = kCellsAcross / width;
     int64_t columns[kManyCells], rows[kManyCells];
     int cells = 0;
     for (int64_t i = 0; i < count; ++i) {
         const int64_t column = static_cast<int64_t>((u[i] + cx) * scale),
                       row = static_cast<int64_t>((v[i] + cy) * scale);
-        bool is_known = false;
-        for (int k = 0; k < cells && !is_known; ++k) is_known = columns[k] == column && rows[k] == row;
-        if (is_known) continue;
+        bool is_listed = false;
+        for (int k = 0; k < cells && !is_listed; ++k) is_listed = columns[k] == column && rows[k] == row;
+        if (is_listed) continue;
         columns[cells] = column;
         rows[cells] = row;
         if (++cells == kManyCells) return count;
     }
-    // In order, take each cell that touches none of those taken.
+    // 2. Sort them by column, then by row (insertion sort).
     for (int i = 1; i < cells; ++i)
         for (int k = i; k > 0; --k) {
             if (columns[k - 1] < columns[k] || (columns[k - 1] == columns[k] && rows[k - 1] < rows[k])) break;
@@ -52,24 +65,25 @@ static int64_t independent_inliers(const double* u, const double* v, int64_t cou
             columns[k - 1] = column;
             rows[k - 1] = row;
         }
-    int alone = 0;
+    // 3. In this order, count each cell that touches no counted cell.
+    int counted = 0;
     for (int i = 0; i < cells; ++i) {
         bool touches = false;
-        for (int k = 0; k < alone && !touches; ++k) {
+        for (int k = 0; k < counted && !touches; ++k) {
             const int64_t right = columns[i] - columns[k], down = rows[i] - rows[k];
             touches = (right == 1 && down >= -1 && down <= 1) || (right == 0 && down == 1);
         }
         if (touches) continue;
-        columns[alone] = columns[i];
-        rows[alone] = rows[i];
-        ++alone;
+        columns[counted] = columns[i];
+        rows[counted] = rows[i];
+        ++counted;
     }
-    return alone;
+    return counted;
 }
 
-// Return the number that would stand at `kth` if the numbers were sorted; they are rearranged.
+// Return the k-th smallest number, counted from 0, and rearrange the numbers on the way (quickselect).
 // Source: Hoare, Algorithm 65: FIND, CACM 1961.
-static double selected(double* numbers, int64_t count, int64_t kth) {
+static double select_kth(double* numbers, int64_t count, int64_t kth) {
     int64_t low = 0, high = count - 1;
     while (low < high) {
         const double pivot = numbers[low + (high - low) / 2];
@@ -90,44 +104,52 @@ static double selected(double* numbers, int64_t count, int64_t kth) {
     return numbers[kth];
 }
 
-// Return width over length of points of two or three coordinates (z null for two): 0 on a line, 0 if they
-// coincide.  Width is what 80 % of the points stay below.
-static double width_to_length(const double* x, const double* y, const double* z, int64_t count, double* along,
-                              double* aside) {
-    double middle[3] = {0.0, 0.0, 0.0}, moments[3][3] = {};
-    const double share = 1.0 / static_cast<double>(count);
+// Return width over length of a set of points: 0 if they are collinear or coincide, about 1 if they are round.
+//
+// Length and width are the 80 % quantiles of the distances of the points from their centroid along and across their
+// main axis.  z is null for points of the image.  length2, width2: scratch memory for `count` numbers each.
+static double width_to_length(const double* x, const double* y, const double* z, int64_t count, double* length2,
+                              double* width2) {
+    // 1. Compute centroid and second moments.
+    double centroid[3] = {0.0, 0.0, 0.0}, moments[3][3] = {};
+    const double count_inverse = 1.0 / static_cast<double>(count);
     for (int64_t i = 0; i < count; ++i) {
-        middle[0] += x[i];
-        middle[1] += y[i];
-        middle[2] += z != nullptr ? z[i] : 0.0;
+        centroid[0] += x[i];
+        centroid[1] += y[i];
+        centroid[2] += z != nullptr ? z[i] : 0.0;
     }
-    for (double& each : middle) each *= share;
+    for (double& coordinate : centroid) coordinate *= count_inverse;
     for (int64_t i = 0; i < count; ++i) {
-        const double p[3] = {x[i] - middle[0], y[i] - middle[1], z != nullptr ? z[i] - middle[2] : 0.0};
+        const double p[3] = {x[i] - centroid[0], y[i] - centroid[1], z != nullptr ? z[i] - centroid[2] : 0.0};
         for (int j = 0; j < 3; ++j)
             for (int k = j; k < 3; ++k) moments[j][k] += p[j] * p[k];
     }
     moments[1][0] = moments[0][1];
     moments[2][0] = moments[0][2];
     moments[2][1] = moments[1][2];
+    // 2. Take the main axis, which has the largest second moment.
     double values[3], axes[3][3];
-    eigenvectors(moments, values, axes);
+    compute_eigenvectors(moments, values, axes);
+    // 3. Measure the squared distances along and across the axis.
     for (int64_t i = 0; i < count; ++i) {
-        const double p[3] = {x[i] - middle[0], y[i] - middle[1], z != nullptr ? z[i] - middle[2] : 0.0};
-        const double main = p[0] * axes[2][0] + p[1] * axes[2][1] + p[2] * axes[2][2];
-        along[i] = main * main;
-        aside[i] = (p[0] * p[0] + p[1] * p[1] + p[2] * p[2]) - along[i];
+        const double p[3] = {x[i] - centroid[0], y[i] - centroid[1], z != nullptr ? z[i] - centroid[2] : 0.0};
+        const double along = p[0] * axes[2][0] + p[1] * axes[2][1] + p[2] * axes[2][2];
+        length2[i] = along * along;
+        width2[i] = (p[0] * p[0] + p[1] * p[1] + p[2] * p[2]) - length2[i];
     }
-    const int64_t share_at = static_cast<int64_t>(kKeptShare * static_cast<double>(count));
-    const int64_t kth = share_at < count - 1 ? share_at : count - 1;
-    const double width2 = selected(aside, count, kth), length2 = selected(along, count, kth);
-    if (!(length2 > 1e-18)) return 0.0;
-    return square_root((width2 > 0.0 ? width2 : 0.0) / length2);
+    // 4. Take their quantiles.
+    const int64_t quantile_at = static_cast<int64_t>(kShapeQuantile * static_cast<double>(count));
+    const int64_t kth = quantile_at < count - 1 ? quantile_at : count - 1;
+    const double width_quantile2 = select_kth(width2, count, kth), length_quantile2 = select_kth(length2, count, kth);
+    if (!(length_quantile2 > 1e-18)) return 0.0;
+    return square_root((width_quantile2 > 0.0 ? width_quantile2 : 0.0) / length_quantile2);
 }
 
-// Write how the inliers lie in the image: width over length, and the root mean square distance from their centre.
-static void write_shape(const rse_pf::Workspace& view, int64_t count, const rse_pf_pnp_request& request,
-                        rse_pf_pnp_result& result) {
+// Measure how the inliers lie in the image, and write it to the result: inlier_width_to_length, and radius_px, the root
+// mean square distance from their centroid.
+static void measure_shape(const rse_pf::Workspace& view, int64_t count, const rse_pf_pnp_request& request,
+                          rse_pf_pnp_result& result) {
+    // 1. Sum the pixels and their products.
     typedef Lanes<double> F;
     F u = all(0.0), v = u, uu = u, uv = u, vv = u;
     const int64_t whole = count / kLanes * kLanes;
@@ -149,23 +171,27 @@ static void write_shape(const rse_pf::Workspace& view, int64_t count, const rse_
         suv += pu * pv;
         svv += pv * pv;
     }
+    // 2. Compute the eigenvalues length2 >= width2 of the second moments about the centroid.
     const double k = static_cast<double>(count), mean_u = su / k, mean_v = sv / k;
     const double xx = suu - su * mean_u, xy = suv - su * mean_v, yy = svv - sv * mean_v;
     const double half = 0.5 * (xx - yy), mean = 0.5 * (xx + yy), root = square_root(half * half + xy * xy);
     const double length2 = mean + root, width2 = mean - root, spread = length2 + width2;
     result.radius_px = square_root((spread > 0.0 ? spread : 0.0) / k);
-    // No inlier lies further out than the corner of the image (or, outside it, than three times the rms).
-    const double at_u = mean_u + request.cx, at_v = mean_v + request.cy;
-    const double other_u = request.width - at_u, other_v = request.height - at_v;
-    const double reach_u = at_u > other_u ? at_u : other_u, reach_v = at_v > other_v ? at_v : other_v;
+    // 3. Subtract from width2 what a few outlying inliers may contribute: each the squared distance to the farthest
+    // corner of the image, or the square of three times the radius where that is larger.  If the inliers are still
+    // wide, this bound is the answer; otherwise compute the quantiles, which takes longer.
+    const double left = mean_u + request.cx, top = mean_v + request.cy;
+    const double right = request.width - left, bottom = request.height - top;
+    const double reach_u = left > right ? left : right, reach_v = top > bottom ? top : bottom;
     const double corner2 = reach_u * reach_u + reach_v * reach_v, rms2 = 9.0 * result.radius_px * result.radius_px;
-    const double margin = width2 - kOutlierFactor * (corner2 > rms2 ? corner2 : rms2);
-    if (margin > kClearlyWide * kClearlyWide * length2)
-        result.inlier_thinness = square_root(margin / length2);
+    const double width_bound2 = width2 - kOutlierFactor * (corner2 > rms2 ? corner2 : rms2);
+    if (width_bound2 > kClearlyWide * kClearlyWide * length2)
+        result.inlier_width_to_length = square_root(width_bound2 / length2);
     else
-        result.inlier_thinness = width_to_length(view.u, view.v, nullptr, count, view.along, view.aside);
+        result.inlier_width_to_length = width_to_length(view.u, view.v, nullptr, count, view.length2, view.width2);
 }
 
+// A symmetric 3x3 matrix by its upper triangle.
 struct Symmetric3 {
     double xx, xy, xz, yy, yz, zz;
 };
@@ -184,16 +210,18 @@ RSE_PF_INLINE double at(const Symmetric3& m, int i, int j) {
     return full[i][j];
 }
 
-// Write variance (px^2) times the inverse of J^T J; false where some motion of the camera changes no pixel.
-static bool covariance_of(const Normal& normal, double variance, double (&out)[36]) {
+// Write the covariance of the pose, variance (px^2) times the inverse of J^T J, by the inverse of a 2x2 block matrix.
+// Return false where it does not exist, because some motion of the camera changes no pixel.
+static bool compute_covariance(const Normal& normal, double variance, double (&out)[36]) {
     const double s = 1.0 / variance;
+    // 1. Split J^T J / variance into the blocks A (translation), B (mixed) and D (rotation); P = A^-1.
     const auto& A = normal.A;
     const Symmetric3 P = inverse(
         {A[0][0] * s, A[0][1] * s, A[0][2] * s, A[1][1] * s, A[1][2] * s, A[2][2] * s});
     double B[3][3], W[3][3], S[3][3], X[3][3];
     for (int i = 0; i < 3; ++i)
         for (int j = 0; j < 3; ++j) B[i][j] = A[i][j + 3] * s;
-    // W = A^-1 B, then the Schur complement S = D - B^T W.
+    // 2. W = A^-1 B, and the Schur complement S = D - B^T W, whose inverse is the covariance of the rotation.
     for (int i = 0; i < 3; ++i)
         for (int j = 0; j < 3; ++j)
             W[i][j] = at(P, i, 0) * B[0][j] + at(P, i, 1) * B[1][j] + at(P, i, 2) * B[2][j];
@@ -201,7 +229,7 @@ static bool covariance_of(const Normal& normal, double variance, double (&out)[3
         for (int j = i; j < 3; ++j)
             S[i][j] = A[i + 3][j + 3] * s - B[0][i] * W[0][j] - B[1][i] * W[1][j] - B[2][i] * W[2][j];
     const Symmetric3 Q = inverse({S[0][0], S[0][1], S[0][2], S[1][1], S[1][2], S[2][2]});
-    // X = W S^-1 is minus the block off the diagonal, and the first block is A^-1 + X W^T.
+    // 3. With X = W S^-1, the mixed block of the covariance is -X, and the block of the translation is A^-1 + X W^T.
     for (int i = 0; i < 3; ++i)
         for (int j = 0; j < 3; ++j)
             X[i][j] = W[i][0] * at(Q, 0, j) + W[i][1] * at(Q, 1, j) + W[i][2] * at(Q, 2, j);
@@ -213,8 +241,9 @@ static bool covariance_of(const Normal& normal, double variance, double (&out)[3
         }
     for (int i = 0; i < 3; ++i)
         for (int j = 0; j < 3; ++j) out[6 * i + j + 3] = out[6 * (j + 3) + i] = -X[i][j];
+    // 4. Refuse a covariance that is not finite (x - x is nan then) or has a variance that is not positive.
     double total = 0.0;
-    for (const double each : out) total += each;
+    for (const double element : out) total += element;
     if (!(total - total == 0.0)) return false;
     for (int i = 0; i < 6; ++i)
         if (!(out[7 * i] > 0.0)) return false;

@@ -1,4 +1,5 @@
-// The two loops that take the time: the score of a pose, and the normal equations of a refinement.
+// The two loops that take most of the time of a request: the MSAC cost of a pose, and the normal equations of a
+// refinement step.  Both process eight correspondences at a time.
 #pragma once
 
 #include "small.hpp"
@@ -6,29 +7,30 @@
 
 namespace RSE_PF_ISA {
 
-constexpr double kNear = 1e-6;           // metres; what is nearer lies behind the camera
-constexpr double kNowhere = 1e9;         // pixel of the rows that fill up the last vector: no pose explains it
-constexpr double kFarthest2 = 1e14;      // px^2 beyond which a residual has no weight under Cauchy's loss
-constexpr int64_t kRowsBetweenStops = 64;
+constexpr double kMinDepthM = 1e-6;  // metres: points with a smaller depth count as behind the camera
+constexpr double kPaddingPixel = 1e9;  // pixels: observation of the rows that pad the last vector, never an inlier
+constexpr double kMaxError2 = 1e14;    // px^2: larger squared errors, such as those of padding, have no weight
+constexpr int64_t kRowsBetweenStops = 64;  // rows of the MSAC cost between two tests whether to stop early
 
-struct Optics {
-    double fx, fy;  // pixels
+// Focal lengths in pixels; the principal point was subtracted from the pixels before.
+struct FocalLengths {
+    double fx, fy;
 };
 
-// Return the MSAC score: the sum of squared errors, each at most limit2 (px^2).  It stops at `stop`, and
-// returns a number that is not below it, as soon as the sum has reached it.
+// Return the MSAC cost of a pose (px^2): the sum of the squared reprojection errors, each truncated at limit2 (px^2).
+// As soon as the sum has reached `stop`, the loop ends and some number that is not below `stop` is returned.
 // Source: Torr and Zisserman, MLESAC, CVIU 2000.
-static double score(const rse_pf::Columns<float>& rows, int64_t count, const Optics& optics, const Pose& pose,
+static double msac_cost(const rse_pf::Columns<float>& rows, int64_t count, const FocalLengths& focal, const Pose& pose,
                     double limit2, double stop) {
     typedef Lanes<float> F;
-    const float fx = static_cast<float>(optics.fx), fy = static_cast<float>(optics.fy);
+    const float fx = static_cast<float>(focal.fx), fy = static_cast<float>(focal.fy);
     const F r00 = all(static_cast<float>(pose.R[0][0]) * fx), r01 = all(static_cast<float>(pose.R[0][1]) * fx),
             r02 = all(static_cast<float>(pose.R[0][2]) * fx), tx = all(static_cast<float>(pose.t.x) * fx);
     const F r10 = all(static_cast<float>(pose.R[1][0]) * fy), r11 = all(static_cast<float>(pose.R[1][1]) * fy),
             r12 = all(static_cast<float>(pose.R[1][2]) * fy), ty = all(static_cast<float>(pose.t.y) * fy);
     const F r20 = all(static_cast<float>(pose.R[2][0])), r21 = all(static_cast<float>(pose.R[2][1])),
             r22 = all(static_cast<float>(pose.R[2][2])), tz = all(static_cast<float>(pose.t.z));
-    const F limit = all(static_cast<float>(limit2)), near = all(static_cast<float>(kNear)), one = all(1.0f);
+    const F limit = all(static_cast<float>(limit2)), near = all(static_cast<float>(kMinDepthM)), one = all(1.0f);
     const int64_t end = padded(count);
     double total = 0.0;
     for (int64_t begin = 0; begin < end; begin += kRowsBetweenStops) {
@@ -41,8 +43,8 @@ static double score(const rse_pf::Columns<float>& rows, int64_t count, const Opt
             const F du = (r00 * x + r01 * y + (r02 * z + tx)) * inverse - load(rows.u + i);
             const F dv = (r10 * x + r11 * y + (r12 * z + ty)) * inverse - load(rows.v + i);
             const F error2 = du * du + dv * dv;
-            const F capped = where_less(error2, limit, error2, limit);  // and what is nan, too
-            cost = cost + where_less(near, depth, capped, limit);
+            const F truncated = where_less(error2, limit, error2, limit);  // nan becomes limit as well
+            cost = cost + where_less(near, depth, truncated, limit);
         }
         total += static_cast<double>(sum<float>(cost));
         if (!(total < stop)) break;
@@ -50,17 +52,19 @@ static double score(const rse_pf::Columns<float>& rows, int64_t count, const Opt
     return total;
 }
 
+// Loss of a squared reprojection error e2 (px^2) with the scale limit2 (px^2).
 enum class Loss {
-    kTruncated,  // squared error up to limit2, constant beyond
-    kCauchy,     // limit2 log(1 + squared error / limit2)
-    kSquared,    // squared error; infinite cost where a point lies behind the camera
+    kTruncated,  // min(e2, limit2), the loss of MSAC
+    kCauchy,     // limit2 * log(1 + e2 / limit2)
+    kSquared,    // e2
 };
 
-// Fill the normal equations at `pose` and return the cost; under the truncated loss, `agree` becomes the number
-// of rows that have weight.
+// Fill in the normal equations at a pose, and return the cost (px^2).  The cost is infinite under the Cauchy and the
+// squared loss where a point lies behind the camera.  Under the truncated loss, `inliers` becomes the number of rows
+// with a squared error below limit2.
 template <class T, Loss loss>
-static double linearised(const rse_pf::Columns<T>& rows, int64_t count, const Optics& optics, const Pose& pose,
-                         double limit2, Normal& normal, int64_t& agree) {
+static double linearise(const rse_pf::Columns<T>& rows, int64_t count, const FocalLengths& focal, const Pose& pose,
+                         double limit2, Normal& normal, int64_t& inliers) {
     typedef Lanes<T> F;
     const F r00 = all(static_cast<T>(pose.R[0][0])), r01 = all(static_cast<T>(pose.R[0][1])),
             r02 = all(static_cast<T>(pose.R[0][2])), tx = all(static_cast<T>(pose.t.x));
@@ -68,18 +72,20 @@ static double linearised(const rse_pf::Columns<T>& rows, int64_t count, const Op
             r12 = all(static_cast<T>(pose.R[1][2])), ty = all(static_cast<T>(pose.t.y));
     const F r20 = all(static_cast<T>(pose.R[2][0])), r21 = all(static_cast<T>(pose.R[2][1])),
             r22 = all(static_cast<T>(pose.R[2][2])), tz = all(static_cast<T>(pose.t.z));
-    const F fx = all(static_cast<T>(optics.fx)), fy = all(static_cast<T>(optics.fy));
-    const F limit = all(static_cast<T>(limit2)), near = all(static_cast<T>(kNear));
-    const F farthest = all(static_cast<T>(kFarthest2)), unlikely = all(static_cast<T>(limit2 > 0 ? 1.0 / limit2 : 0));
+    const F fx = all(static_cast<T>(focal.fx)), fy = all(static_cast<T>(focal.fy));
+    const F limit = all(static_cast<T>(limit2)), near = all(static_cast<T>(kMinDepthM));
+    const F max_error2 = all(static_cast<T>(kMaxError2)), limit_inverse = all(static_cast<T>(limit2 > 0 ? 1.0 / limit2 : 0));
     const F one = all(T(1)), zero = all(T(0));
     F A00 = zero, A02 = zero, A03 = zero, A04 = zero, A05 = zero, A11 = zero, A12 = zero, A13 = zero, A14 = zero,
       A15 = zero, A22 = zero, A23 = zero, A24 = zero, A25 = zero, A33 = zero, A34 = zero, A35 = zero, A44 = zero,
       A45 = zero, A55 = zero;
     F b0 = zero, b1 = zero, b2 = zero, b3 = zero, b4 = zero, b5 = zero;
-    F cost = zero, weights = zero, behind = zero, likely = one;
-    double logs = 0.0;
+    F cost = zero, weights = zero, behind = zero;
+    F ratios = one;     // product of (1 + e2 / limit2) of up to 16 rows of each lane, whose logarithm is taken once
+    double logs = 0.0;  // sum of the logarithms
     const int64_t end = padded(count);
     for (int64_t i = 0; i < end; i += kLanes) {
+        // 1. Project the points to the normalised image plane (a, b), and take the residuals (ru, rv) in pixels.
         const F x = load(rows.x + i), y = load(rows.y + i), z = load(rows.z + i);
         const F depth = r20 * x + r21 * y + (r22 * z + tz);
         const F inverse = one / where_less(near, depth, depth, one);
@@ -87,28 +93,31 @@ static double linearised(const rse_pf::Columns<T>& rows, int64_t count, const Op
         const F b = (r10 * x + r11 * y + (r12 * z + ty)) * inverse;
         const F ru = load(rows.u + i) - fx * a, rv = load(rows.v + i) - fy * b;
         const F error2 = ru * ru + rv * rv;
+        // 2. Weigh the rows by the loss (iteratively reweighted least squares), and sum the cost.
         F weight;
         if (loss == Loss::kTruncated) {
             weight = where_less(near, depth, where_less(error2, limit, one, zero), zero);
             cost = cost + where_less(near, depth, where_less(error2, limit, error2, limit), limit);
         } else if (loss == Loss::kCauchy) {
-            const F ratio = one + error2 * unlikely;
-            const F inside = where_less(near, depth, where_less(error2, farthest, one, zero), zero);
+            const F ratio = one + error2 * limit_inverse;
+            const F inside = where_less(near, depth, where_less(error2, max_error2, one, zero), zero);
             weight = inside / ratio;
-            likely = likely * where_less(zero, inside, ratio, one);
+            ratios = ratios * where_less(zero, inside, ratio, one);
             behind = behind + where_less(near, depth, zero, one);
             if ((i / kLanes) % 16 == 15 || i + kLanes >= end) {
-                alignas(64) T each[kLanes];
-                store(each, likely);
-                for (int k = 0; k < kLanes; ++k) logs += natural_log(static_cast<double>(each[k]));
-                likely = one;
+                alignas(64) T product[kLanes];
+                store(product, ratios);
+                for (int k = 0; k < kLanes; ++k) logs += natural_log(static_cast<double>(product[k]));
+                ratios = one;
             }
         } else {
-            weight = where_less(error2, farthest, one, zero);
+            weight = where_less(error2, max_error2, one, zero);
             cost = cost + error2 * weight;
             behind = behind + where_less(near, depth, zero, one) * weight;
         }
         if (loss == Loss::kTruncated) weights = weights + weight;
+        // 3. Add the rows to A = J^T W J and b = J^T W r.  With the inverse depth i the rows of the Jacobian are
+        // du = fx * (i, 0, -a i, -a b, 1 + a^2, -b) and dv = fy * (0, i, -b i, -(1 + b^2), a b, a).
         const F gu = weight * fx, gv = weight * fy;
         const F wu = gu * fx, wv = gv * fy;
         const F eu = gu * ru, ev = gv * rv;
@@ -143,6 +152,7 @@ static double linearised(const rse_pf::Columns<T>& rows, int64_t count, const Op
         b4 = b4 + (eu * a1 + ev * ab);
         b5 = b5 + (ev * a - eu * b);
     }
+    // 4. Sum the lanes.
     const F* upper[6][6] = {{&A00, &zero, &A02, &A03, &A04, &A05}, {nullptr, &A11, &A12, &A13, &A14, &A15},
                             {nullptr, nullptr, &A22, &A23, &A24, &A25}, {nullptr, nullptr, nullptr, &A33, &A34, &A35},
                             {nullptr, nullptr, nullptr, nullptr, &A44, &A45}, {nullptr, nullptr, nullptr, nullptr, nullptr, &A55}};
@@ -152,22 +162,22 @@ static double linearised(const rse_pf::Columns<T>& rows, int64_t count, const Op
         normal.b[i] = static_cast<double>(sum<T>(*right[i]));
     }
     if (loss == Loss::kTruncated) {
-        agree = static_cast<int64_t>(sum<T>(weights));
+        inliers = static_cast<int64_t>(sum<T>(weights));
         return static_cast<double>(sum<T>(cost));
     }
     if (static_cast<double>(sum<T>(behind)) > 0.0) return kInfinity;
     return loss == Loss::kCauchy ? limit2 * logs : static_cast<double>(sum<T>(cost));
 }
 
-// Fill the view of the first `count` rows from `pose`: projected pixels from the principal point, 1/z, and
-// squared errors (px^2), infinite behind the camera.
-static void project(const rse_pf::Columns<double>& rows, int64_t count, const Optics& optics, const Pose& pose,
+// Project `count` rows by a pose, and write to the workspace for each row the pixel relative to the principal point,
+// the inverse depth (1/m), and the squared reprojection error (px^2), which is infinite behind the camera.
+static void project(const rse_pf::Columns<double>& rows, int64_t count, const FocalLengths& focal, const Pose& pose,
                     const rse_pf::Workspace& view) {
     typedef Lanes<double> F;
     const F r00 = all(pose.R[0][0]), r01 = all(pose.R[0][1]), r02 = all(pose.R[0][2]), tx = all(pose.t.x);
     const F r10 = all(pose.R[1][0]), r11 = all(pose.R[1][1]), r12 = all(pose.R[1][2]), ty = all(pose.t.y);
     const F r20 = all(pose.R[2][0]), r21 = all(pose.R[2][1]), r22 = all(pose.R[2][2]), tz = all(pose.t.z);
-    const F fx = all(optics.fx), fy = all(optics.fy), near = all(kNear), one = all(1.0), never = all(kInfinity);
+    const F fx = all(focal.fx), fy = all(focal.fy), near = all(kMinDepthM), one = all(1.0), never = all(kInfinity);
     const int64_t end = padded(count);
     for (int64_t i = 0; i < end; i += kLanes) {
         const F x = load(rows.x + i), y = load(rows.y + i), z = load(rows.z + i);

@@ -1,10 +1,11 @@
-// Eight numbers at a time, with the same bytes on every processor.
+// Vectors of eight numbers ("lanes"), whose results are the same bytes on every processor.
 //
-// A vector of eight is one register, or a pair of narrower vectors; what is computed in a lane
-// never depends on that, because every operation is a single IEEE operation (the build forbids contraction)
-// and sums over lanes have one fixed order.  This header is compiled once for each set of instructions, inside
-// the namespace RSE_PF_ISA, and uses no templates of the standard library, so no function compiled for AVX2
-// can be linked into the portable solver.
+// A vector is one register, or a pair of narrower vectors where registers are narrower.  The width changes no result,
+// because every operation is a single IEEE 754 operation (the build forbids contraction), and because the eight lanes
+// are summed in one fixed order.
+//
+// This header is compiled once for each set of instructions, inside the namespace RSE_PF_ISA.  It uses no templates of
+// the standard library: the linker could otherwise take a function compiled for AVX2 into the portable solver.
 #pragma once
 
 #include <cstdint>
@@ -13,6 +14,7 @@
 
 namespace RSE_PF_ISA {
 
+// Numbers in a vector: eight doubles fill a register of AVX-512.
 constexpr int64_t kLanes = 8;
 
 typedef float Float4 __attribute__((vector_size(16)));
@@ -54,7 +56,7 @@ RSE_PF_INLINE Pair<V> operator/(const Pair<V>& a, const Pair<V>& b) {
     return {a.low / b.low, a.high / b.high};
 }
 
-// Return `yes` in the lanes where a < b, else `no`.
+// Return for each lane the value of `yes` where a < b, else (also where a or b is nan) the value of `no`.
 RSE_PF_INLINE Float4 where_less(Float4 a, Float4 b, Float4 yes, Float4 no) { return a < b ? yes : no; }
 RSE_PF_INLINE Float8 where_less(Float8 a, Float8 b, Float8 yes, Float8 no) { return a < b ? yes : no; }
 RSE_PF_INLINE Double2 where_less(Double2 a, Double2 b, Double2 yes, Double2 no) { return a < b ? yes : no; }
@@ -78,7 +80,7 @@ struct LanesOf<double> {
 template <class T>
 using Lanes = typename LanesOf<T>::type;
 
-// Arrays are aligned to 64 bytes and padded to a multiple of eight, so a whole vector may be copied.
+// Read eight numbers; the arrays of a Workspace are aligned to 64 bytes and padded to a multiple of eight.
 template <class T>
 RSE_PF_INLINE Lanes<T> load(const T* from) {
     Lanes<T> lanes;
@@ -110,14 +112,15 @@ RSE_PF_INLINE Lanes<T> all(T value) {
     return lanes;
 }
 
-// Return the sum of the eight lanes, always in the same order.
+// Return the sum of the eight lanes, in one order on every processor.
 template <class T>
 RSE_PF_INLINE T sum(const Lanes<T>& lanes) {
-    alignas(64) T each[kLanes];
-    store(each, lanes);
-    return ((each[0] + each[1]) + (each[2] + each[3])) + ((each[4] + each[5]) + (each[6] + each[7]));
+    alignas(64) T x[kLanes];
+    store(x, lanes);
+    return ((x[0] + x[1]) + (x[2] + x[3])) + ((x[4] + x[5]) + (x[6] + x[7]));
 }
 
+// Return the number of rows, rounded up to whole vectors.
 RSE_PF_INLINE int64_t padded(int64_t rows) { return (rows + kLanes - 1) / kLanes * kLanes; }
 
 }  // namespace RSE_PF_ISA

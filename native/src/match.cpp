@@ -1,7 +1,7 @@
-// Points at keypoints, and matches of 256-bit descriptors by Hamming distance.
+// Back-projection of keypoints by a depth image, and brute-force matching of 256-bit descriptors.
 //
-// The caller lends all memory.  The results are integers, or single IEEE operations in one order, so the
-// instructions chosen below change no byte.
+// The caller provides all memory.  The results are integers, or single IEEE 754 operations in one order, so the choice
+// of instructions changes no byte.
 #include "rse_pf_match.h"
 
 #include <cstring>
@@ -12,14 +12,21 @@ namespace {
 
 using namespace rse_pf_match_detail;
 
+// Most keypoints or descriptors of one call.
 constexpr int64_t kMaxRows = int64_t{1} << 24;
+// Largest height or width of a depth image, pixels.
 constexpr int64_t kMaxSide = int64_t{1} << 16;
-constexpr int kPatch = 9, kLeastReadings = 5;
+// Pixels of a patch of 3 x 3.
+constexpr int kPatch = 9;
+// Fewest valid depths of a patch whose median is used: more than half.
+constexpr int kMinDepths = 5;
+// Number of keypoints that memory is fetched ahead, so that it has arrived when their median is computed.
 constexpr int64_t kAhead = 16;
 
 double not_a_number() { return __builtin_nan(""); }
 
-// A sorting network of 25 exchanges for nine numbers (Floyd 1964; Knuth, TAOCP 3, sect. 5.3.4): no branches.
+// A sorting network of 25 exchanges for nine numbers, which needs no branches (Floyd 1964; Knuth, TAOCP 3, Sect.
+// 5.3.4).
 constexpr int8_t kExchanges[][2] = {{0, 3}, {1, 7}, {2, 5}, {4, 8}, {0, 7}, {2, 4}, {3, 8}, {5, 6}, {0, 2},
                                     {1, 3}, {4, 5}, {7, 8}, {1, 4}, {3, 6}, {5, 7}, {0, 1}, {2, 4}, {3, 5},
                                     {6, 8}, {2, 3}, {4, 5}, {6, 7}, {1, 2}, {3, 4}, {5, 6}};
@@ -29,41 +36,46 @@ struct DepthImage {
     int64_t width, height;
 };
 
-// Return the index of the first reading of a pixel's patch, -1 if the patch is not inside.
-int64_t patch_at(const DepthImage& image, const double* pixel) {
+// Return the index of the first depth of a pixel's patch, -1 if the patch is not inside the image.
+int64_t first_of_patch(const DepthImage& image, const double* pixel) {
     const double column = __builtin_rint(pixel[0]), row = __builtin_rint(pixel[1]);
     const bool is_inside = column >= 1.0 && row >= 1.0 && column < static_cast<double>(image.width - 1) &&
                            row < static_cast<double>(image.height - 1);
     return is_inside ? (static_cast<int64_t>(row) - 1) * image.width + static_cast<int64_t>(column) - 1 : -1;
 }
 
-// A camera's image is in no cache, and its patches lie anywhere: fetch them while others are sorted.
-void fetch(const DepthImage& image, int64_t first) {
+// Fetch a patch into the cache while others are sorted: a camera's image is in no cache, and its patches are in no
+// order.
+void prefetch_patch(const DepthImage& image, int64_t first) {
     if (first < 0) return;
     for (int64_t row = 0; row < 3; ++row) __builtin_prefetch(image.depth_m + first + row * image.width);
 }
 
-// Return the median of the 3x3 patch that begins at an index, NaN where it cannot be trusted.
-double median_of_patch(const DepthImage& image, int64_t first, double least, double most, double spread) {
+// Return the median depth (metres) of the 3x3 patch that begins at an index.  NaN where fewer than kMinDepths are
+// valid, where they differ by `spread` times the median or more (a depth edge), or where the median is out of range.
+double median_of_patch(const DepthImage& image, int64_t first, double min_depth_m, double max_depth_m, double spread) {
+    // 1. Read the depths; invalid ones become infinite, and are sorted to the end.
     float ascending[kPatch];
     int count = 0;
     for (int k = 0; k < kPatch; ++k) {
-        const float reading = image.depth_m[first + k / 3 * image.width + k % 3];
-        const bool is_valid = reading > 0.0f && reading <= __FLT_MAX__;
+        const float depth = image.depth_m[first + k / 3 * image.width + k % 3];
+        const bool is_valid = depth > 0.0f && depth <= __FLT_MAX__;
         count += is_valid ? 1 : 0;
-        ascending[k] = is_valid ? reading : __builtin_inff();
+        ascending[k] = is_valid ? depth : __builtin_inff();
     }
-    if (count < kLeastReadings) return not_a_number();
+    if (count < kMinDepths) return not_a_number();
+    // 2. Sort them.
 #pragma GCC unroll 25
     for (const auto& pair : kExchanges) {
         const float a = ascending[pair[0]], b = ascending[pair[1]];
         ascending[pair[0]] = b < a ? b : a;
         ascending[pair[1]] = b < a ? a : b;
     }
+    // 3. Take the median of the valid depths, and test it.
     const double median = static_cast<double>(ascending[(count - 1) / 2]);
-    const double apart = static_cast<double>(ascending[count - 1]) - static_cast<double>(ascending[0]);
-    const bool is_trusted = apart < median * spread && median >= least && median <= most;
-    return is_trusted ? median : not_a_number();
+    const double difference = static_cast<double>(ascending[count - 1]) - static_cast<double>(ascending[0]);
+    const bool is_reliable = difference < median * spread && median >= min_depth_m && median <= max_depth_m;
+    return is_reliable ? median : not_a_number();
 }
 
 }  // namespace
@@ -82,8 +94,8 @@ __attribute__((visibility("default"))) int32_t rse_pf_points_at(const float* dep
         return -1;
     const DepthImage image = {depth_m, width, height};
     for (int64_t i = 0; i < rows; ++i) {
-        if (i + kAhead < rows) fetch(image, patch_at(image, pixels + 2 * (i + kAhead)));
-        const int64_t first = patch_at(image, pixels + 2 * i);
+        if (i + kAhead < rows) prefetch_patch(image, first_of_patch(image, pixels + 2 * (i + kAhead)));
+        const int64_t first = first_of_patch(image, pixels + 2 * i);
         const double z = first < 0 ? not_a_number() : median_of_patch(image, first, min_depth_m, max_depth_m, spread);
         points_camera[3 * i] = (pixels[2 * i] - cx) / fx * z;
         points_camera[3 * i + 1] = (pixels[2 * i + 1] - cy) / fy * z;
@@ -100,38 +112,40 @@ __attribute__((visibility("default"))) int64_t rse_pf_match(const uint8_t* refer
         reference_rows < 0 || reference_rows > kMaxRows || frame_rows < 0 || frame_rows > kMaxRows)
         return -1;
     if (frame_rows < 2) return 0;
-    uint64_t* const nearest = workspace;               // of each reference row
-    uint64_t* const takers = nearest + reference_rows;  // of each frame row: distance and reference row
-    const Lanes most = (flags & RSE_PF_MATCH_PORTABLE) != 0 ? Lanes::words
-                       : (flags & RSE_PF_MATCH_AVX2) != 0   ? Lanes::avx2
-                                                            : Lanes::avx512;
-    const Search search = prepared(frame, frame_rows, takers + frame_rows, most);
+    uint64_t* const nearest = workspace;  // for each reference row the frame row that it chooses, or kNone
+    uint64_t* const best_of_frame_row = nearest + reference_rows;  // the best candidate that chose a frame row
+    const Lanes widest = (flags & RSE_PF_MATCH_PORTABLE) != 0 ? Lanes::words
+                         : (flags & RSE_PF_MATCH_AVX2) != 0   ? Lanes::avx2
+                                                              : Lanes::avx512;
+    const Search search = prepare_search(frame, frame_rows, best_of_frame_row + frame_rows, widest);
 
-    std::memset(takers, 0xff, static_cast<size_t>(frame_rows) * sizeof *takers);
+    // 1. Each reference row chooses the nearest frame row, if the ratio test allows; a frame row keeps the nearest of
+    // the reference rows that choose it.
+    std::memset(best_of_frame_row, 0xff, static_cast<size_t>(frame_rows) * sizeof *best_of_frame_row);
     for (int64_t row = 0; row < reference_rows; ++row) {
         nearest[row] = kNone;
-        const Nearest found = two_nearest(search, reference + kBytes * row);
-        const double first = static_cast<double>(distance_of(found.first));
-        if (!(first < ratio * static_cast<double>(distance_of(found.second)))) continue;
-        nearest[row] = row_of(found.first);
-        const uint64_t taker = key(distance_of(found.first), static_cast<uint64_t>(row));
-        if (taker < takers[nearest[row]]) takers[nearest[row]] = taker;
+        const TwoNearest two = find_two_nearest(search, reference + kBytes * row);
+        const double first = static_cast<double>(distance_of(two.first));
+        if (!(first < ratio * static_cast<double>(distance_of(two.second)))) continue;
+        nearest[row] = row_of(two.first);
+        const uint64_t candidate = make_candidate(distance_of(two.first), static_cast<uint64_t>(row));
+        if (candidate < best_of_frame_row[nearest[row]]) best_of_frame_row[nearest[row]] = candidate;
     }
 
-    // The rows that kept their frame row, the nearest first: one place for each distance.
-    int64_t places[kBits + 2] = {};
-    const auto has_kept = [&](int64_t row) {
-        return nearest[row] != kNone && row_of(takers[nearest[row]]) == static_cast<uint64_t>(row);
+    // 2. Write the matches by ascending distance, by a counting sort over the distances 0..256.
+    int64_t starts[kBits + 2] = {};
+    const auto is_matched = [&](int64_t row) {
+        return nearest[row] != kNone && row_of(best_of_frame_row[nearest[row]]) == static_cast<uint64_t>(row);
     };
     for (int64_t row = 0; row < reference_rows; ++row)
-        if (has_kept(row)) ++places[distance_of(takers[nearest[row]]) + 1];
-    for (int64_t distance = 0; distance <= kBits; ++distance) places[distance + 1] += places[distance];
-    const int64_t count = places[kBits + 1];
+        if (is_matched(row)) ++starts[distance_of(best_of_frame_row[nearest[row]]) + 1];
+    for (int64_t distance = 0; distance <= kBits; ++distance) starts[distance + 1] += starts[distance];
+    const int64_t count = starts[kBits + 1];
     for (int64_t row = 0; row < reference_rows; ++row) {
-        if (!has_kept(row)) continue;
-        const int64_t place = places[distance_of(takers[nearest[row]])]++;
-        rows[place] = row;
-        columns[place] = static_cast<int64_t>(nearest[row]);
+        if (!is_matched(row)) continue;
+        const int64_t match = starts[distance_of(best_of_frame_row[nearest[row]])]++;
+        rows[match] = row;
+        columns[match] = static_cast<int64_t>(nearest[row]);
     }
     return count;
 }

@@ -1,5 +1,5 @@
-// Where ORB compares intensities (Rublee et al., ICCV 2011, sect. 4.3), as OpenCV does.  The first places of the 256
-// pairs stand before the second ones; pixels from the keypoint.
+// The pixels that ORB compares (Rublee et al., ICCV 2011, Sect. 4.3), equal to OpenCV's: columns and rows relative to
+// the keypoint, in pixels of its level.  Bit k of a descriptor compares pixel k with pixel k + 256.
 #pragma once
 
 constexpr float kPatternX[512] = {

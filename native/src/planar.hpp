@@ -1,37 +1,48 @@
-// The second pose of a plane: under weak perspective, a plane and its mirror image look alike.
+// The second pose of a planar scene: under weak perspective, a tilted plane looks like the plane tilted the other way.
 //
-// Source: Schweighofer and Pinz, PAMI 2006; Collins and Bartoli, IJCV 2014.
+// Sources: Schweighofer and Pinz, Robust Pose Estimation from a Planar Target, PAMI 2006; Collins and Bartoli,
+// Infinitesimal Plane-Based Pose Estimation, IJCV 2014.
 #pragma once
 
 #include "kernels.hpp"
 
 namespace RSE_PF_ISA {
 
-constexpr double kWeakPerspective = 0.08;  // variation of 1/z below which a plane may have two poses
-constexpr int kMirrorSteps = 15;
-constexpr double kMaxMirrorStep = 10.0, kConverged = 1e-7;
-constexpr double kDistinctMetres = 0.05;
-constexpr double kDistinctSine = 0.017452406437283512;  // of 1 degree
+// Standard deviation over mean of the inliers' inverse depths below which a second pose is sought: above it,
+// perspective distinguishes the two poses.
+constexpr double kWeakPerspective = 0.08;
+// Iterations of the refinement of the second pose: it starts near its minimum.
+constexpr int kSecondPoseIterations = 15;
+// Largest component of a step of that refinement (metres, radians): a larger one shows that it diverges.
+constexpr double kMaxSecondPoseStep = 10.0;
+// Relative decrease of the cost below which that refinement has converged.
+constexpr double kConvergedDecrease = 1e-7;
+// Poses whose translations differ by less than this (metres) and whose rotations differ by less than 1 degree count as
+// the same pose.
+constexpr double kSameTranslationM = 0.05;
+// Sine of the largest angle, 1 degree, between the rotations of two poses that count as the same.
+constexpr double kSameRotationSine = 0.017452406437283512;
 
-static bool refine_mirrored(const rse_pf::Columns<double>& rows, int64_t count, const Optics& optics, Pose& pose) {
+// Refine a pose by the Levenberg-Marquardt method under the squared loss; return false if it diverges.
+static bool refine_second_pose(const rse_pf::Columns<double>& rows, int64_t count, const FocalLengths& focal, Pose& pose) {
     Normal normal, next_normal;
-    int64_t agree = 0;
+    int64_t unused_inliers = 0;
     double damping = 1e-3;
-    double cost = linearised<double, Loss::kSquared>(rows, count, optics, pose, 0.0, normal, agree);
+    double cost = linearise<double, Loss::kSquared>(rows, count, focal, pose, 0.0, normal, unused_inliers);
     if (!(cost < kInfinity)) return false;
-    for (int step = 0; step < kMirrorSteps; ++step) {
-        double twist[6], length = 0.0;
-        if (!solved(normal, damping, twist)) return false;
-        for (const double each : twist) length = absolute(each) > length ? absolute(each) : length;
-        if (!(length < kMaxMirrorStep)) return false;
-        const Pose next = moved_along(twist, pose);
+    for (int step = 0; step < kSecondPoseIterations; ++step) {
+        double twist[6], largest = 0.0;
+        if (!solve_normal_equations(normal, damping, twist)) return false;
+        for (const double component : twist) largest = absolute(component) > largest ? absolute(component) : largest;
+        if (!(largest < kMaxSecondPoseStep)) return false;
+        const Pose next = apply_twist(twist, pose);
         const double next_cost =
-            linearised<double, Loss::kSquared>(rows, count, optics, next, 0.0, next_normal, agree);
+            linearise<double, Loss::kSquared>(rows, count, focal, next, 0.0, next_normal, unused_inliers);
         if (next_cost > cost) {
             damping *= 10.0;
             continue;
         }
-        const bool has_converged = cost - next_cost < kConverged * cost;
+        const bool has_converged = cost - next_cost < kConvergedDecrease * cost;
         pose = next;
         cost = next_cost;
         normal = next_normal;
@@ -41,24 +52,30 @@ static bool refine_mirrored(const rse_pf::Columns<double>& rows, int64_t count, 
     return true;
 }
 
-// Find the second pose of the gathered inliers and its sum of squared errors (px^2), which is -1 where the
-// refinement fails or comes back to `pose`.  `origin` is the origin of the rows in the caller's world.
-static double second_pose(const rse_pf::Workspace& data, int64_t count, const Optics& optics, const Pose& pose,
-                          const Vector3& origin, Pose& other) {
+// Find the second pose of a planar scene, and return its sum of squared reprojection errors over the inliers (px^2), or
+// -1 where there is none: the refinement diverges, or returns to the first pose.
+//
+// data.inliers holds the `count` inliers of the first pose; `origin` is the caller's world origin that was subtracted
+// from the points.
+static double find_second_pose(const rse_pf::Workspace& data, int64_t count, const FocalLengths& focal, const Pose& pose,
+                               const Vector3& origin, Pose& second) {
     const rse_pf::Columns<double>& rows = data.inliers;
+    // 1. Fit a plane to the inliers in the camera frame: its normal is the axis of the smallest second moment.
     Vector3 centre = {0.0, 0.0, 0.0};
     for (int64_t i = 0; i < count; ++i)
-        centre = centre + (rotated(pose.R, {rows.x[i], rows.y[i], rows.z[i]}) + pose.t);
+        centre = centre + (rotate(pose.R, {rows.x[i], rows.y[i], rows.z[i]}) + pose.t);
     centre = centre * (1.0 / static_cast<double>(count));
     double moments[3][3] = {}, values[3], axes[3][3];
     for (int64_t i = 0; i < count; ++i) {
-        const Vector3 p = rotated(pose.R, {rows.x[i], rows.y[i], rows.z[i]}) + pose.t - centre;
-        const double each[3] = {p.x, p.y, p.z};
+        const Vector3 p = rotate(pose.R, {rows.x[i], rows.y[i], rows.z[i]}) + pose.t - centre;
+        const double xyz[3] = {p.x, p.y, p.z};
         for (int j = 0; j < 3; ++j)
-            for (int k = 0; k < 3; ++k) moments[j][k] += each[j] * each[k];
+            for (int k = 0; k < 3; ++k) moments[j][k] += xyz[j] * xyz[k];
     }
-    eigenvectors(moments, values, axes);
-    const Vector3 sight = normalised(centre), normal = {axes[0][0], axes[0][1], axes[0][2]};
+    compute_eigenvectors(moments, values, axes);
+    // 2. Rotate the plane about its centroid so that its normal becomes the reflection of the normal in the plane that
+    // is perpendicular to the line of sight.
+    const Vector3 sight = normalise(centre), normal = {axes[0][0], axes[0][1], axes[0][2]};
     const Vector3 mirrored = normal - sight * (2.0 * dot(normal, sight));
     Vector3 axis = cross(normal, mirrored);
     const double sine = square_root(dot(axis, axis));
@@ -70,32 +87,34 @@ static double second_pose(const rse_pf::Workspace& data, int64_t count, const Op
     if (!(sine >= 1e-6)) return -1.0;
     const Vector3 k = axis * (1.0 / sine);
     const double c = 1.0 - cosine;
-    const double turn[3][3] = {
+    const double rotation[3][3] = {  // Rodrigues' formula
         {cosine + c * k.x * k.x, c * k.x * k.y - sine * k.z, c * k.x * k.z + sine * k.y},
         {c * k.x * k.y + sine * k.z, cosine + c * k.y * k.y, c * k.y * k.z - sine * k.x},
         {c * k.x * k.z - sine * k.y, c * k.y * k.z + sine * k.x, cosine + c * k.z * k.z},
     };
-    other = moved(turn, centre - rotated(turn, centre), pose);
-    if (!refine_mirrored(rows, count, optics, other)) return -1.0;
-    // The poses are told apart as pose_difference in rse_pf/geometry.py does, in the caller's world.
+    second = compose(rotation, centre - rotate(rotation, centre), pose);
+    // 3. Refine the rotated pose.
+    if (!refine_second_pose(rows, count, focal, second)) return -1.0;
+    // 4. Compare both poses in the caller's world, as pose_difference of rse_pf/geometry.py does.
     double D[3][3];
     for (int i = 0; i < 3; ++i)
         for (int j = 0; j < 3; ++j)
-            D[i][j] = other.R[0][i] * pose.R[0][j] + other.R[1][i] * pose.R[1][j] + other.R[2][i] * pose.R[2][j];
-    const Vector3 apart = (pose.t - rotated(pose.R, origin)) - (other.t - rotated(other.R, origin));
-    const double metres = square_root(dot(apart, apart));
+            D[i][j] = second.R[0][i] * pose.R[0][j] + second.R[1][i] * pose.R[1][j] + second.R[2][i] * pose.R[2][j];
+    const Vector3 offset = (pose.t - rotate(pose.R, origin)) - (second.t - rotate(second.R, origin));
+    const double distance_m = square_root(dot(offset, offset));
     const double a = D[2][1] - D[1][2], b = D[0][2] - D[2][0], d = D[1][0] - D[0][1];
-    const double sine_apart = 0.5 * square_root(a * a + b * b + d * d);
-    const double cosine_apart = 0.5 * (D[0][0] + D[1][1] + D[2][2] - 1.0);
-    if (metres < kDistinctMetres && cosine_apart > 0.0 && sine_apart < kDistinctSine) return -1.0;
-    project(rows, count, optics, other, data);
+    const double angle_sine = 0.5 * square_root(a * a + b * b + d * d);
+    const double angle_cosine = 0.5 * (D[0][0] + D[1][1] + D[2][2] - 1.0);
+    if (distance_m < kSameTranslationM && angle_cosine > 0.0 && angle_sine < kSameRotationSine) return -1.0;
+    // 5. Sum the squared errors.
+    project(rows, count, focal, second, data);
     double squares = 0.0;
     for (int64_t i = 0; i < count; ++i) squares += data.error2[i];
     return squares;
 }
 
-// Return the standard deviation of 1/z over its mean, for the rows in the view.
-static double depth_variation(const rse_pf::Workspace& view, int64_t count) {
+// Return the standard deviation of the inverse depth over its mean, for the first `count` rows that `project` wrote.
+static double inverse_depth_variation(const rse_pf::Workspace& view, int64_t count) {
     double w = 0.0, ww = 0.0;
     for (int64_t i = 0; i < count; ++i) {
         w += view.z_inverse[i];

@@ -1,4 +1,4 @@
-// The solver for every processor of the architecture.
+// The solver, compiled for every processor of the architecture (on x86-64: x86-64-v2).
 #define RSE_PF_ISA rse_pf_portable
 #include "solve.hpp"
 

@@ -1,5 +1,5 @@
-// What the processor can do and the operating system allows: own checks, because __builtin_cpu_supports answers 0
-// in a library that zig builds.
+// The vector instructions that the processor has and the operating system supports.  The library reads CPUID itself,
+// because __builtin_cpu_supports returns 0 in a library that zig 0.17 compiled.
 #pragma once
 
 namespace rse_pf {
@@ -10,7 +10,7 @@ struct Processor {
     bool avx512_popcount;  // AVX-512 F and VPOPCNTDQ
 };
 
-// Return what this process may use; asked once, when the library is loaded.
+// Return the instructions that this process may use; they are determined once, when the library is loaded.
 const Processor& processor();
 
 }  // namespace rse_pf

@@ -1,4 +1,5 @@
-// The levels of ORB's pyramid, which are integers: bit by bit those of OpenCV (INTER_LINEAR_EXACT).
+// The levels of ORB's image pyramid, equal bit by bit to OpenCV's (cv::resize with INTER_LINEAR_EXACT): bilinear
+// interpolation in fixed-point numbers, with weights in 1/256.
 #pragma once
 
 #include <smmintrin.h>
@@ -8,110 +9,124 @@
 
 namespace rse_pf {
 
-constexpr int64_t kMaxSide = int64_t{1} << 14, kMaxRows = int64_t{1} << 24;
+// Largest height or width of an image, pixels: the index of a pixel then fits into 32 bits.
+constexpr int64_t kMaxSide = int64_t{1} << 14;
+// Most keypoints of one call.
+constexpr int64_t kMaxRows = int64_t{1} << 24;
+// Most levels of a pyramid.
 constexpr int32_t kMaxLevels = 32;
-constexpr int64_t kEightBytes = 80;
+// Bytes of an EightPixels, which the workspace of the caller holds.
+constexpr int64_t kEightPixelsBytes = 80;
 
 struct Image {
     const uint8_t* pixels;
     int64_t width, height;
 };
 
-// How a line is made shorter: for each output pixel the first of two input pixels, and the share of the second.
-struct Shares {
+// Horizontal interpolation: for each output pixel the first of two neighbouring input pixels, and the weight of the
+// second in 1/256.
+struct Weights {
     int32_t* from;
-    uint16_t* share;
+    uint16_t* weight;
 };
 
-// What making a level smaller needs, for the widest level.
-struct Shortening {
-    Shares across;
-    uint16_t *above, *under;  // shortened lines
-    uint8_t* eights;          // for eight output pixels each
+// Memory for the computation of one level; it has room for the widest level.
+struct ResizeMemory {
+    Weights columns;
+    uint16_t *above, *below;  // two input lines after horizontal interpolation, in 1/256 grey levels
+    uint8_t* eights;          // EightPixels of a line
 };
 
-inline int64_t rounded(float value) { return static_cast<int64_t>(__builtin_rintf(value)); }
+inline int64_t round_to_integer(float value) { return static_cast<int64_t>(__builtin_rintf(value)); }
 
-// Where an output pixel lies between two input pixels: the first one, and the share of the second in 256.
-inline void between(int64_t at, double scale, int64_t size, int64_t& from, uint16_t& share) {
-    const double place = scale * (static_cast<double>(at) + 0.5) - 0.5;
-    const double below = __builtin_floor(place);
-    from = below < 0.0 ? 0 : static_cast<int64_t>(below);
-    share = below < 0.0 ? uint16_t{0} : static_cast<uint16_t>(__builtin_rint((place - below) * 256.0));
+// Find the two neighbouring input pixels (or lines) between which output pixel `at` lies: the first one, and the weight
+// of the second in 1/256.  `scale` is the input size over the output size, `size` the input size.
+inline void find_neighbours(int64_t at, double scale, int64_t size, int64_t& from, uint16_t& weight) {
+    const double position = scale * (static_cast<double>(at) + 0.5) - 0.5;
+    const double whole = __builtin_floor(position);
+    from = whole < 0.0 ? 0 : static_cast<int64_t>(whole);
+    weight = whole < 0.0 ? uint16_t{0} : static_cast<uint16_t>(__builtin_rint((position - whole) * 256.0));
     if (from >= size - 1) {
         from = size - 2;
-        share = 256;
+        weight = 256;
     }
 }
 
-inline void shorten(const uint8_t* line, const Shares& shares, int64_t width, uint16_t* to) {
+// Interpolate a line horizontally, one pixel at a time.
+inline void interpolate_line(const uint8_t* line, const Weights& weights, int64_t width, uint16_t* to) {
     for (int64_t x = 0; x < width; ++x) {
-        const uint8_t* const at = line + shares.from[x];
-        to[x] = static_cast<uint16_t>(at[0] * (256 - shares.share[x]) + at[1] * shares.share[x]);
+        const uint8_t* const at = line + weights.from[x];
+        to[x] = static_cast<uint16_t>(at[0] * (256 - weights.weight[x]) + at[1] * weights.weight[x]);
     }
 }
 
-inline void blend(const uint16_t* above, const uint16_t* under, uint32_t share, int64_t begin, int64_t width, uint8_t* to) {
+// Interpolate vertically between two lines, one pixel at a time, from column `begin` on.
+inline void blend_lines(const uint16_t* above, const uint16_t* below, uint32_t weight, int64_t begin, int64_t width,
+                        uint8_t* to) {
     for (int64_t x = begin; x < width; ++x)
-        to[x] = static_cast<uint8_t>((above[x] * (256 - share) + under[x] * share + 32768) >> 16);
+        to[x] = static_cast<uint8_t>((above[x] * (256 - weight) + below[x] * weight + 32768) >> 16);
 }
 
-// What eight neighbours of a shortened line need: 16 bytes that hold all their pixels, where the pixels are in
-// them, and their shares.
-struct Eight {
+// The horizontal interpolation of eight neighbouring output pixels by SSE: `base` is the first of 16 input bytes that
+// hold all their neighbours, `at` the first output pixel; `positions` selects the bytes, `weights` weighs them.
+struct EightPixels {
     int64_t base, at;
-    __m128i places[2], shares[2];
+    __m128i positions[2], weights[2];
 };
-static_assert(sizeof(Eight) == kEightBytes);
+static_assert(sizeof(EightPixels) == kEightPixelsBytes);
 
-// Return how many eights make the line, the last one beside its end; 0 if they cannot.
-inline int64_t eights_of(const Shares& shares, int64_t width, int64_t size, Eight* eights) {
+// Prepare the groups of eight pixels that make up a line, the last one aligned with its end, and return their number.
+// Return 0 if the line is too short, or shrinks so much that 16 bytes do not hold the neighbours of eight pixels.
+inline int64_t prepare_eights(const Weights& weights, int64_t width, int64_t size, EightPixels* eights) {
     if (width < 8 || size < 16) return 0;
     const int64_t count = (width + 7) / 8;
     for (int64_t i = 0; i < count; ++i) {
-        Eight& each = eights[i];
-        each.at = 8 * i < width - 8 ? 8 * i : width - 8;
-        each.base = shares.from[each.at] < size - 16 ? shares.from[each.at] : size - 16;
+        EightPixels& eight = eights[i];
+        eight.at = 8 * i < width - 8 ? 8 * i : width - 8;
+        eight.base = weights.from[eight.at] < size - 16 ? weights.from[eight.at] : size - 16;
         for (int64_t half = 0; half < 2; ++half) {
-            int8_t places[16];
-            int16_t parts[8];
+            int8_t positions[16];
+            int16_t pairs[8];
             for (int64_t k = 0; k < 4; ++k) {
-                const int64_t x = each.at + 4 * half + k, place = shares.from[x] - each.base;
-                if (place < 0 || place > 14) return 0;
-                places[4 * k] = static_cast<int8_t>(place);
-                places[4 * k + 2] = static_cast<int8_t>(place + 1);
-                places[4 * k + 1] = places[4 * k + 3] = -1;  // zero
-                parts[2 * k] = static_cast<int16_t>(256 - shares.share[x]);
-                parts[2 * k + 1] = static_cast<int16_t>(shares.share[x]);
+                const int64_t x = eight.at + 4 * half + k, position = weights.from[x] - eight.base;
+                if (position < 0 || position > 14) return 0;
+                positions[4 * k] = static_cast<int8_t>(position);
+                positions[4 * k + 2] = static_cast<int8_t>(position + 1);
+                positions[4 * k + 1] = positions[4 * k + 3] = -1;  // the shuffle instruction writes 0 there
+                pairs[2 * k] = static_cast<int16_t>(256 - weights.weight[x]);
+                pairs[2 * k + 1] = static_cast<int16_t>(weights.weight[x]);
             }
-            std::memcpy(&each.places[half], places, sizeof places);
-            std::memcpy(&each.shares[half], parts, sizeof parts);
+            std::memcpy(&eight.positions[half], positions, sizeof positions);
+            std::memcpy(&eight.weights[half], pairs, sizeof pairs);
         }
     }
     return count;
 }
 
-inline void shorten(const uint8_t* line, const Eight* eights, int64_t count, uint16_t* to) {
+// Interpolate a line horizontally, eight pixels at a time.
+inline void interpolate_line(const uint8_t* line, const EightPixels* eights, int64_t count, uint16_t* to) {
     for (int64_t i = 0; i < count; ++i) {
-        const Eight& each = eights[i];
+        const EightPixels& eight = eights[i];
         __m128i pixels;
-        std::memcpy(&pixels, line + each.base, sizeof pixels);
-        const __m128i low = _mm_madd_epi16(_mm_shuffle_epi8(pixels, each.places[0]), each.shares[0]);
-        const __m128i high = _mm_madd_epi16(_mm_shuffle_epi8(pixels, each.places[1]), each.shares[1]);
+        std::memcpy(&pixels, line + eight.base, sizeof pixels);
+        const __m128i low = _mm_madd_epi16(_mm_shuffle_epi8(pixels, eight.positions[0]), eight.weights[0]);
+        const __m128i high = _mm_madd_epi16(_mm_shuffle_epi8(pixels, eight.positions[1]), eight.weights[1]);
         const __m128i both = _mm_packus_epi32(low, high);
-        std::memcpy(to + each.at, &both, sizeof both);
+        std::memcpy(to + eight.at, &both, sizeof both);
     }
 }
 
-// As the loop above, eight at a time; a number less 2^15 has a sign, so that two products are added at once.
-inline int64_t blend_eights(const uint16_t* above, const uint16_t* under, uint32_t share, int64_t width, uint8_t* to) {
-    const __m128i parts = _mm_set1_epi32(static_cast<int32_t>((256 - share) | share << 16));
+// Interpolate vertically between two lines, eight pixels at a time; return the number of pixels done.  The numbers have
+// 16 bits without a sign, but the instruction that adds two products takes signed ones: 2^15 is subtracted before, and
+// its products are added back.
+inline int64_t blend_eights(const uint16_t* above, const uint16_t* below, uint32_t weight, int64_t width, uint8_t* to) {
+    const __m128i parts = _mm_set1_epi32(static_cast<int32_t>((256 - weight) | weight << 16));
     const __m128i sign = _mm_set1_epi16(-32768), back = _mm_set1_epi32((256 << 15) + 32768);
     int64_t x = 0;
     for (; x + 8 <= width; x += 8) {
         __m128i a, b;
         std::memcpy(&a, above + x, sizeof a);
-        std::memcpy(&b, under + x, sizeof b);
+        std::memcpy(&b, below + x, sizeof b);
         a = _mm_xor_si128(a, sign);
         b = _mm_xor_si128(b, sign);
         const __m128i low = _mm_add_epi32(_mm_madd_epi16(_mm_unpacklo_epi16(a, b), parts), back);
@@ -123,68 +138,74 @@ inline int64_t blend_eights(const uint16_t* above, const uint16_t* under, uint32
     return x;
 }
 
-// Linear interpolation in parts of 256, rounded once.
-inline void resize(const Image& image, uint8_t* to, int64_t width, int64_t height, const Shortening& work) {
-    const double across = 1.0 / (static_cast<double>(width) / static_cast<double>(image.width));
-    const double down = 1.0 / (static_cast<double>(height) / static_cast<double>(image.height));
+// Write the image, reduced to width x height by bilinear interpolation that is rounded once.
+inline void resize(const Image& image, uint8_t* to, int64_t width, int64_t height, const ResizeMemory& memory) {
+    // 1. Prepare the horizontal interpolation, which is the same for all lines.
+    const double column_scale = 1.0 / (static_cast<double>(width) / static_cast<double>(image.width));
+    const double row_scale = 1.0 / (static_cast<double>(height) / static_cast<double>(image.height));
     for (int64_t x = 0; x < width; ++x) {
         int64_t from;
-        between(x, across, image.width, from, work.across.share[x]);
-        work.across.from[x] = static_cast<int32_t>(from);
+        find_neighbours(x, column_scale, image.width, from, memory.columns.weight[x]);
+        memory.columns.from[x] = static_cast<int32_t>(from);
     }
-    Eight* const each = reinterpret_cast<Eight*>(work.eights);
-    const int64_t eights = eights_of(work.across, width, image.width, each);
-    const auto shortened = [&](int64_t row, uint16_t* line) {
+    EightPixels* const eights = reinterpret_cast<EightPixels*>(memory.eights);
+    const int64_t eight_count = prepare_eights(memory.columns, width, image.width, eights);
+    const auto interpolate_row = [&](int64_t row, uint16_t* line) {
         const uint8_t* const pixels = image.pixels + row * image.width;
-        if (eights > 0) return shorten(pixels, each, eights, line);
-        return shorten(pixels, work.across, width, line);
+        if (eight_count > 0) return interpolate_line(pixels, eights, eight_count, line);
+        return interpolate_line(pixels, memory.columns, width, line);
     };
-    uint16_t *above = work.above, *under = work.under;
-    int64_t held = -1;  // the row that `under` holds
+    uint16_t *above = memory.above, *below = memory.below;
+    int64_t row_below = -1;  // the input row whose interpolation `below` holds
     for (int64_t y = 0; y < height; ++y) {
+        // 2. Interpolate the two input lines of an output line horizontally, unless the memory holds them already.
         int64_t row;
-        uint16_t share;
-        between(y, down, image.height, row, share);
-        if (held != row + 1) {
-            if (held == row) {
+        uint16_t weight;
+        find_neighbours(y, row_scale, image.height, row, weight);
+        if (row_below != row + 1) {
+            if (row_below == row) {
                 uint16_t* const free = above;
-                above = under;
-                under = free;
+                above = below;
+                below = free;
             } else {
-                shortened(row, above);
+                interpolate_row(row, above);
             }
-            shortened(row + 1, under);
-            held = row + 1;
+            interpolate_row(row + 1, below);
+            row_below = row + 1;
         }
-        const int64_t done = blend_eights(above, under, share, width, to + y * width);
-        blend(above, under, share, done, width, to + y * width);
+        // 3. Interpolate between them.
+        const int64_t done = blend_eights(above, below, weight, width, to + y * width);
+        blend_lines(above, below, weight, done, width, to + y * width);
     }
 }
 
-// Two levels at a time, of an image of a width and a height.
+// A pyramid of which two levels exist at a time: the present one, and the next smaller one.
 struct Pyramid {
-    Shortening shortening;
+    ResizeMemory resize_memory;
     uint8_t *level, *next;
 
-    // Take memory, and return what is behind it, aligned to 4 bytes: the widest numbers first.
-    uint8_t* lend(uint64_t* workspace, int64_t width, int64_t height) {
-        shortening.eights = reinterpret_cast<uint8_t*>((reinterpret_cast<uintptr_t>(workspace) + 15) / 16 * 16);
-        shortening.across.from = reinterpret_cast<int32_t*>(shortening.eights + kEightBytes * (width / 8 + 1));
-        shortening.across.share = reinterpret_cast<uint16_t*>(shortening.across.from + width);
-        shortening.above = shortening.across.share + width;
-        shortening.under = shortening.above + width;
-        level = reinterpret_cast<uint8_t*>(shortening.under + width);
+    // Divide the caller's workspace for an image of a size, arrays with the strictest alignment first.  Return the
+    // address behind the last array, aligned to 4 bytes.
+    uint8_t* divide_workspace(uint64_t* workspace, int64_t width, int64_t height) {
+        resize_memory.eights = reinterpret_cast<uint8_t*>((reinterpret_cast<uintptr_t>(workspace) + 15) / 16 * 16);
+        resize_memory.columns.from =
+            reinterpret_cast<int32_t*>(resize_memory.eights + kEightPixelsBytes * (width / 8 + 1));
+        resize_memory.columns.weight = reinterpret_cast<uint16_t*>(resize_memory.columns.from + width);
+        resize_memory.above = resize_memory.columns.weight + width;
+        resize_memory.below = resize_memory.above + width;
+        level = reinterpret_cast<uint8_t*>(resize_memory.below + width);
         next = level + width * height;
         return reinterpret_cast<uint8_t*>((reinterpret_cast<uintptr_t>(next + width * height) + 3) / 4 * 4);
     }
 
-    // Replace a level by the next one, *scale* times smaller than the whole image; say whether it has a size.
+    // Replace a level by the next one, `scale` times smaller than the whole image.  Return false if that would have
+    // fewer than 2 pixels on a side, or more than the present level.
     bool shrink(Image& image, const Image& whole, float scale) {
         const float inverse = 1.0f / scale;
-        const int64_t width = rounded(static_cast<float>(whole.width) * inverse);
-        const int64_t height = rounded(static_cast<float>(whole.height) * inverse);
+        const int64_t width = round_to_integer(static_cast<float>(whole.width) * inverse);
+        const int64_t height = round_to_integer(static_cast<float>(whole.height) * inverse);
         if (width < 2 || height < 2 || width > image.width || height > image.height) return false;
-        resize(image, next, width, height, shortening);
+        resize(image, next, width, height, resize_memory);
         image = {next, width, height};
         uint8_t* const free = level;
         level = next;

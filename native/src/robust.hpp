@@ -1,6 +1,7 @@
-// The robust estimate: samples of three, MSAC, early local refinement, and a last refinement of the inliers.
+// Robust estimation of a pose: LO-RANSAC with P3P samples and the MSAC cost, then a refinement over the inliers.
 //
-// Source: Chum, Matas and Kittler, Locally Optimized RANSAC, DAGM 2003; Lebeda, Matas and Chum, BMVC 2012.
+// Sources: Chum, Matas and Kittler, Locally Optimized RANSAC, DAGM 2003; Lebeda, Matas and Chum, Fixing the Locally
+// Optimized RANSAC, BMVC 2012.
 #pragma once
 
 #include "p3p.hpp"
@@ -8,13 +9,22 @@
 
 namespace RSE_PF_ISA {
 
+// Most Gauss-Newton steps of a local optimisation within RANSAC: it only has to come near the minimum, since the last
+// refinement converges.
 constexpr int kLocalSteps = 4;
-// With few rows a trial is cheap, and one row more or less decides about the verdict.
-constexpr int64_t kFewRows = 32, kTrialsOfFewRows = 30;
-constexpr int kLastSteps = 100;
-constexpr double kDoneStep = 1e-6;  // metres and radians: what is left then is a tenth of it
+// Up to this number of correspondences, at least kMinTrialsOfFewRows samples are drawn: a sample is cheap then, and one
+// inlier more or less decides whether the pose is weak.
+constexpr int64_t kFewRows = 32;
+// Fewest samples of RANSAC for requests with at most kFewRows correspondences.
+constexpr int64_t kMinTrialsOfFewRows = 30;
+// Most Levenberg-Marquardt steps of the last refinement: a bound for input on which it does not converge.
+constexpr int kMaxRefinementSteps = 100;
+// Step (largest component, metres and radians) at which the last refinement stops: the remaining error is a tenth of
+// it.
+constexpr double kConvergedStep = 1e-6;
 
-// A sequence of pseudo-random numbers; Steele, Lea and Flood, OOPSLA 2014 (SplitMix64).
+// A pseudo-random generator with a fixed seed, so that equal requests draw equal samples: SplitMix64 (Steele, Lea and
+// Flood, OOPSLA 2014).
 struct Sampler {
     uint64_t state;
 
@@ -25,8 +35,8 @@ struct Sampler {
         z = (z ^ (z >> 27)) * 0x94D049BB133111EBu;
         return z ^ (z >> 31);
     }
-    // Fill in three different rows of n >= 3.
-    void three(int64_t n, int64_t (&rows)[3]) {
+    // Draw three different row numbers below n, which is at least 3.
+    void draw_three(int64_t n, int64_t (&rows)[3]) {
         const uint64_t bits = next(), range = static_cast<uint64_t>(n);
         uint64_t a = ((bits & 0x1FFFFF) * range) >> 21, b = (((bits >> 21) & 0x1FFFFF) * (range - 1)) >> 21,
                  c = (((bits >> 42) & 0x1FFFFF) * (range - 2)) >> 21;
@@ -40,99 +50,109 @@ struct Sampler {
     }
 };
 
-// How many trials find three right rows with the confidence asked for, when `agree` of n are right.
-static inline double trials_for(int64_t agree, int64_t n, double confidence) {
-    if (agree < 3) return kInfinity;
-    const double k = static_cast<double>(agree), all_rows = static_cast<double>(n);
+// Return the number of samples after which one of them holds three inliers with the wanted probability (confidence),
+// where `inliers` of n rows are inliers.
+static inline double required_trials(int64_t inliers, int64_t n, double confidence) {
+    if (inliers < 3) return kInfinity;
+    const double k = static_cast<double>(inliers), all_rows = static_cast<double>(n);
     const double share = k * (k - 1.0) * (k - 2.0) / (all_rows * (all_rows - 1.0) * (all_rows - 2.0));
     if (share >= 1.0) return 0.0;
     return natural_log(1.0 - confidence) / natural_log(1.0 - share);
 }
 
-struct Model {
+// A pose with its MSAC cost (px^2) and its number of inliers.
+struct Hypothesis {
     Pose pose;
     double cost;
-    int64_t agree;
+    int64_t inliers;
 };
 
-// Refine by Gauss-Newton steps under the truncated loss for as long as they help.
-static void refine_locally(const rse_pf::Columns<float>& rows, int64_t n, const Optics& optics, double limit2,
-                           Model& model) {
+// Refine a hypothesis by Gauss-Newton steps under the truncated loss, until a step does not lower the cost, lowers it
+// by less than 0.1 %, or kLocalSteps are done.  `limit2` is the squared inlier limit (px^2).
+static void refine_locally(const rse_pf::Columns<float>& rows, int64_t n, const FocalLengths& focal, double limit2,
+                           Hypothesis& hypothesis) {
     Normal normal;
-    model.cost = linearised<float, Loss::kTruncated>(rows, n, optics, model.pose, limit2, normal, model.agree);
+    hypothesis.cost =
+        linearise<float, Loss::kTruncated>(rows, n, focal, hypothesis.pose, limit2, normal, hypothesis.inliers);
     for (int step = 0; step < kLocalSteps; ++step) {
         double twist[6];
-        if (!solved(normal, 0.0, twist)) return;
-        Model next;
-        next.pose = moved(twist, model.pose);
-        next.cost = linearised<float, Loss::kTruncated>(rows, n, optics, next.pose, limit2, normal, next.agree);
-        if (!(next.cost < model.cost)) return;
-        const bool has_converged = model.cost - next.cost < 1e-3 * model.cost;
-        model = next;
+        if (!solve_normal_equations(normal, 0.0, twist)) return;
+        Hypothesis next;
+        next.pose = apply_twist_by_cayley(twist, hypothesis.pose);
+        next.cost = linearise<float, Loss::kTruncated>(rows, n, focal, next.pose, limit2, normal, next.inliers);
+        if (!(next.cost < hypothesis.cost)) return;
+        const bool has_converged = hypothesis.cost - next.cost < 1e-3 * hypothesis.cost;
+        hypothesis = next;
         if (has_converged) return;
     }
 }
 
-struct SearchOptions {
-    double limit2;  // px^2
-    double confidence;
+struct RansacOptions {
+    double limit2;      // squared inlier limit, px^2
+    double confidence;  // probability with which some sample holds three inliers when RANSAC stops
     int64_t max_iterations, min_iterations;
 };
 
-// Find the pose that most rows agree with; say whether there is any.
-static bool search(const rse_pf::Task& task, const Optics& optics, const SearchOptions& options, Model& best) {
+// Find the hypothesis with the lowest MSAC cost by LO-RANSAC; return false if no sample has a pose.
+static bool run_ransac(const rse_pf::Task& task, const FocalLengths& focal, const RansacOptions& options,
+                       Hypothesis& best) {
     const rse_pf::Workspace& data = *task.workspace;
     const int64_t n = task.request->rows;
     Sampler sampler = {0};
     best.cost = kInfinity;
-    best.agree = 0;
-    double needed = static_cast<double>(options.max_iterations);
-    int64_t least = options.min_iterations;
-    if (n <= kFewRows && least < kTrialsOfFewRows) least = kTrialsOfFewRows;
+    best.inliers = 0;
+    double required = static_cast<double>(options.max_iterations);
+    int64_t min_trials = options.min_iterations;
+    if (n <= kFewRows && min_trials < kMinTrialsOfFewRows) min_trials = kMinTrialsOfFewRows;
     for (int64_t trial = 0; trial < options.max_iterations; ++trial) {
-        if (trial >= least && static_cast<double>(trial) >= needed) break;
+        if (trial >= min_trials && static_cast<double>(trial) >= required) break;
+        // 1. Draw three correspondences, and solve P3P for them.
         int64_t rows[3];
-        sampler.three(n, rows);
+        sampler.draw_three(n, rows);
         Vector3 bearings[3], points[3];
         for (int i = 0; i < 3; ++i) {
             const int64_t row = rows[i];
             points[i] = {data.all.x[row], data.all.y[row], data.all.z[row]};
-            bearings[i] = normalised({data.all.u[row] / optics.fx, data.all.v[row] / optics.fy, 1.0});
+            bearings[i] = normalise({data.all.u[row] / focal.fx, data.all.v[row] / focal.fy, 1.0});
         }
         Pose poses[4];
-        const int found = p3p(bearings, points, poses);
-        for (int i = 0; i < found; ++i) {
-            if (!(score(data.single, n, optics, poses[i], options.limit2, best.cost) < best.cost)) continue;
-            Model model = {poses[i], 0.0, 0};
-            refine_locally(data.single, n, optics, options.limit2, model);
-            if (!(model.cost < best.cost)) continue;
-            best = model;
-            needed = trials_for(best.agree, n, options.confidence);
+        const int solutions = solve_p3p(bearings, points, poses);
+        for (int i = 0; i < solutions; ++i) {
+            // 2. Drop a pose as soon as its cost exceeds the lowest cost.
+            if (!(msac_cost(data.single, n, focal, poses[i], options.limit2, best.cost) < best.cost)) continue;
+            // 3. Refine it over all rows (local optimisation).
+            Hypothesis hypothesis = {poses[i], 0.0, 0};
+            refine_locally(data.single, n, focal, options.limit2, hypothesis);
+            if (!(hypothesis.cost < best.cost)) continue;
+            // 4. Keep it, and compute anew how many samples its inlier ratio requires.
+            best = hypothesis;
+            required = required_trials(best.inliers, n, options.confidence);
         }
     }
     return best.cost < kInfinity;
 }
 
-// Refine over the rows by Levenberg and Marquardt's method; false where it cannot start.
+// Refine a pose over the rows by the Levenberg-Marquardt method, undamped (Gauss-Newton) until a step fails.  Return
+// false where the first cost is infinite: a point lies behind the camera.
 template <Loss loss>
-static bool refine(const rse_pf::Columns<double>& rows, int64_t count, const Optics& optics, double limit2,
+static bool refine(const rse_pf::Columns<double>& rows, int64_t count, const FocalLengths& focal, double limit2,
                    Pose& pose) {
     Normal normal, next_normal;
-    int64_t agree = 0;
-    double cost = linearised<double, loss>(rows, count, optics, pose, limit2, normal, agree), damping = 0.0;
+    int64_t unused_inliers = 0;
+    double cost = linearise<double, loss>(rows, count, focal, pose, limit2, normal, unused_inliers), damping = 0.0;
     if (!(cost < kInfinity)) return false;
-    for (int step = 0; step < kLastSteps; ++step) {
+    for (int step = 0; step < kMaxRefinementSteps; ++step) {
         double twist[6];
-        if (!solved(normal, damping, twist)) {
+        if (!solve_normal_equations(normal, damping, twist)) {
             damping = damping > 0.0 ? damping * 10.0 : 1e-3;
             continue;
         }
-        double length = 0.0;
-        for (const double each : twist) length = absolute(each) > length ? absolute(each) : length;
-        const Pose next = moved(twist, pose);
+        double largest = 0.0;
+        for (const double component : twist) largest = absolute(component) > largest ? absolute(component) : largest;
+        const Pose next = apply_twist_by_cayley(twist, pose);
         const double next_cost =
-            linearised<double, loss>(rows, count, optics, next, limit2, next_normal, agree);
-        // Rounding hides the gain of the last step.
+            linearise<double, loss>(rows, count, focal, next, limit2, next_normal, unused_inliers);
+        // Accept an equal cost within rounding: near the minimum, rounding hides the decrease of a step.
         if (!(next_cost <= cost * (1.0 + 1e-12))) {
             damping = damping > 0.0 ? damping * 10.0 : 1e-3;
             continue;
@@ -141,16 +161,17 @@ static bool refine(const rse_pf::Columns<double>& rows, int64_t count, const Opt
         cost = next_cost;
         normal = next_normal;
         damping = damping > 1e-9 ? damping * 0.1 : 0.0;
-        if (length < kDoneStep) break;
+        if (largest < kConvergedStep) break;
     }
     return true;
 }
 
-// Copy the rows whose squared error in the view is at most limit2, and note their numbers; return how many.
-static int64_t gather(const rse_pf::Workspace& data, int64_t n, double limit2, uint32_t* numbers) {
+// Copy the inliers, which are the rows whose squared error (as `project` wrote it) is at most limit2, to data.inliers,
+// pad the last vector, and write their row numbers unless `numbers` is null.  Return the number of inliers.
+static int64_t gather_inliers(const rse_pf::Workspace& data, int64_t n, double limit2, uint32_t* numbers) {
     const rse_pf::Columns<double>&from = data.all, &to = data.inliers;
     int64_t count = 0;
-    for (int64_t i = 0; i < n; ++i) {
+    for (int64_t i = 0; i < n; ++i) {  // Without branches: an outlier is overwritten by the next row.
         to.x[count] = from.x[i];
         to.y[count] = from.y[i];
         to.z[count] = from.z[i];
@@ -161,38 +182,42 @@ static int64_t gather(const rse_pf::Workspace& data, int64_t n, double limit2, u
     }
     for (int64_t i = count; i < padded(count); ++i) {
         to.x[i] = to.y[i] = to.z[i] = 0.0;
-        to.u[i] = to.v[i] = kNowhere;
+        to.u[i] = to.v[i] = kPaddingPixel;
     }
     return count;
 }
 
-// Refine the pose over the rows that agree with it; they are gathered, and the view then holds them only.
-static int64_t refine_inliers(const rse_pf::Workspace& data, int64_t n, const Optics& optics, double limit2,
-                              Pose& pose) {
-    project(data.all, n, optics, pose, data);
-    const int64_t count = gather(data, n, limit2, nullptr);
-    // Half of the inlier limit is the scale of Cauchy's loss, as in PoseLib.
-    if (count >= 4) refine<Loss::kCauchy>(data.inliers, count, optics, 0.25 * limit2, pose);
-    project(data.inliers, count, optics, pose, data);
+// Refine a pose over its inliers under the Cauchy loss, and return their number.  Afterwards data.inliers holds them,
+// and the projections in the workspace are those of the inliers at the refined pose.
+static int64_t refine_over_inliers(const rse_pf::Workspace& data, int64_t n, const FocalLengths& focal, double limit2,
+                                   Pose& pose) {
+    project(data.all, n, focal, pose, data);
+    const int64_t count = gather_inliers(data, n, limit2, nullptr);
+    // The scale of the Cauchy loss is half of the inlier limit, as in PoseLib.
+    if (count >= 4) refine<Loss::kCauchy>(data.inliers, count, focal, 0.25 * limit2, pose);
+    project(data.inliers, count, focal, pose, data);
     return count;
 }
 
-// Find the robust pose of the rows as they stand in the workspace; say whether there is any.
-static bool propose(const rse_pf::Task& task, const Optics& optics, const SearchOptions& options,
-                      const Vector3& origin, Pose& pose) {
-    Model best;
-    if (!search(task, optics, options, best)) return false;
+// Estimate a pose of the rows in the workspace; return false if there is none.  `origin` is the caller's world origin
+// that was subtracted from the points.
+static bool estimate_pose(const rse_pf::Task& task, const FocalLengths& focal, const RansacOptions& options,
+                          const Vector3& origin, Pose& pose) {
+    // 1. Search by LO-RANSAC in single precision.
+    Hypothesis best;
+    if (!run_ransac(task, focal, options, best)) return false;
+    // 2. Refine over the inliers in double precision.
     const rse_pf::Workspace& data = *task.workspace;
     const int64_t n = task.request->rows;
     pose = best.pose;
-    const int64_t count = refine_inliers(data, n, optics, options.limit2, pose);
-    if (count >= 4 && depth_variation(data, count) < kWeakPerspective) {
-        // The search may have ended in the worse one of the two poses of a plane.
-        Pose twin;
-        if (second_pose(data, count, optics, pose, origin, twin) >= 0.0) {
-            refine_inliers(data, n, optics, options.limit2, twin);
-            const double cost = score(data.single, n, optics, pose, options.limit2, kInfinity);
-            if (score(data.single, n, optics, twin, options.limit2, cost) < cost) pose = twin;
+    const int64_t count = refine_over_inliers(data, n, focal, options.limit2, pose);
+    // 3. For a planar scene, RANSAC may have found the worse one of its two poses: take the one with the lower cost.
+    if (count >= 4 && inverse_depth_variation(data, count) < kWeakPerspective) {
+        Pose second;
+        if (find_second_pose(data, count, focal, pose, origin, second) >= 0.0) {
+            refine_over_inliers(data, n, focal, options.limit2, second);
+            const double cost = msac_cost(data.single, n, focal, pose, options.limit2, kInfinity);
+            if (msac_cost(data.single, n, focal, second, options.limit2, cost) < cost) pose = second;
         }
     }
     return is_finite(pose);

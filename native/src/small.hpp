@@ -1,4 +1,4 @@
-// Vectors of three, poses, and systems of six equations.
+// Vectors of three numbers, camera poses, and normal equations of six unknowns.
 #pragma once
 
 #include "elementary.hpp"
@@ -15,15 +15,15 @@ RSE_PF_INLINE double dot(const Vector3& a, const Vector3& b) { return a.x * b.x 
 RSE_PF_INLINE Vector3 cross(const Vector3& a, const Vector3& b) {
     return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
 }
-RSE_PF_INLINE Vector3 normalised(const Vector3& a) { return a * (1.0 / square_root(dot(a, a))); }
+RSE_PF_INLINE Vector3 normalise(const Vector3& a) { return a * (1.0 / square_root(dot(a, a))); }
 
-// Maps a point p of the world into the camera's frame: R p + t.
+// T_camera_world: a point p of the world has the camera coordinates R p + t (metres).
 struct Pose {
     double R[3][3];
     Vector3 t;
 };
 
-RSE_PF_INLINE Vector3 rotated(const double (&R)[3][3], const Vector3& p) {
+RSE_PF_INLINE Vector3 rotate(const double (&R)[3][3], const Vector3& p) {
     return {R[0][0] * p.x + R[0][1] * p.y + R[0][2] * p.z, R[1][0] * p.x + R[1][1] * p.y + R[1][2] * p.z,
             R[2][0] * p.x + R[2][1] * p.y + R[2][2] * p.z};
 }
@@ -34,39 +34,42 @@ RSE_PF_INLINE bool is_finite(const Pose& pose) {
     return total - total == 0.0;
 }
 
-// Return R turned by `turn` first and shifted then, both in the camera's frame.
-static inline Pose moved(const double (&turn)[3][3], const Vector3& shift, const Pose& pose) {
-    Pose out;
+// Return the product (rotation, translation) * pose: a rigid motion in the camera frame, after the pose.
+static inline Pose compose(const double (&rotation)[3][3], const Vector3& translation, const Pose& pose) {
+    Pose product;
     for (int i = 0; i < 3; ++i)
         for (int j = 0; j < 3; ++j)
-            out.R[i][j] = turn[i][0] * pose.R[0][j] + turn[i][1] * pose.R[1][j] + turn[i][2] * pose.R[2][j];
-    out.t = rotated(turn, pose.t) + shift;
-    return out;
+            product.R[i][j] =
+                rotation[i][0] * pose.R[0][j] + rotation[i][1] * pose.R[1][j] + rotation[i][2] * pose.R[2][j];
+    product.t = rotate(rotation, pose.t) + translation;
+    return product;
 }
 
-// Apply the twist (rho, phi) to the left of the pose.  The rotation is Cayley's, a rational function that
-// agrees with the exponential map up to second order, so steps that vanish lead to the same pose.
-static inline Pose moved(const double (&twist)[6], const Pose& pose) {
+// Return the pose after a small twist (rho metres, phi radians) on its left.  The rotation is Cayley's map, a rational
+// function that agrees with the exponential map to second order, so an iteration has the same fixed point with both.
+static inline Pose apply_twist_by_cayley(const double (&twist)[6], const Pose& pose) {
     const double a = 0.5 * twist[3], b = 0.5 * twist[4], c = 0.5 * twist[5];
     const double s = 2.0 / (1.0 + a * a + b * b + c * c);
-    const double turn[3][3] = {
+    const double rotation[3][3] = {
         {1.0 - s * (b * b + c * c), s * (a * b - c), s * (a * c + b)},
         {s * (a * b + c), 1.0 - s * (a * a + c * c), s * (b * c - a)},
         {s * (a * c - b), s * (b * c + a), 1.0 - s * (a * a + b * b)},
     };
-    return moved(turn, {twist[0], twist[1], twist[2]}, pose);
+    return compose(rotation, {twist[0], twist[1], twist[2]}, pose);
 }
 
-// Return exp(twist) pose, for steps of any length: the series of a small part of the twist, then squared.
+// Return exp(twist) * pose for a twist (rho metres, phi radians) of any length, by scaling and squaring.
 // Source: Moler and Van Loan, Nineteen Dubious Ways, SIAM Review 2003, method 3.
-static inline Pose moved_along(const double (&twist)[6], const Pose& pose) {
+static inline Pose apply_twist(const double (&twist)[6], const Pose& pose) {
+    // 1. Halve the twist until its angle is at most 1/4 rad.
     Vector3 rho = {twist[0], twist[1], twist[2]}, phi = {twist[3], twist[4], twist[5]};
     int doublings = 0;
     for (; dot(phi, phi) > 0.0625 && doublings < 12; ++doublings) {
         rho = rho * 0.5;
         phi = phi * 0.5;
     }
-    // sin(a)/a, (1 - cos a)/a^2 and (a - sin a)/a^3 by their series; Barfoot (2017), eqs. 7.16 and 7.34.
+    // 2. Compute its exponential from the Taylor series of sin(x)/x, (1 - cos x)/x^2 and (x - sin x)/x^3 with
+    // x^2 = q; Barfoot, State Estimation for Robotics (2017), eqs. 7.16 and 7.34.
     const double q = dot(phi, phi);
     const double a = 1.0 - q / 6.0 * (1.0 - q / 20.0 * (1.0 - q / 42.0 * (1.0 - q / 72.0 * (1.0 - q / 110.0))));
     const double b = 0.5 * (1.0 - q / 12.0 * (1.0 - q / 30.0 * (1.0 - q / 56.0 * (1.0 - q / 90.0))));
@@ -76,18 +79,21 @@ static inline Pose moved_along(const double (&twist)[6], const Pose& pose) {
                   {b * x * y + a * z, 1.0 - b * (x * x + z * z), b * y * z - a * x},
                   {b * x * z - a * y, b * y * z + a * x, 1.0 - b * (x * x + y * y)}},
                  rho + cross(phi, rho) * b + cross(phi, cross(phi, rho)) * c};
-    for (; doublings > 0; --doublings) step = moved(step.R, step.t, Pose(step));
-    return moved(step.R, step.t, pose);
+    // 3. Square the exponential as often as the twist was halved.
+    for (; doublings > 0; --doublings) step = compose(step.R, step.t, Pose(step));
+    return compose(step.R, step.t, pose);
 }
 
-// J^T J and J^T r of a left perturbation (rho, phi); only the upper triangle is filled.
+// The normal equations of a left perturbation (rho, phi) of a pose: A = J^T W J and b = J^T W r.  Only the upper
+// triangle of A is filled.
 struct Normal {
     double A[6][6];
     double b[6];
 };
 
-// Solve (A + damping diag A) x = b by Cholesky's method; false where A is not positive.
-static bool solved(const Normal& normal, double damping, double (&x)[6]) {
+// Solve (A + damping diag(A)) x = b by Cholesky decomposition; return false where the matrix is not positive definite.
+static bool solve_normal_equations(const Normal& normal, double damping, double (&x)[6]) {
+    // 1. Decompose the matrix into L L^T.
     double L[6][6], inverse[6];
     for (int i = 0; i < 6; ++i) {
         double pivot = normal.A[i][i] * (1.0 + damping);
@@ -100,6 +106,7 @@ static bool solved(const Normal& normal, double damping, double (&x)[6]) {
             L[j][i] = value * inverse[i];
         }
     }
+    // 2. Solve L y = b, then L^T x = y.
     for (int i = 0; i < 6; ++i) {
         double value = normal.b[i];
         for (int k = 0; k < i; ++k) value -= L[i][k] * x[k];
@@ -113,9 +120,9 @@ static bool solved(const Normal& normal, double damping, double (&x)[6]) {
     return true;
 }
 
-// Return the eigenvalues of a symmetric 3x3 matrix, smallest first, and its eigenvectors as rows of `axes`.
-// Jacobi's method; Golub and Van Loan, Matrix Computations, Sect. 8.5.
-static void eigenvectors(const double (&matrix)[3][3], double (&values)[3], double (&axes)[3][3]) {
+// Write the eigenvalues of a symmetric 3x3 matrix in ascending order, and its unit eigenvectors as rows of `axes`.
+// Cyclic Jacobi method; Golub and Van Loan, Matrix Computations, Sect. 8.5.
+static void compute_eigenvectors(const double (&matrix)[3][3], double (&values)[3], double (&axes)[3][3]) {
     double a[3][3];
     for (int i = 0; i < 3; ++i)
         for (int j = 0; j < 3; ++j) {
@@ -123,8 +130,8 @@ static void eigenvectors(const double (&matrix)[3][3], double (&values)[3], doub
             axes[i][j] = i == j ? 1.0 : 0.0;
         }
     for (int sweep = 0; sweep < 12; ++sweep) {
-        const double aside = absolute(a[0][1]) + absolute(a[0][2]) + absolute(a[1][2]);
-        if (!(aside > 1e-17 * (absolute(a[0][0]) + absolute(a[1][1]) + absolute(a[2][2])))) break;
+        const double off_diagonal = absolute(a[0][1]) + absolute(a[0][2]) + absolute(a[1][2]);
+        if (!(off_diagonal > 1e-17 * (absolute(a[0][0]) + absolute(a[1][1]) + absolute(a[2][2])))) break;
         for (int p = 0; p < 2; ++p)
             for (int q = p + 1; q < 3; ++q) {
                 if (a[p][q] == 0.0) continue;
@@ -149,6 +156,7 @@ static void eigenvectors(const double (&matrix)[3][3], double (&values)[3], doub
                 }
             }
     }
+    // Sort by bubble sort: two passes suffice for three values.
     for (int i = 0; i < 3; ++i) values[i] = a[i][i];
     for (int pass = 0; pass < 2; ++pass)
         for (int i = 0; i < 2; ++i)

@@ -1,14 +1,15 @@
-// Disparities of features between the two images of a rectified stereo pair; rse_pf/slam/stereo.py says why.
+// Sparse stereo matching of a rectified pair: normalised cross-correlation along the row, a left-right check, and
+// sub-pixel refinement by least squares.  rse_pf/slam/stereo.py calls it.
 //
-// Sums of products of pixels are integers, and everything else is single IEEE operations in one order, so the
-// instructions chosen below change no byte.
+// Sums of products of pixels are integers, and everything else is single IEEE 754 operations in one order, so the
+// choice of instructions below changes no byte of the result.
 #include "rse_pf_stereo.h"
 
 #include <cstring>
 
 #include "processor.hpp"
 
-// What is inlined into a function for AVX2 is compiled for it.
+// A function that is inlined into a function for AVX2 is compiled for AVX2 as well.
 #define RSE_PF_STEREO_INLINE inline __attribute__((always_inline))
 #if defined(__x86_64__)
 #include <immintrin.h>
@@ -17,30 +18,47 @@
 
 namespace {
 
-constexpr int64_t kMaxRows = int64_t{1} << 24, kMaxSide = int64_t{1} << 16;
-constexpr int64_t kRadius = 5, kSide = 2 * kRadius + 1, kCount = kSide * kSide;
-// A row of a patch, filled up with zeros, so that what stands beside it in the image does not count.
-constexpr int64_t kWide = 16;
-constexpr int64_t kStrip = RSE_PF_STEREO_MOST + kSide + kWide;
-constexpr int64_t kBeside = 2;
-constexpr int kSteps = 8;
-constexpr double kConvergedPx = 0.002, kFarPx = 1.25, kStepPx = 0.05;
+// Most features of a request.
+constexpr int64_t kMaxRows = int64_t{1} << 24;
+// Largest height or width of an image, pixels.
+constexpr int64_t kMaxSide = int64_t{1} << 16;
+// Pixels on each side of a feature that its patch reaches: patches are 11 x 11.
+constexpr int64_t kRadius = 5;
+// Pixels of a row of a patch.
+constexpr int64_t kSide = 2 * kRadius + 1;
+// Pixels of a patch.
+constexpr int64_t kCount = kSide * kSide;
+// Numbers that store a row of a patch: a vector of 16, padded with zeros so that neighbours in the image do not count.
+constexpr int64_t kPaddedSide = 16;
+// Pixels of a row of the search strip of the other image.
+constexpr int64_t kStrip = RSE_PF_STEREO_MAX_DISPARITY_PX + kSide + kPaddedSide;
+// Disparities next to the best one (px) that are not its rivals: the correlation has a broad peak.
+constexpr int64_t kPeakRadius = 2;
+// Most steps of the sub-pixel refinement.
+constexpr int kMaxSteps = 8;
+// Step (px) of the sub-pixel refinement at which it has converged.
+constexpr double kConvergedPx = 0.002;
+// Largest distance (px) that the refinement may move from the integer disparity: beyond it lies another peak.
+constexpr double kMaxShiftPx = 1.25;
+// Largest last step (px) of a refinement that is accepted.
+constexpr double kMaxLastStepPx = 0.05;
 
 double not_a_number() { return __builtin_nan(""); }
 RSE_PF_STEREO_INLINE double absolute(double value) { return value < 0.0 ? -value : value; }
 
+// The image that holds a feature, and the image in which it is searched for.
 struct Images {
     const uint8_t *from, *to;
     int64_t width, height;
 };
 
-// One patch with its sums.  All sums of products, times kCount, are below 2^30.
+// The pixels of a patch, their sum and the sum of their squares; sums of products times kCount stay below 2^30.
 struct Patch {
-    int16_t pixels[kSide][kWide];
+    int16_t pixels[kSide][kPaddedSide];
     int32_t sum, sum2;
 };
 
-RSE_PF_STEREO_INLINE Patch patch_at(const Images& images, int64_t column, int64_t row) {
+RSE_PF_STEREO_INLINE Patch read_patch(const Images& images, int64_t column, int64_t row) {
     Patch patch = {};
     for (int64_t y = 0; y < kSide; ++y) {
         const uint8_t* const line = images.from + (row - kRadius + y) * images.width + column - kRadius;
@@ -54,8 +72,8 @@ RSE_PF_STEREO_INLINE Patch patch_at(const Images& images, int64_t column, int64_
     return patch;
 }
 
-// Write the sums of products of a patch with the pixels that begin at each of the first places of a strip.
-void products_portably(const Patch& patch, const int16_t* strip, int64_t count, int32_t* products) {
+// Write the sum of products of a patch with the pixels of a strip, for `count` horizontal offsets of the patch.
+void correlate_portably(const Patch& patch, const int16_t* strip, int64_t count, int32_t* products) {
     for (int64_t at = 0; at < count; ++at, ++strip) {
 #if defined(__x86_64__)
         __m128i sum = _mm_setzero_si128();
@@ -77,7 +95,7 @@ void products_portably(const Patch& patch, const int16_t* strip, int64_t count, 
 }
 
 #if defined(__x86_64__)
-RSE_PF_STEREO_AVX2 void products_by_avx2(const Patch& patch, const int16_t* strip, int64_t count, int32_t* products) {
+RSE_PF_STEREO_AVX2 void correlate_with_avx2(const Patch& patch, const int16_t* strip, int64_t count, int32_t* products) {
     __m256i own[kSide];
     for (int64_t y = 0; y < kSide; ++y) own[y] = _mm256_loadu_si256(reinterpret_cast<const __m256i*>(patch.pixels[y]));
     for (int64_t at = 0; at < count; ++at, ++strip) {
@@ -93,44 +111,48 @@ RSE_PF_STEREO_AVX2 void products_by_avx2(const Patch& patch, const int16_t* stri
 }
 #endif
 
-using Products = void(const Patch& patch, const int16_t* strip, int64_t count, int32_t* products);
+using Correlate = void(const Patch& patch, const int16_t* strip, int64_t count, int32_t* products);
 
-struct Best {
+// The best disparity with its signed squared correlation (-1..1), and that of the best one outside of its peak.
+struct Match {
     int64_t disparity = 0;
-    double likeness = -1.0, rival = -1.0;
+    double correlation2 = -1.0, rival_correlation2 = -1.0;
 };
 
-// Seek the patch of an image at a pixel in the other one, at column + sign * d; the first of equals is taken.
-RSE_PF_STEREO_INLINE Best searched(const Images& images, int64_t column, int64_t row, int64_t most, int64_t sign,
-                                   Products* write_products) {
-    Best best;
-    const Patch patch = patch_at(images, column, row);
+// Find the disparity d, 0..max_disparity, for which the patch at (column, row) of an image correlates best with that at
+// (column + sign * d, row) of the other image.  The smallest of equal disparities is taken.
+RSE_PF_STEREO_INLINE Match find_match(const Images& images, int64_t column, int64_t row, int64_t max_disparity,
+                                      int64_t sign, Correlate* correlate) {
+    Match best;
+    const Patch patch = read_patch(images, column, row);
     const int32_t variance = static_cast<int32_t>(kCount) * patch.sum2 - patch.sum * patch.sum;
     if (variance <= 0) return best;
-    // Centres of patches that lie within the image, from left to right.
-    int64_t first = sign < 0 ? column - most : column, last = sign < 0 ? column : column + most;
+    // 1. Find the first and last column of the other image whose patch lies inside.
+    int64_t first = sign < 0 ? column - max_disparity : column, last = sign < 0 ? column : column + max_disparity;
     first = first < kRadius + 1 ? kRadius + 1 : first;
     last = last > images.width - kRadius - 2 ? images.width - kRadius - 2 : last;
     if (first > last) return best;
-    const int64_t count = last - first + 1, wide = last - first + kSide;
+    // 2. Copy their pixels to a strip, and sum pixels and squares of each column of the strip.
+    const int64_t count = last - first + 1, width = last - first + kSide;
     int16_t strip[kSide * kStrip];
     int32_t sums[kStrip], squares[kStrip];
-    std::memset(sums, 0, static_cast<size_t>(wide) * sizeof *sums);
-    std::memset(squares, 0, static_cast<size_t>(wide) * sizeof *squares);
+    std::memset(sums, 0, static_cast<size_t>(width) * sizeof *sums);
+    std::memset(squares, 0, static_cast<size_t>(width) * sizeof *squares);
     for (int64_t y = 0; y < kSide; ++y) {
         const uint8_t* const line = images.to + (row - kRadius + y) * images.width + first - kRadius;
         int16_t* const into = strip + y * kStrip;
-        for (int64_t x = 0; x < wide; ++x) {
+        for (int64_t x = 0; x < width; ++x) {
             const int32_t pixel = line[x];
             into[x] = static_cast<int16_t>(pixel);
             sums[x] += pixel;
             squares[x] += pixel * pixel;
         }
-        std::memset(into + wide, 0, kWide * sizeof *into);
+        std::memset(into + width, 0, kPaddedSide * sizeof *into);
     }
-    // Of the patch that is centred at first + at.
-    int32_t sum[RSE_PF_STEREO_MOST + 1], sum2[RSE_PF_STEREO_MOST + 1], products[RSE_PF_STEREO_MOST + 1];
-    double likeness[RSE_PF_STEREO_MOST + 1];
+    // 3. For the patch centred at column first + at, compute the sums of its pixels and squares by running sums.
+    constexpr int64_t kMaxOffsets = RSE_PF_STEREO_MAX_DISPARITY_PX + 1;
+    int32_t sum[kMaxOffsets], sum2[kMaxOffsets], products[kMaxOffsets];
+    double correlation2[kMaxOffsets];
     int32_t running = 0, running2 = 0;
     for (int64_t x = 0; x < kSide - 1; ++x) {
         running += sums[x];
@@ -144,28 +166,30 @@ RSE_PF_STEREO_INLINE Best searched(const Images& images, int64_t column, int64_t
         running -= sums[at];
         running2 -= squares[at];
     }
-    write_products(patch, strip, count, products);
-    const auto own = static_cast<double>(variance);
+    // 4. Compute the squared correlation of each offset, with the sign of the correlation.
+    correlate(patch, strip, count, products);
+    const auto patch_variance = static_cast<double>(variance);
     for (int64_t at = 0; at < count; ++at) {
-        const int32_t other = static_cast<int32_t>(kCount) * sum2[at] - sum[at] * sum[at];
-        const int32_t shared = static_cast<int32_t>(kCount) * products[at] - patch.sum * sum[at];
-        const auto covariance = static_cast<double>(shared);
-        const double squared = covariance * absolute(covariance) / (own * static_cast<double>(other > 0 ? other : 1));
-        likeness[at] = other > 0 ? squared : -1.0;
+        const int32_t other_variance = static_cast<int32_t>(kCount) * sum2[at] - sum[at] * sum[at];
+        const int32_t product = static_cast<int32_t>(kCount) * products[at] - patch.sum * sum[at];
+        const auto covariance = static_cast<double>(product);
+        const double squared = covariance * absolute(covariance) /
+                               (patch_variance * static_cast<double>(other_variance > 0 ? other_variance : 1));
+        correlation2[at] = other_variance > 0 ? squared : -1.0;
     }
-    // By growing disparities, the nearest of which is here.
-    const int64_t nearest = sign < 0 ? count - 1 : 0, step = sign;
-    const int64_t least = sign < 0 ? column - last : first - column;
+    // 5. In the order of ascending disparities, take the best one, then the best one outside of its peak.
+    const int64_t start = sign < 0 ? count - 1 : 0, step = sign;
+    const int64_t min_disparity = sign < 0 ? column - last : first - column;
     for (int64_t i = 0; i < count; ++i)
-        if (likeness[nearest + step * i] > best.likeness) {
-            best.likeness = likeness[nearest + step * i];
+        if (correlation2[start + step * i] > best.correlation2) {
+            best.correlation2 = correlation2[start + step * i];
             best.disparity = i;
         }
     for (int64_t i = 0; i < count; ++i)
-        if ((i < best.disparity - kBeside || i > best.disparity + kBeside) &&
-            likeness[nearest + step * i] > best.rival)
-            best.rival = likeness[nearest + step * i];
-    best.disparity += least;
+        if ((i < best.disparity - kPeakRadius || i > best.disparity + kPeakRadius) &&
+            correlation2[start + step * i] > best.rival_correlation2)
+            best.rival_correlation2 = correlation2[start + step * i];
+    best.disparity += min_disparity;
     return best;
 }
 
@@ -185,13 +209,17 @@ RSE_PF_STEREO_INLINE double dot(const double (&a)[kCount], const double (&b)[kCo
     return sum;
 }
 
-RSE_PF_STEREO_INLINE void centre(double (&values)[kCount]) {
+RSE_PF_STEREO_INLINE void subtract_mean(double (&values)[kCount]) {
     const double mean = mean_of(values);
     for (double& value : values) value -= mean;
 }
 
-// Return the disparity with its fraction, NaN where the least squares fail.
-RSE_PF_STEREO_INLINE double refined(const Images& images, int64_t column, int64_t row, int64_t best, double min_likeness) {
+// Refine an integer disparity to a fraction of a pixel by least squares matching: Gauss-Newton steps on the difference
+// of the patches L (left) and R (right, interpolated), after the mean and the gain of brightness are removed.  Return
+// NaN where the steps do not converge, or where the patches correlate less than min_correlation2.
+RSE_PF_STEREO_INLINE double refine_disparity(const Images& images, int64_t column, int64_t row, int64_t disparity,
+                                             double min_correlation2) {
+    // 1. Read the left patch and its horizontal gradient, and remove from the gradient its part along the patch.
     double L[kCount], slopes[kCount], R[kCount];
     for (int64_t y = 0, i = 0; y < kSide; ++y) {
         const uint8_t* const line = images.from + (row - kRadius + y) * images.width + column - kRadius;
@@ -200,76 +228,85 @@ RSE_PF_STEREO_INLINE double refined(const Images& images, int64_t column, int64_
             slopes[i] = (static_cast<double>(line[x + 1]) - static_cast<double>(line[x - 1])) / 2.0;
         }
     }
-    centre(L);
-    centre(slopes);
-    const double own2 = dot(L, L), gain = dot(slopes, L) / own2;
+    subtract_mean(L);
+    subtract_mean(slopes);
+    const double left2 = dot(L, L), gain = dot(slopes, L) / left2;
     for (int64_t i = 0; i < kCount; ++i) slopes[i] -= gain * L[i];
     const double information = dot(slopes, slopes);
     if (!(information > 0.0)) return not_a_number();
-    const auto begin = static_cast<double>(best);
-    double found = begin, last = kFarPx, likeness = 0.0;
-    for (int step = 0; step < kSteps && !(last < kConvergedPx); ++step) {
-        const double x = static_cast<double>(column) - found;
+    const auto start = static_cast<double>(disparity);
+    double refined = start, last_step = kMaxShiftPx, correlation2 = 0.0;
+    for (int step = 0; step < kMaxSteps && !(last_step < kConvergedPx); ++step) {
+        // 2. Interpolate the right patch at the present disparity.
+        const double x = static_cast<double>(column) - refined;
         const double whole = __builtin_floor(x), share = x - whole;
-        const int64_t near = static_cast<int64_t>(whole) - kRadius;
-        if (near < 0 || near + kSide >= images.width) return not_a_number();
+        const int64_t first = static_cast<int64_t>(whole) - kRadius;
+        if (first < 0 || first + kSide >= images.width) return not_a_number();
         for (int64_t v = 0, i = 0; v < kSide; ++v) {
-            const uint8_t* const line = images.to + (row - kRadius + v) * images.width + near;
+            const uint8_t* const line = images.to + (row - kRadius + v) * images.width + first;
             for (int64_t u = 0; u < kSide; ++u, ++i)
                 R[i] = (1.0 - share) * static_cast<double>(line[u]) + share * static_cast<double>(line[u + 1]);
         }
-        centre(R);
-        const double other2 = dot(R, R), shared = dot(L, R);
-        if (!(other2 > 0.0 && shared > 0.0)) return not_a_number();
-        const double move = shared / other2 * dot(slopes, R) / information;
-        likeness = shared * shared / (own2 * other2);
-        if (!(absolute(found + move - begin) <= kFarPx)) return not_a_number();
-        found += move;
-        last = absolute(move);
+        subtract_mean(R);
+        // 3. Step by the difference of the patches along the gradient.
+        const double right2 = dot(R, R), product = dot(L, R);
+        if (!(right2 > 0.0 && product > 0.0)) return not_a_number();
+        const double move = product / right2 * dot(slopes, R) / information;
+        correlation2 = product * product / (left2 * right2);
+        if (!(absolute(refined + move - start) <= kMaxShiftPx)) return not_a_number();
+        refined += move;
+        last_step = absolute(move);
     }
-    return last <= kStepPx && likeness >= min_likeness ? found : not_a_number();
+    return last_step <= kMaxLastStepPx && correlation2 >= min_correlation2 ? refined : not_a_number();
 }
 
-bool fits(const rse_pf_stereo_request& request) {
+bool is_valid(const rse_pf_stereo_request& request) {
     return request.abi == RSE_PF_STEREO_ABI && (request.flags & ~RSE_PF_STEREO_PORTABLE) == 0 && request.left != nullptr &&
            request.right != nullptr && request.pixels != nullptr && request.rows >= 0 && request.rows <= kMaxRows &&
            request.width >= 1 && request.height >= 1 && request.width <= kMaxSide && request.height <= kMaxSide &&
-           request.max_disparity_px >= 1 && request.max_disparity_px <= RSE_PF_STEREO_MOST &&
-           request.left_right_px <= RSE_PF_STEREO_MOST && request.min_disparity_px > 0.0 &&
-           request.min_likeness > 0.0 && request.uniqueness > 0.0;
+           request.max_disparity_px >= 1 && request.max_disparity_px <= RSE_PF_STEREO_MAX_DISPARITY_PX &&
+           request.left_right_px <= RSE_PF_STEREO_MAX_DISPARITY_PX && request.min_disparity_px > 0.0 &&
+           request.min_correlation2 > 0.0 && request.uniqueness > 0.0;
 }
 
-RSE_PF_STEREO_INLINE double disparity_of(const rse_pf_stereo_request& request, const double* pixel,
-                                         Products* write_products) {
+// Return the disparity (px) of the feature at a pixel of the left image, NaN where no match passes the limits.
+RSE_PF_STEREO_INLINE double measure_disparity(const rse_pf_stereo_request& request, const double* pixel,
+                                              Correlate* correlate) {
+    // 1. Round to the nearest pixel; its patch must lie inside.
     const double u = __builtin_rint(pixel[0]), v = __builtin_rint(pixel[1]);
     const bool is_inside = u >= static_cast<double>(kRadius + 1) && v >= static_cast<double>(kRadius + 1) &&
                            u <= static_cast<double>(request.width - kRadius - 2) &&
                            v <= static_cast<double>(request.height - kRadius - 2);
     if (!is_inside) return not_a_number();
     const auto column = static_cast<int64_t>(u), row = static_cast<int64_t>(v);
-    const Images there = {request.left, request.right, request.width, request.height};
-    const Best best = searched(there, column, row, request.max_disparity_px, -1, write_products);
-    if (!(best.likeness >= request.min_likeness && 1.0 - best.likeness < request.uniqueness * (1.0 - best.rival)))
+    // 2. Find the match in the right image; it must be good and unique.
+    const Images left_to_right = {request.left, request.right, request.width, request.height};
+    const Match match = find_match(left_to_right, column, row, request.max_disparity_px, -1, correlate);
+    if (!(match.correlation2 >= request.min_correlation2 &&
+          1.0 - match.correlation2 < request.uniqueness * (1.0 - match.rival_correlation2)))
         return not_a_number();
+    // 3. Search back in the left image, which must lead to the feature again.
     if (request.left_right_px >= 0) {
-        const Images back = {request.right, request.left, request.width, request.height};
-        const Best again = searched(back, column - best.disparity, row, request.max_disparity_px, 1, write_products);
-        const int64_t apart = again.disparity - best.disparity;
-        if (apart > request.left_right_px || apart < -request.left_right_px) return not_a_number();
+        const Images right_to_left = {request.right, request.left, request.width, request.height};
+        const Match back =
+            find_match(right_to_left, column - match.disparity, row, request.max_disparity_px, 1, correlate);
+        const int64_t difference = back.disparity - match.disparity;
+        if (difference > request.left_right_px || difference < -request.left_right_px) return not_a_number();
     }
-    const double found = refined(there, column, row, best.disparity, request.min_likeness);
-    return found >= request.min_disparity_px ? found : not_a_number();
+    // 4. Refine to a fraction of a pixel.
+    const double disparity = refine_disparity(left_to_right, column, row, match.disparity, request.min_correlation2);
+    return disparity >= request.min_disparity_px ? disparity : not_a_number();
 }
 
 void match_portably(const rse_pf_stereo_request& request, double* disparities) {
     for (int64_t i = 0; i < request.rows; ++i)
-        disparities[i] = disparity_of(request, request.pixels + 2 * i, products_portably);
+        disparities[i] = measure_disparity(request, request.pixels + 2 * i, correlate_portably);
 }
 
 #if defined(__x86_64__)
-RSE_PF_STEREO_AVX2 void match_by_avx2(const rse_pf_stereo_request& request, double* disparities) {
+RSE_PF_STEREO_AVX2 void match_with_avx2(const rse_pf_stereo_request& request, double* disparities) {
     for (int64_t i = 0; i < request.rows; ++i)
-        disparities[i] = disparity_of(request, request.pixels + 2 * i, products_by_avx2);
+        disparities[i] = measure_disparity(request, request.pixels + 2 * i, correlate_with_avx2);
 }
 #endif
 
@@ -281,10 +318,10 @@ __attribute__((visibility("default"))) uint32_t rse_pf_stereo_abi(void) { return
 
 __attribute__((visibility("default"))) int32_t rse_pf_disparities(const rse_pf_stereo_request* request,
                                                                   double* disparities) {
-    if (request == nullptr || disparities == nullptr || !fits(*request)) return -1;
+    if (request == nullptr || disparities == nullptr || !is_valid(*request)) return -1;
 #if defined(__x86_64__)
     if ((request->flags & RSE_PF_STEREO_PORTABLE) == 0 && rse_pf::processor().avx2) {
-        match_by_avx2(*request, disparities);
+        match_with_avx2(*request, disparities);
         return 0;
     }
 #endif

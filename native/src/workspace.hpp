@@ -1,4 +1,4 @@
-// The memory of one thread: arrays for the rows of a request, kept for the next one.
+// The memory of one thread: arrays with an element for each correspondence, reused from request to request.
 #pragma once
 
 #include <cstdint>
@@ -7,19 +7,24 @@
 
 namespace rse_pf {
 
+// Correspondences as a structure of arrays.
 template <class T>
 struct Columns {
-    T *x, *y, *z, *u, *v;  // metres in the centred world; pixels from the principal point
+    T *x, *y, *z;  // point, metres, in the world frame shifted so that its origin is a median of the points
+    T *u, *v;      // pixel, relative to the principal point
 };
 
 struct Workspace {
-    Columns<float> single;
-    Columns<double> all, inliers;
-    double *error2, *u, *v, *z_inverse;  // the view of all rows from the pose
-    double *along, *aside;               // scratch of the width of a cloud of points
+    Columns<float> single;    // all correspondences in single precision, for the search
+    Columns<double> all;      // all correspondences in double precision
+    Columns<double> inliers;  // the inliers of the pose, copied together
+    double *error2;           // squared reprojection error of each row at the last projected pose, px^2
+    double *u, *v;            // projection of each row at that pose, pixels from the principal point
+    double *z_inverse;        // inverse depth of each row at that pose, 1/m
+    double *length2, *width2; // scratch of width_to_length: squared distances along and across the main axis
 };
 
-// What the caller of the solvers has prepared; the centre was taken from all points.
+// One request with the memory that the solver uses for it.
 struct Task {
     const rse_pf_pnp_request* request;
     Workspace* workspace;
