@@ -1,9 +1,10 @@
-"""The gate before tracking: what a source states, assumes and delivers, compared before a frame is used.
+"""Facts that a recording or camera states about itself, and the refusal of facts that contradict each other.
 
-Each reader (folder, data set, bag, video, device) fills in `SourceFacts` and calls `check_source`, which
-knows no file and no device.  Two facts that contradict each other raise an error with both of them.  What is
-only unlikely is a `Doubt`: the source is used, the doubt is printed, and the check of the drive gives no
-advice until the user accepts the doubt by its name.
+Each reader (folder, data set, bag, video, device) fills in `SourceFacts`: what files and messages state, what
+the reader assumed, and what the images show.  `check_source` compares these facts before a frame is tracked.
+Facts that contradict each other are an error with both numbers.  Facts that are only unlikely are a `Doubt`:
+the source is used, the doubt is printed as a finding, and ``rse-pf check`` gives no advice until the user
+accepts the doubt by its name (``--accept NAME``).
 """
 
 from __future__ import annotations
@@ -27,61 +28,79 @@ __all__ = [
     "unresolved",
 ]  # fmt: skip
 
-MIN_MEDIAN_DEPTH_M = 0.05  # nearer than any depth camera measures
-MAX_MEDIAN_DEPTH_M = 30.0  # farther than any depth camera measures
-MIN_ASSUMED_MEDIAN_DEPTH_M = 0.2  # of a depth unit that nobody stated
-MAX_ASSUMED_MEDIAN_DEPTH_M = 6.0  # of a depth unit that nobody stated: rooms are smaller
-MIN_INTERVAL_S = 1e-4  # no camera is faster than 10,000 Hz
-MAX_INTERVAL_S = 1e3  # slower than any drive: the unit of the time stamps is wrong
-_EPOCH_S = (1e9, 1e10)  # seconds since 1970 of the years 2001 to 2286
-_UNITS_S = {"seconds": 1.0, "milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9}
-_USUAL_LOSS = 0.1  # of the images of a camera that runs freely beside another find no partner
-_MAX_APART = 0.5  # frames between the last images of two videos that were recorded together
-_MAX_NAMED = 12  # files that one sentence names at most
+MIN_MEDIAN_DEPTH_M = 0.05  # median of some depth images: no depth camera measures nearer
+MAX_MEDIAN_DEPTH_M = 30.0  # median of some depth images: no depth camera measures farther
+MIN_ASSUMED_MEDIAN_DEPTH_M = 0.2  # median depth where the unit is assumed: nearer is a wrong unit
+MAX_ASSUMED_MEDIAN_DEPTH_M = 6.0  # median depth where the unit is assumed: rooms are smaller
+MIN_INTERVAL_S = 1e-4  # median time between images: no camera is faster than 10,000 Hz
+MAX_INTERVAL_S = 1e3  # median time between images: a longer one is a wrong unit of the time stamps
+_MIN_EPOCH_S = 1e9  # time stamps from here on are seconds since 1970: the year 2001
+_MAX_EPOCH_S = 1e10  # time stamps below are seconds since 1970: the year 2286
+_TIME_UNITS_S = {"seconds": 1.0, "milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9}
+"""Units that time stamps of recordings have, each with its length in seconds."""
+_USUAL_LOSS_SHARE = 0.1
+"""Share of images without a partner, up to which a loss is no finding: two cameras that are not triggered
+together always lose some."""
+_MAX_VIDEO_END_DIFFERENCE = 0.5
+"""Difference between the times of the last images of two videos, in image intervals: more means that one
+video lacks an image."""
+_MAX_NAMES_IN_SENTENCE = 12  # files that one sentence names at most; the others are counted
 
 
 class DoubtName(str, Enum):
-    """The names of doubts, as ``--accept`` takes them; the values are stable."""
+    """Names of doubts, as users write them after ``--accept``; a value never changes."""
 
-    TIME_ORDER = "time-order"  # time stamps go back: the clock was set in the drive
-    EQUAL_STAMPS = "equal-stamps"  # several images have one time stamp
-    REFERENCE_TIMES = "reference-times"  # truth or odometry has no time stamp within the recording
-    LEFT_OUT = "left-out"  # images were damaged, empty or without a partner
-    ENDED_EARLY = "ended-early"  # the source failed in the drive
-    CAMERA_CHANGES = "camera-changes"  # several calibrations are stated in one drive
+    TIME_ORDER = "time-order"  # time stamps go back, because the clock was set during the recording
+    EQUAL_STAMPS = "equal-stamps"  # several images have the same time stamp
+    REFERENCE_TIMES = "reference-times"  # ground truth or odometry has no time stamp within the recording
+    LEFT_OUT = "left-out"  # images are not used: damaged, empty, or without a partner
+    ENDED_EARLY = "ended-early"  # the source failed after it had delivered frames
+    CAMERA_CHANGES = "camera-changes"  # several calibrations of one camera are stated in one recording
     DEPTH_REGISTRATION = "depth-registration"  # nothing says that depth is registered to the colour image
     DEPTH_ALONG_RAY = "depth-along-ray"  # depth is measured along the ray, not along the optical axis
-    STATIC_PATTERN = "static-pattern"  # something stands still in the image while the camera moves
+    STATIC_PATTERN = "static-pattern"  # something is fixed in the image while the camera moves, such as dirt
     FROZEN_IMAGES = "frozen-images"  # the driver repeats an image
     MOVING_OBJECTS = "moving-objects"  # something moves in most of the view
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Doubt:
-    """Something unlikely that was found in a source; *hint* is the action that settles it."""
+    """An unlikely fact about a source, which is used all the same until the user decides.
+
+    Attributes:
+        name: Kind of the doubt, which the user may accept.
+        sentence: What is unlikely, with the numbers.
+        hint: The action that removes the cause.
+    """
 
     name: DoubtName
     sentence: str
     hint: str
 
     def line(self) -> str:
-        """Return the doubt in one line for people."""
+        """Return the doubt as one line of output, see `doubt_line`."""
         return doubt_line(self.to_dict())
 
     def to_dict(self) -> dict[str, str]:
-        """Return what a report holds of the doubt."""
+        """Return the doubt as an object for a JSON report."""
         return {"name": self.name.value, "sentence": self.sentence, "hint": self.hint}
 
 
-def doubt_line(told: Mapping[str, Any]) -> str:
-    """Return a doubt of a report in one line for people."""
-    name = told.get("name")
-    return f"finding {name}: {told.get('sentence')}; {told.get('hint')}, or --accept {name}"
+def doubt_line(doubt: Mapping[str, Any]) -> str:
+    """Return one line of output for a doubt of a JSON report, as `Doubt.to_dict` made it."""
+    name = doubt.get("name")
+    return f"finding {name}: {doubt.get('sentence')}; {doubt.get('hint')}, or --accept {name}"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CameraFacts:
-    """A camera as its source states it (*stated_by* is a file or topic), and the images that it delivers."""
+    """A camera as its source states it, before undistortion and rectification.
+
+    Attributes:
+        stated_by: The file, topic or person that states the lens, for error messages.
+        lens: The stated camera and its distortion.
+        image_size_px: Width and height of the images; None if no image was read yet.
+    """
 
     stated_by: str
     lens: Lens
@@ -90,9 +109,13 @@ class CameraFacts:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DepthFacts:
-    """Depth of some frames: its median, m (None without a reading), and the unit that gave it.
+    """What a source states about its depth images, and the depth that some of them show.
 
-    ``is_registered`` says whether depth images show the view of the colour camera; None if nobody stated it.
+    Attributes:
+        median_m: Median reading of some depth images, m; None if they have no reading.
+        units_per_m: Units of a depth image in a metre, by which the median was computed.
+        is_unit_stated: Whether the source states this unit; else the reader assumed it.
+        is_registered: Whether depth images show the view of the colour camera; None if nobody stated it.
     """
 
     median_m: float | None
@@ -103,9 +126,14 @@ class DepthFacts:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LossFacts:
-    """Images that a source states and does not deliver: *lost* of *total*; *sentence* says which, and why.
+    """Images that a source lists, and that cannot be used.
 
-    ``is_usual`` says that a few of them are lost by all recorders: two cameras that run freely lose partners.
+    Attributes:
+        sentence: Which images are lost, and why, for the user.
+        lost: Number of lost images.
+        total: Number of images that the source lists.
+        is_usual: Whether every recorder loses some images in this way, such as those without a partner of
+            cameras that are not triggered together.
     """
 
     sentence: str
@@ -116,20 +144,23 @@ class LossFacts:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VideoFacts:
-    """How many images a video states, and the mean time between them."""
+    """The number of images that a video file states, and the mean time between them (s)."""
 
     frames: int
     period_s: float
 
     @property
     def last_s(self) -> float:
-        """When the last image is shown, seconds after the first."""
+        """Time of the last image, seconds after the first."""
         return (self.frames - 1) * self.period_s
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class TimeFacts:
-    """Time stamps ``(n,)`` in seconds, in the order of the source; *stated_by* is a file or topic."""
+    """Time stamps ``(n,)`` of images or poses, seconds, in the order of the source.
+
+    ``stated_by`` is the file or topic that holds them, for error messages.
+    """
 
     stated_by: str
     stamps_s: Array
@@ -137,18 +168,18 @@ class TimeFacts:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SourceFacts:
-    """What a source states, what was assumed, and what it delivers.
+    """All facts that a reader has about a source before the first frame is tracked.
 
     Attributes:
-        name: Of the source, for people.
-        cameras: As they are stated, before undistortion and rectification.
-        depth: None without depth.
-        times: Of the images, of each camera that has its own.
-        videos: Of the two videos of a pair, by their names.
-        references: Times of the truth and of the odometry.
-        losses: Images that are left out.
-        doubts: What the reader itself met.
-        assumed: Sentences on what the source does not state.
+        name: Path or device of the source, for messages.
+        cameras: The cameras whose images are used.
+        depth: Facts about depth images; None if the source has none, or they are not used.
+        times: Time stamps of the images, one entry for each camera with time stamps of its own.
+        videos: Two videos of a stereo pair by their file names, else empty.
+        references: Time stamps of the ground truth and of the odometry.
+        losses: Images that cannot be used.
+        doubts: Doubts that the reader had while it read the source.
+        assumed: Sentences on what the source does not state, and the reader assumed.
     """
 
     name: str
@@ -163,40 +194,45 @@ class SourceFacts:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What is said about the source and needs no action: what was assumed, and losses that are usual."""
+        """Sentences for the user that need no action: what was assumed, and usual losses."""
         return (*self.assumed, *(loss.sentence for loss in self.losses if not _is_finding(loss)))
 
     @property
     def span_s(self) -> tuple[float, float] | None:
-        """The first and the last time stamp of the images; None if they are not known before the drive."""
-        stamps_s = np.concatenate([each.stamps_s for each in self.times]) if self.times else np.empty(0)
+        """The first and last time stamp of the images, s; None if they are known only while images come."""
+        stamps_s = np.concatenate([times.stamps_s for times in self.times]) if self.times else np.empty(0)
         return (float(stamps_s.min()), float(stamps_s.max())) if len(stamps_s) else None
 
 
 class DoubtLog:
-    """The doubts about a source: those of the gate, and those that appear while the source is read."""
+    """The doubts about a source: those of `check_source`, and those that arise while frames are read."""
 
     def __init__(self, doubts: Iterable[Doubt] = ()) -> None:
         self._doubts = list(doubts)
         self._left_out: list[str] = []
 
     def add(self, doubt: Doubt) -> None:
-        """Add a doubt that appeared in the drive."""
+        """Add a doubt that arose while frames were read."""
         self._doubts.append(doubt)
 
     def add_reference(self, file: str, stamps_s: Array, span_s: tuple[float, float] | None) -> None:
-        """Add a doubt if an odometry or truth has no time stamp within the span of the images."""
+        """Add a doubt if *file*, an odometry or ground truth, has no time stamp within the span of the
+        images.
+
+        *stamps_s* ``(n,)`` are the time stamps of the file, *span_s* the first and last one of the images;
+        None for the span adds nothing.
+        """
         if span_s is not None:
             reference = TimeFacts(stated_by=file, stamps_s=stamps_s)
             self._doubts += check_reference(reference, span_s)
 
     def leave_out(self, image: str) -> None:
-        """Count an image that cannot be used, by its name."""
+        """Count an image that cannot be used; *image* is its file name or time."""
         self._left_out.append(image)
 
     @property
     def doubts(self) -> tuple[Doubt, ...]:
-        """All doubts so far, in the order in which they appeared."""
+        """All doubts so far, with one doubt at the end for all images that were left out."""
         if not self._left_out:
             return tuple(self._doubts)
         images = f"{len(self._left_out)} image" + ("s" if len(self._left_out) > 1 else "")
@@ -209,23 +245,23 @@ class DoubtLog:
 
 
 def ended_early(error: RsePfError, frames: int) -> Doubt:
-    """Return the doubt about a source that failed after it had delivered some frames."""
+    """Return the doubt about a source that failed with *error* after it had delivered *frames* frames."""
     sentence = f"the source failed after {frames} frames, which are kept: {error.message}"
     return Doubt(name=DoubtName.ENDED_EARLY, sentence=sentence, hint=error.hint)
 
 
 def check_source(facts: SourceFacts) -> tuple[Doubt, ...]:
-    """Return the doubts about a source.
+    """Compare the facts of a source with each other, and return the doubts about them.
 
     Raises:
         UsageError: Two facts contradict each other, or a fact is impossible.
     """
-    return (*facts.doubts, *(doubt for rule in _RULES for doubt in rule(facts)))
+    return (*facts.doubts, *(doubt for check in _CHECKS for doubt in check(facts)))
 
 
 def check_accepted(names: Iterable[str]) -> None:
-    """Refuse names of ``--accept`` that are no doubt's; raises UsageError."""
-    known = [each.value for each in DoubtName]
+    """Refuse names after ``--accept`` that are not in `DoubtName`; raises UsageError."""
+    known = [name.value for name in DoubtName]
     for name in names:
         if name not in known:
             raise UsageError(
@@ -235,22 +271,22 @@ def check_accepted(names: Iterable[str]) -> None:
 
 
 def unresolved(doubts: Iterable[Doubt], accepted: Iterable[str]) -> tuple[Doubt, ...]:
-    """Return the doubts whose names are not accepted."""
-    names = set(accepted)
-    return tuple(doubt for doubt in doubts if doubt.name.value not in names)
+    """Return the doubts whose names the user has not accepted."""
+    accepted_names = set(accepted)
+    return tuple(doubt for doubt in doubts if doubt.name.value not in accepted_names)
 
 
 def time_unit_s(stamps: Array) -> tuple[str, float]:
-    """Return the name and the length, s, of the unit of time stamps ``(n,)`` that state none.
+    """Return the name and the length (s) of the most likely unit of time stamps ``(n,)`` that state no unit.
 
-    Stamps since 1970 tell their unit by their size.  Of others it is the unit in which images come 0.1 to
-    100 times a second.
+    Time stamps since 1970 show their unit by their size.  All others show it by their median interval: below
+    10 they are seconds, below 10,000 milliseconds, below 10 million microseconds, and else nanoseconds.
     """
     unit = _unit_since_1970(stamps)
     if unit is not None:
         return unit
-    steps = np.diff(np.unique(stamps))
-    interval = float(np.median(steps)) if len(steps) else 0.0
+    intervals = np.diff(np.unique(stamps))
+    interval = float(np.median(intervals)) if len(intervals) else 0.0
     if interval < 10.0:
         return "seconds", 1.0
     if interval < 1e4:
@@ -259,55 +295,68 @@ def time_unit_s(stamps: Array) -> tuple[str, float]:
 
 
 def is_since_1970(stamps_s: Array) -> bool:
-    """Return whether stamps ``(n,)`` are seconds since 1970, of the years 2001 to 2286."""
-    return bool(len(stamps_s)) and _EPOCH_S[0] <= float(np.median(stamps_s)) < _EPOCH_S[1]
+    """Return whether the median of time stamps ``(n,)`` is seconds since 1970 of the years 2001 to 2286."""
+    return bool(len(stamps_s)) and _MIN_EPOCH_S <= float(np.median(stamps_s)) < _MAX_EPOCH_S
 
 
 def _unit_since_1970(stamps: Array) -> tuple[str, float] | None:
-    return next((unit for unit in _UNITS_S.items() if is_since_1970(stamps * unit[1])), None)
+    """Return the unit in which time stamps ``(n,)`` are times since 1970; None if there is no such unit."""
+    return next((unit for unit in _TIME_UNITS_S.items() if is_since_1970(stamps * unit[1])), None)
 
 
 def stamps_in_seconds(
     stamps: Array, stated_by: str, layout_unit: str | None = None
 ) -> tuple[Array, tuple[str, ...]]:
-    """Return time stamps ``(n,)`` in seconds, and a note where their unit was assumed.
+    """Return time stamps ``(n,)`` in seconds, and a note if they are not in the unit that the format
+    prescribes.
 
-    *layout_unit* is the unit that the format of the file prescribes; it counts unless the stamps are times
-    since 1970 in another one.  None means seconds, unless the stamps look otherwise.
+    Args:
+        stamps: Time stamps in an unknown unit.
+        stated_by: The file that holds them, for the note.
+        layout_unit: Name of the unit that the file's format prescribes, which is used unless the stamps are
+            times since 1970 in another unit.  For None, the unit is that of `time_unit_s`, and a note is
+            returned unless that is seconds.
     """
     expected = layout_unit or "seconds"
     unit, unit_s = time_unit_s(stamps)
     if layout_unit is not None:
-        unit, unit_s = _unit_since_1970(stamps) or (expected, _UNITS_S[expected])
+        unit, unit_s = _unit_since_1970(stamps) or (expected, _TIME_UNITS_S[expected])
     notes = () if unit == expected else (f"the time stamps of {stated_by} are taken as {unit}",)
     return stamps * unit_s if unit_s == 1.0 else stamps / round(1.0 / unit_s), notes
 
 
 def median_depth_m(images: Iterable[npt.NDArray[np.float32]]) -> float | None:
-    """Return the median reading, m, of ``(h, w)`` depth images; None without a reading."""
-    readings = [some[some > 0] for some in (image[::8, ::8] for image in images)]
-    known = np.concatenate(readings) if readings else np.empty(0, dtype=np.float32)
-    return float(np.median(known)) if len(known) else None
+    """Return the median depth of ``(h, w)`` depth images, m, by every eighth row and column; None without
+    readings.
+
+    A pixel without a reading is 0.
+    """
+    readings = [sample[sample > 0] for sample in (image[::8, ::8] for image in images)]
+    depths_m = np.concatenate(readings) if readings else np.empty(0, dtype=np.float32)
+    return float(np.median(depths_m)) if len(depths_m) else None
 
 
 def rows_in_time(times: TimeFacts) -> tuple[list[int], tuple[Doubt, ...]]:
-    """Return the rows whose time stamps increase, and doubts about the others.
+    """Return the rows whose time stamps increase, and the doubts about all other rows.
 
-    Rows with the time stamp of the row before are left out.  The recording ends where the clock was set
-    back.
+    A row with the time stamp of the row before is left out.  Where the clock was set back once, the recording
+    ends.
 
     Raises:
-        UsageError: The time stamps go back more than once, or at once: the rows are in no order of time.
+        UsageError: The time stamps go back more than once, or between the first two rows, so that the rows
+            are not in the order of time.
     """
     steps_s = np.diff(times.stamps_s)
-    backs = np.flatnonzero(steps_s < 0.0)
     total = len(times.stamps_s)
+    # 1. Where the clock goes back.
+    backs = np.flatnonzero(steps_s < 0.0)
     if len(backs) > 1 or (len(backs) == 1 and backs[0] == 0):
         raise UsageError(
             f"{times.stated_by}: {len(backs)} of {total} time stamps are earlier than the one before, first "
             f"{times.stamps_s[backs[0] + 1]:.6f} s after {times.stamps_s[backs[0]]:.6f} s",
             hint="sort the images in the order in which they were taken, if their clock can be trusted",
         )
+    # 2. The recording ends before the jump.
     doubts = []
     end = total
     if len(backs):
@@ -320,15 +369,16 @@ def rows_in_time(times: TimeFacts) -> tuple[list[int], tuple[Doubt, ...]]:
                 hint="make two recordings of it, one before and one after the jump",
             )
         )
+    # 3. Of rows with equal time stamps, the first is used.
     rows = [0][:total] + [row + 1 for row in range(end - 1) if steps_s[row] > 0.0]
-    equal = end - len(rows)
-    if equal:
+    equal_count = end - len(rows)
+    if equal_count:
         first_s = times.stamps_s[int(np.flatnonzero(steps_s[: end - 1] == 0.0)[0])]
         doubts.append(
             Doubt(
                 name=DoubtName.EQUAL_STAMPS,
-                sentence=f"{times.stated_by}: {equal} of {total} images have the time stamp of the image "
-                f"before, first {first_s:.6f} s; they are left out",
+                sentence=f"{times.stated_by}: {equal_count} of {total} images have the time stamp of the "
+                f"image before, first {first_s:.6f} s; they are left out",
                 hint="write the time of each exposure, with all its digits",
             )
         )
@@ -336,7 +386,7 @@ def rows_in_time(times: TimeFacts) -> tuple[list[int], tuple[Doubt, ...]]:
 
 
 def check_reference(reference: TimeFacts, span_s: tuple[float, float]) -> tuple[Doubt, ...]:
-    """Return a doubt if a truth or an odometry has no time stamp within the span of the images."""
+    """Return a doubt if a ground truth or an odometry has no time stamp within the span of the images, s."""
     stamps_s = reference.stamps_s
     if not len(stamps_s) or ((stamps_s >= span_s[0]) & (stamps_s <= span_s[1])).any():
         return ()
@@ -349,32 +399,33 @@ def check_reference(reference: TimeFacts, span_s: tuple[float, float]) -> tuple[
 
 
 def some_names(names: Sequence[str]) -> str:
-    """Return the first names of a list, and how many there are."""
-    more = len(names) - _MAX_NAMED
-    return ", ".join(names[:_MAX_NAMED]) + (f" and {more} more" if more > 0 else "")
+    """Return the first twelve names of a list, and the number of the others, for a sentence."""
+    more = len(names) - _MAX_NAMES_IN_SENTENCE
+    return ", ".join(names[:_MAX_NAMES_IN_SENTENCE]) + (f" and {more} more" if more > 0 else "")
 
 
 def _check_cameras(facts: SourceFacts) -> Iterable[Doubt]:
-    for each in facts.cameras:
-        camera = each.lens.camera
+    """Refuse intrinsics of another image size than the images have, or with an implausible field of view."""
+    for stated in facts.cameras:
+        camera, lens = stated.lens.camera, stated.lens
         size = (camera.width, camera.height)
-        if each.image_size_px is not None and each.image_size_px != size:
+        if stated.image_size_px is not None and stated.image_size_px != size:
             raise UsageError(
-                f"{facts.name} has images of {each.image_size_px[0]}x{each.image_size_px[1]} px, "
-                f"{each.stated_by} is for {size[0]}x{size[1]} px",
+                f"{facts.name} has images of {stated.image_size_px[0]}x{stated.image_size_px[1]} px, "
+                f"{stated.stated_by} is for {size[0]}x{size[1]} px",
                 hint="give the intrinsics of this size: scale fx fy cx cy with the image",
             )
         if not (0.0 <= camera.cx <= camera.width and 0.0 <= camera.cy <= camera.height):
             raise UsageError(
-                f"{each.stated_by}: the principal point ({camera.cx:g}, {camera.cy:g}) lies outside of the "
+                f"{stated.stated_by}: the principal point ({camera.cx:g}, {camera.cy:g}) lies outside of the "
                 f"image of {size[0]}x{size[1]} px",
                 hint="give the intrinsics of this size: scale fx fy cx cy with the image",
             )
-        smallest_deg, largest_deg = each.lens.plausible_field_of_view_deg
-        if not smallest_deg <= each.lens.field_of_view_deg <= largest_deg:
+        smallest_deg, largest_deg = lens.plausible_field_of_view_deg
+        if not smallest_deg <= lens.field_of_view_deg <= largest_deg:
             raise UsageError(
-                f"{each.stated_by}: fx {camera.fx:g} fy {camera.fy:g} at {size[0]}x{size[1]} px is a "
-                f"field of view of {each.lens.field_of_view_deg:.0f} degrees, not within "
+                f"{stated.stated_by}: fx {camera.fx:g} fy {camera.fy:g} at {size[0]}x{size[1]} px is a "
+                f"field of view of {lens.field_of_view_deg:.0f} degrees, not within "
                 f"{smallest_deg:g}..{largest_deg:g}",
                 hint="give fx and fy in pixels of this image size; a wide lens has model fisheye",
             )
@@ -382,6 +433,7 @@ def _check_cameras(facts: SourceFacts) -> Iterable[Doubt]:
 
 
 def _check_depth(facts: SourceFacts) -> Iterator[Doubt]:
+    """Refuse a unit of depth that gives an impossible median, and doubt depth that is not registered."""
     depth = facts.depth
     if depth is not None and depth.is_registered is False:
         yield Doubt(
@@ -391,57 +443,62 @@ def _check_depth(facts: SourceFacts) -> Iterator[Doubt]:
             hint="record depth that the driver has aligned to the colours",
         )
     if depth is not None and depth.median_m is not None:
-        low, high = MIN_MEDIAN_DEPTH_M, MAX_MEDIAN_DEPTH_M
+        min_m, max_m = MIN_MEDIAN_DEPTH_M, MAX_MEDIAN_DEPTH_M
         if not depth.is_unit_stated:
-            low, high = MIN_ASSUMED_MEDIAN_DEPTH_M, MAX_ASSUMED_MEDIAN_DEPTH_M
-        if not low <= depth.median_m <= high:
-            how = "" if depth.is_unit_stated else "assumed "
+            min_m, max_m = MIN_ASSUMED_MEDIAN_DEPTH_M, MAX_ASSUMED_MEDIAN_DEPTH_M
+        if not min_m <= depth.median_m <= max_m:
+            assumed = "" if depth.is_unit_stated else "assumed "
             raise UsageError(
-                f"the median depth of {facts.name} is {depth.median_m:g} m at {how}{depth.units_per_m:g} "
-                f"units a metre, not within {low:g}..{high:g} m",
+                f"the median depth of {facts.name} is {depth.median_m:g} m at {assumed}{depth.units_per_m:g} "
+                f"units a metre, not within {min_m:g}..{max_m:g} m",
                 hint="state the unit of depth: depth_scale 1000 for mm, 5000 for TUM, 4000 for 0.25 mm",
             )
 
 
 def _check_times(facts: SourceFacts) -> Iterator[Doubt]:
-    named: set[DoubtName] = set()
-    for each in facts.times:
-        # Colour and depth of one driver have one fault.
-        doubts = [doubt for doubt in rows_in_time(each)[1] if doubt.name not in named]
-        named |= {doubt.name for doubt in doubts}
+    """Refuse unordered time stamps and wrong units, and doubt time stamps that repeat or jump back once."""
+    reported: set[DoubtName] = set()
+    for times in facts.times:
+        # Colour and depth images of one driver have the same fault, which is reported once.
+        doubts = [doubt for doubt in rows_in_time(times)[1] if doubt.name not in reported]
+        reported |= {doubt.name for doubt in doubts}
         yield from doubts
-        steps_s = np.diff(np.unique(each.stamps_s))
-        interval_s = float(np.median(steps_s)) if len(steps_s) else 1.0
+        intervals_s = np.diff(np.unique(times.stamps_s))
+        interval_s = float(np.median(intervals_s)) if len(intervals_s) else 1.0
         if not MIN_INTERVAL_S <= interval_s <= MAX_INTERVAL_S:
             raise UsageError(
-                f"{each.stated_by}: images are {interval_s:g} s apart in the median, not within "
+                f"{times.stated_by}: images are {interval_s:g} s apart in the median, not within "
                 f"{MIN_INTERVAL_S:g}..{MAX_INTERVAL_S:g} s",
                 hint="correct the unit of the time stamps",
             )
 
 
 def _is_finding(loss: LossFacts) -> bool:
-    return loss.lost > (_USUAL_LOSS * loss.total if loss.is_usual else 0)
+    """Return whether a loss is reported as a doubt, and not only as a note."""
+    return loss.lost > (_USUAL_LOSS_SHARE * loss.total if loss.is_usual else 0)
 
 
 def _check_losses(facts: SourceFacts) -> Iterator[Doubt]:
     for loss in facts.losses:
         if _is_finding(loss):
             yield Doubt(
-                name=DoubtName.LEFT_OUT, sentence=loss.sentence,
+                name=DoubtName.LEFT_OUT,
+                sentence=loss.sentence,
                 hint="copy the recording again, or record it again",
-            )  # fmt: skip
+            )
 
 
 def _check_videos(facts: SourceFacts) -> Iterable[Doubt]:
-    """Refuse two videos whose last images have different times: where the times differ, no one can tell.
+    """Refuse two videos of a stereo pair that end at different times.
 
-    A camera that lost an image delivers a shorter video with times in equal steps, as one does that was
-    stopped earlier.  Where the times have a gap for the lost image, both videos end at the same time.
+    Many recorders write time stamps in equal steps.  If a camera lost an image, its video is then shorter,
+    and all images after the loss have wrong partners.  A video that was only stopped earlier looks the same,
+    so that both are refused.  Where the time stamps have a gap for the lost image, both videos end at one
+    time.
     """
     if len(facts.videos) == 2:
         (name, video), (other_name, other) = facts.videos.items()
-        if abs(video.last_s - other.last_s) > _MAX_APART * min(video.period_s, other.period_s):
+        if abs(video.last_s - other.last_s) > _MAX_VIDEO_END_DIFFERENCE * min(video.period_s, other.period_s):
             raise UsageError(
                 f"{name} has {video.frames} images until {video.last_s:.3f} s, {other_name} {other.frames} "
                 f"until {other.last_s:.3f} s: their times do not say which images belong together",
@@ -453,11 +510,17 @@ def _check_videos(facts: SourceFacts) -> Iterable[Doubt]:
 
 def _check_references(facts: SourceFacts) -> Iterator[Doubt]:
     span_s = facts.span_s
-    for each in facts.references:
+    for reference in facts.references:
         if span_s is not None:
-            yield from check_reference(each, span_s)
+            yield from check_reference(reference, span_s)
 
 
-_RULES: tuple[Callable[[SourceFacts], Iterable[Doubt]], ...] = (
-    _check_cameras, _check_depth, _check_times, _check_losses, _check_videos, _check_references,
-)  # fmt: skip
+_CHECKS: tuple[Callable[[SourceFacts], Iterable[Doubt]], ...] = (
+    _check_cameras,
+    _check_depth,
+    _check_times,
+    _check_losses,
+    _check_videos,
+    _check_references,
+)
+"""The checks of `check_source`, in the order in which their errors and doubts are reported."""

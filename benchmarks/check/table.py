@@ -27,7 +27,7 @@ from client_sdk.check.findings import CheckReport, FaultKind
 from client_sdk.check.motion import MotionReference
 from client_sdk.check.observer import DriveObserver
 from client_sdk.frontend import Frame, FrontEndOptions
-from client_sdk.rigs.checks import fault_of_pairs, spread_pairs
+from client_sdk.rigs.stereo_pair_checks import choose_pairs, find_fault_of_frames
 from client_sdk.tracking.tracker import Tracker
 
 __all__ = ["table"]
@@ -47,7 +47,9 @@ def checked(frames: Sequence[Frame], reference: MotionReference | None) -> tuple
     observer, tracker, took_s = DriveObserver(reference), Tracker(FrontEndOptions()), 0.0
     if _has_stereo(frames):
         observer.add_pairs(
-            fault_of_pairs((frames[row], frames[after]) for row, after in spread_pairs(range(len(frames))))
+            find_fault_of_frames(
+                (frames[row], frames[after]) for row, after in choose_pairs(range(len(frames)))
+            )
         )
     for frame in frames:
         result = track(tracker, frame)

@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from client_sdk.frontend import describe
-from client_sdk.rigs.checks import match_features
+from client_sdk.rigs.stereo_pair_checks import match_features
 from rse_pf.geometry import Array, Lens
 
 __all__ = ["mismatch_px"]

@@ -23,10 +23,10 @@ from client_sdk.datasets import CameraChoice, open_dataset
 from client_sdk.datasets.recordings import is_listed
 from client_sdk.datasets.rig_recordings import is_euroc, is_kitti
 from client_sdk.frontend import Frame
+from client_sdk.rigs.folder_camera import find_folder_camera
 from client_sdk.rigs.intrinsics import TYPICAL_HINT, Intrinsics, read_intrinsics
 from client_sdk.rigs.rig import Rig
 from client_sdk.rigs.rig_file import read_calibration, read_rig
-from client_sdk.rigs.stated_camera import stated_camera
 from client_sdk.source_facts import CameraFacts, DoubtLog, SourceFacts, check_source
 from rse_pf.errors import UsageError
 from rse_pf.files import check_exists
@@ -119,7 +119,7 @@ def open_camera(
     if path.is_dir():
         if own is None:
             file = path / "intrinsics.json"
-            found = None if file.exists() else stated_camera(path, lambda: list_folder(path).size_px)
+            found = None if file.exists() else find_folder_camera(path, lambda: list_folder(path).size_px)
             file, own = (file, read_intrinsics(file)) if found is None else found
             stated_by = str(file)
         return _folder(path, own, stated_by, rate_hz, depth)

@@ -20,10 +20,15 @@ from client_sdk.auto_close import Closing
 from client_sdk.datasets.thinning import Thinning
 from client_sdk.frontend import Frame, load_opencv
 from client_sdk.image_map import map_to_pinhole
-from client_sdk.rigs.checks import PairLook, check_pairs, fault_of_looks, measure_pair
 from client_sdk.rigs.intrinsics import Intrinsics
 from client_sdk.rigs.rectification import Rectification
 from client_sdk.rigs.rig import Rig
+from client_sdk.rigs.stereo_pair_checks import (
+    PairMeasurement,
+    check_stereo_pairs,
+    find_fault,
+    measure_pair,
+)
 from client_sdk.source_facts import Doubt, DoubtLog, DoubtName
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Camera
@@ -227,7 +232,7 @@ class StereoSource(FrameStream):
         self._ahead: deque[Frame] | None = None
         self._given = 0
         self._last: Frame | None = None
-        self._looks: deque[PairLook] = deque(maxlen=_LOOKS)
+        self._looks: deque[PairMeasurement] = deque(maxlen=_LOOKS)
 
     def __next__(self) -> Frame:
         """Return the next frame; the first ones are compared before one is given out, and some later ones."""
@@ -238,7 +243,7 @@ class StereoSource(FrameStream):
                     self._ahead.append(super().__next__())
                 except StopIteration:
                     break
-            check_pairs(itertools.pairwise(self._ahead), self.name)
+            check_stereo_pairs(itertools.pairwise(self._ahead), self.name)
         frame = self._ahead.popleft() if self._ahead else super().__next__()
         self._look_at(frame)
         return frame
@@ -251,7 +256,7 @@ class StereoSource(FrameStream):
         """
         if self._given % _LOOK_EVERY == 1 and self._last is not None:
             self._looks.append(measure_pair(self._last, frame))
-            fault = fault_of_looks(self._looks)
+            fault = find_fault(self._looks)
             if fault is not None and len(self._looks) == _LOOKS:
                 raise UsageError(
                     f"{self.name}: the pairs of images fit at the start, and no longer before "

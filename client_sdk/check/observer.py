@@ -27,7 +27,7 @@ from client_sdk.check.pairs import PairsJudgement, judge_pairs
 from client_sdk.check.scene import SceneWatch, doubts_of_depth
 from client_sdk.frontend import Frame, TrackedFrame
 from client_sdk.imu.history import ImuHistory
-from client_sdk.rigs.checks import PairFault
+from client_sdk.rigs.stereo_pair_checks import PairFault
 from client_sdk.source_facts import Doubt, unresolved
 from client_sdk.tracking.stereo_adjustment import StereoAdjustment
 from rse_pf.geometry import Array
@@ -81,7 +81,7 @@ class DriveObserver:
             self._poses.append((frame.timestamp_s, tracked.T_world_camera, tracked.segment))
 
     def add_pairs(self, fault: PairFault | None) -> None:
-        """Take what `client_sdk.rigs.checks.fault_of_pairs` found in stereo pairs of the drive."""
+        """Take the result of `client_sdk.rigs.stereo_pair_checks.find_fault_of_frames` for the drive."""
         self._pair_fault = fault
 
     def add_offsets(self, found: Mapping[int, StereoAdjustment]) -> None:

@@ -11,8 +11,8 @@ from client_sdk.datasets.images import readable
 from client_sdk.datasets.thinning import Thinning, median_interval_s
 from client_sdk.frontend import Frame
 from client_sdk.mapping import Trajectory
-from client_sdk.rigs.checks import check_pairs, spread_pairs
 from client_sdk.rigs.imu_track import ImuTrack, with_imu
+from client_sdk.rigs.stereo_pair_checks import check_stereo_pairs, choose_pairs
 from client_sdk.source_facts import Doubt, DoubtLog
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Array, Camera
@@ -83,7 +83,7 @@ class Dataset:
             UsageError: The cameras are swapped, not synchronised, or rectified wrongly.
         """
         if self.has_stereo:
-            check_pairs(self.some_pairs(), self.name)
+            check_stereo_pairs(self.some_pairs(), self.name)
 
     def some_pairs(self) -> Iterator[tuple[Frame, Frame]]:
         """Yield some frames, each with the one after it; damaged images are passed over."""
@@ -91,7 +91,7 @@ class Dataset:
         def read(rows: tuple[int, int]) -> tuple[Frame, Frame]:
             return self.read(rows[0]), self.read(rows[1])
 
-        return readable(spread_pairs(self.rows), read, DoubtLog())
+        return readable(choose_pairs(self.rows), read, DoubtLog())
 
     def thinned(self, rate_hz: float) -> Dataset:
         """Return frames at *rate_hz* on average; all of them at the recording's own rate, or a higher one.

@@ -25,10 +25,10 @@ from client_sdk.datasets.rig_recordings import CameraChoice, is_euroc, is_kitti,
 from client_sdk.frontend import Frame
 from client_sdk.image_map import map_to_pinhole
 from client_sdk.mapping import Trajectory, read_trajectory
+from client_sdk.rigs.folder_camera import find_folder_camera
 from client_sdk.rigs.intrinsics import Intrinsics
 from client_sdk.rigs.rig import Rig
 from client_sdk.rigs.rig_file import read_calibration
-from client_sdk.rigs.stated_camera import stated_camera
 from client_sdk.source_facts import (
     CameraFacts,
     DepthFacts,
@@ -189,7 +189,7 @@ def _open_tum(folder: Path, of_camera: Path) -> Dataset:
         height, width = probe(colours.images, lambda name: read_colour(folder / name))[0].shape[:2]
         return width, height
 
-    stated = None if of_camera.exists() or of_camera.parent != folder else stated_camera(folder, size_px)
+    stated = None if of_camera.exists() or of_camera.parent != folder else find_folder_camera(folder, size_px)
     of_camera = of_camera if stated is None else stated[0]
     intrinsics, is_unit_stated, notes = _intrinsics(
         folder, of_camera, None if stated is None else stated[1], has_depth=depths is not None

@@ -1,4 +1,5 @@
-"""Rigs: what cameras and IMU a robot carries, how they are mounted, and stereo pairs that are rectified.
+"""Rigs: the cameras and the IMU of a robot, how they are mounted, and the rectification of stereo pairs.
 
-Lenses, files of calibrations and the checks of them belong here; devices and recordings do not.
+Calibration files of this and other programs, and checks of calibrations, belong here.  Devices and recordings
+belong to `client_sdk.cameras` and `client_sdk.datasets`.
 """

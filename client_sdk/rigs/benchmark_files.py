@@ -1,4 +1,4 @@
-"""Rigs as EuRoC (``sensor.yaml``) and KITTI (``calib.txt``) write them."""
+"""Read the rigs of the benchmarks EuRoC (``sensor.yaml``) and KITTI (``calib.txt``)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from rse_pf.files import read_regular_file
 from rse_pf.geometry import Array, Camera
 
 __all__ = [
-    "number_list",
+    "parse_numbers",
     "read_euroc_camera",
     "read_euroc_imu",
     "read_kitti_rig",
@@ -23,105 +23,143 @@ __all__ = [
     "read_text",
 ]
 
-_MAX_BYTES = 64 << 20
+_MAX_FILE_BYTES = 64 << 20  # size of a text file of a recording, the longest of which lists IMU samples
+_EUROC_IMU_FIELDS = {
+    "gyro_noise": "gyroscope_noise_density",
+    "gyro_walk": "gyroscope_random_walk",
+    "accel_noise": "accelerometer_noise_density",
+    "accel_walk": "accelerometer_random_walk",
+    "rate_hz": "rate_hz",
+}
+"""Fields of `RigImu`, each with its name in ``sensor.yaml``."""
 
 
 def read_euroc_camera(path: Path, name: str) -> RigCamera:
-    """Return the camera of a ``sensor.yaml``; its ``T_BS`` is the pose of the camera in the body.
+    """Return the camera of a ``sensor.yaml`` of EuRoC under the name *name*.
+
+    ``T_BS`` of the file is the pose of the camera in the body, row by row.
 
     Raises:
-        UsageError: A number is missing or impossible.
+        UsageError: The file cannot be read, a number is missing or impossible, or the lens model is unknown.
     """
     text = read_text(path)
-    found = {
-        name: _list_after(text, rf"^{name}:", path)
-        for name in ("resolution", "intrinsics", "distortion_coefficients")
-    }
-    pose = _list_after(text, r"^\s*data:", path)
-    if [len(found["resolution"]), len(found["intrinsics"]), len(pose)] != [2, 4, 16]:
-        raise UsageError(f"{path} is not that of a camera", hint="unpack the recording again")
-    (fx, fy, cx, cy), (width, height) = found["intrinsics"], found["resolution"]
+    width_height = _list_after(text, r"^resolution:", path)
+    fx_fy_cx_cy = _list_after(text, r"^intrinsics:", path)
+    distortion = _list_after(text, r"^distortion_coefficients:", path)
+    T_body_camera = _list_after(text, r"^\s*data:", path)
+    if [len(width_height), len(fx_fy_cx_cy), len(T_body_camera)] != [2, 4, 16]:
+        raise UsageError(
+            f"{path} is not that of a camera: it holds {len(width_height)} of 2 numbers of the resolution, "
+            f"{len(fx_fy_cx_cy)} of 4 of the intrinsics, {len(T_body_camera)} of 16 of T_BS",
+            hint="unpack the recording again",
+        )
+    (fx, fy, cx, cy), (width, height) = fx_fy_cx_cy, width_height
     try:
         camera = Camera(fx=fx, fy=fy, cx=cx, cy=cy, width=int(width), height=int(height))
         parse_lens_model(_word_after(text, "camera_model"))  # refuses projections such as omni
         lens = Intrinsics(
-            camera=camera, model=parse_lens_model(_word_after(text, "distortion_model")),
-            distortion=tuple(found["distortion_coefficients"]),
-        )  # fmt: skip
-        return RigCamera(name=name, lens=lens, T_body_camera=np.array(pose).reshape(4, 4))
+            camera=camera,
+            model=parse_lens_model(_word_after(text, "distortion_model")),
+            distortion=tuple(distortion),
+        )
+        return RigCamera(name=name, lens=lens, T_body_camera=np.array(T_body_camera).reshape(4, 4))
     except (InvalidCamera, UsageError) as error:
         raise UsageError(f"{path}: {error.message}", hint=error.hint) from error
 
 
 def read_euroc_imu(path: Path) -> RigImu:
-    """Return the IMU of a ``sensor.yaml``.
+    """Return the IMU of a ``sensor.yaml`` of EuRoC; ``T_BS`` is the pose of the IMU in the body.
 
     Raises:
-        UsageError: A number is missing or impossible.
+        UsageError: The file cannot be read, or a number is missing or impossible.
     """
     text = read_text(path)
-    pose = _list_after(text, r"^\s*data:", path)
-    names = {
-        "gyro_noise": "gyroscope_noise_density", "gyro_walk": "gyroscope_random_walk",
-        "accel_noise": "accelerometer_noise_density", "accel_walk": "accelerometer_random_walk",
-        "rate_hz": "rate_hz",
-    }  # fmt: skip
-    found = {field: re.search(rf"^{name}:\s*([^\s#]+)", text, re.MULTILINE) for field, name in names.items()}
-    if len(pose) != 16 or None in found.values():
-        raise UsageError(f"{path} is not that of an IMU", hint="unpack the recording again, or --no-imu")
-    numbers = {field: float(read_numbers(path, [match[1]])[0]) for field, match in found.items() if match}
+    T_body_imu = _list_after(text, r"^\s*data:", path)
+    names = _EUROC_IMU_FIELDS.values()
+    matches = (re.search(rf"^{name}:\s*([^\s#]+)", text, re.MULTILINE) for name in names)
+    words = {field: match[1] for field, match in zip(_EUROC_IMU_FIELDS, matches, strict=True) if match}
+    missing = [name for field, name in _EUROC_IMU_FIELDS.items() if field not in words]
+    if len(T_body_imu) != 16 or missing:
+        raise UsageError(
+            f"{path} is not that of an IMU: it holds {len(T_body_imu)} of 16 numbers of T_BS"
+            + (f", and no {missing[0]}" if missing else ""),
+            hint="unpack the recording again, or --no-imu",
+        )
+    numbers = {field: float(read_numbers(path, [word])[0]) for field, word in words.items()}
     try:
-        return RigImu(T_body_imu=np.array(pose).reshape(4, 4), **numbers)
+        return RigImu(T_body_imu=np.array(T_body_imu).reshape(4, 4), **numbers)
     except UsageError as error:
         raise UsageError(f"{path}: {error.message}", hint=error.hint) from error
 
 
-def read_kitti_rig(path: Path, size: tuple[int, int], keys: Sequence[str]) -> Rig:
-    """Return the cameras of a ``calib.txt``, of images of *size*; the body is the left grey one.
+def read_kitti_rig(path: Path, size: tuple[int, int], projection_names: Sequence[str]) -> Rig:
+    """Return the rectified cameras of a ``calib.txt`` of KITTI; the frame of the body is that of ``P0``.
 
-    *keys* are the names of the projections, such as ``P0`` and ``P1``, the left camera first.
+    Args:
+        path: The file ``calib.txt``.
+        size: Width and height of the images, px, which the file does not state.
+        projection_names: Names of the projections in the file, such as ``P0`` and ``P1``, the left camera
+            first.
 
     Raises:
-        UsageError: A number is missing or impossible.
+        UsageError: The file cannot be read, or a number is missing or impossible.
     """
     lines = dict(line.split(":", 1) for line in read_text(path).splitlines() if ":" in line)
     cameras = []
-    for key, name in zip(keys, ("left", "right"), strict=False):
-        numbers = number_list(path, lines.get(key, ""))
+    for projection_name, name in zip(projection_names, ("left", "right"), strict=False):
+        numbers = parse_numbers(path, lines.get(projection_name, ""))
         if len(numbers) != 12:
-            raise UsageError(f"{path} lacks the 12 numbers of {key}", hint="unpack the sequence again")
+            raise UsageError(
+                f"{path} has {len(numbers)} of the 12 numbers of {projection_name}",
+                hint="unpack the sequence again",
+            )
         projection = np.array(numbers).reshape(3, 4)
         try:
             camera = Camera(
                 fx=numbers[0], fy=numbers[5], cx=numbers[2], cy=numbers[6], width=size[0], height=size[1]
             )
-            T_left_camera = np.eye(4)
-            # P = K [I | t], and t moves points of the left camera into this one.
-            T_left_camera[:3, 3] = -np.linalg.solve(projection[:, :3], projection[:, 3])
-            cameras.append(RigCamera(name=name, lens=Intrinsics(camera=camera), T_body_camera=T_left_camera))
+            T_body_camera = np.eye(4)
+            # P = K [I | t], where t moves points of the body (P0) into this camera.
+            T_body_camera[:3, 3] = -np.linalg.solve(projection[:, :3], projection[:, 3])
+            cameras.append(RigCamera(name=name, lens=Intrinsics(camera=camera), T_body_camera=T_body_camera))
         except (InvalidCamera, UsageError) as error:
             raise UsageError(f"{path}: {error.message}", hint=error.hint) from error
         except np.linalg.LinAlgError as error:
-            raise UsageError(f"{path}: {key} is no camera", hint="unpack the sequence again") from error
+            raise UsageError(
+                f"{path}: the matrix of {projection_name} is singular, which is no camera",
+                hint="unpack the sequence again",
+            ) from error
     return Rig(cameras=tuple(cameras))
 
 
 def read_text(path: Path) -> str:
-    """Return the text of a file of a recording; raises UsageError."""
+    """Return the text of a UTF-8 file of a recording.
+
+    Raises:
+        UsageError: The file is missing, no regular file, larger than 64 MiB, or no UTF-8.
+    """
     try:
-        return read_regular_file(path, _MAX_BYTES).decode("utf-8-sig")
+        return read_regular_file(path, _MAX_FILE_BYTES).decode("utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         raise UsageError(f"cannot read {path}", hint="unpack the recording again") from error
 
 
-def number_list(path: Path, text: str) -> list[float]:
-    """Return the numbers of a text that stand between spaces or commas; raises UsageError."""
+def parse_numbers(path: Path, text: str) -> list[float]:
+    """Return the numbers of a text, separated by spaces or commas; *path* is named in errors.
+
+    Raises:
+        UsageError: A word is no number, or a number is not finite.
+    """
     numbers: list[float] = read_numbers(path, text.replace(",", " ").split()).tolist()
     return numbers
 
 
 def read_numbers(path: Path, words: Sequence[str]) -> Array:
-    """Return words of a file as finite numbers, or raise UsageError."""
+    """Return words as finite numbers ``(n,)``; *path*, the file that holds them, is named in errors.
+
+    Raises:
+        UsageError: A word is no number, or a number is not finite.
+    """
     try:
         values = np.array([float(word) for word in words])
     except ValueError as error:
@@ -132,11 +170,12 @@ def read_numbers(path: Path, words: Sequence[str]) -> Array:
 
 
 def _word_after(text: str, field: str) -> str | None:
-    """Return the value of a field that is one word, in quotes or not; None without it."""
-    found = re.search(rf"^{field}:\s*['\"]?([\w-]+)", text, re.MULTILINE)
-    return None if found is None else found[1]
+    """Return the value of a YAML field, one word with or without quotes; None without the field."""
+    match = re.search(rf"^{field}:\s*['\"]?([\w-]+)", text, re.MULTILINE)
+    return None if match is None else match[1]
 
 
 def _list_after(text: str, heading: str, path: Path) -> list[float]:
-    found = re.search(rf"{heading}\s*\[([^\]]*)\]", text, re.MULTILINE)
-    return [] if found is None else number_list(path, found[1])
+    """Return the numbers in the brackets after the pattern *heading*; empty without the heading."""
+    match = re.search(rf"{heading}\s*\[([^\]]*)\]", text, re.MULTILINE)
+    return [] if match is None else parse_numbers(path, match[1])

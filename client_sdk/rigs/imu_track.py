@@ -1,4 +1,4 @@
-"""All samples of an IMU of a recording or a device, from which each frame takes those since the last one."""
+"""Attach to each frame the IMU samples between the frame before it and itself."""
 
 from __future__ import annotations
 
@@ -16,10 +16,16 @@ __all__ = ["ImuTrack", "with_imu"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImuTrack:
-    """Samples on the clock of the camera: ``(n,)`` seconds, ``(n, 3)`` rad/s and m/s^2, and the model.
+    """All samples of the IMU of a recording, with time stamps on the clock of the camera.
+
+    Attributes:
+        timestamps_s: ``(n,)``, ascending.
+        gyro: ``(n, 3)`` angular rates, rad/s, in the frame of the IMU.
+        accel: ``(n, 3)`` specific forces, m/s^2, in the frame of the IMU.
+        model: The noise of the IMU and its pose relative to the camera.
 
     Raises:
-        UsageError: The shapes do not fit, a number is not finite, or times do not ascend.
+        UsageError: The shapes do not fit, a number is not finite, or time stamps do not ascend.
     """
 
     timestamps_s: Array
@@ -31,21 +37,23 @@ class ImuTrack:
         check_samples(self.timestamps_s, self.gyro, self.accel)
 
     def between(self, since_s: float, until_s: float) -> ImuSamples:
-        """Return the samples from one at or before *since_s* to one at or after *until_s*."""
+        """Return the samples from the last at or before *since_s* to the first at or after *until_s*."""
         first = max(0, int(np.searchsorted(self.timestamps_s, since_s, side="right")) - 1)
-        last = int(np.searchsorted(self.timestamps_s, until_s, side="left")) + 1
-        rows = slice(first, last)
+        end = int(np.searchsorted(self.timestamps_s, until_s, side="left")) + 1
+        rows = slice(first, end)
         return ImuSamples(self.timestamps_s[rows], self.gyro[rows], self.accel[rows], self.model)
 
 
 def with_imu(frames: Iterable[Frame], track: ImuTrack | None) -> Iterator[Frame]:
-    """Yield frames, each with the samples since the one before it; None leaves them as they are."""
-    last_s = None
+    """Yield *frames*, each with the IMU samples since the frame before it; without a track, as they are.
+
+    The first frame gets the samples around its own time stamp.
+    """
+    previous_s = None
     for frame in frames:
         if track is None:
             yield frame
             continue
-        yield replace(
-            frame, imu=track.between(frame.timestamp_s if last_s is None else last_s, frame.timestamp_s)
-        )
-        last_s = frame.timestamp_s
+        since_s = frame.timestamp_s if previous_s is None else previous_s
+        yield replace(frame, imu=track.between(since_s, frame.timestamp_s))
+        previous_s = frame.timestamp_s

@@ -7,7 +7,7 @@ reads.
      "model": "radial-tangential", "distortion": [k1, k2, p1, p2, k3],
      "depth_scale": 1000, "rms_px": 0.31, "views": 24}
 
-Lengths are pixels.  These fields may be left out:  ``distortion`` (coefficients in OpenCV's order), ``model``
+Lengths are pixels.  These fields may be left out: ``distortion`` (coefficients in OpenCV's order), ``model``
 (``radial-tangential`` by default, or ``fisheye`` with ``[k1, k2, k3, k4]``), ``depth_scale`` (units of a
 16-bit depth image in a metre), ``rate_hz`` (of images that have no time stamps), ``rms_px`` (reprojection
 error of the calibration) and ``views`` (number of its images).  Fields that other programs name differently

@@ -1,6 +1,8 @@
-"""Rigs as Kalibr writes them: ``camchain.yaml`` or ``camchain-imucam.yaml``, with the ``imu.yaml`` beside it.
+"""Read rigs of Kalibr: ``camchain.yaml`` or ``camchain-imucam.yaml``, and the ``imu.yaml`` in the same
+folder.
 
-The body is the IMU where the file says where that is, else the first camera.
+The frame of the body is that of the IMU where the camchain states ``T_cam_imu``, else that of the first
+camera.
 """
 
 from __future__ import annotations
@@ -19,67 +21,81 @@ from rse_pf.geometry import Array, Camera, inverse
 
 __all__ = ["read_kalibr"]
 
-_MAX_BYTES = 1 << 18
-_HINT = "name the camchain that kalibr_calibrate_cameras or kalibr_calibrate_imu_camera wrote"
-_IMU_HINT = "it needs the noise densities and random walks of the IMU, and update_rate"
-_MODELS = ("radtan", "none", "equidistant")
-_NAMES = ("left", "right")
-_IMU_FILES = ("imu.yaml", "imu0.yaml")
+_MAX_FILE_BYTES = 1 << 18  # size of a camchain: that of eight cameras has a few kilobytes
+_CAMCHAIN_HINT = "name the camchain that kalibr_calibrate_cameras or kalibr_calibrate_imu_camera wrote"
+_IMU_HINT = "give the noise densities and random walks of the IMU, and update_rate, as imu.yaml has them"
+_CAMERA_NAMES = ("left", "right")  # of cam0 and cam1 in the rig; further cameras keep their names
+_IMU_FILES = ("imu.yaml", "imu0.yaml")  # names under which users keep the IMU file of Kalibr
 
 
 def read_kalibr(path: Path) -> Rig:
-    """Return the cameras ``cam0``, ``cam1``, ... of a camchain, the first one called left, the second right.
+    """Return the rig of a camchain.
+
+    The camera ``cam0`` is called left, and ``cam1`` right; further cameras keep their names.
 
     Raises:
-        UsageError: The file is no camchain, has a lens model that is not known, or an impossible number.
+        UsageError: The file is no camchain, or has an unknown lens model or an impossible number.
         MissingExtra: PyYAML is not installed.
     """
     values = _read_yaml(path)
-    with name_file_in_errors(path, _HINT):
+    with name_file_in_errors(path, _CAMCHAIN_HINT):
         names = sorted(name for name in values if str(name).startswith("cam"))
         if not names or names[0] != "cam0":
             raise UsageError("there is no camera cam0", hint=INTRINSICS_HINT)
         cameras: list[RigCamera] = []
-        for row, name in enumerate(names):
-            each = values[name]
-            with_imu = "T_cam_imu" in each
-            if with_imu:
-                pose = inverse(_pose(each["T_cam_imu"]))
-            elif row:
-                pose = cameras[-1].T_body_camera @ inverse(_pose(each["T_cn_cnm1"]))
+        for number, name in enumerate(names):
+            stated = values[name]
+            if "T_cam_imu" in stated:
+                T_body_camera = inverse(_parse_pose(stated["T_cam_imu"]))
+            elif number:
+                T_body_camera = cameras[-1].T_body_camera @ inverse(_parse_pose(stated["T_cn_cnm1"]))
             else:
-                pose = np.eye(4)
+                T_body_camera = np.eye(4)
             cameras.append(
                 RigCamera(
-                    name=_NAMES[row] if row < len(_NAMES) else str(name), lens=_lens(each),
-                    T_body_camera=pose, time_offset_s=float(each.get("timeshift_cam_imu", 0.0)),
+                    name=_CAMERA_NAMES[number] if number < len(_CAMERA_NAMES) else str(name),
+                    lens=_parse_lens(stated),
+                    T_body_camera=T_body_camera,
+                    time_offset_s=float(stated.get("timeshift_cam_imu", 0.0)),
                 )
-            )  # fmt: skip
+            )
         has_imu = "T_cam_imu" in values["cam0"]
-    return Rig(cameras=tuple(cameras), imu=_imu_beside(path) if has_imu else None)
+    return Rig(cameras=tuple(cameras), imu=_read_imu_of_camchain(path) if has_imu else None)
 
 
-def _lens(values: Any) -> Intrinsics:
-    model, distortion = values["camera_model"], values.get("distortion_model", "none")
-    if model != "pinhole" or distortion not in _MODELS:
+def _parse_lens(stated: Any) -> Intrinsics:
+    """Return the lens of a camera of a camchain.
+
+    Raises:
+        UsageError: The projection is not pinhole, or the distortion model is not known.
+    """
+    projection, distortion_model = stated["camera_model"], stated.get("distortion_model", "none")
+    if projection != "pinhole":
         raise UsageError(
-            f"a camera of model {model!s:.40} with distortion {distortion!s:.40} is not known",
+            f"a camera of model {projection!s:.40} with distortion {distortion_model!s:.40} is not known",
             hint="calibrate with pinhole-radtan or pinhole-equi",
         )
-    fx, fy, cx, cy = (float(value) for value in values["intrinsics"])
-    width, height = values["resolution"]
+    fx, fy, cx, cy = (float(value) for value in stated["intrinsics"])
+    width, height = stated["resolution"]
     return Intrinsics(
         camera=Camera(fx=fx, fy=fy, cx=cx, cy=cy, width=int(width), height=int(height)),
-        distortion=tuple(float(value) for value in values.get("distortion_coeffs", ())),
-        model=parse_lens_model(distortion),
+        distortion=tuple(float(value) for value in stated.get("distortion_coeffs", ())),
+        model=parse_lens_model(distortion_model),
     )
 
 
-def _imu_beside(path: Path) -> RigImu | None:
-    """Return the IMU of the file that Kalibr leaves beside a camchain; None without one."""
-    known = [path.with_name(path.name.replace("camchain-imucam", "imu").replace("camchain", "imu"))]
-    known += [path.with_name(name) for name in _IMU_FILES]
-    file = next((each for each in known if each != path and each.is_file()), None)
+def _read_imu_of_camchain(camchain: Path) -> RigImu | None:
+    """Return the IMU of the file that Kalibr writes into the folder of a camchain; None without a file.
+
+    The file is called like the camchain with ``imu`` for ``camchain`` or ``camchain-imucam``, else
+    ``imu.yaml`` or ``imu0.yaml``.
+
+    Raises:
+        UsageError: The file lacks a number, or a number is impossible.
+    """
+    name = camchain.name.replace("camchain-imucam", "imu").replace("camchain", "imu")
+    candidates = [camchain.with_name(name), *(camchain.with_name(name) for name in _IMU_FILES)]
+    file = next((path for path in candidates if path != camchain and path.is_file()), None)
     if file is None:
         return None
     values = _read_yaml(file)
@@ -95,21 +111,27 @@ def _imu_beside(path: Path) -> RigImu | None:
         )
 
 
-def _pose(rows: Any) -> Array:
+def _parse_pose(rows: Any) -> Array:
     pose = np.array(rows, dtype=np.float64)
     if pose.shape != (4, 4):
-        raise UsageError(f"a pose has the shape {pose.shape}", hint="it has 4 rows of 4 numbers")
+        raise UsageError(f"a pose has the shape {pose.shape}, not (4, 4)", hint="give 4 rows of 4 numbers")
     return pose
 
 
-def _read_yaml(path: Path) -> Any:
+def _read_yaml(path: Path) -> dict[Any, Any]:
+    """Return the mapping that a YAML file of Kalibr or OpenCV holds.
+
+    Raises:
+        UsageError: The file is missing, too large, no YAML mapping, or uses aliases.
+        MissingExtra: PyYAML is not installed.
+    """
     try:
         yaml: Any = importlib.import_module("yaml")
     except ImportError as error:
         raise MissingExtra("pyyaml", "vision") from error
 
     class LoaderWithoutAliases(yaml.SafeLoader):  # type: ignore[misc]  # PyYAML has no types
-        """Refuses aliases: nested ones unfold to gigabytes wherever a value is used."""
+        """A YAML loader that refuses aliases, because nested aliases unfold to gigabytes."""
 
         def compose_node(self, parent: Any, index: Any) -> Any:
             if self.check_event(yaml.AliasEvent):
@@ -125,6 +147,7 @@ def _read_yaml(path: Path) -> Any:
             raise ValueError("it names no camera")
         return values
 
-    return read_document(
-        path, "a camchain of Kalibr", hint=INTRINSICS_HINT, parse=parse, max_bytes=_MAX_BYTES
+    mapping: dict[Any, Any] = read_document(
+        path, "a camchain of Kalibr", hint=INTRINSICS_HINT, parse=parse, max_bytes=_MAX_FILE_BYTES
     )
+    return mapping

@@ -1,6 +1,6 @@
-"""A rig: the cameras and the IMU of a robot, and where they sit on its body.
+"""The rig of a robot: its cameras and its IMU, and their poses on the body.
 
-It knows no file and no device; `client_sdk.rigs.rectification` makes a pair of its cameras ready for stereo.
+Files of rigs are read by `client_sdk.rigs.rig_file`; `client_sdk.rigs.rectification` rectifies a stereo pair.
 """
 
 from __future__ import annotations
@@ -17,25 +17,26 @@ from rse_pf.geometry import Array, inverse, rigid
 
 __all__ = ["Rig", "RigCamera", "RigImu"]
 
-_MAX_CAMERAS = 8
-_MAX_ARM_M = 10.0
-_MAX_OFFSET_S = 1.0
-_MAX_NAME = 64
+_MAX_CAMERAS = 8  # of a rig: only the first two are used, and a longer list is no rig
+_MAX_LEVER_ARM_M = 10.0  # between a sensor and the origin of the body: a longer one is in millimetres
+_MAX_TIME_OFFSET_S = 1.0  # between the clocks of a camera and the IMU: a larger one is in milliseconds
+_MAX_NAME_LENGTH = 64  # characters in the name of a camera, which error lines repeat
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class RigCamera:
-    """A camera of a rig.
+    """A camera of a rig: its lens, its pose on the body, and its clock.
 
     Attributes:
-        name: For people, such as ``left``.
-        lens: Its intrinsics.
+        name: Name of the camera in messages, such as ``left``.
+        lens: Intrinsics of the camera.
         T_body_camera: ``(4, 4)``, metres, pose of the camera in the body.
-        time_offset_s: What must be added to the times of its images to get the clock of the rig, which is
-            that of the IMU where there is one.
+        time_offset_s: Seconds to add to a time stamp of the camera for the time on the clock of the rig,
+            which is the clock of the IMU where there is one.
 
     Raises:
-        UsageError: The pose is no rigid motion or is over 10 m long, or the offset is above 1 s.
+        UsageError: The name is empty or longer than 64 characters, the pose is no rigid motion or its
+            translation is above 10 m on an axis, or the time offset is above 1 s.
     """
 
     name: str
@@ -44,22 +45,29 @@ class RigCamera:
     time_offset_s: float = 0.0
 
     def __post_init__(self) -> None:
-        if not 1 <= len(self.name) <= _MAX_NAME or not self.name.isprintable():
-            raise UsageError("the name of a camera is empty, or too long", hint="call it left or right")
-        _set_pose(self, "T_body_camera", f"T_body_camera of the camera {self.name}")
-        if not abs(self.time_offset_s) <= _MAX_OFFSET_S:
+        if not 1 <= len(self.name) <= _MAX_NAME_LENGTH or not self.name.isprintable():
             raise UsageError(
-                f"a time offset of {self.time_offset_s:g} s is not within {_MAX_OFFSET_S:g} s",
-                hint="give seconds; Kalibr calls it timeshift_cam_imu",
+                f"the name of a camera has {len(self.name)} characters, not 1..{_MAX_NAME_LENGTH}, or some "
+                "that cannot be printed",
+                hint="call the cameras left and right",
+            )
+        _normalise_pose(self, "T_body_camera", f"T_body_camera of the camera {self.name}")
+        if not abs(self.time_offset_s) <= _MAX_TIME_OFFSET_S:
+            raise UsageError(
+                f"the time offset {self.time_offset_s:g} s of {self.name} is not within "
+                f"{_MAX_TIME_OFFSET_S:g} s",
+                hint="give seconds; Kalibr calls the offset timeshift_cam_imu",
             )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class RigImu:
-    """The IMU of a rig: ``T_body_imu`` ``(4, 4)``, metres; the other numbers are those of `ImuModel`.
+    """The IMU of a rig: its pose ``T_body_imu`` ``(4, 4)``, metres, on the body, and its noise.
+
+    The other fields have the units of `client_sdk.imu.samples.ImuModel`.
 
     Raises:
-        UsageError: A number is impossible.
+        UsageError: The pose is no rigid motion within 10 m, or `ImuModel` refuses a number.
     """
 
     T_body_imu: Array
@@ -72,25 +80,31 @@ class RigImu:
     max_accel: float = math.inf
 
     def __post_init__(self) -> None:
-        _set_pose(self, "T_body_imu", "T_body_imu")
+        _normalise_pose(self, "T_body_imu", "T_body_imu")
         self.model(self.T_body_imu)
 
     def model(self, T_body_camera: Array) -> ImuModel:
-        """Return the model that frames of the camera at ``T_body_camera`` ``(4, 4)`` carry."""
+        """Return the model of the IMU as seen from a camera with the pose *T_body_camera* ``(4, 4)``."""
         return ImuModel(
             T_imu_camera=inverse(self.T_body_imu) @ T_body_camera,
-            gyro_noise=self.gyro_noise, gyro_walk=self.gyro_walk,
-            accel_noise=self.accel_noise, accel_walk=self.accel_walk,
-            rate_hz=self.rate_hz, max_gyro=self.max_gyro, max_accel=self.max_accel,
-        )  # fmt: skip
+            gyro_noise=self.gyro_noise,
+            gyro_walk=self.gyro_walk,
+            accel_noise=self.accel_noise,
+            accel_walk=self.accel_walk,
+            rate_hz=self.rate_hz,
+            max_gyro=self.max_gyro,
+            max_accel=self.max_accel,
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Rig:
-    """One to eight cameras, the left one first and the right one second, and an IMU or None.
+    """The sensors of a robot: one to eight cameras, and an IMU or None.
+
+    Of a stereo rig, the first camera is the left one and the second the right one.
 
     Raises:
-        UsageError: There is no camera, there are too many, or two have one name.
+        UsageError: There is no camera, there are more than eight, or two cameras have the same name.
     """
 
     cameras: tuple[RigCamera, ...]
@@ -104,28 +118,34 @@ class Rig:
             )
         names = [camera.name for camera in self.cameras]
         if len(set(names)) < len(names):
-            raise UsageError(f"two cameras of {', '.join(names)} have one name", hint="rename one")
+            raise UsageError(f"two of the cameras {', '.join(names)} have the same name", hint="rename one")
 
     @property
     def left(self) -> RigCamera:
-        """The first camera."""
+        """The first camera: the left one of a stereo rig, or the only one."""
         return self.cameras[0]
 
     @property
     def right(self) -> RigCamera | None:
-        """The second camera; None of a rig with one."""
+        """The second camera: the right one of a stereo rig; None for a rig with one camera."""
         return self.cameras[1] if len(self.cameras) > 1 else None
 
 
-def _set_pose(owner: object, field: str, name: str) -> None:
-    """Replace a pose by its nearest rigid motion, or refuse it."""
-    given = np.asarray(getattr(owner, field), dtype=np.float64)
-    pose = rigid(given, _MAX_ARM_M) if given.shape == (4, 4) else None
+def _normalise_pose(sensor: object, field: str, name: str) -> None:
+    """Replace a pose of a frozen *sensor* by the nearest rigid motion.
+
+    Raises:
+        UsageError: The pose is no ``(4, 4)`` rigid motion within 10 m; *name* is how the error calls the
+            pose.
+    """
+    stated = np.asarray(getattr(sensor, field), dtype=np.float64)
+    pose = rigid(stated, _MAX_LEVER_ARM_M) if stated.shape == (4, 4) else None
     if pose is None:
-        length = float(np.linalg.norm(given[:3, 3])) if given.shape == (4, 4) else 0.0
-        unit = ": in millimetres?" if _MAX_ARM_M < length <= 1e3 * _MAX_ARM_M else ""
+        length_m = float(np.linalg.norm(stated[:3, 3])) if stated.shape == (4, 4) else 0.0
+        is_millimetres = _MAX_LEVER_ARM_M < length_m <= 1e3 * _MAX_LEVER_ARM_M
         raise UsageError(
-            f"{name} is no rigid motion within {_MAX_ARM_M:g} m{unit}",
+            f"{name} is no rigid motion within {_MAX_LEVER_ARM_M:g} m"
+            + (": in millimetres?" if is_millimetres else ""),
             hint="give 4 rows of 4 numbers: a rotation, metres, and 0 0 0 1",
         )
-    object.__setattr__(owner, field, pose)
+    object.__setattr__(sensor, field, pose)

@@ -1,4 +1,4 @@
-"""``rig.json``: the cameras and the IMU of a robot, as calibration writes it; and the files of others.
+"""Read and write ``rig.json``: the cameras and the IMU of a robot, with their poses on its body.
 
 ::
 
@@ -7,8 +7,9 @@
      "imu": {"T_body_imu": [[...]], "gyro_noise": 1.7e-4, "gyro_walk": 2e-5,
              "accel_noise": 2e-3, "accel_walk": 3e-3, "rate_hz": 200}}
 
-A camera is what ``intrinsics.json`` holds, with a name, its pose in the body (metres), and ``time_offset_s``,
-which may be left out.  ``imu`` may be left out, and so may ``max_gyro`` and ``max_accel``.
+A camera has the fields of ``intrinsics.json``, a name, its pose in the body (metres), and ``time_offset_s``,
+which may be left out.  The IMU has the units of `client_sdk.imu.samples.ImuModel`; ``imu``, ``max_gyro`` and
+``max_accel`` may be left out.  A camchain of Kalibr is read in the place of ``rig.json``.
 """
 
 from __future__ import annotations
@@ -34,32 +35,33 @@ from rse_pf.geometry import Array
 
 __all__ = ["read_calibration", "read_rig", "write_rig"]
 
-_HINT = "it needs cameras, each with name, fx fy cx cy width height and T_body_camera: see docs/cameras.md"
-_OF_RIG = ("name", "T_body_camera", "time_offset_s")
-"""Fields of a camera beside those of its lens."""
-_NOISE = ("gyro_noise", "gyro_walk", "accel_noise", "accel_walk", "rate_hz")
-_LIMITS = ("max_gyro", "max_accel")
+_HINT = "write cameras, each with name, fx fy cx cy width height and T_body_camera: see docs/cameras.md"
+_CAMERA_FIELDS = ("name", "T_body_camera", "time_offset_s")  # of a camera in rig.json, but not of its lens
+_IMU_FIELDS = ("gyro_noise", "gyro_walk", "accel_noise", "accel_walk", "rate_hz")  # that each IMU must state
+_IMU_RANGE_FIELDS = ("max_gyro", "max_accel")  # measuring ranges of an IMU; without them there is no limit
 
 
 def read_rig(path: Path | str) -> Rig:
     """Return the rig of ``rig.json``, or of a camchain of Kalibr (``.yaml``).
 
     Raises:
-        UsageError: The file is missing, or lacks a number, or a number is impossible.
-        MissingExtra: PyYAML is needed and not installed.
+        UsageError: The file is missing, lacks a number, has an impossible number, or holds one camera only.
+        MissingExtra: The file is YAML, and PyYAML is not installed.
     """
-    found = read_calibration(path)
-    if isinstance(found, Intrinsics):
-        raise UsageError(f"{path} holds one camera, and not its place", hint=_HINT)
-    return found
+    calibration = read_calibration(path)
+    if isinstance(calibration, Intrinsics):
+        raise UsageError(f"{path} holds the intrinsics of one camera, and no rig", hint=_HINT)
+    return calibration
 
 
 def read_calibration(path: Path | str) -> Intrinsics | Rig:
     """Return the intrinsics of ``intrinsics.json``, or the rig of a file that `read_rig` reads.
 
+    A JSON object with the field ``cameras`` is a rig.
+
     Raises:
-        UsageError: The file is neither.
-        MissingExtra: PyYAML is needed and not installed.
+        UsageError: The file holds neither intrinsics nor a rig, or a number is missing or impossible.
+        MissingExtra: The file is YAML, and PyYAML is not installed.
     """
     path = Path(path)
     if path.suffix in (".yaml", ".yml"):
@@ -70,8 +72,8 @@ def read_calibration(path: Path | str) -> Intrinsics | Rig:
             return parse_intrinsics(values)
     with name_file_in_errors(path, _HINT):
         return Rig(
-            cameras=tuple(_camera(each) for each in values["cameras"]),
-            imu=None if values.get("imu") is None else _imu(values["imu"]),
+            cameras=tuple(_parse_camera(camera) for camera in values["cameras"]),
+            imu=None if values.get("imu") is None else _parse_imu(values["imu"]),
         )
 
 
@@ -80,38 +82,41 @@ def write_rig(path: Path | str, rig: Rig) -> None:
     values: dict[str, Any] = {
         "cameras": [
             {
-                "name": each.name,
-                **intrinsics_to_json(each.lens),
-                "T_body_camera": each.T_body_camera.tolist(),
-                "time_offset_s": each.time_offset_s,
+                "name": camera.name,
+                **intrinsics_to_json(camera.lens),
+                "T_body_camera": camera.T_body_camera.tolist(),
+                "time_offset_s": camera.time_offset_s,
             }
-            for each in rig.cameras
+            for camera in rig.cameras
         ]
     }
     if rig.imu is not None:
-        limits = {name: getattr(rig.imu, name) for name in _LIMITS}
+        ranges = {name: getattr(rig.imu, name) for name in _IMU_RANGE_FIELDS}
         values["imu"] = {
             "T_body_imu": rig.imu.T_body_imu.tolist(),
-            **{name: getattr(rig.imu, name) for name in _NOISE},
-            **{name: value for name, value in limits.items() if np.isfinite(value)},
+            **{name: getattr(rig.imu, name) for name in _IMU_FIELDS},
+            **{name: value for name, value in ranges.items() if np.isfinite(value)},
         }
     write_json(path, values)
 
 
-def _camera(values: Any) -> RigCamera:
-    lens = {name: value for name, value in values.items() if name not in _OF_RIG}
+def _parse_camera(values: Any) -> RigCamera:
     return RigCamera(
-        name=str(values["name"]), lens=parse_intrinsics(lens), T_body_camera=_pose(values["T_body_camera"]),
+        name=str(values["name"]),
+        lens=parse_intrinsics({name: value for name, value in values.items() if name not in _CAMERA_FIELDS}),
+        T_body_camera=_parse_pose(values["T_body_camera"]),
         time_offset_s=float(values.get("time_offset_s", 0.0)),
-    )  # fmt: skip
-
-
-def _imu(values: Any) -> RigImu:
-    limits = {name: float(values[name]) for name in _LIMITS if name in values}
-    return RigImu(
-        T_body_imu=_pose(values["T_body_imu"]), **{name: float(values[name]) for name in _NOISE}, **limits
     )
 
 
-def _pose(rows: Any) -> Array:
+def _parse_imu(values: Any) -> RigImu:
+    ranges = {name: float(values[name]) for name in _IMU_RANGE_FIELDS if name in values}
+    return RigImu(
+        T_body_imu=_parse_pose(values["T_body_imu"]),
+        **{name: float(values[name]) for name in _IMU_FIELDS},
+        **ranges,
+    )
+
+
+def _parse_pose(rows: Any) -> Array:
     return np.array(rows, dtype=np.float64)

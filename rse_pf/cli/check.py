@@ -34,8 +34,8 @@ if TYPE_CHECKING:
     from client_sdk.check.findings import CheckReport
     from client_sdk.check.motion import MotionReference
     from client_sdk.frontend import Frame
-    from client_sdk.rigs.checks import PairFault
     from client_sdk.rigs.intrinsics import Intrinsics
+    from client_sdk.rigs.stereo_pair_checks import PairFault
 
 __all__ = ["add_arguments", "run"]
 
@@ -153,9 +153,9 @@ def _checked(
     dataset = open_dataset(path, camera=args.camera, imu=args.imu, intrinsics=args.intrinsics)
     fault: PairFault | None = None
     if dataset.has_stereo:
-        from client_sdk.rigs.checks import fault_of_pairs
+        from client_sdk.rigs.stereo_pair_checks import find_fault_of_frames
 
-        fault = fault_of_pairs(dataset.some_pairs())
+        fault = find_fault_of_frames(dataset.some_pairs())
     truth = MotionReference.of_truth(dataset.truth, dataset.truth_kind, is_camera=not is_bag(path))
     reference = _reference(args, truth)
     log = dataset.log if reference is truth else _compared(dataset.log, reference, dataset.span_s)

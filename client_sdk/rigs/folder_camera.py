@@ -1,4 +1,4 @@
-"""The camera that a folder states in a file of another program, where it has no ``intrinsics.json``."""
+"""Find the intrinsics of a folder of images in a file of another program than this one."""
 
 from __future__ import annotations
 
@@ -12,31 +12,34 @@ from client_sdk.rigs.intrinsics import INTRINSICS_HINT, Intrinsics, name_file_in
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Camera
 
-__all__ = ["stated_camera"]
+__all__ = ["find_folder_camera"]
 
-_OBJECTS = ("camera_intrinsic.json", "intrinsic.json")  # of Open3D and its recorders
-_NUMBERS = ("calibration.txt", "intrinsics.txt", "intrinsic/intrinsic_color.txt")  # ETH3D, SUN3D, ScanNet
+_JSON_FILES = ("camera_intrinsic.json", "intrinsic.json")  # intrinsics of Open3D and its recorders
+_TEXT_FILES = ("calibration.txt", "intrinsics.txt", "intrinsic/intrinsic_color.txt")
+"""Intrinsics of ETH3D, SUN3D and ScanNet: texts of numbers without names."""
 
 
-def stated_camera(folder: Path, size_px: Callable[[], tuple[int, int]]) -> tuple[Path, Intrinsics] | None:
-    """Return the file that states the camera of a folder, and what it states; None if there is none.
+def find_folder_camera(
+    folder: Path, size_px: Callable[[], tuple[int, int]]
+) -> tuple[Path, Intrinsics] | None:
+    """Return the file that states the camera of *folder*, and its intrinsics; None if there is no such file.
 
-    A text holds ``fx fy cx cy``, or a matrix of 3x3 or 4x4 numbers, and no size of the images: that is what
-    *size_px* returns, width and height.
+    A text file holds ``fx fy cx cy``, or the camera matrix as 3x3 or 4x4 numbers row by row.  The file does
+    not state the size of the images, so that *size_px* is called for their width and height.
 
     Raises:
-        UsageError: The file has other numbers.
+        UsageError: The file cannot be read, or its numbers are no intrinsics.
     """
-    for name in _OBJECTS:
+    for name in _JSON_FILES:
         if (folder / name).is_file():
             return folder / name, read_intrinsics(folder / name)
-    for name in _NUMBERS:
+    for name in _TEXT_FILES:
         file = folder / name
         if file.is_file():
             values = read_numbers(file, read_text(file).split())
             if len(values) not in (4, 9, 16):
                 raise UsageError(
-                    f"{file} holds {len(values)} numbers, neither fx fy cx cy nor a matrix",
+                    f"{file} holds {len(values)} numbers, neither fx fy cx cy nor a matrix of 9 or 16",
                     hint=INTRINSICS_HINT,
                 )
             side = round(len(values) ** 0.5)

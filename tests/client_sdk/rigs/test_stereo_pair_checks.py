@@ -12,7 +12,7 @@ import pytest
 
 from client_sdk.datasets import Dataset, open_dataset
 from client_sdk.frontend import Frame
-from client_sdk.rigs.checks import check_pairs
+from client_sdk.rigs.stereo_pair_checks import check_stereo_pairs
 from client_sdk.simulator.camera import Painter
 from client_sdk.simulator.world import make_world
 from client_sdk.stereo.view import StereoView
@@ -83,7 +83,7 @@ def pairs(frames: list[Frame], fault: Callable[[list[Frame], int], Frame]) -> li
 
 
 def test_a_healthy_pair_raises_nothing(drive: list[Frame]) -> None:
-    check_pairs(pairs(drive, lambda frames, row: frames[row]), "room")
+    check_stereo_pairs(pairs(drive, lambda frames, row: frames[row]), "room")
 
 
 def test_a_pair_without_texture_raises_nothing(drive: list[Frame]) -> None:
@@ -92,7 +92,7 @@ def test_a_pair_without_texture_raises_nothing(drive: list[Frame]) -> None:
         for each in drive
     ]
 
-    check_pairs(pairs(blank, swapped), "dark")
+    check_stereo_pairs(pairs(blank, swapped), "dark")
 
 
 @pytest.mark.parametrize(
@@ -108,7 +108,7 @@ def test_a_wrong_pair_is_named_in_one_line(
     drive: list[Frame], fault: Callable[[list[Frame], int], Frame], says: str
 ) -> None:
     with pytest.raises(UsageError, match=says) as told:
-        check_pairs(pairs(drive, fault), "room")
+        check_stereo_pairs(pairs(drive, fault), "room")
     assert told.value.hint
     assert told.value.message.startswith("room: ")
 

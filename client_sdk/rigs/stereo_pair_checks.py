@@ -1,0 +1,257 @@
+"""Find faults of a stereo rig in its rectified images: swapped, not synchronised, or badly rectified.
+
+In a correct pair, a point of the scene lies in the same row of both images, and farther left in the right
+one.  ORB features are matched over the whole image, not along rows, so that a faulty rig cannot hide its
+errors.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from client_sdk.frontend import DescribedPixels, Frame, describe, load_opencv
+from rse_pf.errors import UsageError
+from rse_pf.geometry import Array
+
+__all__ = [
+    "PairFault",
+    "PairMeasurement",
+    "check_stereo_pairs",
+    "choose_pairs",
+    "find_fault",
+    "find_fault_of_frames",
+    "match_features",
+    "measure_pair",
+]
+
+_MAX_FEATURES = 600  # ORB features of each image that are matched: more do not change the medians taken here
+_MAX_DISTANCE_RATIO = 0.8
+"""Hamming distance of the nearest descriptor over that of the second nearest, above which a match is
+ambiguous (Lowe's ratio test)."""
+_MAX_PYRAMID_SCALE = 2.0
+"""Scale of the image pyramid at which a feature was found: positions of coarser levels are too imprecise."""
+_MAX_ROW_OFFSET_PX = 40.0  # between the rows of a match: larger offsets are wrong matches, not a faulty rig
+_MIN_MATCHES = 60  # of all pairs together: with fewer matches, no fault is reported
+_MIN_SWAPPED_DISPARITY_PX = -1.5
+"""Disparity (column in the left minus column in the right image) below which a match says that the cameras
+are swapped; the disparity of a distant point may be a little below 0 by noise."""
+_SWAPPED_SHARE = 0.6  # share of matches with such a disparity, above which the cameras are swapped
+_MAYBE_SWAPPED_SHARE = 0.2
+"""Share of matches with a disparity of swapped cameras, above which the error about wrong rows also names
+swapped cameras as a possible cause."""
+_MAX_MEDIAN_ROW_OFFSET_PX = 1.5  # median of |row offset|: beyond it, rows do not belong together
+_MIN_DELAY_S = 0.004  # delay of the right image, above which the cameras count as not synchronised
+_MIN_DELAY_EFFECT_PX = 0.7  # standard deviation of row offsets that a delay causes, above which it matters
+_MIN_EXPLAINED_VARIANCE = 0.3  # share of the variance of row offsets that a reported delay must explain
+_FAST_PX_S = 15.0  # motion of a feature across rows, above which a delay shifts the feature visibly
+_MAX_RESIDUAL_PX = 2.0  # between a row offset and what the delay predicts: beyond it a match is an outlier
+_ALL_FAST_SHARE = 0.9
+"""Share of fast features, above which the slow ones are too few to show the row offset of the rectification
+alone."""
+_REFINEMENTS = 5  # least-squares fits of the delay, each to the inliers of the fit before
+_MAX_PAIRS = 14  # stereo pairs of a recording that are compared when it is opened, since each takes time
+
+
+class PairMeasurement(NamedTuple):
+    """The matched features of one stereo pair, three arrays ``(n,)``.
+
+    Attributes:
+        disparities_px: Column in the left image minus column in the right one.
+        row_offsets_px: Row in the left image minus row in the right one.
+        row_rates_px_s: Motion of the row in the left image until the next frame; NaN where it is not known.
+    """
+
+    disparities_px: Array
+    row_offsets_px: Array
+    row_rates_px_s: Array
+
+
+def choose_pairs(rows: Sequence[int]) -> list[tuple[int, int]]:
+    """Return at most 14 rows of a recording, spread evenly, each together with the row after it."""
+    places = np.unique(np.linspace(0, len(rows) - 2, _MAX_PAIRS).astype(int)) if len(rows) > 1 else ()
+    return [(rows[place], rows[place + 1]) for place in places]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PairFault:
+    """What is wrong with a stereo rig.
+
+    Attributes:
+        what: ``swapped``, ``late`` (the images are of two moments), or ``rows`` (rectified wrongly).
+        value: The share of swapped matches, the delay of the right image (s), or the row offset (px).
+        unit: Of the value: ``share``, ``s`` or ``px``.
+        message: One sentence for the user.
+        hint: What the user can do.
+    """
+
+    what: Literal["swapped", "late", "rows"]
+    value: float
+    unit: str
+    message: str
+    hint: str
+
+
+def check_stereo_pairs(pairs: Iterable[tuple[Frame, Frame]], name: str) -> None:
+    """Refuse the source *name* if its stereo frames show a faulty rig, see `find_fault_of_frames`.
+
+    Raises:
+        UsageError: The images are swapped, the right one is of another time, or rows do not fit.
+        MissingExtra: OpenCV is not installed.
+    """
+    fault = find_fault_of_frames(pairs)
+    if fault is not None:
+        raise UsageError(f"{name}: {fault.message}", hint=fault.hint)
+
+
+def find_fault_of_frames(pairs: Iterable[tuple[Frame, Frame]]) -> PairFault | None:
+    """Return the fault of the rig that stereo frames show, each given with the frame after it.
+
+    The result is None for a correct rig, and also where the images have too few features to tell.
+
+    Raises:
+        MissingExtra: OpenCV is not installed.
+    """
+    return find_fault(measure_pair(frame, later) for frame, later in pairs)
+
+
+def find_fault(measurements: Iterable[PairMeasurement]) -> PairFault | None:
+    """Return the fault of a stereo rig by what `measure_pair` measured; None if there is none, or too few
+    data.
+
+    The first fault in this order is returned: swapped cameras, images of two moments, wrong rows.
+    """
+    pairs = list(measurements)
+    if not pairs:
+        return None
+    columns = (np.concatenate(column) for column in zip(*pairs, strict=True))
+    disparities_px, row_offsets_px, row_rates_px_s = columns
+    if len(row_offsets_px) < _MIN_MATCHES:
+        return None
+    # 1. Swapped cameras show points farther right in the right image.
+    swapped_share = float(np.mean(disparities_px < _MIN_SWAPPED_DISPARITY_PX))
+    if swapped_share > _SWAPPED_SHARE:
+        return PairFault(
+            what="swapped",
+            value=swapped_share,
+            unit="share",
+            message=f"{100 * swapped_share:.0f} % of what both cameras see lies farther right in the right "
+            "image: the cameras are swapped",
+            hint="exchange left and right, in the rig or in the images",
+        )
+    # 2. A delay shifts rows in proportion to their motion; rows that are all shifted one way show a rotation.
+    has_rate = np.isfinite(row_rates_px_s)
+    low_px, high_px = np.percentile(row_offsets_px, (10, 90))
+    is_rotated = bool(low_px * high_px > 0.0 and min(abs(low_px), abs(high_px)) > _MAX_MEDIAN_ROW_OFFSET_PX)
+    delay_s = None if is_rotated else _estimate_delay_s(row_offsets_px[has_rate], row_rates_px_s[has_rate])
+    if delay_s is not None:
+        return PairFault(
+            what="late",
+            value=delay_s,
+            unit="s",
+            message=f"the right image is taken {1e3 * abs(delay_s):.0f} ms "
+            f"{'after' if delay_s > 0 else 'before'} the left one: the cameras are not synchronised",
+            hint="trigger both cameras together, or take one: --camera left",
+        )
+    # 3. What else shifts rows is a wrong rectification.
+    median_offset_px = float(np.median(np.abs(row_offsets_px)))
+    if median_offset_px > _MAX_MEDIAN_ROW_OFFSET_PX:
+        swap = "the cameras are swapped, or " if swapped_share > _MAYBE_SWAPPED_SHARE else ""
+        return PairFault(
+            what="rows",
+            value=median_offset_px,
+            unit="px",
+            message=f"rows of the two images differ by {median_offset_px:.1f} px in the median, above "
+            f"{_MAX_MEDIAN_ROW_OFFSET_PX:g} px: {swap}the rectification does not fit",
+            hint="calibrate the pair again: rse-pf camera calibrate --stereo; or take one: --camera left",
+        )
+    return None
+
+
+def measure_pair(frame: Frame, later: Frame) -> PairMeasurement:
+    """Match the features of a rectified stereo frame, and those of its left image with the frame after it.
+
+    A frame without a right image gives no match.
+
+    Raises:
+        MissingExtra: OpenCV is not installed.
+    """
+    if frame.stereo is None:
+        return PairMeasurement(np.empty(0), np.empty(0), np.empty(0))
+    right_rgb = np.repeat(frame.stereo.gray[:, :, None], 3, axis=2)
+    left, right, next_left = (describe(image, _MAX_FEATURES) for image in (frame.rgb, right_rgb, later.rgb))
+    left_rows, right_rows = match_features(left, right)
+    offsets_px = left.pixels[left_rows] - right.pixels[right_rows]
+    is_plausible = np.abs(offsets_px[:, 1]) < _MAX_ROW_OFFSET_PX
+    row_rates_px_s = np.full(len(left.pixels), np.nan)
+    tracked_rows, next_rows = match_features(left, next_left)
+    seconds = later.timestamp_s - frame.timestamp_s
+    if seconds > 0.0:
+        moved_px = next_left.pixels[next_rows, 1] - left.pixels[tracked_rows, 1]
+        row_rates_px_s[tracked_rows] = moved_px / seconds
+    return PairMeasurement(
+        offsets_px[is_plausible, 0], offsets_px[is_plausible, 1], row_rates_px_s[left_rows[is_plausible]]
+    )
+
+
+def _estimate_delay_s(row_offsets_px: Array, row_rates_px_s: Array) -> float | None:
+    """Return the delay of the right image, s, if a delay explains the row offsets ``(n,)``; else None.
+
+    A right image that is late by *t* shows a point ``t * rate`` farther down, so that ``offset = -t * rate``.
+    """
+    is_fast = np.abs(row_rates_px_s) > _FAST_PX_S
+    if is_fast.sum() < _MIN_MATCHES:
+        return None
+    # 1. Remove the offset that is left where nothing moves: that of the rectification.
+    is_reference = np.ones_like(is_fast) if is_fast.mean() > _ALL_FAST_SHARE else ~is_fast
+    row_offsets_px = row_offsets_px - np.median(row_offsets_px[is_reference])
+    # 2. Begin with the median of the delays that single features say.
+    delay_s = -float(np.median(row_offsets_px[is_fast] / row_rates_px_s[is_fast]))
+    # 3. Refine by the slope of a line through the inliers.
+    is_inlier = is_fast
+    for _ in range(_REFINEMENTS):
+        is_inlier = np.abs(row_offsets_px + delay_s * row_rates_px_s) <= _MAX_RESIDUAL_PX
+        if (is_inlier & is_fast).sum() < _MIN_MATCHES // 2:
+            return None
+        x, y = row_rates_px_s[is_inlier], row_offsets_px[is_inlier]
+        delay_s = -float(((x - x.mean()) * (y - y.mean())).sum() / ((x - x.mean()) ** 2).sum())
+    # 4. Report a delay only if it is long, matters in pixels, and explains the offsets.
+    x, y = row_rates_px_s[is_inlier], row_offsets_px[is_inlier]
+    explained_variance = 1.0 - float(np.var(y + delay_s * x) / max(np.var(y), 1e-9))
+    effect_px = abs(delay_s) * float(np.std(x))
+    is_significant = abs(delay_s) > _MIN_DELAY_S and effect_px > _MIN_DELAY_EFFECT_PX
+    return delay_s if is_significant and explained_variance > _MIN_EXPLAINED_VARIANCE else None
+
+
+def match_features(
+    first: DescribedPixels, second: DescribedPixels
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    """Return the rows of matching ORB features in two images, two arrays ``(m,)``.
+
+    Two features match if each is the nearest neighbour of the other, and Lowe's ratio test holds.
+
+    Raises:
+        MissingExtra: OpenCV is not installed.
+    """
+    cv2 = load_opencv()
+    first_rows, second_rows = (
+        np.flatnonzero(features.sizes <= _MAX_PYRAMID_SCALE) for features in (first, second)
+    )
+    if len(first_rows) < 2 or len(second_rows) < 2:
+        return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
+    first_descriptors = first.descriptors[first_rows]
+    second_descriptors = second.descriptors[second_rows]
+    distances, nearest = cv2.batchDistance(
+        first_descriptors, second_descriptors, cv2.CV_32S, normType=cv2.NORM_HAMMING, K=2
+    )
+    _, nearest_back = cv2.batchDistance(
+        second_descriptors, first_descriptors, cv2.CV_32S, normType=cv2.NORM_HAMMING, K=1
+    )
+    is_unambiguous = distances[:, 0] < _MAX_DISTANCE_RATIO * distances[:, 1]
+    is_mutual = nearest_back[nearest[:, 0], 0] == np.arange(len(first_rows))
+    matched = np.flatnonzero(is_unambiguous & is_mutual)
+    return first_rows[matched], second_rows[nearest[matched, 0]]
