@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from client_sdk.frontend import Features, Frame
 from client_sdk.tracking.segments import certain_rows
-from rse_pf.slam.cloud_deform import voxels_of
+from rse_pf.slam.cloud_deform import voxel_keys
 from rse_pf.slam.keyframe_points import encode_points
 
 __all__ = ["points_of"]
@@ -63,6 +63,6 @@ def _grid(frame: Frame, most: int) -> _Pixels:
 
 def _one_per_voxel(points: npt.NDArray[np.float64]) -> npt.NDArray[np.int64]:
     """Return the rows of the first point of each voxel, in order."""
-    _, first = np.unique(voxels_of(points, _VOXEL_M), axis=0, return_index=True)
+    _, first = np.unique(voxel_keys(points, _VOXEL_M), axis=0, return_index=True)
     rows: npt.NDArray[np.int64] = np.sort(first)
     return rows

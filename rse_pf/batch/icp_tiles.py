@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from rse_pf.errors import BadRequest
 from rse_pf.geometry import Array, inverse, transform
-from rse_pf.slam.cloud_deform import observers_of
+from rse_pf.slam.cloud_deform import find_observers
 from rse_pf.slam.consistency import LoopClosure
 from rse_pf.slam.icp import IcpOptions, align
 from rse_pf.slam.links import Atlas
@@ -93,5 +93,5 @@ def _within(cloud: Array, low: Array, size_m: float) -> Mask:
 
 def _observer(atlas: Atlas, rows: Rows, point: Array) -> int:
     """Return the row of the keyframe that saw *point* best."""
-    place = observers_of(point[None], [atlas.keyframes[row] for row in rows.tolist()])[0]
+    place = find_observers(point[None], [atlas.keyframes[row] for row in rows.tolist()])[0]
     return int(rows[place])

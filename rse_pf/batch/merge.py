@@ -25,7 +25,7 @@ from rse_pf.maps.format import MapLimits, MapVersion, decode_map
 from rse_pf.object_store import ObjectStore
 from rse_pf.service import Report
 from rse_pf.services.mapping.place import map_limits
-from rse_pf.slam.cloud_deform import joined_cloud
+from rse_pf.slam.cloud_deform import merge_clouds
 from rse_pf.slam.consistency import LoopClosure
 from rse_pf.slam.links import Atlas, LoopProposals, MergeOptions, Refused, maps_of
 from rse_pf.slam.map_merge import MergedMap, MergeSteps, merge_versions
@@ -355,7 +355,7 @@ class BatchMerge:
             for which in joined
         ]
         clouds = [result.arrays["points"] for result in self._run(parts)]
-        return joined_cloud(clouds, [versions[which].colours for which in joined])
+        return merge_clouds(clouds, [versions[which].colours for which in joined])
 
 
 def strongest(atlas: Atlas, links: Sequence[LoopClosure], most: int) -> tuple[list[LoopClosure], Refused]:

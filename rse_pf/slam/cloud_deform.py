@@ -1,4 +1,5 @@
-"""Deform the clouds of maps whose keyframes were moved: each point follows the keyframe that observed it."""
+"""Deform the point cloud of a map after its keyframes moved: each point follows the keyframe that observed
+it."""
 
 from __future__ import annotations
 
@@ -11,10 +12,12 @@ from rse_pf.geometry import Array, inverse, transform
 from rse_pf.maps.format import Keyframe, MapVersion
 from rse_pf.slam.ply import Colours, Points
 
-__all__ = ["deform_cloud", "deform_clouds", "joined_cloud", "observers_of", "voxels_of"]
+__all__ = ["deform_cloud", "deform_clouds", "find_observers", "merge_clouds", "voxel_keys"]
 
-_VOXEL_M = 0.01
-_MIN_DEPTH_M, _MAX_DEPTH_M = 0.2, 6.0
+_VOXEL_M = 0.01  # edge in metres of the voxels to which a merged cloud is thinned
+_MIN_DEPTH_M = 0.2  # smallest depth in metres at which a keyframe can have observed a point of the cloud
+_MAX_DEPTH_M = 6.0  # largest depth in metres at which a keyframe can have observed a point of the cloud
+_UNOBSERVED_COST = 1e3  # added to the distance of a keyframe that does not see a point; above any depth
 
 
 def deform_clouds(
@@ -24,77 +27,88 @@ def deform_clouds(
     T_world_camera: Array,
     rows: npt.NDArray[np.int64],
 ) -> tuple[Points, Colours]:
-    """Return the clouds of the maps of *rows* with each point moved like its keyframe, one point per voxel.
+    """Return the deformed clouds of several maps as one cloud with at most one point in each voxel of 1 cm.
 
     Args:
-        versions: The maps, with clouds in their own worlds.
-        of_map: ``(n,)``, the map of each keyframe.
-        keyframes: All *n*, with their old poses.
-        T_world_camera: ``(n, 4, 4)``, their new poses.
-        rows: Keyframes that are in the result.
+        versions: The maps, whose clouds are in their own worlds.
+        of_map: ``(n,)``, the index in *versions* of the map of each keyframe.
+        keyframes: All *n* keyframes, with their old poses.
+        T_world_camera: ``(n, 4, 4)``, the new poses of the keyframes.
+        rows: Indices of the keyframes of the result; maps without such a keyframe are left out.
     """
     clouds: list[Array] = []
     colours: list[Colours] = []
-    for which in np.unique(of_map[rows]).tolist():
-        version = versions[which]
-        own = [int(row) for row in rows if of_map[row] == which]
+    for map_index in np.unique(of_map[rows]).tolist():
+        version = versions[map_index]
+        map_rows = [int(row) for row in rows if of_map[row] == map_index]
         if len(version.points):
-            moved = T_world_camera[own]
-            clouds.append(deform_cloud(version.points, [keyframes[row] for row in own], moved))
+            map_keyframes = [keyframes[row] for row in map_rows]
+            clouds.append(deform_cloud(version.points, map_keyframes, T_world_camera[map_rows]))
             colours.append(version.colours)
-    return joined_cloud(clouds, colours)
+    return merge_clouds(clouds, colours)
 
 
 def deform_cloud(points: Points, keyframes: Sequence[Keyframe], T_world_camera: Array) -> Array:
-    """Return ``(m, 3)`` *points* of one map, each moved like the keyframe that observed it.
+    """Return the points ``(m, 3)`` of one map after each moved like the keyframe that observed it.
 
     Args:
-        points: ``(m, 3)``, metres, in the old world of the map.
-        keyframes: All *n* of the map, with their old poses.
-        T_world_camera: ``(n, 4, 4)``, their new poses.
+        points: ``(m, 3)`` metres, in the old world of the map.
+        keyframes: The *n* keyframes of the map, with their old poses.
+        T_world_camera: ``(n, 4, 4)``, the new poses of the keyframes.
     """
-    observer = observers_of(np.asarray(points, dtype=np.float64), keyframes)
+    observers = find_observers(np.asarray(points, dtype=np.float64), keyframes)
     moved = np.empty((len(points), 3))
-    for place, keyframe in enumerate(keyframes):
-        mine = observer == place
-        correction = T_world_camera[place] @ inverse(keyframe.T_world_camera)
-        moved[mine] = transform(correction, points[mine].astype(np.float64))
+    for row, keyframe in enumerate(keyframes):
+        is_observed = observers == row
+        correction = T_world_camera[row] @ inverse(keyframe.T_world_camera)
+        moved[is_observed] = transform(correction, points[is_observed].astype(np.float64))
     return moved
 
 
-def joined_cloud(clouds: Sequence[Array], colours: Sequence[Colours]) -> tuple[Points, Colours]:
-    """Return moved clouds as one, with one point for each voxel."""
+def merge_clouds(clouds: Sequence[Array], colours: Sequence[Colours]) -> tuple[Points, Colours]:
+    """Concatenate clouds that are in the same world, and thin them to one point in each voxel of 1 cm."""
     if not clouds:
         return np.empty((0, 3), dtype=np.float32), np.empty((0, 3), dtype=np.uint8)
     return _thin(np.concatenate(clouds), np.concatenate(colours))
 
 
-def observers_of(points: Array, keyframes: Sequence[Keyframe]) -> npt.NDArray[np.int64]:
-    """Return for each point the keyframe that observed it at the smallest depth, else the nearest one."""
-    best = np.full(len(points), np.inf)
-    observer = np.zeros(len(points), dtype=np.int64)
-    for place, keyframe in enumerate(keyframes):
-        seen = transform(inverse(keyframe.T_world_camera), points)
-        depth = seen[:, 2]
-        ahead = np.where(depth > _MIN_DEPTH_M, depth, 1.0)
+def find_observers(points: Array, keyframes: Sequence[Keyframe]) -> npt.NDArray[np.int64]:
+    """Return for each point the index of the keyframe that saw it at the smallest depth, ``(m,)``.
+
+    A keyframe sees a point that is projected into its image at a depth of 0.2 to 6 m.  A point that no
+    keyframe sees is assigned to the keyframe with the nearest camera.
+
+    Args:
+        points: ``(m, 3)`` metres, in the world of the keyframes.
+        keyframes: The keyframes; at least one.
+    """
+    best_cost = np.full(len(points), np.inf)
+    observers = np.zeros(len(points), dtype=np.int64)
+    for row, keyframe in enumerate(keyframes):
         camera = keyframe.camera
-        u = camera.fx * seen[:, 0] / ahead + camera.cx
-        v = camera.fy * seen[:, 1] / ahead + camera.cy
-        inside = (
-            (depth > _MIN_DEPTH_M) & (depth < _MAX_DEPTH_M)
-            & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
-        )  # fmt: skip
-        # A point outside of every image follows the nearest keyframe.
-        cost = np.where(inside, depth, 1e3 + np.linalg.norm(seen, axis=1))
-        nearer = cost < best
-        best[nearer], observer[nearer] = cost[nearer], place
-    return observer
+        points_camera = transform(inverse(keyframe.T_world_camera), points)
+        depth = points_camera[:, 2]
+        safe_depth = np.where(depth > _MIN_DEPTH_M, depth, 1.0)
+        u = camera.fx * points_camera[:, 0] / safe_depth + camera.cx
+        v = camera.fy * points_camera[:, 1] / safe_depth + camera.cy
+        is_in_image = (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
+        is_seen = (depth > _MIN_DEPTH_M) & (depth < _MAX_DEPTH_M) & is_in_image
+        cost = np.where(is_seen, depth, _UNOBSERVED_COST + np.linalg.norm(points_camera, axis=1))
+        is_better = cost < best_cost
+        best_cost[is_better], observers[is_better] = cost[is_better], row
+    return observers
 
 
-def voxels_of(points: Array, voxel_m: float) -> npt.NDArray[np.int64]:
-    """Return the voxel of each of ``(n, 3)`` points as one number, ``(n,)``, in the order of its three.
+def voxel_keys(points: Array, voxel_m: float) -> npt.NDArray[np.int64]:
+    """Return a key of the voxel of each point; equal keys mean the same voxel.
 
-    Points that are farther apart than 2**21 voxels get these three numbers, ``(n, 3)``.
+    Args:
+        points: ``(n, 3)`` metres.
+        voxel_m: Edge of a voxel.
+
+    Returns:
+        ``(n,)``, sorted as the indices of x, y and z; ``(n, 3)`` with these indices if the points span more
+        than 2**21 voxels along an axis, which one number cannot hold.
     """
     voxels = np.floor(points / voxel_m).astype(np.int64)
     voxels -= voxels.min(axis=0, initial=0)
@@ -105,8 +119,8 @@ def voxels_of(points: Array, voxel_m: float) -> npt.NDArray[np.int64]:
 
 
 def _thin(points: Array, colours: Colours) -> tuple[Points, Colours]:
-    """Return the mean of the points of each voxel, with the colour of the first."""
-    _, first, group = np.unique(voxels_of(points, _VOXEL_M), axis=0, return_index=True, return_inverse=True)
+    """Return for each voxel the mean of its points, with the colour of the first of them."""
+    _, first, group = np.unique(voxel_keys(points, _VOXEL_M), axis=0, return_index=True, return_inverse=True)
     group = group.ravel()
     count = np.bincount(group)
     means = np.stack([np.bincount(group, weights=points[:, axis]) / count for axis in range(3)], axis=1)

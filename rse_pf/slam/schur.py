@@ -11,7 +11,7 @@ import numpy as np
 
 from rse_pf.geometry import Array
 
-__all__ = ["NormalEquations", "Reduced"]
+__all__ = ["NormalEquations", "ReducedEquations"]
 
 
 @dataclass(slots=True, eq=False)
@@ -19,12 +19,12 @@ class NormalEquations:
     """Gauss-Newton equations of *c* camera parameters and *l* landmarks.
 
     Attributes:
-        H: ``(c, c)``, of the camera parameters.
-        g: ``(c,)``, their gradient.
-        E: ``(l, 3, c)``, between landmarks and camera parameters; the rows of a landmark lie together, so
-            that the large product below is of one array with itself.
-        H_landmarks: ``(l, 3, 3)``, of the landmarks.
-        g_landmarks: ``(l, 3)``, their gradient.
+        H: ``(c, c)``, the block of the camera parameters.
+        g: ``(c,)``, the gradient of the camera parameters.
+        E: ``(l, 3, c)``, the blocks between landmarks and camera parameters; the rows of a landmark are
+            contiguous, so that the large product in `reduce` is that of one matrix with its own transpose.
+        H_landmarks: ``(l, 3, 3)``, the blocks of the landmarks.
+        g_landmarks: ``(l, 3)``, the gradients of the landmarks.
     """
 
     H: Array
@@ -33,39 +33,46 @@ class NormalEquations:
     H_landmarks: Array
     g_landmarks: Array
 
-    def reduce(self, damping: float, prior: float | Array, landmark_prior: float) -> Reduced:
+    def reduce(self, damping: float, prior: float | Array, landmark_prior: float) -> ReducedEquations:
         """Return the equations of the camera parameters alone, damped as Levenberg-Marquardt does.
 
         Args:
-            damping: Share of each diagonal that is added to it.
-            prior: Information that is added to the diagonal of the camera parameters, one number or ``(c,)``.
+            damping: Share of each diagonal element that is added to this element.
+            prior: Information that is added to the diagonal of the camera parameters, a number or ``(c,)``.
             landmark_prior: Information that is added to the diagonal of each landmark.
 
         Raises:
-            numpy.linalg.LinAlgError: A landmark is not determined.
+            numpy.linalg.LinAlgError: The block of a landmark is not positive definite: the observations do
+                not determine this landmark.
         """
-        size = len(self.g)
+        c = len(self.g)
+        # 1. Factor the damped blocks of the landmarks: inverse(block) = root^T root.
         damped = self.H_landmarks * (1.0 + damping * np.eye(3)) + landmark_prior * np.eye(3)
         root: Array = np.linalg.inv(np.linalg.cholesky(damped)).astype(np.float64, copy=False)
-        Z = (root @ self.E).reshape(3 * len(self.E), size)
+        # 2. Subtract E^T inverse(block) E from H, and the same of the gradients.
+        Z = (root @ self.E).reshape(3 * len(self.E), c)
         S = self.H - Z.T @ Z
         right = (root @ self.g_landmarks[:, :, None]).ravel() @ Z - self.g
-        diagonal = np.arange(size)
+        # 3. Damp the camera parameters.
+        diagonal = np.arange(c)
         S[diagonal, diagonal] += damping * self.H[diagonal, diagonal] + prior
-        return Reduced(S, right, root.transpose(0, 2, 1) @ root)
+        return ReducedEquations(S, right, root.transpose(0, 2, 1) @ root)
 
-    def landmark_steps(self, reduced: Reduced, step: Array) -> Array:
-        """Return the ``(l, 3)`` steps of the landmarks that belong to the *step* ``(c,)`` of the cameras."""
-        back = -(self.g_landmarks + self.E @ step)
-        steps: Array = (reduced.landmark_covariance @ back[:, :, None])[:, :, 0]
+    def landmark_steps(self, reduced: ReducedEquations, step: Array) -> Array:
+        """Return the steps ``(l, 3)`` of the landmarks for the *step* ``(c,)`` of the camera parameters."""
+        right = -(self.g_landmarks + self.E @ step)
+        steps: Array = (reduced.landmark_covariance @ right[:, :, None])[:, :, 0]
         return steps
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Reduced:
-    """Equations ``S step = right`` of the camera parameters.
+class ReducedEquations:
+    """The equations ``S step = right`` of the camera parameters, after the landmarks were eliminated.
 
-    ``landmark_covariance`` ``(l, 3, 3)`` is the inverse of the landmarks' damped blocks.
+    Attributes:
+        S: ``(c, c)``, the Schur complement.
+        right: ``(c,)``, the right side.
+        landmark_covariance: ``(l, 3, 3)``, the inverses of the damped blocks of the landmarks.
     """
 
     S: Array

@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from rse_pf.errors import BadRequest, DegenerateGeometry
 from rse_pf.geometry import Array, Camera, exp_se3, inverse, skew
-from rse_pf.slam.schur import NormalEquations, Reduced
+from rse_pf.slam.schur import NormalEquations, ReducedEquations
 
 __all__ = [
     "UNKNOWNS",
@@ -447,7 +447,7 @@ class _System:
         equations.H_landmarks = _summed(J_pt @ J_p, self.landmarks, self.l)
         equations.g_landmarks = _summed((J_pt @ self._r[:, :, None])[:, :, 0], self.landmarks, self.l)
 
-    def _reduced(self, damping: float) -> Reduced:
+    def _reduced(self, damping: float) -> ReducedEquations:
         """Return the equations of poses and calibration, with priors."""
         reduced = self._equations.reduce(damping, self._prior(), _POINT_INFORMATION)
         if self._c == 7:

@@ -18,7 +18,7 @@ from rse_pf.errors import BadRequest, NotFound
 from rse_pf.geometry import Array, transform
 from rse_pf.live_map.versions import PointSource
 from rse_pf.object_store import ObjectStore, digest_of
-from rse_pf.slam.cloud_deform import joined_cloud
+from rse_pf.slam.cloud_deform import merge_clouds
 from rse_pf.slam.keyframe_points import MAX_POINTS_BYTES, decode_points
 from rse_pf.slam.ply import Colours, Points
 
@@ -76,7 +76,7 @@ class KeyframeObjects:
                 each = -(-len(found[0]) // most) or 1
                 clouds.append(transform(source.T_world_camera, found[0][::each]).astype(np.float32))
                 colours.append(found[1][::each])
-        points, joined = joined_cloud(clouds, colours)
+        points, joined = merge_clouds(clouds, colours)
         return Cloud(points=points, colours=joined, keyframes=len(clouds), missing=len(chosen) - len(clouds))
 
     def delete(self, objects: Iterable[tuple[str, str]]) -> None:

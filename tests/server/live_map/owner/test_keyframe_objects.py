@@ -19,7 +19,7 @@ from rse_pf.maps.registry import MapRegistry
 from rse_pf.object_store import MemoryStore
 from rse_pf.server.live_map.owner.keyframe_objects import KeyframeObjects
 from rse_pf.server.live_map.owner.state import LIVE_MAP
-from rse_pf.slam.cloud_deform import joined_cloud
+from rse_pf.slam.cloud_deform import merge_clouds
 from rse_pf.slam.keyframe import SentKeyframe, encode_keyframe, make_features
 from rse_pf.slam.keyframe_points import ObjectReference, encode_points
 from rse_pf.wire.live_map import KeyframeRequest
@@ -152,9 +152,9 @@ def test_many_keyframes_of_many_points_take_no_more_memory_than_a_few(
 
     def join(clouds: list[np.ndarray], colours: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         joined.append(sum(map(len, clouds)))
-        return joined_cloud(clouds, colours)
+        return merge_clouds(clouds, colours)
 
-    monkeypatch.setattr(f"{module}.joined_cloud", join)
+    monkeypatch.setattr(f"{module}.merge_clouds", join)
     found = [keeper.cloud([source(ONE, each) for each in references]) for _ in range(2)]
 
     assert [each.keyframes for each in found] == [10, 10]
