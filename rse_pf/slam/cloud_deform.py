@@ -1,5 +1,4 @@
-"""Deform the point cloud of a map after its keyframes moved: each point follows the keyframe that observed
-it."""
+"""Deform the point cloud of a map after its keyframes moved: a point follows the keyframe that saw it."""
 
 from __future__ import annotations
 

@@ -164,7 +164,7 @@ def _differences(numbers: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
 
 
 def _encode_planes(numbers: npt.NDArray[np.int64], dtype: str) -> bytes:
-    """Return numbers modulo the range of *dtype*: the lowest bytes of all, then the second bytes, and so on."""
+    """Return numbers modulo the range of *dtype*: the lowest bytes of all numbers, then the second bytes."""
     integer = np.dtype(dtype)
     wrapped = (numbers & ((1 << (8 * integer.itemsize)) - 1)).astype(integer)
     planes: bytes = wrapped.view(np.uint8).reshape(-1, integer.itemsize).T.tobytes()
