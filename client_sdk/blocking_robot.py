@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
     from client_sdk.frontend import Frame
     from client_sdk.live.blocking import BlockingLiveMapper
-    from client_sdk.live.mapper import LiveMapper
+    from client_sdk.live.live_mapper import LiveMapper
     from client_sdk.mapper import BlockingMapper, Mapper
 
 __all__ = ["BlockingRobot", "connect_blocking"]

@@ -1,7 +1,23 @@
-"""From frames to a trajectory and a map: the one object that a robot with a camera needs.
+"""Track a camera frame by frame, and keep its trajectory and its map.
 
-`Mapper` sends each frame's matches to the PnP service and keeps what comes back.  It opens no connection and
-no camera: it is given a function that answers pose queries, such as that of a connected robot.
+`Mapper` is what a robot with one camera needs.  It opens neither a connection nor a camera: it gets frames,
+and a function that answers pose queries, such as `ask_robot` makes of a connected robot.
+
+**Choice of the tracker.**  The first frame decides.  A frame with depth or with a right image is tracked by
+`client_sdk.tracking.tracker.Tracker`, in metres.  A frame without (all depths zero, or ``depth=False``) is
+tracked by `client_sdk.tracking.monocular_tracker.MonocularTracker`, up to scale until odometry, a marker or
+an IMU gives the metric scale.
+
+**Segment.**  A part of the drive whose poses are in one world.  After tracking was lost for too long the
+tracker begins another segment, with a world of its own.  Segment 0 is the trajectory and the map that users
+see.
+
+**Join.**  When the camera recognises a place of an older segment, the newer segment is moved into the world
+of the older one: poses, cloud and keyframes.
+
+**Correction.**  A change of poses that were returned before: after a join, after the world was turned so that
+z points up, or after a monocular tracker adjusted its keyframes.  The result of the frame that caused it has
+``corrected`` set, and `Mapper.trajectory` has the poses as they are now.
 """
 
 from __future__ import annotations
@@ -13,13 +29,13 @@ from collections import Counter
 from collections.abc import Awaitable, Callable, Coroutine, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
 
 from client_sdk.commands.answer_types import PoseAnswer
 from client_sdk.frontend import Features, Frame, FrontEndOptions, PoseQuery, TrackedFrame
-from client_sdk.imu.inertial import ImuScale, Inertial, upright
+from client_sdk.imu.estimator import ImuEstimator, ImuScale, level_start_pose
 from client_sdk.imu.samples import ImuSamples
 from client_sdk.mapping import MapOptions, PointMap, Trajectory, write_ply, write_trajectory
 from client_sdk.monocular.scale import MarkerScale, OdometryScale
@@ -41,32 +57,33 @@ from rse_pf.maps.format import UP, UP_FIELD, Keyframe, MapVersion, encode_map
 from rse_pf.pnp import DepthNoise, PnpOptions
 from rse_pf.slam.inertial import KeyframeImu, upright_rotation
 
-if TYPE_CHECKING:  # only robots that record need what it imports
+if TYPE_CHECKING:  # importing the recorder costs memory, which only robots that record should pay
     from rse_pf.recording.robot_recorder import RobotRecorder
 
 __all__ = ["AskPose", "BlockingMapper", "Mapper", "ask_robot"]
 
 
 AskPose = Callable[[PoseQuery], Awaitable[PoseAnswer]]
-"""Answers one pose query, or raises an RsePfError, with which the query counts as not answered."""
+"""Function that answers one pose query.  If it raises an RsePfError, the query counts as not answered."""
 
-_MIN_READINGS = 2
-_UP_TO_SCALE = "up to scale"
-_LEVEL_GRAVITY: Array = np.array([0.0, 9.81, 0.0])
-_USUAL_DEPTH_M = 2.0
+_MIN_READINGS = 2  # readings that a voxel of a dense map needs to be saved: single ones are mostly noise
+_UP_TO_SCALE: Final = "up to scale"
+_GRAVITY_OF_LEVEL_CAMERA: Array = np.array([0.0, 9.81, 0.0])
+"""Gravity in m/s^2 in the frame of a level camera (y down), assumed while the IMU has not measured it."""
+_DEFAULT_DEPTH_M = 2.0  # median depth that is assumed for the noise of poses while no feature has a depth
 
 
 def ask_robot(solve_pnp: Callable[..., Awaitable[PoseAnswer]], deadline_s: float | None = None) -> AskPose:
-    """Return a function that answers pose queries by `Robot.solve_pnp`, within *deadline_s* each."""
+    """Return a function that answers pose queries with `Robot.solve_pnp`, each within *deadline_s*."""
 
     async def ask(query: PoseQuery) -> PoseAnswer:
-        found = query.correspondences
+        correspondences = query.correspondences
         return await solve_pnp(
-            found.points_world,
-            found.pixels,
+            correspondences.points_world,
+            correspondences.pixels,
             query.camera,
             PnpOptions(inlier_px=query.inlier_px, max_iterations=query.max_iterations),
-            depths_m=found.depths_m if found.depths_m.any() else None,
+            depths_m=correspondences.depths_m if correspondences.depths_m.any() else None,
             depth_noise=query.depth_noise,
             deadline_s=deadline_s,
             keep=True,
@@ -76,7 +93,7 @@ def ask_robot(solve_pnp: Callable[..., Awaitable[PoseAnswer]], deadline_s: float
 
 
 class Mapper:
-    """Tracks a camera frame by frame, and keeps its trajectory and its map.
+    """Track a camera frame by frame, and keep its trajectory and its map.
 
     ::
 
@@ -86,8 +103,8 @@ class Mapper:
                 tracked = await mapper.track(frame)
             mapper.save(Path("out"))
 
-    Frames with depth give a dense map in metres, stereo pairs the points of their features.  Frames without
-    depth (all zero) give landmarks, up to scale unless *scale* knows a length.
+    Frames with depth give a dense map in metres, stereo pairs a map of the points of their features, in
+    metres too.  Frames without depth give a map of landmarks, up to scale unless there is a source of scale.
     """
 
     def __init__(
@@ -110,46 +127,50 @@ class Mapper:
         loops: LoopsFunction | None = None,
         optimiser: OptimiserFunction | None = None,
     ) -> None:
-        """Start without frames.
+        """Make a mapper without frames; it chooses its tracker with the first frame.
 
         Args:
             ask: Answers pose queries.
-            camera: Frames of another camera are refused; None takes that of the first frame.
-            options: For frames with depth.
-            monocular: For frames without depth.
-            depth: Whether to use depth; None means: if the first frame has some.
-            scale: For frames without depth: where metres come from; None means from the IMU, if frames have
-                one, else "up to scale".
+            camera: Intrinsics; frames of another camera are refused.  None takes those of the first frame.
+            options: Options of the tracker for depth and stereo pairs.
+            monocular: Options of the tracker for frames without depth.
+            depth: Whether to use depth.  None: if the first frame has some.
+            scale: Source of the metric scale of frames without depth.  None: the IMU, if frames carry its
+                samples, else the map stays up to scale.
             map_options: Density of the map of frames with depth.
-            T_world_start: ``(4, 4)``, pose of the first camera; None means the identity, or, with an IMU, a
-                world whose z points up, in which a level camera looks along x.
-            keyframes_of: Name of the robot under which keyframes are kept, about 50 kB each, for
-                `encoded_map`; empty keeps none.
-            adds_frames: Whether each frame with depth is added to the map; else the caller adds to `map`
-                what it wants.
-            recorder: Gets each frame before it is tracked, and the points of each map that is saved.
-            holds_world: Whether poses that were returned are never turned, when gravity becomes known better,
-                nor moved by an adjustment of stereo pairs.
-            features: Finds the features of an image; None for ORB.
-            motion: Expects the pose of the next frame; None for a constant velocity.
-            loops: Describes an image, so that places are recognised; None takes its features.
-            optimiser: Adjusts keyframes and landmarks of a camera without depth; None for the built-in one.
+            T_world_start: ``(4, 4)`` pose of the first camera in the world.  None: the identity; with an
+                IMU a pose whose world has z up, in which a level camera looks along x.
+            keyframes_of: Name of the robot whose keyframes are kept for `encoded_map`, about 50 kB each.
+                Empty: none is kept.
+            adds_frames: Whether each frame with depth is added to the map.  With False the caller adds
+                what it wants to `map`.
+            recorder: Receives each frame before it is tracked, and the points of each map that is saved.
+            holds_world: Whether poses that were returned must stay: the world is not turned when gravity
+                becomes known, and keyframes of stereo pairs are not adjusted at the end.
+            features: Function that finds the features of an image; None: ORB.
+            motion: Function that predicts the pose of the next frame; None: constant velocity.
+            loops: Function that describes an image for place recognition; None: the features describe it.
+            optimiser: Function for the bundle adjustment of a camera without depth; None: the built-in one.
 
         Raises:
-            UsageError: One of these is no function, or *features* has no name.
+            UsageError: An argument that must be a function is none, or *features* has no name.
         """
         self.camera = camera
+        """Intrinsics of the frames; None before the first frame."""
         self.T_body_camera: Array | None = None
+        """Pose ``(4, 4)`` of the camera in the body frame of its rig, metres; None without a rig."""
         self._ask = ask
         self._options = options
-        self._monocular = monocular
-        self._depth = depth
+        self._monocular_options = monocular
+        self._uses_depth = depth
         self._scale: OdometryScale | MarkerScale | ImuScale | None = scale
-        self._inertial: Inertial | None = None
-        self._began_s = self._last_stamp_s = float("-inf")
-        self._is_depth_known = False
-        self._holds_poses, self._disparity_deviation_px = holds_world, float("nan")
-        self._is_upright, self._holds_world = False, holds_world or T_world_start is not None
+        self._imu: ImuEstimator | None = None
+        self._odometry_start_s = self._last_stamp_s = float("-inf")
+        self._is_depth_unit_checked = False
+        self._holds_poses = holds_world
+        self._holds_world = holds_world or T_world_start is not None
+        self._is_upright = False
+        self._disparity_deviation_px = float("nan")
         self._map_options = map_options or MapOptions()
         self._T_world_start = T_world_start
         self._tracker: Tracker | MonocularTracker | None = None
@@ -158,46 +179,51 @@ class Mapper:
         self._adds_frames = adds_frames
         self._recorder = recorder
         self._slots = Slots.of(features=features, motion=motion, loops=loops, optimiser=optimiser)
-        self._joined = 0
-        self._depth_by: Literal["depth", "stereo"] = "depth"
-        self._metric: set[int] = set()
-        self._one_frame = asyncio.Lock()
+        self._processed_joins = 0  # of a monocular tracker also its loop closures
+        self._depth_source: Literal["depth", "stereo"] = "depth"
+        self._metric_segments: set[int] = set()  # segments of a monocular tracker whose scale is known
+        self._frame_lock = asyncio.Lock()
         self._round_trips_ms: list[float] = []
-        self._sources: Counter[str] = Counter()
-        self._reasons: Counter[str] = Counter()
+        self._answer_sources: Counter[str] = Counter()
+        self._lost_reasons: Counter[str] = Counter()
 
     async def track(self, frame: Frame, *, position_m: Array | None = None) -> TrackedFrame:
-        """Return the pose of the next frame, or why there is none; the work is done in a thread.
+        """Return the pose of the next frame, or the reason why it has none.
+
+        Images are processed in a thread.  A call waits until the call for the frame before has returned.
 
         Args:
-            frame: Of the same camera as all others, in the order of time.
-            position_m: ``(3,)``, position of the camera by the robot's odometry, for `OdometryScale`.
+            frame: Next frame of the same camera, in the order of time.
+            position_m: ``(3,)`` position of the camera by the robot's odometry, metres, for `OdometryScale`.
 
         Raises:
             UsageError: The frame is of another camera, not later than the one before, or its depth is not in
-                metres.
-            ConfigurationError: The function that answers cannot work at all, such as without a package.
+                metres; such a frame changes nothing.
+            ConfigurationError: The function that answers pose queries cannot work, such as without a package.
         """
-        async with self._one_frame:
+        async with self._frame_lock:
+            # 1. Refuse a frame that cannot follow the one before.
             self._check(frame)
             if self._recorder is not None:
                 self._recorder.frame(frame.timestamp_s, frame.rgb)
+            # 2. Choose the tracker with the first frame, and add the frame's IMU samples.
             tracker = self._tracker_for(frame)
-            if self._inertial is not None and frame.imu is not None:
-                self._inertial.add(frame.imu)
-            step = await _in_thread(tracker, functools.partial(tracker.prepare, frame))
+            if self._imu is not None and frame.imu is not None:
+                self._imu.add(frame.imu)
+            # 3. Match the frame, and solve the pose queries that the tracker yields one after the other.
+            step = await _run_in_thread(tracker, functools.partial(tracker.prepare, frame))
             answer: PoseAnswer | None = None
             failure = ""
             while isinstance(step, PoseQuery):
                 try:
                     answer, failure = await self._ask(step), ""
                 except ConfigurationError:
-                    _give_up(tracker, step)
+                    _close_query(tracker, step)
                     raise
                 except RsePfError as error:
                     answer, failure = None, f"{error.code}: {error.message}"
                 except BaseException:
-                    _give_up(tracker, step)
+                    _close_query(tracker, step)
                     raise
                 solution = None if answer is None else answer.solution
                 accept = functools.partial(
@@ -207,12 +233,13 @@ class Mapper:
                     0 if solution is None else len(solution.inliers),
                     is_weak=solution is not None and solution.verdict == "weak",
                 )
-                step = await _in_thread(tracker, accept)
-            return await asyncio.to_thread(self._finished, step, answer, failure, position_m)
+                step = await _run_in_thread(tracker, accept)
+            # 4. Add the result to trajectory and map; apply joins, gravity and scale.
+            return await asyncio.to_thread(self._finish, step, answer, failure, position_m)
 
     @property
     def map(self) -> PointMap:
-        """The map so far: dense with depth, else its landmarks."""
+        """The map of segment 0 so far: a dense cloud with depth, else points of features or landmarks."""
         tracker = self._tracker
         if not isinstance(tracker, MonocularTracker):
             return self._records.first.cloud
@@ -220,102 +247,116 @@ class Mapper:
 
     @property
     def trajectory(self) -> Trajectory:
-        """The poses so far, with all corrections, of the first segment and all that was joined to it."""
+        """Poses of segment 0 and of all segments that were joined to it, with all corrections."""
         if isinstance(self._tracker, MonocularTracker):
             return self._tracker.trajectory()
         return self._records.first.trajectory()
 
     @property
     def frames(self) -> int:
-        """The number of frames tracked so far."""
+        """Number of frames tracked so far."""
         return 0 if self._tracker is None else self._tracker.frames
 
     def restart_clock(self) -> None:
-        """Accept frames of an earlier time: their source began anew, such as a bag that is played again."""
+        """Accept a next frame with an earlier time stamp, such as after a bag was started again."""
         self._last_stamp_s = float("-inf")
 
     @property
     def lost_frames(self) -> int:
-        """The number of frames without a pose, but for those before the start of a camera without depth."""
+        """Number of frames without a pose; frames before the start of a camera without depth do not count."""
         return 0 if self._tracker is None else self._tracker.lost_frames
 
     @property
     def frames_before_start(self) -> int:
-        """The number of frames of a camera without depth before it had moved enough to begin."""
+        """Number of frames of a camera without depth before it had moved enough to begin."""
         return self._tracker.starting_frames if isinstance(self._tracker, MonocularTracker) else 0
 
     @property
     def keyframes(self) -> int:
-        """The number of keyframes."""
+        """Number of keyframes of the tracker."""
         return 0 if self._tracker is None else self._tracker.keyframes
 
     @property
     def scale(self) -> str:
-        """Where metres come from: ``metric, by depth``, ``metric, by ...``, or ``up to scale``."""
-        if self._tracker is None or isinstance(self._tracker, Tracker):
-            return f"metric, by {self._depth_by}" if self._tracker is not None else "unknown: no frame yet"
-        return f"metric, by {self._scale.name}" if 0 in self._metric and self._scale else _UP_TO_SCALE
+        """Source of the metric scale of segment 0.
 
-    @property
-    def imu(self) -> str:
-        """``none``, ``used``, ``not used yet``, or ``not used: `` and why, in one line."""
-        if self._inertial is None:
-            return "none"
-        if self._inertial.trouble:
-            return f"not used: {self._inertial.trouble}"
-        return "not used yet" if self._inertial.alignment is None else "used"
-
-    @property
-    def gravity(self) -> Array | None:
-        """``(3,)`` m/s^2 in the world; None while it is not known."""
-        return None if self._inertial is None else self._inertial.gravity
-
-    def keyframe_imu(
-        self, T_world_camera: Array, since_s: float | None, timestamp_s: float
-    ) -> KeyframeImu | None:
-        """Return what a keyframe tells of the IMU, as `Inertial.keyframe` does; None while it is unknown."""
+        ``metric, by depth`` or another source, ``up to scale``, or ``unknown: no frame yet``.
+        """
+        if self._tracker is None:
+            return "unknown: no frame yet"
+        if isinstance(self._tracker, Tracker):
+            return f"metric, by {self._depth_source}"
         return (
-            None if self._inertial is None else self._inertial.keyframe(T_world_camera, since_s, timestamp_s)
+            f"metric, by {self._scale.name}" if 0 in self._metric_segments and self._scale else _UP_TO_SCALE
         )
 
     @property
+    def imu(self) -> str:
+        """State of the IMU: ``none``, ``used``, ``not used yet``, or ``not used: `` with the reason."""
+        if self._imu is None:
+            return "none"
+        if self._imu.trouble:
+            return f"not used: {self._imu.trouble}"
+        return "not used yet" if self._imu.alignment is None else "used"
+
+    @property
+    def gravity(self) -> Array | None:
+        """Gravity ``(3,)`` in the world, m/s^2; None while it is not known within 0.5 degrees."""
+        return None if self._imu is None else self._imu.gravity_m_s2
+
+    def keyframe_imu(
+        self, T_world_camera: Array, previous_s: float | None, timestamp_s: float
+    ) -> KeyframeImu | None:
+        """Return gravity and preintegrated motion for a keyframe; None while gravity is not known.
+
+        The arguments are those of `ImuEstimator.keyframe_imu`.
+        """
+        return None if self._imu is None else self._imu.keyframe_imu(T_world_camera, previous_s, timestamp_s)
+
+    @property
     def unrecognised(self) -> int:
-        """The number of lost frames since the last pose that show enough; a covered lens does not count."""
+        """Number of lost frames since the last pose that have enough features; 0 without depth.
+
+        Frames of a covered lens have too few features and do not count.
+        """
         return self._tracker.unrecognised if isinstance(self._tracker, Tracker) else 0
 
     @property
-    def landmark_tracker(self) -> MonocularTracker | None:
+    def monocular_tracker(self) -> MonocularTracker | None:
         """The tracker of a camera without depth; None with depth, and before the first frame."""
         return self._tracker if isinstance(self._tracker, MonocularTracker) else None
 
     @property
     def features(self) -> Features | None:
-        """The features of the last frame that has a pose; None before it, and without depth."""
+        """Features of the last frame, if it has a pose; None otherwise, and without depth."""
         return self._tracker.last_features if isinstance(self._tracker, Tracker) else None
 
     @property
     def depth_noise(self) -> DepthNoise:
-        """The noise of the camera's depths, as it was measured on the way; a Kinect's without depth."""
+        """Noise of the camera's depths, as measured during the drive; that of a Kinect without depth."""
         return self._tracker.noise.noise if isinstance(self._tracker, Tracker) else DepthNoise()
 
     def restart(self, T_world_start: Array) -> None:
-        """Begin a new odometry frame: the next frame is at *T_world_start*, whatever was seen before.
+        """Begin another world: the next frame gets the ``(4, 4)`` pose *T_world_start*, whatever it shows.
 
         Raises:
-            UsageError: The frames have no depth, or a frame is being tracked.
+            UsageError: The camera has no depth, or no frame was tracked, or a frame is being tracked.
         """
         if not isinstance(self._tracker, Tracker):
-            raise UsageError("only a camera with depth can start anew", hint="make another mapper")
+            raise UsageError(
+                "only a mapper that has tracked frames with depth can restart at a given pose",
+                hint="make another mapper with T_world_start",
+            )
         self._tracker.restart(T_world_start)
-        if self._inertial is not None:
+        if self._imu is not None:
             stamps_s = self._records.first.stamps_s
-            self._began_s = max(stamps_s, default=self._began_s)
-            self._inertial.forget()
+            self._odometry_start_s = max(stamps_s, default=self._odometry_start_s)
+            self._imu.forget_gravity()
 
     def report(self) -> dict[str, Any]:
-        """Return the figures of the drive, as for ``report.json``."""
+        """Return the figures of the drive, as `save` writes them to ``report.json``."""
         trips = np.array(self._round_trips_ms)
-        trajectory, apart = self.trajectory, self._apart()
+        trajectory, separate = self.trajectory, self._separate_segments()
         offset: dict[str, float] = {}
         if isinstance(self._tracker, Tracker) and np.isfinite(self._disparity_deviation_px):
             offset["disparity_offset_px"] = round(self._tracker.disparity_offset_px, 3)
@@ -325,82 +366,84 @@ class Mapper:
             "lost_frames": self.lost_frames,
             "frames_before_start": self.frames_before_start,
             "keyframes": self.keyframes,
-            "segments_apart": len(apart),
-            "frames_apart": sum(len(record.poses) for record, _ in apart),
+            "segments_apart": len(separate),
+            "frames_apart": sum(len(record.poses) for record, _ in separate),
             "scale": self.scale,
             **offset,
-            **({} if self._inertial is None else {"imu": self.imu}),
+            **({} if self._imu is None else {"imu": self.imu}),
             **({} if self.T_body_camera is None else {"T_body_camera": self.T_body_camera.tolist()}),
             "unit": "unit of the map" if self.scale == _UP_TO_SCALE else "m",
             "path": round(trajectory.length_m, 3) if len(trajectory) > 1 else 0.0,
             "map_points": len(self.map),
-            "answered_by": dict(self._sources),
+            "answered_by": dict(self._answer_sources),
             "round_trip_ms": {
                 f"p{q}": round(float(np.percentile(trips, q)), 2) if len(trips) else None
                 for q in (50, 95, 99)
             },
-            "lost_because": dict(self._reasons.most_common(5)),
+            "lost_because": dict(self._lost_reasons.most_common(5)),
         }
 
     def encoded_map(self) -> bytes:
-        """Return cloud and keyframes as one map that others can merge with theirs, or be found in.
+        """Return cloud and keyframes as one encoded map, for merging and for localisation.
 
-        `DataClient.update_map` shares it; `merge_maps` makes one map of several.
+        `DataClient.update_map` shares it, and `merge_maps` merges several.
 
         Raises:
-            UsageError: No keyframe was kept: the scale is not known, or *keyframes_of* is empty.
+            UsageError: There is no keyframe in metres: the scale is not known, or *keyframes_of* is empty.
         """
-        keyframes = self._kept_keyframes()
+        keyframes = self._metric_keyframes()
         if not keyframes:
             raise UsageError(
                 "no keyframe was kept in metres, so there is no map to share",
                 hint="make the mapper with keyframes_of=ROBOT, and give it frames with depth, or a scale",
             )
-        points, colours = self.map.points(min_readings=self._least_readings)
-        made_by: dict[str, Any] = {"made_by": "mapper", "robot": self._keyframes_of}
+        points, colours = self.map.points(min_readings=self._min_readings)
+        provenance: dict[str, Any] = {"made_by": "mapper", "robot": self._keyframes_of}
         if self._is_upright:
-            made_by[UP_FIELD] = list(UP)
+            provenance[UP_FIELD] = list(UP)
         numbered = tuple(replace(keyframe, id=number) for number, keyframe in enumerate(keyframes))
-        version = MapVersion(keyframes=numbered, points=points, colours=colours, provenance=made_by)
+        version = MapVersion(keyframes=numbered, points=points, colours=colours, provenance=provenance)
         return encode_map(version)
 
     def save(self, folder: Path) -> dict[str, Any]:
-        """Write ``map.ply``, ``trajectory.txt`` and ``report.json``; return the report.
+        """Write ``map.ply``, ``trajectory.txt`` and ``report.json`` to a folder; return the report.
 
-        With a rig, ``trajectory-body.txt`` has the poses of its body, where they are in metres.
+        Keyframes of stereo pairs and of a camera without depth are adjusted before, which takes seconds;
+        those of stereo pairs change only if `adjust_pairs` finds a clear offset of the disparities.
 
-        Segments that were not joined to the first one have files of their own: ``map-2.ply``,
-        ``trajectory-2.txt`` and so on.
-
-        A map with depth has the points that were read at least twice; the report counts those.  Without depth
-        and with stereo pairs all keyframes are adjusted together before, which takes seconds.  Pairs move
-        only if their disparities are clearly too small or too large: by the report's ``disparity_offset_px``.
+        A map with depth has the voxels that were read at least twice, and the report counts only these.
+        Segments that were not joined to segment 0 have files of their own: ``map-2.ply``,
+        ``trajectory-2.txt`` and so on.  With a rig and in metres, ``trajectory-body.txt`` has the poses of
+        the rig's body.
 
         Raises:
             UsageError: The folder cannot be written.
         """
+        # 1. Adjust the keyframes, and bring segments to metric scale and z up.
         if isinstance(self._tracker, MonocularTracker):
             self._tracker.adjust()
-            for segment in self._metric:
-                self._make_metric(self._tracker, segment)
+            for segment in self._metric_segments:
+                self._apply_scale(self._tracker, segment)
         elif self._tracker is not None:
             self.adjust_pairs()
-            if self._inertial is not None:
-                self._align(self._tracker)
-                self._make_upright(self._tracker)
+            if self._imu is not None:
+                self._align_imu(self._tracker)
+                self._turn_upright(self._tracker)
+        # 2. Collect report and points.
         report = self.report()
-        points, colours = self.map.points(min_readings=self._least_readings)
+        points, colours = self.map.points(min_readings=self._min_readings)
         report["map_points"] = len(points)
         if self._recorder is not None:
             self._recorder.map(points)
+        # 3. Write the files of segment 0, then those of the separate segments.
         is_metric = self.scale != _UP_TO_SCALE
+        body = self.T_body_camera
         try:
             folder.mkdir(parents=True, exist_ok=True)
             write_ply(folder / "map.ply", points, colours, is_metric=is_metric)
-            body = self.T_body_camera
             path = folder / "trajectory.txt"
             write_trajectory(path, self.trajectory, is_metric=is_metric, T_body_camera=body)
-            for number, (record, is_metric) in enumerate(self._apart(), start=2):
+            for number, (record, is_metric) in enumerate(self._separate_segments(), start=2):
                 write_ply(folder / f"map-{number}.ply", *record.cloud.points(), is_metric=is_metric)
                 path = folder / f"trajectory-{number}.txt"
                 write_trajectory(path, record.trajectory(), is_metric=is_metric, T_body_camera=body)
@@ -413,13 +456,14 @@ class Mapper:
         return report
 
     def adjust_pairs(self) -> Mapping[int, StereoAdjustment]:
-        """Adjust all keyframes of stereo pairs together, with what their disparities lack, as `save` does.
+        """Adjust all keyframes of stereo pairs together with one offset of their disparities, as `save` does.
 
-        Returned is by segment what was found, also where it is not clear and nothing moves; nothing of other
-        cameras, and of a mapper that holds its poses.
+        Returns:
+            The adjustment of each segment by its number, also those that are not clear enough to move poses.
+            Empty for other cameras, and for a mapper with *holds_world*.
         """
         tracker = self._tracker
-        if not isinstance(tracker, Tracker) or self._depth_by != "stereo" or self._holds_poses:
+        if not isinstance(tracker, Tracker) or self._depth_source != "stereo" or self._holds_poses:
             return {}
         adjusted = tracker.adjust_pairs()
         self._records.correct(adjusted)
@@ -427,8 +471,10 @@ class Mapper:
             self._disparity_deviation_px = adjusted[tracker.segment].deviation_px
         return tracker.pair_offsets
 
-    def _kept_keyframes(self) -> list[Keyframe]:
-        """Return the keyframes that others may use: those in metres."""
+    # --- Contents of the map ---
+
+    def _metric_keyframes(self) -> list[Keyframe]:
+        """Return the keyframes of segment 0, if they are in metres; only these may be shared."""
         tracker = self._tracker
         if not isinstance(tracker, MonocularTracker):
             return self._records.first.keyframes
@@ -437,23 +483,25 @@ class Mapper:
         return landmark_keyframes(tracker, self.camera, self._keyframes_of)
 
     @property
-    def _least_readings(self) -> int:
-        """How often a voxel of the map must have been read to be trusted: twice, if the map is dense."""
-        is_sparse = isinstance(self._tracker, MonocularTracker) or self._depth_by == "stereo"
+    def _min_readings(self) -> int:
+        """How often a voxel must have been read to be in a saved map: twice, once if the map is sparse."""
+        is_sparse = isinstance(self._tracker, MonocularTracker) or self._depth_source == "stereo"
         return 1 if is_sparse else _MIN_READINGS
 
-    def _apart(self) -> list[tuple[SegmentRecord, bool]]:
-        """Return the segments that were not joined to the first one, and whether they are in metres."""
+    def _separate_segments(self) -> list[tuple[SegmentRecord, bool]]:
+        """Return the segments that were not joined to segment 0, and whether they are in metres."""
         tracker = self._tracker
         if not isinstance(tracker, MonocularTracker):
             return [(record, True) for record in self._records.apart]
         return [
-            (tracker_record(tracker, number, self._map_options), number in self._metric)
+            (tracker_record(tracker, number, self._map_options), number in self._metric_segments)
             for number in tracker.segments[1:]
         ]
 
+    # --- First frame ---
+
     def _check(self, frame: Frame) -> None:
-        """Refuse a frame that cannot follow the one before; what is refused changes nothing."""
+        """Refuse a frame that cannot follow the one before; a refused frame changes nothing."""
         own, camera = frame.camera, self.camera or frame.camera
         if own != camera:
             raise UsageError(
@@ -467,66 +515,52 @@ class Mapper:
                 f"of {self._last_stamp_s:.6f} s",
                 hint="give frames in the order of their exposure, each with its own time",
             )
-        if not self._is_depth_known and frame.stereo is None:
+        if not self._is_depth_unit_checked and frame.stereo is None:
             median_m = median_depth_m([frame.depth_m])
             depth = DepthFacts(median_m=median_m, units_per_m=1.0, is_unit_stated=True)
             check_source(SourceFacts(name="a frame", depth=depth))
-            self._is_depth_known = median_m is not None
+            self._is_depth_unit_checked = median_m is not None
         self.camera, self._last_stamp_s = camera, frame.timestamp_s
 
     def _tracker_for(self, frame: Frame) -> Tracker | MonocularTracker:
+        """Return the tracker, which the first frame chooses: with depth, with a stereo pair, or monocular."""
         if self.T_body_camera is None:
             self.T_body_camera = frame.T_body_camera
         if self._tracker is None:
             if frame.imu is not None:
-                self._begin_inertial(frame.imu, frame.camera)
-            if frame.stereo is not None or (
-                bool(frame.depth_m.any()) if self._depth is None else self._depth
-            ):
-                self._depth_by = "depth" if frame.stereo is None else "stereo"
+                self._start_imu(frame.imu, frame.camera)
+            has_depth = bool(frame.depth_m.any()) if self._uses_depth is None else self._uses_depth
+            if frame.stereo is not None or has_depth:
+                self._depth_source = "depth" if frame.stereo is None else "stereo"
                 self._tracker = Tracker(self._options, self._T_world_start, self._slots)
             else:
-                self._tracker = MonocularTracker(self._monocular, self._T_world_start, self._slots)
+                self._tracker = MonocularTracker(self._monocular_options, self._T_world_start, self._slots)
         return self._tracker
 
-    def _begin_inertial(self, samples: ImuSamples, camera: Camera) -> None:
-        """Take the IMU of the first frame, which says where down is, and metres if nothing else does."""
-        self._inertial = Inertial(samples.model, camera)
-        self._inertial.add(samples)
-        self._slots = replace(self._slots, inertial=self._inertial)
-        self._scale = self._scale or ImuScale(self._inertial)
+    def _start_imu(self, samples: ImuSamples, camera: Camera) -> None:
+        """Start the IMU estimator; gravity levels the first camera, unless its pose was given."""
+        self._imu = ImuEstimator(samples.model, camera)
+        self._imu.add(samples)
+        self._slots = replace(self._slots, inertial=self._imu)
+        self._scale = self._scale or ImuScale(self._imu)
         if self._T_world_start is None:
-            gravity = self._inertial.first_gravity()
-            self._T_world_start = upright(_LEVEL_GRAVITY if gravity is None else gravity)
+            gravity_camera = self._imu.stationary_gravity()
+            self._T_world_start = level_start_pose(
+                _GRAVITY_OF_LEVEL_CAMERA if gravity_camera is None else gravity_camera
+            )
 
-    def _align(self, tracker: Tracker) -> None:
-        """Find gravity and biases of a drive in metres."""
-        assert self._inertial is not None
-        path = self._records.first.trajectory()
-        first = int(np.searchsorted(path.timestamps_s, self._began_s, side="right"))
-        depths_m = np.empty(0) if tracker.last_features is None else tracker.last_features.points_camera[:, 2]
-        depths_m = depths_m[np.isfinite(depths_m)]
-        depth_m = float(np.median(depths_m)) if len(depths_m) else _USUAL_DEPTH_M
-        self._inertial.align(path.timestamps_s[first:], path.T_world_camera[first:], depth_m, is_metric=True)
+    # --- Result of a frame ---
 
-    def _make_upright(self, tracker: Tracker | MonocularTracker) -> bool:
-        """Turn the world, if gravity is known, so that z points up; say whether it was turned."""
-        gravity = None if self._inertial is None else self._inertial.gravity
-        if gravity is None or self._holds_world:
-            return False
-        turned = upright_rotation(gravity)
-        tracker.turn(turned)
-        if isinstance(tracker, Tracker):
-            self._records.turn(turned)
-        self._is_upright = True
-        return True
-
-    def _finished(
+    def _finish(
         self, tracked: TrackedFrame, answer: PoseAnswer | None, failure: str, position_m: Array | None
     ) -> TrackedFrame:
-        """Complete the result of a frame, and add it to trajectory and map."""
+        """Complete the result of a frame, and add the frame to trajectory and map.
+
+        *failure* is why the last pose query was not answered, empty if it was.
+        """
         tracker, pose = self._tracker, tracked.T_world_camera
-        is_first = isinstance(tracker, Tracker) and pose is not None and not self._records.first.poses
+        assert tracker is not None
+        # 1. Say why there is no pose, or why the pose is weak.
         reason = tracked.reason or (failure if pose is None else "")
         if pose is None and not reason:
             reason = f"only {tracked.matches} matches, or their pose is not plausible"
@@ -534,77 +568,109 @@ class Mapper:
                 reason = "no matches: it shows nothing that was seen just before"
         if pose is not None and answer is not None and answer.solution.verdict == "weak":
             reason = answer.solution.reason
+        # 2. Determine the status.
         status = tracked.status
         if pose is None and status == "tracked":
             status = "lost"
+        if status == "lost":
+            self._lost_reasons[reason] += 1
+        if isinstance(tracker, Tracker) and pose is not None and not self._records.first.poses:
+            status = "first"
+        # 3. Add what the answer says.
         if answer is not None:
             self._round_trips_ms.append(answer.round_trip_ms)
-            self._sources[answer.source] += 1
-        if status == "lost":
-            self._reasons[reason] += 1
-        done = replace(
+            self._answer_sources[answer.source] += 1
+        tracked = replace(
             tracked,
-            status="first" if is_first else status,
+            status=status,
             reason=reason,
             covariance=None if answer is None or pose is None else answer.solution.covariance,
             source="none" if answer is None else answer.source,
             round_trip_ms=None if answer is None else answer.round_trip_ms,
         )
+        # 4. Without depth, the tracker holds trajectory and map itself: only the scale is left to apply.
         if isinstance(tracker, MonocularTracker):
-            return self._with_scale(tracker, done, position_m)
-        assert tracker is not None
+            return self._finish_monocular(tracker, tracked, position_m)
+        # 5. With depth, add the frame to the record of its segment, then apply joins and gravity.
         if pose is not None:
-            record = self._records.add(done, pose)
+            record = self._records.add(tracked, pose)
             if self._adds_frames:
-                self._records.add_to_cloud(done, pose, tracker.last_features)
-            if done.keyframe and self._keyframes_of and tracker.last_features is not None:
-                record.keyframes.append(keyframe_of(done, pose, tracker.last_features, self._keyframes_of))
-        return self._with_gravity(tracker, self._with_joins(tracker, done))
+                self._records.add_to_cloud(tracked, pose, tracker.last_features)
+            if tracked.keyframe and self._keyframes_of and tracker.last_features is not None:
+                record.keyframes.append(keyframe_of(tracked, pose, tracker.last_features, self._keyframes_of))
+        return self._apply_gravity(tracker, self._apply_joins(tracker, tracked))
 
-    def _with_gravity(self, tracker: Tracker, done: TrackedFrame) -> TrackedFrame:
-        """Turn the world once gravity is known; the poses that were returned before are corrected."""
-        inertial, pose = self._inertial, done.T_world_camera
-        if inertial is None or pose is None or not inertial.is_due(done.frame.timestamp_s):
-            return done
-        self._align(tracker)
-        if self._is_upright or inertial.gravity is None:
-            return done
-        T = upright_rotation(inertial.gravity)
-        if not self._make_upright(tracker):
-            return done
-        return replace(done, T_world_camera=T @ pose, corrected=True, T_new_old=T)
-
-    def _with_joins(self, tracker: Tracker, done: TrackedFrame) -> TrackedFrame:
-        """Move what was joined since the last frame; the poses that were returned before are corrected."""
-        joins = tracker.joins[self._joined :]
+    def _apply_joins(self, tracker: Tracker, tracked: TrackedFrame) -> TrackedFrame:
+        """Move the segments that were joined since the last frame; these correct poses returned before."""
+        joins = tracker.joins[self._processed_joins :]
         for join in joins:
             self._records.join(join)
-        self._joined = len(tracker.joins)
-        return replace(done, corrected=bool(joins))
+        self._processed_joins = len(tracker.joins)
+        return replace(tracked, corrected=bool(joins))
 
-    def _with_scale(
-        self, tracker: MonocularTracker, done: TrackedFrame, position_m: Array | None
+    def _apply_gravity(self, tracker: Tracker, tracked: TrackedFrame) -> TrackedFrame:
+        """Align the IMU when it is due; turn the world once, which corrects all poses returned before."""
+        imu, pose = self._imu, tracked.T_world_camera
+        if imu is None or pose is None or not imu.is_due(tracked.frame.timestamp_s):
+            return tracked
+        self._align_imu(tracker)
+        T_new_old = None if self._is_upright else self._turn_upright(tracker)
+        if T_new_old is None:
+            return tracked
+        return replace(tracked, T_world_camera=T_new_old @ pose, corrected=True, T_new_old=T_new_old)
+
+    def _align_imu(self, tracker: Tracker) -> None:
+        """Estimate gravity and biases from the poses of segment 0, which are in metres."""
+        assert self._imu is not None
+        path = self._records.first.trajectory()
+        first = int(np.searchsorted(path.timestamps_s, self._odometry_start_s, side="right"))
+        depths_m = np.empty(0) if tracker.last_features is None else tracker.last_features.points_camera[:, 2]
+        depths_m = depths_m[np.isfinite(depths_m)]
+        depth_m = float(np.median(depths_m)) if len(depths_m) else _DEFAULT_DEPTH_M
+        self._imu.align(path.timestamps_s[first:], path.T_world_camera[first:], depth_m, is_metric=True)
+
+    def _turn_upright(self, tracker: Tracker | MonocularTracker) -> Array | None:
+        """Turn the world so that z points up, if gravity is known and the world may be turned.
+
+        Return ``T_new_old`` ``(4, 4)``, or None if the world was not turned.
+        """
+        gravity = self.gravity
+        if gravity is None or self._holds_world:
+            return None
+        T_new_old = upright_rotation(gravity)
+        tracker.turn(T_new_old)
+        if isinstance(tracker, Tracker):
+            self._records.turn(T_new_old)
+        self._is_upright = True
+        return T_new_old
+
+    def _finish_monocular(
+        self, tracker: MonocularTracker, tracked: TrackedFrame, position_m: Array | None
     ) -> TrackedFrame:
-        """Return the result in metres where they are known; a keyframe corrects poses that were returned."""
-        frame, segment = done.frame, done.segment
-        corrected = done.keyframe
-        merged = tracker.loops + len(tracker.joins)
-        self._metric.intersection_update(tracker.segments)
-        is_due = self._scale is not None and self._scale.is_due(
-            frame.timestamp_s, is_known=segment in self._metric
-        )
-        if self._scale is not None and (is_due or merged != self._joined):
-            if segment not in self._metric:
-                self._scale.observe(frame.timestamp_s, frame.rgb, position_m)
-            if done.T_world_camera is not None and self._make_metric(tracker, segment):
-                corrected = True
-                done = replace(done, T_world_camera=tracker.trajectory(segment).T_world_camera[-1])
-        self._joined = merged
-        is_metric = segment in self._metric
-        return replace(done, corrected=corrected, scale="metric" if is_metric else "up to scale")
+        """Return the result in metres, if the scale of its segment is known.
 
-    def _make_metric(self, tracker: MonocularTracker, segment: int) -> bool:
-        """Scale a segment to metres, also after an adjustment of all; say whether the scale is known."""
+        A keyframe, and a scale that becomes known or better, correct poses that were returned before.
+        """
+        frame, segment, scale = tracked.frame, tracked.segment, self._scale
+        is_corrected = tracked.keyframe
+        joins_and_loops = tracker.loops + len(tracker.joins)
+        self._metric_segments.intersection_update(tracker.segments)
+        if scale is not None:
+            is_known = segment in self._metric_segments
+            is_due = scale.is_due(frame.timestamp_s, is_known=is_known)
+            if is_due or joins_and_loops != self._processed_joins:
+                if not is_known:
+                    scale.observe(frame.timestamp_s, frame.rgb, position_m)
+                if tracked.T_world_camera is not None and self._apply_scale(tracker, segment):
+                    is_corrected = True
+                    newest_pose = tracker.trajectory(segment).T_world_camera[-1]
+                    tracked = replace(tracked, T_world_camera=newest_pose)
+        self._processed_joins = joins_and_loops
+        is_metric = segment in self._metric_segments
+        return replace(tracked, corrected=is_corrected, scale="metric" if is_metric else _UP_TO_SCALE)
+
+    def _apply_scale(self, tracker: MonocularTracker, segment: int) -> bool:
+        """Scale a segment to metres by the newest estimate; return False if there is none."""
         if self._scale is None or self.camera is None:
             return False
         path = tracker.trajectory(segment)
@@ -613,17 +679,22 @@ class Mapper:
         if scale is None:
             return False
         tracker.rescale(scale, segment)
-        self._metric.add(segment)
+        self._metric_segments.add(segment)
         if segment == min(tracker.segments):
-            self._make_upright(tracker)
+            self._turn_upright(tracker)
         return True
 
 
 class BlockingMapper:
-    """A `Mapper` whose `track` blocks; everything else is that of the mapper."""
+    """Wrap a `Mapper` for programs without asyncio; properties that are not here are read from ``mapper``."""
 
     def __init__(self, mapper: Mapper, wait: Callable[[Coroutine[Any, Any, Any]], Any] = asyncio.run) -> None:
-        """Wrap *mapper*; *wait* runs a coroutine to its end, such as in the event loop of a robot."""
+        """Wrap a mapper.
+
+        Args:
+            mapper: The mapper to use; it stays available as ``mapper``.
+            wait: Runs a coroutine and returns its result, such as in the event loop of a blocking robot.
+        """
         self.mapper = mapper
         self._wait = wait
 
@@ -634,44 +705,47 @@ class BlockingMapper:
 
     @property
     def map(self) -> PointMap:
-        """The map so far; see `Mapper.map`."""
+        """The map of segment 0 so far; see `Mapper.map`."""
         return self.mapper.map
 
     @property
     def trajectory(self) -> Trajectory:
-        """The poses so far; see `Mapper.trajectory`."""
+        """Poses of segment 0 so far; see `Mapper.trajectory`."""
         return self.mapper.trajectory
 
     @property
     def scale(self) -> str:
-        """Where metres come from; see `Mapper.scale`."""
+        """Source of the metric scale; see `Mapper.scale`."""
         return self.mapper.scale
 
     def encoded_map(self) -> bytes:
-        """Return a map that others can merge with theirs; see `Mapper.encoded_map`."""
+        """Return cloud and keyframes as one encoded map; see `Mapper.encoded_map`."""
         return self.mapper.encoded_map()
 
     def save(self, folder: Path) -> dict[str, Any]:
-        """Write the map, the trajectory and the report; see `Mapper.save`."""
+        """Write map, trajectory and report to a folder; see `Mapper.save`."""
         return self.mapper.save(folder)
 
 
-async def _in_thread(
-    tracker: Tracker | MonocularTracker, act: Callable[[], PoseQuery | TrackedFrame]
+async def _run_in_thread(
+    tracker: Tracker | MonocularTracker, work: Callable[[], PoseQuery | TrackedFrame]
 ) -> PoseQuery | TrackedFrame:
-    """Return the next step of a frame.  A cancellation waits for it, since the thread goes on anyway."""
-    work = asyncio.ensure_future(asyncio.to_thread(act))
+    """Run a step of a tracker in a thread and return its result.
+
+    A cancellation waits for the thread, which cannot be stopped, and closes the query that it returned.
+    """
+    task = asyncio.ensure_future(asyncio.to_thread(work))
     try:
-        return await asyncio.shield(work)
+        return await asyncio.shield(task)
     except asyncio.CancelledError:
-        step = await work
+        step = await task
         if isinstance(step, PoseQuery):
-            _give_up(tracker, step)
+            _close_query(tracker, step)
         raise
 
 
-def _give_up(tracker: Tracker | MonocularTracker, query: PoseQuery) -> None:
-    """Close the open query, so that the next frame can be tracked after a cancellation."""
+def _close_query(tracker: Tracker | MonocularTracker, query: PoseQuery) -> None:
+    """Answer a query and all that follow it with no pose, so that the tracker can take the next frame."""
     step: PoseQuery | TrackedFrame = query
     while isinstance(step, PoseQuery):
         step = tracker.accept(step, None)

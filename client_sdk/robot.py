@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
     from client_sdk.frontend import Frame, FrontEndOptions
-    from client_sdk.live.mapper import LiveMapper
+    from client_sdk.live.live_mapper import LiveMapper
     from client_sdk.live.options import LiveOptions
     from client_sdk.mapper import Mapper
     from client_sdk.mapping import MapOptions
@@ -367,7 +367,7 @@ class Robot:
         of the tenant that do the same.  The other arguments are those of `LiveMapper`.
         """
         from client_sdk.frontend import FrontEndOptions
-        from client_sdk.live.mapper import LiveMapper
+        from client_sdk.live.live_mapper import LiveMapper
         from client_sdk.live.options import LiveOptions
         from client_sdk.mapper import ask_robot
 

@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from client_sdk.imu.inertial import Inertial
+from client_sdk.imu.estimator import ImuEstimator
 from client_sdk.monocular.bundle import Bundle
 from rse_pf.errors import BadRequest, UsageError
 from rse_pf.geometry import Array, Camera, rigid
@@ -355,7 +355,7 @@ class Slots:
     motion: MotionSlot | None = None
     loops: LoopsSlot | None = None
     optimiser: OptimiserSlot | None = None
-    inertial: Inertial | None = None
+    inertial: ImuEstimator | None = None
 
     @classmethod
     def of(

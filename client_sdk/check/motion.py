@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from client_sdk.check.findings import CannotTell, FaultKind, Finding
-from client_sdk.imu.checks import RateCheck, check_rates, trouble_of_samples
+from client_sdk.imu.checks import RateCheck, check_rates, find_sample_trouble
 from client_sdk.imu.history import ImuHistory
 from client_sdk.mapping import Trajectory, read_trajectory
 from client_sdk.source_facts import stamps_in_seconds
@@ -120,7 +120,7 @@ def nothing_to_compare(*, has_depth: bool) -> list[CannotTell]:
 
 def check_imu(history: ImuHistory, stamps_s: Array, T_world_camera: Array) -> tuple[list[Finding], list[str]]:
     """Return what is wrong with an IMU beside ``(n, 4, 4)`` poses of the camera, and notes for people."""
-    trouble = trouble_of_samples(history)
+    trouble = find_sample_trouble(history)
     if trouble:
         return [], [f"IMU: {trouble}"]
     check = check_rates(history, stamps_s, T_world_camera[:, :3, :3], 0.0) if len(stamps_s) > 1 else None

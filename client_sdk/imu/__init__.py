@@ -1,4 +1,13 @@
-"""Inertial measurement units: their samples, the motion that they measure, and what it tells of a drive.
+"""Inertial measurement units: samples, preintegration, and alignment with the poses of a camera.
 
-Rotation between frames, metres, gravity and biases belong here; frames, tracking and the wire do not.
+1. `samples` holds the samples that travel with a frame, and the model of the IMU; `history` collects the last
+   five minutes of them.
+2. `checks` refuses an IMU whose samples are faulty, or whose gyroscope contradicts the camera's rotations.
+3. `preintegration` integrates the samples between two frames on the manifold (Forster et al. 2017).
+4. `alignment` estimates metric scale, gravity, velocities and biases from tracked poses and preintegrated
+   motions (as the initialisation of VINS-Mono, then a batch optimisation).
+5. `estimator` runs these steps over a drive, predicts the rotation between frames, and gives keyframes their
+   gravity.
+
+Frames, tracking and messages belong to other packages; raw samples never leave the robot.
 """

@@ -1,8 +1,16 @@
-"""Metres, gravity, velocities and biases of a drive, from the poses of its camera and from its IMU.
+"""Estimate metric scale, gravity, velocities and biases from the poses of a camera and its IMU.
 
-The poses may be up to scale.  They are measurements with noise: the smoothed poses agree with both.
-Source of the first solution: Qin et al., "VINS-Mono", T-RO 2018, Sect. V-B; of the problem: Campos et al.,
-"Inertial-Only Optimization for Visual-Inertial Initialization", ICRA 2020.
+The camera's poses, which may be up to scale, are measurements with noise (a loosely coupled problem):
+
+1. The bias of the gyroscope follows from the rotations of the poses (VINS-Mono, eq. 15).
+2. A linear problem gives velocities, gravity and scale (VINS-Mono, Sect. V-B), and refuses a sensor with the
+   wrong sign or scale.  Gravity is then set to 9.81 m/s^2.
+3. A nonlinear least-squares problem refines these, and also rotations, positions and biases of all poses:
+   residuals of preintegrated motions (Forster et al. 2017) and of poses, Huber loss, Levenberg-Marquardt.
+
+Source:
+    Qin et al., "VINS-Mono", T-RO 2018, for steps 1 and 2; Campos et al., "Inertial-Only Optimization for
+    Visual-Inertial Initialization", ICRA 2020, for estimating scale, gravity and biases with their noise.
 """
 
 from __future__ import annotations
@@ -12,336 +20,412 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from client_sdk.imu.checks import GRAVITY_M_S2, MOST_OFF_M_S2, off_gravity
+from client_sdk.imu.checks import GRAVITY_M_S2, MAX_GRAVITY_ERROR_M_S2, describe_gravity_error
 from client_sdk.imu.preintegration import Preintegration
 from client_sdk.imu.samples import ImuModel
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Array, exp_so3, left_jacobian_so3, log_so3, right_jacobian_so3, skew
 
-__all__ = ["GRAVITY_M_S2", "Alignment", "align", "bias_of_gyro"]
+__all__ = ["GRAVITY_M_S2", "ImuAlignment", "align_imu", "estimate_gyro_bias"]
 
-_STATE = 15
-_T, _P, _V, _BG, _BA = (slice(3 * number, 3 * number + 3) for number in range(5))
-_GYRO_PRIOR, _ACCEL_PRIOR = 0.1, 0.2
-"""Deviations of biases before anything is measured: rad/s, m/s^2."""
-_HUBER = 3.0
-"""In standard deviations of each axis."""
-_BEYOND_DOUBT = 10.0
-_ITERATIONS, _CONVERGED, _MAX_DAMPING = 12, 1e-4, 1e8
+# Parts of the state of one pose: rotation vector, position, velocity, gyroscope bias, accelerometer bias.
+_STATE_SIZE = 15
+_ROTATION = slice(0, 3)
+_POSITION = slice(3, 6)
+_VELOCITY = slice(6, 9)
+_GYRO_BIAS = slice(9, 12)
+_ACCEL_BIAS = slice(12, 15)
+_BIASES = slice(9, 15)
+
+_GYRO_BIAS_PRIOR_RAD_S = 0.1  # standard deviation of the gyroscope's bias before anything is measured
+_ACCEL_BIAS_PRIOR_M_S2 = 0.2  # standard deviation of the accelerometer's bias before anything is measured
+_HUBER_WIDTH = 3.0  # root mean square of a residual's three whitened axes from which on the loss is linear
+_CERTAIN_DEVIATIONS = 10.0  # standard deviations of a linear estimate from which on its error is certain
+_MAX_ITERATIONS = 12  # accepted steps of Levenberg-Marquardt
+_CONVERGED_FRACTION = 1e-4  # a step that lowers the cost by less than this fraction is the last one
+_FIRST_DAMPING = 1e-5  # damping of the first step; bad steps multiply it by 10, good ones divide it by 10
+_MIN_DAMPING = 1e-9  # smallest damping of a step
+_MAX_DAMPING = 1e8  # damping at which the search for a better step ends
+_COVARIANCE_FLOOR = 1e-14  # added to variances of preintegrated motions, so that they have a Cholesky factor
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Alignment:
-    """What an IMU and the poses of a camera tell together.
+class ImuAlignment:
+    """Metric scale, gravity, velocities and biases, and the smoothed poses that agree with them.
 
     Attributes:
-        scale: Metres per unit of the poses.
-        scale_deviation: Standard deviation of its logarithm: a share of it.
-        gravity: ``(3,)`` m/s^2 in the world of the poses; it points down.
-        gravity_deviation: Standard deviation of its direction, rad, the larger of both axes.
-        R_world_imu: ``(n, 3, 3)``, smoothed.
-        positions_m: ``(n, 3)`` of the IMU, metres, smoothed.
-        velocities: ``(n, 3)`` m/s.
-        bias_gyro: ``(n, 3)`` rad/s.
-        bias_accel: ``(n, 3)`` m/s^2.
-        bias_covariance: ``(6, 6)`` of the last biases of gyroscope and accelerometer.
-        misfit: Root of the squared residuals per degree of freedom, about 1 if the noise is as stated; all
-            deviations have been multiplied by what is above 1.
+        scale: Metres per unit of the camera's poses.
+        scale_deviation: Standard deviation of the logarithm of the scale, thus relative; 0 for metric poses.
+        gravity_m_s2: ``(3,)`` in the world of the poses; it points down.
+        gravity_deviation_rad: Standard deviation of the direction of gravity about its less certain axis.
+        R_world_imu: ``(n, 3, 3)`` smoothed rotations of the IMU.
+        positions_m: ``(n, 3)`` smoothed positions of the IMU in the world.
+        velocities_m_s: ``(n, 3)`` velocities of the IMU in the world.
+        gyro_bias_rad_s: ``(n, 3)`` biases of the gyroscope.
+        accel_bias_m_s2: ``(n, 3)`` biases of the accelerometer.
+        bias_covariance: ``(6, 6)`` of the last pose's biases of gyroscope and accelerometer.
+        misfit: Square root of the chi-square per degree of freedom: about 1 if the noise is as stated.  All
+            deviations and covariances above were multiplied by it, or its square, if it is above 1.
     """
 
     scale: float
     scale_deviation: float
-    gravity: Array
-    gravity_deviation: float
+    gravity_m_s2: Array
+    gravity_deviation_rad: float
     R_world_imu: Array
     positions_m: Array
-    velocities: Array
-    bias_gyro: Array
-    bias_accel: Array
+    velocities_m_s: Array
+    gyro_bias_rad_s: Array
+    accel_bias_m_s2: Array
     bias_covariance: Array
     misfit: float
 
 
-def bias_of_gyro(R_world_imu: Array, motions: Sequence[Preintegration]) -> Array:
-    """Return the ``(3,)`` bias of the gyroscope that fits the rotations ``(n, 3, 3)`` of tracked poses best.
+def estimate_gyro_bias(R_world_imu: Array, motions: Sequence[Preintegration]) -> Array:
+    """Return the ``(3,)`` gyroscope bias in rad/s with which motions fit the rotations ``(n, 3, 3)`` best.
+
+    The n - 1 motions lie between neighbouring rotations.
 
     Source:
         VINS-Mono, eq. 15.
     """
-    measured = np.stack([motion.rotation for motion in motions])
-    J = np.stack([motion.jacobian[:3, :3] for motion in motions])
-    turned = np.swapaxes(R_world_imu[:-1], 1, 2) @ R_world_imu[1:]
-    differences = log_so3(np.swapaxes(measured, 1, 2) @ turned)
+    measured = np.stack([motion.delta_rotation for motion in motions])
+    J = np.stack([motion.bias_jacobian[:3, :3] for motion in motions])
+    observed = np.swapaxes(R_world_imu[:-1], 1, 2) @ R_world_imu[1:]
+    differences = log_so3(np.swapaxes(measured, 1, 2) @ observed)
     JT = np.swapaxes(J, 1, 2)
-    more = np.linalg.solve((JT @ J).sum(axis=0), np.einsum("nij,nj->i", JT, differences))
-    bias: Array = motions[0].bias_gyro + more
+    change = np.linalg.solve((JT @ J).sum(axis=0), np.einsum("nij,nj->i", JT, differences))
+    bias: Array = motions[0].gyro_bias_rad_s + change
     return bias
 
 
-def align(
+def align_imu(
     T_world_camera: Array,
     motions: Sequence[Preintegration],
     model: ImuModel,
     pose_noise: tuple[float, float],
     *,
     is_metric: bool = False,
-) -> Alignment | None:
-    """Return the alignment of poses and preintegrated motions; None if they do not tell the scale.
+) -> ImuAlignment | None:
+    """Align an IMU with the poses of a camera; return None if the poses do not determine the scale.
 
     Args:
-        T_world_camera: ``(n, 4, 4)``, n >= 5; translations in any unit, or in metres.
-        motions: ``n - 1``, each between two neighbours of the poses.
-        model: Of the IMU.
-        pose_noise: Standard deviations of a pose: rad, and units of the poses.
-        is_metric: Whether the poses are in metres.
+        T_world_camera: ``(n, 4, 4)`` poses, n >= 5, with translations in any one unit.
+        motions: n - 1 preintegrated motions, each between two neighbouring poses.
+        model: Model of the IMU.
+        pose_noise: Standard deviations of a pose's rotation (rad) and position (unit of the poses).
+        is_metric: Whether the unit of the poses is the metre, so that the scale is 1.
 
     Raises:
-        UsageError: The scale is below 0 beyond doubt: what is measured points the wrong way.
+        UsageError: Scale or magnitude of gravity are wrong by more than ten standard deviations, so that the
+            accelerometer has the wrong sign, scale or bias.
     """
-    bias = bias_of_gyro(T_world_camera[:, :3, :3] @ model.T_imu_camera[:3, :3].T, motions)
-    first = _linear(T_world_camera, motions, model, bias, is_metric=is_metric)
-    if first is None:
+    gyro_bias = estimate_gyro_bias(T_world_camera[:, :3, :3] @ model.T_imu_camera[:3, :3].T, motions)
+    linear = _align_linearly(T_world_camera, motions, model, gyro_bias, is_metric=is_metric)
+    if linear is None:
         return None
-    scale, gravity, velocities = first
-    return _Problem(T_world_camera, motions, model, pose_noise, is_metric=is_metric).solve(
-        scale, gravity, velocities, bias
+    scale, gravity, velocities = linear
+    return _AlignmentProblem(T_world_camera, motions, model, pose_noise, is_metric=is_metric).solve(
+        scale, gravity, velocities, gyro_bias
     )
 
 
-def _linear(
-    T_world_camera: Array, motions: Sequence[Preintegration], model: ImuModel, bias_gyro: Array,
-    *, is_metric: bool,
-) -> tuple[float, Array, Array] | None:  # fmt: skip
-    """Return scale, gravity and velocities of the linear problem; None if the scale is not above 0.
+def _align_linearly(
+    T_world_camera: Array,
+    motions: Sequence[Preintegration],
+    model: ImuModel,
+    gyro_bias: Array,
+    *,
+    is_metric: bool,
+) -> tuple[float, Array, Array] | None:
+    """Return scale, gravity and velocities ``(n, 3)`` by linear least squares; None for a scale below 0.
 
-    Gravity is of any length in it, and the accelerometer has no bias.
+    The magnitude of gravity is free in the problem and set to 9.81 m/s^2 afterwards; the accelerometer has no
+    bias in it.  Raises UsageError as `align_imu` does.
     """
-    R, arm = _imu_rotations(T_world_camera, model)
+    # 1. Correct the motions for the change of the gyroscope bias.
+    R, camera_in_imu = _imu_rotations(T_world_camera, model)
     p = T_world_camera[:, :3, 3]
     n = len(R)
     dt = np.array([motion.duration_s for motion in motions])
+    bias_change = gyro_bias - np.stack([motion.gyro_bias_rad_s for motion in motions])
+    J = np.stack([motion.bias_jacobian[3:, :3] for motion in motions])
+    deltas = _velocity_and_position_deltas(motions) + np.einsum("nij,nj->ni", J, bias_change)
+    # 2. Set up 6 equations for each motion; the unknowns are n velocities, gravity and scale.
     A, b = np.zeros((n - 1, 6, 3 * n + 4)), np.zeros((n - 1, 6))
-    more = bias_gyro - np.stack([motion.bias_gyro for motion in motions])
-    J = np.stack([motion.jacobian[3:, :3] for motion in motions])
-    moved = _moved(motions) + np.einsum("nij,nj->ni", J, more)
     for row in range(n - 1):
-        here, after = slice(3 * row, 3 * row + 3), slice(3 * row + 3, 3 * row + 6)
-        A[row, :3, here], A[row, :3, after] = -np.eye(3), np.eye(3)
+        velocity, next_velocity = slice(3 * row, 3 * row + 3), slice(3 * row + 3, 3 * row + 6)
+        A[row, :3, velocity], A[row, :3, next_velocity] = -np.eye(3), np.eye(3)
         A[row, :3, 3 * n : 3 * n + 3] = -dt[row] * np.eye(3)
-        A[row, 3:, here] = -dt[row] * np.eye(3)
+        A[row, 3:, velocity] = -dt[row] * np.eye(3)
         A[row, 3:, 3 * n : 3 * n + 3] = -0.5 * dt[row] ** 2 * np.eye(3)
         A[row, 3:, -1] = p[row + 1] - p[row]
-        b[row, :3] = R[row] @ moved[row, :3]
-        b[row, 3:] = R[row] @ moved[row, 3:] + (R[row + 1] - R[row]) @ arm
+        b[row, :3] = R[row] @ deltas[row, :3]
+        b[row, 3:] = R[row] @ deltas[row, 3:] + (R[row + 1] - R[row]) @ camera_in_imu
     matrix, right = A.reshape(-1, 3 * n + 4), b.ravel()
     if is_metric:
         right, matrix = right - matrix[:, -1], matrix[:, :-1]
-    found = np.asarray(np.linalg.lstsq(matrix, right, rcond=None)[0], dtype=np.float64)
-    scale = 1.0 if is_metric else float(found[-1])
-    gravity: Array = found[3 * n : 3 * n + 3]
-    length = float(np.linalg.norm(gravity))
+    # 3. Solve them.
+    solution = np.asarray(np.linalg.lstsq(matrix, right, rcond=None)[0], dtype=np.float64)
+    scale = 1.0 if is_metric else float(solution[-1])
+    gravity: Array = solution[3 * n : 3 * n + 3]
+    magnitude = float(np.linalg.norm(gravity))
+    # 4. Refuse an accelerometer whose sign or scale is certainly wrong.
     if not is_metric and scale < 0.0:
-        deviations = _last_deviations(matrix, right - matrix @ found, 1)
-        if -scale > _BEYOND_DOUBT * deviations[0]:
+        deviations = _deviations_of_last(matrix, right - matrix @ solution, 1)
+        if -scale > _CERTAIN_DEVIATIONS * deviations[0]:
             raise UsageError(
                 "the accelerometer measures the opposite of how the camera moves: an axis has the wrong sign",
-                hint="a resting accelerometer points up with 9.81; see T_imu_camera",
+                hint="an accelerometer at rest reads 9.81 upwards; correct its axes, or T_imu_camera",
             )
-    if not scale > 0.0 or not length > 0.0:
+    if not scale > 0.0 or not magnitude > 0.0:
         return None
-    if abs(length - GRAVITY_M_S2) > MOST_OFF_M_S2:
-        deviations = _last_deviations(matrix, right - matrix @ found, 3 if is_metric else 4)
-        if abs(length - GRAVITY_M_S2) - MOST_OFF_M_S2 > _BEYOND_DOUBT * deviations[:3].max():
+    if abs(magnitude - GRAVITY_M_S2) > MAX_GRAVITY_ERROR_M_S2:
+        deviations = _deviations_of_last(matrix, right - matrix @ solution, 3 if is_metric else 4)
+        excess = abs(magnitude - GRAVITY_M_S2) - MAX_GRAVITY_ERROR_M_S2
+        if excess > _CERTAIN_DEVIATIONS * deviations[:3].max():
             raise UsageError(
-                off_gravity(length, "of gravity beside the camera"),
+                describe_gravity_error(magnitude, "of gravity beside the camera"),
                 hint="calibrate the accelerometer; at rest it must read 9.81 m/s^2",
             )
-    gravity = gravity * (GRAVITY_M_S2 / length)
-    velocities: Array = found[: 3 * n].reshape(n, 3)
+    # 5. Set the magnitude of gravity.
+    gravity = gravity * (GRAVITY_M_S2 / magnitude)
+    velocities: Array = solution[: 3 * n].reshape(n, 3)
     return scale, gravity, velocities
 
 
-def _last_deviations(matrix: Array, residuals: Array, count: int) -> Array:
-    """Return the ``(count,)`` standard deviations of the last unknowns of a linear problem."""
-    left = np.square(residuals).sum() / max(1, len(residuals) - matrix.shape[1])
-    # The last rows of R, as the QR decomposition leaves it, hold these unknowns alone.
+def _deviations_of_last(matrix: Array, residuals: Array, count: int) -> Array:
+    """Return the ``(count,)`` standard deviations of the last unknowns of a linear least-squares problem."""
+    variance = np.square(residuals).sum() / max(1, len(residuals) - matrix.shape[1])
+    # In the QR decomposition the last rows of R contain the last unknowns alone.
     R = np.asarray(np.linalg.qr(matrix, mode="r"))[-count:, -count:]
     if not np.abs(np.diag(R)).min() > 0.0:
         return np.full(count, np.inf)
-    deviations: Array = np.sqrt(left * np.square(np.linalg.inv(R)).sum(axis=1))
+    deviations: Array = np.sqrt(variance * np.square(np.linalg.inv(R)).sum(axis=1))
     return deviations
 
 
-def _moved(motions: Sequence[Preintegration]) -> Array:
-    """Return velocity and position of each motion, ``(n, 6)``."""
-    return np.stack([np.concatenate([motion.velocity, motion.position]) for motion in motions])
+def _velocity_and_position_deltas(motions: Sequence[Preintegration]) -> Array:
+    """Return the preintegrated changes of velocity and position ``(n, 6)``."""
+    return np.stack(
+        [np.concatenate([motion.delta_velocity_m_s, motion.delta_position_m]) for motion in motions]
+    )
 
 
 def _imu_rotations(T_world_camera: Array, model: ImuModel) -> tuple[Array, Array]:
-    """Return ``R_world_imu`` of each pose, and the position of the camera in the frame of the IMU."""
+    """Return ``R_world_imu`` ``(n, 3, 3)`` and the position ``(3,)`` of the camera in the IMU's frame."""
     R: Array = T_world_camera[:, :3, :3] @ model.T_imu_camera[:3, :3].T
     return R, model.T_imu_camera[:3, 3]
 
 
-class _Problem:
-    """Least squares over rotations, positions, velocities and biases of all poses, scale and gravity.
+class _AlignmentProblem:
+    """Nonlinear least squares over the states of all poses, the scale, and the direction of gravity.
 
-    The states of neighbours alone are coupled, and all with scale and gravity: the matrix is block
-    tridiagonal with a border, and solved in time proportional to the number of poses.
+    Only the states of neighbours are coupled, and all states with scale and gravity.  The normal equations
+    are therefore block tridiagonal with a border, and are solved in time proportional to the number of poses.
     """
 
     def __init__(
-        self, T_world_camera: Array, motions: Sequence[Preintegration], model: ImuModel,
-        pose_noise: tuple[float, float], *, is_metric: bool,
-    ) -> None:  # fmt: skip
-        self._seen_R, self._arm = _imu_rotations(T_world_camera, model)
-        self._seen = T_world_camera[:, :3, 3]
-        self._noise = pose_noise
+        self,
+        T_world_camera: Array,
+        motions: Sequence[Preintegration],
+        model: ImuModel,
+        pose_noise: tuple[float, float],
+        *,
+        is_metric: bool,
+    ) -> None:
+        self._observed_R, self._camera_in_imu = _imu_rotations(T_world_camera, model)
+        self._observed_p = T_world_camera[:, :3, 3]
+        self._rotation_noise, self._position_noise = pose_noise
         self._is_metric = is_metric
         self._dt = np.array([motion.duration_s for motion in motions])
-        self._rotation = np.stack([motion.rotation for motion in motions])
-        self._moved = _moved(motions)
-        self._J = np.stack([motion.jacobian for motion in motions])
-        self._at = np.stack([np.concatenate([motion.bias_gyro, motion.bias_accel]) for motion in motions])
+        self._delta_rotations = np.stack([motion.delta_rotation for motion in motions])
+        self._deltas = _velocity_and_position_deltas(motions)
+        self._J = np.stack([motion.bias_jacobian for motion in motions])
+        self._motion_biases = np.stack(
+            [np.concatenate([motion.gyro_bias_rad_s, motion.accel_bias_m_s2]) for motion in motions]
+        )
+        # Square roots of the information matrices of motions and of the biases' random walk.
         walk = np.repeat([model.gyro_walk, model.accel_walk], 3) ** 2
-        self._whiten = np.zeros((len(motions), 15, 15))
+        self._sqrt_information = np.zeros((len(motions), 15, 15))
         for row, motion in enumerate(motions):
-            covariance = motion.covariance + 1e-14 * np.eye(9)
-            self._whiten[row, :9, :9] = np.linalg.inv(np.linalg.cholesky(covariance))
-            self._whiten[row, 9:, 9:] = np.diag(1.0 / np.sqrt(walk * motion.duration_s))
+            covariance = motion.covariance + _COVARIANCE_FLOOR * np.eye(9)
+            self._sqrt_information[row, :9, :9] = np.linalg.inv(np.linalg.cholesky(covariance))
+            self._sqrt_information[row, 9:, 9:] = np.diag(1.0 / np.sqrt(walk * motion.duration_s))
 
-    def solve(self, scale: float, gravity: Array, velocities: Array, bias_gyro: Array) -> Alignment | None:
-        """Return the best states from a first solution on, by Levenberg and Marquardt with Huber weights."""
-        n = len(self._seen)
+    def solve(self, scale: float, gravity: Array, velocities: Array, gyro_bias: Array) -> ImuAlignment | None:
+        """Refine a first solution by Levenberg-Marquardt; return None if its covariance is not positive."""
+        n = len(self._observed_p)
         state = _State(
-            R=self._seen_R.copy(), p=scale * self._seen - self._seen_R @ self._arm, v=velocities.copy(),
-            biases=np.tile(np.concatenate([bias_gyro, np.zeros(3)]), (n, 1)), scale=scale, gravity=gravity,
-        )  # fmt: skip
-        cost, damping = self._cost(state), 1e-5
-        system = self._linearised(state)
-        for _ in range(_ITERATIONS):
+            R=self._observed_R.copy(),
+            p=scale * self._observed_p - self._observed_R @ self._camera_in_imu,
+            v=velocities.copy(),
+            biases=np.tile(np.concatenate([gyro_bias, np.zeros(3)]), (n, 1)),
+            scale=scale,
+            gravity=gravity,
+        )
+        cost, damping = self._cost(state), _FIRST_DAMPING
+        equations = self._linearise(state)
+        for _ in range(_MAX_ITERATIONS):
+            # 1. Increase the damping until a step lowers the cost.
             is_better = False
             while damping < _MAX_DAMPING:
-                moved = state.moved(*system.step(damping))
-                moved_cost = self._cost(moved)
-                if moved_cost < cost:
+                candidate = state.moved_by(*equations.solve(damping))
+                candidate_cost = self._cost(candidate)
+                if candidate_cost < cost:
                     is_better = True
                     break
                 damping *= 10.0
             if not is_better:
                 break
-            is_done = cost - moved_cost < _CONVERGED * cost
-            state, cost, damping = moved, moved_cost, max(0.1 * damping, 1e-9)
-            system = self._linearised(state)
-            if is_done:
+            # 2. Take the step; stop if it changed little.
+            is_converged = cost - candidate_cost < _CONVERGED_FRACTION * cost
+            state, cost, damping = candidate, candidate_cost, max(0.1 * damping, _MIN_DAMPING)
+            equations = self._linearise(state)
+            if is_converged:
                 break
-        return self._alignment(state, system)
+        return self._make_alignment(state, equations)
 
-    def _alignment(self, state: _State, system: _System) -> Alignment | None:
-        covariance = system.last_covariance()
+    def _make_alignment(self, state: _State, equations: _NormalEquations) -> ImuAlignment | None:
+        """Return the alignment with deviations from the inverse of the normal equations; None if singular."""
+        covariance = equations.last_covariance()
         if covariance is None or not np.isfinite(covariance).all():
             return None
-        inertial, seen = self._residuals(state)
-        free = inertial.size + seen.size + 6 - _STATE * len(seen) - len(system.c)
-        misfit = float(np.sqrt((np.square(inertial).sum() + np.square(seen).sum()) / free))
+        motion_residuals, pose_residuals = self._residuals(state)
+        unknowns = _STATE_SIZE * len(pose_residuals) + len(equations.border_gradient)
+        freedom = motion_residuals.size + pose_residuals.size + 6 - unknowns  # 6: priors of the first biases
+        chi_square = np.square(motion_residuals).sum() + np.square(pose_residuals).sum()
+        misfit = float(np.sqrt(chi_square / freedom))
         covariance *= max(1.0, misfit) ** 2
-        biases = covariance[_BG.start : _BA.stop, _BG.start : _BA.stop]
-        tilt = covariance[_STATE + 1 :, _STATE + 1 :] if not self._is_metric else covariance[_STATE:, _STATE:]
-        return Alignment(
+        tilt_begin = _STATE_SIZE if self._is_metric else _STATE_SIZE + 1
+        tilt_covariance = covariance[tilt_begin:, tilt_begin:]
+        return ImuAlignment(
             scale=state.scale,
-            scale_deviation=0.0 if self._is_metric else float(np.sqrt(covariance[_STATE, _STATE])),
-            gravity=state.gravity,
-            gravity_deviation=float(np.sqrt(np.linalg.eigvalsh(tilt)[-1])),
-            R_world_imu=state.R, positions_m=state.p, velocities=state.v,
-            bias_gyro=state.biases[:, :3], bias_accel=state.biases[:, 3:], bias_covariance=biases,
+            scale_deviation=0.0 if self._is_metric else float(np.sqrt(covariance[_STATE_SIZE, _STATE_SIZE])),
+            gravity_m_s2=state.gravity,
+            gravity_deviation_rad=float(np.sqrt(np.linalg.eigvalsh(tilt_covariance)[-1])),
+            R_world_imu=state.R,
+            positions_m=state.p,
+            velocities_m_s=state.v,
+            gyro_bias_rad_s=state.biases[:, :3],
+            accel_bias_m_s2=state.biases[:, 3:],
+            bias_covariance=covariance[_BIASES, _BIASES],
             misfit=misfit,
-        )  # fmt: skip
+        )
 
     def _cost(self, state: _State) -> float:
-        inertial, seen = self._residuals(state)
+        motion_residuals, pose_residuals = self._residuals(state)
         prior = (state.biases[0] / _bias_prior()) ** 2
-        return float(_huber_cost(inertial).sum() + _huber_cost(seen).sum() + prior.sum())
+        return float(_huber_cost(motion_residuals).sum() + _huber_cost(pose_residuals).sum() + prior.sum())
 
     def _residuals(self, state: _State) -> tuple[Array, Array]:
         """Return the whitened residuals of motions ``(n - 1, 15)`` and of poses ``(n, 6)``."""
-        raw, _ = self._raw(state)
-        inertial = np.einsum("nij,nj->ni", self._whiten, raw)
-        turned = log_so3(np.swapaxes(self._seen_R, 1, 2) @ state.R) / self._noise[0]
-        apart = (state.p + state.R @ self._arm - state.scale * self._seen) / (self._noise[1] * state.scale)
-        return inertial, np.concatenate([turned, apart], axis=1)
+        raw, _ = self._motion_residuals(state)
+        motion_residuals = np.einsum("nij,nj->ni", self._sqrt_information, raw)
+        rotations = log_so3(np.swapaxes(self._observed_R, 1, 2) @ state.R) / self._rotation_noise
+        camera_positions = state.p + state.R @ self._camera_in_imu
+        positions = (camera_positions - state.scale * self._observed_p) / (self._position_noise * state.scale)
+        return motion_residuals, np.concatenate([rotations, positions], axis=1)
 
-    def _raw(self, state: _State) -> tuple[Array, Array]:
-        """Return the residuals of motions, and how the changed bias turns them ``(n - 1, 3)``."""
+    def _motion_residuals(self, state: _State) -> tuple[Array, Array]:
+        """Return the residuals of motions ``(n - 1, 15)``, and the rotation vectors ``(n - 1, 3)`` by which
+        the changes of the gyroscope biases correct the preintegrated rotations.
+        """
         RT = np.swapaxes(state.R[:-1], 1, 2)
-        more = state.biases[:-1] - self._at
-        by_bias = np.einsum("nij,nj->ni", self._J, more)
+        bias_changes = state.biases[:-1] - self._motion_biases
+        corrections = np.einsum("nij,nj->ni", self._J, bias_changes)
         raw = np.empty((len(self._dt), 15))
-        expected = self._rotation @ exp_so3(by_bias[:, :3])
-        raw[:, :3] = log_so3(np.swapaxes(expected, 1, 2) @ RT @ state.R[1:])
-        moved = self._moved + by_bias[:, 3:]
-        raw[:, 3:6] = np.einsum("nij,nj->ni", RT, self._gained(state)) - moved[:, :3]
-        raw[:, 6:9] = np.einsum("nij,nj->ni", RT, self._passed(state)) - moved[:, 3:]
+        rotations = self._delta_rotations @ exp_so3(corrections[:, :3])
+        raw[:, :3] = log_so3(np.swapaxes(rotations, 1, 2) @ RT @ state.R[1:])
+        deltas = self._deltas + corrections[:, 3:]
+        raw[:, 3:6] = np.einsum("nij,nj->ni", RT, self._velocity_changes(state)) - deltas[:, :3]
+        raw[:, 6:9] = np.einsum("nij,nj->ni", RT, self._position_changes(state)) - deltas[:, 3:]
         raw[:, 9:] = state.biases[1:] - state.biases[:-1]
-        return raw, by_bias[:, :3]
+        return raw, corrections[:, :3]
 
-    def _gained(self, state: _State) -> Array:
-        gained: Array = state.v[1:] - state.v[:-1] - self._dt[:, None] * state.gravity
-        return gained
+    def _velocity_changes(self, state: _State) -> Array:
+        """Return the changes of velocity ``(n - 1, 3)`` in the world, without gravity."""
+        changes: Array = state.v[1:] - state.v[:-1] - self._dt[:, None] * state.gravity
+        return changes
 
-    def _passed(self, state: _State) -> Array:
+    def _position_changes(self, state: _State) -> Array:
+        """Return the changes of position ``(n - 1, 3)`` in the world, without velocity and gravity."""
         dt = self._dt[:, None]
-        passed: Array = state.p[1:] - state.p[:-1] - dt * state.v[:-1] - 0.5 * dt**2 * state.gravity
-        return passed
+        changes: Array = state.p[1:] - state.p[:-1] - dt * state.v[:-1] - 0.5 * dt**2 * state.gravity
+        return changes
 
-    def _linearised(self, state: _State) -> _System:
-        """Return the normal equations at a state; Jacobians after Forster et al. 2017, appendix C."""
-        n, m = len(self._seen), 2 if self._is_metric else 3
-        raw, by_bias = self._raw(state)
+    def _linearise(self, state: _State) -> _NormalEquations:
+        """Return the weighted normal equations at a state.
+
+        The border holds the logarithm of the scale (unless the poses are metric) and two angles of gravity.
+
+        Source:
+            Jacobians of preintegrated motions: Forster et al. 2017, appendix C.
+        """
+        n, border_size = len(self._observed_p), 2 if self._is_metric else 3
+        # 1. Differentiate the residuals of motions by the states before and behind, and by the border.
+        raw, rotation_corrections = self._motion_residuals(state)
         RT = np.swapaxes(state.R[:-1], 1, 2)
         dt = self._dt[:, None, None]
-        back = np.asarray(np.linalg.inv(right_jacobian_so3(raw[:, :3])), dtype=np.float64)
-        first, second = np.zeros((n - 1, 15, 15)), np.zeros((n - 1, 15, 15))
-        border = np.zeros((n - 1, 15, m))
-        first[:, _T, _T] = -back @ np.swapaxes(state.R[1:], 1, 2) @ state.R[:-1]
-        second[:, _T, _T] = back
-        # Log(Exp(-J d) Exp(r)): the bias turns on the left, by the inverse of the left Jacobian.
-        first[:, _T, _BG] = (
-            -np.linalg.inv(left_jacobian_so3(raw[:, :3])) @ right_jacobian_so3(by_bias) @ self._J[:, :3, :3]
+        inverse_right_jacobian = np.asarray(np.linalg.inv(right_jacobian_so3(raw[:, :3])), dtype=np.float64)
+        before, behind = np.zeros((n - 1, 15, 15)), np.zeros((n - 1, 15, 15))
+        border = np.zeros((n - 1, 15, border_size))
+        before[:, _ROTATION, _ROTATION] = (
+            -inverse_right_jacobian @ np.swapaxes(state.R[1:], 1, 2) @ state.R[:-1]
         )
-        first[:, 3:6, _T] = skew(np.einsum("nij,nj->ni", RT, self._gained(state)))
-        first[:, 6:9, _T] = skew(np.einsum("nij,nj->ni", RT, self._passed(state)))
-        first[:, 3:6, _V], second[:, 3:6, _V] = -RT, RT
-        first[:, 6:9, _P], second[:, 6:9, _P], first[:, 6:9, _V] = -RT, RT, -dt * RT
-        first[:, 3:9, 9:] = -self._J[:, 3:]
-        first[:, 9:, 9:], second[:, 9:, 9:] = -np.eye(6), np.eye(6)
-        tilt = -skew(state.gravity) @ _tangents(state.gravity)
-        border[:, 3:6, m - 2 :] = -dt * RT @ tilt
-        border[:, 6:9, m - 2 :] = -0.5 * dt**2 * RT @ tilt
-        inertial, seen = self._residuals(state)
-        weights = np.sqrt(_huber_weights(inertial))[:, :, None]
-        first, second, border = (weights * (self._whiten @ each) for each in (first, second, border))
-        inertial = weights[:, :, 0] * inertial
-        # Of the poses that were seen.
-        own, own_border = np.zeros((n, 6, 15)), np.zeros((n, 6, m))
-        own[:, :3, _T] = np.linalg.inv(right_jacobian_so3(seen[:, :3] * self._noise[0])) / self._noise[0]
-        far = self._noise[1] * state.scale
-        own[:, 3:, _T] = -state.R @ skew(self._arm) / far
-        own[:, 3:, _P] = np.eye(3) / far
+        behind[:, _ROTATION, _ROTATION] = inverse_right_jacobian
+        # Log(Exp(-J d) Exp(r)): a change d of the bias acts on the left, by the inverse left Jacobian.
+        before[:, _ROTATION, _GYRO_BIAS] = (
+            -np.linalg.inv(left_jacobian_so3(raw[:, :3]))
+            @ right_jacobian_so3(rotation_corrections)
+            @ self._J[:, :3, :3]
+        )
+        before[:, 3:6, _ROTATION] = skew(np.einsum("nij,nj->ni", RT, self._velocity_changes(state)))
+        before[:, 6:9, _ROTATION] = skew(np.einsum("nij,nj->ni", RT, self._position_changes(state)))
+        before[:, 3:6, _VELOCITY] = -RT
+        behind[:, 3:6, _VELOCITY] = RT
+        before[:, 6:9, _POSITION] = -RT
+        behind[:, 6:9, _POSITION] = RT
+        before[:, 6:9, _VELOCITY] = -dt * RT
+        before[:, 3:9, _BIASES] = -self._J[:, 3:]
+        before[:, 9:, _BIASES] = -np.eye(6)
+        behind[:, 9:, _BIASES] = np.eye(6)
+        gravity_by_angles = -skew(state.gravity) @ _tangents(state.gravity)
+        border[:, 3:6, border_size - 2 :] = -dt * RT @ gravity_by_angles
+        border[:, 6:9, border_size - 2 :] = -0.5 * dt**2 * RT @ gravity_by_angles
+        # 2. Whiten and weight them.
+        motion_residuals, pose_residuals = self._residuals(state)
+        weights = np.sqrt(_huber_weights(motion_residuals))[:, :, None]
+        before, behind, border = (
+            weights * (self._sqrt_information @ jacobian) for jacobian in (before, behind, border)
+        )
+        motion_residuals = weights[:, :, 0] * motion_residuals
+        # 3. Differentiate the residuals of poses, and weight them.
+        own, own_border = np.zeros((n, 6, 15)), np.zeros((n, 6, border_size))
+        rotation_residuals = pose_residuals[:, :3] * self._rotation_noise
+        own[:, :3, _ROTATION] = np.linalg.inv(right_jacobian_so3(rotation_residuals)) / self._rotation_noise
+        noise_m = self._position_noise * state.scale
+        own[:, 3:, _ROTATION] = -state.R @ skew(self._camera_in_imu) / noise_m
+        own[:, 3:, _POSITION] = np.eye(3) / noise_m
         if not self._is_metric:
-            own_border[:, 3:, 0] = -state.scale * self._seen / far
-        weights = np.sqrt(_huber_weights(seen))[:, :, None]
-        own, own_border, seen = weights * own, weights * own_border, weights[:, :, 0] * seen
-        system = _System(n, m)
-        system.add(own, own_border, seen)
-        system.add_pairs(first, second, border, inertial)
+            own_border[:, 3:, 0] = -state.scale * self._observed_p / noise_m
+        weights = np.sqrt(_huber_weights(pose_residuals))[:, :, None]
+        own, own_border = weights * own, weights * own_border
+        pose_residuals = weights[:, :, 0] * pose_residuals
+        # 4. Add both to the normal equations, and the prior of the first biases.
+        equations = _NormalEquations(n, border_size)
+        equations.add(own, own_border, pose_residuals)
+        equations.add_pairs(before, behind, border, motion_residuals)
         information = 1.0 / _bias_prior() ** 2
-        system.D[0, 9:, 9:] += np.diag(information)
-        system.b[0, 9:] += information * state.biases[0]
-        return system
+        equations.diagonal[0, 9:, 9:] += np.diag(information)
+        equations.gradient[0, 9:] += information * state.biases[0]
+        return equations
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _State:
+    """Unknowns: for n poses rotation, position, velocity and biases of the IMU; scale and gravity."""
+
     R: Array
     p: Array
     v: Array
@@ -349,123 +433,139 @@ class _State:
     scale: float
     gravity: Array
 
-    def moved(self, steps: Array, shared: Array) -> _State:
-        """Return the state after ``(n, 15)`` steps, and those of scale, if there is one, and gravity."""
-        scale = self.scale * float(np.exp(shared[0])) if len(shared) == 3 else self.scale
-        turn = exp_so3(_tangents(self.gravity) @ shared[-2:])
+    def moved_by(self, steps: Array, border_step: Array) -> _State:
+        """Return the state after steps ``(n, 15)`` of the poses and ``(2,)`` or ``(3,)`` of the border."""
+        scale = self.scale * float(np.exp(border_step[0])) if len(border_step) == 3 else self.scale
+        turn = exp_so3(_tangents(self.gravity) @ border_step[-2:])
         return _State(
-            R=self.R @ exp_so3(steps[:, _T]), p=self.p + steps[:, _P], v=self.v + steps[:, _V],
-            biases=self.biases + steps[:, 9:], scale=scale, gravity=turn @ self.gravity,
-        )  # fmt: skip
+            R=self.R @ exp_so3(steps[:, _ROTATION]),
+            p=self.p + steps[:, _POSITION],
+            v=self.v + steps[:, _VELOCITY],
+            biases=self.biases + steps[:, _BIASES],
+            scale=scale,
+            gravity=turn @ self.gravity,
+        )
 
 
-class _System:
-    """Normal equations: blocks ``D`` on the diagonal, ``E`` beside it, the border ``C``, and ``G`` of it."""
+class _NormalEquations:
+    """Block tridiagonal normal equations with a border, solved by block elimination.
+
+    For n states of 15 unknowns and a border of m unknowns: ``diagonal`` ``(n, 15, 15)``, ``coupling``
+    ``(n - 1, 15, 15)`` of each state with the next, ``border`` ``(n, 15, m)`` of each state with the border,
+    ``corner`` ``(m, m)`` of the border with itself, and the gradients ``(n, 15)`` and ``(m,)``.
+    """
 
     def __init__(self, n: int, m: int) -> None:
-        self.D, self.E = np.zeros((n, _STATE, _STATE)), np.zeros((n - 1, _STATE, _STATE))
-        self.C, self.G = np.zeros((n, _STATE, m)), np.zeros((m, m))
-        self.b, self.c = np.zeros((n, _STATE)), np.zeros(m)
+        self.diagonal = np.zeros((n, _STATE_SIZE, _STATE_SIZE))
+        self.coupling = np.zeros((n - 1, _STATE_SIZE, _STATE_SIZE))
+        self.border, self.corner = np.zeros((n, _STATE_SIZE, m)), np.zeros((m, m))
+        self.gradient, self.border_gradient = np.zeros((n, _STATE_SIZE)), np.zeros(m)
 
     def add(self, J: Array, border: Array, residuals: Array) -> None:
-        """Add residuals ``(n, k)`` of each state alone."""
+        """Add residuals ``(n, k)`` of single states, with Jacobians by the state and by the border."""
         JT, borderT = np.swapaxes(J, 1, 2), np.swapaxes(border, 1, 2)
-        self.D += JT @ J
-        self.C += JT @ border
-        self.b += np.einsum("nij,nj->ni", JT, residuals)
-        self.G += (borderT @ border).sum(axis=0)
-        self.c += np.einsum("nij,nj->i", borderT, residuals)
+        self.diagonal += JT @ J
+        self.border += JT @ border
+        self.gradient += np.einsum("nij,nj->ni", JT, residuals)
+        self.corner += (borderT @ border).sum(axis=0)
+        self.border_gradient += np.einsum("nij,nj->i", borderT, residuals)
 
-    def add_pairs(self, first: Array, second: Array, border: Array, residuals: Array) -> None:
-        """Add residuals ``(n - 1, k)`` of neighbours."""
-        firstT, secondT, borderT = (np.swapaxes(each, 1, 2) for each in (first, second, border))
-        self.D[:-1] += firstT @ first
-        self.D[1:] += secondT @ second
-        self.E += firstT @ second
-        self.C[:-1] += firstT @ border
-        self.C[1:] += secondT @ border
-        self.b[:-1] += np.einsum("nij,nj->ni", firstT, residuals)
-        self.b[1:] += np.einsum("nij,nj->ni", secondT, residuals)
-        self.G += (borderT @ border).sum(axis=0)
-        self.c += np.einsum("nij,nj->i", borderT, residuals)
+    def add_pairs(self, before: Array, behind: Array, border: Array, residuals: Array) -> None:
+        """Add residuals ``(n - 1, k)`` of neighbours, with Jacobians by both states and by the border."""
+        beforeT, behindT, borderT = (np.swapaxes(jacobian, 1, 2) for jacobian in (before, behind, border))
+        self.diagonal[:-1] += beforeT @ before
+        self.diagonal[1:] += behindT @ behind
+        self.coupling += beforeT @ behind
+        self.border[:-1] += beforeT @ border
+        self.border[1:] += behindT @ border
+        self.gradient[:-1] += np.einsum("nij,nj->ni", beforeT, residuals)
+        self.gradient[1:] += np.einsum("nij,nj->ni", behindT, residuals)
+        self.corner += (borderT @ border).sum(axis=0)
+        self.border_gradient += np.einsum("nij,nj->i", borderT, residuals)
 
-    def step(self, damping: float) -> tuple[Array, Array]:
-        """Return the steps of the states ``(n, 15)`` and of the border ``(m,)``."""
-        found, G, c = self._eliminated(damping)
-        n = len(self.D)
-        shared = np.asarray(np.linalg.solve(G, -c), dtype=np.float64)
-        steps = np.empty((n, _STATE))
-        after = np.zeros(_STATE)
+    def solve(self, damping: float) -> tuple[Array, Array]:
+        """Return the steps of the states ``(n, 15)`` and of the border ``(m,)`` for a damping."""
+        # 1. Eliminate all states.
+        eliminated: list[Array] = []
+        D, C, G, b, c = self._eliminate_all_but_last(damping, eliminated)
+        solved = np.asarray(np.linalg.solve(D, np.column_stack([b, C])), dtype=np.float64)
+        eliminated.append(solved)
+        G, c = G - C.T @ solved[:, 1:], c - C.T @ solved[:, 0]
+        # 2. Solve for the border, then substitute back from the last state to the first.
+        n, m = len(self.diagonal), len(c)
+        border_step = np.asarray(np.linalg.solve(G, -c), dtype=np.float64)
+        steps = np.empty((n, _STATE_SIZE))
+        next_step = np.zeros(_STATE_SIZE)
         for row in range(n - 1, -1, -1):
-            solved = found[row]
-            steps[row] = -solved[:, 0] - solved[:, 1 : 1 + len(shared)] @ shared
+            solved = eliminated[row]
+            steps[row] = -solved[:, 0] - solved[:, 1 : 1 + m] @ border_step
             if row < n - 1:
-                steps[row] -= solved[:, 1 + len(shared) :] @ after
-            after = steps[row]
-        return steps, shared
+                steps[row] -= solved[:, 1 + m :] @ next_step
+            next_step = steps[row]
+        return steps, border_step
 
     def last_covariance(self) -> Array | None:
-        """Return the covariance of the last state and the border, ``(15 + m, 15 + m)``; None if singular."""
-        D, C, G, _, _ = self._forward(0.0)
-        whole = np.block([[D, C], [C.T, G]])
+        """Return the covariance ``(15 + m, 15 + m)`` of the last state and the border; None if singular."""
+        D, C, G, _, _ = self._eliminate_all_but_last(0.0)
         try:
-            made: Array = np.linalg.inv(whole)
+            covariance: Array = np.linalg.inv(np.block([[D, C], [C.T, G]]))
         except np.linalg.LinAlgError:
             return None
-        return made if (np.diag(made) > 0.0).all() else None
+        return covariance if (np.diag(covariance) > 0.0).all() else None
 
-    def _eliminated(self, damping: float) -> tuple[list[Array], Array, Array]:
-        found: list[Array] = []
-        D, C, G, b, c = self._forward(damping, found)
-        solved = np.asarray(np.linalg.solve(D, np.column_stack([b, C])), dtype=np.float64)
-        found.append(solved)
-        return found, G - C.T @ solved[:, 1:], c - C.T @ solved[:, 0]
-
-    def _forward(
-        self, damping: float, found: list[Array] | None = None
+    def _eliminate_all_but_last(
+        self, damping: float, eliminated: list[Array] | None = None
     ) -> tuple[Array, Array, Array, Array, Array]:
-        """Eliminate all states but the last; return its block, its border, that of the border, both sides."""
-        n, m = len(self.D), len(self.c)
-        G, c = self.G + damping * np.diag(np.diag(self.G)), self.c.copy()
-        D, C, b = self._damped(0, damping), self.C[0], self.b[0]
+        """Eliminate the states from the first to the last but one.
+
+        Returns diagonal and border of the last state, the corner, and the gradients of the last state and of
+        the border.  *eliminated* collects for each state what gradient, border and next state became.
+        """
+        n, m = len(self.diagonal), len(self.border_gradient)
+        G, c = self.corner + damping * np.diag(np.diag(self.corner)), self.border_gradient.copy()
+        D, C, b = self._damped_diagonal(0, damping), self.border[0], self.gradient[0]
         for row in range(n - 1):
-            E = self.E[row]
+            E = self.coupling[row]
             solved = np.asarray(np.linalg.solve(D, np.column_stack([b, C, E])), dtype=np.float64)
-            if found is not None:
-                found.append(solved)
+            if eliminated is not None:
+                eliminated.append(solved)
             ET, CT = E.T, C.T
             G, c = G - CT @ solved[:, 1 : 1 + m], c - CT @ solved[:, 0]
-            D = self._damped(row + 1, damping) - ET @ solved[:, 1 + m :]
-            C, b = self.C[row + 1] - ET @ solved[:, 1 : 1 + m], self.b[row + 1] - ET @ solved[:, 0]
+            D = self._damped_diagonal(row + 1, damping) - ET @ solved[:, 1 + m :]
+            C = self.border[row + 1] - ET @ solved[:, 1 : 1 + m]
+            b = self.gradient[row + 1] - ET @ solved[:, 0]
         return D, C, G, b, c
 
-    def _damped(self, row: int, damping: float) -> Array:
-        D: Array = self.D[row] + damping * np.diag(np.diag(self.D[row]))
+    def _damped_diagonal(self, row: int, damping: float) -> Array:
+        D: Array = self.diagonal[row] + damping * np.diag(np.diag(self.diagonal[row]))
         return D
 
 
 def _bias_prior() -> Array:
-    return np.repeat([_GYRO_PRIOR, _ACCEL_PRIOR], 3)
+    """Return the standard deviations ``(6,)`` of the biases of gyroscope and accelerometer."""
+    return np.repeat([_GYRO_BIAS_PRIOR_RAD_S, _ACCEL_BIAS_PRIOR_M_S2], 3)
 
 
 def _tangents(gravity: Array) -> Array:
-    """Return two unit vectors ``(3, 2)`` across gravity."""
+    """Return two unit vectors ``(3, 2)`` perpendicular to gravity and to each other."""
     unit = gravity / np.linalg.norm(gravity)
     helper = np.eye(3)[int(np.argmin(np.abs(unit)))]
-    one = np.cross(unit, helper)
-    one /= np.linalg.norm(one)
-    return np.column_stack([one, np.cross(unit, one)])
+    first = np.cross(unit, helper)
+    first /= np.linalg.norm(first)
+    return np.column_stack([first, np.cross(unit, first)])
 
 
 def _huber_weights(residuals: Array) -> Array:
-    """Return the weights of groups of three numbers, repeated for each number."""
+    """Return the Huber weights of groups of three whitened axes, repeated for each axis."""
     norms = np.linalg.norm(residuals.reshape(len(residuals), -1, 3), axis=2) / np.sqrt(3.0)
-    weights: Array = np.repeat(np.minimum(1.0, _HUBER / np.maximum(norms, 1e-12)), 3, axis=1)
+    weights: Array = np.repeat(np.minimum(1.0, _HUBER_WIDTH / np.maximum(norms, 1e-12)), 3, axis=1)
     return weights
 
 
 def _huber_cost(residuals: Array) -> Array:
+    """Return the Huber loss of each group of three whitened axes."""
     squared = np.square(residuals.reshape(len(residuals), -1, 3)).sum(axis=2)
     norms = np.sqrt(squared / 3.0)
-    cost: Array = np.where(norms <= _HUBER, squared, 3.0 * (2.0 * _HUBER * norms - _HUBER**2))
+    linear = 3.0 * (2.0 * _HUBER_WIDTH * norms - _HUBER_WIDTH**2)
+    cost: Array = np.where(norms <= _HUBER_WIDTH, squared, linear)
     return cost

@@ -1,4 +1,7 @@
-"""What is wrong with an IMU, said in one line: by its samples alone, and beside the rotations of a camera."""
+"""Check an IMU by its samples alone, and compare its gyroscope with the rotations of a camera.
+
+Each check returns what is wrong in one line for people; an IMU with a fault is not used.
+"""
 
 from __future__ import annotations
 
@@ -11,190 +14,252 @@ from client_sdk.imu.history import ImuHistory
 from client_sdk.imu.samples import ImuModel
 from rse_pf.geometry import Array, log_so3, rotation_angle_deg
 
-__all__ = ["GRAVITY_M_S2", "MOST_OFF_M_S2", "RateCheck", "check_rates", "off_gravity", "trouble_of_samples"]
+__all__ = [
+    "GRAVITY_M_S2",
+    "MAX_GRAVITY_ERROR_M_S2",
+    "RateCheck",
+    "check_rates",
+    "describe_gravity_error",
+    "find_sample_trouble",
+]
 
-GRAVITY_M_S2 = 9.81
-MOST_OFF_M_S2 = 0.6
-"""So far may the bias of an accelerometer make gravity seem longer or shorter: three deviations of a bias."""
-_FEWEST_SAMPLES, _FEWEST_RATES = 100, 30
-_REST_S, _FEWEST_RESTS = 0.5, 3
-_REST_NOISES, _REST_GYRO, _REST_ACCEL = 3.0, 0.02, 0.1
-"""At rest samples scatter by less than these rad/s or m/s^2, and so many times their noise."""
-_MISSING, _SATURATED = 0.05, 0.01
-_LEAST_RATE = 0.04
-"""rad/s, deviation about two axes: slower turns do not tell axes apart."""
-_WRONG_DEG = 8.0
-_RATIO = 1.25
-_MOST_OFFSET_S, _OFFSET_STEP_S, _REFUSED_OFFSET_S = 0.1, 0.002, 0.06
-_LEAST_OFFSET_S = 0.003
-"""Offsets below are not corrected: the estimate is no better."""
-_OUTLIER = 4.0
-"""Rates that are so many times as far apart as the median of them are left out."""
-_EXPLAINED = 0.5
-"""Rates that agree leave so little of the deviation, as a share."""
+GRAVITY_M_S2 = 9.81  # magnitude of gravity; it varies by 0.03 over the Earth, far below a sensor's bias
+MAX_GRAVITY_ERROR_M_S2 = 0.6
+"""Largest error of the magnitude of gravity, in m/s^2, that the bias of a sound accelerometer may cause:
+three standard deviations (0.2 m/s^2) of such a bias."""
+
+# Limits of `find_sample_trouble`
+_MIN_SAMPLES = 100  # samples before anything is said about them: half a second at 200 Hz
+_MAX_MISSING_FRACTION = 0.05  # samples that may be missing between those that arrived
+_MAX_SATURATED_FRACTION = 0.01  # samples that may be at the end of the sensor's range
+_SATURATION = 0.999  # fraction of the sensor's range from which on a sample counts as saturated
+_MIN_IN_G = 0.7  # mean magnitude from which on an accelerometer probably states its values in g
+_MAX_IN_G = 1.3  # mean magnitude up to which an accelerometer probably states its values in g
+_MIN_MEAN_ACCEL = 0.7  # smallest plausible mean magnitude of an accelerometer, as a multiple of gravity
+_MAX_MEAN_ACCEL = 1.5  # largest plausible one: a drone or a hand shakes, but not by this much on average
+_REST_S = 0.5  # length of the time windows in which an IMU is tested for being stationary
+_MIN_REST_WINDOWS = 3  # stationary windows before the magnitude of gravity is taken from them
+_REST_NOISE_FACTOR = 3.0  # multiple of its white noise by which a stationary sensor may scatter
+_REST_GYRO_RAD_S = 0.02  # standard deviation that a stationary gyroscope may have besides its noise
+_REST_ACCEL_M_S2 = 0.1  # standard deviation that a stationary accelerometer may have besides its noise
+
+# Limits of `check_rates`
+_MIN_INTERVALS = 30  # intervals between poses before rates are compared
+_MAX_INTERVAL_S = 0.5  # longest interval between poses: over longer ones the mean rate says little
+_MIN_RATE_SPREAD_RAD_S = 0.04
+"""Smallest standard deviation of the camera's rates about its second most turned axis, in rad/s: slower
+rotations, or rotations about one axis, do not tell the axes of the gyroscope apart."""
+_MAX_OFFSET_S = 0.1  # time offsets between the clocks of IMU and camera are sought up to this, either way
+_OFFSET_STEP_S = 0.002  # step of this search; the best offset is interpolated between steps
+_MIN_OFFSET_S = 0.003  # smallest change of the offset that is applied: the estimate is no better than that
+_MAX_USABLE_OFFSET_S = 0.06  # a larger offset between the clocks is reported as a fault, not corrected
+_OUTLIER_FACTOR = 4.0  # rates that differ by more than this multiple of the median difference are left out
+_MAX_UNEXPLAINED = 0.5  # largest part of the camera's rates that a rotation may leave unexplained
+_MIN_DEGREES_RATIO = 40.0  # ratio of the rates from which on the gyroscope states degrees (57.3 per rad)
+_MAX_RATE_RATIO = 1.25  # largest ratio of the rates, either way, of a gyroscope in rad/s
+_MAX_AXES_ERROR_DEG = 8.0  # largest angle between the gyroscope's axes and those that T_imu_camera states
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class RateCheck:
-    """What the rates of a gyroscope are beside those of a camera; ``trouble`` is empty if all is well.
+    """Result of comparing the rates of a gyroscope with those of a camera.
 
-    ``fault`` is empty unless axes or clock cause the trouble.  ``offset_s`` is by how much the clock of the
-    IMU is ahead; ``bias_gyro`` ``(3,)`` is in rad/s.
+    Attributes:
+        trouble: Why the IMU must not be used, in one line; empty if it may be used.
+        fault: Kind of the trouble, if wrong axes or a wrong clock cause it; empty otherwise.
+        offset_s: Time by which the clock of the IMU is ahead of that of the camera.
+        gyro_bias_rad_s: ``(3,)`` bias of the gyroscope.
     """
 
     trouble: str
     fault: Literal["", "axes", "offset"]
     offset_s: float
-    bias_gyro: Array
+    gyro_bias_rad_s: Array
 
 
-def trouble_of_samples(history: ImuHistory) -> str:
-    """Return in one line why samples cannot be used, empty if nothing is wrong with them alone."""
-    rows, model = history.rows(), history.model
-    if len(rows) < _FEWEST_SAMPLES:
+def find_sample_trouble(history: ImuHistory) -> str:
+    """Return in one line why the samples of an IMU cannot be used; empty if they can.
+
+    Missing and saturated samples are found, values in g, and an accelerometer that does not measure 9.81
+    m/s^2 while the IMU is stationary.  Before 100 samples the result is empty.
+    """
+    samples, model = history.to_array(), history.model
+    if len(samples) < _MIN_SAMPLES:
         return ""
-    steps = np.diff(rows[:, 0]) * model.rate_hz
+    # 1. Missing samples.
+    steps = np.diff(samples[:, 0]) * model.rate_hz
     missing = float(np.maximum(0.0, np.round(steps) - 1.0).sum() / (steps.sum() + 1e-9))
-    if missing > _MISSING:
+    if missing > _MAX_MISSING_FRACTION:
         return f"{100 * missing:.0f} % of the IMU's samples are missing at {model.rate_hz:g} Hz"
-    for name, unit, columns, largest in (
+    # 2. Saturated samples.
+    for name, unit, columns, limit in (
         ("gyroscope", "rad/s", slice(1, 4), model.max_gyro),
         ("accelerometer", "m/s^2", slice(4, 7), model.max_accel),
     ):
-        share = float((np.abs(rows[:, columns]) >= 0.999 * largest).any(axis=1).mean())
-        if share > _SATURATED:
-            return f"the {name} is saturated at {largest:g} {unit} in {100 * share:.0f} % of its samples"
-    length = float(np.linalg.norm(rows[:, 4:7], axis=1).mean())
-    if 0.7 < length < 1.3:
-        return f"the accelerometer reads {length:.2f} on average: in g, where m/s^2 are needed"
-    if not 0.7 * GRAVITY_M_S2 < length < 1.5 * GRAVITY_M_S2:
-        return f"the accelerometer reads {length:.1f} m/s^2 on average, where gravity is 9.8"
-    at_rest = _accel_at_rest(rows, model)
-    return "" if at_rest is None else off_gravity(at_rest, "at rest")
+        saturated = float((np.abs(samples[:, columns]) >= _SATURATION * limit).any(axis=1).mean())
+        if saturated > _MAX_SATURATED_FRACTION:
+            return f"the {name} is saturated at {limit:g} {unit} in {100 * saturated:.0f} % of its samples"
+    # 3. Unit of the accelerometer.
+    mean_accel = float(np.linalg.norm(samples[:, 4:7], axis=1).mean())
+    if _MIN_IN_G < mean_accel < _MAX_IN_G:
+        return f"the accelerometer reads {mean_accel:.2f} on average: in g, where m/s^2 are needed"
+    if not _MIN_MEAN_ACCEL * GRAVITY_M_S2 < mean_accel < _MAX_MEAN_ACCEL * GRAVITY_M_S2:
+        return f"the accelerometer reads {mean_accel:.1f} m/s^2 on average, where gravity is 9.8"
+    # 4. Magnitude of gravity while the IMU is stationary.
+    stationary_accel = _stationary_accel(samples, model)
+    return "" if stationary_accel is None else describe_gravity_error(stationary_accel, "at rest")
 
 
-def off_gravity(length: float, where: str) -> str:
-    """Return in one line by how much an accelerometer is wrong that measures gravity as *length* m/s^2.
+def describe_gravity_error(measured_m_s2: float, circumstance: str) -> str:
+    """Return in one line how wrong an accelerometer is that measures gravity as *measured_m_s2*.
 
-    Empty if a bias may explain it.  One direction of gravity does not tell a scale from a bias.
+    Empty up to an error of 0.6 m/s^2, which the usual bias explains.  One direction of gravity does not tell
+    a wrong scale from a bias, so the line names both.  *circumstance* follows the measured value in the line.
     """
-    off = length - GRAVITY_M_S2
-    if abs(off) <= MOST_OFF_M_S2:
+    error = measured_m_s2 - GRAVITY_M_S2
+    if abs(error) <= MAX_GRAVITY_ERROR_M_S2:
         return ""
-    share, much = 100.0 * abs(off) / GRAVITY_M_S2, "much" if off > 0.0 else "little"
+    percent, direction = 100.0 * abs(error) / GRAVITY_M_S2, "much" if error > 0.0 else "little"
     return (
-        f"the accelerometer reads {length:.2f} m/s^2 {where}, {share:.0f} % too {much}: its scale is wrong, "
-        f"or it has a bias of {abs(off):.1f} m/s^2"
+        f"the accelerometer reads {measured_m_s2:.2f} m/s^2 {circumstance}, {percent:.0f} % too {direction}: "
+        f"its scale is wrong, or it has a bias of {abs(error):.1f} m/s^2"
     )
 
 
-def _accel_at_rest(rows: Array, model: ImuModel) -> float | None:
-    """Return the median length of accelerations where neither they nor the rates change; None if never."""
+def _stationary_accel(samples: Array, model: ImuModel) -> float | None:
+    """Return the median magnitude of the specific force in windows in which the IMU is stationary.
+
+    Stationary means that neither rates nor forces scatter beyond the noise.  None with fewer than 3 such
+    windows of 0.5 s.
+    """
     size = round(_REST_S * model.rate_hz)
-    count = len(rows) // size
-    if count < _FEWEST_RESTS:
+    count = len(samples) // size
+    if count < _MIN_REST_WINDOWS:
         return None
-    parts = rows[: count * size].reshape(count, size, 7)
-    scatter, white = parts[:, :, 1:].std(axis=1), _REST_NOISES * model.rate_hz**0.5
-    gyro, accel = _REST_GYRO + white * model.gyro_noise, _REST_ACCEL + white * model.accel_noise
-    rests = (scatter[:, :3] <= gyro).all(axis=1) & (scatter[:, 3:] <= accel).all(axis=1)
-    if rests.sum() < _FEWEST_RESTS:
+    windows = samples[: count * size].reshape(count, size, 7)
+    scatter, noise_factor = windows[:, :, 1:].std(axis=1), _REST_NOISE_FACTOR * model.rate_hz**0.5
+    max_gyro = _REST_GYRO_RAD_S + noise_factor * model.gyro_noise
+    max_accel = _REST_ACCEL_M_S2 + noise_factor * model.accel_noise
+    is_stationary = (scatter[:, :3] <= max_gyro).all(axis=1) & (scatter[:, 3:] <= max_accel).all(axis=1)
+    if is_stationary.sum() < _MIN_REST_WINDOWS:
         return None
-    return float(np.median(np.linalg.norm(parts[rests, :, 4:].mean(axis=1), axis=1)))
+    return float(np.median(np.linalg.norm(windows[is_stationary, :, 4:].mean(axis=1), axis=1)))
 
 
 def check_rates(
     history: ImuHistory, timestamps_s: Array, R_world_camera: Array, offset_s: float
 ) -> RateCheck | None:
-    """Compare the gyroscope with how the camera turned; None while it turns too little to tell.
+    """Compare the gyroscope with the rotations of the camera: time offset, bias, unit, and axes.
 
     Args:
-        history: Samples of the time.
-        timestamps_s: ``(n,)`` of the poses.
-        R_world_camera: ``(n, 3, 3)``.
-        offset_s: As it is known so far.
+        history: Samples of the time of the poses.
+        timestamps_s: ``(n,)`` of the poses, ascending.
+        R_world_camera: ``(n, 3, 3)`` rotations of the poses.
+        offset_s: Time offset in use; a difference below 3 ms leaves it as it is.
+
+    Returns:
+        The result; None while the camera rotates too little to compare anything.
+
+    Source:
+        Rotation between two sets of vectors: Kabsch, Acta Cryst. A32, 1976.
     """
+    # 1. Compute the camera's mean rate in each interval, in the IMU's frame.
     R_imu_camera = history.model.T_imu_camera[:3, :3]
     dt = np.diff(timestamps_s)
-    usable = np.flatnonzero((dt > 0.0) & (dt <= 0.5))
-    if len(usable) < _FEWEST_RATES:
+    usable = np.flatnonzero((dt > 0.0) & (dt <= _MAX_INTERVAL_S))
+    if len(usable) < _MIN_INTERVALS:
         return None
     begins, ends = timestamps_s[usable], timestamps_s[usable + 1]
-    turned = np.swapaxes(R_world_camera[usable], 1, 2) @ R_world_camera[usable + 1]
-    seen = log_so3(turned) / dt[usable, None] @ R_imu_camera.T
-    spread = np.linalg.eigvalsh(np.cov(seen.T))
-    if not spread[1] > _LEAST_RATE**2:
+    rotations = np.swapaxes(R_world_camera[usable], 1, 2) @ R_world_camera[usable + 1]
+    camera_rates = log_so3(rotations) / dt[usable, None] @ R_imu_camera.T
+    variances = np.linalg.eigvalsh(np.cov(camera_rates.T))  # about the principal axes, ascending
+    if not variances[1] > _MIN_RATE_SPREAD_RAD_S**2:
         return None
-    is_usable = np.ones(len(seen), dtype=bool)
+    # 2. Find the time offset, twice: the second time without the outliers of the first.
+    is_inlier = np.ones(len(camera_rates), dtype=bool)
     for _ in range(2):
-        best = _best_offset(history, begins[is_usable], ends[is_usable], seen[is_usable])
-        rates = history.mean_gyro(begins + best, ends + best)
-        left = np.linalg.norm(rates - seen - np.median(rates - seen, axis=0), axis=1)
-        is_usable = left <= _OUTLIER * np.median(left)
-    seen, rates = seen[is_usable], rates[is_usable]
-    seen_only = seen - seen.mean(axis=0)
-    bias = rates.mean(axis=0) - seen.mean(axis=0)
-    rates_only = rates - rates.mean(axis=0)
-    ratio = float(np.sqrt(np.square(rates_only).sum() / np.square(seen_only).sum()))
-    U, _, Vt = np.linalg.svd(seen_only.T @ rates_only)
-    Q = U @ Vt  # takes the rates of the gyroscope to those of the camera
+        best_offset_s = _find_offset_s(history, begins[is_inlier], ends[is_inlier], camera_rates[is_inlier])
+        gyro_rates = history.mean_gyro(begins + best_offset_s, ends + best_offset_s)
+        differences = gyro_rates - camera_rates
+        distances = np.linalg.norm(differences - np.median(differences, axis=0), axis=1)
+        is_inlier = distances <= _OUTLIER_FACTOR * np.median(distances)
+    camera_rates, gyro_rates = camera_rates[is_inlier], gyro_rates[is_inlier]
+    # 3. Compute the bias, and the ratio of both rates without their means.
+    camera_centred = camera_rates - camera_rates.mean(axis=0)
+    bias = gyro_rates.mean(axis=0) - camera_rates.mean(axis=0)
+    gyro_centred = gyro_rates - gyro_rates.mean(axis=0)
+    ratio = float(np.sqrt(np.square(gyro_centred).sum() / np.square(camera_centred).sum()))
+    # 4. Find the orthogonal matrix that maps the gyroscope's rates to those of the camera (Kabsch).
+    U, _, Vt = np.linalg.svd(camera_centred.T @ gyro_centred)
+    Q = U @ Vt
     is_mirrored = float(np.linalg.det(Q)) < 0.0
-    if is_mirrored and not spread[0] > _LEAST_RATE**2:
-        # Turns about two axes leave the sign of the third one open.
+    if is_mirrored and not variances[0] > _MIN_RATE_SPREAD_RAD_S**2:
+        # Rotations about two axes leave the sign of the third one open: take the proper rotation.
         U[:, 2] *= -1.0
         Q, is_mirrored = U @ Vt, False
-    explained = float(
-        np.sqrt(np.square(rates_only @ Q.T / ratio - seen_only).sum() / np.square(seen_only).sum())
-    )
-    fault, trouble = _trouble_of(ratio, Q, explained, best, is_mirrored=is_mirrored)
+    residuals = gyro_centred @ Q.T / ratio - camera_centred
+    unexplained = float(np.sqrt(np.square(residuals).sum() / np.square(camera_centred).sum()))
+    # 5. Name the fault, if there is one.
+    fault, trouble = _find_rate_trouble(ratio, Q, unexplained, best_offset_s, is_mirrored=is_mirrored)
     return RateCheck(
         trouble=trouble,
         fault=fault,
-        offset_s=best if abs(best - offset_s) > _LEAST_OFFSET_S else offset_s,
-        bias_gyro=bias,
+        offset_s=best_offset_s if abs(best_offset_s - offset_s) > _MIN_OFFSET_S else offset_s,
+        gyro_bias_rad_s=bias,
     )
 
 
-def _best_offset(history: ImuHistory, begins_s: Array, ends_s: Array, seen: Array) -> float:
-    """Return the offset in time at which rates ``(n, 3)`` of the camera and of the gyroscope agree best.
+def _find_offset_s(history: ImuHistory, begins_s: Array, ends_s: Array, camera_rates: Array) -> float:
+    """Return the time offset within 0.1 s at which the rates ``(n, 3)`` of camera and gyroscope fit best.
 
-    The rotation between both is free, so that swapped axes do not hide an offset.
+    The rotation between both is free, so that swapped axes do not hide an offset.  The maximum of the fit is
+    interpolated by a parabola.
     """
-    seen_only = seen - seen.mean(axis=0)
-    shifts = np.arange(-_MOST_OFFSET_S, _MOST_OFFSET_S + 1e-9, _OFFSET_STEP_S)
+    camera_centred = camera_rates - camera_rates.mean(axis=0)
+    offsets_s = np.arange(-_MAX_OFFSET_S, _MAX_OFFSET_S + 1e-9, _OFFSET_STEP_S)
     fits = []
-    for shift_s in shifts.tolist():
-        rates = history.mean_gyro(begins_s + shift_s, ends_s + shift_s)
-        rates = rates - rates.mean(axis=0)
-        agreeing = np.linalg.svd(seen_only.T @ rates, compute_uv=False).sum()
-        fits.append(float(agreeing / (np.linalg.norm(rates) + 1e-12)))
+    for offset_s in offsets_s.tolist():
+        gyro_rates = history.mean_gyro(begins_s + offset_s, ends_s + offset_s)
+        gyro_rates = gyro_rates - gyro_rates.mean(axis=0)
+        # The sum of singular values is the largest correlation over all orthogonal matrices.
+        correlation = np.linalg.svd(camera_centred.T @ gyro_rates, compute_uv=False).sum()
+        fits.append(float(correlation / (np.linalg.norm(gyro_rates) + 1e-12)))
     peak = int(np.argmax(fits))
-    if not 0 < peak < len(shifts) - 1:
-        return float(shifts[peak])
+    if not 0 < peak < len(offsets_s) - 1:
+        return float(offsets_s[peak])
     before, at, after = fits[peak - 1 : peak + 2]
-    return float(shifts[peak]) + 0.5 * _OFFSET_STEP_S * (before - after) / (before - 2.0 * at + after)
+    return float(offsets_s[peak]) + 0.5 * _OFFSET_STEP_S * (before - after) / (before - 2.0 * at + after)
 
 
-def _trouble_of(
-    ratio: float, Q: Array, left: float, offset_s: float, *, is_mirrored: bool
+def _find_rate_trouble(
+    ratio: float, Q: Array, unexplained: float, offset_s: float, *, is_mirrored: bool
 ) -> tuple[Literal["", "axes", "offset"], str]:
-    """Return what is wrong, see `RateCheck`; *left* is the share of the rates that no rotation explains."""
-    if left > _EXPLAINED:
+    """Return fault and trouble as in `RateCheck`.
+
+    Args:
+        ratio: Magnitude of the gyroscope's rates divided by that of the camera's.
+        Q: ``(3, 3)`` orthogonal matrix that maps the gyroscope's rates to the camera's; the identity if the
+            axes are as stated.
+        unexplained: Part of the camera's rates that the gyroscope does not explain with this matrix, 0 to 1.
+        offset_s: Time by which the clock of the IMU is ahead.
+        is_mirrored: Whether *Q* is a reflection.
+    """
+    if unexplained > _MAX_UNEXPLAINED:
         return "", "the gyroscope does not turn as the camera does, at any offset in time within 100 ms"
-    if ratio > 40.0:
+    if ratio > _MIN_DEGREES_RATIO:
         return "", (
             f"the gyroscope reads {ratio:.0f} times what the camera turns: in degrees, where rad/s are needed"
         )
-    if not 1.0 / _RATIO < ratio < _RATIO:
+    if not 1.0 / _MAX_RATE_RATIO < ratio < _MAX_RATE_RATIO:
         return "", f"the gyroscope reads {ratio:.2f} times what the camera turns: is its unit rad/s?"
     if is_mirrored:
         return "axes", "an axis of the gyroscope has the wrong sign, or two are swapped: they are left-handed"
     angle = rotation_angle_deg(Q)
-    if angle > _WRONG_DEG:
+    if angle > _MAX_AXES_ERROR_DEG:
         return "axes", (
             f"the axes of the IMU are turned by {angle:.0f} degrees from what T_imu_camera says: "
             "are two of them swapped?"
         )
-    if abs(offset_s) > _REFUSED_OFFSET_S:
+    if abs(offset_s) > _MAX_USABLE_OFFSET_S:
         return "offset", f"the clock of the IMU is {1e3 * offset_s:.0f} ms off that of the camera"
     return "", ""

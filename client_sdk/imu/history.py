@@ -1,4 +1,4 @@
-"""The samples of an IMU in the order of time, and those of any interval."""
+"""Collect the samples of an IMU in the order of time, and return those of any interval."""
 
 from __future__ import annotations
 
@@ -9,86 +9,94 @@ from rse_pf.geometry import Array
 
 __all__ = ["ImuHistory"]
 
-_KEPT_S = 300.0
-_LONGEST_GAP = 5.0
-"""Samples that are so many intervals apart have others missing between them."""
+_KEPT_S = 300.0  # samples older than this are dropped, so that the memory of a long drive is bounded
+_MAX_GAP_INTERVALS = 5.0
+"""Longest distance between two samples, in sampling intervals, over which they are interpolated: beyond it
+samples were lost, and the motion between them is unknown."""
+_MAX_HOLD_INTERVALS = 1.5
+"""Longest time, in sampling intervals, for which the newest sample stands for what follows it: a frame often
+arrives before the sample behind it."""
 
 
 class ImuHistory:
-    """The samples of the last five minutes; ``model`` is that of the last ones."""
+    """Samples of the last five minutes; ``model`` is the IMU model of the newest samples."""
 
     def __init__(self, model: ImuModel) -> None:
         self.model = model
-        self._parts: list[Array] = []
-        self._rows: Array = np.empty((0, 7))
+        self._new_parts: list[Array] = []  # arrays as those of `to_array`, not appended to it yet
+        self._samples: Array = np.empty((0, 7))
 
     def add(self, samples: ImuSamples) -> None:
-        """Take the samples of a frame; those that are known already are left out."""
+        """Append the samples that are later than the newest known one."""
         self.model = samples.model
-        rows = np.column_stack([samples.timestamps_s, samples.gyro, samples.accel])
-        rows = rows[rows[:, 0] > self.last_s]
-        if len(rows):
-            self._parts.append(rows)
+        part = np.column_stack([samples.timestamps_s, samples.gyro, samples.accel])
+        part = part[part[:, 0] > self.last_s]
+        if len(part):
+            self._new_parts.append(part)
 
     @property
     def last_s(self) -> float:
-        """The time of the newest sample; minus infinity before the first."""
-        if self._parts:
-            return float(self._parts[-1][-1, 0])
-        return float(self._rows[-1, 0]) if len(self._rows) else float("-inf")
+        """Time stamp of the newest sample; minus infinity before the first."""
+        if self._new_parts:
+            return float(self._new_parts[-1][-1, 0])
+        return float(self._samples[-1, 0]) if len(self._samples) else float("-inf")
 
     def between(self, begin_s: float, end_s: float, shift_s: float = 0.0) -> ImuSamples | None:
-        """Return the samples of an interval, interpolated at its ends; None if it is not covered.
+        """Return the samples of an interval, with interpolated samples at its begin and end.
 
         Args:
-            begin_s: On the clock of the camera.
-            end_s: Later than *begin_s*.
-            shift_s: Added to the interval, to get that on the clock of the IMU.
+            begin_s: Begin of the interval on the clock of the camera.
+            end_s: End of the interval, later than *begin_s*.
+            shift_s: Added to both times to convert them to the clock of the IMU.
+
+        Returns:
+            Samples on the clock of the IMU; None if samples are missing, or do not reach to both ends.
         """
-        rows = self.rows()
+        samples = self.to_array()
         begin_s, end_s = begin_s + shift_s, end_s + shift_s
-        if len(rows) < 2 or not rows[0, 0] <= begin_s < end_s:
+        if len(samples) < 2 or not samples[0, 0] <= begin_s < end_s:
             return None
-        # The last sample may be one interval before the last frame: its rates are held until then.
-        if end_s > rows[-1, 0] + 1.5 / self.model.rate_hz:
+        if end_s > samples[-1, 0] + _MAX_HOLD_INTERVALS / self.model.rate_hz:
             return None
-        first = int(np.searchsorted(rows[:, 0], begin_s, side="right")) - 1
-        last = int(np.searchsorted(rows[:, 0], end_s, side="left")) + 1
-        part = rows[first:last]
-        if float(np.diff(part[:, 0]).max(initial=0.0)) > _LONGEST_GAP / self.model.rate_hz:
+        first = int(np.searchsorted(samples[:, 0], begin_s, side="right")) - 1
+        last = int(np.searchsorted(samples[:, 0], end_s, side="left")) + 1
+        part = samples[first:last]
+        if float(np.diff(part[:, 0]).max(initial=0.0)) > _MAX_GAP_INTERVALS / self.model.rate_hz:
             return None
         inside = part[(part[:, 0] > begin_s) & (part[:, 0] < end_s)]
-        ends = np.array(
-            [[stamp, *(np.interp(stamp, part[:, 0], part[:, axis]) for axis in range(1, 7))]
-             for stamp in (begin_s, end_s)]
-        )  # fmt: skip
-        found = np.concatenate([ends[:1], inside, ends[1:]])
-        return ImuSamples(found[:, 0], found[:, 1:4], found[:, 4:7], self.model)
+        first_and_last = np.array(
+            [
+                [stamp, *(np.interp(stamp, part[:, 0], part[:, axis]) for axis in range(1, 7))]
+                for stamp in (begin_s, end_s)
+            ]
+        )
+        interval = np.concatenate([first_and_last[:1], inside, first_and_last[1:]])
+        return ImuSamples(interval[:, 0], interval[:, 1:4], interval[:, 4:7], self.model)
 
     def mean_gyro(self, begins_s: Array, ends_s: Array) -> Array:
-        """Return the mean rates ``(n, 3)`` of intervals on the clock of the IMU, rad/s."""
-        rows = self.rows()
-        dt = np.diff(rows[:, 0])[:, None]
-        turned = np.concatenate(
-            [np.zeros((1, 3)), np.cumsum(0.5 * dt * (rows[1:, 1:4] + rows[:-1, 1:4]), axis=0)]
+        """Return the mean angular rates ``(n, 3)`` of n intervals on the clock of the IMU, rad/s."""
+        samples = self.to_array()
+        dt = np.diff(samples[:, 0])[:, None]
+        integral = np.concatenate(
+            [np.zeros((1, 3)), np.cumsum(0.5 * dt * (samples[1:, 1:4] + samples[:-1, 1:4]), axis=0)]
         )
-        both = [
-            np.stack([np.interp(stamps, rows[:, 0], turned[:, axis]) for axis in range(3)], axis=1)
+        at_begins, at_ends = (
+            np.stack([np.interp(stamps, samples[:, 0], integral[:, axis]) for axis in range(3)], axis=1)
             for stamps in (begins_s, ends_s)
-        ]
-        rates: Array = (both[1] - both[0]) / (ends_s - begins_s)[:, None]
+        )
+        rates: Array = (at_ends - at_begins) / (ends_s - begins_s)[:, None]
         return rates
 
     def mean_accel(self) -> Array | None:
-        """Return the mean ``(3,)`` of all accelerations, m/s^2; None without samples."""
-        rows = self.rows()
-        return rows[:, 4:7].mean(axis=0) if len(rows) else None
+        """Return the mean ``(3,)`` of all specific forces in the IMU's frame, m/s^2; None without samples."""
+        samples = self.to_array()
+        return samples[:, 4:7].mean(axis=0) if len(samples) else None
 
-    def rows(self) -> Array:
-        """Return all samples ``(n, 7)``: time, rates, accelerations."""
-        if self._parts:
-            self._rows = np.concatenate([self._rows, *self._parts])
-            self._parts = []
-            oldest = int(np.searchsorted(self._rows[:, 0], self._rows[-1, 0] - _KEPT_S))
-            self._rows = self._rows[oldest:]
-        return self._rows
+    def to_array(self) -> Array:
+        """Return all samples ``(n, 7)``: time (s), angular rates (rad/s), specific forces (m/s^2)."""
+        if self._new_parts:
+            self._samples = np.concatenate([self._samples, *self._new_parts])
+            self._new_parts = []
+            oldest = int(np.searchsorted(self._samples[:, 0], self._samples[-1, 0] - _KEPT_S))
+            self._samples = self._samples[oldest:]
+        return self._samples

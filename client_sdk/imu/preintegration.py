@@ -1,10 +1,13 @@
-"""The motion between two frames as an IMU measured it, whatever its velocity and the direction of gravity.
+"""Preintegrate the samples of an IMU between two frames on the manifold (Forster et al. 2017).
 
-*i* and *j* are the frames of the IMU at the begin and the end, *g* is gravity in the world::
+With *i* and *j* the frames of the IMU at begin and end, *g* gravity in the world and *dt* the duration::
 
-    rotation = R_world_i' R_world_j
-    velocity = R_world_i' (v_j - v_i - g dt)
-    position = R_world_i' (p_j - p_i - v_i dt - g dt^2 / 2)
+    delta_rotation = R_world_i' R_world_j
+    delta_velocity = R_world_i' (v_j - v_i - g dt)
+    delta_position = R_world_i' (p_j - p_i - v_i dt - g dt^2 / 2)
+
+The right sides depend on the initial velocity and on gravity; the left sides depend on the samples and the
+biases alone, so that they are computed once.
 
 Source:
     Forster et al., "On-Manifold Preintegration for Real-Time Visual-Inertial Odometry", T-RO 2017.
@@ -22,86 +25,103 @@ from rse_pf.geometry import Array, exp_so3, right_jacobian_so3, skew
 
 __all__ = ["Preintegration", "preintegrate"]
 
-_PHI, _V, _P, _BG, _BA = (slice(3 * number, 3 * number + 3) for number in range(5))
+# Parts of the error state: rotation vector, velocity, position, gyroscope bias, accelerometer bias.
+_ROTATION = slice(0, 3)
+_VELOCITY = slice(3, 6)
+_POSITION = slice(6, 9)
+_GYRO_BIAS = slice(9, 12)
+_ACCEL_BIAS = slice(12, 15)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Preintegration:
-    """A preintegrated motion with its covariance, and how it changes with the biases.
+    """Preintegrated motion between two frames, its covariance, and its derivatives by the biases.
 
     Attributes:
-        rotation: ``(3, 3)``.
-        velocity: ``(3,)`` m/s.
-        position: ``(3,)`` m.
-        duration_s: Above 0.
-        covariance: ``(9, 9)`` of the errors (rotation vector on the right, velocity, position).
-        jacobian: ``(9, 6)``, derivative of these by the biases of gyroscope and accelerometer.
-        bias_gyro: ``(3,)`` rad/s, which was subtracted.
-        bias_accel: ``(3,)`` m/s^2, which was subtracted.
+        delta_rotation: ``(3, 3)`` rotation from the IMU's frame at the end to that at the begin.
+        delta_velocity_m_s: ``(3,)`` change of velocity without gravity, in the IMU's frame at the begin.
+        delta_position_m: ``(3,)`` change of position without initial velocity and gravity, in the same frame.
+        duration_s: Time between the two frames, above 0.
+        covariance: ``(9, 9)`` of the errors of rotation (rotation vector on the right, rad), velocity and
+            position.
+        bias_jacobian: ``(9, 6)`` derivatives of rotation, velocity and position by the biases of gyroscope
+            and accelerometer, to correct the motion for small changes of the biases.
+        gyro_bias_rad_s: ``(3,)`` bias that was subtracted from the angular rates.
+        accel_bias_m_s2: ``(3,)`` bias that was subtracted from the specific forces.
     """
 
-    rotation: Array
-    velocity: Array
-    position: Array
+    delta_rotation: Array
+    delta_velocity_m_s: Array
+    delta_position_m: Array
     duration_s: float
     covariance: Array
-    jacobian: Array
-    bias_gyro: Array
-    bias_accel: Array
+    bias_jacobian: Array
+    gyro_bias_rad_s: Array
+    accel_bias_m_s2: Array
 
 
-def preintegrate(samples: ImuSamples, bias_gyro: Array, bias_accel: Array) -> Preintegration:
-    """Integrate from the first sample to the last one, by the midpoint rule.
+def preintegrate(samples: ImuSamples, gyro_bias_rad_s: Array, accel_bias_m_s2: Array) -> Preintegration:
+    """Preintegrate from the first sample to the last one, with the midpoint rule.
 
     Args:
         samples: Two or more.
-        bias_gyro: ``(3,)`` rad/s.
-        bias_accel: ``(3,)`` m/s^2.
+        gyro_bias_rad_s: ``(3,)``, subtracted from the angular rates.
+        accel_bias_m_s2: ``(3,)``, subtracted from the specific forces.
 
     Raises:
         UsageError: There are fewer than two samples.
 
     Source:
-        Forster et al. 2017, Sect. VI and appendices A and B; the biases are states of the error, so that one
-        product of ``(15, 15)`` matrices carries covariance and Jacobians.
+        Forster et al. 2017, Sect. VI and appendices A and B.  The biases are part of the error state, so
+        that one product of ``(15, 15)`` matrices propagates both the covariance and the derivatives.
     """
     if len(samples) < 2:
         raise UsageError(f"{len(samples)} IMU samples are no interval", hint="give two samples or more")
+    # 1. Take mean rates and forces of each step, and the rotations of whole and half steps.
     dt = np.diff(samples.timestamps_s)
-    omega = 0.5 * (samples.gyro[1:] + samples.gyro[:-1]) - bias_gyro
-    accel = 0.5 * (samples.accel[1:] + samples.accel[:-1]) - bias_accel
-    turns = omega * dt[:, None]
-    steps, halves = exp_so3(turns), exp_so3(0.5 * turns)
-    by_rate = right_jacobian_so3(turns) * dt[:, None, None]
-    by_rate_half = 0.5 * right_jacobian_so3(0.5 * turns) * dt[:, None, None]
-    crossed = skew(accel)
-    model = samples.model
-    gyro_variance, accel_variance = model.gyro_noise**2 / dt, model.accel_noise**2 / dt
+    rates = 0.5 * (samples.gyro[1:] + samples.gyro[:-1]) - gyro_bias_rad_s
+    accels = 0.5 * (samples.accel[1:] + samples.accel[:-1]) - accel_bias_m_s2
+    rotation_vectors = rates * dt[:, None]
+    step_rotations, half_rotations = exp_so3(rotation_vectors), exp_so3(0.5 * rotation_vectors)
+    rotation_by_rate = right_jacobian_so3(rotation_vectors) * dt[:, None, None]
+    half_rotation_by_rate = 0.5 * right_jacobian_so3(0.5 * rotation_vectors) * dt[:, None, None]
+    accel_skews = skew(accels)
+    gyro_variance = samples.model.gyro_noise**2 / dt
+    accel_variance = samples.model.accel_noise**2 / dt
     rotation, velocity, position = np.eye(3), np.zeros(3), np.zeros(3)
     covariance, transition = np.zeros((15, 15)), np.eye(15)
     for row in range(len(dt)):
-        step, middle = float(dt[row]), rotation @ halves[row]
-        # Of the velocity, by the error of the rotation before, and by the biases (eqs. A.7 to A.9).
-        turned = -step * (middle @ crossed[row])
+        step_s, middle_rotation = float(dt[row]), rotation @ half_rotations[row]
+        # 2. Linearise the step: velocity by rotation and biases (Forster et al., eqs. A.7 to A.9), position
+        # by half of the velocity's change.
+        velocity_by_middle = -step_s * (middle_rotation @ accel_skews[row])
         A = np.eye(15)
-        A[_PHI, _PHI], A[_PHI, _BG] = steps[row].T, -by_rate[row]
-        A[_V, _PHI], A[_V, _BG], A[_V, _BA] = (
-            turned @ halves[row].T, -turned @ by_rate_half[row], -step * middle,
-        )  # fmt: skip
-        A[_P] += 0.5 * step * A[_V]
-        A[_P, _V] = step * np.eye(3)
+        A[_ROTATION, _ROTATION] = step_rotations[row].T
+        A[_ROTATION, _GYRO_BIAS] = -rotation_by_rate[row]
+        A[_VELOCITY, _ROTATION] = velocity_by_middle @ half_rotations[row].T
+        A[_VELOCITY, _GYRO_BIAS] = -velocity_by_middle @ half_rotation_by_rate[row]
+        A[_VELOCITY, _ACCEL_BIAS] = -step_s * middle_rotation
+        A[_POSITION] += 0.5 * step_s * A[_VELOCITY]
+        A[_POSITION, _VELOCITY] = step_s * np.eye(3)
+        # 3. Propagate derivatives and covariance; white noise enters as a bias of this step does.
         transition = A @ transition
         covariance = A @ covariance @ A.T
-        by_gyro, by_accel = A[:, _BG].copy(), A[:, _BA].copy()
-        by_gyro[_BG] = by_accel[_BA] = 0.0
+        by_gyro, by_accel = A[:, _GYRO_BIAS].copy(), A[:, _ACCEL_BIAS].copy()
+        by_gyro[_GYRO_BIAS] = by_accel[_ACCEL_BIAS] = 0.0
         covariance += gyro_variance[row] * (by_gyro @ by_gyro.T)
         covariance += accel_variance[row] * (by_accel @ by_accel.T)
-        moved = middle @ accel[row] * step
-        position = position + velocity * step + 0.5 * step * moved
-        velocity = velocity + moved
-        rotation = rotation @ steps[row]
+        # 4. Integrate the motion.
+        velocity_change = middle_rotation @ accels[row] * step_s
+        position = position + velocity * step_s + 0.5 * step_s * velocity_change
+        velocity = velocity + velocity_change
+        rotation = rotation @ step_rotations[row]
     return Preintegration(
-        rotation=rotation, velocity=velocity, position=position, duration_s=float(dt.sum()),
-        covariance=covariance[:9, :9], jacobian=transition[:9, 9:],
-        bias_gyro=np.array(bias_gyro, dtype=np.float64), bias_accel=np.array(bias_accel, dtype=np.float64),
-    )  # fmt: skip
+        delta_rotation=rotation,
+        delta_velocity_m_s=velocity,
+        delta_position_m=position,
+        duration_s=float(dt.sum()),
+        covariance=covariance[:9, :9],
+        bias_jacobian=transition[:9, 9:],
+        gyro_bias_rad_s=np.array(gyro_bias_rad_s, dtype=np.float64),
+        accel_bias_m_s2=np.array(accel_bias_m_s2, dtype=np.float64),
+    )

@@ -1,6 +1,6 @@
-"""Samples of an inertial measurement unit, as they travel with the frames of a robot.
+"""Samples of an inertial measurement unit, as they travel with the frames of a robot, and its model.
 
-Nothing here leaves the robot.
+Raw samples stay on the robot; only gravity and preintegrated motions of keyframes are sent.
 """
 
 from __future__ import annotations
@@ -16,27 +16,28 @@ from rse_pf.geometry import Array, rigid
 __all__ = ["MAX_SAMPLES", "ImuModel", "ImuSamples", "check_samples"]
 
 MAX_SAMPLES = 100_000
-"""Of one frame: 20 seconds of an IMU of 5 kHz."""
-_LEAST_HZ, _MOST_HZ = 10.0, 10_000.0
-_MAX_ARM_M = 10.0
+"""Largest number of IMU samples that one frame carries: 20 seconds of an IMU at 5 kHz."""
+_MIN_RATE_HZ = 10.0  # slowest IMU: below it the camera itself measures rotations more often
+_MAX_RATE_HZ = 10_000.0  # fastest IMU: a larger number is a rate in another unit
+_MAX_LEVER_ARM_M = 10.0  # longest distance between IMU and camera: a longer one is not in metres
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ImuModel:
-    """Where an IMU is mounted, and its noise, as Kalibr and EuRoC state it.
+    """Mounting, noise and range of an IMU; the noise is that of Kalibr's and EuRoC's files.
 
     Attributes:
-        T_imu_camera: ``(4, 4)``, pose of the camera (rectified, left) in the frame of the IMU.
-        gyro_noise: rad/s/sqrt(Hz), white noise of the gyroscope.
-        gyro_walk: rad/s^2/sqrt(Hz), random walk of its bias.
-        accel_noise: m/s^2/sqrt(Hz), white noise of the accelerometer.
-        accel_walk: m/s^3/sqrt(Hz), random walk of its bias.
-        rate_hz: Samples a second.
-        max_gyro: rad/s, from which on the gyroscope is saturated.
-        max_accel: m/s^2, from which on the accelerometer is saturated.
+        T_imu_camera: ``(4, 4)`` pose of the camera (of a pair: the rectified left one) in the IMU's frame.
+        gyro_noise: White noise of the gyroscope, rad/s/sqrt(Hz).
+        gyro_walk: Random walk of the gyroscope's bias, rad/s^2/sqrt(Hz).
+        accel_noise: White noise of the accelerometer, m/s^2/sqrt(Hz).
+        accel_walk: Random walk of the accelerometer's bias, m/s^3/sqrt(Hz).
+        rate_hz: Samples per second, 10 to 10,000.
+        max_gyro: Rate at which the gyroscope saturates, rad/s.
+        max_accel: Acceleration at which the accelerometer saturates, m/s^2.
 
     Raises:
-        UsageError: The pose is no rigid motion or is over 10 m long, or a number is not above 0.
+        UsageError: The pose is no rigid motion within 10 m, or a number is outside its range.
     """
 
     T_imu_camera: Array
@@ -49,43 +50,47 @@ class ImuModel:
     max_accel: float = math.inf
 
     def __post_init__(self) -> None:
-        if np.shape(self.T_imu_camera) != (4, 4) or rigid(self.T_imu_camera, _MAX_ARM_M) is None:
+        if np.shape(self.T_imu_camera) != (4, 4) or rigid(self.T_imu_camera, _MAX_LEVER_ARM_M) is None:
             raise UsageError(
                 "T_imu_camera is no rigid motion within 10 m",
-                hint="give the pose of the camera in the frame of the IMU, metres",
+                hint="give the pose of the camera in the frame of the IMU, translation in metres",
             )
         for name in ("gyro_noise", "gyro_walk", "accel_noise", "accel_walk"):
             value = getattr(self, name)
             if not 0.0 < value < math.inf:
                 raise UsageError(
                     f"{name} = {value:g} is not a finite number above 0",
-                    hint="take the noise from the data sheet, or from allan_variance_ros",
+                    hint="take the noise from the data sheet, or measure it with allan_variance_ros",
                 )
-        if not _LEAST_HZ <= self.rate_hz <= _MOST_HZ:
+        if not _MIN_RATE_HZ <= self.rate_hz <= _MAX_RATE_HZ:
             raise UsageError(
-                f"an IMU of {self.rate_hz:g} Hz is not within {_LEAST_HZ:g}..{_MOST_HZ:g} Hz",
-                hint="give the samples a second",
+                f"rate_hz = {self.rate_hz:g} is not within {_MIN_RATE_HZ:g}..{_MAX_RATE_HZ:g} Hz",
+                hint="give the samples per second",
             )
-        if not (self.max_gyro > 0.0 and self.max_accel > 0.0):
-            raise UsageError(
-                "max_gyro or max_accel is not above 0", hint="leave it out if the IMU does not saturate"
-            )
+        for name in ("max_gyro", "max_accel"):
+            if not getattr(self, name) > 0.0:
+                raise UsageError(
+                    f"{name} = {getattr(self, name):g} is not above 0",
+                    hint="leave it out if the sensor does not saturate",
+                )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImuSamples:
-    """What an IMU measured since the last frame, on the clock of the camera.
+    """Samples since the last frame, with time stamps on the clock of the camera.
 
-    There is one sample at or before the last frame, and one at or after this one, where they exist.
+    The first sample is at or before the last frame and the last sample at or after this frame, as far as such
+    samples exist, so that samples can be interpolated at both frames.
 
     Attributes:
-        timestamps_s: ``(n,)``, ascending.
-        gyro: ``(n, 3)`` rad/s, in the axes of the IMU.
-        accel: ``(n, 3)`` m/s^2, in the same axes; at rest it points up with 9.81.
-        model: Of the IMU.
+        timestamps_s: ``(n,)``, strictly ascending.
+        gyro: ``(n, 3)`` angular rates in the IMU's frame, rad/s.
+        accel: ``(n, 3)`` specific forces in the IMU's frame, m/s^2: a stationary IMU measures 9.81 upwards.
+        model: Model of the IMU.
 
     Raises:
-        UsageError: The shapes do not fit, a number is not finite, times do not ascend, or there are too many.
+        UsageError: The shapes do not fit, a number is not finite, times do not ascend, or there are more than
+            100,000 samples.
     """
 
     timestamps_s: Array
@@ -94,11 +99,11 @@ class ImuSamples:
     model: ImuModel
 
     def __post_init__(self) -> None:
-        n = check_samples(self.timestamps_s, self.gyro, self.accel)
-        if n > MAX_SAMPLES:
+        count = check_samples(self.timestamps_s, self.gyro, self.accel)
+        if count > MAX_SAMPLES:
             raise UsageError(
-                f"{n} IMU samples of one frame are above {MAX_SAMPLES}",
-                hint="give those since the last frame",
+                f"{count} IMU samples of one frame are above {MAX_SAMPLES}",
+                hint="give only the samples since the last frame",
             )
 
     def __len__(self) -> int:
@@ -106,7 +111,12 @@ class ImuSamples:
 
 
 def check_samples(timestamps_s: Array, gyro: Array, accel: Array) -> int:
-    """Return the number n of samples: ``(n,)`` seconds, ``(n, 3)`` rad/s and m/s^2.
+    """Check the arrays of IMU samples, and return the number n of samples.
+
+    Args:
+        timestamps_s: ``(n,)``.
+        gyro: ``(n, 3)`` rad/s.
+        accel: ``(n, 3)`` m/s^2.
 
     Raises:
         UsageError: The shapes do not fit, a number is not finite, or times do not ascend.
@@ -117,7 +127,7 @@ def check_samples(timestamps_s: Array, gyro: Array, accel: Array) -> int:
             f"IMU: times {timestamps_s.shape}, gyro {gyro.shape} and accel {accel.shape} do not fit",
             hint="give three rates and three accelerations for each time",
         )
-    if not all(np.isfinite(each).all() for each in (timestamps_s, gyro, accel)):
+    if not all(np.isfinite(array).all() for array in (timestamps_s, gyro, accel)):
         raise UsageError("an IMU sample is not finite", hint="leave out samples that were not measured")
     if not (np.diff(timestamps_s) > 0.0).all():
         raise UsageError("the times of the IMU do not ascend", hint="sort the samples, each time once")

@@ -1,11 +1,30 @@
-"""The robot's side of a live map: keyframes up, alignments down, one `LiveMapper` for both.
+"""Share one live map with other robots: keyframes go up to the map server, alignments come down.
 
-Tracking belongs to `client_sdk.mapper`; the map itself and its owner belong to the servers.
+The way of a keyframe, from the tracker to the live map and back:
+
+1. `LiveMapper.track` tracks a frame with `client_sdk.mapper.Mapper`; its pose is in the odometry frame.
+2. With depth or a stereo pair, a frame 0.1 m or 6 degrees from the last keyframe becomes a keyframe
+   (`LiveOptions`).  Of a camera without depth, `monocular_odometry` takes the tracker's keyframes once they
+   have settled.
+3. `LiveMapper` encodes features, pose, camera, gravity and references to the attachments
+   (`rse_pf.slam.keyframe`); `attachments` encodes coloured points and image.
+4. `keyframe_queue` holds the keyframe, in memory or on disk, until the map has acknowledged it.
+5. `attachments` uploads points and image to the object store while nothing more urgent waits.
+6. `keyframe_sender` asks for the robot's next keyframe number in the map (``live-show``), and sends the
+   oldest keyframe (``live-keyframe``) until the map server has logged it.
+7. While the segment is not aligned, `relocaliser` also asks where the keyframe was made
+   (``live-relocalise``).
+8. The map server measures loop closures and optimises its pose graph (`rse_pf.live_map`), and publishes the
+   alignment of each segment as an update of the map's topic.
+9. `alignments` applies updates and relocalisations, and returns a `Correction` for each change.
+10. `LiveMapper` publishes the correction; from the next frame on, ``T_map_camera`` uses the new alignment.
+
+Tracking belongs to `client_sdk.mapper`; the map itself belongs to the map server.
 """
 
 from client_sdk.live.alignments import Correction, OtherRobot
 from client_sdk.live.blocking import BlockingLiveMapper
-from client_sdk.live.mapper import LiveMapper
+from client_sdk.live.live_mapper import LiveMapper
 from client_sdk.live.options import LiveOptions
 
 __all__ = ["BlockingLiveMapper", "Correction", "LiveMapper", "LiveOptions", "OtherRobot"]

@@ -1,12 +1,17 @@
-"""What a robot knows of a live map: where its segments lie in it, where the others are, what state it is in.
+"""Keep what a robot knows of a live map: alignments of its own segments, other robots, state of the map.
 
-Updates go in, corrections come out; no clock, no connection.  A segment is one odometry frame of the robot:
-tracking that was lost begins a new one.
+A segment is one odometry frame of the robot: a robot that has lost tracking begins another one.  The
+alignment of a segment is the pose of its odometry frame in the map, with a scale for a camera without depth.
+`Alignments` takes the map's updates and returns corrections, without clock and network; `CorrectionStream`
+hands corrections to their readers.
 """
 
 from __future__ import annotations
 
+import asyncio
 import math
+from collections import deque
+from collections.abc import AsyncIterator
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -17,44 +22,59 @@ from rse_pf.geometry import Array, inverse, scaled
 from rse_pf.wire import as_type
 from rse_pf.wire.live_map import AlignmentUpdate, MapUpdate, PoseUpdate, RelocaliseReply
 
-__all__ = ["NOT_ASKED", "AlignedBy", "Alignments", "Correction", "OtherRobot", "SegmentAlignment"]
+__all__ = ["AlignedBy", "Alignments", "Correction", "CorrectionStream", "OtherRobot", "SegmentAlignment"]
 
-NOT_ASKED = "the map has not answered yet"
-_UPPER = np.triu_indices(6)
+_NO_ANSWER = "the map has not answered yet"  # reason of a segment that no update of the map has named
+_UPPER_TRIANGLE = np.triu_indices(6)
+_MAX_CORRECTIONS = 1000  # corrections that are kept for a reader that falls behind; the oldest are dropped
 
 AlignedBy = Literal["map", "relocalisation", "nothing"]
+"""Source of an alignment: loop closures of the map, one keyframe that the map localised, or none."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SegmentAlignment:
-    """Where one odometry frame lies in the map; ``reason`` says why that is unknown.
+    """Pose and scale of one odometry frame in the map.
 
-    ``covariance`` ``(6, 6)`` is of the twist (metres, radians) on the left of ``T_map_odom`` ``(4, 4)``.  An
-    alignment by relocalisation comes from one keyframe, and holds until the map has its own.  ``scale`` is
-    how many metres the unit of the odometry frame is; its lengths are multiplied by it before.
+    Attributes:
+        T_map_odom: ``(4, 4)``, metres; None while the segment is not aligned.
+        covariance: ``(6, 6)`` of the twist (metres, radians) on the left of ``T_map_odom``; None if unknown.
+        by: Source of the alignment.  One by relocalisation holds until the map has an alignment of its own.
+        reason: Why the segment is not aligned; empty if it is.
+        metres_per_unit: Metric scale of the odometry frame, 1 for a camera with depth.
     """
 
     T_map_odom: Array | None = None
     covariance: Array | None = None
     by: AlignedBy = "nothing"
-    reason: str = NOT_ASKED
-    scale: float = 1.0
+    reason: str = _NO_ANSWER
+    metres_per_unit: float = 1.0
 
-    def in_map(self, T_odom_camera: Array) -> Array | None:
-        """Return a pose of the odometry frame in the map, metres; None while it is not aligned."""
+    def pose_in_map(self, T_odom_camera: Array) -> Array | None:
+        """Return ``T_map_camera`` ``(4, 4)`` in metres for a pose in the odometry frame and its unit.
+
+        None while the segment is not aligned.
+        """
         if self.T_map_odom is None:
             return None
-        placed: Array = self.T_map_odom @ scaled(T_odom_camera, self.scale)
-        return placed
+        T_map_camera: Array = self.T_map_odom @ scaled(T_odom_camera, self.metres_per_unit)
+        return T_map_camera
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Correction:
-    """The alignment of a segment changed: every later ``T_map_camera`` uses the new one.
+    """A change of the alignment of one segment, which every later ``T_map_camera`` uses.
 
-    ``before`` and ``after`` are ``T_map_odom`` ``(4, 4)``, None where the segment was or is not aligned.
-    ``cause`` is the robot and the number of the keyframe that made the map change, if one did.  ``scale`` is
-    how many metres the unit of the segment is, 1 where it has metres.
+    Attributes:
+        segment: The robot's number of the segment, from 0.
+        before: ``T_map_odom`` ``(4, 4)`` before the change; None if the segment was not aligned.
+        after: ``T_map_odom`` ``(4, 4)`` from now on; None if the segment is not aligned any more.
+        covariance: ``(6, 6)`` of the twist (metres, radians) on the left of ``after``; None if unknown.
+        by: Source of the new alignment.
+        reason: Why the segment is not aligned any more; empty if it is.
+        version: Position in the log of the map.
+        cause: Name of the robot and number of the keyframe that changed the map; None if unknown.
+        scale: Metres per unit of the odometry frame, 1 for a camera with depth.
     """
 
     segment: int
@@ -70,7 +90,13 @@ class Correction:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class OtherRobot:
-    """Where another robot made its newest keyframe; ``T_map_camera`` is None while it is not aligned."""
+    """Pose of another robot's newest keyframe in the map.
+
+    Attributes:
+        T_map_camera: ``(4, 4)``, metres; None while the robot's segment is not aligned.
+        timestamp_s: Time stamp of the keyframe, by that robot's camera; None while it is not aligned.
+        reason: Why the robot's segment is not aligned; empty if it is.
+    """
 
     T_map_camera: Array | None
     timestamp_s: float | None
@@ -78,94 +104,103 @@ class OtherRobot:
 
 
 class Alignments:
-    """The newest known state of one live map, as one robot sees it."""
+    """Newest known state of one live map, as one robot sees it."""
 
     def __init__(self) -> None:
-        """Know nothing yet."""
         self.version = 0
+        """Newest position in the log of the map that an update named."""
         self.map_keyframes = 0
+        """Number of keyframes of all robots in the map."""
         self.map_state = ""
-        self.owner = ""
+        """State of the map as its server reports it; empty before its first update."""
+        self.map_server = ""
+        """Identity of the map server; empty before the map's first update."""
         self.others: dict[str, OtherRobot] = {}
-        self._me = ""
+        """Other robots of the map by their names."""
+        self._own_name = ""
         self._first_segment = 0
         self._segments: dict[int, SegmentAlignment] = {}
 
-    def know_myself(self, robot: str, first_segment: int) -> list[Correction]:
-        """Take the robot's name in the map, and the map's number of the robot's segment 0.
+    def identify_robot(self, name: str, first_segment: int) -> list[Correction]:
+        """Store this robot's name in the map, and the map's number of the robot's segment 0.
 
-        Another number of it means that the map began anew, so that no alignment holds any longer.
+        A changed number of segment 0 means that the map was started again: all alignments end, and their
+        corrections are returned.
         """
-        began_anew = bool(self._me) and first_segment != self._first_segment
-        self._me, self._first_segment = robot, first_segment
-        self.others.pop(robot, None)
-        return self.forget("the map began anew") if began_anew else []
-
-    def forget(self, reason: str) -> list[Correction]:
-        """Forget every alignment."""
+        is_new_map = bool(self._own_name) and first_segment != self._first_segment
+        self._own_name, self._first_segment = name, first_segment
+        self.others.pop(name, None)
+        if not is_new_map:
+            return []
         self.others.clear()
-        return [
-            change
-            for segment in list(self._segments)
-            if (change := self._set(segment, SegmentAlignment(reason=reason), None)) is not None
-        ]
+        unaligned = SegmentAlignment(reason="the map was started again")
+        corrections = [self._set(segment, unaligned, None) for segment in list(self._segments)]
+        return [correction for correction in corrections if correction is not None]
 
-    def of(self, segment: int) -> SegmentAlignment:
-        """Return the alignment of a segment of this robot."""
-        return self._segments.get(segment, _UNKNOWN)
+    def get(self, segment: int) -> SegmentAlignment:
+        """Return the alignment of a segment of this robot, by the robot's own number."""
+        return self._segments.get(segment, _UNALIGNED)
 
-    def updated(self, key: str, payload: Any) -> Correction | None:
-        """Take an update of the map's topic; return the correction that it is, if it is one.
+    def apply_update(self, key: str, payload: Any) -> Correction | None:
+        """Apply an update of the map's topic; return a correction if an own segment's alignment changed.
+
+        Args:
+            key: ``map``, ``pose/ROBOT`` or ``alignment/ROBOT``; updates of other keys are ignored.
+            payload: A value of the message type that belongs to the key.
 
         Raises:
-            BadMessage: The payload does not fit its key; nothing has changed.
+            BadMessage: The payload does not fit the key; nothing is applied.
         """
         kind = key.partition("/")[0]
         if kind == "map":
-            self._take_map(as_type(payload, MapUpdate))
+            update = as_type(payload, MapUpdate)
+            self.version, self.map_keyframes = update.version, update.keyframes
+            self.map_state, self.map_server = update.state, update.owner
         elif kind == "pose":
-            self._take_pose(as_type(payload, PoseUpdate))
+            pose = as_type(payload, PoseUpdate)
+            if pose.robot != self._own_name:
+                self.others[pose.robot] = OtherRobot(
+                    T_map_camera=_parse_pose(pose.T_map_camera), timestamp_s=pose.timestamp_s, reason=""
+                )
         elif kind == "alignment":
-            return self._take_alignment(as_type(payload, AlignmentUpdate))
+            return self._apply_alignment(as_type(payload, AlignmentUpdate))
         return None
 
-    def relocalised(self, segment: int, T_odom_camera: Array, reply: RelocaliseReply) -> Correction | None:
-        """Take the answer to a keyframe of *segment*; what the map itself found wins over it.
+    def apply_relocalisation(
+        self, segment: int, T_odom_camera: Array, reply: RelocaliseReply
+    ) -> Correction | None:
+        """Apply the reply to a relocalisation, unless the map has aligned the segment in the meantime.
+
+        Args:
+            segment: The robot's number of the segment of the keyframe that was localised.
+            T_odom_camera: ``(4, 4)`` pose of that keyframe in its odometry frame and unit.
+            reply: The map's reply; only its verdict ``ok`` aligns the segment.
 
         Raises:
-            BadMessage: It says ``ok`` without a pose.
+            BadMessage: A number of the reply is not finite or has the wrong shape.
         """
-        if self.of(segment).by == "map":
+        present = self.get(segment)
+        if present.by == "map":
             return None
         if reply.verdict != "ok" or reply.T_map_camera is None:
-            why = f"not relocalised: {reply.reason or reply.verdict}"
-            kept = self.of(segment)
-            if kept.by == "nothing":
-                self._segments[segment] = SegmentAlignment(reason=why)
+            if present.by == "nothing":
+                reason = f"not relocalised: {reply.reason or reply.verdict}"
+                self._segments[segment] = SegmentAlignment(reason=reason)
             return None
-        found = SegmentAlignment(
-            T_map_odom=_pose(reply.T_map_camera) @ inverse(scaled(T_odom_camera, _scale(reply.scale))),
-            covariance=_covariance(reply.covariance),
+        metres_per_unit = _parse_scale(reply.scale)
+        relocalised = SegmentAlignment(
+            T_map_odom=_parse_pose(reply.T_map_camera) @ inverse(scaled(T_odom_camera, metres_per_unit)),
+            covariance=_parse_covariance(reply.covariance),
             by="relocalisation",
             reason="",
-            scale=_scale(reply.scale),
+            metres_per_unit=metres_per_unit,
         )
         self.version = max(self.version, reply.version)
-        return self._set(segment, found, None)
+        return self._set(segment, relocalised, None)
 
-    def _take_map(self, update: MapUpdate) -> None:
-        self.version, self.map_keyframes = update.version, update.keyframes
-        self.map_state, self.owner = update.state, update.owner
-
-    def _take_pose(self, update: PoseUpdate) -> None:
-        if update.robot != self._me:
-            self.others[update.robot] = OtherRobot(
-                T_map_camera=_pose(update.T_map_camera), timestamp_s=update.timestamp_s, reason=""
-            )
-
-    def _take_alignment(self, update: AlignmentUpdate) -> Correction | None:
+    def _apply_alignment(self, update: AlignmentUpdate) -> Correction | None:
         self.version = max(self.version, update.version)
-        if update.robot != self._me:
+        if update.robot != self._own_name:
             if not update.aligned:
                 self.others[update.robot] = OtherRobot(
                     T_map_camera=None, timestamp_s=None, reason=update.reason
@@ -173,75 +208,122 @@ class Alignments:
             return None
         segment = update.segment - self._first_segment
         if segment < 0:
-            return None  # of an earlier run of this robot
+            return None  # a segment of an earlier run of this robot
         if not update.aligned:
-            kept = self.of(segment)
-            if kept.by == "relocalisation" and not update.reason.startswith("ambiguous"):
+            # A relocalisation outlives "not enough closures yet", but not the proof of an ambiguous place.
+            is_ambiguous = update.reason.startswith("ambiguous")
+            if self.get(segment).by == "relocalisation" and not is_ambiguous:
                 return None
             return self._set(segment, SegmentAlignment(reason=update.reason or "not aligned"), update)
         if update.T_map_odom is None:
             raise BadMessage("an alignment without T_map_odom", hint="update the server")
-        found = SegmentAlignment(
-            T_map_odom=_pose(update.T_map_odom),
-            covariance=_covariance(update.covariance),
+        aligned = SegmentAlignment(
+            T_map_odom=_parse_pose(update.T_map_odom),
+            covariance=_parse_covariance(update.covariance),
             by="map",
             reason="",
-            scale=_scale(update.scale),
+            metres_per_unit=_parse_scale(update.scale),
         )
-        return self._set(segment, found, update)
+        return self._set(segment, aligned, update)
 
     def _set(
-        self, segment: int, found: SegmentAlignment, update: AlignmentUpdate | None
+        self, segment: int, alignment: SegmentAlignment, update: AlignmentUpdate | None
     ) -> Correction | None:
-        """Keep *found*, and return the correction if the transform changed."""
-        before, scale = self.of(segment).T_map_odom, self.of(segment).scale
-        self._segments[segment] = found
-        after = found.T_map_odom
+        """Store an alignment; return the correction if pose or scale of the segment changed."""
+        present = self.get(segment)
+        self._segments[segment] = alignment
+        before, after = present.T_map_odom, alignment.T_map_odom
         is_equal = before is not None and after is not None and np.array_equal(before, after)
-        if before is after or (is_equal and scale == found.scale):
+        if before is after or (is_equal and present.metres_per_unit == alignment.metres_per_unit):
             return None
         cause = None if update is None or update.cause is None else (update.cause.robot, update.cause.number)
         return Correction(
             segment=segment,
             before=before,
             after=after,
-            covariance=found.covariance,
-            by=found.by,
-            reason=found.reason,
+            covariance=alignment.covariance,
+            by=alignment.by,
+            reason=alignment.reason,
             version=self.version,
             cause=cause,
-            scale=found.scale,
+            scale=alignment.metres_per_unit,
         )
 
 
-_UNKNOWN = SegmentAlignment()
+class CorrectionStream:
+    """Corrections of one live map, for any number of readers that each read at their own speed."""
+
+    def __init__(self) -> None:
+        self._recent: deque[Correction] = deque(maxlen=_MAX_CORRECTIONS)
+        self._readers: list[asyncio.Queue[Correction | None]] = []
+        self._is_closed = False
+
+    def publish(self, correction: Correction) -> None:
+        """Add a correction; a reader that has 1,000 unread ones loses its oldest."""
+        self._recent.append(correction)
+        for reader in self._readers:
+            if reader.qsize() >= _MAX_CORRECTIONS:
+                reader.get_nowait()
+            reader.put_nowait(correction)
+
+    def close(self) -> None:
+        """End the stream: each reader gets what it has not read, then stops."""
+        self._is_closed = True
+        for reader in self._readers:
+            reader.put_nowait(None)
+
+    async def read(self) -> AsyncIterator[Correction]:
+        """Yield the last 1,000 corrections, then each new one, until the stream is closed."""
+        reader: asyncio.Queue[Correction | None] = asyncio.Queue()
+        for correction in self._recent:
+            reader.put_nowait(correction)
+        if self._is_closed:
+            reader.put_nowait(None)
+        self._readers.append(reader)
+        try:
+            while (unread := await reader.get()) is not None:
+                yield unread
+        finally:
+            self._readers.remove(reader)
 
 
-def _pose(numbers: Any) -> Array:
-    """Return the ``(4, 4)`` pose of 16 finite numbers; raises BadMessage."""
+_UNALIGNED = SegmentAlignment()
+
+
+def _parse_pose(numbers: Any) -> Array:
+    """Return 16 finite numbers, row by row, as a ``(4, 4)`` pose; raises BadMessage."""
     pose = np.array(numbers, dtype=np.float64).ravel()
     if pose.shape != (16,) or not np.isfinite(pose).all():
-        raise BadMessage("a pose needs 16 finite numbers", hint="update the server")
+        raise BadMessage(f"a pose has {pose.size} numbers, not 16 finite ones", hint="update the server")
     return pose.reshape(4, 4)
 
 
-def _scale(scale: float | None) -> float:
-    """Return how many metres a unit is; raises BadMessage where it is none."""
-    if scale is None:
+def _parse_scale(metres_per_unit: float | None) -> float:
+    """Return a metric scale, 1 for None; raises BadMessage unless it is above 0 and finite."""
+    if metres_per_unit is None:
         return 1.0
-    if not 0.0 < scale < math.inf:
-        raise BadMessage("a scale is above 0 and finite", hint="update the server")
-    return scale
+    if not 0.0 < metres_per_unit < math.inf:
+        raise BadMessage(
+            f"a scale of {metres_per_unit:g} metres per unit is not above 0 and finite",
+            hint="update the server",
+        )
+    return metres_per_unit
 
 
-def _covariance(numbers: Any) -> Array | None:
-    """Return the ``(6, 6)`` covariance of the 21 numbers of its upper triangle; raises BadMessage."""
+def _parse_covariance(numbers: Any) -> Array | None:
+    """Return the 21 numbers of an upper triangle, row by row, as a symmetric ``(6, 6)`` covariance.
+
+    Raises:
+        BadMessage: There are not 21 finite numbers.
+    """
     if numbers is None:
         return None
     upper = np.array(numbers, dtype=np.float64).ravel()
     if upper.shape != (21,) or not np.isfinite(upper).all():
-        raise BadMessage("a covariance needs 21 finite numbers", hint="update the server")
+        raise BadMessage(
+            f"a covariance has {upper.size} numbers, not 21 finite ones", hint="update the server"
+        )
     covariance = np.zeros((6, 6))
-    covariance[_UPPER] = upper
-    covariance.T[_UPPER] = upper
+    covariance[_UPPER_TRIANGLE] = upper
+    covariance.T[_UPPER_TRIANGLE] = upper
     return covariance

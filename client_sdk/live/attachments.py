@@ -1,52 +1,103 @@
-"""What a robot stores beside its keyframes: made with a keyframe, sent when the link is idle."""
+"""Make the points and the image that belong to a keyframe, and store them as objects in the background.
+
+A keyframe holds references to its attachments; the attachments themselves are objects of the robot in the
+object store.  The map makes its cloud of the points, and exports the images.  Pose queries and keyframes have
+priority: attachments are uploaded at a limited byte rate while neither waits, and the oldest are dropped when
+too many wait.  A keyframe whose points were dropped makes the cloud of the map thinner, and nothing else.
+"""
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import hashlib
+import math
+from collections import deque
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
+from client_sdk.concurrency.user_callbacks import Callbacks
 from client_sdk.frontend import Features, Frame, load_opencv
-from client_sdk.live.keyframe_points import points_of
-from client_sdk.live.object_sender import ObjectSender, StoreObject
 from client_sdk.live.options import LiveOptions
+from client_sdk.tracking.segments import certain_rows
 from client_sdk.transfer.data_connection import MAX_SINGLE_PUT_BYTES
-from rse_pf.slam.keyframe_points import ObjectReference
+from rse_pf.errors import (
+    BadRequest,
+    Forbidden,
+    InternalError,
+    LimitExceeded,
+    QuotaExceeded,
+    RsePfError,
+    Unauthorized,
+    UsageError,
+)
+from rse_pf.slam.cloud_deform import voxel_keys
+from rse_pf.slam.keyframe_points import ObjectReference, encode_points
 from rse_pf.token_bucket import TokenBucket
 
-__all__ = ["Attached", "Attachments"]
+__all__ = ["Attachments", "BackgroundUploader", "EncodedAttachments", "StoreObject", "encode_keyframe_points"]
 
-_BUDGET_S = 2.0
-"""What a robot has not used of its share for so long, it may use for the next keyframe."""
-_POINT_BYTES = 4.5
-_LEAST_POINTS = 400
-_QUALITY = 85
+StoreObject = Callable[[bytes], Awaitable[str]]
+"""Function that stores bytes as an object of the robot and returns their digest; it may raise RsePfError."""
+
+_BURST_S = 2.0  # seconds of the rate limit that a robot which sent nothing may spend on its next keyframe
+_BYTES_PER_POINT = 4.5  # mean size of an encoded point after zlib, to turn a byte budget into a point count
+_MIN_POINTS = 400  # points of a keyframe, about 2 kB, that are sent even when the byte budget is spent
+_JPEG_QUALITY = 85  # of 100, for the images of keyframes
+
+_MIN_POINT_DEPTH_M = 0.3  # nearer readings of a depth camera are not sent, as in the robot's own cloud
+_MAX_POINT_DEPTH_M = 3.5  # farther readings are not sent: a depth camera is off by centimetres there
+_VOXEL_M = 0.01  # edge of the voxels of which each sends one point, so that near surfaces take few bytes
+_MAX_DEPTH_STEP = 0.05
+"""Largest difference between the depths of a pixel and of its four neighbours, as a fraction of its depth: a
+pixel with a larger one lies between two surfaces, and its depth may belong to neither."""
+
+_REQUEST_BYTES = 1_000  # added to each object for the rate limit: head and token of the request, and answer
+_MAX_WAITING_BYTES = 16 << 20  # objects that wait in memory; above it the oldest are dropped
+_MAX_QUIET_WAIT_S = 1.0  # longest wait of an object for poses and keyframes, which could else block it
+_FIRST_PAUSE_S = 0.5  # pause after the first failed upload; it doubles with each failure
+_MAX_PAUSE_S = 30.0  # longest pause between failed uploads
+_OBJECT_REFUSALS = (LimitExceeded, BadRequest, UsageError)
+"""Errors with which one object is refused for good: it is dropped, and the next one is tried."""
+_ALL_REFUSALS = (Forbidden, Unauthorized, QuotaExceeded)
+"""Errors with which every object of the robot would be refused: all waiting objects are dropped."""
+
+_Pixels = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Attached:
-    """The bytes of a keyframe's points and of its image (JPEG), None where it has none."""
+class EncodedAttachments:
+    """Attachments of one keyframe as they are stored.
+
+    Attributes:
+        points: Coloured points, as `rse_pf.slam.keyframe_points.encode_points` returns them; None without.
+        image: Image of the frame as JPEG; None without.
+    """
 
     points: bytes | None = None
     image: bytes | None = None
 
     @property
     def points_reference(self) -> ObjectReference | None:
-        """What the keyframe says of its points."""
-        return _reference(self.points)
+        """Digest and size of the points, which the keyframe holds; None without points."""
+        return _make_reference(self.points)
 
     @property
     def image_reference(self) -> ObjectReference | None:
-        """What the keyframe says of its image."""
-        return _reference(self.image)
+        """Digest and size of the image, which the keyframe holds; None without an image."""
+        return _make_reference(self.image)
 
 
 class Attachments:
-    """Makes and sends what belongs to the keyframes of one robot; without *store*, nothing."""
+    """Make the attachments of one robot's keyframes, and upload them in the background.
+
+    Points and images have a rate limit each, so that images, which are larger, do not delay points.  Without
+    a function that stores objects no attachment is made.
+    """
 
     def __init__(
         self,
@@ -55,68 +106,235 @@ class Attachments:
         clock: Callable[[], float],
         wait_quiet: Callable[[], Awaitable[None]],
     ) -> None:
+        """Describe the attachments; *wait_quiet* returns once no pose query is open and no keyframe waits.
+
+        Args:
+            store: Stores one object; None: keyframes have no attachments.
+            options: Number of points, whether images are wanted, and the rate limits of both.
+            clock: Monotonic time in seconds.
+            wait_quiet: Delays each upload until nothing more urgent waits.
+        """
         self._options, self._clock = options, clock
-        self.may_have_images = False
-        """Whether the platform allows images; it says so when the robot joins the map."""
-        self._points, self._images = (
-            ObjectSender(store, bytes_per_s=rate, clock=clock, wait_quiet=wait_quiet)
-            if store is not None and is_wanted
-            else None
-            for rate, is_wanted in (
-                (options.points_bytes_per_s, options.points > 0), (options.images_bytes_per_s, options.images)
+        self.may_store_images = False
+        """Whether the operator allows images; the map says so when the robot joins it."""
+        self._point_uploader = self._image_uploader = None
+        if store is not None and options.points > 0:
+            self._point_uploader = BackgroundUploader(
+                store, bytes_per_s=options.points_bytes_per_s, clock=clock, wait_quiet=wait_quiet
             )
-        )  # fmt: skip
-        self._budget, self._image_budget = (
-            TokenBucket(rate, burst=_BUDGET_S * rate)
-            for rate in (options.points_bytes_per_s, options.images_bytes_per_s)
+        if store is not None and options.images:
+            self._image_uploader = BackgroundUploader(
+                store, bytes_per_s=options.images_bytes_per_s, clock=clock, wait_quiet=wait_quiet
+            )
+        self._point_budget = TokenBucket(
+            options.points_bytes_per_s, burst=_BURST_S * options.points_bytes_per_s
+        )
+        self._image_budget = TokenBucket(
+            options.images_bytes_per_s, burst=_BURST_S * options.images_bytes_per_s
         )
 
-    def make(self, frame: Frame, features: Features) -> Attached:
-        """Return what belongs to a keyframe; in any thread."""
+    def make(self, frame: Frame, features: Features) -> EncodedAttachments:
+        """Encode points and image of a keyframe, as far as the rate limits allow; may run in any thread."""
         points, image, now = None, None, self._clock()
-        if self._points is not None:
-            self._budget.fill(now)
-            most = min(self._options.points, int(self._budget.tokens / _POINT_BYTES))
-            points = points_of(frame, features, max(most, _LEAST_POINTS))
-            self._budget.spend(len(points or b""), now)
-        if self._images is not None and self.may_have_images:
+        if self._point_uploader is not None:
+            self._point_budget.fill(now)
+            affordable_points = int(self._point_budget.tokens / _BYTES_PER_POINT)
+            max_points = max(min(self._options.points, affordable_points), _MIN_POINTS)
+            points = encode_keyframe_points(frame, features, max_points)
+            self._point_budget.spend(len(points or b""), now)
+        if self._image_uploader is not None and self.may_store_images:
             self._image_budget.fill(now)
             if self._image_budget.tokens > 0:
-                image = _jpeg(frame)
+                image = _encode_jpeg(frame)
                 self._image_budget.spend(len(image or b""), now)
-        return Attached(points=points, image=image)
+        return EncodedAttachments(points=points, image=image)
 
-    def add(self, attached: Attached) -> None:
-        """Send what belongs to a keyframe that was queued."""
-        for sender, data in ((self._points, attached.points), (self._images, attached.image)):
-            if sender is not None and data is not None:
-                sender.add(data)
+    def add(self, encoded: EncodedAttachments) -> None:
+        """Hand over the attachments of a queued keyframe for upload."""
+        if self._point_uploader is not None and encoded.points is not None:
+            self._point_uploader.add(encoded.points)
+        if self._image_uploader is not None and encoded.image is not None:
+            self._image_uploader.add(encoded.image)
 
     async def run(self) -> None:
-        """Send until cancelled."""
-        await asyncio.gather(*(sender.run() for sender in self._senders()))
+        """Upload attachments until cancelled."""
+        await asyncio.gather(*(uploader.run() for uploader in self._uploaders()))
 
     async def wait_empty(self) -> None:
-        """Wait until nothing waits."""
-        for sender in self._senders():
-            await sender.wait_empty()
+        """Wait until every attachment was uploaded or dropped."""
+        for uploader in self._uploaders():
+            await uploader.wait_empty()
 
     def report(self) -> dict[str, Any]:
-        """Return what was sent, by kind."""
-        named = {"points": self._points, "images": self._images if self.may_have_images else None}
-        return {name: sender.report() for name, sender in named.items() if sender is not None}
+        """Return what `BackgroundUploader.report` says of ``points`` and ``images``, if they are in use."""
+        image_uploader = self._image_uploader if self.may_store_images else None
+        uploaders = {"points": self._point_uploader, "images": image_uploader}
+        return {name: uploader.report() for name, uploader in uploaders.items() if uploader is not None}
 
-    def _senders(self) -> list[ObjectSender]:
-        return [sender for sender in (self._points, self._images) if sender is not None]
+    def _uploaders(self) -> list[BackgroundUploader]:
+        return [uploader for uploader in (self._point_uploader, self._image_uploader) if uploader is not None]
 
 
-def _jpeg(frame: Frame) -> bytes | None:
-    """Return the image of a frame as JPEG; None if it is too large for one request."""
+class BackgroundUploader:
+    """Store waiting objects one after the other, oldest first, at a limited rate and low priority."""
+
+    def __init__(
+        self,
+        store: StoreObject,
+        *,
+        bytes_per_s: float,
+        clock: Callable[[], float],
+        wait_quiet: Callable[[], Awaitable[None]],
+    ) -> None:
+        """Describe the uploader; `run` uploads.
+
+        Args:
+            store: Stores one object; any exception of it is reported, and the upload repeated.
+            bytes_per_s: Rate limit of objects and their requests.
+            clock: Monotonic time in seconds.
+            wait_quiet: Returns once no pose query is open and no keyframe waits.
+        """
+        self._sent = 0
+        self._sent_bytes = 0
+        self._dropped = 0
+        self._trouble = ""
+        self._store, self._clock, self._wait_quiet = store, clock, wait_quiet
+        self._rate_limit = TokenBucket(bytes_per_s, burst=0.0)
+        self._callbacks = Callbacks()
+        self._waiting: deque[bytes] = deque()
+        self._waiting_bytes = 0
+        self._has_object, self._is_empty = asyncio.Event(), asyncio.Event()
+        self._is_empty.set()
+
+    def add(self, data: bytes) -> None:
+        """Append an object; the oldest waiting ones are dropped while more than 16 MiB wait."""
+        self._waiting.append(data)
+        self._waiting_bytes += len(data)
+        while self._waiting_bytes > _MAX_WAITING_BYTES:
+            self._waiting_bytes -= len(self._waiting.popleft())
+            self._dropped += 1
+        self._is_empty.clear()
+        self._has_object.set()
+
+    def report(self) -> dict[str, int | str]:
+        """Return the numbers of objects that were sent, wait and were dropped, the bytes sent, and trouble.
+
+        ``bytes`` counts 1,000 bytes for each request besides its object.  ``trouble`` is the last failure as
+        ``code: sentence``, empty after a success.
+        """
+        return {
+            "sent": self._sent,
+            "bytes": self._sent_bytes,
+            "waiting": len(self._waiting),
+            "dropped": self._dropped,
+            "trouble": self._trouble,
+        }
+
+    async def wait_empty(self) -> None:
+        """Wait until no object waits."""
+        await self._is_empty.wait()
+
+    async def run(self) -> None:
+        """Upload objects until cancelled; a failed upload is repeated after a pause, unless it is refused."""
+        pause_s = _FIRST_PAUSE_S
+        while True:
+            # 1. Wait for an object, for the rate limit, and until nothing more urgent waits.
+            while not self._waiting:
+                self._is_empty.set()
+                self._has_object.clear()
+                await self._has_object.wait()
+            data = self._waiting[0]
+            await asyncio.sleep(self._rate_limit.spend(len(data) + _REQUEST_BYTES, self._clock()))
+            with contextlib.suppress(asyncio.TimeoutError):
+                await asyncio.wait_for(self._wait_quiet(), _MAX_QUIET_WAIT_S)
+            # 2. Store the object.
+            try:
+                await self._store(data)
+            except Exception as error:  # noqa: BLE001  the function may belong to the user's program
+                # 3. Drop what is refused, and pause.
+                if not isinstance(error, RsePfError):
+                    self._callbacks.report("store", error)
+                    error = InternalError(
+                        f"store raised {type(error).__name__}", hint="read its traceback in the log"
+                    )
+                self._trouble = f"{error.code}: {error.message}"
+                if isinstance(error, _OBJECT_REFUSALS):
+                    self._dropped += self._remove_if_first(data)
+                elif isinstance(error, _ALL_REFUSALS):
+                    self._dropped += len(self._waiting)
+                    self._waiting.clear()
+                    self._waiting_bytes = 0
+                    self._is_empty.set()
+                await asyncio.sleep(pause_s)
+                pause_s = min(2 * pause_s, _MAX_PAUSE_S)
+            else:
+                self._sent += self._remove_if_first(data)
+                self._sent_bytes += len(data) + _REQUEST_BYTES
+                self._trouble, pause_s = "", _FIRST_PAUSE_S
+
+    def _remove_if_first(self, data: bytes) -> bool:
+        """Remove the oldest object if it is *data*; return False if `add` dropped *data* in the meantime."""
+        is_first = bool(self._waiting) and self._waiting[0] is data
+        if is_first:
+            self._waiting.popleft()
+            self._waiting_bytes -= len(data)
+        return is_first
+
+
+def encode_keyframe_points(frame: Frame, features: Features, max_points: int) -> bytes | None:
+    """Choose and encode at most *max_points* coloured points of a keyframe; return None if it has none.
+
+    Of a depth image these are pixels on a regular grid that do not lie on depth edges, 0.3 to 3.5 m away; of
+    a stereo pair the features whose depth has a standard deviation of at most 5 %.  Points are thinned to one
+    in each voxel of 1 cm.
+    """
+    # 1. Choose pixels with a trusted depth.
+    if frame.stereo is None:
+        pixels = _choose_grid_pixels(frame, max_points)
+        depths_m = frame.depth_m[pixels[:, 1], pixels[:, 0]].astype(np.float64)
+    else:
+        rows = certain_rows(frame, features)
+        last_pixel = np.array([frame.camera.width, frame.camera.height]) - 1
+        pixels = np.clip(np.rint(features.pixels[rows]).astype(np.int64), 0, last_pixel)
+        depths_m = features.points_camera[rows, 2].astype(np.float64)
+    # 2. Keep the first point in each voxel.
+    points_camera = frame.camera.back_project(pixels.astype(np.float64), depths_m)
+    _, first_in_voxel = np.unique(voxel_keys(points_camera, _VOXEL_M), axis=0, return_index=True)
+    chosen = np.sort(first_in_voxel)[:max_points]
+    if not len(chosen):
+        return None
+    # 3. Encode pixels, depths and colours.
+    pixels = pixels[chosen]
+    return encode_points(pixels, depths_m[chosen], frame.rgb[pixels[:, 1], pixels[:, 0]], frame.camera)
+
+
+def _choose_grid_pixels(frame: Frame, max_points: int) -> _Pixels:
+    """Return ``(n, 2)`` columns and rows of grid pixels whose depth is in range and not on a depth edge.
+
+    The step of the grid is the same along columns and rows, at least 2 px, and large enough that the grid has
+    about *max_points* pixels.
+    """
+    depth = frame.depth_m
+    height, width = depth.shape
+    step = max(2, math.ceil(math.sqrt(height * width / max_points)))
+    grid_rows, grid_columns = np.mgrid[step // 2 : height - 1 : step, step // 2 : width - 1 : step]
+    v, u = grid_rows.ravel(), grid_columns.ravel()
+    z = depth[v, u]
+    with np.errstate(invalid="ignore"):
+        is_usable = (z >= _MIN_POINT_DEPTH_M) & (z <= _MAX_POINT_DEPTH_M)
+        for dv, du in ((0, 1), (0, -1), (1, 0), (-1, 0)):
+            is_usable &= np.abs(depth[v + dv, u + du] - z) <= _MAX_DEPTH_STEP * z
+    pixels: _Pixels = np.column_stack((u, v))[is_usable].astype(np.int64)
+    return pixels
+
+
+def _encode_jpeg(frame: Frame) -> bytes | None:
+    """Encode the image of a frame as JPEG; return None if it is too large for one request (256 KiB)."""
     cv2 = load_opencv()
-    image = np.ascontiguousarray(frame.rgb[:, :, ::-1])
-    is_encoded, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
+    bgr = np.ascontiguousarray(frame.rgb[:, :, ::-1])
+    is_encoded, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
     return data.tobytes() if is_encoded and data.nbytes <= MAX_SINGLE_PUT_BYTES else None
 
 
-def _reference(data: bytes | None) -> ObjectReference | None:
+def _make_reference(data: bytes | None) -> ObjectReference | None:
     return None if data is None else ObjectReference(hashlib.sha256(data).hexdigest(), len(data))

@@ -1,4 +1,4 @@
-"""A live map for programs without asyncio: the mapper runs in the event loop of a blocking robot."""
+"""Use a live map in a program without asyncio: the mapper runs in the event loop of a blocking robot."""
 
 from __future__ import annotations
 
@@ -8,28 +8,33 @@ from typing import Any
 
 from client_sdk.frontend import Frame, TrackedFrame
 from client_sdk.live.alignments import Correction
-from client_sdk.live.mapper import LiveMapper
+from client_sdk.live.live_mapper import LiveMapper
 
 __all__ = ["BlockingLiveMapper"]
 
 
 class BlockingLiveMapper:
-    """A `LiveMapper` whose methods block; what it knows of the map is in `mapper`."""
+    """Wrap a `LiveMapper` in methods that block; its properties are read from ``mapper``."""
 
     def __init__(self, mapper: LiveMapper, wait: Callable[[Coroutine[Any, Any, Any]], Any]) -> None:
-        """Wrap *mapper*; *wait* runs a coroutine to its end in the event loop of its robot."""
+        """Wrap a mapper.
+
+        Args:
+            mapper: The live mapper to use; its properties stay available as ``mapper``.
+            wait: Runs a coroutine in the event loop of the mapper's robot, and returns its result.
+        """
         self.mapper = mapper
         self._wait = wait
 
     def __enter__(self) -> BlockingLiveMapper:
-        """Join the map; see `LiveMapper.__aenter__`."""
+        """Join the map; raises as `LiveMapper.__aenter__` does."""
         self._wait(self.mapper.__aenter__())
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Send what waits, and leave the map."""
+        """Send the queued keyframes, for `LiveOptions.leave_s` at most, and leave the map."""
         self._wait(self.mapper.__aexit__(kind, error, trace))
 
     def track(self, frame: Frame) -> TrackedFrame:
@@ -38,11 +43,11 @@ class BlockingLiveMapper:
         return tracked
 
     def corrections(self) -> Iterator[Correction]:
-        """Yield each change of an alignment, and wait for the next; see `LiveMapper.corrections`."""
-        changes = self.mapper.corrections()
+        """Yield each change of an alignment, waiting for the next; see `LiveMapper.corrections`."""
+        corrections = self.mapper.corrections()
 
-        async def following() -> Correction | None:
-            return await anext(changes, None)
+        async def next_correction() -> Correction | None:
+            return await anext(corrections, None)
 
-        while (correction := self._wait(following())) is not None:
+        while (correction := self._wait(next_correction())) is not None:
             yield correction

@@ -1,40 +1,45 @@
-"""How a robot takes part in a live map: which keyframes it makes, and how it sends them."""
+"""Options of a robot in a live map: which keyframes it makes, and at which rates it sends them."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 from rse_pf.errors import UsageError
 from rse_pf.slam.keyframe_points import MAX_POINTS
 
 __all__ = ["LiveOptions"]
 
-_JSON_FEATURES = 650
-"""Plain JSON has bytes in base64, a third longer: 650 features and the rest of the message are 34 kB."""
+_MAX_JSON_FEATURES = 650
+"""Features of a keyframe that is sent with the codec ``json``, which writes bytes in base64, a third longer:
+650 features and the rest of the message take 34 kB, as 870 do with ``zlib`` and ``bin``."""
+_MAY_BE_ZERO = ("points", "leave_s")  # options for which 0 is a value: no points, and leaving at once
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LiveOptions:
-    """How a robot takes part in a live map.
+    """Options of a robot in a live map.
 
     Attributes:
-        keyframe_m: A frame farther from the last keyframe becomes one,
-        keyframe_deg: or turned further; the tracker's own keyframes are apart from these.  A camera without
-            depth sends those of its tracker.
-        features: At most so many features of a keyframe are sent; 870 take 34 kB with zlib and bin, and
-            `sent_with` lowers them for json.
-        points: At most so many coloured points of a keyframe are sent for the cloud of the map, fewer where
-            keyframes follow each other fast; 0 sends none.
-        points_bytes_per_s: Share of the link that points may take.
-        images: Whether the image of a keyframe is sent, too, where the operator allows it (``live.images``).
-        images_bytes_per_s: Share of the link that images may take; a keyframe beyond it has none.
-        segment_after: A new segment begins after so many frames that show enough and no place that the robot
-            knows; a covered lens does not count.
-        relocalise_s: While a segment is not aligned, the robot asks for its place so often at most; after six
-            answers without any place, a quarter as often, since the map tries each of its keyframes, too.
-        bytes_per_s: Share of the link that keyframes may take.
-        deadline_s: Of one attempt to send a keyframe, and of a relocalisation.
-        leave_s: How long leaving waits until the map has every keyframe.
+        keyframe_m: A frame becomes a keyframe if it is farther than this from the last keyframe, in metres.
+            A camera without depth sends the keyframes of its tracker instead.
+        keyframe_deg: A frame becomes a keyframe if it is rotated by more than this against the last one.
+        features: Limit of the features of a keyframe that are sent: 870 take 34 kB with ``zlib`` and
+            ``bin``; `sent_with` lowers it for ``json``.
+        points: Limit of the coloured points of a keyframe that are sent for the cloud of the map; there are
+            fewer where keyframes follow each other fast.  0 sends none.
+        points_bytes_per_s: Rate limit of the points.
+        images: Whether the images of keyframes are sent, where the operator allows it (``live.images``).
+        images_bytes_per_s: Rate limit of the images; a keyframe beyond it has no image.
+        segment_after: Lost frames in a row after which a new segment begins.  Only frames with enough
+            features count, so a covered lens begins no segment.
+        relocalise_s: Shortest time between two relocalisations of a segment that is not aligned; it becomes
+            four times as long after six replies in a row that found no place in the map.
+        bytes_per_s: Rate limit of the keyframes.
+        deadline_s: Deadline of one attempt to send a keyframe, and of one relocalisation.
+        leave_s: Longest time for which leaving waits until the map has acknowledged every keyframe.
+
+    Raises:
+        UsageError: A number is not above 0 (``points``, ``leave_s``: below 0), or *points* is above 16,000.
     """
 
     keyframe_m: float = 0.1
@@ -51,16 +56,14 @@ class LiveOptions:
     leave_s: float = 5.0
 
     def __post_init__(self) -> None:
-        numbers = (
-            self.keyframe_m, self.keyframe_deg, self.features, self.segment_after, self.relocalise_s,
-            self.bytes_per_s, self.deadline_s, self.points_bytes_per_s,
-            self.images_bytes_per_s,
-        )  # fmt: skip
-        if min(numbers) <= 0 or min(self.leave_s, self.points) < 0:
-            raise UsageError("a number of LiveOptions is not above 0", hint="leave it out for the default")
+        for name in (field.name for field in fields(self) if field.name != "images"):
+            value = getattr(self, name)
+            if value < 0 or (value == 0 and name not in _MAY_BE_ZERO):
+                limit = "at least 0" if name in _MAY_BE_ZERO else "above 0"
+                raise UsageError(f"{name} = {value:g} is not {limit}", hint="leave it out for the default")
         if self.points > MAX_POINTS:
             raise UsageError(f"points = {self.points} is above {MAX_POINTS}", hint="12500 are enough")
 
     def sent_with(self, codec: str) -> LiveOptions:
-        """Return these options with as many features as fit into 34 kB in *codec* of the connection."""
-        return replace(self, features=min(self.features, _JSON_FEATURES)) if codec == "json" else self
+        """Return these options with as many features as fit into 34 kB in the codec of the connection."""
+        return replace(self, features=min(self.features, _MAX_JSON_FEATURES)) if codec == "json" else self

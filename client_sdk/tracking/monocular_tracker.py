@@ -441,7 +441,7 @@ class MonocularTracker:
         if T is not None:
             return inverse(T)
         T_last_now = inverse(self._motion)
-        turned = None if inertial is None else inertial.turn(self._last_s, self._frame.timestamp_s)
+        turned = None if inertial is None else inertial.camera_rotation(self._last_s, self._frame.timestamp_s)
         if turned is not None:
             T_last_now[:3, :3] = turned
         expected: Array = inverse(T_last_now) @ last.T_camera_world

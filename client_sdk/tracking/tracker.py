@@ -356,7 +356,7 @@ class Tracker:
         if T is not None:
             return T
         T_last_now = self._motion.copy()
-        turned = None if inertial is None else inertial.turn(self._last_s, self._frame.timestamp_s)
+        turned = None if inertial is None else inertial.camera_rotation(self._last_s, self._frame.timestamp_s)
         if turned is not None:
             T_last_now[:3, :3] = turned
         return _rotation_made(self._T_last @ T_last_now)

@@ -51,7 +51,7 @@ class LiveRecorder:
                 "T_odom": _numbers(done.T_world_camera),
                 "T_map": _numbers(done.T_map_camera),
                 "by": self._mapper.aligned_by,
-                "owner": self._mapper.owner,
+                "owner": self._mapper.map_server,
                 "state": self._mapper.state,
                 "waiting": self._mapper.keyframes_waiting,
             }

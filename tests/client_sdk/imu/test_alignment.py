@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from client_sdk.imu.alignment import Alignment, align
+from client_sdk.imu.alignment import ImuAlignment, align_imu
 from client_sdk.imu.history import ImuHistory
 from client_sdk.imu.preintegration import preintegrate
 from client_sdk.imu.samples import ImuModel, ImuSamples
@@ -28,7 +28,7 @@ DEPTH_M, STEP_S = 3.0, 0.2
 class Aligned:
     """What was found in a drive, and the truth of it, in the world of the poses."""
 
-    found: Alignment | None
+    found: ImuAlignment | None
     scale: float
     down: Array
     bias: Array
@@ -41,7 +41,7 @@ class Aligned:
     @property
     def gravity_error_deg(self) -> float:
         assert self.found is not None
-        return float(np.degrees(np.arccos(min(1.0, self.found.gravity @ self.down / 9.81))))
+        return float(np.degrees(np.arccos(min(1.0, self.found.gravity_m_s2 @ self.down / 9.81))))
 
 
 def aligned(seed: int, duration_s: float, *, noise: float = 1.0, motion: Motion | None = None) -> Aligned:
@@ -64,7 +64,7 @@ def aligned(seed: int, duration_s: float, *, noise: float = 1.0, motion: Motion 
         motions.append(preintegrate(part, np.zeros(3), np.zeros(3)))
     last = int(np.searchsorted(imu.timestamps_s, stamps[-2]))
     return Aligned(
-        found=align(seen, motions, MODEL, (POSE_NOISE, POSE_NOISE * DEPTH_M / scale)),
+        found=align_imu(seen, motions, MODEL, (POSE_NOISE, POSE_NOISE * DEPTH_M / scale)),
         scale=scale, down=turned @ np.array([0.0, 0.0, -1.0]),
         bias=np.concatenate([imu.bias_gyro[last], imu.bias_accel[last]]),
     )  # fmt: skip
@@ -84,8 +84,8 @@ def test_with_noise_all_is_found_within_its_deviations(seed):
     assert drive.found is not None
     assert drive.scale_error < min(0.02, 3.5 * drive.found.scale_deviation)
     assert drive.gravity_error_deg < 0.5
-    assert np.radians(drive.gravity_error_deg) < 3.5 * drive.found.gravity_deviation
-    own = np.concatenate([drive.found.bias_gyro[-1], drive.found.bias_accel[-1]])
+    assert np.radians(drive.gravity_error_deg) < 3.5 * drive.found.gravity_deviation_rad
+    own = np.concatenate([drive.found.gyro_bias_rad_s[-1], drive.found.accel_bias_m_s2[-1]])
     assert (np.abs(own - drive.bias) < 3.5 * np.sqrt(np.diag(drive.found.bias_covariance))).all()
     assert 0.8 < drive.found.misfit < 1.25
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from client_sdk.imu.inertial import ImuScale, Inertial, upright
+from client_sdk.imu.estimator import ImuEstimator, ImuScale, level_start_pose
 from client_sdk.imu.samples import ImuModel, ImuSamples
 from rse_pf.geometry import Array, Camera, exp_se3, exp_so3, inverse, rotation_angle_deg
 from rse_pf.slam.inertial import upright_rotation
@@ -28,7 +28,7 @@ SEED = 6
 class Driven:
     """What an IMU told beside tracked poses, frame by frame; ``scales`` holds None while none is known."""
 
-    inertial: Inertial
+    inertial: ImuEstimator
     drive: InertialDrive
     imu: SimulatedImu
     scales: list[float | None]
@@ -59,7 +59,7 @@ def driven(
     pixel = 0.3 / CAMERA.fx
     T[:, :3, :3] = T[:, :3, :3] @ exp_so3(pixel * rng.normal(size=(len(T), 3)))
     T[:, :3, 3] = (T[:, :3, 3] + pixel * DEPTH_M * rng.normal(size=(len(T), 3))) / UNIT_M
-    inertial = Inertial(model, CAMERA)
+    inertial = ImuEstimator(model, CAMERA)
     source, scales = ImuScale(inertial), []
     for row, stamp in enumerate(stamps.tolist()):
         inertial.add(change(imu.between(max(-0.2, stamp - 1.0 / RATE_HZ), stamp)))
@@ -74,8 +74,8 @@ def test_metres_come_once_they_are_known_and_improve():
     assert made.inertial.trouble == ""
     assert made.scales[0] is None
     assert made.scale_error < 0.01
-    assert made.inertial.gravity is not None
-    assert made.inertial.gravity[2] / 9.81 == pytest.approx(-1.0, abs=1e-4)
+    assert made.inertial.gravity_m_s2 is not None
+    assert made.inertial.gravity_m_s2[2] / 9.81 == pytest.approx(-1.0, abs=1e-4)
 
 
 def test_a_drone_at_rest_waits_for_its_metres():
@@ -90,7 +90,7 @@ def test_the_gyroscope_tells_how_the_camera_turns():
     made = driven()
     T = made.drive.T_world_camera(np.array([7.5, 7.55]))
 
-    turned = made.inertial.turn(7.5, 7.55)
+    turned = made.inertial.camera_rotation(7.5, 7.55)
 
     assert turned is not None
     assert rotation_angle_deg((inverse(T[0]) @ T[1])[:3, :3]) > 0.5
@@ -150,7 +150,7 @@ def test_a_bad_imu_is_named_in_one_line_and_not_used(change, line):
     assert "\n" not in made.inertial.trouble
     assert re.search(line, made.inertial.trouble), made.inertial.trouble
     assert all(scale is None for scale in made.scales)
-    assert made.inertial.turn(1.0, 1.05) is None
+    assert made.inertial.camera_rotation(1.0, 1.05) is None
 
 
 @pytest.mark.parametrize("factor", [0.9, 1.1])
@@ -186,7 +186,7 @@ def test_a_transposed_mount_is_named():
 
 
 def test_the_world_of_a_level_camera_has_z_up_and_x_ahead():
-    T = upright(np.array([0.0, 1.0, 0.0]))
+    T = level_start_pose(np.array([0.0, 1.0, 0.0]))
 
     np.testing.assert_allclose(T[:3, 2], [1.0, 0.0, 0.0], atol=1e-12)
     np.testing.assert_allclose(T[:3, 1], [0.0, 0.0, -1.0], atol=1e-12)

@@ -37,16 +37,22 @@ def test_it_agrees_with_the_exact_motion(interval):
     made = preintegrate(samples(*interval, is_exact=True), np.zeros(3), np.zeros(3))
 
     assert made.duration_s == pytest.approx(dt)
-    np.testing.assert_allclose(made.rotation, R[0].T @ R[1], atol=3e-5)
-    np.testing.assert_allclose(made.velocity, R[0].T @ (v[1] - v[0] - GRAVITY * dt), atol=3e-4)
+    np.testing.assert_allclose(made.delta_rotation, R[0].T @ R[1], atol=3e-5)
+    np.testing.assert_allclose(made.delta_velocity_m_s, R[0].T @ (v[1] - v[0] - GRAVITY * dt), atol=3e-4)
     position = R[0].T @ (p[1] - p[0] - v[0] * dt - 0.5 * GRAVITY * dt**2)
-    np.testing.assert_allclose(made.position, position, atol=3e-4)
+    np.testing.assert_allclose(made.delta_position_m, position, atol=3e-4)
 
 
 def errors_between(made, other):
     """The error of *other* beside *made*: rotation vector on the right, velocity, position."""
-    turned = log_so3((made.rotation.T @ other.rotation)[None])[0]
-    return np.concatenate([turned, other.velocity - made.velocity, other.position - made.position])
+    turned = log_so3((made.delta_rotation.T @ other.delta_rotation)[None])[0]
+    return np.concatenate(
+        [
+            turned,
+            other.delta_velocity_m_s - made.delta_velocity_m_s,
+            other.delta_position_m - made.delta_position_m,
+        ]
+    )
 
 
 def test_the_jacobian_is_that_of_numeric_differentiation():
@@ -59,7 +65,7 @@ def test_the_jacobian_is_that_of_numeric_differentiation():
         more = preintegrate(measured, BIAS_GYRO + moved[:3], BIAS_ACCEL + moved[3:])
         less = preintegrate(measured, BIAS_GYRO - moved[:3], BIAS_ACCEL - moved[3:])
         numeric = (errors_between(made, more) - errors_between(made, less)) / (2 * step)
-        np.testing.assert_allclose(made.jacobian[:, column], numeric, atol=1e-6)
+        np.testing.assert_allclose(made.bias_jacobian[:, column], numeric, atol=1e-6)
 
 
 def test_the_covariance_is_that_of_many_noisy_measurements():

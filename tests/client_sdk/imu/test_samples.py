@@ -27,7 +27,7 @@ def samples(n: int) -> ImuSamples:
         ({"T_imu_camera": np.array([[1, 0, 0, 11.0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])}, "10 m"),
         ({"gyro_noise": 0.0}, "gyro_noise = 0"),
         ({"accel_walk": float("inf")}, "accel_walk = inf"),
-        ({"rate_hz": 1.0}, "1 Hz"),
+        ({"rate_hz": 1.0}, "rate_hz = 1 "),
         ({"max_accel": -1.0}, "max_accel"),
     ],
 )

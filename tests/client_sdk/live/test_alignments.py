@@ -17,15 +17,15 @@ FIRST, SECOND = exp_se3([1.0, 0, 0, 0, 0, 0]), exp_se3([1.1, 0, 0, 0, 0, 0])
 @pytest.fixture
 def known() -> Alignments:
     alignments = Alignments()
-    alignments.know_myself("me", 3)
+    alignments.identify_robot("me", 3)
     return alignments
 
 
 def test_only_a_change_of_the_alignment_is_a_correction(known: Alignments) -> None:
-    first = known.updated("alignment/me", alignment("me", FIRST, segment=3))
-    again = known.updated("alignment/me", alignment("me", FIRST, segment=3))
-    second = known.updated("alignment/me", alignment("me", SECOND, segment=3))
-    lost = known.updated("alignment/me", alignment("me", None, segment=3, reason="a link was removed"))
+    first = known.apply_update("alignment/me", alignment("me", FIRST, segment=3))
+    again = known.apply_update("alignment/me", alignment("me", FIRST, segment=3))
+    second = known.apply_update("alignment/me", alignment("me", SECOND, segment=3))
+    lost = known.apply_update("alignment/me", alignment("me", None, segment=3, reason="a link was removed"))
 
     assert first is not None
     assert again is None
@@ -34,45 +34,47 @@ def test_only_a_change_of_the_alignment_is_a_correction(known: Alignments) -> No
     np.testing.assert_array_equal(second.after, SECOND)
     assert lost is not None
     assert lost.after is None
-    assert known.of(0).reason == "a link was removed"
+    assert known.get(0).reason == "a link was removed"
 
 
 def test_a_relocalisation_never_replaces_what_the_map_found(known: Alignments) -> None:
-    known.updated("alignment/me", alignment("me", FIRST, segment=3))
+    known.apply_update("alignment/me", alignment("me", FIRST, segment=3))
 
-    late = known.relocalised(0, np.eye(4), RelocaliseReply(verdict="ok", T_map_camera=SECOND.ravel()))
+    late = known.apply_relocalisation(
+        0, np.eye(4), RelocaliseReply(verdict="ok", T_map_camera=SECOND.ravel())
+    )
 
     assert late is None
-    np.testing.assert_array_equal(known.of(0).T_map_odom, FIRST)
+    np.testing.assert_array_equal(known.get(0).T_map_odom, FIRST)
 
 
 def test_segments_of_an_earlier_run_and_of_others_are_not_mine(known: Alignments) -> None:
-    assert known.updated("alignment/me", alignment("me", FIRST, segment=2)) is None
-    assert known.updated("alignment/other", alignment("other", FIRST, segment=3)) is None
-    assert known.of(0).by == "nothing"
+    assert known.apply_update("alignment/me", alignment("me", FIRST, segment=2)) is None
+    assert known.apply_update("alignment/other", alignment("other", FIRST, segment=3)) is None
+    assert known.get(0).by == "nothing"
 
 
 def test_a_damaged_pose_changes_nothing(known: Alignments) -> None:
     damaged = {**alignment("me", FIRST, segment=3), "T_map_odom": [1.0, 2.0]}
 
-    with pytest.raises(BadMessage, match="16 finite numbers"):
-        known.updated("alignment/me", damaged)
+    with pytest.raises(BadMessage, match="2 numbers, not 16 finite"):
+        known.apply_update("alignment/me", damaged)
 
-    assert known.of(0).by == "nothing"
+    assert known.get(0).by == "nothing"
 
 
 def test_a_relocalisation_with_a_scale_places_the_keyframe_where_it_says(known: Alignments) -> None:
     pose = exp_se3([2.0, 1.0, 0, 0, 0, 0.4])
     reply = RelocaliseReply(verdict="ok", T_map_camera=SECOND.ravel(), scale=0.25)
 
-    known.relocalised(0, pose, reply)
+    known.apply_relocalisation(0, pose, reply)
 
-    np.testing.assert_allclose(known.of(0).in_map(pose), SECOND, atol=1e-12)
+    np.testing.assert_allclose(known.get(0).pose_in_map(pose), SECOND, atol=1e-12)
 
 
 @pytest.mark.parametrize("scale", [0.0, -1.0, float("nan"), float("inf")])
 def test_an_absurd_scale_changes_nothing(known: Alignments, scale: float) -> None:
     with pytest.raises(BadMessage, match="a scale"):
-        known.updated("alignment/me", {**alignment("me", FIRST, segment=3), "scale": scale})
+        known.apply_update("alignment/me", {**alignment("me", FIRST, segment=3), "scale": scale})
 
-    assert known.of(0).by == "nothing"
+    assert known.get(0).by == "nothing"

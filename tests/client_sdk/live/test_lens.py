@@ -11,7 +11,7 @@ import pytest
 
 from client_sdk.frontend import Frame, TrackedFrame
 from client_sdk.live import LiveMapper, LiveOptions
-from client_sdk.live.keyframe_chain import KeyframeChain
+from client_sdk.live.monocular_odometry import MonocularOdometry
 from client_sdk.simulator.camera import add_image_noise
 from client_sdk.tracking.monocular_tracker import SeenKeyframe
 from rse_pf.errors import UsageError
@@ -46,7 +46,7 @@ async def test_settled_keyframes_of_one_lens_are_sent_in_one_unit(robot: FakeLiv
     async with live_map(robot) as mapper:
         done = await drive(mapper, range(24))
         await robot.until(lambda: mapper.keyframes_waiting == 0)
-        tracker = mapper._mapper.landmark_tracker
+        tracker = mapper._mapper.monocular_tracker
         assert tracker is not None
         assert len(robot.kept) == mapper.keyframes == tracker.segment_keyframes - 2 > 5
 
@@ -109,7 +109,7 @@ async def test_a_first_frame_without_the_depth_that_was_promised_is_refused(robo
 async def test_a_tracker_that_changes_its_unit_changes_none_that_was_sent(robot: FakeLiveRobot) -> None:
     async with live_map(robot) as mapper:
         done = await drive(mapper, range(14))
-        tracker = mapper._mapper.landmark_tracker
+        tracker = mapper._mapper.monocular_tracker
         assert tracker is not None
         tracker.rescale(0.3)  # as an IMU does
         done += await drive(mapper, range(14, 18))
@@ -203,9 +203,9 @@ def at(x: float) -> Array:
     return exp_se3([x, 0.0, 0.0, 0.0, 0.1 * x, 0.0])
 
 
-def test_a_chain_keeps_its_unit_and_is_not_torn_by_adjustments() -> None:
+def test_an_odometry_keeps_its_unit_and_its_sent_poses_through_adjustments() -> None:
     tracker: Any = MovingTracker()
-    chain, sent = KeyframeChain(tracker), []
+    odometry, sent = MonocularOdometry(tracker), []
     for number in range(8):
         tracker.poses.append(scaled(at(number), tracker.unit))
         if number == 3:
@@ -215,10 +215,10 @@ def test_a_chain_keeps_its_unit_and_is_not_torn_by_adjustments() -> None:
             moved = tracker.poses
         if number > 5:
             tracker.poses[-1] = exp_se3([0.0, 0.3, 0.0, 0.0, 0.0, 0.4]) @ tracker.poses[-1]
-        assert not chain.follow()
-        sent += chain.settled()
+        assert not odometry.start_if_broken()
+        sent += odometry.take_settled()
         assert len(sent) == max(0, number - 1)  # two newer ones exist
-        np.testing.assert_allclose(chain.pose(tracker.poses[-1]), at(number), atol=1e-9)
+        np.testing.assert_allclose(odometry.pose_in_odometry(tracker.poses[-1]), at(number), atol=1e-9)
 
     assert moved is not None
     for number, (seen, T_odom_camera) in enumerate(sent):
@@ -229,16 +229,16 @@ def test_a_chain_keeps_its_unit_and_is_not_torn_by_adjustments() -> None:
 @pytest.mark.parametrize(("scale", "begins"), [(1.02, False), (1 / 1.02, False), (1.05, True), (0.9, True)])
 def test_a_loop_that_changes_the_unit_ends_an_odometry(scale: float, begins: bool) -> None:
     tracker: Any = MovingTracker()
-    chain = KeyframeChain(tracker)
+    odometry = MonocularOdometry(tracker)
     tracker.poses = [at(number) for number in range(5)]
-    assert not chain.follow()
-    sent = list(chain.settled())
+    assert not odometry.start_if_broken()
+    sent = list(odometry.take_settled())
     tracker.rescale(scale)
     tracker.loop_scales.append(scale)
 
-    assert chain.follow() == begins
-    assert not list(chain.settled())
-    newest = chain.pose(tracker.poses[-1])
+    assert odometry.start_if_broken() == begins
+    assert not list(odometry.take_settled())
+    newest = odometry.pose_in_odometry(tracker.poses[-1])
     moved = pose_difference(newest, at(4))[0]
     assert math.isclose(moved, 4.0 * abs(scale - 1.0) if begins else 0.0, rel_tol=0.01, abs_tol=1e-9)
     assert len(sent) == 3
@@ -246,26 +246,26 @@ def test_a_loop_that_changes_the_unit_ends_an_odometry(scale: float, begins: boo
 
 def test_a_segment_that_is_known_goes_on_with_its_next_keyframes() -> None:
     tracker: Any = MovingTracker()
-    chain = KeyframeChain(tracker)
+    odometry = MonocularOdometry(tracker)
     old = tracker.poses = [at(number) for number in range(5)]
-    assert not chain.follow()
-    assert len(list(chain.settled())) == 3
+    assert not odometry.start_if_broken()
+    assert len(list(odometry.take_settled())) == 3
     tracker.segment, tracker.poses, tracker.unit = 1, [at(0.0), at(1.0), at(2.0)], 7.0
-    assert chain.follow()
-    [(first, T_odom_camera)] = chain.settled()
+    assert odometry.start_if_broken()
+    [(first, T_odom_camera)] = odometry.take_settled()
     assert first.timestamp_s == 0.0
     np.testing.assert_allclose(first.depths, [14.0, np.nan])  # it begins in the unit of now
     np.testing.assert_allclose(T_odom_camera, at(0.0))
-    np.testing.assert_allclose(chain.pose(at(2.0)), at(2.0), atol=1e-9)
-    assert not chain.follow()
+    np.testing.assert_allclose(odometry.pose_in_odometry(at(2.0)), at(2.0), atol=1e-9)
+    assert not odometry.start_if_broken()
 
     tracker.segment, tracker.poses, tracker.unit = 0, old, 1.0
-    assert chain.follow()
-    assert not list(chain.settled())
+    assert odometry.start_if_broken()
+    assert not list(odometry.take_settled())
     tracker.poses += [at(5.0), at(6.0), at(7.0)]
-    assert [seen.timestamp_s for seen, _ in chain.settled()] == [5.0]
+    assert [seen.timestamp_s for seen, _ in odometry.take_settled()] == [5.0]
     tracker.joins.append(None)
-    assert chain.follow()
+    assert odometry.start_if_broken()
 
 
 async def test_one_lens_gets_its_metres_within_3_percent_from_a_robot_with_depth() -> None:

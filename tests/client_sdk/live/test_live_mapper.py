@@ -16,8 +16,13 @@ from client_sdk import connect
 from client_sdk.commands.answer_types import PoseAnswer
 from client_sdk.frontend import Frame, FrontEndOptions, PoseQuery, TrackedFrame, extract
 from client_sdk.live import BlockingLiveMapper, Correction, LiveMapper, LiveOptions
-from client_sdk.live.sender import keyframe_request
-from client_sdk.live.waiting_keyframes import Base, WaitingKeyframe, WaitingKeyframes, rebase
+from client_sdk.live.keyframe_queue import (
+    KeyframeQueue,
+    NumberOffset,
+    QueuedKeyframe,
+    choose_number_offset,
+)
+from client_sdk.live.keyframe_sender import make_request
 from rse_pf.config import SessionSettings
 from rse_pf.errors import BadRequest, Busy, Forbidden, MissingExtra, UsageError
 from rse_pf.geometry import exp_se3
@@ -110,8 +115,8 @@ def test_the_largest_keyframe_takes_at_most_34_kb_in_every_codec(codec: str) -> 
         timestamp_s=1.8e9 + 0.123456789, T_odom_camera=exp_se3(rng.uniform(-3.0, 3.0, 6)), camera=CAMERA,
         features=features,
     )  # fmt: skip
-    waiting = WaitingKeyframe(10**6, 999, encode_keyframe(keyframe))
-    request = keyframe_request("warehouse", waiting, Base(10**6, 10))
+    queued = QueuedKeyframe(10**6, 999, encode_keyframe(keyframe))
+    request = make_request("warehouse", queued, NumberOffset(10**6, 10))
 
     message = make_codec(codec, SessionSettings()).encode(
         Command(id=10**6, service="live-keyframe", payload=request, deadline_ms=5000.0)
@@ -167,7 +172,7 @@ async def test_others_and_the_state_of_the_map_are_known(robot: FakeLiveRobot) -
 
         np.testing.assert_allclose(mapper.others["r2"].T_map_camera, T_MAP_ODOM)
         assert mapper.others["r3"].reason == "too few links"
-        assert (mapper.map_keyframes, mapper.version, mapper.owner) == (9, 12, "o")
+        assert (mapper.map_keyframes, mapper.version, mapper.map_server) == (9, 12, "o")
 
         robot.tell("pose/r2", {"robot": "r2"})  # damaged: told, and nothing else
         await robot.until(lambda: "bad-message" in mapper.trouble)
@@ -236,16 +241,16 @@ async def test_a_spool_in_use_is_refused_in_one_line_and_free_again_when_its_pro
 def test_the_spool_of_a_program_that_was_killed_is_free(tmp_path: Path) -> None:
     code = (
         "import os, sys; from pathlib import Path\n"
-        "from client_sdk.live.waiting_keyframes import WaitingKeyframes\n"
-        "WaitingKeyframes(Path(sys.argv[1])).open()\n"
+        "from client_sdk.live.keyframe_queue import KeyframeQueue\n"
+        "KeyframeQueue(Path(sys.argv[1])).open()\n"
         "os.kill(os.getpid(), 9)"
     )
     subprocess.run([sys.executable, "-c", code, str(tmp_path)], check=False)
     assert (tmp_path / ".lock").exists()
 
-    waiting = WaitingKeyframes(tmp_path)
-    waiting.open()
-    waiting.close()
+    queue = KeyframeQueue(tmp_path)
+    queue.open()
+    queue.close()
 
 
 async def test_keyframes_that_were_refused_are_counted_after_the_drive_too(
@@ -254,7 +259,7 @@ async def test_keyframes_that_were_refused_are_counted_after_the_drive_too(
     async with live_map(robot) as mapper:
         await drive(mapper, range(6))
         await robot.until(lambda: mapper.keyframes_waiting == 0)
-        mapper._sender.refused = 2
+        mapper._sender.refused_keyframes = 2
     assert mapper.report()["live"]["keyframes_refused"] == 2
 
 
@@ -372,15 +377,15 @@ async def test_a_robot_that_asks_in_vain_asks_more_rarely_until_its_next_segment
     robot.foreign_keyframes = 50
     async with live_map(robot) as mapper:
         for row in range(30):
-            if mapper._asked_in_vain == 6:
+            if mapper._relocaliser.verdicts["none"] == 6:
                 break
-            assert mapper._relocalise_pause_s() == QUICK.relocalise_s
+            assert mapper._relocaliser.pause_s == QUICK.relocalise_s
             await drive(mapper, range(row, row + 1))
-            asking = mapper._relocalising
-            await robot.until(lambda: asking is None or asking.done())  # noqa: B023
-        assert mapper._relocalise_pause_s() == 4 * QUICK.relocalise_s
+            task = mapper._relocaliser.task
+            await robot.until(lambda: task is None or task.done())  # noqa: B023
+        assert mapper._relocaliser.pause_s == 4 * QUICK.relocalise_s
         mapper._begin_segment()
-        assert mapper._relocalise_pause_s() == QUICK.relocalise_s
+        assert mapper._relocaliser.pause_s == QUICK.relocalise_s
 
 
 async def test_an_ambiguous_place_ends_a_relocalisation(robot: FakeLiveRobot) -> None:
@@ -464,27 +469,41 @@ async def test_a_map_that_is_not_joined_is_refused(robot: FakeLiveRobot) -> None
 
 
 def test_a_full_spool_drops_the_newest_and_a_damaged_one_is_told(tmp_path: Path) -> None:
-    waiting = WaitingKeyframes(tmp_path, max_bytes=10)
-    waiting.open()
-    assert waiting.next_index == 0
-    assert not len(waiting)
-    waiting.close()
+    queue = KeyframeQueue(tmp_path, max_bytes=10)
+    queue.open()
+    assert queue.next_index == 0
+    assert not len(queue)
+    queue.close()
     (tmp_path / "000000000000.keyframe").write_bytes(b"no keyframe")
     with pytest.raises(UsageError, match="cannot use the keyframes in"):
-        WaitingKeyframes(tmp_path).open()
+        KeyframeQueue(tmp_path).open()
 
 
 @pytest.mark.parametrize(
-    ("base", "wanted", "expected"),
+    ("current", "next_number", "unused_segment", "expected"),
     [
-        (None, Base(7, 2), (Base(3, 1), 0)),  # never asked before: index 4 of segment 1 becomes 7 of 2
-        (Base(0, 0), Base(4, 3), (Base(0, 0), 0)),  # as expected
-        (Base(0, 0), Base(6, 3), (Base(0, 0), 2)),  # two acknowledgements were lost
-        (Base(0, 0), Base(0, 0), (Base(-4, -1), 0)),  # the map began anew
-        (Base(0, 0), Base(10, 5), (Base(6, 4), 0)),  # more than this robot has sent
+        # never asked before: index 4 of segment 1 becomes keyframe 7 of segment 2
+        (None, 7, 2, (NumberOffset(3, 1), 0)),
+        # the map expects the oldest queued keyframe
+        (NumberOffset(0, 0), 4, 3, (NumberOffset(0, 0), 0)),
+        # two acknowledgements were lost
+        (NumberOffset(0, 0), 6, 3, (NumberOffset(0, 0), 2)),
+        # the map was started again
+        (NumberOffset(0, 0), 0, 0, (NumberOffset(-4, -1), 0)),
+        # the map has more keyframes than this robot has sent
+        (NumberOffset(0, 0), 10, 5, (NumberOffset(6, 4), 0)),
     ],
 )
 def test_numbers_follow_what_the_map_expects(
-    base: Base | None, wanted: Base, expected: tuple[Base, int]
+    current: NumberOffset | None, next_number: int, unused_segment: int, expected: tuple[NumberOffset, int]
 ) -> None:
-    assert rebase(base, Base(4, 1), 9, wanted) == expected
+    chosen = choose_number_offset(
+        current,
+        first_index=4,
+        first_segment=1,
+        next_index=9,
+        next_number=next_number,
+        unused_segment=unused_segment,
+    )
+
+    assert chosen == expected

@@ -12,7 +12,7 @@ import pytest
 from client_sdk.commands.answer_types import PoseAnswer
 from client_sdk.frontend import Frame, FrontEndOptions, PoseQuery, extract
 from client_sdk.live import LiveMapper, LiveOptions
-from client_sdk.live.keyframe_points import points_of
+from client_sdk.live.attachments import encode_keyframe_points
 from rse_pf.errors import ConnectError, Forbidden, UsageError
 from rse_pf.slam.keyframe import decode_keyframe
 from rse_pf.slam.keyframe_points import decode_points
@@ -51,7 +51,7 @@ def test_points_lie_on_surfaces_and_not_between_them_and_have_their_colours() ->
     frame = frame_at(3, depth=True)
     frame.depth_m[40:60, 100:120] = np.nan
 
-    data = points_of(frame, NO_FEATURES, 2_000)
+    data = encode_keyframe_points(frame, NO_FEATURES, 2_000)
 
     assert data is not None
     points, colours = decode_points(data, CAMERA)
@@ -67,7 +67,7 @@ def test_near_points_are_thinned_to_one_for_each_centimetre() -> None:
     frame = frame_at(0, depth=True)
     near = Frame(timestamp_s=0.0, rgb=frame.rgb, depth_m=np.full_like(frame.depth_m, 0.4), camera=CAMERA)
 
-    data = points_of(near, NO_FEATURES, 12_000)
+    data = encode_keyframe_points(near, NO_FEATURES, 12_000)
 
     assert data is not None
     points, _ = decode_points(data, CAMERA)
@@ -76,7 +76,7 @@ def test_near_points_are_thinned_to_one_for_each_centimetre() -> None:
 
 
 def test_a_frame_without_depth_has_no_points() -> None:
-    assert points_of(frame_at(0, depth=False), NO_FEATURES, 2_000) is None
+    assert encode_keyframe_points(frame_at(0, depth=False), NO_FEATURES, 2_000) is None
 
 
 async def test_each_keyframe_refers_to_points_that_the_robot_stores(robot: FakeLiveRobot) -> None:
@@ -111,7 +111,7 @@ async def test_points_wait_while_a_pose_is_asked_for(robot: FakeLiveRobot) -> No
         is_asked.clear()
         tracking = asyncio.ensure_future(mapper.track(frame_at(2, depth=True)))
         await is_asked.wait()
-        mapper._attachments._points.add(b"more")  # type: ignore[union-attr]
+        mapper._attachments._point_uploader.add(b"more")  # type: ignore[union-attr]
         for _ in range(200):
             await asyncio.sleep(0)
         assert len(objects.held) == 1

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from client_sdk.frontend import Frame, TrackedFrame
-from client_sdk.imu.inertial import Inertial
+from client_sdk.imu.estimator import ImuEstimator
 from client_sdk.imu.samples import ImuModel, ImuSamples
 from client_sdk.mapper import Mapper
 from rse_pf.geometry import Array, exp_se3, inverse
@@ -86,16 +86,16 @@ def test_frames_are_tracked_on_in_a_world_that_was_turned():
 @pytest.fixture
 def leaning_first(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let the first samples tell a false gravity, and the motion the true one after the fourth frame."""
-    monkeypatch.setattr(Inertial, "first_gravity", lambda inertial: np.array([0.0, 9.0, 4.0]))
-    monkeypatch.setattr(Inertial, "is_due", lambda inertial, timestamp_s: timestamp_s > 0.25)
-    monkeypatch.setattr(Inertial, "align", align_by_first_pose)
+    monkeypatch.setattr(ImuEstimator, "stationary_gravity", lambda imu: np.array([0.0, 9.0, 4.0]))
+    monkeypatch.setattr(ImuEstimator, "is_due", lambda imu, timestamp_s: timestamp_s > 0.25)
+    monkeypatch.setattr(ImuEstimator, "align", align_by_first_pose)
     monkeypatch.setattr(
-        Inertial, "gravity", property(lambda inertial: getattr(inertial, "found_gravity", None))
+        ImuEstimator, "gravity_m_s2", property(lambda imu: getattr(imu, "estimated_gravity", None))
     )
 
 
-def align_by_first_pose(inertial: Any, timestamps_s: Array, poses: Array, depth: float, **kind: bool) -> None:
-    inertial.found_gravity = 9.81 * poses[0, :3, :3] @ DOWN
+def align_by_first_pose(imu: Any, timestamps_s: Array, poses: Array, depth: float, **kind: bool) -> None:
+    imu.estimated_gravity = 9.81 * poses[0, :3, :3] @ DOWN
 
 
 @pytest.mark.usefixtures("leaning_first")

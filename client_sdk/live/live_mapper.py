@@ -1,0 +1,670 @@
+"""Track a camera and share its keyframes with other robots in one live map.
+
+`LiveMapper` tracks as `client_sdk.mapper.Mapper` does, sends keyframes in the background, and knows the pose
+of its odometry frame in the map.  `client_sdk.live` lists the way of a keyframe step by step.
+
+**Two poses.**  ``tracked.T_world_camera`` is the pose in the robot's odometry frame, which the map never
+moves or turns; control loops use this one.  ``tracked.T_map_camera`` is the pose in the map, None until the
+segment is aligned.
+
+**Corrections.**  Each change of an alignment is a `Correction`.  It is in `LiveMapper.corrections` before a
+pose uses it, and the first pose that uses it has ``corrected`` set.
+
+**Segments.**  After tracking was lost for `LiveOptions.segment_after` frames a new segment begins: its
+odometry frame continues at the last known pose, and has an alignment of its own.
+
+**A camera without depth** is tracked up to scale.  Its keyframes are sent in the unit of their segment, after
+they have settled.  The map finds the metric scale (`LiveMapper.metres_per_unit`), so that ``T_map_camera`` is
+in metres, while ``T_world_camera`` stays in the unit of the segment.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import time
+from collections import deque
+from collections.abc import AsyncIterator, Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+
+from client_sdk.commands.answer_types import PoseAnswer
+from client_sdk.frontend import Features, Frame, FrontEndOptions, PoseQuery, TrackedFrame
+from client_sdk.live.alignments import Alignments, Correction, CorrectionStream, OtherRobot
+from client_sdk.live.attachments import Attachments, EncodedAttachments, StoreObject
+from client_sdk.live.keyframe_queue import KeyframeQueue, NumberOffset, QueuedKeyframe
+from client_sdk.live.keyframe_sender import REFUSALS, KeyframeSender, LiveRobot, RobotInMap
+from client_sdk.live.monocular_odometry import MonocularOdometry
+from client_sdk.live.options import LiveOptions
+from client_sdk.live.relocaliser import Relocaliser
+from client_sdk.mapper import AskPose, Mapper
+from client_sdk.mapping import MapOptions, PointMap, Trajectory
+from client_sdk.slots import FeaturesFunction, LoopsFunction, MotionFunction
+from client_sdk.tracking.monocular_tracker import MonocularTracker, SeenKeyframe
+from client_sdk.tracking.segments import add_to_cloud
+from rse_pf.errors import BadMessage, BadRequest, RsePfError, UnsupportedProtocol, UsageError
+from rse_pf.geometry import Array, Camera, pose_difference
+from rse_pf.maps.descriptors import DescriptorKind
+from rse_pf.slam.keyframe import (
+    MAX_FEATURES,
+    SentKeyframe,
+    encode_keyframe,
+    make_features,
+    make_scaleless_features,
+    max_features,
+)
+from rse_pf.wire.live_map import RelocaliseReply, live_topic
+
+__all__ = ["KeyframeSent", "LiveMapper"]
+
+_JOIN_REFUSALS = (*REFUSALS, BadRequest, UnsupportedProtocol)
+"""Errors with which a live map refuses to be joined for good: another attempt would fail in the same way."""
+_RESUBSCRIBE_PAUSE_S = 1.0  # pause before the robot subscribes to the map's updates again after a failure
+_LEAVE_DEADLINE_S = 1.0  # deadline of the call that leaves the map, so that a lost connection delays no exit
+_NEVER = 1_000_000_000
+"""Lost frames after which the tracker begins a segment of its own: never, because `LiveMapper` must begin
+each segment and tell the map."""
+_MAX_SENT_RECORDS = 100_000  # times of acknowledged keyframes that are kept for measurements; a few MB
+
+
+@dataclass(frozen=True, slots=True)
+class KeyframeSent:
+    """Times of a keyframe that the map has acknowledged.
+
+    Attributes:
+        number: The map's number of the keyframe among those of this robot.
+        sent_s: Time of the successful attempt to send the keyframe, by the mapper's clock.
+        kept_s: Time of the acknowledgement, by the same clock.
+    """
+
+    number: int
+    sent_s: float
+    kept_s: float
+
+
+class LiveMapper:
+    """Track a camera and share its keyframes in a live map; made by `Robot.live_map`.
+
+    ::
+
+        async with robot.live_map("warehouse", camera=camera) as mapper:
+            async for frame in frames:
+                tracked = await mapper.track(frame)
+                show(tracked.T_map_camera, mapper.others)
+    """
+
+    def __init__(
+        self,
+        robot: LiveRobot,
+        name: str,
+        *,
+        ask: AskPose,
+        camera: Camera | None = None,
+        depth: bool | None = None,
+        spool: Path | None = None,
+        options: FrontEndOptions | None = None,
+        live: LiveOptions | None = None,
+        map_options: MapOptions | None = None,
+        T_world_start: Array | None = None,
+        features: FeaturesFunction | None = None,
+        motion: MotionFunction | None = None,
+        loops: LoopsFunction | None = None,
+        store: StoreObject | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """Describe the robot's part in a live map; ``async with`` joins the map.
+
+        Args:
+            robot: The robot that calls the services; it need not be connected yet.
+            name: Name of the map: small letters, digits and hyphens.
+            ask: Answers pose queries.
+            camera: Intrinsics; frames of another camera are refused.  None takes those of the first frame.
+            depth: Whether to use depth.  None: if the first frame has some, or is a stereo pair.  With True a
+                first frame without depth is refused.
+            spool: Folder for keyframes that the map has not acknowledged, for this robot alone; they survive
+                a restart of this program.  None keeps them in memory.
+            options: Options of the tracker.
+            live: Options of keyframes and of their sending.
+            map_options: Density of the robot's own cloud, to which its keyframes are added.
+            T_world_start: ``(4, 4)`` pose of the first camera in the odometry frame; None: the identity.
+            features: Function that finds the features of an image; None: ORB.  All robots of a map must use
+                the same.
+            motion: Function that predicts the pose of the next frame; None: constant velocity.
+            loops: Function that describes an image for the robot's own place recognition; other robots'
+                keyframes are recognised by their features.
+            store: Stores an object of this robot in the object store; None: the map gets no points and no
+                images of this robot.
+            clock: Monotonic time in seconds.
+
+        Raises:
+            UsageError: An argument that must be a function is none, or *features* has no name.
+        """
+        self.name = name
+        self.options = live or LiveOptions()
+        self.sent_keyframes: deque[KeyframeSent] = deque(maxlen=_MAX_SENT_RECORDS)
+        """Times of the newest 100,000 keyframes that the map has acknowledged in this run."""
+        self._robot, self._clock, self._ask = robot, clock, ask
+        self._queue = KeyframeQueue(None if spool is None else spool / name)
+        self._sender: KeyframeSender  # made when the map is joined
+        self._attachments = Attachments(store, self.options, clock, self._wait_quiet)
+        self._relocaliser = Relocaliser(robot, name, self.options, clock, self._apply_relocalisation)
+        self._mapper = Mapper(
+            ask=self._ask_with_priority,
+            camera=camera,
+            depth=depth,
+            options=replace(options or FrontEndOptions.live(), segment_after=_NEVER),
+            map_options=map_options,
+            T_world_start=T_world_start,
+            adds_frames=False,
+            holds_world=True,
+            features=features,
+            motion=motion,
+            loops=loops,
+        )
+        self._has_depth = depth
+        self._monocular_odometry: MonocularOdometry | None = None
+        self._alignments = Alignments()
+        self._correction_stream = CorrectionStream()
+        self._is_corrected = False  # since the last frame, in the present segment
+        self._segment = 0
+        self._last_keyframe: Array | None = None
+        self._last_keyframe_s: float | None = None
+        self._poses: list[
+            tuple[float, int, Array]
+        ] = []  # time stamp, segment and T_odom_camera of each frame
+        self._made_keyframes = self._dropped_keyframes = 0
+        self._tasks: list[asyncio.Task[None]] = []
+        self._cloud_update: asyncio.Future[Any] | None = None
+        self._update_trouble = ""
+        self._frame_lock = asyncio.Lock()
+        self._is_introduced = False
+        self._is_joined = False
+        self._was_left = False
+
+    async def __aenter__(self) -> LiveMapper:
+        """Join the map; a robot without a connection joins it as soon as it is connected.
+
+        Raises:
+            Forbidden: The token has no scope for this map.
+            UnknownService: The platform has no live maps.
+            BadRequest: The name of the map is invalid.
+            UsageError: The spool folder cannot be used, or another program uses it.
+        """
+        self._segment = await asyncio.to_thread(self._queue.open)
+        try:
+            await self._join()
+        except BaseException:
+            self._queue.close()
+            raise
+        return self
+
+    async def _join(self) -> None:
+        self._sender = KeyframeSender(
+            self._robot,
+            self.name,
+            self._queue,
+            deadline_s=self.options.deadline_s,
+            bytes_per_s=self.options.bytes_per_s,
+            clock=self._clock,
+            on_introduced=self._apply_introduction,
+            on_acknowledged=lambda *record: self.sent_keyframes.append(KeyframeSent(*record)),
+        )
+        self._sender.current_segment = self._segment
+        if self._robot.connected:
+            try:
+                await self._sender.introduce()
+            except _JOIN_REFUSALS:
+                raise
+            except RsePfError as error:
+                self._update_trouble = f"{error.code}: {error.message}"
+        if len(self._queue):
+            self._sender.notify_added()
+        self._is_joined = True
+        works = self._sender.run(), self._follow_updates(), self._attachments.run()
+        self._tasks = [asyncio.create_task(work) for work in works]
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Send the queued keyframes and attachments, for `LiveOptions.leave_s` at most, and leave the map.
+
+        Keyframes that were not acknowledged by then stay in the spool folder, or are lost without one;
+        `keyframes_waiting` is their number.
+        """
+        self._is_joined = False
+        try:
+            await self._wait_for_cloud()
+            if self._robot.connected and not isinstance(error, asyncio.CancelledError):
+                with contextlib.suppress(asyncio.TimeoutError):
+                    await asyncio.wait_for(self._wait_sent(), self.options.leave_s)
+                with contextlib.suppress(RsePfError):
+                    await self._robot.call(
+                        "live-leave", {"map": self.name}, deadline_s=_LEAVE_DEADLINE_S, keep=True
+                    )
+        finally:
+            relocalisation = self._relocaliser.task
+            tasks = [*self._tasks, *([relocalisation] if relocalisation else [])]
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
+            self._queue.close()
+            self._was_left = True
+            self._correction_stream.close()
+
+    async def track(self, frame: Frame) -> TrackedFrame:
+        """Return the pose of the next frame in the odometry frame and in the map, or why there is none.
+
+        Args:
+            frame: Next frame of the same camera, in the order of time.
+
+        Raises:
+            UsageError: The map is not joined, the frame is of another camera, the first frame lacks the depth
+                that *depth* promised, or a keyframe cannot be written to the spool folder.
+        """
+        if not self._is_joined:
+            raise UsageError("this live map is not joined", hint="use async with robot.live_map(...)")
+        async with self._frame_lock:
+            # 1. Refuse a first frame without the promised depth.
+            has_depth = frame.stereo is not None or frame.depth_m.any()
+            if self.frames == 0 and self._has_depth and not has_depth:
+                raise UsageError(
+                    "the first frame has no depth",
+                    hint="wait for depth, or leave depth=True out for one lens",
+                )
+            # 2. Begin another segment at the last known pose, if tracking was lost for too long.
+            if self._mapper.unrecognised >= self.options.segment_after and self._poses:
+                self._mapper.restart(self._poses[-1][2])
+                self._begin_segment()
+            # 3. Track the frame.
+            tracked = await self._mapper.track(frame)
+            # 4. Queue the keyframes that a monocular tracker has settled.
+            tracker = self._mapper.monocular_tracker
+            if tracker is not None and tracked.T_world_camera is not None:
+                tracked = await self._follow_monocular(tracker, tracked, tracked.T_world_camera)
+            # 5. With depth, make a keyframe of the frame itself.
+            pose = tracked.T_world_camera
+            if pose is not None:
+                self._poses.append((frame.timestamp_s, self._segment, pose))
+                features = self._mapper.features
+                if features is not None and self._is_keyframe(pose):
+                    await self._make_keyframe(tracked, pose, features)
+            # 6. Add the pose in the map by the present alignment.
+            tracked = replace(
+                tracked,
+                segment=self._segment,
+                T_map_camera=None if pose is None else self._alignments.get(self._segment).pose_in_map(pose),
+                corrected=self._is_corrected,
+            )
+            self._is_corrected = False
+            return tracked
+
+    @property
+    def aligned(self) -> bool:
+        """Whether the pose of the present odometry frame in the map is known; `reason` says why not."""
+        return self.T_map_odom is not None
+
+    @property
+    def reason(self) -> str:
+        """Why the present segment is not aligned; empty if it is."""
+        return self._alignments.get(self._segment).reason
+
+    @property
+    def T_map_odom(self) -> Array | None:
+        """Pose ``(4, 4)`` of the present odometry frame in the map, metres; None while it is not aligned.
+
+        Lengths in the odometry frame are multiplied by `metres_per_unit` before the pose is applied.
+        """
+        return self._alignments.get(self._segment).T_map_odom
+
+    @property
+    def metres_per_unit(self) -> float | None:
+        """Metric scale of the present odometry frame: 1 with depth; without depth, None until aligned."""
+        if self._mapper.monocular_tracker is None:
+            return 1.0
+        return self._alignments.get(self._segment).metres_per_unit if self.aligned else None
+
+    @property
+    def covariance(self) -> Array | None:
+        """Covariance ``(6, 6)`` of the twist (metres, radians) on the left of `T_map_odom`, or None."""
+        return self._alignments.get(self._segment).covariance
+
+    @property
+    def aligned_by(self) -> str:
+        """Source of the present segment's alignment: ``map``, ``relocalisation``, or ``nothing``."""
+        return self._alignments.get(self._segment).by
+
+    @property
+    def segment(self) -> int:
+        """Number of the present odometry frame, from 0; it grows when tracking was lost for too long."""
+        return self._segment
+
+    @property
+    def others(self) -> dict[str, OtherRobot]:
+        """The other robots of the map by their names."""
+        return dict(self._alignments.others)
+
+    @property
+    def version(self) -> int:
+        """Newest position in the log of the map that this robot was notified of."""
+        return self._alignments.version
+
+    @property
+    def map_keyframes(self) -> int:
+        """Number of keyframes of all robots in the map."""
+        return self._alignments.map_keyframes
+
+    @property
+    def map_server(self) -> str:
+        """Identity of the map server, the one process that changes the map; empty until it is known."""
+        return self._alignments.map_server
+
+    @property
+    def state(self) -> str:
+        """State of the map as this robot knows it.
+
+        ``joining``, ``live``, ``waiting for the store`` or ``moving`` (to another server), as the map server
+        reports it; ``offline`` without a connection; ``refused: ...`` if the platform refuses all keyframes
+        of this robot.
+        """
+        if self._is_joined and self._sender.is_refused:
+            return f"refused: {self._sender.trouble}"
+        if not self._robot.connected:
+            return "offline"
+        return self._alignments.map_state or "joining"
+
+    @property
+    def trouble(self) -> str:
+        """The newest failure to send keyframes, receive updates or relocalise, as ``code: sentence``.
+
+        Empty if all of them succeed.  A failed relocalisation counts only while the segment is not aligned.
+        """
+        relocalisation_trouble = "" if self.aligned else self._relocaliser.trouble
+        sender_trouble = self._sender.trouble if self._is_joined else ""
+        return sender_trouble or self._update_trouble or relocalisation_trouble
+
+    @property
+    def keyframes_waiting(self) -> int:
+        """Number of keyframes that the map has not acknowledged."""
+        return len(self._queue)
+
+    @property
+    def features(self) -> Features | None:
+        """Features of the last frame, if it has a pose and depth; see `Mapper.features`."""
+        return self._mapper.features
+
+    def relocalise(self) -> None:
+        """Ask for the robot's pose in the map with the next keyframe, without the usual pause.
+
+        Nothing is asked while the segment is aligned.
+        """
+        self._relocaliser.skip_pause()
+
+    @property
+    def map(self) -> PointMap:
+        """The robot's own cloud of its keyframes, in its odometry frame; the newest one may be missing.
+
+        Of a camera without depth these are its landmarks, as in `Mapper.map`.
+        """
+        return self._mapper.map
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """Poses of all frames in the odometry frame; without depth with the tracker's later adjustments."""
+        return self._mapper.trajectory
+
+    @property
+    def map_trajectory(self) -> Trajectory:
+        """Poses of all frames of aligned segments in the map, by the newest alignment of each segment."""
+        poses_in_map = [
+            (timestamp_s, T_map_camera)
+            for timestamp_s, segment, T_odom_camera in self._poses
+            if (T_map_camera := self._alignments.get(segment).pose_in_map(T_odom_camera)) is not None
+        ]
+        return Trajectory(
+            np.array([timestamp_s for timestamp_s, _ in poses_in_map]),
+            np.array([T_map_camera for _, T_map_camera in poses_in_map]).reshape(-1, 4, 4),
+        )
+
+    @property
+    def frames(self) -> int:
+        """Number of frames tracked so far."""
+        return self._mapper.frames
+
+    def restart_clock(self) -> None:
+        """Accept a next frame with an earlier time stamp, such as after a bag was started again."""
+        self._mapper.restart_clock()
+
+    @property
+    def lost_frames(self) -> int:
+        """Number of frames without a pose; see `Mapper.lost_frames`."""
+        return self._mapper.lost_frames
+
+    @property
+    def frames_before_start(self) -> int:
+        """Number of frames of a camera without depth before it had moved enough to begin."""
+        return self._mapper.frames_before_start
+
+    @property
+    def keyframes(self) -> int:
+        """Number of keyframes queued for the map in this run."""
+        return self._made_keyframes
+
+    @property
+    def scale(self) -> str:
+        """Source of the metric scale, as in `Mapper.scale`.
+
+        Without depth: ``metric, by the live map`` once the segment is aligned, else ``up to scale``.
+        """
+        if self._mapper.monocular_tracker is None:
+            return self._mapper.scale
+        return "metric, by the live map" if self.aligned else "up to scale"
+
+    @property
+    def T_body_camera(self) -> Array | None:
+        """Pose ``(4, 4)`` of the camera in the body frame of its rig, metres; None without a rig."""
+        return self._mapper.T_body_camera
+
+    def report(self) -> dict[str, Any]:
+        """Return the figures of the drive: those of `Mapper.report`, and ``live`` of the live map."""
+        has_sender = self._is_joined or self._was_left
+        return {
+            **self._mapper.report(),
+            "live": {
+                "map": self.name,
+                "state": self.state,
+                "segments": self._segment + 1,
+                "aligned": self.aligned,
+                "aligned_by": self.aligned_by,
+                "reason": self.reason,
+                "scale": self.scale,
+                "metres_per_unit": self.metres_per_unit,
+                "keyframes": self._made_keyframes,
+                "keyframes_kept": len(self.sent_keyframes),
+                "keyframes_waiting": len(self._queue),
+                "keyframes_dropped": self._dropped_keyframes,
+                "keyframes_refused": self._sender.refused_keyframes if has_sender else 0,
+                "relocalisations": dict(self._relocaliser.verdicts),
+                "others": sorted(self._alignments.others),
+                **self._attachments.report(),
+            },
+        }
+
+    def save(self, folder: Path) -> dict[str, Any]:
+        """Write the robot's own cloud and trajectory as `Mapper.save` does; return the report of `Mapper`."""
+        return self._mapper.save(folder)
+
+    def corrections(self) -> AsyncIterator[Correction]:
+        """Return an iterator over all changes of alignments, beginning with the last 1,000 before the call.
+
+        It ends when the map is left.  A reader with more than 1,000 unread corrections loses the oldest.
+        """
+        return self._correction_stream.read()
+
+    # --- Segments and keyframes ---
+
+    def _begin_segment(self) -> None:
+        """Begin another odometry frame, whose first frame becomes a keyframe and is relocalised at once."""
+        self._segment += 1
+        self._sender.current_segment = self._segment
+        self._last_keyframe = self._last_keyframe_s = None
+        self.relocalise()
+
+    def _is_keyframe(self, T_odom_camera: Array) -> bool:
+        if self._last_keyframe is None:
+            return True
+        moved_m, turned_deg = pose_difference(T_odom_camera, self._last_keyframe)
+        return moved_m > self.options.keyframe_m or turned_deg > self.options.keyframe_deg
+
+    async def _make_keyframe(self, tracked: TrackedFrame, T_odom_camera: Array, features: Features) -> None:
+        """Queue a frame with depth as a keyframe, and add it to the robot's own cloud in a thread."""
+        data, attachments = await asyncio.to_thread(
+            self._encode_keyframe, tracked.frame, T_odom_camera, features
+        )
+        self._last_keyframe, self._last_keyframe_s = T_odom_camera, tracked.frame.timestamp_s
+        await self._wait_for_cloud()
+        self._cloud_update = asyncio.ensure_future(
+            asyncio.to_thread(add_to_cloud, self.map, tracked.frame, T_odom_camera, features, True)
+        )
+        if await self._queue_keyframe(data, T_odom_camera):
+            self._attachments.add(attachments)
+
+    async def _follow_monocular(
+        self, tracker: MonocularTracker, tracked: TrackedFrame, T_world_camera: Array
+    ) -> TrackedFrame:
+        """Queue the settled keyframes of a camera without depth; return the frame's pose in the odometry."""
+        if self._monocular_odometry is None:
+            self._monocular_odometry = MonocularOdometry(tracker)
+        odometry = self._monocular_odometry
+        if odometry.start_if_broken():
+            self._begin_segment()
+        for keyframe, T_odom_camera in odometry.take_settled():
+            data = await asyncio.to_thread(self._encode_monocular_keyframe, keyframe, T_odom_camera)
+            self._last_keyframe_s = keyframe.timestamp_s
+            await self._queue_keyframe(data, T_odom_camera)
+        pose = odometry.pose_in_odometry(T_world_camera)
+        return replace(tracked, T_world_camera=pose, scale="up to scale")
+
+    async def _queue_keyframe(self, data: bytes, T_odom_camera: Array) -> bool:
+        """Queue an encoded keyframe and relocalise it if needed; return False if the queue is full."""
+        keyframe = QueuedKeyframe(self._queue.next_index, self._segment, data)
+        if not await asyncio.to_thread(self._queue.add, keyframe):
+            self._dropped_keyframes += 1
+            return False
+        self._made_keyframes += 1
+        self._sender.notify_added()
+        has_foreign_keyframes = self._alignments.map_keyframes > len(self.sent_keyframes)
+        if not self.aligned and self._robot.connected and has_foreign_keyframes:
+            self._relocaliser.start_if_due(keyframe, T_odom_camera)
+        return True
+
+    def _encode_keyframe(
+        self, frame: Frame, T_odom_camera: Array, features: Features
+    ) -> tuple[bytes, EncodedAttachments]:
+        """Encode a keyframe and its attachments.
+
+        Of the features that have depth the keyframe takes the first ones, in the order of the front end.
+        """
+        attachments = self._attachments.make(frame, features)
+        depths_m = features.points_camera[:, 2]
+        rows = np.flatnonzero(np.isfinite(depths_m))[: self._max_features(features.kind)]
+        keyframe = SentKeyframe(
+            timestamp_s=frame.timestamp_s,
+            T_odom_camera=T_odom_camera,
+            camera=frame.camera,
+            features=make_features(
+                features.pixels[rows],
+                depths_m[rows],
+                features.descriptors[rows],
+                self._mapper.depth_noise,
+                features.kind,
+                0.0 if frame.stereo is None else frame.camera.fx * frame.stereo.baseline_m,
+            ),
+            imu=self._mapper.keyframe_imu(T_odom_camera, self._last_keyframe_s, frame.timestamp_s),
+            points=attachments.points_reference,
+            image=attachments.image_reference,
+        )
+        return encode_keyframe(keyframe), attachments
+
+    def _encode_monocular_keyframe(self, seen: SeenKeyframe, T_odom_camera: Array) -> bytes:
+        """Encode a keyframe up to scale: features with a landmark, thus a depth, come first."""
+        assert self._mapper.camera is not None
+        rows = np.argsort(np.isnan(seen.depths), kind="stable")[: self._max_features(seen.kind)]
+        keyframe = SentKeyframe(
+            timestamp_s=seen.timestamp_s,
+            T_odom_camera=T_odom_camera,
+            camera=self._mapper.camera,
+            features=make_scaleless_features(
+                seen.image.pixels[rows], seen.depths[rows], seen.image.descriptors[rows], seen.kind
+            ),
+            imu=self._mapper.keyframe_imu(seen.T_world_camera, self._last_keyframe_s, seen.timestamp_s),
+        )
+        return encode_keyframe(keyframe)
+
+    def _max_features(self, kind: DescriptorKind) -> int:
+        """Return the limit of features of a keyframe; larger descriptors than ORB's lower it."""
+        return self.options.features * max_features(kind) // MAX_FEATURES
+
+    # --- Priorities: pose queries before keyframes, keyframes before attachments ---
+
+    async def _ask_with_priority(self, query: PoseQuery) -> PoseAnswer:
+        """Ask for a pose while keyframes wait."""
+        self._sender.pause_for_pose_query()
+        try:
+            return await self._ask(query)
+        finally:
+            self._sender.resume_after_pose_query()
+
+    async def _wait_quiet(self) -> None:
+        """Wait until no keyframe is queued and no pose query is open."""
+        await self._sender.wait_empty()
+        await self._sender.wait_no_pose_query()
+
+    async def _wait_sent(self) -> None:
+        """Wait until the map has acknowledged every keyframe, and every attachment was uploaded."""
+        await self._sender.wait_empty()
+        await self._attachments.wait_empty()
+
+    async def _wait_for_cloud(self) -> None:
+        """Wait until the last keyframe is in the robot's own cloud."""
+        if self._cloud_update is not None:
+            await self._cloud_update
+
+    # --- Updates of the map ---
+
+    async def _follow_updates(self) -> None:
+        """Apply the updates of the map's topic until cancelled; after a failure, subscribe again."""
+        while True:
+            try:
+                if not self._is_introduced:
+                    await self._sender.introduce()
+                async for key, payload in self._robot.subscribe(live_topic(self.name)):
+                    self._update_trouble = ""
+                    try:
+                        self._publish(self._alignments.apply_update(key, payload))
+                    except BadMessage as error:
+                        self._update_trouble = f"{error.code}: {error.message}"
+            except RsePfError as error:
+                self._update_trouble = f"{error.code}: {error.message}"
+            await asyncio.sleep(_RESUBSCRIBE_PAUSE_S)
+
+    def _apply_introduction(self, robot_in_map: RobotInMap, offset: NumberOffset) -> None:
+        """Apply the map's reply about this robot: name, segment numbers, permission for images."""
+        self._is_introduced = True
+        self._attachments.may_store_images = robot_in_map.allows_images
+        if robot_in_map.name:
+            for correction in self._alignments.identify_robot(robot_in_map.name, offset.segment):
+                self._publish(correction)
+        self._alignments.map_keyframes = max(self._alignments.map_keyframes, robot_in_map.map_keyframes)
+
+    def _apply_relocalisation(self, segment: int, T_odom_camera: Array, reply: RelocaliseReply) -> None:
+        self._publish(self._alignments.apply_relocalisation(segment, T_odom_camera, reply))
+
+    def _publish(self, correction: Correction | None) -> None:
+        """Publish a correction, if there is one, and mark the next frame as corrected."""
+        if correction is not None:
+            self._is_corrected |= correction.segment == self._segment
+            self._correction_stream.publish(correction)

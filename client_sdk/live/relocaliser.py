@@ -1,0 +1,91 @@
+"""Ask a live map where a keyframe was made, while the robot's segment is not aligned."""
+
+from __future__ import annotations
+
+import asyncio
+from collections import Counter
+from collections.abc import Callable
+
+from client_sdk.live.keyframe_queue import QueuedKeyframe
+from client_sdk.live.keyframe_sender import LiveRobot
+from client_sdk.live.options import LiveOptions
+from rse_pf.errors import RsePfError
+from rse_pf.geometry import Array
+from rse_pf.wire.live_map import LiveRelocalise, RelocaliseReply
+
+__all__ = ["Relocaliser"]
+
+_MAX_FAST_FAILURES = 6
+"""Replies in a row that found no place, after which the robot asks less often: no other robot seems to have
+been here, and the map compares every keyframe with the others anyway."""
+_SLOW_FACTOR = 4.0  # the pause between relocalisations becomes so many times as long after these replies
+
+
+class Relocaliser:
+    """Run one relocalisation at a time, with a pause between two."""
+
+    def __init__(
+        self,
+        robot: LiveRobot,
+        map_name: str,
+        options: LiveOptions,
+        clock: Callable[[], float],
+        on_reply: Callable[[int, Array, RelocaliseReply], None],
+    ) -> None:
+        """Describe the relocaliser.
+
+        Args:
+            robot: The robot that calls ``live-relocalise``.
+            map_name: Name of the live map.
+            options: Pause between relocalisations, and their deadline.
+            clock: Monotonic time in seconds.
+            on_reply: Called with the segment and the ``(4, 4)`` pose ``T_odom_camera`` of the keyframe, and
+                the map's reply; an RsePfError that it raises counts as a failed call.
+        """
+        self.trouble = ""
+        """Why the last call failed, as ``code: sentence``; empty after a reply of any verdict."""
+        self.verdicts: Counter[str] = Counter()
+        """Number of replies by their verdicts, and of failed calls by their error codes."""
+        self._robot, self._map_name, self._options = robot, map_name, options
+        self._clock, self._on_reply = clock, on_reply
+        self._started_s = float("-inf")
+        self._failures_in_a_row = 0
+        self.task: asyncio.Task[None] | None = None
+        """The call that was started last; None before the first."""
+
+    @property
+    def pause_s(self) -> float:
+        """Time between the starts of two relocalisations, in seconds."""
+        is_slow = self._failures_in_a_row >= _MAX_FAST_FAILURES
+        return self._options.relocalise_s * (_SLOW_FACTOR if is_slow else 1.0)
+
+    def skip_pause(self) -> None:
+        """Let the next keyframe be localised at once, and the pause be short again."""
+        self._started_s, self._failures_in_a_row = float("-inf"), 0
+
+    def start_if_due(self, keyframe: QueuedKeyframe, T_odom_camera: Array) -> None:
+        """Start a task that localises a keyframe, unless one runs or the pause is not over."""
+        now = self._clock()
+        is_running = self.task is not None and not self.task.done()
+        if now >= self._started_s + self.pause_s and not is_running:
+            self._started_s = now
+            self.task = asyncio.create_task(self._localise(keyframe, T_odom_camera))
+
+    async def _localise(self, keyframe: QueuedKeyframe, T_odom_camera: Array) -> None:
+        request = LiveRelocalise(map=self._map_name, keyframe=keyframe.data)
+        try:
+            answer = await self._robot.call(
+                "live-relocalise",
+                request,
+                RelocaliseReply,
+                deadline_s=self._options.deadline_s,
+                keep=True,
+            )
+            verdict = answer.reply.verdict
+            self.trouble = ""
+            self.verdicts[verdict] += 1
+            self._failures_in_a_row = self._failures_in_a_row + 1 if verdict == "none" else 0
+            self._on_reply(keyframe.segment, T_odom_camera, answer.reply)
+        except RsePfError as error:
+            self.verdicts[error.code] += 1
+            self.trouble = f"{error.code}: {error.message}"
