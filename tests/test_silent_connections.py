@@ -17,8 +17,8 @@ from http_service import http_service
 from rse_pf.config.front_door import BALANCER_IDLE_TIMEOUT_S
 from rse_pf.control_http import ControlReply, serve_control
 from rse_pf.local.control.control_port import serve_control_port
-from rse_pf.server.live_map.owner.link_security import client_context, server_context
-from rse_pf.server.live_map.owner.server import listen
+from rse_pf.server.live_map.connection_security import client_context, server_context
+from rse_pf.server.live_map.map_server.worker_connections import listen
 from rse_pf.silent_connections import (
     FIRST_REQUEST_S,
     KEEP_ALIVE_S,

@@ -14,7 +14,7 @@ from rse_pf.live_map.events import KeyframeAdded, LoopClosuresMeasured
 from rse_pf.live_map.live_map import LiveMap
 from rse_pf.live_map.versions import started_from
 from rse_pf.maps.format import decode_map, encode_map
-from rse_pf.server.live_map.router import _check_keyframe, _request_of
+from rse_pf.server.live_map.router import _check_keyframe, _decode_request
 from rse_pf.slam.keyframe import encode_keyframe
 from rse_pf.slam.optimise import OptimiseOptions
 from rse_pf.slam.pose_graph import PoseGraph
@@ -29,7 +29,7 @@ def sent(T: Array, good: KeyframeAdded, number: int) -> KeyframeAdded:
     """Return the event of a keyframe that a raw client sent with the pose *T*."""
     keyframe = encode_keyframe(dataclasses.replace(good.keyframe, timestamp_s=1.0, T_odom_camera=T))
     payload = {"map": "m", "segment": 0, "number": number, "keyframe": keyframe}
-    request = _request_of("live-keyframe", payload)
+    request = _decode_request("live-keyframe", payload)
     _check_keyframe(request)
     assert isinstance(request, KeyframeRequest)
     return KeyframeAdded(robot="default/raw", segment=0, number=number, data=request.keyframe)
@@ -128,7 +128,7 @@ def test_a_log_of_an_earlier_release_with_scaled_rotations_is_replayed_and_publi
     assert len(decode_map(encode_map(one.to_version())).keyframes) == 12
 
 
-def test_a_map_that_cannot_be_published_is_no_bad_request_of_who_asks() -> None:
+def test_a_map_that_cannot_be_published_is_no_bad_decode_request_who_asks() -> None:
     world = GeneratedWorld(seed=1)
     drive = world.drive("a", straight(0.0, 1.2))
     live_map = LiveMap()

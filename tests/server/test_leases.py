@@ -12,8 +12,8 @@ from rse_pf.errors import Conflict, NotFound, StoreError
 from rse_pf.lease import Lease
 from rse_pf.server.jobs.lease import JobLease, JobRecord
 from rse_pf.server.jobs.lease import verdict_on as verdict_on_job
-from rse_pf.server.live_map.owner.lease import OwnerLease, decode_lease
-from rse_pf.server.live_map.owner.lease import verdict_on as verdict_on_map
+from rse_pf.server.live_map.lease import MapLease, decode_lease
+from rse_pf.server.live_map.lease import next_action as verdict_on_map
 
 LEASE_S = 1.5
 NAME = "lease"
@@ -166,7 +166,7 @@ class OwnerProcess(Process):
             if verdict == "claim":
                 self.claims += 1
                 owner = f"{self.name}-{self.claims}"
-                self.lease = OwnerLease(self, NAME, owner=owner, server=self.name, clock=world.clock)
+                self.lease = MapLease(self, NAME, owner=owner, server=self.name, clock=world.clock)
                 self.holds = self.do("claim", lambda: self.lease.claim(self.watch.known))
             return
         choices = [

@@ -11,7 +11,7 @@ from rse_pf.config import PlatformSettings
 from rse_pf.config.resource_names import KEYS_NAME, SERVICES_PREFIX
 from rse_pf.config.settings import LIVE_PORTS
 from rse_pf.errors import ConfigurationError
-from rse_pf.server.live_map.owner.lease import lease_name
+from rse_pf.server.live_map.lease import lease_name
 
 Assembly = Any
 READ_LIKE_ANY_OBJECT = {"STANDARD_IA", "GLACIER_IR"}

@@ -22,7 +22,7 @@ from rse_pf.terminal import counted, show, show_json
 from rse_pf.wire.live_map import LiveForget, LiveMapRequest, LiveRequest, LiveStart
 
 if TYPE_CHECKING:
-    from rse_pf.server.live_map.map_link import OwnerLinks
+    from rse_pf.server.live_map.client import LiveMapClient
 
 __all__ = ["LIVE_ACTIONS", "add_live_arguments", "run_live", "run_publish"]
 
@@ -148,24 +148,24 @@ def _ask(
     deadline_s: float = _DEADLINE_S,
 ) -> dict[str, Any]:  # fmt: skip
     """Return what the owner of the map answers; raises what it refuses, or Busy."""
-    from rse_pf.server.live_map.owner.lease import map_folder
+    from rse_pf.server.live_map.lease import map_folder
 
     map_folder(args.tenant, args.name)  # refuse a wrong name first
     operator = RobotId(args.tenant, "operator")
 
-    async def ask(links: OwnerLinks) -> dict[str, Any]:
+    async def ask(links: LiveMapClient) -> dict[str, Any]:
         return await links.request(args.tenant, args.name, operator, operation, request, deadline_s)
 
     return asyncio.run(_with_links(settings, ask))
 
 
-async def _with_links(settings: PlatformSettings, act: Callable[[OwnerLinks], Any]) -> Any:
-    from rse_pf.server.live_map.map_link import OwnerLinks
+async def _with_links(settings: PlatformSettings, act: Callable[[LiveMapClient], Any]) -> Any:
+    from rse_pf.server.live_map.client import LiveMapClient
     from rse_pf.server.log import JsonLog
 
     settings = settings.replace(serving={"log_level": "error"})  # the owner's lines are for a server's log
     log = JsonLog(level="error", server="operator", wall_clock=time.time).start()
-    links = OwnerLinks(
+    links = LiveMapClient(
         store=open_data_store(settings), settings=settings, server_id=f"operator-{os.getpid()}",
         log=log, on_update=lambda tenant, name, payload: None,
     )  # fmt: skip
@@ -178,10 +178,11 @@ async def _with_links(settings: PlatformSettings, act: Callable[[OwnerLinks], An
 
 def _read(args: argparse.Namespace, settings: PlatformSettings) -> dict[str, Any]:
     """Return what the log says of a map that has no owner now; raises NotFound."""
-    from rse_pf.server.live_map.owner.lease import decode_lease, lease_name, map_folder
-    from rse_pf.server.live_map.owner.log import LiveLog
-    from rse_pf.server.live_map.owner.replies import show_reply
-    from rse_pf.server.live_map.owner.state import LIVE_MAP, restore
+    from rse_pf.server.live_map.lease import decode_lease, lease_name, map_folder
+    from rse_pf.server.live_map.map_server.environment import LIVE_MAP
+    from rse_pf.server.live_map.map_server.log import LiveLog
+    from rse_pf.server.live_map.map_server.messages import show_reply
+    from rse_pf.server.live_map.map_server.state import restore
 
     store = open_data_store(settings)
     name = lease_name(args.tenant, args.name)
@@ -195,7 +196,7 @@ def _read(args: argparse.Namespace, settings: PlatformSettings) -> dict[str, Any
     log = LiveLog(store, map_folder(args.tenant, args.name), owner="", epoch=0, base=lease.base)
     state = restore(log, LIVE_MAP)
     return show_reply(
-        RobotId(args.tenant, "operator"), state, lease, told_state="idle", name_of=shown_name,
+        RobotId(args.tenant, "operator"), state, lease, service_state="idle", name_of=shown_name,
         is_present=lambda folder: False,
     )  # fmt: skip
 

@@ -26,7 +26,7 @@ from rse_pf.local.faults.failing_store import failing_environment, set_failing_p
 from rse_pf.local.faults.faults import signal_tree
 from rse_pf.local.faults.network_emulator import PROFILES, LinkProcess
 from rse_pf.object_store import DirectoryStore
-from rse_pf.server.live_map.owner.lease import LeaseRecord, decode_lease, lease_name
+from rse_pf.server.live_map.lease import LeaseRecord, decode_lease, lease_name
 
 __all__ = ["LIVE_FAULTS", "Disturbance", "LiveFault"]
 

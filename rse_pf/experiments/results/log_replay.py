@@ -20,9 +20,10 @@ from rse_pf.identity import DEFAULT_TENANT, shown_name
 from rse_pf.ipc import encode_message, receive
 from rse_pf.live_map.events import KeyframeAdded, decode_events
 from rse_pf.object_store import DirectoryStore
-from rse_pf.server.live_map.owner.lease import map_folder
-from rse_pf.server.live_map.owner.log import LiveLog, MapSnapshot
-from rse_pf.server.live_map.owner.state import LIVE_MAP, MapState
+from rse_pf.server.live_map.lease import map_folder
+from rse_pf.server.live_map.map_server.environment import LIVE_MAP
+from rse_pf.server.live_map.map_server.log import LiveLog, MapSnapshot
+from rse_pf.server.live_map.map_server.state import MapState
 
 __all__ = ["LoggedMap", "read_log", "run"]
 
@@ -44,7 +45,7 @@ class LoggedMap:
 class _WholeLog(LiveLog):
     """A log that is read from its first entry."""
 
-    def snapshots(self) -> Iterator[MapSnapshot]:
+    def read_snapshots(self) -> Iterator[MapSnapshot]:
         """Yield none."""
         return iter(())
 
@@ -76,7 +77,7 @@ def _replay(objects: Path, position: int) -> LoggedMap:
     state = MapState(LIVE_MAP.empty(), 0)
     keyframes: list[tuple[str, int, float]] = []
     epochs = set()
-    for entry in log.entries():
+    for entry in log.read_entries():
         events = decode_events(entry.events)
         epochs.add(entry.epoch)
         keyframes += [

@@ -1,14 +1,16 @@
-"""Bring robots' commands to the owners of live maps, and the owners' updates to the robots of one worker.
+"""Pass commands of robots to the map servers of live maps, and updates back to the robots of one worker.
 
-The worker judges the right, the size and the form of a command; what it means is judged by the map's owner.
-A robot that sends garbage loses the live maps for a while, and nothing else.
+The worker checks the scope of the robot's token, and the size and format of each request; the map server
+validates its content.  A robot that sends many invalid requests may not use live maps for a minute.
 """
 
 from __future__ import annotations
 
 import asyncio
+import math
 import traceback
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -27,8 +29,7 @@ from rse_pf.errors import (
     RsePfError,
 )
 from rse_pf.identity import RobotId
-from rse_pf.server.live_map.garbage import GarbageCounts
-from rse_pf.server.live_map.map_link import OwnerLinks
+from rse_pf.server.live_map.client import LiveMapClient
 from rse_pf.server.live_map.subscriptions import Subscriptions
 from rse_pf.server.ports import Subscriber, WorkerContext
 from rse_pf.server.scheduling.command_queue import CommandQueue, QueueReport
@@ -51,217 +52,311 @@ from rse_pf.wire.live_map import (
     map_of_topic,
 )
 
-__all__ = ["LIVE_LIST", "LIVE_SERVICES", "LiveMapRouter"]
+__all__ = ["LIVE_LIST", "LIVE_SERVICES", "InvalidRequestCounter", "LiveMapRouter"]
 
 LIVE_LIST = "live-list"
+"""Name of the service that lists the live maps of the tenant; the worker answers it from the store."""
 LIVE_SERVICES = frozenset((*LIVE_REQUESTS, LIVE_LIST))
-"""The commands that go to the owner of a live map."""
+"""Names of all services of live maps."""
 
-_FOR_OPERATORS = frozenset((PUBLISH, STOP, FORGET, START))
-_MAX_HELD_BYTES = 64 << 20
-"""Size of all messages that wait for owners; while a store is slow, robots keep the others."""
-_MAX_HELD_OF_TENANT_BYTES = _MAX_HELD_BYTES // 4
+_OPERATOR_SERVICES = frozenset((PUBLISH, STOP, FORGET, START))
+"""Services that need the scope ``maps:write``; all others need ``maps:live``."""
+_MAX_WAITING_BYTES = 64 << 20
+"""Largest total size in bytes of the messages of one worker that wait for map servers.  Beyond it, commands
+are refused with Busy, and robots keep their keyframes."""
+_MAX_WAITING_BYTES_PER_TENANT = _MAX_WAITING_BYTES // 4
+"""Largest size in bytes of the messages of one tenant that wait for map servers in one worker: four tenants
+that fill their part do not stop each other."""
 _BUSY_RETRY_MS = 500.0
-_IS_GARBAGE = (BadRequest.code, BadMessage.code, LimitExceeded.code, InvalidCamera.code)
-_JUDGED_BY_OWNER = (KEYFRAME, RELOCALISE)
-"""Of these the owner judges the request; its other errors are those of the map, and count against nobody."""
+"""Milliseconds after which a robot sends a command again that was refused because too many wait."""
+_INVALID_REQUEST_CODES = (BadRequest.code, BadMessage.code, LimitExceeded.code, InvalidCamera.code)
+"""Codes of errors that the sender of a request has caused."""
+_SERVICES_WITH_BLAME = (KEYFRAME, RELOCALISE)
+"""Services for which an invalid-request error of the map server counts against the robot.  Errors of other
+services may come from the state of the map, for example of one that cannot be published."""
+_MAX_INVALID_REQUESTS = 10
+"""Number of invalid requests within `_WINDOW_S` after which live maps are closed to a robot.  A robot with a
+matching SDK sends none."""
+_WINDOW_S = 60.0
+"""Seconds over which invalid requests of a robot are counted."""
+_BLOCKED_S = 60.0
+"""Seconds for which live maps are closed to a robot that sent too many invalid requests."""
+_MAX_COUNTED_ROBOTS = 4096
+"""Largest number of robots whose invalid requests are counted, to bound memory; the oldest count is dropped
+first."""
+
+
+@dataclass(slots=True)
+class _InvalidRequests:
+    window_start_s: float
+    count: int = 0
+    blocked_until_s: float = -math.inf
+
+
+class InvalidRequestCounter:
+    """Counts the invalid requests of each robot of a worker, and blocks robots that send too many."""
+
+    def __init__(self) -> None:
+        self._by_robot: dict[RobotId, _InvalidRequests] = {}
+
+    def __len__(self) -> int:
+        """Return the number of robots with a count."""
+        return len(self._by_robot)
+
+    def count(self, robot: RobotId, now: float) -> None:
+        """Count one invalid request of *robot* at the monotonic time *now* in seconds."""
+        requests = self._by_robot.pop(robot, None)
+        if requests is None or now - requests.window_start_s > _WINDOW_S:
+            requests = _InvalidRequests(now)
+        self._by_robot[robot] = requests
+        requests.count += 1
+        if requests.count >= _MAX_INVALID_REQUESTS:
+            requests.blocked_until_s = now + _BLOCKED_S
+        if len(self._by_robot) > _MAX_COUNTED_ROBOTS:
+            del self._by_robot[next(iter(self._by_robot))]
+
+    def seconds_blocked(self, robot: RobotId, now: float) -> float:
+        """Return for how many more seconds *robot* is blocked at the monotonic time *now*; 0 if it is not."""
+        requests = self._by_robot.get(robot)
+        return 0.0 if requests is None else max(0.0, requests.blocked_until_s - now)
 
 
 class LiveMapRouter(CommandQueue):
-    """The live maps as the robots of one worker see them."""
+    """The live maps as the robots of one worker use them: a queue of commands, and subscriptions."""
 
     judges_scope = True
-    """By the name of the map."""
+    """The scope of a token is checked here, because it contains the name of the map."""
 
     def __init__(
         self,
         context: WorkerContext,
         *,
-        owners: Callable[[Callable[[str, str, dict[str, Any]], None]], OwnerLinks],
+        make_client: Callable[[Callable[[str, str, dict[str, Any]], None]], LiveMapClient],
         answer: Callable[[QueuedCommand, Result | Failure], None],
     ) -> None:
-        """Ask no owner yet.
+        """Prepare; no map server is contacted before the first command or subscription.
 
         Args:
-            context: Of the worker.
-            owners: Makes the connections to owners; is given what takes an update: tenant, map, payload.
+            context: Context of the worker.
+            make_client: Makes the client of the live maps; its argument is called with tenant, map name and
+                payload of each update.
             answer: Called exactly once for each submitted command.
         """
         self._context = context
         self._monotonic = context.clocks.monotonic
         self._answer = answer
-        self._owners = owners(self.update)
-        self._garbage = GarbageCounts()
+        self._client = make_client(self.update)
+        self._invalid_requests = InvalidRequestCounter()
         self._tasks: dict[asyncio.Task[None], QueuedCommand] = {}
-        self._held_bytes = 0
-        self._held_of_tenant: dict[str, int] = {}
-        self._waiting: dict[RobotId, int] = {}
+        self._waiting_bytes = 0
+        self._waiting_bytes_of_tenant: dict[str, int] = {}
+        self._waiting_of_robot: dict[RobotId, int] = {}  # number of commands
         self._subscriptions = Subscriptions(
-            loop=context.loop, log=context.log, unwatch=self._owners.unwatch,
-            watch=lambda tenant, name, may_start: self._owners.watch(tenant, name, may_start=may_start),
-        )  # fmt: skip
+            loop=context.loop,
+            log=context.log,
+            watch=lambda tenant, name, may_start: self._client.watch(tenant, name, may_start=may_start),
+            unwatch=self._client.unwatch,
+        )
 
     @property
     def held(self) -> int:
-        """Commands that have no answer yet."""
+        """Number of commands without an answer."""
         return len(self._tasks)
 
     def offers(self, service: str) -> bool:
-        """Return whether *service* is a command to a live map."""
+        """Return whether *service* is a service of live maps."""
         return service in LIVE_SERVICES
 
     def backlog(self, queued: QueuedCommand) -> QueueBacklog:
-        """Return how many commands of the robot have no answer yet."""
-        return QueueBacklog(self._waiting.get(queued.robot, 0))
+        """Return the number of commands to live maps by the robot of *queued* that have no answer yet."""
+        return QueueBacklog(self._waiting_of_robot.get(queued.robot, 0))
 
-    # --- commands ------------------------------------------------------------------------------
+    # --- Commands of robots and operators ---
 
     def submit(self, queued: QueuedCommand, now: float) -> None:
-        """Pass a command to the owner of its map; the answer comes later, or at once if it is refused."""
+        """Pass a command to the map server of its map; the answer follows later, a error at once."""
+        tenant = queued.robot.tenant
         try:
-            self._check_garbage(queued.robot, now)
-            held = self._held_of_tenant.get(queued.robot.tenant, 0) + queued.size_bytes
-            if held > _MAX_HELD_OF_TENANT_BYTES or self._held_bytes + queued.size_bytes > _MAX_HELD_BYTES:
+            self._check_not_blocked(queued.robot, now)
+            tenant_bytes = self._waiting_bytes_of_tenant.get(tenant, 0) + queued.size_bytes
+            worker_bytes = self._waiting_bytes + queued.size_bytes
+            if tenant_bytes > _MAX_WAITING_BYTES_PER_TENANT or worker_bytes > _MAX_WAITING_BYTES:
                 raise Busy(
-                    "too many commands wait for live maps", hint="try again later",
+                    f"{tenant_bytes} bytes of commands to live maps wait for this tenant, and {worker_bytes} "
+                    f"for all; at most {_MAX_WAITING_BYTES_PER_TENANT} and {_MAX_WAITING_BYTES} may wait",
+                    hint="send the command again after retry_after_ms",
                     retry_after_ms=_BUSY_RETRY_MS,
-                )  # fmt: skip
-            work = self._check_command(queued, now)
+                )
+            request = self._prepare_request(queued, now)
         except RsePfError as error:
-            if error.code in _IS_GARBAGE:
-                self._garbage.note(queued.robot, now)
-            self._fail(queued, error)
+            if error.code in _INVALID_REQUEST_CODES:
+                self._invalid_requests.count(queued.robot, now)
+            self._answer_failure(queued, error)
             return
-        task = self._context.loop.create_task(self._follow(queued, work))
+        task = self._context.loop.create_task(self._answer_command(queued, request))
         self._tasks[task] = queued
-        self._held_bytes += queued.size_bytes
-        self._held_of_tenant[queued.robot.tenant] = held
-        self._waiting[queued.robot] = self._waiting.get(queued.robot, 0) + 1
-        task.add_done_callback(self._done)
+        self._waiting_bytes = worker_bytes
+        self._waiting_bytes_of_tenant[tenant] = tenant_bytes
+        self._waiting_of_robot[queued.robot] = self._waiting_of_robot.get(queued.robot, 0) + 1
+        task.add_done_callback(self._on_answered)
 
-    def _check_command(self, queued: QueuedCommand, now: float) -> Callable[[], Any]:
-        """Return a function that asks the owner; raises RsePfError if the request is refused."""
+    def _prepare_request(self, queued: QueuedCommand, now: float) -> Callable[[], Any]:
+        """Check a command and return a function that sends its request; raises RsePfError to refuse it."""
         command, claims = queued.command, queued.owner.claims
         robot, service = queued.robot, command.service
         deadline_s = queued.deadline_s - now
         if service == LIVE_LIST:
-            return lambda: self._list(robot.tenant, claims)
-        request = _request_of(service, {} if command.payload is None else command.payload)
-        right = "maps:write" if service in _FOR_OPERATORS else "maps:live"
-        forbidden = _forbidden(claims, right, request.map)
-        if forbidden is None and isinstance(request, LiveStart):
-            forbidden = _forbidden_source(claims, request)
-        if forbidden is not None:
-            raise forbidden
+            return lambda: self._list_maps(robot.tenant, claims)
+        request = _decode_request(service, {} if command.payload is None else command.payload)
+        scope = "maps:write" if service in _OPERATOR_SERVICES else "maps:live"
+        error = _find_scope_error(claims, scope, request.map)
+        if error is None and isinstance(request, LiveStart):
+            error = _find_source_error(claims, request)
+        if error is not None:
+            raise error
         _check_keyframe(request)
-        return lambda: self._owners.request(robot.tenant, request.map, robot, service, request, deadline_s)
+        return lambda: self._client.request(robot.tenant, request.map, robot, service, request, deadline_s)
 
-    async def _list(self, tenant: str, claims: Claims | None) -> dict[str, Any]:
-        """Return the maps of a tenant that a robot may enter."""
-        maps = await self._owners.list_maps(tenant)
+    async def _list_maps(self, tenant: str, claims: Claims | None) -> dict[str, Any]:
+        """Return the reply of ``live-list``: the maps of *tenant* in which the token may drive."""
+        maps = await self._client.list_maps(tenant)
         return {
-            "maps": [each for each in maps if _forbidden(claims, "maps:live", str(each.get("name"))) is None]
+            "maps": [
+                entry
+                for entry in maps
+                if _find_scope_error(claims, "maps:live", str(entry.get("name"))) is None
+            ]
         }
 
-    async def _follow(self, queued: QueuedCommand, work: Callable[[], Any]) -> None:
-        """Answer one command with what its owner says, within its deadline."""
-        started = self._monotonic()
+    async def _answer_command(self, queued: QueuedCommand, request: Callable[[], Any]) -> None:
+        """Send the request of a command and answer the command by its deadline."""
+        started_s = self._monotonic()
         command, server = queued.command, self._context.server_id
-        queued.started_s = started
+        queued.started_s = started_s
         try:
-            reply = await asyncio.wait_for(work(), max(0.0, queued.deadline_s - started))
+            reply = await asyncio.wait_for(request(), max(0.0, queued.deadline_s - started_s))
         except asyncio.TimeoutError:
-            late = Expired("the live map did not answer in time", hint="send it again: nothing counts twice")
-            self._fail(queued, late)
+            self._answer_failure(
+                queued,
+                Expired(
+                    "the live map did not answer before the deadline of the command",
+                    hint="send it again: a command to a live map has its effect only once",
+                ),
+            )
         except RsePfError as error:
-            if command.service in _JUDGED_BY_OWNER and error.code in _IS_GARBAGE:
-                self._garbage.note(queued.robot, self._monotonic())
-            self._fail(queued, error)
+            if command.service in _SERVICES_WITH_BLAME and error.code in _INVALID_REQUEST_CODES:
+                self._invalid_requests.count(queued.robot, self._monotonic())
+            self._answer_failure(queued, error)
         except Exception as error:  # noqa: BLE001  a defect must not leave the robot without an answer
             text = "".join(traceback.format_exception(type(error), error, error.__traceback__))
             self._context.log.error("defect", service=command.service, trace=command.trace, traceback=text)
-            self._fail(queued, InternalError("the live map failed", hint="see the server's log"))
+            self._answer_failure(
+                queued,
+                InternalError(
+                    "the worker failed on this command to a live map",
+                    hint="read the traceback in the server's log",
+                ),
+            )
         else:
-            compute_ms = (self._monotonic() - started) * 1e3
-            result = Result(id=command.id, reply=_with_arrays(reply), server=server, compute_ms=compute_ms)
+            compute_ms = (self._monotonic() - started_s) * 1e3
+            result = Result(
+                id=command.id, reply=_decode_matrices(reply), server=server, compute_ms=compute_ms
+            )
             self._answer(queued, result)
 
-    def _done(self, task: asyncio.Task[None]) -> None:
+    def _on_answered(self, task: asyncio.Task[None]) -> None:
+        """Subtract an answered command from the numbers of waiting commands and bytes."""
         queued = self._tasks.pop(task)
         tenant = queued.robot.tenant
-        self._held_bytes -= queued.size_bytes
-        self._held_of_tenant[tenant] -= queued.size_bytes
-        if not self._held_of_tenant[tenant]:
-            del self._held_of_tenant[tenant]
-        left = self._waiting.pop(queued.robot) - 1
-        if left:
-            self._waiting[queued.robot] = left
+        self._waiting_bytes -= queued.size_bytes
+        self._waiting_bytes_of_tenant[tenant] -= queued.size_bytes
+        if not self._waiting_bytes_of_tenant[tenant]:
+            del self._waiting_bytes_of_tenant[tenant]
+        remaining = self._waiting_of_robot.pop(queued.robot) - 1
+        if remaining:
+            self._waiting_of_robot[queued.robot] = remaining
 
-    def _fail(self, queued: QueuedCommand, error: RsePfError) -> None:
+    def _answer_failure(self, queued: QueuedCommand, error: RsePfError) -> None:
         self._answer(queued, failure_of(error, queued.command, server=self._context.server_id))
 
-    def _check_garbage(self, robot: RobotId, now: float) -> None:
-        left_s = self._garbage.cut_off_s(robot, now)
-        if left_s > 0:
+    def _check_not_blocked(self, robot: RobotId, now: float) -> None:
+        """Raise Forbidden if the robot has sent too many invalid requests."""
+        blocked_s = self._invalid_requests.seconds_blocked(robot, now)
+        if blocked_s > 0:
             self._context.metrics.shed["live-garbage"] += 1
             raise Forbidden(
                 f"this robot sent too many invalid requests to live maps; they are closed to it for "
-                f"{left_s:.0f} s",
+                f"{blocked_s:.0f} s",
                 hint="update the robot's SDK, or correct what it sends",
             )
 
-    # --- updates -------------------------------------------------------------------------------
+    # --- Subscriptions of robots to updates ---
 
     def subscribe(self, connection: Any, identity: int, topic: str) -> None:
-        """Begin the updates of a live map for a robot's connection, or refuse them."""
-        tenant, reader = connection.robot.tenant, connection
+        """Begin the updates of the live map in *topic* (``live/MAP``), or send the robot a error.
+
+        Args:
+            connection: Connection of the robot.
+            identity: The robot's id of the subscription.
+            topic: Topic to which the robot subscribes.
+        """
+        tenant = connection.robot.tenant
         try:
             map_name = map_of_topic(topic)
-            forbidden = _forbidden_to_read(connection.claims, map_name)
-            if forbidden is not None:
-                raise forbidden
+            error = _find_reading_error(connection.claims, map_name)
+            if error is not None:
+                raise error
         except RsePfError as error:
             connection.refuse_updates(identity, error)
             return
-        judged = connection.claims
+        checked_claims = connection.claims
 
-        def may_go_on() -> RsePfError | None:
-            nonlocal judged
-            if connection.claims is judged:
+        def find_error() -> RsePfError | None:
+            """Check the scope again if the robot has renewed its token since the last check."""
+            nonlocal checked_claims
+            if connection.claims is checked_claims:
                 return None
-            judged = connection.claims
-            if _forbidden(judged, "maps:live", map_name) is not None:
-                self._subscriptions.stop_starting(reader, identity)
-            return _forbidden_to_read(judged, map_name)
+            checked_claims = connection.claims
+            if _find_scope_error(checked_claims, "maps:live", map_name) is not None:
+                self._subscriptions.stop_starting(connection, identity)
+            return _find_reading_error(checked_claims, map_name)
 
         self._subscriptions.begin(
-            reader, identity, tenant, map_name, may_go_on=may_go_on,
-            may_start=_forbidden(judged, "maps:live", map_name) is None,
-        )  # fmt: skip
+            connection,
+            identity,
+            tenant,
+            map_name,
+            find_error=find_error,
+            may_start=_find_scope_error(checked_claims, "maps:live", map_name) is None,
+        )
 
     def unsubscribe(self, connection: Subscriber, identity: int) -> None:
-        """End a subscription."""
+        """End the subscription with the id *identity* of a robot's connection."""
         self._subscriptions.end(connection, identity)
 
     def withdraw(self, owner: Any, command_id: int) -> None:
-        """Do nothing: the owner of the map answers before the deadline."""
+        """Ignore the cancellation of a command: the map server answers it before its deadline."""
 
     def leave(self, owner: Subscriber) -> list[QueuedCommand]:
-        """Forget the subscriptions of a connection that ended; its keyframes go on to their map."""
-        self._subscriptions.left(owner)
+        """End the subscriptions of a closed connection; its keyframes are still passed to their map."""
+        self._subscriptions.end_all(owner)
         return []
 
     def update(self, tenant: str, map_name: str, payload: dict[str, Any]) -> None:
-        """Take an update of an owner; ``key`` is that of "latest wins" and no part of the payload."""
-        told = _with_arrays(payload)
-        kind, robot = str(told.get("kind", "")), told.get("robot")
-        key = told.pop("key", None) or (kind if robot is None else f"{kind}/{robot}")
-        self._subscriptions.update(tenant, map_name, str(key), told)
+        """Pass an update of a map server to the subscribers of the map.
 
-    # --- the whole -----------------------------------------------------------------------------
+        The field ``key`` of *payload*, or else its kind and robot, decides which older update it replaces;
+        ``key`` is not sent to robots.
+        """
+        fields = _decode_matrices(payload)
+        kind, robot = str(fields.get("kind", "")), fields.get("robot")
+        key = fields.pop("key", None) or (kind if robot is None else f"{kind}/{robot}")
+        self._subscriptions.update(tenant, map_name, str(key), fields)
+
+    # --- Metrics and shutdown ---
 
     def report(self) -> QueueReport:
-        """Return the gauges of this worker, and the processor time of the owners that it started."""
+        """Return the gauges of live maps in this worker, and the CPU time of its map servers by tenant."""
         subscriptions = self._subscriptions
         return QueueReport(
             gauges={
@@ -270,53 +365,57 @@ class LiveMapRouter(CommandQueue):
                 "updates_replaced": float(subscriptions.replaced),
                 "live_waiting": float(self.held),
             },
-            cpu_s={"live-maps": self._owners.cpu_by_tenant()},
+            cpu_s={"live-maps": self._client.cpu_by_tenant()},
         )
 
     def give_up(self) -> None:
-        """Leave the maps of this server to others: it drains."""
-        self._owners.give_up()
+        """Release the maps that this worker's processes serve, because the server drains."""
+        self._client.give_up()
 
     def close(self) -> None:
-        """End what waits."""
+        """Cancel all commands that have no answer."""
         for task in list(self._tasks):
             task.cancel()
 
     async def wait_closed(self) -> None:
-        """Close, wait for what waited, and end the connections to owners."""
+        """Cancel all commands, wait until they have ended, and close the connections to map servers."""
         self.close()
         await asyncio.gather(*self._tasks, return_exceptions=True)
-        await self._owners.close()
+        await self._client.close()
 
 
-def _forbidden(claims: Claims | None, right: str, map_name: str) -> RsePfError | None:
-    """Return why a token does not give *right* on a map; None if it does, or if none is required."""
-    if claims is None or scopes_allow(claims.scopes, right, map_name):
+def _find_scope_error(claims: Claims | None, scope: str, map_name: str) -> RsePfError | None:
+    """Return an error if a token lacks ``SCOPE/MAP``; None if it has it, or if no tokens are required."""
+    if claims is None or scopes_allow(claims.scopes, scope, map_name):
         return None
-    return Forbidden(f"this token does not hold the scope {right}/{map_name}", hint="issue one that does")
+    return Forbidden(
+        f"this token does not hold the scope {scope}/{map_name}",
+        hint=f"issue a token with the scope {scope}/{map_name}",
+    )
 
 
-def _forbidden_source(claims: Claims | None, request: LiveStart) -> RsePfError | None:
-    """Return why a token does not allow to begin a map with another one: who starts it, may read it then."""
+def _find_source_error(claims: Claims | None, request: LiveStart) -> RsePfError | None:
+    """Return an error if a map starts from a version of another map that the token may not read."""
     source, _ = request.source_version()
-    return None if source == request.map else _forbidden(claims, "maps:read", source)
+    return None if source == request.map else _find_scope_error(claims, "maps:read", source)
 
 
-def _forbidden_to_read(claims: Claims | None, map_name: str) -> RsePfError | None:
-    """Return why a token does not allow to subscribe to a map: who may drive there may, too."""
-    if _forbidden(claims, "maps:watch", map_name) is None:
+def _find_reading_error(claims: Claims | None, map_name: str) -> RsePfError | None:
+    """Return an error if a token has neither of the scopes with which a robot may subscribe to a live map."""
+    if _find_scope_error(claims, "maps:watch", map_name) is None:
         return None
-    return _forbidden(claims, "maps:live", map_name)
+    return _find_scope_error(claims, "maps:live", map_name)
 
 
-def _request_of(service: str, payload: Any) -> LiveRequest:
-    """Return the typed request of a command.
+def _decode_request(service: str, payload: Any) -> LiveRequest:
+    """Return the typed request of a command to *service*.
 
     Raises:
-        RsePfError: It is too long, or not valid.
+        LimitExceeded: The keyframe is too large.
+        BadRequest: The payload is not a valid request.
     """
     if isinstance(payload, dict):
-        _check_size(payload.get("keyframe"), "a keyframe is", MAX_KEYFRAME_BYTES)
+        _check_keyframe_size(payload.get("keyframe"))
     try:
         request: LiveRequest = as_type(payload, LIVE_REQUESTS[service])
     except BadMessage as error:
@@ -324,30 +423,39 @@ def _request_of(service: str, payload: Any) -> LiveRequest:
     return request
 
 
-def _check_size(value: Any, what: str, most: int) -> None:
-    """Raise LimitExceeded if bytes are too long, before anything is made from them."""
-    size = 0
-    if isinstance(value, str):  # base64: four characters for three bytes
-        size = len(value) // 4 * 3 - 2
-    elif isinstance(value, bytes | bytearray | memoryview):
-        size = len(value)
-    if size > most:
-        raise LimitExceeded(f"{what} {size} bytes, above {most}", hint="send fewer features")
+def _check_keyframe_size(keyframe: Any) -> None:
+    """Raise LimitExceeded if an encoded keyframe, as bytes or as base64 text, is too large to decode."""
+    size_bytes = 0
+    if isinstance(keyframe, str):  # base64: four characters for three bytes, at most two of them padding
+        size_bytes = len(keyframe) // 4 * 3 - 2
+    elif isinstance(keyframe, bytes | bytearray | memoryview):
+        size_bytes = len(keyframe)
+    if size_bytes > MAX_KEYFRAME_BYTES:
+        raise LimitExceeded(
+            f"a keyframe has {size_bytes} bytes, above {MAX_KEYFRAME_BYTES}", hint="send fewer features"
+        )
 
 
 def _check_keyframe(request: LiveRequest) -> None:
-    """Raise RsePfError for a keyframe that is garbage: the owner, which others share, decodes none."""
+    """Raise RsePfError if the keyframe of a request is malformed or implausible.
+
+    The worker decodes keyframes first, because a defect of the decoder in the map server would concern all
+    robots of the map.
+    """
     if isinstance(request, KeyframeRequest):
         check_odometry_range(decode_keyframe(request.keyframe))
     elif isinstance(request, LiveRelocalise):
         decode_keyframe(request.keyframe)
 
 
-def _with_arrays(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return *values* with matrices that came as bytes as arrays, which every codec can encode."""
+def _decode_matrices(fields: Mapping[str, Any]) -> dict[str, Any]:
+    """Return *fields* with poses and covariances as flat float64 arrays in place of bytes.
+
+    Every codec of the protocol can encode arrays; bytes only the binary one.
+    """
     return {
         name: np.frombuffer(value, "<f8")
         if isinstance(value, bytes) and (name.startswith("T_") or name == "covariance")
         else value
-        for name, value in values.items()
+        for name, value in fields.items()
     }

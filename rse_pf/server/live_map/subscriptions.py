@@ -1,7 +1,8 @@
-"""The subscriptions of one worker's robots to live maps: the newest value of each key, to each reader.
+"""Send the robots of one worker the newest update of each key of the live maps to which they subscribe.
 
-A map's present values are kept once for all of its readers, so that a slow reader costs the names of the keys
-that it has not got yet, and no value.  Who may subscribe is decided elsewhere.
+The newest updates of a map are stored once for all its subscribers.  For a slow subscriber only the keys are
+stored that it has not received, so its memory is bounded: an update that it misses is replaced by the newest
+one of the key.  Who may subscribe is decided by the caller.
 """
 
 from __future__ import annotations
@@ -22,54 +23,57 @@ from rse_pf.wire.server_session import ServerSession
 
 __all__ = ["Subscriptions"]
 
-_GATHER_S = 0.01
-"""Values leave this long after the last ones, or at once; until then they replace each other."""
-_RETRY_S = 0.05
-"""A reader whose socket is full is looked at again after this time."""
+_MIN_ROUND_INTERVAL_S = 0.01
+"""Seconds between two rounds of sending; updates that arrive in between replace older ones of their key."""
+_SLOW_RETRY_S = 0.05
+"""Seconds after which a subscriber whose socket was full is tried again."""
 _MAX_UNSENT_BYTES = 16_384
-"""Above this a reader gets no updates until it has read; the answers to its commands come in any case."""
-_MAX_SENT_AT_ONCE = 200
-"""Updates in one round of the event loop; each takes about 20 us, and robots' commands wait meanwhile."""
+"""Bytes that may wait in the socket of a subscriber.  Above this limit no updates are written until the
+subscriber has read some bytes; answers to commands are written in any case."""
+_MAX_SENT_PER_ROUND = 200
+"""Largest number of updates in one round of the event loop.  Each takes about 20 us, and commands of robots
+wait meanwhile."""
 _MAX_KEYS = 1024
-"""Values of one map; the one that changed longest ago is forgotten first."""
-_MAX_VALUE_BYTES = 65_536
-_NO_OWNER = {"kind": "map", "keyframes": 0, "version": 0, "owner": "", "state": "moving"}
-"""The value of the key ``map`` as long as the map's owner has sent none."""
+"""Largest number of keys of one map; the key whose update is oldest is dropped first."""
+_MAX_UPDATE_BYTES = 65_536
+"""Largest encoded payload of an update in bytes; a larger one is logged and not sent."""
+_UPDATE_WITHOUT_MAP_SERVER = {"kind": "map", "keyframes": 0, "version": 0, "owner": "", "state": "moving"}
+"""Payload of the key ``map`` until the map server has sent one."""
 
 
 @dataclass(eq=False, slots=True)
-class _Value:
-    """A payload, and its bytes in each encoding that a reader uses."""
+class _MapUpdate:
+    """The payload of an update, and its encoding for binary (True) and text (False) codecs, made once."""
 
     payload: dict[str, Any]
     encoded: dict[bool, msgspec.Raw | None] = field(default_factory=dict)
 
 
 @dataclass(eq=False, slots=True)
-class _Topic:
-    """A map with at least one reader."""
+class _WatchedMap:
+    """A map with at least one subscription."""
 
     tenant: str
-    map_name: str
-    values: dict[str, _Value] = field(default_factory=dict)
-    readers: dict[_Subscription, None] = field(default_factory=dict)
-    starters: set[_Subscription] = field(default_factory=set)
-    """Those for whom an owner is started."""
+    name: str
+    updates: dict[str, _MapUpdate] = field(default_factory=dict)  # the newest by key, the oldest first
+    subscriptions: dict[_Subscription, None] = field(default_factory=dict)
+    starters: set[_Subscription] = field(default_factory=set)  # those for which a map server is started
 
 
 @dataclass(eq=False, slots=True)
 class _Subscription:
-    reader: Subscriber
+    subscriber: Subscriber
     id: int
-    topic: _Topic
-    may_go_on: Callable[[], RsePfError | None]
+    map: _WatchedMap
+    find_error: Callable[[], RsePfError | None]
     seq: int = 0
-    waiting: dict[str, int] = field(default_factory=dict)
-    """How many values each key has had since the reader got one; the key that waited longest comes first."""
+    unsent: dict[str, int] = field(default_factory=dict)
+    """For each key with an unsent update, the number of updates since the last one that was sent.  The key
+    that has waited longest comes first."""
 
 
 class Subscriptions:
-    """All subscriptions of one worker."""
+    """All subscriptions of one worker to live maps; all methods are called in the event loop."""
 
     def __init__(
         self,
@@ -79,199 +83,214 @@ class Subscriptions:
         watch: Callable[[str, str, bool], None],
         unwatch: Callable[[str, str], None],
     ) -> None:
-        """Serve no reader yet.
+        """Begin without subscriptions.
 
         Args:
             loop: Event loop of the worker.
-            log: Of the worker.
-            watch: Called with tenant and map when its first reader comes, and whether an owner may be
-                started for its readers; again when that changes.
-            unwatch: Called when its last reader has left.
+            log: Log of the worker.
+            watch: Called with tenant, map name, and whether a map server may be started, when a map gets its
+                first subscription, and when the third value changes.
+            unwatch: Called with tenant and map name when a map has lost its last subscription.
         """
-        self.sent = self.replaced = 0
-        """Values that were sent, and those that newer ones replaced before."""
+        self.sent = 0
+        """Number of updates that were sent."""
+        self.replaced = 0
+        """Number of updates that were not sent to a subscriber, because a newer one replaced them."""
         self._loop = loop
         self._log = log
         self._watch = watch
         self._unwatch = unwatch
-        self._topics: dict[tuple[str, str], _Topic] = {}
-        self._of_reader: dict[Subscriber, dict[int, _Subscription]] = {}
-        self._due: dict[_Subscription, None] = {}
-        self._slow: dict[_Subscription, None] = {}
-        self._is_sending = self._is_retrying = False
-        self._sent_s = float("-inf")
+        self._maps: dict[tuple[str, str], _WatchedMap] = {}  # by tenant and name
+        self._by_subscriber: dict[Subscriber, dict[int, _Subscription]] = {}
+        self._due: dict[_Subscription, None] = {}  # those with unsent updates, in their order
+        self._slow: dict[_Subscription, None] = {}  # those whose socket was full
+        self._has_round = False  # a round of sending is scheduled
+        self._has_slow_retry = False  # a retry for slow subscribers is scheduled
+        self._last_round_s = float("-inf")
 
     def __len__(self) -> int:
-        """Return how many subscriptions there are."""
-        return sum(len(own) for own in self._of_reader.values())
+        """Return the number of subscriptions."""
+        return sum(len(subscriptions) for subscriptions in self._by_subscriber.values())
 
     def begin(
         self,
-        reader: Subscriber,
+        subscriber: Subscriber,
         identity: int,
         tenant: str,
         map_name: str,
         *,
-        may_go_on: Callable[[], RsePfError | None],
+        find_error: Callable[[], RsePfError | None],
         may_start: bool = True,
     ) -> None:
-        """Send the present values of a map to *reader*, and then each newer one.
+        """Send the newest update of each key of a map to a subscriber now, and each newer one later.
 
         Args:
-            reader: The robot's connection.
+            subscriber: Connection of the robot.
             identity: The robot's id of the subscription.
-            tenant: Of the robot.
-            map_name: A map of the tenant.
-            may_go_on: Returns why the robot may read the map no longer; called before anything is sent.
-            may_start: Whether an owner is started for this reader if the map has none.
+            tenant: Tenant of the robot.
+            map_name: Name of a live map of the tenant.
+            find_error: Returns an error if the robot may no longer read the map; called before each sending.
+            may_start: Whether a map server is started for this subscription if the map has none.
         """
         key = (tenant, map_name)
-        topic = self._topics.get(key)
-        is_new = topic is None
-        if topic is None:
-            topic = self._topics[key] = _Topic(tenant, map_name)
-            topic.values["map"] = _Value(_NO_OWNER)
-        subscription = _Subscription(reader, identity, topic, may_go_on)
-        topic.readers[subscription] = None
-        self._of_reader.setdefault(reader, {})[identity] = subscription
-        subscription.waiting = dict.fromkeys(topic.values, 1)
-        reader.bound_unsent(_MAX_UNSENT_BYTES)
-        self._send_soon(subscription)
+        watched_map = self._maps.get(key)
+        is_new = watched_map is None
+        if watched_map is None:
+            watched_map = self._maps[key] = _WatchedMap(tenant, map_name)
+            watched_map.updates["map"] = _MapUpdate(_UPDATE_WITHOUT_MAP_SERVER)
+        subscription = _Subscription(subscriber, identity, watched_map, find_error)
+        watched_map.subscriptions[subscription] = None
+        self._by_subscriber.setdefault(subscriber, {})[identity] = subscription
+        subscription.unsent = dict.fromkeys(watched_map.updates, 1)
+        subscriber.bound_unsent(_MAX_UNSENT_BYTES)
+        self._schedule(subscription)
         if is_new:
             self._watch(tenant, map_name, may_start)
         if may_start:
-            self._set_starter(subscription, is_starter=True, is_told=is_new)
+            self._set_starter(subscription, is_starter=True, notify=not is_new)
 
-    def stop_starting(self, reader: Subscriber, identity: int) -> None:
-        """Start no owner for this subscription any more: the reader may only watch from now on."""
-        subscription = self._of_reader.get(reader, {}).get(identity)
+    def stop_starting(self, subscriber: Subscriber, identity: int) -> None:
+        """Start no map server for a subscription from now on, because the robot may only watch the map."""
+        subscription = self._by_subscriber.get(subscriber, {}).get(identity)
         if subscription is not None:
             self._set_starter(subscription, is_starter=False)
 
-    def _set_starter(self, subscription: _Subscription, *, is_starter: bool, is_told: bool = False) -> None:
-        topic = subscription.topic
-        before = bool(topic.starters)
-        (topic.starters.add if is_starter else topic.starters.discard)(subscription)
-        if topic.readers and bool(topic.starters) != before and not is_told:
-            self._watch(topic.tenant, topic.map_name, is_starter)
+    def _set_starter(self, subscription: _Subscription, *, is_starter: bool, notify: bool = True) -> None:
+        """Note whether a map server is started for a subscription, and *notify* `watch` if that matters."""
+        watched_map = subscription.map
+        had_starters = bool(watched_map.starters)
+        if is_starter:
+            watched_map.starters.add(subscription)
+        else:
+            watched_map.starters.discard(subscription)
+        if watched_map.subscriptions and bool(watched_map.starters) != had_starters and notify:
+            self._watch(watched_map.tenant, watched_map.name, is_starter)
 
-    def end(self, reader: Subscriber, identity: int) -> None:
-        """Send no more to a subscription; does nothing if it has ended."""
-        own = self._of_reader.get(reader, {})
-        subscription = own.pop(identity, None)
+    def end(self, subscriber: Subscriber, identity: int) -> None:
+        """End the subscription *identity* of a subscriber; does nothing if it has ended already."""
+        subscriptions = self._by_subscriber.get(subscriber, {})
+        subscription = subscriptions.pop(identity, None)
         if subscription is None:
             return
-        if not own:
-            del self._of_reader[reader]
+        if not subscriptions:
+            del self._by_subscriber[subscriber]
         self._due.pop(subscription, None)
         self._slow.pop(subscription, None)
-        topic = subscription.topic
-        del topic.readers[subscription]
+        watched_map = subscription.map
+        del watched_map.subscriptions[subscription]
         self._set_starter(subscription, is_starter=False)
-        if not topic.readers:
-            del self._topics[topic.tenant, topic.map_name]
-            self._unwatch(topic.tenant, topic.map_name)
+        if not watched_map.subscriptions:
+            del self._maps[watched_map.tenant, watched_map.name]
+            self._unwatch(watched_map.tenant, watched_map.name)
 
-    def left(self, reader: Subscriber) -> None:
-        """End all subscriptions of a connection that ended."""
-        for identity in list(self._of_reader.get(reader, ())):
-            self.end(reader, identity)
+    def end_all(self, subscriber: Subscriber) -> None:
+        """End all subscriptions of a connection that was closed."""
+        for identity in list(self._by_subscriber.get(subscriber, ())):
+            self.end(subscriber, identity)
 
     def update(self, tenant: str, map_name: str, key: str, payload: dict[str, Any]) -> None:
-        """Take the newest value of one key of a map; it is forgotten if nobody reads the map."""
-        topic = self._topics.get((tenant, map_name))
-        if topic is None:
+        """Replace the newest update of *key* and schedule it for all subscribers of the map.
+
+        The update of a map without subscribers is dropped.
+        """
+        watched_map = self._maps.get((tenant, map_name))
+        if watched_map is None:
             return
-        topic.values.pop(key, None)
-        topic.values[key] = _Value(payload)
-        if len(topic.values) > _MAX_KEYS:
-            oldest = next(iter(topic.values))
-            del topic.values[oldest]
-            for subscription in topic.readers:
-                subscription.waiting.pop(oldest, None)
-        for subscription in topic.readers:
-            subscription.waiting[key] = subscription.waiting.get(key, 0) + 1
+        watched_map.updates.pop(key, None)
+        watched_map.updates[key] = _MapUpdate(payload)
+        if len(watched_map.updates) > _MAX_KEYS:
+            oldest = next(iter(watched_map.updates))
+            del watched_map.updates[oldest]
+            for subscription in watched_map.subscriptions:
+                subscription.unsent.pop(oldest, None)
+        for subscription in watched_map.subscriptions:
+            subscription.unsent[key] = subscription.unsent.get(key, 0) + 1
             if subscription not in self._slow:
-                self._send_soon(subscription)
+                self._schedule(subscription)
 
-    def _send_soon(self, subscription: _Subscription) -> None:
+    def _schedule(self, subscription: _Subscription) -> None:
         self._due[subscription] = None
-        if not self._is_sending:
-            self._is_sending = True
-            self._loop.call_later(max(0.0, self._sent_s + _GATHER_S - self._loop.time()), self._send)
+        if not self._has_round:
+            self._has_round = True
+            delay_s = self._last_round_s + _MIN_ROUND_INTERVAL_S - self._loop.time()
+            self._loop.call_later(max(0.0, delay_s), self._send_round)
 
-    def _send(self) -> None:
-        """Send what is due, up to a bound; then the event loop serves the robots' commands first."""
-        self._sent_s = self._loop.time()
-        left = _MAX_SENT_AT_ONCE
-        while self._due and left > 0:
+    def _send_round(self) -> None:
+        """Send up to 200 due updates; the rest follows after the event loop has served robots' commands."""
+        self._last_round_s = self._loop.time()
+        remaining = _MAX_SENT_PER_ROUND
+        while self._due and remaining > 0:
             subscription = next(iter(self._due))
             del self._due[subscription]
-            left = self._send_to(subscription, left)
-        self._is_sending = bool(self._due)
-        if self._is_sending:
-            self._loop.call_soon(self._send)
+            remaining = self._send_to(subscription, remaining)
+        self._has_round = bool(self._due)
+        if self._has_round:
+            self._loop.call_soon(self._send_round)
 
-    def _send_to(self, subscription: _Subscription, left: int) -> int:
-        """Send up to *left* values to one reader; return how many more may be sent."""
-        reader, session = subscription.reader, subscription.reader.session
-        if session is None or not reader.is_connected:
-            return left
-        forbidden = subscription.may_go_on()
-        if forbidden is not None:
-            self.end(reader, subscription.id)
-            reader.refuse_updates(subscription.id, forbidden)
-            return left
-        topic, waiting = subscription.topic, subscription.waiting
-        while waiting:
-            if reader.unsent_bytes > _MAX_UNSENT_BYTES:
+    def _send_to(self, subscription: _Subscription, remaining: int) -> int:
+        """Send up to *remaining* updates to one subscriber; return how many more the round may send."""
+        subscriber, session = subscription.subscriber, subscription.subscriber.session
+        if session is None or not subscriber.is_connected:
+            return remaining
+        error = subscription.find_error()
+        if error is not None:
+            self.end(subscriber, subscription.id)
+            subscriber.refuse_updates(subscription.id, error)
+            return remaining
+        watched_map, unsent = subscription.map, subscription.unsent
+        while unsent:
+            if subscriber.unsent_bytes > _MAX_UNSENT_BYTES:
                 self._retry_later(subscription)
-                return left
-            if left <= 0:
+                return remaining
+            if remaining <= 0:
                 self._due[subscription] = None
-                return left
-            key = next(iter(waiting))
-            count = waiting.pop(key)
-            encoded = self._encoded(topic, key, topic.values[key], session)
+                return remaining
+            key = next(iter(unsent))
+            count = unsent.pop(key)
+            encoded = self._encode(watched_map, key, session)
             if encoded is None:
                 continue
             subscription.seq += count
             update = Update(
-                id=subscription.id, topic=live_topic(topic.map_name), seq=subscription.seq, key=key,
+                id=subscription.id,
+                topic=live_topic(watched_map.name),
+                seq=subscription.seq,
+                key=key,
                 payload=encoded,
-            )  # fmt: skip
-            reader.write(session.codec.encode(update))
+            )
+            subscriber.write(session.codec.encode(update))
             self.sent += 1
             self.replaced += count - 1
-            left -= 1
-        return left
+            remaining -= 1
+        return remaining
 
-    def _encoded(self, topic: _Topic, key: str, value: _Value, session: ServerSession) -> msgspec.Raw | None:
-        """Return the payload as the reader's codec has it; None if it cannot be sent."""
+    def _encode(self, watched_map: _WatchedMap, key: str, session: ServerSession) -> msgspec.Raw | None:
+        """Return the newest payload of *key* in the codec of the session, or None if it cannot be sent."""
+        update = watched_map.updates[key]
         is_binary = session.codec.name == "bin"
-        if is_binary in value.encoded:
-            return value.encoded[is_binary]
-        why, encoded = "", None
+        if is_binary in update.encoded:
+            return update.encoded[is_binary]
+        reason, encoded = "", None
         try:
-            data = encode_payload(session.codec, value.payload)
+            data = encode_payload(session.codec, update.payload)
         except BadMessage as error:
-            why = error.message
+            reason = error.message
         else:
-            encoded = msgspec.Raw(data) if len(data) <= _MAX_VALUE_BYTES else None
-            why = f"{len(data)} bytes are above {_MAX_VALUE_BYTES}"
+            encoded = msgspec.Raw(data) if len(data) <= _MAX_UPDATE_BYTES else None
+            reason = f"{len(data)} bytes are above {_MAX_UPDATE_BYTES}"
         if encoded is None:
-            self._log.error("update-not-sent", map=topic.map_name, key=key, reason=why)
-        value.encoded[is_binary] = encoded
+            self._log.error("update-not-sent", map=watched_map.name, key=key, reason=reason)
+        update.encoded[is_binary] = encoded
         return encoded
 
     def _retry_later(self, subscription: _Subscription) -> None:
         self._slow[subscription] = None
-        if not self._is_retrying:
-            self._is_retrying = True
-            self._loop.call_later(_RETRY_S, self._retry)
+        if not self._has_slow_retry:
+            self._has_slow_retry = True
+            self._loop.call_later(_SLOW_RETRY_S, self._retry_slow)
 
-    def _retry(self) -> None:
+    def _retry_slow(self) -> None:
         slow, self._slow = self._slow, {}
-        self._is_retrying = False
+        self._has_slow_retry = False
         for subscription in slow:
-            self._send_soon(subscription)
+            self._schedule(subscription)

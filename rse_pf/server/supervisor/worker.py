@@ -47,7 +47,7 @@ from rse_pf.server.jobs.manager import JobManager
 from rse_pf.server.jobs.process import spawner
 from rse_pf.server.jobs.runner import JobContext
 from rse_pf.server.jobs.slots import JobSlots
-from rse_pf.server.live_map.map_link import OwnerLinks
+from rse_pf.server.live_map.client import LiveMapClient
 from rse_pf.server.live_map.router import LIVE_SERVICES, LiveMapRouter
 from rse_pf.server.log import JsonLog
 from rse_pf.server.object_refs import ObjectRefs
@@ -509,10 +509,10 @@ class _Worker:
 
 
 def _live_maps(context: WorkerContext, answers: Answers, store: ObjectStore) -> LiveMapRouter:
-    def owners(on_update: Callable[[str, str, dict[str, Any]], None]) -> OwnerLinks:
-        return OwnerLinks(
+    def make_client(on_update: Callable[[str, str, dict[str, Any]], None]) -> LiveMapClient:
+        return LiveMapClient(
             store=store, settings=context.settings, server_id=context.server_id, log=context.log,
             on_update=on_update,
         )  # fmt: skip
 
-    return LiveMapRouter(context, owners=owners, answer=answers.send_message)
+    return LiveMapRouter(context, make_client=make_client, answer=answers.send_message)

@@ -10,8 +10,8 @@ import pytest
 from rse_pf.cli.main import main
 from rse_pf.live_map.events import MapServerChanged, encode_events
 from rse_pf.object_store import DirectoryStore
-from rse_pf.server.live_map.owner.lease import OwnerLease, lease_name, map_folder
-from rse_pf.server.live_map.owner.log import LiveLog
+from rse_pf.server.live_map.lease import MapLease, lease_name, map_folder
+from rse_pf.server.live_map.map_server.log import LiveLog
 
 
 @pytest.fixture
@@ -19,7 +19,7 @@ def store(tmp_path: Path) -> Path:
     """A store with the live maps "hall", which its owner released, and "attic", which was stopped."""
     objects = DirectoryStore(tmp_path / "store")
     for name in ("hall", "attic"):
-        lease = OwnerLease(
+        lease = MapLease(
             objects,
             lease_name("default", name),
             owner="a-1",
@@ -27,7 +27,7 @@ def store(tmp_path: Path) -> Path:
             clock=lambda: 0.0,
         )
         lease.claim(None)
-        LiveLog(objects, map_folder("default", name), owner="a-1", epoch=1).write(
+        LiveLog(objects, map_folder("default", name), owner="a-1", epoch=1).write_entry(
             encode_events([MapServerChanged(owner="a-1", epoch=1)])
         )
         assert lease.release() if name == "hall" else lease.stop(1)

@@ -20,8 +20,8 @@ from rse_pf.geometry import Camera, exp_se3
 from rse_pf.identity import DEFAULT_TENANT
 from rse_pf.live_map.events import KeyframeAdded, MapServerChanged, encode_events
 from rse_pf.object_store import DirectoryStore
-from rse_pf.server.live_map.owner.lease import map_folder
-from rse_pf.server.live_map.owner.log import LiveLog
+from rse_pf.server.live_map.lease import map_folder
+from rse_pf.server.live_map.map_server.log import LiveLog
 from rse_pf.slam.keyframe import SentKeyframe, encode_keyframe, make_features
 
 NUMBERS = range(4)
@@ -45,14 +45,14 @@ def write_run(folder: Path, keyframes: list[KeyframeAdded], *, fault: str = "kil
     store = DirectoryStore(folder / "platform" / "objects")
     where = map_folder(DEFAULT_TENANT, "demo")
     log = LiveLog(store, where, owner="one", epoch=1)
-    log.write(encode_events([MapServerChanged(owner="one", epoch=1)]))
+    log.write_entry(encode_events([MapServerChanged(owner="one", epoch=1)]))
     for each in keyframes[:2]:
-        log.write(encode_events([each]))
+        log.write_entry(encode_events([each]))
     second = LiveLog(store, where, owner="two", epoch=2)
     second.position = log.position
-    position = second.write(encode_events([MapServerChanged(owner="two", epoch=2)]))
+    position = second.write_entry(encode_events([MapServerChanged(owner="two", epoch=2)]))
     for each in keyframes[2:]:
-        position = second.write(encode_events([each]))
+        position = second.write_entry(encode_events([each]))
     (folder / "robot-1").mkdir()
     lines: list[dict[str, Any]] = [
         {

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import pytest
 from fakes import FakeLoop
 from server.gateway.worker_parts import WorkerParts, quiet_log, worker_parts
-from server.live_map.fake_owners import FakeReader
+from server.live_map.fake_client import FakeReader
 
 from rse_pf.server.gateway.connection import RobotConnection
 from rse_pf.server.live_map.subscriptions import Subscriptions
@@ -77,13 +77,13 @@ def _watch_and_leave(quiet: JsonLog) -> None:
     def cycle() -> None:
         reader = FakeReader()
         for number in range(4):
-            subscriptions.begin(reader, number, "default", f"m-{number}", may_go_on=lambda: None)
+            subscriptions.begin(reader, number, "default", f"m-{number}", find_error=lambda: None)
         reader.unsent_bytes = 1 << 20
         loop.advance(0.02)
         subscriptions.update("default", "m-1", "pose/r", {"kind": "pose", "robot": "r", "x": 1.0})
         subscriptions.end(reader, 0)
         loop.advance(0.02)
-        subscriptions.left(reader)
+        subscriptions.end_all(reader)
 
     readers = held(FakeReader)
     for _ in range(TIMES):

@@ -24,8 +24,7 @@ from rse_pf.live_map.feature_parts import SnapshotParts
 from rse_pf.live_map.outcomes import Added, Alignment, Corrected, Outcome
 from rse_pf.live_map.versions import PointSource
 from rse_pf.maps.format import Keyframe, MapVersion
-from rse_pf.server.live_map.owner.state import MapKind
-from rse_pf.server.live_map.owner.whole_fit import WholeFit
+from rse_pf.server.live_map.map_server.environment import GraphOptimiser, MapImplementation
 from rse_pf.slam.keyframe import SentKeyframe, UnknownBlock, encode_keyframe, make_features
 from rse_pf.wire.live_map import KeyframeRequest
 
@@ -99,7 +98,7 @@ class FakeMap:
     ) -> list[Callable[[], LoopClosuresMeasured]]:
         return [lambda: LoopClosuresMeasured(keyframe=keyframe)]
 
-    def prepare_optimisation(self, solve: WholeFit | None = None) -> Callable[[], Optimised]:
+    def prepare_optimisation(self, solve: GraphOptimiser | None = None) -> Callable[[], Optimised]:
         return lambda: Optimised(up_to=0, ids=(), T_map_camera=b"")
 
     def prepare_relocalisation(self, view: SentKeyframe) -> Callable[[], Any]:
@@ -168,7 +167,7 @@ def _started(version: MapVersion, source: str) -> MapStarted:
     )
 
 
-FAKE_MAP = MapKind(empty=FakeMap, restore=FakeMap.restore, started_from=_started)
+FAKE_MAP = MapImplementation(empty=FakeMap, restore=FakeMap.restore, started_from=_started)
 
 
 def keyframe_bytes(timestamp_s: float, content: bytes) -> bytes:

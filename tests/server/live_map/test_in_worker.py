@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 from server.gateway.worker_parts import BINARY, WorkerParts, worker_parts
-from server.live_map.fake_owners import FakeOwners
+from server.live_map.fake_client import FakeLiveMapClient
 
 from rse_pf.server.gateway.answers import Answers
 from rse_pf.server.gateway.connection import RobotConnection
@@ -22,20 +22,20 @@ HELLO = Hello(capabilities=("updates",))
 class Worker(WorkerParts):
     """A worker with live maps, whose owners are fake."""
 
-    owners: FakeOwners
+    client: FakeLiveMapClient
 
     def __init__(self, *args: Any, **more: Any) -> None:
         super().__init__(*args, live_maps=self._router, **more)
 
     def _router(self, context: WorkerContext, answers: Answers) -> LiveMapRouter:
-        def owners(on_update: Any) -> FakeOwners:
-            self.owners = FakeOwners(on_update)
-            return self.owners
+        def make_client(on_update: Any) -> FakeLiveMapClient:
+            self.client = FakeLiveMapClient(on_update)
+            return self.client
 
-        return LiveMapRouter(context, owners=owners, answer=answers.send_message)
+        return LiveMapRouter(context, make_client=make_client, answer=answers.send_message)
 
     def tell(self, keyframes: int) -> None:
-        self.owners.on_update("default", "m", {"kind": "map", "keyframes": keyframes})
+        self.client.on_update("default", "m", {"kind": "map", "keyframes": keyframes})
         self.loop.advance(0.1)
 
     def subscriber(self, name: str = "r") -> tuple[RobotConnection, Any]:
@@ -78,7 +78,7 @@ def test_a_robot_without_the_capability_is_refused_and_sees_nothing_new(worker: 
 
     [failure] = wire.sent
     assert (failure.id, failure.code) == (4, "bad-request")
-    assert worker.owners.watched == []
+    assert worker.client.watched == []
 
 
 def test_a_ninth_subscription_is_above_the_quota_until_one_ends(worker: Worker) -> None:
@@ -90,8 +90,8 @@ def test_a_ninth_subscription_is_above_the_quota_until_one_ends(worker: Worker) 
     worker.say(connection, Unsubscribe(id=0))
     worker.say(connection, Subscribe(id=8, topic="live/m8"))
 
-    assert [name for _, name in worker.owners.watched] == [f"m{number}" for number in range(9)]
-    assert worker.owners.unwatched == [("default", "m0")]
+    assert [name for _, name in worker.client.watched] == [f"m{number}" for number in range(9)]
+    assert worker.client.unwatched == [("default", "m0")]
 
 
 def test_a_subscription_of_a_live_id_begins_again(worker: Worker) -> None:
@@ -123,7 +123,7 @@ def test_the_end_of_a_connection_ends_its_subscriptions(worker: Worker) -> None:
 
     connection.on_socket_end()
 
-    assert worker.owners.unwatched == [("default", "m")]
+    assert worker.client.unwatched == [("default", "m")]
     worker.tell(1)
 
 
@@ -152,7 +152,7 @@ def test_a_refused_command_is_answered_and_counted(worker: Worker) -> None:
 def test_a_server_that_drains_gives_its_maps_up(worker: Worker) -> None:
     worker.dispatcher.move_all("drain", 1000.0)
 
-    assert worker.owners.gave_up
+    assert worker.client.gave_up
 
 
 def test_without_live_maps_topics_and_services_are_unknown() -> None:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from server.gateway.worker_parts import quiet_log
-from server.live_map.fake_owners import FakeOwners, FakeReader
+from server.live_map.fake_client import FakeLiveMapClient, FakeReader
 
 from rse_pf.auth.tokens import Claims
 from rse_pf.config import PlatformSettings
@@ -67,12 +67,14 @@ class Parts:
         self.context = context
         self.answers: list[Result | Failure] = []
         self.router = LiveMapRouter(
-            context, owners=self._owners, answer=lambda queued, message: self.answers.append(message)
+            context,
+            make_client=self._make_client,
+            answer=lambda queued, message: self.answers.append(message),
         )
 
-    def _owners(self, on_update: Any) -> FakeOwners:
-        self.owners = FakeOwners(on_update)
-        return self.owners
+    def _make_client(self, on_update: Any) -> FakeLiveMapClient:
+        self.client = FakeLiveMapClient(on_update)
+        return self.client
 
     def submit(
         self,
@@ -114,7 +116,7 @@ async def a_router(now: list[float] | None = None) -> AsyncIterator[Parts]:
         parts = Parts(context)
         yield parts
         await asyncio.wait_for(parts.router.wait_closed(), 20.0)
-        assert parts.owners.closed
+        assert parts.client.closed
 
 
 async def test_a_keyframe_goes_to_the_owner_of_its_tenants_map_and_the_reply_comes_back() -> None:
@@ -124,7 +126,7 @@ async def test_a_keyframe_goes_to_the_owner_of_its_tenants_map_and_the_reply_com
         assert isinstance(answer, Result)
         assert answer.reply == {"number": 1, "version": 1}
         assert answer.server == "s-1"
-        [(tenant, name, robot, operation, payload, deadline_s)] = parts.owners.asked
+        [(tenant, name, robot, operation, payload, deadline_s)] = parts.client.asked
         assert (tenant, name, robot, operation) == ("acme", "m", RobotId("acme", "bob"), "live-keyframe")
         assert 4.0 < deadline_s <= 5.0
         assert payload == KeyframeRequest(map="m", segment=0, number=0, keyframe=KEYFRAME)
@@ -135,8 +137,8 @@ async def test_a_keyframe_arrives_the_same_from_json_and_from_messagepack() -> N
         for number, sent in enumerate((KEYFRAME, base64.b64encode(KEYFRAME).decode())):
             await parts.ask("live-keyframe", keyframe(number, keyframe=sent))
 
-        assert [asked[4].keyframe for asked in parts.owners.asked] == [KEYFRAME] * 2
-        assert [asked[4].number for asked in parts.owners.asked] == [0, 1]
+        assert [asked[4].keyframe for asked in parts.client.asked] == [KEYFRAME] * 2
+        assert [asked[4].number for asked in parts.client.asked] == [0, 1]
 
 
 async def test_a_keyframe_ahead_of_the_next_number_is_a_conflict_and_no_garbage() -> None:
@@ -188,7 +190,7 @@ async def test_an_invalid_keyframe_is_refused_before_any_owner_sees_it(changes: 
 
         assert isinstance(answer, Failure)
         assert (answer.code, bool(answer.hint)) == (code, True), answer
-        assert parts.owners.asked == []
+        assert parts.client.asked == []
 
 
 @pytest.mark.parametrize("payload", [None, 3, [], "m", {}])
@@ -222,12 +224,12 @@ async def test_the_scope_of_the_map_decides(service: str, scopes: tuple[str, ...
         connection = FakeReader()
         connection.claims = claims(*scopes)
         payload = {**keyframe(), "robot": "bob", "from": "m@ab12"}
-        parts.owners.answer = lambda operation, payload: {}
+        parts.client.answer = lambda operation, payload: {}
 
         answer = await parts.ask(service, payload, connection=connection)
 
         assert isinstance(answer, Result) is allowed
-        assert len(parts.owners.asked) == allowed
+        assert len(parts.client.asked) == allowed
         assert allowed or (isinstance(answer, Failure) and answer.code == "forbidden")
 
 
@@ -250,18 +252,18 @@ async def test_a_map_begins_with_another_one_for_who_may_read_that(
     async with a_router() as parts:
         connection = FakeReader()
         connection.claims = claims(*scopes)
-        parts.owners.answer = lambda operation, payload: {}
+        parts.client.answer = lambda operation, payload: {}
 
         answer = await parts.ask("live-start", {"map": "m", "from": source}, connection=connection)
 
         assert isinstance(answer, Result) is allowed
-        assert len(parts.owners.asked) == allowed
+        assert len(parts.client.asked) == allowed
         assert allowed or (isinstance(answer, Failure) and "maps:read/secret" in answer.message)
 
 
 async def test_a_robot_lists_the_maps_of_its_tenant_that_it_may_enter() -> None:
     async with a_router() as parts:
-        parts.owners.maps = {"default": [{"name": "a"}, {"name": "b"}], "acme": [{"name": "secret"}]}
+        parts.client.maps = {"default": [{"name": "a"}, {"name": "b"}], "acme": [{"name": "secret"}]}
         connection = FakeReader()
         connection.claims = claims("maps:live/b")
 
@@ -273,7 +275,7 @@ async def test_a_robot_lists_the_maps_of_its_tenant_that_it_may_enter() -> None:
 
 async def test_an_owner_that_does_not_answer_ends_with_the_deadline() -> None:
     async with a_router() as parts:
-        parts.owners.answer = lambda operation, payload: None
+        parts.client.answer = lambda operation, payload: None
 
         answer = await parts.ask("live-show", {"map": "m"}, allowed_s=0.02)
 
@@ -286,7 +288,7 @@ async def test_an_owner_that_does_not_answer_ends_with_the_deadline() -> None:
 
 async def test_while_the_owner_changes_a_robot_is_told_when_to_ask_again() -> None:
     async with a_router() as parts:
-        parts.owners.answer = lambda *_: Busy("the owner changes", hint="wait", retry_after_ms=300.0)
+        parts.client.answer = lambda *_: Busy("the owner changes", hint="wait", retry_after_ms=300.0)
 
         answer = await parts.ask("live-show", {"map": "m"})
 
@@ -300,7 +302,7 @@ async def test_a_defect_is_an_internal_failure_without_its_text() -> None:
         def broken(operation: str, payload: dict[str, Any]) -> dict[str, Any]:
             raise ZeroDivisionError("secret")
 
-        parts.owners.answer = broken
+        parts.client.answer = broken
 
         answer = await parts.ask("live-show", {"map": "m"})
 
@@ -315,7 +317,7 @@ async def test_a_sender_of_garbage_loses_the_live_maps_for_a_while_and_the_other
     async with a_router(now) as parts:
         hostile, good = FakeReader("hostile"), FakeReader("good")
         namesake = FakeReader("hostile", tenant="acme")
-        parts.owners.answer = lambda operation, payload: (
+        parts.client.answer = lambda operation, payload: (
             BadRequest("a keyframe of 10 km away") if payload.segment else {}
         )
         for _ in range(9):
@@ -323,12 +325,12 @@ async def test_a_sender_of_garbage_loses_the_live_maps_for_a_while_and_the_other
         assert isinstance(await parts.ask("live-keyframe", keyframe(), connection=hostile), Result)
 
         await parts.ask("live-keyframe", keyframe(keyframe=5), connection=hostile)
-        asked = len(parts.owners.asked)
+        asked = len(parts.client.asked)
         refused = await parts.ask("live-keyframe", keyframe(), connection=hostile)
 
         assert isinstance(refused, Failure)
         assert refused.code == "forbidden"
-        assert len(parts.owners.asked) == asked
+        assert len(parts.client.asked) == asked
         assert isinstance(await parts.ask("live-keyframe", keyframe(), connection=good), Result)
         assert isinstance(await parts.ask("live-keyframe", keyframe(), connection=namesake), Result)
         now[0] += 61.0
@@ -337,7 +339,7 @@ async def test_a_sender_of_garbage_loses_the_live_maps_for_a_while_and_the_other
 
 async def test_what_a_robot_of_that_name_in_another_tenant_asked_does_not_count_as_its_own() -> None:
     async with a_router() as parts:
-        parts.owners.answer = lambda operation, payload: None
+        parts.client.answer = lambda operation, payload: None
         parts.submit("live-show", {"map": "m"}, connection=FakeReader("r", tenant="acme"))
 
         assert (parts.router.held, waiting(parts)) == (1, 0)
@@ -345,7 +347,7 @@ async def test_what_a_robot_of_that_name_in_another_tenant_asked_does_not_count_
 
 async def test_more_bytes_than_one_worker_holds_are_busy() -> None:
     async with a_router() as parts:
-        parts.owners.answer = lambda operation, payload: None
+        parts.client.answer = lambda operation, payload: None
         for tenant in "abcd":
             reader = FakeReader("r", tenant=tenant)
             parts.submit("live-show", {"map": "m"}, connection=reader, size_bytes=15 << 20)
@@ -378,9 +380,9 @@ async def test_two_workers_tell_their_robots_the_same() -> None:
             "T_map_odom": np.eye(4).astype("<f8").tobytes(), "covariance": np.arange(21.0).tobytes(),
         }  # fmt: skip
         for each in (parts, other):
-            assert each.owners.watched == [("default", "m")]
-            each.owners.on_update("default", "m", payload)
-            each.owners.on_update("default", "m", {"kind": "map", "keyframes": 3, "key": "map"})
+            assert each.client.watched == [("default", "m")]
+            each.client.on_update("default", "m", payload)
+            each.client.on_update("default", "m", {"kind": "map", "keyframes": 3, "key": "map"})
 
         for reader in (here, there):
             updates = {each.key: each.payload for each in await settled(reader, 2)}
@@ -413,7 +415,7 @@ async def test_a_subscription_that_is_not_allowed_is_refused_by_its_id(
 
         [failure] = reader.written
         assert (failure.id, failure.code) == (9, code)
-        assert parts.owners.watched == []
+        assert parts.client.watched == []
 
 
 async def test_a_right_that_a_fresh_token_does_not_give_ends_the_subscription() -> None:
@@ -424,11 +426,11 @@ async def test_a_right_that_a_fresh_token_does_not_give_ends_the_subscription() 
         await settled(reader, 1)
 
         reader.claims = claims("maps:live/other")
-        parts.owners.on_update("default", "m", {"kind": "map", "keyframes": 1})
+        parts.client.on_update("default", "m", {"kind": "map", "keyframes": 1})
 
         failure: Any = (await settled(reader, 2))[1]
         assert (failure.id, failure.code) == (9, "forbidden")
-        assert parts.owners.unwatched == [("default", "m")]
+        assert parts.client.unwatched == [("default", "m")]
 
 
 async def test_a_token_to_watch_a_map_subscribes_to_it_and_starts_no_owner() -> None:
@@ -437,13 +439,13 @@ async def test_a_token_to_watch_a_map_subscribes_to_it_and_starts_no_owner() -> 
         viewer.claims = claims("maps:watch/m")
         driver.claims = claims("maps:live/m")
         parts.router.subscribe(viewer, 9, "live/m")
-        assert parts.owners.may_start == {("default", "m"): False}
+        assert parts.client.may_start == {("default", "m"): False}
 
         parts.router.subscribe(driver, 3, "live/m")
-        assert parts.owners.may_start == {("default", "m"): True}
+        assert parts.client.may_start == {("default", "m"): True}
         parts.router.leave(driver)
-        assert parts.owners.may_start == {("default", "m"): False}
-        parts.owners.on_update("default", "m", {"kind": "map", "keyframes": 1})
+        assert parts.client.may_start == {("default", "m"): False}
+        parts.client.on_update("default", "m", {"kind": "map", "keyframes": 1})
 
         [update] = [each for each in await settled(viewer, 1) if isinstance(each, Update)]
         assert update.payload["keyframes"] == 1
@@ -451,7 +453,7 @@ async def test_a_token_to_watch_a_map_subscribes_to_it_and_starts_no_owner() -> 
         failure: Any = viewer.written[-1]
         assert (failure.id, failure.code) == (10, "forbidden")
         parts.router.unsubscribe(viewer, 9)
-        assert parts.owners.unwatched == [("default", "m")]
+        assert parts.client.unwatched == [("default", "m")]
 
 
 async def test_a_driver_whose_fresh_token_only_allows_to_watch_goes_on_reading_and_starts_no_owner() -> None:
@@ -460,13 +462,13 @@ async def test_a_driver_whose_fresh_token_only_allows_to_watch_goes_on_reading_a
         reader.claims = claims("maps:live/m")
         parts.router.subscribe(reader, 9, "live/m")
         await settled(reader, 1)
-        assert parts.owners.may_start == {("default", "m"): True}
+        assert parts.client.may_start == {("default", "m"): True}
 
         reader.claims = claims("maps:watch/m")
-        parts.owners.on_update("default", "m", {"kind": "map", "keyframes": 1})
+        parts.client.on_update("default", "m", {"kind": "map", "keyframes": 1})
 
         assert isinstance((await settled(reader, 2))[1], Update)
-        assert parts.owners.may_start == {("default", "m"): False}
+        assert parts.client.may_start == {("default", "m"): False}
 
 
 @pytest.mark.parametrize(
@@ -480,7 +482,7 @@ async def test_a_driver_whose_fresh_token_only_allows_to_watch_goes_on_reading_a
 @pytest.mark.parametrize("service", sorted(LIVE_SERVICES - {"live-keyframe", "live-relocalise", "live-list"}))
 async def test_an_error_of_the_map_never_counts_against_who_asked(service: str, error: RsePfError) -> None:
     async with a_router() as parts:
-        parts.owners.answer = lambda operation, payload: error
+        parts.client.answer = lambda operation, payload: error
         payload = {"map": "m", "robot": "bob", "from": "m@ab12"}
 
         for _ in range(15):
@@ -494,7 +496,7 @@ async def test_an_error_of_the_map_never_counts_against_who_asked(service: str, 
 )
 async def test_a_keyframe_that_the_store_or_the_quota_refuses_is_no_garbage(error: RsePfError) -> None:
     async with a_router() as parts:
-        parts.owners.answer = lambda operation, payload: error
+        parts.client.answer = lambda operation, payload: error
 
         for _ in range(15):
             answer = await parts.ask("live-keyframe", keyframe())
@@ -504,7 +506,7 @@ async def test_a_keyframe_that_the_store_or_the_quota_refuses_is_no_garbage(erro
 
 async def test_what_waits_for_owners_is_bounded_for_each_tenant() -> None:
     async with a_router() as parts:
-        parts.owners.answer = lambda operation, payload: None
+        parts.client.answer = lambda operation, payload: None
         hostile, good = FakeReader("r", tenant="acme"), FakeReader("r", tenant="rival")
         for _ in range(20):
             parts.submit("live-show", {"map": "m"}, connection=hostile, size_bytes=1 << 20)
@@ -518,7 +520,7 @@ async def test_what_waits_for_owners_is_bounded_for_each_tenant() -> None:
 
 async def test_closing_ends_what_waits() -> None:
     async with a_router() as parts:
-        parts.owners.answer = lambda operation, payload: None
+        parts.client.answer = lambda operation, payload: None
         parts.submit("live-show", {"map": "m"})
         await asyncio.sleep(0)
         parts.router.give_up()
@@ -526,5 +528,5 @@ async def test_closing_ends_what_waits() -> None:
         with suppress(asyncio.CancelledError):
             await parts.router.wait_closed()
 
-        assert parts.owners.gave_up
+        assert parts.client.gave_up
         assert parts.router.held == 0

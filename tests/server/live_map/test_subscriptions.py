@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from fakes import FakeLog, FakeLoop
-from server.live_map.fake_owners import FakeReader
+from server.live_map.fake_client import FakeReader
 
 from rse_pf.errors import Forbidden, RsePfError
 from rse_pf.server.live_map.subscriptions import Subscriptions
@@ -28,7 +28,7 @@ class Parts:
         )
 
     def begin(self, reader: FakeReader, identity: int = 7, name: str = "m", **more: Any) -> None:
-        more.setdefault("may_go_on", lambda: None)
+        more.setdefault("find_error", lambda: None)
         self.all.begin(reader, identity, reader.robot.tenant, name, **more)
 
     def pose(self, robot: str, x: float, *, tenant: str = "default") -> None:
@@ -104,16 +104,16 @@ def test_a_reader_that_never_reads_costs_the_names_of_the_keys_only(parts: Parts
     parts.begin(reader)
     parts.settle()
     reader.unsent_bytes = 1 << 20
-    [subscription] = parts.all._of_reader[reader].values()  # type: ignore[index]
+    [subscription] = parts.all._by_subscriber[reader].values()  # type: ignore[index]
 
     for step in range(3000):
         parts.pose(f"robot-{step % 1500}", float(step))
     parts.settle()
 
     assert told(reader) == [(1, "map")]
-    assert len(subscription.topic.values) == 1024
-    assert len(subscription.waiting) <= 1024
-    assert sys.getsizeof(subscription.waiting) < 100_000
+    assert len(subscription.map.updates) == 1024
+    assert len(subscription.unsent) <= 1024
+    assert sys.getsizeof(subscription.unsent) < 100_000
 
 
 def test_values_that_come_together_replace_each_other_before_they_are_sent(parts: Parts) -> None:
@@ -170,7 +170,7 @@ def test_an_ended_subscription_gets_nothing_and_the_last_one_ends_the_watch(part
     assert (poses(first), poses(second)) == ([], [1.0])
     assert parts.watched == [("default", "m")]
 
-    parts.all.left(second)
+    parts.all.end_all(second)
     assert parts.watched == []
     assert len(parts.all) == 0
     parts.pose("x", 2.0)
@@ -185,7 +185,7 @@ def test_a_reader_that_is_slow_when_it_leaves_is_forgotten(parts: Parts) -> None
     parts.pose("a", 1.0)
     parts.settle()
 
-    parts.all.left(reader)
+    parts.all.end_all(reader)
     reader.unsent_bytes = 0
     parts.settle()
 
@@ -195,7 +195,7 @@ def test_a_reader_that_is_slow_when_it_leaves_is_forgotten(parts: Parts) -> None
 def test_a_robot_whose_right_ends_is_told_and_gets_no_further_value(parts: Parts) -> None:
     reader = FakeReader()
     wrong: list[RsePfError] = []
-    parts.begin(reader, may_go_on=lambda: wrong[0] if wrong else None)
+    parts.begin(reader, find_error=lambda: wrong[0] if wrong else None)
     parts.settle()
 
     wrong.append(Forbidden("no more"))

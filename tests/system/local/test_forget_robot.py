@@ -24,8 +24,8 @@ from rse_pf.maps.format import MapVersion
 from rse_pf.maps.registry import MapRegistry
 from rse_pf.object_store import DirectoryStore
 from rse_pf.slam.keyframe_points import ObjectReference
-from tests.server.live_map.owner.test_keyframe_objects import keyframe_request, some_points
-from tests.server.live_map.owner_bench import MAP
+from tests.server.live_map.map_server.test_keyframe_objects import keyframe_request, some_points
+from tests.server.live_map.map_server_bench import MAP
 
 pytestmark = [pytest.mark.slow, pytest.mark.system, pytest.mark.timeout(180)]
 

@@ -29,14 +29,14 @@ from rse_pf.config import PlatformSettings
 from rse_pf.config.settings import LIVE_PORTS
 from rse_pf.ipc import FrameReader, encode_message
 from rse_pf.object_store import DirectoryStore
-from rse_pf.server.live_map.owner.lease import LeaseRecord, decode_lease, lease_name
-from rse_pf.server.live_map.owner.link_security import (
+from rse_pf.server.live_map.connection_security import (
     TOKEN_S,
-    LinkClaims,
+    ConnectionClaims,
     client_context,
     internal_key,
     make_token,
 )
+from rse_pf.server.live_map.lease import LeaseRecord, decode_lease, lease_name
 
 pytestmark = [pytest.mark.slow, pytest.mark.system]
 
@@ -176,7 +176,7 @@ async def first_words(record: LeaseRecord, address: str, key: bytes, *, tls: boo
         address, record.port, ssl=client_context() if tls else None
     )
     try:
-        claims = LinkClaims(
+        claims = ConnectionClaims(
             tenant="default", map_name="m", epoch=record.epoch, certificate=record.certificate,
             expires_s=time.time() + TOKEN_S,
         )  # fmt: skip

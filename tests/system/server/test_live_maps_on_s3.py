@@ -16,7 +16,7 @@ import client_sdk
 from rse_pf.aws.clients import make_client
 from rse_pf.aws.storage import open_bucket
 from rse_pf.config import PlatformSettings
-from rse_pf.server.live_map.owner.lease import decode_lease, lease_name
+from rse_pf.server.live_map.lease import decode_lease, lease_name
 
 pytestmark = [pytest.mark.slow, pytest.mark.system]
 

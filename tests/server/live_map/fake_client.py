@@ -18,7 +18,7 @@ from rse_pf.wire.server_session import ServerSession
 OnUpdate = Callable[[str, str, dict[str, Any]], None]
 
 
-class FakeOwners:
+class FakeLiveMapClient:
     """Owners that count a robot's keyframes, unless ``answer`` says otherwise."""
 
     def __init__(self, on_update: OnUpdate) -> None:

@@ -12,24 +12,24 @@ from rse_pf.errors import BadRequest, StoreError, Unauthorized
 from rse_pf.lease import Lease, read_record
 from rse_pf.live_map.events import MapServerChanged, encode_events
 from rse_pf.object_store import MemoryStore
-from rse_pf.server.live_map.owner.lease import LeaseRecord, OwnerLease, decode_lease, map_folder, verdict_on
-from rse_pf.server.live_map.owner.link_security import (
+from rse_pf.server.live_map.connection_security import (
     TOKEN_S,
-    LinkClaims,
+    ConnectionClaims,
     check_token,
     internal_key,
     make_token,
 )
-from rse_pf.server.live_map.owner.log import LiveLog, MapSnapshot, OwnershipLost, snapshot_entries
-from rse_pf.server.live_map.owner.state import MapState, restore
+from rse_pf.server.live_map.lease import LeaseRecord, MapLease, decode_lease, map_folder, next_action
+from rse_pf.server.live_map.map_server.log import LeaseLost, LiveLog, MapSnapshot, entries_between_snapshots
+from rse_pf.server.live_map.map_server.state import MapState, restore
 from tests.server.live_map.fake_map import FAKE_MAP, FakeMap
-from tests.server.live_map.owner_bench import FOLDER, LEASE, HandClock
+from tests.server.live_map.map_server_bench import FOLDER, LEASE, HandClock
 
 LEASE_S = 1.5
 
 
-def leased(store: MemoryStore, name: str, clock: HandClock) -> OwnerLease:
-    return OwnerLease(store, LEASE, owner=name, server=name, clock=clock)
+def leased(store: MemoryStore, name: str, clock: HandClock) -> MapLease:
+    return MapLease(store, LEASE, owner=name, server=name, clock=clock)
 
 
 def log_of(store: MemoryStore, epoch: int = 1, **options: int) -> LiveLog:
@@ -61,7 +61,7 @@ def record(**changes: object) -> LeaseRecord:
 def test_a_map_is_taken_over_when_its_lease_has_ended(
     found: LeaseRecord | None, unchanged_s: float, verdict: str
 ) -> None:
-    assert verdict_on(found, unchanged_s=unchanged_s, lease_s=LEASE_S) == verdict
+    assert next_action(found, unchanged_s=unchanged_s, lease_s=LEASE_S) == verdict
 
 
 def test_of_two_processes_that_claim_a_map_one_gets_it():
@@ -109,52 +109,52 @@ def test_a_renewal_that_the_owner_told_is_no_change_when_it_is_read_later():
 def test_an_owner_that_finds_its_number_taken_is_the_owner_no_longer():
     store = MemoryStore()
     old, new = log_of(store, 1), log_of(store, 2)
-    assert old.write(b"one") == 1
+    assert old.write_entry(b"one") == 1
 
-    assert [entry.events for entry in new.entries()] == [b"one"]
-    assert new.write(b"two") == 2
-    with pytest.raises(OwnershipLost):
-        old.write(b"other")
-    assert [entry.events for entry in log_of(store, 3).entries()] == [b"one", b"two"]
+    assert [entry.events for entry in new.read_entries()] == [b"one"]
+    assert new.write_entry(b"two") == 2
+    with pytest.raises(LeaseLost):
+        old.write_entry(b"other")
+    assert [entry.events for entry in log_of(store, 3).read_entries()] == [b"one", b"two"]
 
 
 def test_an_entry_whose_answer_was_lost_is_written_once():
     store = MemoryStore()
     log = log_of(store)
-    log.write(b"one")
+    log.write_entry(b"one")
     log.position = 0  # nobody told it
 
-    assert log.write(b"one") == 1
+    assert log.write_entry(b"one") == 1
 
 
 def test_a_missing_or_damaged_entry_ends_a_replay():
     store = MemoryStore()
     log = log_of(store)
     for _ in range(3):
-        log.write(b"x")
+        log.write_entry(b"x")
     store.delete(f"{FOLDER}log/{2:012d}")
     with pytest.raises(StoreError, match="entry 2 of the log is missing, but 3 is there"):
-        list(log_of(store).entries())
+        list(log_of(store).read_entries())
     store.put(f"{FOLDER}log/{2:012d}", b"\xff")
     with pytest.raises(StoreError, match="damaged"):
-        list(log_of(store).entries())
+        list(log_of(store).read_entries())
 
 
 def test_two_snapshots_are_kept_and_a_damaged_one_is_passed_over():
     store = MemoryStore()
     log = log_of(store)
     for number in range(1, 7):
-        log.write(b"x")
+        log.write_entry(b"x")
         if number % 2 == 0:
             log.write_snapshot(MapSnapshot(position=number, unmeasured=(number,), head=b"%d" % number))
 
     restored = log_of(store)
-    assert next(restored.snapshots()) == MapSnapshot(position=6, unmeasured=(6,), head=b"6")
+    assert next(restored.read_snapshots()) == MapSnapshot(position=6, unmeasured=(6,), head=b"6")
     assert restored.position == 6
     newest = f"{FOLDER}snapshot/{6:012d}"
     store.put(newest, store.get(newest)[:-1] + b"7")
-    assert next(restored.snapshots()) == MapSnapshot(position=4, unmeasured=(4,), head=b"4")
-    assert len(list(restored.entries())) == 2
+    assert next(restored.read_snapshots()) == MapSnapshot(position=4, unmeasured=(4,), head=b"4")
+    assert len(list(restored.read_entries())) == 2
     numbers = [int(info.name[-12:]) for info in store.list(f"{FOLDER}log/")]
     assert numbers == [5, 6]
 
@@ -170,7 +170,7 @@ def test_snapshots_share_their_parts_and_none_is_kept_that_no_snapshot_needs():
     log = log_of(store)
 
     def write(position: int, **parts: bytes | None) -> list[str]:
-        log.write(b"x")
+        log.write_entry(b"x")
         log.write_snapshot(MapSnapshot(position=position, unmeasured=(), head=b"h", parts=parts))
         return parts_in(store)
 
@@ -178,7 +178,7 @@ def test_snapshots_share_their_parts_and_none_is_kept_that_no_snapshot_needs():
     assert set(log.stored_parts) == {"a", "b"}
     assert write(2, a=None, c=b"3") == ["1-a", "1-b", "1-c"]
     assert write(3, a=None, d=b"4") == ["1-a", "1-c", "1-d"]
-    assert next(log_of(store).snapshots()).parts == {"a": None, "d": None}
+    assert next(log_of(store).read_snapshots()).parts == {"a": None, "d": None}
     log.delete_until(3)
     assert list(store.list(FOLDER)) == []
 
@@ -188,7 +188,7 @@ def test_an_old_owner_that_wakes_up_deletes_no_part_of_a_snapshot_that_the_new_o
     old = log_of(store, 1)
     old.write_snapshot(MapSnapshot(position=1, unmeasured=(), head=b"h", parts={"a": b"1", "b": b"2"}))
     new = log_of(store, 2)
-    next(new.snapshots())
+    next(new.read_snapshots())
     half = MapSnapshot(position=2, unmeasured=(), head=b"h", parts={"a": None, "c": b"3"})
     store.put(f"{FOLDER}features/{2:09d}-c", b"3")  # the part of it, but not yet the snapshot
 
@@ -205,8 +205,8 @@ def test_a_snapshot_whose_part_is_missing_is_passed_over():
     change = [MapServerChanged(owner="a", epoch=1)]
     newest = ""
     for _ in range(2):
-        state.apply(log.write(encode_events(change)), change)
-        log.write_snapshot(state.snapshot(log.stored_parts))
+        state.apply(log.write_entry(encode_events(change)), change)
+        log.write_snapshot(state.make_snapshot(log.stored_parts))
         (newest,) = log.stored_parts.values()
     assert restore(log_of(store), FAKE_MAP).digest() == state.digest()
     store.delete(f"{FOLDER}features/{newest}")
@@ -215,14 +215,14 @@ def test_a_snapshot_whose_part_is_missing_is_passed_over():
 
 
 def test_a_small_map_has_a_snapshot_after_40_entries_and_a_large_one_after_200():
-    assert [snapshot_entries(keyframes) for keyframes in (0, 100, 400, 10_000)] == [40, 40, 100, 200]
+    assert [entries_between_snapshots(keyframes) for keyframes in (0, 100, 400, 10_000)] == [40, 40, 100, 200]
 
 
 def test_a_snapshot_that_this_version_cannot_read_costs_time_and_no_map():
     store = MemoryStore()
     log = log_of(store, keeps_all=True)
     for number in range(1, 5):
-        log.write(encode_events([MapServerChanged(owner="a", epoch=number)]))
+        log.write_entry(encode_events([MapServerChanged(owner="a", epoch=number)]))
     log.write_snapshot(MapSnapshot(position=4, unmeasured=(), head=b"of another version"))
 
     def refuse(head: bytes, part: Callable[[str], bytes]) -> FakeMap:
@@ -239,7 +239,7 @@ def test_a_log_that_experiments_replay_keeps_all_entries():
     store = MemoryStore()
     log = log_of(store, keeps_all=True)
     for number in range(1, 7):
-        log.write(b"x")
+        log.write_entry(b"x")
         log.write_snapshot(MapSnapshot(position=number, unmeasured=(), head=b""))
 
     assert len(list(store.list(f"{FOLDER}log/"))) == 6
@@ -252,7 +252,7 @@ def test_a_name_that_would_leave_the_folder_of_the_tenant_is_refused(name: str) 
         map_folder("default", name)
 
 
-CLAIMS = LinkClaims(tenant="t", map_name="m", epoch=3, certificate="c", expires_s=1000.0 + TOKEN_S)
+CLAIMS = ConnectionClaims(tenant="t", map_name="m", epoch=3, certificate="c", expires_s=1000.0 + TOKEN_S)
 
 
 def test_a_token_between_servers_holds_for_its_map_its_owner_and_its_time_only():

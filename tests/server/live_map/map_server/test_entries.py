@@ -10,7 +10,7 @@ import pytest
 
 from rse_pf.errors import Busy
 from rse_pf.live_map.events import Event, KeyframeAdded, RobotLeft
-from rse_pf.server.live_map.owner.log import EntryWriter, Submitted
+from rse_pf.server.live_map.map_server.log import LogWriter, SubmittedEvent
 
 
 class Taker:
@@ -19,10 +19,10 @@ class Taker:
     def __init__(self) -> None:
         self.sizes: list[int] = []
 
-    async def take_entry(self, position: int, batch: list[Submitted]) -> None:
+    async def apply_entry(self, position: int, batch: list[SubmittedEvent]) -> None:
         self.sizes.append(len(batch))
         for each in batch:
-            each.done.set_result([])
+            each.applied.set_result([])
 
 
 class Store:
@@ -34,7 +34,7 @@ class Store:
 
         return done()
 
-    def write(self, data: bytes) -> int:
+    def write_entry(self, data: bytes) -> int:
         return 1
 
 
@@ -42,11 +42,11 @@ def keyframe(number: int) -> Event:
     return KeyframeAdded(robot="r", number=number, segment=0, data=b"")
 
 
-def writer(taker: Taker) -> EntryWriter:
+def writer(taker: Taker) -> LogWriter:
     store = cast(Any, Store())
-    return EntryWriter(
-        store, take_entry=taker.take_entry, on_waiting=lambda is_waiting: None, on_lost=lambda reason: None,
-        threads=store, sleep=asyncio.sleep, json_log=cast(Any, None), name="m",
+    return LogWriter(
+        store, apply_entry=taker.apply_entry, on_waiting=lambda is_waiting: None, on_lost=lambda reason: None,
+        threads=store, sleep=asyncio.sleep, json_log=cast(Any, None), map_name="m",
     )  # fmt: skip
 
 

@@ -12,13 +12,18 @@ from fakes import FakeLog
 
 from rse_pf.geometry import Array, exp_se3, inverse
 from rse_pf.live_map.events import Event, LoopClosuresMeasured
-from rse_pf.server.live_map.owner.state import MapState, Measuring, candidates_of
-from rse_pf.server.live_map.owner.threads import Urgency
-from rse_pf.server.live_map.owner.whole_fit import fit_apart, fit_here
+from rse_pf.server.live_map.map_server.environment import Urgency
+from rse_pf.server.live_map.map_server.measurement import (
+    KeyframeMeasurer,
+    choose_candidate_count,
+    optimise_in_child,
+    optimise_in_process,
+)
+from rse_pf.server.live_map.map_server.state import MapState
 from rse_pf.slam.optimise import OptimiseOptions
 from rse_pf.slam.pose_graph import PoseGraph
 from tests.server.live_map.fake_map import FakeMap
-from tests.server.live_map.owner_bench import settle
+from tests.server.live_map.map_server_bench import settle
 
 _T = TypeVar("_T")
 
@@ -32,7 +37,7 @@ class HeldThreads:
     async def compute(self, urgency: Urgency, act: Callable[[], _T]) -> _T:
         return act()
 
-    def look(self, act: Callable[[], _T]) -> asyncio.Future[_T]:
+    def match(self, act: Callable[[], _T]) -> asyncio.Future[_T]:
         held = asyncio.Event()
         self.looking.append(held)
         return asyncio.ensure_future(self._look(held, act))
@@ -41,7 +46,7 @@ class HeldThreads:
         await held.wait()
         return act()
 
-    store = lease = background = look
+    store = lease = background = match
 
 
 class NotingMap(FakeMap):
@@ -59,7 +64,7 @@ class NotingMap(FakeMap):
 
 
 def test_the_more_keyframes_wait_the_fewer_others_each_is_compared_with() -> None:
-    found = [candidates_of(waiting) for waiting in range(40)]
+    found = [choose_candidate_count(waiting) for waiting in range(40)]
     assert found[0] is None
     rest = [each for each in found if each is not None]
     assert found == [None] * (40 - len(rest)) + rest
@@ -69,12 +74,12 @@ def test_the_more_keyframes_wait_the_fewer_others_each_is_compared_with() -> Non
 
 async def test_waiting_keyframes_are_measured_two_at_a_time_and_one_alone_by_both_threads() -> None:
     live_map, threads, taken = NotingMap(), HeldThreads(), list[Event]()
-    measuring = Measuring(
-        MapState(live_map, 0), threads, taken.append, fit=fit_here, name="warehouse",
+    measuring = KeyframeMeasurer(
+        MapState(live_map, 0), threads, taken.append, optimise=optimise_in_process, map_name="warehouse",
         json_log=FakeLog(),
     )  # fmt: skip
     working = asyncio.ensure_future(measuring.run())
-    measuring.measure(range(20))
+    measuring.add_keyframes(range(20))
     await settle()
     assert [each[:2] for each in live_map.asked] == [(0, 1), (1, 1)]
     assert all(candidates is not None for _, _, candidates in live_map.asked)
@@ -84,7 +89,7 @@ async def test_waiting_keyframes_are_measured_two_at_a_time_and_one_alone_by_bot
         await settle()
     assert sorted(each.keyframe for each in taken) == list(range(20))  # type: ignore[union-attr]
     live_map.asked.clear()
-    measuring.measure([20])
+    measuring.add_keyframes([20])
     await settle()
     assert live_map.asked == [(20, 2, None)]
     working.cancel()
@@ -94,8 +99,8 @@ async def test_waiting_keyframes_are_measured_two_at_a_time_and_one_alone_by_bot
 @pytest.mark.slow  # starts a process
 def test_a_graph_that_is_fitted_apart_has_the_same_poses() -> None:
     graph = _loop()
-    apart = fit_apart(graph, OptimiseOptions())
-    assert apart.tobytes() == fit_here(graph, OptimiseOptions()).tobytes()
+    apart = optimise_in_child(graph, OptimiseOptions())
+    assert apart.tobytes() == optimise_in_process(graph, OptimiseOptions()).tobytes()
     assert not np.array_equal(apart, graph.T_world_pose)
 
 

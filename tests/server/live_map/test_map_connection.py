@@ -16,11 +16,10 @@ from rse_pf.errors import Busy, NotFound
 from rse_pf.identity import RobotId
 from rse_pf.ipc import encode_message
 from rse_pf.object_store import MemoryStore
-from rse_pf.server.live_map.children import OwnerChild, OwnerChildren
-from rse_pf.server.live_map.map_link import LinkContext, MapLink, begins_a_map
-from rse_pf.server.live_map.owner.lease import LeaseRecord, OwnerLease, decode_lease, lease_name
-from rse_pf.server.live_map.owner.link_security import server_context
-from rse_pf.server.live_map.owner.process import OwnerOrder
+from rse_pf.server.live_map.connection_security import server_context
+from rse_pf.server.live_map.lease import LeaseRecord, MapLease, decode_lease, lease_name
+from rse_pf.server.live_map.map_connection import ConnectionContext, MapConnection, can_begin_map
+from rse_pf.server.live_map.process_pool import ClaimOrder, MapServerPool, MapServerProcess
 from rse_pf.wire.live_map import KeyframeRequest, LiveMapRequest, LiveStart
 from tests.server.live_map.fake_map import keyframe_request
 
@@ -45,8 +44,8 @@ class PlayedProcess:
         if "do" in message:
             return
         self.claims += 1
-        order = OwnerOrder(**message)
-        lease = OwnerLease(
+        order = ClaimOrder(**message)
+        lease = MapLease(
             self._store,
             LEASE,
             owner=f"owner-{id(self)}",
@@ -71,13 +70,13 @@ class Worker:
         self.store = MemoryStore()
         self.started: list[PlayedProcess] = []
         self.told: list[dict[str, Any]] = []
-        self.children = OwnerChildren(self._spawn, max_owners=2, keeps_spare=False)
-        context = LinkContext(
+        self.pool = MapServerPool(self._spawn, max_processes=2, keeps_spare=False)
+        context = ConnectionContext(
             store=self.store, settings=PlatformSettings().live, server_id="here", log=FakeLog(),
-            call=self._call, key=lambda: b"k" * 32, children=self.children,
+            call=self._call, key=lambda: b"k" * 32, pool=self.pool,
             clock=time.monotonic, wall_clock=time.time,
         )  # fmt: skip
-        self.link = MapLink(
+        self.link = MapConnection(
             context, "default", "warehouse", on_update=self.told.append, on_end=lambda link: None
         ).start()
 
@@ -91,8 +90,8 @@ class Worker:
 
     async def __aexit__(self, *_: object) -> None:
         await self.link.close()
-        self.children.drop_spare()
-        for child in self.children.used:
+        self.pool.kill_spare()
+        for child in self.pool.in_use:
             child.kill()
 
     def _spawn(self, calmly: bool) -> PlayedProcess:
@@ -113,8 +112,8 @@ async def test_a_process_is_started_as_soon_as_a_map_that_nobody_has_begun_is_wa
         worker.link.set_watched(True)
         await until(lambda: worker.started)
         worker.started[0].tell("ready")
-        spare = worker.children.prepare()
-        assert isinstance(spare, OwnerChild)
+        spare = worker.pool.prepare_spare()
+        assert isinstance(spare, MapServerProcess)
         await until(lambda: spare.is_ready)
         assert worker.lease() is None  # the first keyframe begins the map
 
@@ -132,7 +131,7 @@ async def test_an_owner_elsewhere_is_used_before_the_own_process_is_ready() -> N
         await until(lambda: worker.started)  # it never gets ready
         with socket.create_server(("127.0.0.1", 0)) as listener:
             listener.setblocking(False)
-            elsewhere = OwnerLease(worker.store, LEASE, owner="b", server="there", clock=time.monotonic)
+            elsewhere = MapLease(worker.store, LEASE, owner="b", server="there", clock=time.monotonic)
             assert elsewhere.claim(None)
             assert elsewhere.serve("127.0.0.1", listener.getsockname()[1], "c")
             connection, _ = await asyncio.get_running_loop().sock_accept(listener)
@@ -143,7 +142,7 @@ async def test_an_owner_elsewhere_is_used_before_the_own_process_is_ready() -> N
 
 def owner_on_a_closed_port(worker: Worker) -> None:
     """Let another server have the lease, with a port where nobody listens."""
-    elsewhere = OwnerLease(worker.store, LEASE, owner="b", server="there", clock=time.monotonic)
+    elsewhere = MapLease(worker.store, LEASE, owner="b", server="there", clock=time.monotonic)
     assert elsewhere.claim(None)
     with socket.create_server(("127.0.0.1", 0)) as listener:
         port = listener.getsockname()[1]
@@ -153,7 +152,7 @@ def owner_on_a_closed_port(worker: Worker) -> None:
 async def test_an_owner_whose_port_is_closed_is_replaced_at_once_by_those_who_were_connected() -> None:
     async with Worker() as worker:
         owner_on_a_closed_port(worker)
-        worker.link._welcomed = "b"
+        worker.link._reached_owner = "b"
         began_s = time.monotonic()
         sent = asyncio.ensure_future(worker.link.request(ROBOT, "live-keyframe", FIRST, 5.0))
         await until(lambda: worker.started)
@@ -163,7 +162,7 @@ async def test_an_owner_whose_port_is_closed_is_replaced_at_once_by_those_who_we
         sent.cancel()
 
 
-async def test_a_link_that_ends_while_the_owner_has_not_welcomed_it_closes_its_connection() -> None:
+async def test_a_link_that_ends_while_the_owner_has_not_reached_owner_it_closes_its_connection() -> None:
     async with Worker() as worker:
         is_greeted, is_gone = asyncio.Event(), asyncio.Event()
 
@@ -177,7 +176,7 @@ async def test_a_link_that_ends_while_the_owner_has_not_welcomed_it_closes_its_c
 
         context, certificate = server_context("127.0.0.1", now_s=time.time())
         server = await asyncio.start_server(owner, "127.0.0.1", 0, ssl=context)
-        elsewhere = OwnerLease(worker.store, LEASE, owner="b", server="there", clock=time.monotonic)
+        elsewhere = MapLease(worker.store, LEASE, owner="b", server="there", clock=time.monotonic)
         assert elsewhere.claim(None)
         assert elsewhere.serve("127.0.0.1", server.sockets[0].getsockname()[1], certificate)
         worker.link.set_watched(True)
@@ -202,13 +201,13 @@ async def test_an_owner_whose_port_was_never_reached_keeps_its_lease() -> None:
 
 async def test_who_may_only_watch_starts_no_process_and_is_told_that_the_map_is_idle() -> None:
     async with Worker() as worker:
-        lease = OwnerLease(worker.store, LEASE, owner="b", server="there", clock=time.monotonic)
+        lease = MapLease(worker.store, LEASE, owner="b", server="there", clock=time.monotonic)
         assert lease.claim(None)
         assert lease.release()
         worker.link.set_watched(True, may_start=False)
         await until(lambda: worker.told)
         assert worker.told[-1]["state"] == "idle"
-        assert not worker.link.is_in_use
+        assert not worker.link.may_need_process
 
         worker.link.set_watched(True, may_start=True)
         await until(lambda: worker.started)
@@ -220,7 +219,7 @@ async def test_who_may_only_watch_starts_no_process_and_is_told_that_the_map_is_
 async def test_who_may_only_watch_a_map_that_is_driven_in_takes_no_part_in_a_takeover() -> None:
     async with Worker() as worker:
         owner_on_a_closed_port(worker)
-        worker.link._welcomed = "b"
+        worker.link._reached_owner = "b"
         worker.link.set_watched(True, may_start=False)
         await until(lambda: worker.told and worker.told[-1]["state"] == "idle")
         assert worker.started == []
@@ -228,8 +227,8 @@ async def test_who_may_only_watch_a_map_that_is_driven_in_takes_no_part_in_a_tak
 
 
 def test_only_a_first_keyframe_or_an_operator_begins_a_map():
-    assert begins_a_map(keyframe_request(0))
-    assert begins_a_map(LiveStart(map="m"))
-    assert not begins_a_map(keyframe_request(1))
-    assert not begins_a_map(keyframe_request(0, segment=1))
-    assert not begins_a_map(LiveMapRequest(map="m"))
+    assert can_begin_map(keyframe_request(0))
+    assert can_begin_map(LiveStart(map="m"))
+    assert not can_begin_map(keyframe_request(1))
+    assert not can_begin_map(keyframe_request(0, segment=1))
+    assert not can_begin_map(LiveMapRequest(map="m"))

@@ -17,13 +17,13 @@ from rse_pf.identity import RobotId
 from rse_pf.lease import read_record
 from rse_pf.maps.registry import MapRegistry
 from rse_pf.object_store import MemoryStore, ObjectStore
-from rse_pf.server.live_map.owner.context import OwnerContext
-from rse_pf.server.live_map.owner.keyframe_objects import KeyframeObjects
-from rse_pf.server.live_map.owner.lease import LeaseRecord, OwnerLease, decode_lease, lease_name, map_folder
-from rse_pf.server.live_map.owner.live_owner import LiveOwner
-from rse_pf.server.live_map.owner.log import LiveLog
-from rse_pf.server.live_map.owner.state import MapKind, MapState, take_over
-from rse_pf.server.live_map.owner.threads import Urgency
+from rse_pf.server.live_map.lease import LeaseRecord, MapLease, decode_lease, lease_name, map_folder
+from rse_pf.server.live_map.map_server.environment import MapImplementation, MapServerEnvironment, Urgency
+from rse_pf.server.live_map.map_server.keyframe_objects import KeyframeObjects
+from rse_pf.server.live_map.map_server.log import LiveLog
+from rse_pf.server.live_map.map_server.map_server import MapServer
+from rse_pf.server.live_map.map_server.measurement import optimise_in_process
+from rse_pf.server.live_map.map_server.state import MapState, take_over
 from tests.server.live_map.fake_map import FAKE_MAP
 
 __all__ = ["MAP", "ROBOT", "Bench", "FailingStore", "HandClock", "InlineThreads", "OwnerBench", "settle"]
@@ -73,7 +73,7 @@ class InlineThreads:
     async def store(self, act: Callable[[], _T]) -> _T:
         return act()
 
-    look = lease = background = store
+    match = lease = background = store
 
 
 class FailingStore(MemoryStore):
@@ -111,26 +111,35 @@ class OwnerBench:
         self.told: list[dict[str, Any]] = []
         self.beats: list[int] = []
         self.used: list[bool] = []
-        self.lease = OwnerLease(bench.store, LEASE, owner=name, server=name, clock=bench.clock)
+        self.lease = MapLease(bench.store, LEASE, owner=name, server=name, clock=bench.clock)
         self.claimed = self.lease.claim(read_record(bench.store, LEASE))
         record = self.lease.record
         self.log = LiveLog(
             bench.store, FOLDER, owner=name, epoch=record.epoch, base=record.base, keeps_all=bench.keeps_all
         )
-        self.state: MapState = take_over(self.log, bench.kind, owner=name, epoch=record.epoch)
+        self.state: MapState = take_over(self.log, bench.implementation, owner=name, epoch=record.epoch)
         assert self.lease.serve("127.0.0.1", 1, "c")
         account = TenantAccount(
             bench.store, TENANT, bench.settings.data, wall_clock=lambda: 1e9 + bench.clock()
         )
-        context = OwnerContext(
-            map_name=MAP, settings=bench.settings.live, kind=bench.kind, threads=bench.threads,
-            maps=MapRegistry(bench.store, TENANT), clock=bench.clock, wall_clock=lambda: 1000.0,
+        context = MapServerEnvironment(
+            map_name=MAP,
+            settings=bench.settings.live,
+            implementation=bench.implementation,
+            threads=bench.threads,
+            maps=MapRegistry(bench.store, TENANT),
+            clock=bench.clock,
+            wall_clock=lambda: 1000.0,
             sleep=bench.clock.sleep,
-            account=account, objects=KeyframeObjects(bench.store, account),
-            log=bench.log, tell=self.told.append, on_beat=self.beats.append,
+            account=account,
+            objects=KeyframeObjects(bench.store, account),
+            log=bench.log,
+            send_update=self.told.append,
+            on_renewal=self.beats.append,
             on_use=self.used.append,
-        )  # fmt: skip
-        self.owner = LiveOwner(context, self.state, self.log, self.lease)
+            optimise=optimise_in_process,
+        )
+        self.owner = MapServer(context, self.state, self.log, self.lease)
         self.run = asyncio.ensure_future(self.owner.run())
 
     async def keyframe(
@@ -160,10 +169,10 @@ class Bench:
         *,
         keeps_all: bool = False,
         data: dict[str, Any] | None = None,
-        kind: MapKind = FAKE_MAP,
+        implementation: MapImplementation = FAKE_MAP,
         **live: Any,
     ) -> None:
-        self.kind = kind
+        self.implementation = implementation
         self.store: ObjectStore = store or MemoryStore()
         self.clock = HandClock()
         self.settings = PlatformSettings.from_dict({"live": live, "data": data or {}})
@@ -190,10 +199,10 @@ class Bench:
     def replayed(self) -> MapState:
         """Return the map that the entries of the log give, from the first one on."""
         log = LiveLog(self.store, FOLDER, owner="replay", epoch=10**6)
-        state = MapState(self.kind.empty(), 0)
+        state = MapState(self.implementation.empty(), 0)
         from rse_pf.live_map.events import decode_events
 
-        for entry in log.entries():
+        for entry in log.read_entries():
             state.apply(log.position, decode_events(entry.events))
         return state
 

@@ -17,13 +17,13 @@ from rse_pf.live_map.versions import PointSource
 from rse_pf.maps.format import UP_FIELD, encode_map
 from rse_pf.maps.registry import MapRegistry
 from rse_pf.object_store import MemoryStore
-from rse_pf.server.live_map.owner.keyframe_objects import KeyframeObjects
-from rse_pf.server.live_map.owner.state import LIVE_MAP
+from rse_pf.server.live_map.map_server.environment import LIVE_MAP
+from rse_pf.server.live_map.map_server.keyframe_objects import KeyframeObjects
 from rse_pf.slam.cloud_deform import merge_clouds
 from rse_pf.slam.keyframe import SentKeyframe, encode_keyframe, make_features
 from rse_pf.slam.keyframe_points import ObjectReference, encode_points
 from rse_pf.wire.live_map import KeyframeRequest
-from tests.server.live_map.owner_bench import MAP, Bench, settle
+from tests.server.live_map.map_server_bench import MAP, Bench, settle
 
 CAMERA = Camera(fx=525.0, fy=525.0, cx=319.5, cy=239.5, width=640, height=480)
 ONE, OTHER = RobotId("default", "one"), RobotId("default", "other")
@@ -81,7 +81,7 @@ def test_points_lie_where_their_keyframe_is_now() -> None:
     reference = stored(store, ONE, some_points(2.0))
     moved = exp_se3([1.0, -2.0, 0.5, 0.1, 0.2, 0.3])
 
-    before, after = (objects(store).cloud([source(ONE, reference, T)]).points for T in (NOWHERE, moved))
+    before, after = (objects(store).build_cloud([source(ONE, reference, T)]).points for T in (NOWHERE, moved))
 
     assert len(before) == len(after) == 12 * 16
     wanted = transform(moved, before.astype(np.float64))
@@ -93,7 +93,7 @@ def test_a_reference_to_an_object_of_another_robot_gives_nothing() -> None:
     store = MemoryStore()
     reference = stored(store, OTHER, some_points(2.0))
 
-    found = objects(store).cloud([source(ONE, reference)])
+    found = objects(store).build_cloud([source(ONE, reference)])
 
     assert (len(found.points), found.keyframes, found.missing) == (0, 0, 1)
 
@@ -109,7 +109,7 @@ def test_objects_that_are_no_points_are_left_out_and_the_rest_is_there() -> None
     store.put(object_name(ONE, changed.digest), some_points(1.0))
     wrong = [bomb, large, text, lying, ObjectReference(changed.digest, len(some_points(1.0)))]
 
-    found = objects(store).cloud([source(ONE, each) for each in [*wrong, good]])
+    found = objects(store).build_cloud([source(ONE, each) for each in [*wrong, good]])
 
     assert (found.keyframes, found.missing) == (1, 5)
     assert np.allclose(found.points[:, 2], 2.0)
@@ -121,19 +121,19 @@ def test_a_camera_that_makes_metres_of_kilometres_adds_no_point_far_away() -> No
     wide = Camera(fx=32.0, fy=32.0, cx=319.5, cy=239.5, width=640, height=480)
     hostile = PointSource(robot=ONE.folder, reference=reference, camera=wide, T_world_camera=NOWHERE)
 
-    points = objects(store).cloud([hostile]).points
+    points = objects(store).build_cloud([hostile]).points
 
     assert 0 < len(points) < 12 * 16
     assert np.abs(points).max() <= 100.0
 
 
 def test_each_robot_has_its_share_of_a_map_with_many_keyframes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("rse_pf.server.live_map.owner.keyframe_objects._MAX_SOURCES", 10)
+    monkeypatch.setattr("rse_pf.server.live_map.map_server.keyframe_objects._MAX_SOURCES", 10)
     store = MemoryStore()
     mine, theirs = stored(store, ONE, some_points(1.0)), stored(store, OTHER, some_points(3.0))
     many = [source(OTHER, theirs) for _ in range(100)]
 
-    found = objects(store).cloud([*many, source(ONE, mine), source(ONE, mine)])
+    found = objects(store).build_cloud([*many, source(ONE, mine), source(ONE, mine)])
 
     assert found.keyframes == 10
     assert {round(float(z)) for z in found.points[:, 2]} == {1, 3}
@@ -143,11 +143,11 @@ def test_many_keyframes_of_many_points_take_no_more_memory_than_a_few(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """4,000 of the largest objects would be 640 MB of bytes and 1 GB of points."""
-    module = "rse_pf.server.live_map.owner.keyframe_objects"
+    module = "rse_pf.server.live_map.map_server.keyframe_objects"
     store = MemoryStore()
     references = [stored(store, ONE, some_points(1.0 + 0.1 * number)) for number in range(10)]
     monkeypatch.setattr(f"{module}._MAX_POINTS", 5 * 12 * 16)
-    monkeypatch.setattr(f"{module}._MAX_KEPT_BYTES", 3 * max(each.size for each in references))
+    monkeypatch.setattr(f"{module}._MAX_CACHED_BYTES", 3 * max(each.size for each in references))
     keeper, joined = objects(store), []
 
     def join(clouds: list[np.ndarray], colours: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
@@ -155,12 +155,12 @@ def test_many_keyframes_of_many_points_take_no_more_memory_than_a_few(
         return merge_clouds(clouds, colours)
 
     monkeypatch.setattr(f"{module}.merge_clouds", join)
-    found = [keeper.cloud([source(ONE, each) for each in references]) for _ in range(2)]
+    found = [keeper.build_cloud([source(ONE, each) for each in references]) for _ in range(2)]
 
     assert [each.keyframes for each in found] == [10, 10]
     assert joined == [5 * 12 * 16] * 2
-    assert sum(map(len, keeper._read.values())) <= 3 * max(each.size for each in references)
-    assert len(keeper._read) == 3
+    assert sum(map(len, keeper._cache.values())) <= 3 * max(each.size for each in references)
+    assert len(keeper._cache) == 3
 
 
 def test_a_culled_keyframe_loses_its_objects_a_little_later() -> None:
@@ -168,7 +168,7 @@ def test_a_culled_keyframe_loses_its_objects_a_little_later() -> None:
     held = [stored(store, ONE, bytes([number])) for number in range(70)]
     keeper = KeyframeObjects(store, account)  # type: ignore[arg-type]
 
-    keeper.cull([(ONE.folder, each.digest) for each in held])
+    keeper.delete_of_culled([(ONE.folder, each.digest) for each in held])
 
     assert account.released == 6
     assert len(list(store.list(f"objects/{ONE.folder}/"))) == 64
@@ -176,7 +176,7 @@ def test_a_culled_keyframe_loses_its_objects_a_little_later() -> None:
 
 async def test_a_forgotten_robots_points_are_in_no_later_version_and_not_in_the_store() -> None:
     store = MemoryStore()
-    bench = Bench(store, kind=LIVE_MAP, publish_pause_s=0.0)
+    bench = Bench(store, implementation=LIVE_MAP, publish_pause_s=0.0)
     mine, late = stored(store, ONE, some_points(2.0)), some_points(2.5)
     theirs = stored(store, OTHER, some_points(3.0))
     arriving = ObjectReference(hashlib.sha256(late).hexdigest(), len(late))
@@ -207,7 +207,7 @@ async def test_a_version_names_images_where_the_operator_allows_them_and_forget_
     is_allowed: bool,
 ) -> None:
     store = MemoryStore()
-    bench = Bench(store, kind=LIVE_MAP, publish_pause_s=0.0, images=is_allowed)
+    bench = Bench(store, implementation=LIVE_MAP, publish_pause_s=0.0, images=is_allowed)
     mine, theirs = stored(store, ONE, b"my image"), stored(store, OTHER, b"their image")
 
     owner, maps = await bench.own("a"), MapRegistry(store, "default")
@@ -229,7 +229,10 @@ async def test_a_version_names_images_where_the_operator_allows_them_and_forget_
 @pytest.mark.parametrize("up", [[0.0, 0.6, 0.8], None, "up"])
 async def test_a_map_keeps_up_of_the_version_that_it_started_from(up: object) -> None:
     store = MemoryStore()
-    maps, source = MapRegistry(store, "default"), Bench(MemoryStore(), kind=LIVE_MAP, publish_pause_s=0.0)
+    maps, source = (
+        MapRegistry(store, "default"),
+        Bench(MemoryStore(), implementation=LIVE_MAP, publish_pause_s=0.0),
+    )
 
     async def drive(bench: Bench, start: bool) -> None:
         owner = await bench.own("a")
@@ -244,7 +247,7 @@ async def test_a_map_keeps_up_of_the_version_that_it_started_from(up: object) ->
     assert first.up is None
     origin = encode_map(dataclasses.replace(first, provenance={UP_FIELD: up}))
     maps.commit("origin", origin, parent=None, author="t", created_s=0.0)
-    bench = Bench(store, kind=LIVE_MAP, publish_pause_s=0.0)
+    bench = Bench(store, implementation=LIVE_MAP, publish_pause_s=0.0)
 
     await drive(bench, True)
 
@@ -254,7 +257,7 @@ async def test_a_map_keeps_up_of_the_version_that_it_started_from(up: object) ->
 
 async def test_the_next_owner_deletes_what_the_last_one_could_not() -> None:
     store = MemoryStore()
-    bench = Bench(store, kind=LIVE_MAP, lease_s=1.5)
+    bench = Bench(store, implementation=LIVE_MAP, lease_s=1.5)
     mine = stored(store, ONE, some_points(2.0))
 
     owner = await bench.own("a")
@@ -288,7 +291,7 @@ def test_a_snapshot_knows_whose_objects_are_to_be_deleted() -> None:
 
 
 async def test_live_show_has_whole_paths_in_the_map_where_they_are_asked_for() -> None:
-    bench = Bench(kind=LIVE_MAP)
+    bench = Bench(implementation=LIVE_MAP)
 
     owner = await bench.own("a")
     for number in range(5):

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from rse_pf.ipc import encode_message
-from rse_pf.server.live_map.children import OwnerChild, OwnerChildren
+from rse_pf.server.live_map.process_pool import MapServerPool, MapServerProcess
 
 
 class PlayedProcess:
@@ -34,27 +34,30 @@ class PlayedProcess:
 class Worker:
     """The processes of one worker, and time that the test sets."""
 
-    def __init__(self, max_owners: int) -> None:
+    def __init__(self, max_processes: int) -> None:
         self.now_s = 0.0
-        self.children = OwnerChildren(
-            lambda calmly: PlayedProcess(), max_owners=max_owners, keeps_spare=False, clock=lambda: self.now_s
+        self.pool = MapServerPool(
+            lambda calmly: PlayedProcess(),
+            max_processes=max_processes,
+            keeps_spare=False,
+            clock=lambda: self.now_s,
         )
 
     async def __aenter__(self) -> Worker:
         return self
 
     async def __aexit__(self, *_: object) -> None:
-        self.children.drop_spare()
-        for child in self.children.used:
+        self.pool.kill_spare()
+        for child in self.pool.in_use:
             child.kill()
 
-    def take(self, tenant: str, *, only_watched: bool = False) -> OwnerChild | None:
-        return self.children.take(tenant, lambda child, code: None, only_watched=only_watched)
+    def take(self, tenant: str, *, is_watched_only: bool = False) -> MapServerProcess | None:
+        return self.pool.take(tenant, lambda child, code: None, is_watched_only=is_watched_only)
 
     def held(self) -> list[str]:
-        return sorted(child.tenant for child in self.children.used)
+        return sorted(child.tenant for child in self.pool.in_use)
 
-    async def gets(self, tenant: str) -> OwnerChild:
+    async def gets(self, tenant: str) -> MapServerProcess:
         """Return the process that a map of *tenant* gets, which asks again and again."""
         while (child := self.take(tenant)) is None:
             await asyncio.sleep(0)
@@ -66,7 +69,7 @@ async def test_a_tenant_that_holds_all_gives_one_up_and_does_not_get_it_back() -
         for _ in range(3):
             await worker.gets("acme")
         assert worker.take("acme") is None
-        assert not worker.children.is_making_room, "nobody else wants one"
+        assert not worker.pool.is_freeing_process, "nobody else wants one"
         await worker.gets("rival")
         assert worker.held() == ["acme", "acme", "rival"]
         for _ in range(20):
@@ -75,21 +78,21 @@ async def test_a_tenant_that_holds_all_gives_one_up_and_does_not_get_it_back() -
         assert worker.held() == ["acme", "acme", "rival"]
 
 
-async def test_the_map_that_was_only_watched_for_longest_gives_up_first() -> None:
+async def test_the_map_that_was_is_watched_only_for_longest_gives_up_first() -> None:
     async with Worker(3) as worker:
         first, second, third = [await worker.gets("acme") for _ in range(3)]
-        second.unused_s, third.unused_s = 5.0, 4.0
+        second.unused_since_s, third.unused_since_s = 5.0, 4.0
         await worker.gets("rival")
-        assert third not in worker.children.used
-        assert {first, second} < set(worker.children.used)
+        assert third not in worker.pool.in_use
+        assert {first, second} < set(worker.pool.in_use)
 
 
-async def test_a_map_that_is_only_watched_gives_up_for_another_one_of_its_tenant() -> None:
+async def test_a_map_that_is_watched_only_gives_up_for_another_one_of_its_tenant() -> None:
     async with Worker(1) as worker:
         watched = await worker.gets("acme")
-        watched.unused_s = 1.0
+        watched.unused_since_s = 1.0
         driven = await worker.gets("acme")
-        assert worker.children.used == [driven]
+        assert worker.pool.in_use == [driven]
 
 
 async def test_a_tenant_does_not_lose_its_only_map_to_one_that_holds_more() -> None:
@@ -97,60 +100,60 @@ async def test_a_tenant_does_not_lose_its_only_map_to_one_that_holds_more() -> N
         for _ in range(2):
             await worker.gets("acme")
         watched = await worker.gets("rival")
-        watched.unused_s = 1.0
+        watched.unused_since_s = 1.0
         for _ in range(20):
             assert worker.take("acme") is None
             await asyncio.sleep(0)
-        assert watched in worker.children.used
+        assert watched in worker.pool.in_use
 
 
-async def test_a_map_that_is_only_watched_takes_a_process_only_while_no_other_map_wants_one() -> None:
+async def test_a_map_that_is_watched_only_takes_a_process_only_while_no_other_map_wants_one() -> None:
     async with Worker(1) as worker:
         watched = await worker.gets("acme")
-        watched.unused_s = 1.0
-        assert worker.take("rival", only_watched=True) is None
-        assert not worker.children.is_making_room
+        watched.unused_since_s = 1.0
+        assert worker.take("rival", is_watched_only=True) is None
+        assert not worker.pool.is_freeing_process
         assert worker.take("rival") is None
-        while worker.children.used:
+        while worker.pool.in_use:
             await asyncio.sleep(0)
-        assert worker.take("acme", only_watched=True) is None, "the other one is about to ask again"
+        assert worker.take("acme", is_watched_only=True) is None, "the other one is about to ask again"
         worker.now_s += 60.0
-        assert worker.take("acme", only_watched=True) is not None
+        assert worker.take("acme", is_watched_only=True) is not None
 
 
 async def test_a_process_that_is_told_to_be_used_is_not_the_first_to_go() -> None:
     async with Worker(1) as worker:
-        child = worker.children.prepare()
+        child = worker.pool.prepare_spare()
         assert child is not None
         process = child._process
         assert isinstance(process, PlayedProcess)
-        taken = worker.take("acme", only_watched=True)
+        taken = worker.take("acme", is_watched_only=True)
         assert taken is child
-        assert child.unused_s == 0.0
+        assert child.unused_since_s == 0.0
         process.theirs.sendall(encode_message(["used", True]))
-        while child.unused_s is not None:
+        while child.unused_since_s is not None:
             await asyncio.sleep(0)
         worker.now_s = 7.0
         process.theirs.sendall(encode_message(["used", False]))
-        while child.unused_s is None:
+        while child.unused_since_s is None:
             await asyncio.sleep(0)
-        assert child.unused_s == 7.0
+        assert child.unused_since_s == 7.0
 
 
 async def test_the_processor_time_of_owners_counts_for_their_tenants_also_when_they_have_ended(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     taken_s = [0.0]
-    monkeypatch.setattr("rse_pf.server.live_map.children.cpu_seconds", lambda pid: taken_s[0])
+    monkeypatch.setattr("rse_pf.server.live_map.process_pool.cpu_seconds", lambda pid: taken_s[0])
 
     async with Worker(2) as worker:
         taken_s[0] = 1.0  # its imports
         child = await worker.gets("acme")
         taken_s[0] = 3.5
-        assert worker.children.cpu_by_tenant() == {"acme": 2.5}
+        assert worker.pool.cpu_by_tenant() == {"acme": 2.5}
         child.kill()
         taken_s[0] = 4.0
-        assert worker.children.cpu_by_tenant() == {"acme": 2.5}
+        assert worker.pool.cpu_by_tenant() == {"acme": 2.5}
         await worker.gets("acme")
         taken_s[0] = 4.25
-        assert worker.children.cpu_by_tenant() == {"acme": 2.75}
+        assert worker.pool.cpu_by_tenant() == {"acme": 2.75}

@@ -14,12 +14,20 @@ from rse_pf.live_map.events import Event, KeyframeAdded, MapStarted, decode_even
 from rse_pf.live_map.outcomes import Joined, Outcome, Unaligned
 from rse_pf.maps.registry import MapRegistry
 from rse_pf.object_store import MemoryStore
-from rse_pf.server.live_map.owner.lease import verdict_on
-from rse_pf.server.live_map.owner.live_owner import MapMoves
-from rse_pf.server.live_map.owner.log import LiveLog
-from rse_pf.server.live_map.owner.state import MapKind
+from rse_pf.server.live_map.lease import next_action
+from rse_pf.server.live_map.map_server.environment import MapImplementation
+from rse_pf.server.live_map.map_server.log import LiveLog
+from rse_pf.server.live_map.map_server.map_server import MapMoving
 from tests.server.live_map.fake_map import FAKE_MAP, FakeMap
-from tests.server.live_map.owner_bench import FOLDER, MAP, ROBOT, Bench, FailingStore, InlineThreads, settle
+from tests.server.live_map.map_server_bench import (
+    FOLDER,
+    MAP,
+    ROBOT,
+    Bench,
+    FailingStore,
+    InlineThreads,
+    settle,
+)
 
 _T = TypeVar("_T")
 OTHER = RobotId("default", "robot-2", "thumb")
@@ -72,7 +80,11 @@ async def test_the_log_says_when_a_robot_is_aligned_and_when_it_no_longer_is():
                 outcomes.append(Unaligned(robot=event.robot, segment=0, reason="no loop closure"))
             return outcomes
 
-    bench = Bench(kind=MapKind(empty=Joining, restore=Joining.restore, started_from=FAKE_MAP.started_from))
+    bench = Bench(
+        implementation=MapImplementation(
+            empty=Joining, restore=Joining.restore, started_from=FAKE_MAP.started_from
+        )
+    )
     owner = await bench.own("a")
     for number in range(2):
         await owner.keyframe(number)
@@ -122,7 +134,7 @@ async def test_keyframes_are_kept_while_the_links_of_an_earlier_one_are_measured
     may_look = asyncio.Event()
 
     class Threads(InlineThreads):
-        async def look(self, act: Callable[[], _T]) -> _T:
+        async def match(self, act: Callable[[], _T]) -> _T:
             await may_look.wait()
             return act()
 
@@ -144,7 +156,7 @@ async def test_an_optimisation_that_fails_is_no_defect_of_the_owner():
 
     owner = await bench.own("a")
     owner.state.live_map.prepare_optimisation = lambda solve: [].index(0)  # type: ignore[attr-defined]
-    owner.owner._measuring.optimise()
+    owner.owner._measurer.request_optimisation()
     await settle()
     assert not owner.run.done()
     assert (await owner.keyframe(0))["number"] == 1
@@ -167,7 +179,7 @@ async def test_an_owner_that_was_paused_acknowledges_nothing_more_and_ends():
     await settle()
     assert old.run.done()
     assert old.run.result() == "lost"
-    with pytest.raises(MapMoves):
+    with pytest.raises(MapMoving):
         await sent
     assert len(old.told) == old_told
     assert new.state.keyframes == 2
@@ -195,7 +207,7 @@ async def test_an_old_owner_acknowledges_nothing_even_where_its_number_was_delet
     assert bench.store.get(name)  # it could write
     bench.clock.jump(1.0)
     await settle()
-    with pytest.raises(MapMoves):
+    with pytest.raises(MapMoving):
         await sent
     assert old.run.result() == "lost"
     bench.clock.now_s += 10.0
@@ -225,7 +237,7 @@ async def test_keyframes_whose_links_were_not_logged_are_measured_by_the_next_ow
     bench = Bench()
 
     old = await bench.own("a")
-    old.state.measuring = lambda keyframe, pieces: (_ for _ in ()).throw(KeyError)  # type: ignore[method-assign]
+    old.state.prepare_measurement = lambda keyframe, parts: (_ for _ in ()).throw(KeyError)  # type: ignore[method-assign]
     sent = asyncio.ensure_future(old.keyframe(0))
     await settle()
     assert sent.done()
@@ -263,13 +275,13 @@ async def test_a_crash_between_log_and_acknowledgement_is_a_known_keyframe_after
     bench = Bench()
 
     old = await bench.own("a")
-    real = old.log.write
+    real = old.log.write_entry
 
     def write_and_die(events: bytes) -> int:
         real(events)
         raise StoreError("the process dies here")
 
-    old.log.write = write_and_die  # type: ignore[method-assign]
+    old.log.write_entry = write_and_die  # type: ignore[method-assign]
     sent = asyncio.ensure_future(old.keyframe(0))
     await settle()
     assert not sent.done()
@@ -289,9 +301,9 @@ async def test_a_release_writes_a_snapshot_and_frees_the_map_at_once():
     await owner.owner.release()
     assert await owner.run == "released"
     assert bench.lease().state == "released"
-    assert verdict_on(bench.lease(), unchanged_s=0.0, lease_s=1.5) == "claim"
+    assert next_action(bench.lease(), unchanged_s=0.0, lease_s=1.5) == "claim"
     assert [info.name for info in bench.store.list(f"{FOLDER}snapshot/")]
-    with pytest.raises(MapMoves):
+    with pytest.raises(MapMoving):
         await owner.keyframe(1)
     new = await bench.own("b")
     assert new.state.keyframes == 1
@@ -309,7 +321,7 @@ async def test_a_silent_lease_ends_what_is_told_until_it_is_renewed():
     asked = asyncio.ensure_future(owner.ask("live-show"))
     await settle()
     assert not asked.done()  # another process might own the map
-    assert owner.owner.present() == []
+    assert owner.owner.current_updates() == []
     store.is_down = False
     await bench.clock.advance(1.0)
     assert (await asked)["keyframes"] == 1
@@ -362,7 +374,7 @@ async def test_a_map_is_published_when_the_last_robot_leaves_and_the_same_map_on
 
 
 async def test_a_map_that_changes_is_published_every_so_often(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("rse_pf.server.live_map.owner.live_owner.PUBLISH_S", 5.0)
+    monkeypatch.setattr("rse_pf.server.live_map.map_server.map_server.PUBLISH_INTERVAL_S", 5.0)
     bench = Bench()
 
     owner = await bench.own("a")
@@ -422,7 +434,7 @@ async def test_an_empty_map_is_told_that_rooms_look_the_same():
         await owner.ask("live-start", {"equal_rooms_m": -1.0})
     await owner.ask("live-start", {"equal_rooms_m": 5.0})
     log = LiveLog(bench.store, FOLDER, owner="replay", epoch=1)
-    events = [each for entry in log.entries() for each in decode_events(entry.events)]
+    events = [each for entry in log.read_entries() for each in decode_events(entry.events)]
     assert [each.equal_rooms_m for each in events if isinstance(each, MapStarted)] == [5.0]
 
 
@@ -456,12 +468,12 @@ async def test_updates_name_the_cause_and_a_new_reader_gets_the_present_state():
     owner = await bench.own("a")
     await owner.keyframe(0)
     await bench.clock.advance(1.0)
-    assert {payload["kind"] for payload in owner.owner.present()} == {"map", "alignment", "pose"}
+    assert {payload["kind"] for payload in owner.owner.current_updates()} == {"map", "alignment", "pose"}
     await owner.keyframe(1)
     await bench.clock.advance(1.0)
     assert owner.newest("alignment")["cause"] == {"robot": "robot-1", "number": 1}
     assert owner.newest("pose")["timestamp_s"] == 1.0
-    assert owner.owner.present()[0]["kind"] == "map"
+    assert owner.owner.current_updates()[0]["kind"] == "map"
     shown = await owner.ask("live-show")
     assert shown["you"] == {"robot": "robot-1", "number": 2, "segment": 1}
     assert shown["robots"][0]["robot"] == ROBOT.name

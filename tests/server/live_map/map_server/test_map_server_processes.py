@@ -23,12 +23,11 @@ from rse_pf.errors import Conflict, NotFound, RsePfError
 from rse_pf.identity import RobotId
 from rse_pf.live_map.events import KeyframeAdded, decode_events
 from rse_pf.object_store import DirectoryStore
-from rse_pf.server.live_map.children import OwnerChild
-from rse_pf.server.live_map.map_link import OwnerLinks
-from rse_pf.server.live_map.owner.lease import decode_lease, lease_name, map_folder
-from rse_pf.server.live_map.owner.log import LiveLog
-from rse_pf.server.live_map.owner.process import OwnerOrder, start_owner
-from rse_pf.server.live_map.owner.state import MapState
+from rse_pf.server.live_map.client import LiveMapClient
+from rse_pf.server.live_map.lease import decode_lease, lease_name, map_folder
+from rse_pf.server.live_map.map_server.log import LiveLog
+from rse_pf.server.live_map.map_server.state import MapState
+from rse_pf.server.live_map.process_pool import ClaimOrder, MapServerProcess, start_map_server
 from rse_pf.server.log import JsonLog
 from rse_pf.wire.live_map import LiveMapRequest, LiveRequest
 from tests.server.live_map.fake_map import FAKE_MAP, keyframe_request
@@ -44,24 +43,24 @@ class Servers:
     """The links of two servers, in one process and on one store."""
 
     store: DirectoryStore
-    a: OwnerLinks
-    b: OwnerLinks
+    a: LiveMapClient
+    b: LiveMapClient
     updates: list[dict[str, Any]]
 
-    async def send(self, links: OwnerLinks, number: int) -> dict[str, Any]:
+    async def send(self, links: LiveMapClient, number: int) -> dict[str, Any]:
         return await links.request(
             "default", MAP, ROBOT, "live-keyframe", keyframe_request(number), PATIENT_S
         )
 
-    async def show(self, links: OwnerLinks) -> dict[str, Any]:
+    async def show(self, links: LiveMapClient) -> dict[str, Any]:
         return await links.request("default", MAP, ROBOT, "live-show", LiveMapRequest(map=MAP), PATIENT_S)
 
-    async def owner(self) -> OwnerChild:
+    async def owner(self) -> MapServerProcess:
         """Return the process that serves the map; on a busy machine another one may be about to."""
         name, end_s = lease_name("default", MAP), time.monotonic() + PATIENT_S
         while time.monotonic() < end_s:
             epoch = decode_lease(name, self.store.get(name)).epoch
-            for child in (*self.a.children, *self.b.children):
+            for child in (*self.a.processes, *self.b.processes):
                 if child.epoch == epoch:
                     return child
             await asyncio.wait({asyncio.ensure_future(self.show(self.b))})
@@ -71,7 +70,7 @@ class Servers:
         """Return the map that the whole log gives, and the numbers of the keyframes in it."""
         log = LiveLog(self.store, map_folder("default", MAP), owner="", epoch=10**6)
         state, numbers = MapState(FAKE_MAP.empty(), 0), []
-        for entry in log.entries():
+        for entry in log.read_entries():
             events = decode_events(entry.events)
             numbers += [event.number for event in events if isinstance(event, KeyframeAdded)]
             state.apply(log.position, events)
@@ -87,9 +86,9 @@ async def servers(folder: Path, **live: Any) -> AsyncIterator[Servers]:
     store, updates = DirectoryStore(folder), []  # type: tuple[DirectoryStore, list[dict[str, Any]]]
     log = JsonLog(level="error", server="test", wall_clock=time.time).start()
     made = [
-        OwnerLinks(
+        LiveMapClient(
             store=store, settings=settings, server_id=name, log=log,
-            on_update=lambda tenant, name, payload: updates.append(payload), kind=KIND,
+            on_update=lambda tenant, name, payload: updates.append(payload), implementation=KIND,
         )
         for name in ("a", "b")
     ]  # fmt: skip
@@ -124,7 +123,7 @@ async def test_a_server_that_dies_or_stands_still_loses_no_acknowledged_keyframe
             took.append(time.monotonic() - began)
             if fault == signal.SIGSTOP:
                 os.kill(owner.pid, signal.SIGCONT)
-                assert await asyncio.wait_for(asyncio.shield(owner.ended), PATIENT_S) == 0
+                assert await asyncio.wait_for(asyncio.shield(owner.exited), PATIENT_S) == 0
         shown = await both.show(both.b)
         assert shown["epoch"] >= 3  # more where the machine is so busy that a lease ends
         state, numbers = both.replayed()
@@ -164,7 +163,7 @@ async def test_a_tenant_that_holds_most_owners_gives_one_up_within_seconds(
         await drive(victim, "v1", 0)
         number, end_s = 1, time.monotonic() + PATIENT_S
         while not attackers_drive and any(  # they are only watched in the end
-            child.unused_s is None for child in both.a.children if child.tenant == "acme"
+            child.unused_since_s is None for child in both.a.processes if child.tenant == "acme"
         ):
             assert time.monotonic() < end_s
             await drive(victim, "v1", number)
@@ -173,7 +172,7 @@ async def test_a_tenant_that_holds_most_owners_gives_one_up_within_seconds(
         assert (await drive(victim, "v2", 0))["number"] == 1
         assert time.monotonic() - began_s < 10.0
         assert (await drive(victim, "v1", number))["number"] == number + 1
-        assert sorted(child.tenant for child in both.a.children).count("rival") == 2
+        assert sorted(child.tenant for child in both.a.processes).count("rival") == 2
         for each in driving:
             each.cancel()
 
@@ -238,12 +237,12 @@ async def test_a_process_listens_only_once_it_has_a_map(tmp_path: Path) -> None:
     """Strangers would fill the backlog of one that does not accept, and nobody would close them."""
 
     settings = PlatformSettings.from_dict({"data": {"store": f"dir:{tmp_path}"}})
-    child = OwnerChild(start_owner(settings, KIND)).start()
+    child = MapServerProcess(start_map_server(settings, KIND)).start_reading()
     try:
         await child.wait_ready(PATIENT_S)
         assert child.is_ready
         assert not listens(child.pid)
-        order = OwnerOrder(tenant="default", map_name=MAP, server="a", known=None)
+        order = ClaimOrder(tenant="default", map_name=MAP, server="a", known=None)
         assert await asyncio.wait_for(child.claim(order), PATIENT_S)
         assert listens(child.pid)
     finally:

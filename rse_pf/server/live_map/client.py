@@ -1,0 +1,213 @@
+"""Use the live maps of all tenants from one process: send requests and subscribe to updates.
+
+The client keeps one `MapConnection` for each map in use, and the map-server processes that it started.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+from rse_pf.config import PlatformSettings
+from rse_pf.errors import BadRequest
+from rse_pf.identity import RobotId
+from rse_pf.lease import Lease
+from rse_pf.object_store import ObjectStore
+from rse_pf.server.live_map.connection_security import internal_key
+from rse_pf.server.live_map.lease import decode_lease, lease_name, tenant_folder
+from rse_pf.server.live_map.map_connection import ConnectionContext, MapConnection
+from rse_pf.server.live_map.process_pool import (
+    DEFAULT_IMPLEMENTATION,
+    MapServerPool,
+    MapServerProcess,
+    start_map_server,
+)
+from rse_pf.server.log import JsonLog
+from rse_pf.wire.live_map import LiveRequest
+
+__all__ = ["LiveMapClient"]
+
+_STORE_THREADS = 4
+"""Number of threads of a worker that read leases of live maps and block on the object store."""
+_RELEASE_TIMEOUT_S = 5.0
+"""Seconds for which a worker that ends waits until its map servers have released their maps."""
+_LISTED_STATES = {"serving": "live", "starting": "moving", "released": "idle", "stopped": "stopped"}
+"""State of a map in the reply of ``live-list``, for each state of its lease."""
+
+
+class LiveMapClient:
+    """The live maps as one worker, or a command of an operator, uses them.
+
+    All methods are called in the event loop.
+    """
+
+    def __init__(
+        self,
+        *,
+        store: ObjectStore,
+        settings: PlatformSettings,
+        server_id: str,
+        log: JsonLog,
+        on_update: Callable[[str, str, dict[str, Any]], None],
+        implementation: str = DEFAULT_IMPLEMENTATION,
+    ) -> None:
+        """Prepare; nothing is read or started before the first request or subscriber.
+
+        Args:
+            store: Object store that all servers share.
+            settings: Settings of the platform.
+            server_id: Id of this backend server.
+            log: Log of the worker.
+            on_update: Called with tenant, map name and payload of each update of a watched map.
+            implementation: Location of the `MapImplementation`, as ``module:name``.
+        """
+        self._store = store
+        self._settings = settings
+        self._on_update = on_update
+        self._connections: dict[tuple[str, str], MapConnection] = {}  # by tenant and map name
+        self._key: bytes | None = None
+        self._threads = ThreadPoolExecutor(_STORE_THREADS, thread_name_prefix="live-link")
+        self._pool = MapServerPool(
+            lambda at_low_priority: start_map_server(
+                settings, implementation, at_low_priority=at_low_priority
+            ),
+            max_processes=settings.live.max_owners,
+            keeps_spare=settings.live.warm_standby,
+        )
+        self._context = ConnectionContext(
+            store=store,
+            settings=settings.live,
+            server_id=server_id,
+            log=log,
+            call=lambda act: asyncio.get_running_loop().run_in_executor(self._threads, act),
+            key=self._read_key,
+            pool=self._pool,
+            clock=time.monotonic,
+            wall_clock=time.time,
+        )
+
+    async def request(
+        self,
+        tenant: str,
+        map_name: str,
+        robot: RobotId,
+        operation: str,
+        request: LiveRequest,
+        deadline_s: float,
+    ) -> dict[str, Any]:
+        """Send a request to the map server of a live map and return its reply.
+
+        Args:
+            tenant: Tenant of the robot.
+            map_name: Name of the live map.
+            robot: Robot that asks.
+            operation: Name of the service, such as ``live-keyframe``.
+            request: The request; the map server validates it.
+            deadline_s: Seconds from now on within which the reply must arrive.
+
+        Raises:
+            Busy: The map has no map server in time; ``retry_after_ms`` says when to ask again.
+            RsePfError: The map server refused the request: Conflict, BadRequest, NotFound, Forbidden.
+        """
+        connection = self._connection(tenant, map_name)
+        self._pool.set_used(is_used=True)
+        return await connection.request(robot, operation, request, deadline_s)
+
+    async def list_maps(self, tenant: str) -> list[dict[str, Any]]:
+        """Return name, state, owner and server of each live map of *tenant*, read from the store only.
+
+        Raises:
+            StoreError: The store fails, or a lease is damaged.
+        """
+        listed: list[dict[str, Any]] = await self._context.call(lambda: self._read_maps(tenant))
+        return listed
+
+    def watch(self, tenant: str, map_name: str, *, may_start: bool = True) -> None:
+        """Begin the updates of a map; each map server of the map first sends the current state.
+
+        Args:
+            tenant: Tenant of the map.
+            map_name: Name of the map.
+            may_start: Whether a map server is started for the updates if the map has none.
+        """
+        self._connection(tenant, map_name).set_watched(True, may_start=may_start)
+        self._update_spare()
+
+    def unwatch(self, tenant: str, map_name: str) -> None:
+        """End the updates of a map; does nothing for an unknown map."""
+        connection = self._connections.get((tenant, map_name))
+        if connection is not None:
+            connection.set_watched(False)
+            self._update_spare()
+
+    def give_up(self) -> None:
+        """Order the map servers of this worker to release their maps, because the server drains."""
+        self._pool.release_all()
+
+    def cpu_by_tenant(self) -> dict[str, float]:
+        """Return the CPU seconds of the map servers that this worker has started, by tenant."""
+        return self._pool.cpu_by_tenant()
+
+    @property
+    def processes(self) -> list[MapServerProcess]:
+        """The processes of this worker that claim or serve a map."""
+        return self._pool.in_use
+
+    async def close(self) -> None:
+        """Release the maps of this worker's processes (waiting at most 5 s), and close all connections."""
+        self.give_up()
+        exits = [process.exited for process in self._pool.in_use]
+        if exits:
+            await asyncio.wait(exits, timeout=_RELEASE_TIMEOUT_S)
+        for connection in list(self._connections.values()):
+            await connection.close()
+        self._threads.shutdown(wait=False)
+
+    def _connection(self, tenant: str, map_name: str) -> MapConnection:
+        """Return the connection of a map, which is started if there is none; raises BadRequest."""
+        if self._settings.data.store == "memory:":
+            raise BadRequest("live maps need a store that all servers share", hint="set data.store")
+        connection = self._connections.get((tenant, map_name))
+        if connection is None:
+            connection = self._connections[tenant, map_name] = MapConnection(
+                self._context,
+                tenant,
+                map_name,
+                on_update=lambda payload: self._on_update(tenant, map_name, payload),
+                on_end=self._remove,
+            ).start()
+        return connection
+
+    def _update_spare(self) -> None:
+        """Keep a spare process while some map may need a process of this worker."""
+        is_used = any(connection.may_need_process for connection in self._connections.values())
+        self._pool.set_used(is_used=is_used)
+
+    def _remove(self, connection: MapConnection) -> None:
+        self._connections.pop((connection.tenant, connection.map_name), None)
+        self._update_spare()
+
+    def _read_key(self) -> bytes:
+        """Return the key that signs tokens between servers, which is read from the store once; blocks."""
+        if self._key is None:
+            self._key = internal_key(self._store)
+        return self._key
+
+    def _read_maps(self, tenant: str) -> list[dict[str, Any]]:
+        """Return the fields of ``live-list`` for each map of *tenant* that has a lease; blocks."""
+        maps = []
+        for name in self._store.folders(tenant_folder(tenant)):
+            record = Lease(self._store, lease_name(tenant, name), decode_lease, self._context.clock).read()
+            if record is not None:
+                maps.append(
+                    {
+                        "name": name,
+                        "state": _LISTED_STATES[record.state],
+                        "owner": record.owner,
+                        "server": record.server,
+                    }
+                )
+        return maps

@@ -1,0 +1,576 @@
+"""Connect one worker to the map server of one live map; start or replace the map server if necessary.
+
+A worker finds the map server of a map by the lease of the map in the object store.  If there is none, or it
+is dead, the worker lets a process of its own claim the map.  A connection is kept while requests or
+subscribers wait, and for 10 s longer.  Requests without a reply are sent again after a reconnection: every
+operation of a live map may be repeated without harm.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import itertools
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
+from typing import Any
+
+import msgspec
+
+from rse_pf.config import LiveSettings
+from rse_pf.errors import (
+    Busy,
+    Conflict,
+    NotFound,
+    StoreError,
+    Unauthorized,
+    error_from_code,
+)
+from rse_pf.identity import RobotId
+from rse_pf.ipc import FrameReader, encode_message
+from rse_pf.lease import Lease, read_record
+from rse_pf.object_store import ObjectStore
+from rse_pf.server.live_map.connection_security import (
+    MAX_MESSAGE_BYTES,
+    TOKEN_S,
+    ConnectionClaims,
+    check_certificate,
+    client_context,
+    make_token,
+)
+from rse_pf.server.live_map.lease import (
+    LeaseRecord,
+    decode_lease,
+    lease_name,
+    next_action,
+)
+from rse_pf.server.live_map.process_pool import (
+    ClaimOrder,
+    MapServerPool,
+    MapServerProcess,
+)
+from rse_pf.server.log import JsonLog
+from rse_pf.wire.live_map import SHOW, KeyframeRequest, LiveRequest, LiveStart
+
+__all__ = ["ConnectionContext", "MapConnection", "can_begin_map"]
+
+_READ_BYTES = 1 << 18  # largest number of bytes in one read of a socket
+_CONNECT_TIMEOUT_S = 1.0
+"""Seconds within which a map server must accept a connection, and then answer the hello."""
+_POLL_S = 0.1
+"""Seconds between two reads of the lease while a map moves to another map server or the store fails."""
+_RECONNECT_S = 0.02
+"""Seconds after the end of a connection until the lease is read again: the map server is releasing it."""
+_IDLE_POLL_S = 1.0
+"""Seconds between two reads of the lease of a map that has no map server and needs none."""
+_LINGER_S = 10.0
+"""Seconds for which the connection of a map is kept after its last request."""
+_PREPARE_SHARE = 0.66
+"""Share of ``live.lease_s`` without a renewal after which a worker starts a process, so that the process has
+imported its modules when the lease expires."""
+_BUSY_RETRY_MS = 500.0
+"""Milliseconds after which a robot sends a request again that found no map server."""
+_EMPTY_MAP_UPDATE = {"kind": "map", "keyframes": 0, "version": 0, "owner": ""}
+"""Fields of the update ``map`` that a worker sends before the map server has sent one."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ConnectionContext:
+    """The values that all map connections of a worker share.
+
+    Attributes:
+        store: Object store that all servers share.
+        settings: Section ``live`` of the settings.
+        server_id: Id of this backend server.
+        log: Log of the worker.
+        call: Runs a blocking function in a thread.
+        key: Returns the key that signs tokens between servers; blocks on the store.
+        pool: Map-server processes of this worker.
+        clock: Returns monotonic time in seconds.
+        wall_clock: Returns Unix time in seconds.
+    """
+
+    store: ObjectStore
+    settings: LiveSettings
+    server_id: str
+    log: JsonLog
+    call: Callable[[Callable[[], Any]], Awaitable[Any]]
+    key: Callable[[], bytes]
+    pool: MapServerPool
+    clock: Callable[[], float]
+    wall_clock: Callable[[], float]
+
+
+@dataclass(slots=True, eq=False)
+class _PendingRequest:
+    """A request that has no reply yet; the reply or the error is set on ``future``."""
+
+    robot: RobotId
+    operation: str
+    request: LiveRequest
+    future: asyncio.Future[dict[str, Any]]
+
+    def refuse(self, error: Exception) -> None:
+        if not self.future.done():
+            self.future.set_exception(error)
+
+
+class MapConnection:
+    """The connection of one worker to the map server of one live map; methods run in the event loop."""
+
+    def __init__(
+        self,
+        context: ConnectionContext,
+        tenant: str,
+        map_name: str,
+        *,
+        on_update: Callable[[dict[str, Any]], None],
+        on_end: Callable[[MapConnection], None],
+    ) -> None:
+        """Describe the connection; `start` begins to look for the map server.
+
+        Args:
+            context: Values shared by all connections of the worker.
+            tenant: Tenant of the map.
+            map_name: Name of the map.
+            on_update: Called with each update while the map is watched.
+            on_end: Called with this object when it is closed, or when nobody has used the map for 10 s.
+
+        Raises:
+            BadRequest: The name of the map is not valid.
+        """
+        self.tenant, self.map_name = tenant, map_name
+        self.is_watched = False
+        """Whether robots of this worker subscribe to the map."""
+        self.may_start = False
+        """Whether a map server is started for these subscribers."""
+        self.process: MapServerProcess | None = None
+        """Process of this worker that claims or serves the map."""
+        self._context = context
+        self._on_update = on_update
+        self._on_end = on_end
+        self._lease = Lease(context.store, lease_name(tenant, map_name), decode_lease, context.clock)
+        self._request_numbers = itertools.count(1)
+        self._pending: dict[int, _PendingRequest] = {}
+        self._writer: asyncio.StreamWriter | None = None
+        self._dead_epoch: int | None = None  # epoch of a map server whose process has certainly ended
+        self._reached_owner = ""  # name of the last map server that answered our hello
+        self._newest_map_update: dict[str, Any] = {}
+        self._last_use_s = context.clock()
+        self._is_closed = False
+        self._had_requests = False
+        self._wake = asyncio.Event()
+        self._task: asyncio.Task[None]
+
+    def start(self) -> MapConnection:
+        """Begin to look for the map server, and return this object."""
+        self._task = asyncio.get_running_loop().create_task(self._run())
+        return self
+
+    async def request(
+        self, robot: RobotId, operation: str, request: LiveRequest, deadline_s: float
+    ) -> dict[str, Any]:
+        """Send a request to the map server and return its reply.
+
+        Args:
+            robot: Robot that asks.
+            operation: Name of the service, such as ``live-keyframe``.
+            request: The request.
+            deadline_s: Seconds from now on within which the reply must arrive.
+
+        Raises:
+            Busy: There was no reply within *deadline_s*.
+            RsePfError: The map server refused the request.
+        """
+        number = next(self._request_numbers)
+        self._had_requests = True
+        pending = _PendingRequest(robot, operation, request, asyncio.get_running_loop().create_future())
+        self._pending[number] = pending
+        self._send_request(number, pending)
+        self._wake.set()
+        try:
+            return await asyncio.wait_for(pending.future, deadline_s)
+        except asyncio.TimeoutError:
+            raise Busy(
+                f"the live map {self.map_name!r} did not answer within {deadline_s:.1f} s",
+                hint="try again; if this happens repeatedly, look at the servers' logs and the store",
+                retry_after_ms=_BUSY_RETRY_MS,
+            ) from None
+        finally:
+            del self._pending[number]
+            self._last_use_s = self._context.clock()
+
+    def set_watched(self, is_watched: bool, *, may_start: bool = True) -> None:
+        """Begin or end the updates of the map.
+
+        Args:
+            is_watched: Whether updates are wanted.
+            may_start: Whether a map server is started for the updates if the map has none.
+        """
+        self.is_watched, self.may_start = is_watched, is_watched and may_start
+        self._last_use_s = self._context.clock()
+        self._send(["watch" if is_watched else "unwatch"])
+        self._wake.set()
+
+    @property
+    def may_need_process(self) -> bool:
+        """Whether the map had requests, or has subscribers for whom a map server is started."""
+        return self._had_requests or self.may_start
+
+    async def close(self) -> None:
+        """Close the connection; requests without a reply fail with Busy."""
+        # The flag is needed, too: before Python 3.12, a wait that ends may swallow the cancellation.
+        self._is_closed = True
+        self._task.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await self._task
+        self._refuse_all("this server is shutting down")
+
+    # --- Finding or starting the map server ---
+
+    async def _run(self) -> None:
+        try:
+            while self._is_needed():
+                try:
+                    self._lease.note(await self._context.call(self._read_lease))
+                    await self._advance()
+                except StoreError as error:
+                    self._send_state("waiting for the store")
+                    self._context.log.warning("live-link-store", map=self.map_name, error=error.message)
+                    await self._pause(_POLL_S)
+        finally:
+            self._on_end(self)
+
+    async def _advance(self) -> None:
+        """Do what the lease, which was just read, calls for: connect, claim the map, or wait."""
+        record, lease_s = self._lease.record, self._context.settings.lease_s
+        # 1. A map that does not exist or was stopped waits for a request that begins it.
+        if record is None or record.state == "stopped":
+            self._refuse_requests_without_map(is_stopped=record is not None)
+            if not any(can_begin_map(pending.request) for pending in self._pending.values()):
+                if self._context.settings.warm_standby:
+                    self._prepare_spare()  # robots subscribe seconds before their first keyframe
+                await self._pause(_IDLE_POLL_S)
+                return
+        # 2. A map server whose process has certainly ended counts as silent for the whole lease.
+        unchanged_s = self._lease.unchanged_s
+        if record is not None and record.epoch == self._dead_epoch:
+            unchanged_s = max(lease_s, unchanged_s)
+        action = next_action(record, unchanged_s=unchanged_s, lease_s=lease_s)
+        # 3. A map without a map server is claimed, unless its subscribers may start none.
+        if action == "claim" and not self._needs_map_server:
+            self._send_state("idle")
+            await self._pause(_IDLE_POLL_S)
+        elif action == "claim":
+            await self._claim_map()
+        # 4. A map server that listens is used until the connection or its lease ends.
+        elif action == "connect" and record is not None:
+            if await self._use_map_server(record):
+                await asyncio.sleep(_RECONNECT_S)
+            elif record.epoch != self._dead_epoch:
+                self._prepare_spare()
+                await self._pause(_POLL_S)
+        # 5. A map server that is starting, or dead and not replaceable yet, is waited for.
+        else:
+            self._send_state("moving")
+            await self._pause(_POLL_S)
+
+    async def _claim_map(self) -> None:
+        """Let a process of this worker claim the map, unless another process is first."""
+        pool, is_watched_only = self._context.pool, not self._pending
+        # 1. The process must be ready.  While it imports, another process may claim the map, so the lease is
+        # read again before the next try.
+        spare = pool.prepare_spare()
+        if spare is not None and not spare.is_ready:
+            await spare.wait_ready(_POLL_S)
+            return
+        process = pool.take(self.tenant, self._on_process_exit, is_watched_only=is_watched_only)
+        # 2. Without a process, watchers wait until no other map needs one; requests wait only while one is
+        # being freed.
+        if process is None and is_watched_only:
+            self._send_state("idle")
+            await self._pause(_IDLE_POLL_S)
+            return
+        self._send_state("moving")
+        if process is None:
+            if not pool.is_freeing_process:
+                self._refuse_all("all map-server processes of this server are in use, or the server drains")
+            await self._pause(_POLL_S)
+            return
+        # 3. The process claims the lease in the form that this worker has read.
+        order = ClaimOrder(
+            tenant=self.tenant,
+            map_name=self.map_name,
+            server=self._context.server_id,
+            known=self._lease.known,
+        )
+        self.process = process
+        silent_s, began_s = self._lease.unchanged_s, self._context.clock()
+        has_won = await process.claim(order)
+        self._context.log.info(
+            "live-map-claimed",
+            map=self.map_name,
+            tenant=self.tenant,
+            has_won=has_won,
+            silent_s=round(silent_s, 3),
+            seconds=round(self._context.clock() - began_s, 3),
+        )
+        if not has_won:
+            process.kill()
+
+    def _on_process_exit(self, process: MapServerProcess, exit_code: int) -> None:
+        """Note that a process of this worker has exited: if it served the map, the map has no map server."""
+        if process.epoch is not None:
+            self._dead_epoch = process.epoch
+            self._context.log.info("live-owner-ended", map=self.map_name, epoch=process.epoch, code=exit_code)
+        if self.process is process:
+            self.process = None
+        self._wake.set()
+
+    # --- Talking with the map server ---
+
+    async def _use_map_server(self, record: LeaseRecord) -> bool:
+        """Connect to the map server and pass requests on until the connection or its lease ends.
+
+        Returns:
+            False if no connection could be opened.
+        """
+        connection = await self._connect(record)
+        if connection is None:
+            return False
+        reader, writer, frames = connection
+        self._writer = writer
+        try:
+            for number, pending in self._pending.items():
+                self._send_request(number, pending)
+            if self.is_watched:
+                self._send(["watch"])
+            await self._receive(record, reader, frames)
+        finally:
+            self._writer = None
+            writer.close()
+        return True
+
+    async def _connect(
+        self, record: LeaseRecord
+    ) -> tuple[asyncio.StreamReader, asyncio.StreamWriter, FrameReader] | None:
+        """Open an authenticated connection to the map server; return None if that fails."""
+        # 1. TCP and TLS.  A refused connection proves the end of the process only if this worker has reached
+        # its port before: a firewall may refuse what other servers can reach.
+        try:
+            reader, writer = await asyncio.wait_for(
+                asyncio.open_connection(record.address, record.port, ssl=client_context()),
+                _CONNECT_TIMEOUT_S,
+            )
+        except (OSError, asyncio.TimeoutError) as error:
+            if isinstance(error, ConnectionRefusedError) and self._reached_owner == record.owner:
+                self._dead_epoch = record.epoch
+            return None
+        is_welcome = False
+        try:
+            # 2. The certificate of the map server.
+            check_certificate(writer.get_extra_info("ssl_object"), record.certificate)
+            # 3. The token of this worker.
+            claims = ConnectionClaims(
+                tenant=self.tenant,
+                map_name=self.map_name,
+                epoch=record.epoch,
+                certificate=record.certificate,
+                expires_s=self._context.wall_clock() + TOKEN_S,
+            )
+            key = await self._context.call(self._context.key)
+            writer.write(encode_message(["hello", make_token(key, claims)]))
+            # 4. The answer of the map server, perhaps with further messages.
+            frames = FrameReader(MAX_MESSAGE_BYTES)
+            messages = await asyncio.wait_for(_read_messages(reader, frames), _CONNECT_TIMEOUT_S)
+            is_welcome = messages[0] == ["welcome"]
+            if is_welcome:
+                self._reached_owner = record.owner
+                for message in messages[1:]:
+                    self._handle(message)
+                return reader, writer, frames
+            self._context.log.warning("live-link-refused", map=self.map_name, why=str(messages[0])[:200])
+        except (OSError, asyncio.TimeoutError, Unauthorized) as error:
+            self._context.log.warning("live-link-failed", map=self.map_name, why=str(error)[:200])
+        finally:
+            if not is_welcome:  # also if the task is cancelled, or the key cannot be read
+                writer.close()
+        return None
+
+    async def _receive(self, record: LeaseRecord, reader: asyncio.StreamReader, frames: FrameReader) -> None:
+        """Handle messages until the connection ends, or the map server gives the map up or is replaceable."""
+        prepare_after_s = _PREPARE_SHARE * self._context.settings.lease_s
+        read: asyncio.Task[bytes] | None = None
+        try:
+            while self._is_needed():
+                read = read or asyncio.ensure_future(reader.read(_READ_BYTES))
+                silent_s = self._lease.unchanged_s
+                await asyncio.wait({read}, timeout=max(_POLL_S, prepare_after_s - silent_s))
+                if read.done():
+                    with contextlib.suppress(OSError):
+                        data = read.result()
+                        read = None
+                        continues = bool(data)
+                        for message in frames.feed(data):
+                            continues &= self._handle(message)
+                        if continues:
+                            continue
+                    return
+                if self._lease.unchanged_s >= prepare_after_s:
+                    self._prepare_spare()
+                    if await self._is_replaceable(record):
+                        return
+        finally:
+            if read is not None:
+                read.cancel()
+
+    async def _is_replaceable(self, record: LeaseRecord) -> bool:
+        """Return whether a silent map server has lost or released its lease, or its lease has expired.
+
+        While the store fails, the answer is False, because nobody can replace the map server.
+        """
+        try:
+            self._lease.note(await self._context.call(self._read_lease))
+        except StoreError:
+            self._send_state("waiting for the store")
+            return False
+        current = self._lease.record
+        if current is None or current.owner != record.owner or current.state != record.state:
+            return True
+        return self._lease.unchanged_s >= self._context.settings.lease_s
+
+    def _handle(self, message: list[Any]) -> bool:
+        """Handle a message of the map server; return False if it gives the map up."""
+        match message:
+            case ["answer", int(number), dict(reply)]:
+                pending = self._pending.get(number)
+                if pending is not None and not pending.future.done():
+                    pending.future.set_result(reply)
+            case ["refused", int(number), str(code), str(text), str(hint), retry_after_ms]:
+                pending = self._pending.get(number)
+                if pending is not None:
+                    pending.refuse(error_from_code(code, text, hint=hint, retry_after_ms=retry_after_ms))
+            case ["again", int()]:
+                return False
+            case ["update", dict(payload)]:
+                if payload.get("kind") == "map":
+                    self._newest_map_update = payload
+                if self.is_watched:
+                    self._on_update(payload)
+            case ["beat", int(number)]:
+                self._lease.note_beat(number)
+            case ["moving"]:
+                return False
+        return True
+
+    def _send_request(self, number: int, pending: _PendingRequest) -> None:
+        request = msgspec.msgpack.encode(pending.request)
+        self._send(["request", number, list(pending.robot), pending.operation, request])
+
+    def _send(self, message: list[Any]) -> None:
+        """Send *message* if there is a connection; requests are sent again with the next connection."""
+        if self._writer is not None:
+            self._writer.write(encode_message(message))
+
+    # --- Answers of the worker itself, while the map has no map server ---
+
+    def _refuse_requests_without_map(self, *, is_stopped: bool) -> None:
+        """Answer the requests that do not begin a map: with an empty ``live-show``, or with an error."""
+        for pending in self._pending.values():
+            if pending.future.done() or can_begin_map(pending.request):
+                continue
+            if pending.operation == SHOW:
+                pending.future.set_result(_show_reply_without_map(pending.robot))
+            elif is_stopped:
+                pending.refuse(
+                    Conflict(
+                        f"the live map {self.map_name!r} was stopped",
+                        hint="begin it again with keyframe 0 of segment 0",
+                    )
+                )
+            else:
+                pending.refuse(
+                    NotFound(
+                        f"there is no live map {self.map_name!r}",
+                        hint="begin it with keyframe 0 of segment 0; see rse-pf map live list",
+                    )
+                )
+
+    def _refuse_all(self, reason: str) -> None:
+        """Let all requests without a reply fail with Busy."""
+        for pending in self._pending.values():
+            pending.refuse(
+                Busy(
+                    f"the live map {self.map_name!r} has no map server now: {reason}",
+                    hint="try again",
+                    retry_after_ms=_BUSY_RETRY_MS,
+                )
+            )
+
+    def _send_state(self, state: str) -> None:
+        """Send subscribers the *state* of the map in an update of the worker, unless they know it."""
+        if self.is_watched and self._newest_map_update.get("state") != state:
+            self._newest_map_update = {**(self._newest_map_update or _EMPTY_MAP_UPDATE), "state": state}
+            self._on_update(self._newest_map_update)
+
+    @property
+    def _needs_map_server(self) -> bool:
+        """Whether a request waits, or a subscriber for whom a map server is started."""
+        return bool(self._pending) or self.may_start
+
+    def _prepare_spare(self) -> None:
+        if self._needs_map_server:
+            self._context.pool.prepare_spare()
+
+    def _is_needed(self) -> bool:
+        if self._is_closed:
+            return False
+        if self._pending or self.is_watched:
+            return True
+        return self._context.clock() - self._last_use_s < _LINGER_S
+
+    def _read_lease(self) -> bytes | None:
+        return read_record(self._context.store, self._lease.name)
+
+    async def _pause(self, seconds: float) -> None:
+        """Wait for *seconds*, or until a request or a subscriber arrives."""
+        self._wake.clear()
+        with contextlib.suppress(asyncio.TimeoutError):
+            await asyncio.wait_for(self._wake.wait(), seconds)
+
+
+def can_begin_map(request: LiveRequest) -> bool:
+    """Return whether a request begins a live map that does not exist or was stopped.
+
+    The first keyframe of a robot (number 0 of segment 0) and ``live-start`` do.  Later keyframes belong to
+    the map that was stopped.
+    """
+    if isinstance(request, KeyframeRequest):
+        return request.number == 0 and request.segment == 0
+    return isinstance(request, LiveStart)
+
+
+def _show_reply_without_map(robot: RobotId) -> dict[str, Any]:
+    """Return the reply of ``live-show`` to *robot* about a map that does not exist; its state is ``none``."""
+    return {
+        "keyframes": 0,
+        "robots": [],
+        "owner": "",
+        "server": "",
+        "epoch": 0,
+        "version": 0,
+        "links": 0,
+        "state": "none",
+        "you": {"robot": robot.name, "number": 0, "segment": 0},
+    }
+
+
+async def _read_messages(reader: asyncio.StreamReader, frames: FrameReader) -> list[Any]:
+    """Read until at least one message is complete; raises ConnectionResetError at the end of the stream."""
+    while True:
+        data = await reader.read(_READ_BYTES)
+        if not data:
+            raise ConnectionResetError
+        messages = list(frames.feed(data))
+        if messages:
+            return messages

@@ -1,0 +1,183 @@
+"""Read and delete the points and images that robots store as objects together with their keyframes.
+
+A keyframe refers to its objects by SHA-256 digest.  An object is read only under the name of the robot that
+sent the keyframe, so a keyframe cannot refer to objects of other robots.  Objects that are missing, do not
+match their digest, or hold no valid points are left out of the point cloud of the map.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections import Counter, deque
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from rse_pf.accounts import TenantAccount
+from rse_pf.errors import BadRequest, NotFound
+from rse_pf.geometry import Array, transform
+from rse_pf.live_map.versions import PointSource
+from rse_pf.object_store import ObjectStore, digest_of
+from rse_pf.slam.cloud_deform import merge_clouds
+from rse_pf.slam.keyframe_points import MAX_POINTS_BYTES, decode_points
+from rse_pf.slam.ply import Colours, Points
+
+__all__ = ["KeyframeObjects", "PointCloud"]
+
+_MAX_SOURCES = 4_000
+"""Largest number of keyframes whose points are read for one point cloud, which bounds the time of a
+publication."""
+_MAX_POINTS = 3_000_000
+"""Largest number of points of a cloud before it is thinned to one for each voxel: they take about 400 MB of
+the map server's memory.  With many keyframes, fewer points of each keyframe are used."""
+_MAX_CACHED_BYTES = 128 << 20
+"""Memory in bytes for encoded points of keyframes that are kept for the cloud of the next version, so that
+they need not be read from the object store again."""
+_MAX_DISTANCE_M = 100.0
+"""Points are left out if a coordinate in the camera frame is above this distance in metres: a camera that
+reports such points has no metric depth."""
+_DELETIONS = 2
+"""How often the objects of a forgotten robot are deleted: an upload may arrive after the first deletion."""
+_CULLED_OBJECTS_DELAYED = 64
+"""Number of objects of recently culled keyframes that are not deleted yet: their uploads may still arrive."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PointCloud:
+    """The coloured point cloud of a version of a map.
+
+    Attributes:
+        points: ``(m, 3)`` float32 in metres, in the world frame of the version.
+        colours: ``(m, 3)`` uint8, RGB.
+        keyframes: Number of keyframes whose points are in the cloud.
+        missing: Number of keyframes whose points could not be read.
+    """
+
+    points: Points
+    colours: Colours
+    keyframes: int
+    missing: int
+
+
+class KeyframeObjects:
+    """The objects that belong to the keyframes of one live map.
+
+    All methods block on the object store, and are called by one thread at a time.
+    """
+
+    def __init__(self, store: ObjectStore, account: TenantAccount) -> None:
+        """Prepare to read from *store*; the sizes of deleted objects are credited to *account*."""
+        self._store = store
+        self._account = account
+        self._cache: dict[str, bytes] = {}  # content of objects, by object name
+        self._cached_bytes = 0
+        self._culled: deque[tuple[str, str]] = deque()
+        self._deletions: Counter[tuple[str, str]] = Counter()
+
+    def build_cloud(self, sources: Sequence[PointSource]) -> PointCloud:
+        """Build the point cloud of a version from the stored points of its keyframes.
+
+        Of more than 4,000 keyframes an even selection is used, with the same number from each robot.  The
+        points are transformed by the optimised poses of their keyframes and thinned to one for each voxel of
+        1 cm.
+
+        Raises:
+            StoreError: The store fails.
+        """
+        selected = _select_evenly(sources)
+        old_cache, self._cache, self._cached_bytes = self._cache, {}, 0
+        max_points = max(1, _MAX_POINTS // max(1, len(selected)))
+        clouds: list[Array] = []
+        colours: list[Colours] = []
+        for source in selected:
+            points_and_colours = self._read_points(source, old_cache)
+            if points_and_colours is not None:
+                points_camera, point_colours = points_and_colours
+                stride = -(-len(points_camera) // max_points) or 1
+                clouds.append(transform(source.T_world_camera, points_camera[::stride]).astype(np.float32))
+                colours.append(point_colours[::stride])
+        points, joined_colours = merge_clouds(clouds, colours)
+        return PointCloud(
+            points=points,
+            colours=joined_colours,
+            keyframes=len(clouds),
+            missing=len(selected) - len(clouds),
+        )
+
+    def delete(self, objects: Iterable[tuple[str, str]]) -> None:
+        """Delete objects, given as pairs of a robot's folder and a digest; missing objects are skipped.
+
+        Raises:
+            StoreError: The store fails; the remaining objects are not deleted.
+        """
+        for folder, digest in objects:
+            name = f"objects/{folder}/{digest}"
+            self._cache.pop(name, None)
+            with contextlib.suppress(NotFound):
+                size_bytes = self._store.head(name).size
+                self._store.delete(name)
+                self._account.release(size_bytes)
+
+    def delete_of_forgotten(self, objects: Iterable[tuple[str, str]]) -> None:
+        """Delete the objects of forgotten robots; each object is deleted by the first two calls for it only.
+
+        The second deletion removes an object whose upload arrived after the first one.
+
+        Raises:
+            StoreError: The store fails; the next call deletes the remaining objects.
+        """
+        for folder_and_digest in objects:
+            if self._deletions[folder_and_digest] < _DELETIONS:
+                self.delete([folder_and_digest])
+                self._deletions[folder_and_digest] += 1
+
+    def delete_of_culled(self, objects: Iterable[tuple[str, str]]) -> None:
+        """Delete the objects of culled keyframes, except for the last 64, whose uploads may still arrive.
+
+        Raises:
+            StoreError: The store fails; the object that was due is then deleted only when its robot is
+                forgotten.
+        """
+        self._culled += objects
+        while len(self._culled) > _CULLED_OBJECTS_DELAYED:
+            self.delete([self._culled.popleft()])
+
+    def _read_points(self, source: PointSource, old_cache: dict[str, bytes]) -> tuple[Array, Colours] | None:
+        """Return the points of one keyframe in its camera frame (m) with colours; None if there are none."""
+        digest, size_bytes = source.reference.digest, source.reference.size
+        name = f"objects/{source.robot}/{digest}"
+        data = old_cache.get(name)
+        if data is None:
+            try:
+                if not 0 < size_bytes <= MAX_POINTS_BYTES or self._store.head(name).size != size_bytes:
+                    return None
+                data = self._store.get(name)
+            except NotFound:
+                return None
+            if digest_of(data) != digest:
+                return None
+        if self._cached_bytes + len(data) <= _MAX_CACHED_BYTES:
+            self._cache[name] = data
+            self._cached_bytes += len(data)
+        try:
+            points, colours = decode_points(data, source.camera)
+        except BadRequest:
+            return None
+        is_near = (np.abs(points) <= _MAX_DISTANCE_M).all(axis=1)
+        return points[is_near], colours[is_near]
+
+
+def _select_evenly(sources: Sequence[PointSource]) -> list[PointSource]:
+    """Select at most 4,000 keyframes: equally many of each robot, spread evenly over its trajectory."""
+    rows_by_robot: dict[str, list[int]] = {}
+    for row, source in enumerate(sources):
+        rows_by_robot.setdefault(source.robot, []).append(row)
+    selected: list[int] = []
+    robots_left = len(rows_by_robot)
+    for rows in sorted(rows_by_robot.values(), key=len):  # a small share leaves more for the next robots
+        share = (_MAX_SOURCES - len(selected)) // robots_left
+        picks = np.linspace(0, len(rows) - 1, min(share, len(rows))).astype(np.int64)
+        selected += [rows[pick] for pick in picks]
+        robots_left -= 1
+    return [sources[row] for row in sorted(selected)]

@@ -1,0 +1,700 @@
+"""Serve one live map: the only process that changes the map, while it holds the lease of the map.
+
+Two rules keep a map server that was paused or cut off from the store from contradicting its successor:
+
+- An event is applied to the map only when its log entry is durable, and each number of an entry can be
+  written once.
+- A reply or an update is sent only if the last successful renewal of the lease began less than
+  ``live.lease_s`` ago.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import functools
+from collections.abc import Callable, Coroutine, Iterable
+from typing import Any, Literal
+
+import msgspec
+
+from rse_pf.errors import (
+    Busy,
+    Conflict,
+    InternalError,
+    NotFound,
+    StoreError,
+    StoreFull,
+)
+from rse_pf.identity import RobotId, folders_of, shown_name
+from rse_pf.live_map.events import Event, KeyframeAdded, MapStarted, RobotForgotten, RobotLeft
+from rse_pf.live_map.outcomes import (
+    Added,
+    Ambiguous,
+    Corrected,
+    Culled,
+    Joined,
+    LoopClosureRejected,
+    OptimiseWanted,
+    Outcome,
+    Unaligned,
+)
+from rse_pf.server.live_map.lease import MapLease, renewal_s
+from rse_pf.server.live_map.map_server.environment import (
+    FIRST_RETRY_S,
+    MapServerEnvironment,
+    Urgency,
+    next_retry_s,
+)
+from rse_pf.server.live_map.map_server.log import (
+    BUSY_RETRY_MS,
+    SLOW_STORE_S,
+    LiveLog,
+    LogWriter,
+    MapSnapshot,
+    SubmittedEvent,
+)
+from rse_pf.server.live_map.map_server.measurement import KeyframeMeasurer
+from rse_pf.server.live_map.map_server.messages import (
+    MapUpdates,
+    decode_request,
+    paths_reply,
+    relocalise_reply,
+    show_reply,
+    version_reply,
+)
+from rse_pf.server.live_map.map_server.publisher import (
+    NOTE_ALL_LEFT,
+    NOTE_CHANGED,
+    NOTE_UNUSED,
+    Publisher,
+    read_start_version,
+)
+from rse_pf.server.live_map.map_server.state import AppliedEntry, MapState
+from rse_pf.slam.keyframe import decode_keyframe
+from rse_pf.wire.live_map import (
+    LEAVE,
+    PUBLISH,
+    STOP,
+    KeyframeRequest,
+    LiveForget,
+    LiveMapRequest,
+    LiveRelocalise,
+    LiveShow,
+    LiveStart,
+)
+
+__all__ = ["MapMoving", "MapServer", "ServiceEnd"]
+
+PUBLISH_INTERVAL_S = 600.0
+"""Seconds between two automatic versions of a live map that changes and is in use."""
+_SETTLED_S = 5.0
+"""Seconds after which a map server counts as stable, so that earlier failures no longer delay a takeover.  A
+map server that has measured all its keyframes counts as stable at once."""
+_MAX_FINAL_PUBLICATION_S = 3.0
+"""Seconds for which the release of a map waits for the publication of its last version; if that takes longer,
+the next map server publishes the version."""
+_UNUSED_SHARE = 1.0 / 6.0
+"""A map counts as watched only, and not used, when it got no command for this share of ``live.idle_s``."""
+_EVENT_OVERHEAD_BYTES = 512
+"""Bytes that are charged to the quota for the event of a keyframe in the log, in addition to the keyframe."""
+_WAITING_FOR_STORE = "waiting for the store"
+_ALIGNMENT_OUTCOMES = (Joined, Corrected, Unaligned, Ambiguous, LoopClosureRejected)
+"""Classes of outcomes after which the alignments of robots are compared with those that were sent."""
+
+ServiceEnd = Literal["lost", "released", "stopped", "defect"]
+"""Why a map server stopped serving: another process took the map, it was given up, an operator ended it, or
+the map server has a defect."""
+
+
+class MapMoving(Busy):
+    """The live map is being given up: the worker sends the request to the next map server.
+
+    Cause: The server of the map drains, or was paused.
+    Check: rse-pf map live list: which server serves the map.
+    Fix: Nothing; the worker repeats the request.
+    """
+
+
+class MapServer:
+    """Serves one live map; all methods are called in the event loop."""
+
+    def __init__(
+        self, environment: MapServerEnvironment, state: MapState, log: LiveLog, lease: MapLease
+    ) -> None:
+        """Prepare to serve; nothing happens before `run`.
+
+        Args:
+            environment: Threads, clocks, stores and listeners.
+            state: The map, restored by `take_over`.
+            log: Log of the map, at the position of *state*.
+            lease: Lease of the map, which this process has claimed.
+        """
+        self.users = 0
+        """Number of connections of workers; maintained by `WorkerConnections`."""
+        self._environment = environment
+        self._state = state
+        self._log = log
+        self._lease = lease
+        self._robot_names: dict[str, str] = {}  # by RobotId.folder
+        self._updates = MapUpdates(self._name_of)
+        self._writer = LogWriter(
+            log,
+            apply_entry=self.apply_entry,
+            on_lost=self.lose,
+            on_waiting=lambda is_waiting: self.set_waiting_for_store(is_waiting=is_waiting),
+            threads=environment.threads,
+            sleep=environment.sleep,
+            json_log=environment.log,
+            map_name=environment.map_name,
+        )
+        self._measurer = KeyframeMeasurer(
+            state,
+            environment.threads,
+            self._writer.submit,
+            optimise=environment.optimise,
+            json_log=environment.log,
+            map_name=environment.map_name,
+        )
+        self._publisher = Publisher(state, environment, server=lease.record.server)
+        self._additions: dict[tuple[str, int], asyncio.Task[None]] = {}  # by robot and keyframe number
+        self._present_robots: dict[str, None] = {}
+        self._renewed = asyncio.Event()
+        self._snapshot_position = 0
+        self._bytes_since_snapshot = 0
+        self._has_unsent_updates = False
+        self._is_waiting_for_store = False
+        self._is_closing = False
+        self._idle_since_s = self._began_s = environment.clock()
+        self._publish_due_s = self._began_s + PUBLISH_INTERVAL_S
+        self._is_used, self._last_command_s = False, float("-inf")
+        self._ended: asyncio.Future[ServiceEnd] = asyncio.get_running_loop().create_future()
+        self._tasks: set[asyncio.Task[None]] = set()
+
+    @property
+    def is_closing(self) -> bool:
+        """Whether the map is being given up, or was given up or lost."""
+        return self._ended.done() or self._is_closing
+
+    def current_updates(self) -> list[dict[str, Any]]:
+        """Return the updates for a new subscriber; none while another process may hold the lease."""
+        return self._updates.all() if self._holds_lease() else []
+
+    async def run(self) -> ServiceEnd:
+        """Serve until the map is lost, released or stopped, or a task fails; return which."""
+        alignments = await self._environment.threads.compute(Urgency.APPLY, self._state.live_map.alignments)
+        self._updates.set_alignments(alignments, (), self._state.position)
+        self._send_map_state()
+        for work in (
+            self._writer.run(),
+            self._measurer.run(),
+            self._keep_lease(),
+            self._delete_objects_of_forgotten_at_start(),
+        ):
+            self._start_task(work)
+        try:
+            return await asyncio.shield(self._ended)
+        finally:
+            for task in self._tasks:
+                task.cancel()
+            await asyncio.gather(*self._tasks, return_exceptions=True)
+            self._writer.refuse_all(self._moving_error)
+
+    async def answer(self, robot: RobotId, operation: str, request: bytes) -> dict[str, Any]:
+        """Do what a robot or an operator requests, and return the reply.
+
+        Args:
+            robot: Robot that asks.
+            operation: Name of the service, such as ``live-keyframe``.
+            request: Request in MessagePack, as a worker encodes it.
+
+        Raises:
+            MapMoving: The map is being given up, or is lost.
+            RsePfError: The request is refused.
+        """
+        if self.is_closing:
+            raise self._moving_error()
+        self._robot_names[robot.folder] = robot.name
+        self._set_used(is_used=True)
+        reply = await self._reply_to(robot, operation, request)
+        # While the lease is too old, another process may serve the map: the reply waits for a renewal.
+        while operation != STOP and not self._holds_lease():
+            if self._ended.done():
+                raise self._moving_error()
+            self._renewed.clear()
+            await self._renewed.wait()
+        return reply
+
+    async def release(self) -> None:
+        """Write what waits and a snapshot, and give the lease up, so that any server may take the map."""
+        await self._close(self._lease.release, "released")
+
+    # --- Requests of robots and operators ---
+
+    async def _reply_to(self, robot: RobotId, operation: str, data: bytes) -> dict[str, Any]:
+        match decode_request(operation, data):
+            case KeyframeRequest() as request:
+                return await self._take_keyframe(robot, request)
+            case LiveRelocalise() as request:
+                return await self._relocalise(request)
+            case LiveForget() as request:
+                return await self._forget_robot(request)
+            case LiveStart() as request:
+                return await self._start_map(request)
+            case LiveShow() as request:
+                show = functools.partial(self._show, robot, request.paths)
+                return await self._environment.threads.compute(Urgency.ANSWER, show)
+            case LiveMapRequest():
+                return await self._reply_to_map_request(robot, operation)
+
+    async def _reply_to_map_request(self, robot: RobotId, operation: str) -> dict[str, Any]:
+        """Do an operation whose request contains only the name of the map: leave, publish or stop."""
+        if operation == LEAVE:
+            return await self._leave(robot)
+        if operation == PUBLISH:
+            record = await self._publisher.publish(f"published by {robot}")
+            return version_reply(self._environment.map_name, record)
+        return await self._stop_map()
+
+    async def _take_keyframe(self, robot: RobotId, request: KeyframeRequest) -> dict[str, Any]:
+        event = KeyframeAdded(
+            robot=robot.folder, segment=request.segment, number=request.number, data=request.keyframe
+        )
+        key = event.robot, event.number
+        addition = self._additions.get(key)  # present if the robot has sent the keyframe twice
+        if addition is None:
+            self._present_robots[event.robot] = None
+            addition = self._additions[key] = asyncio.ensure_future(self._add_keyframe(event))
+            addition.add_done_callback(lambda _: self._additions.pop(key))
+        await asyncio.shield(addition)
+        return {"number": event.number + 1, "version": self._state.position}
+
+    async def _add_keyframe(self, event: KeyframeAdded) -> None:
+        """Return when a keyframe is durable and applied; raise the error with which it is refused."""
+        compute, live_map = self._environment.threads.compute, self._state.live_map
+        while True:
+            # 1. The keyframe is validated against the map.
+            verdict = await compute(Urgency.VALIDATE, functools.partial(live_map.check_keyframe, event))
+            if verdict == "known":
+                return
+            # 2. The robot's next keyframe is charged, logged and applied.
+            if verdict == "new":
+                await self._charge(len(event.data) + _EVENT_OVERHEAD_BYTES)
+                await asyncio.shield(self._writer.submit(event, len(event.data)))
+                return
+            # 3. A later keyframe waits until the one before is applied, and is validated again.
+            previous = self._additions.get((event.robot, event.number - 1))
+            if previous is not None:
+                await asyncio.wait({previous})
+                continue
+            # 4. A later keyframe whose predecessor was not sent is refused.
+            expected = await compute(Urgency.VALIDATE, functools.partial(live_map.next_number, event.robot))
+            if event.number > expected:
+                raise Conflict(
+                    f"keyframe {event.number} arrived, but {expected} is the next one",
+                    hint=f"send keyframe {expected} first",
+                )
+
+    async def _charge(self, size_bytes: int) -> None:
+        """Charge the tenant's quota with a log entry of *size_bytes*.
+
+        A snapshot stores the features of keyframes a second time before the log is shortened, so the bytes
+        that were logged since the last snapshot must be free as well.
+
+        Raises:
+            QuotaExceeded: The tenant would store more than its quota.
+            StoreFull: The disk is nearly full, and the tenant holds more than its share.
+        """
+        account = self._environment.account
+        if not account.try_charge(size_bytes):
+            reserve = functools.partial(
+                account.reserve, size_bytes, margin=self._bytes_since_snapshot + size_bytes
+            )
+            reservation = asyncio.ensure_future(self._environment.threads.store(reserve))
+            await asyncio.wait({reservation}, timeout=SLOW_STORE_S)
+            if not reservation.done():
+                self.set_waiting_for_store(is_waiting=True)
+            try:
+                await reservation
+            except StoreFull:
+                raise
+            except StoreError:  # the store fails: the entry waits for it, and is charged later
+                pass
+        self._bytes_since_snapshot += size_bytes
+
+    async def _relocalise(self, request: LiveRelocalise) -> dict[str, Any]:
+        view = decode_keyframe(request.keyframe)
+        threads, live_map = self._environment.threads, self._state.live_map
+        relocalise = await threads.compute(
+            Urgency.ANSWER, functools.partial(live_map.prepare_relocalisation, view)
+        )
+        position = self._state.position
+        return relocalise_reply(await threads.match(relocalise), position)
+
+    async def _leave(self, robot: RobotId) -> dict[str, Any]:
+        if robot.folder in await self._environment.threads.compute(
+            Urgency.ANSWER, lambda: self._state.live_map.robots
+        ):
+            await asyncio.shield(self._writer.submit(RobotLeft(robot=robot.folder)))
+        self._present_robots.pop(robot.folder, None)
+        if not self._present_robots:
+            self._publisher.request(NOTE_ALL_LEFT)
+            self._start_task(self._publisher.publish_due())
+        return {}
+
+    async def _forget_robot(self, request: LiveForget) -> dict[str, Any]:
+        """Remove what a robot contributed under each of its enrolments; raises NotFound if it did not."""
+        contributors = await self._environment.threads.compute(
+            Urgency.ANSWER, lambda: list(self._state.live_map.contributors)
+        )
+        folders = [folder for folder in contributors if self._robot_names.get(folder) == request.robot]
+        folders += [folder for folder in folders_of(request.robot, contributors) if folder not in folders]
+        if not folders:
+            raise NotFound(
+                f"robot {request.robot[:80]!r} contributed nothing", hint="see rse-pf map live show MAP"
+            )
+        for folder in folders:
+            await asyncio.shield(self._writer.submit(RobotForgotten(robot=folder)))
+        await self._delete_objects_of_forgotten()
+        return {"forgotten": len(folders), "version": self._state.position}
+
+    async def _delete_objects_of_forgotten(self) -> None:
+        """Delete points and images of forgotten robots from the store; raises StoreError."""
+        threads, objects = self._environment.threads, self._environment.objects
+        forgotten = await threads.compute(Urgency.ANSWER, lambda: self._state.live_map.deletable_objects)
+        if forgotten:
+            await threads.background(functools.partial(objects.delete_of_forgotten, forgotten))
+
+    async def _delete_objects_of_culled(self, culled: list[tuple[str, str]]) -> None:
+        """Delete points and images of culled keyframes; if that fails, they stay as long as their robot."""
+        with contextlib.suppress(StoreError):
+            await self._environment.threads.background(
+                functools.partial(self._environment.objects.delete_of_culled, culled)
+            )
+
+    async def _delete_objects_of_forgotten_at_start(self) -> None:
+        """Delete what the previous map server may have left; if the store fails, a publication deletes it."""
+        with contextlib.suppress(StoreError):
+            await self._delete_objects_of_forgotten()
+
+    async def _start_map(self, request: LiveStart) -> dict[str, Any]:
+        """Begin an empty map, or a map with the keyframes of a version; raises Conflict if it has begun."""
+        map_name, background = self._environment.map_name, self._environment.threads.background
+        if self._state.changes or self._state.keyframes:
+            raise Conflict(
+                f"the live map {map_name!r} has begun already",
+                hint=f"stop it first: rse-pf map live stop {map_name}",
+            )
+        if request.source:
+            version, source = await background(lambda: read_start_version(self._environment.maps, request))
+            event = await background(lambda: self._environment.implementation.started_from(version, source))
+        else:
+            event = MapStarted(source="", keyframes=())
+        if request.source or request.equal_rooms_m:
+            event = msgspec.structs.replace(event, equal_rooms_m=request.equal_rooms_m)
+            await self._charge(
+                sum(len(keyframe.data) + _EVENT_OVERHEAD_BYTES for keyframe in event.keyframes)
+            )
+            await asyncio.shield(self._writer.submit(event))
+        return {"keyframes": self._state.keyframes, "version": self._state.position}
+
+    async def _stop_map(self) -> dict[str, Any]:
+        """Publish the map, give its lease up as stopped, and delete its log."""
+        background, record = self._environment.threads.background, None
+        # 1. The map becomes a version, also above the quota, because its log is deleted afterwards.
+        if self._state.keyframes:
+            freed_bytes = await background(self._log.charged_bytes)
+            record = await self._publisher.publish("the live map was stopped", freed_bytes)
+        # 2. The lease says where the map was stopped.
+        await self._close(lambda: self._lease.stop(self._log.position), "stopped")
+        # 3. The log is deleted; entries that stay after an error are ignored by the next map server.
+        with contextlib.suppress(StoreError):
+            await background(functools.partial(self._log.delete_until, self._lease.record.base))
+        return {} if record is None else version_reply(self._environment.map_name, record)
+
+    def _show(self, robot: RobotId, with_paths: bool) -> dict[str, Any]:
+        """Return the reply of ``live-show`` for *robot*; called in the thread of the map."""
+        reply = show_reply(
+            robot,
+            self._state,
+            self._lease.record,
+            service_state=self._service_state(),
+            name_of=self._name_of,
+            is_present=self._present_robots.__contains__,
+        )
+        paths = {"paths": paths_reply(self._state, self._name_of)} if with_paths else {}
+        return {**reply, "images": self._environment.settings.images, **paths}
+
+    # --- Entries of the log and snapshots ---
+
+    async def apply_entry(self, position: int, batch: list[SubmittedEvent]) -> None:
+        """Apply the events of the durable log entry *position*, and acknowledge them."""
+        events = [submitted.event for submitted in batch]
+        # 1. The thread of the map applies the events.
+        applied, updates, culled = await self._environment.threads.compute(
+            Urgency.APPLY, functools.partial(self._apply_events, position, events)
+        )
+        # 2. Requests that wait for the events are answered, and new keyframes are queued for measurement.
+        self._complete_events(batch, applied)
+        # 3. Objects of keyframes that the map dropped as redundant are deleted.
+        if culled:
+            self._start_task(self._delete_objects_of_culled(culled))
+        # 4. Subscribers get the updates that changed.
+        for update in updates:
+            self._send_update(update)
+        # 5. A snapshot is written after some entries.
+        if self._state.is_snapshot_due:
+            self._start_task(self._write_snapshot(await self._make_snapshot()))
+
+    def _apply_events(
+        self, position: int, events: list[Event]
+    ) -> tuple[AppliedEntry, list[dict[str, Any]], list[tuple[str, str]]]:
+        """Apply the events of an entry; called in the thread of the map.
+
+        Returns:
+            The effects, the updates to send, and the objects of culled keyframes as pairs of a robot's folder
+            and a digest.
+        """
+        applied = self._state.apply(position, events)
+        outcomes = [outcome for event_outcomes in applied.outcomes for outcome in event_outcomes]
+        self._log_alignments(outcomes)
+        updates: list[dict[str, Any]] = []
+        keyframes = [event for event in events if isinstance(event, KeyframeAdded)]
+        if (
+            any(isinstance(outcome, _ALIGNMENT_OUTCOMES) for outcome in outcomes)
+            or any(isinstance(event, RobotForgotten) for event in events)
+            or not all(map(self._updates.has_segment, keyframes))
+        ):
+            alignments = self._state.live_map.alignments()
+            updates += self._updates.set_alignments(alignments, outcomes, position)
+        for keyframe in keyframes:
+            updates += self._updates.add_pose(keyframe)
+        culled = [id_ for outcome in outcomes if isinstance(outcome, Culled) for id_ in outcome.ids]
+        return applied, updates, self._state.live_map.objects_of(culled) if culled else []
+
+    def _log_alignments(self, outcomes: Iterable[Outcome]) -> None:
+        for outcome in outcomes:
+            if isinstance(outcome, Joined):
+                self._environment.log.info(
+                    "live-aligned", map=self._environment.map_name, robot=self._name_of(outcome.robot)
+                )
+            elif isinstance(outcome, Unaligned):
+                self._environment.log.warning(
+                    "live-alignment-lost",
+                    map=self._environment.map_name,
+                    robot=self._name_of(outcome.robot),
+                    reason=outcome.reason,
+                )
+
+    def _complete_events(self, batch: list[SubmittedEvent], applied: AppliedEntry) -> None:
+        """Set the result of each event of an entry, and request the measurements that follow from it."""
+        for submitted, outcomes, defect in zip(batch, applied.outcomes, applied.defects, strict=True):
+            if defect is not None:
+                self._environment.log.error(
+                    "live-map-defect", map=self._environment.map_name, error=repr(defect)
+                )
+                submitted.applied.set_exception(
+                    InternalError(
+                        "the live map failed on this event, which has no effect",
+                        hint="report the line live-map-defect of the server's log",
+                    )
+                )
+            elif not submitted.applied.done():
+                submitted.applied.set_result(outcomes)
+            if any(isinstance(outcome, OptimiseWanted) for outcome in outcomes):
+                self._measurer.request_optimisation()
+            if isinstance(submitted.event, KeyframeAdded):
+                self._measurer.add_keyframes(outcome.id for outcome in outcomes if isinstance(outcome, Added))
+
+    async def _make_snapshot(self) -> MapSnapshot:
+        return await self._environment.threads.compute(
+            Urgency.APPLY, functools.partial(self._state.make_snapshot, self._log.stored_parts)
+        )
+
+    async def _write_snapshot(self, snapshot: MapSnapshot) -> None:
+        """Write a snapshot; if the store fails, a restart reads more entries until the next snapshot."""
+        saved_bytes = self._bytes_since_snapshot
+        try:
+            await self._environment.threads.background(lambda: self._log.write_snapshot(snapshot))
+        except StoreError as error:
+            self._environment.log.warning(
+                "live-snapshot-failed", map=self._environment.map_name, error=error.message
+            )
+        else:
+            self._snapshot_position = snapshot.position
+            self._bytes_since_snapshot -= saved_bytes
+
+    # --- Renewal of the lease, and the end of the service ---
+
+    async def _keep_lease(self) -> None:
+        """Renew the lease until the service ends or another process has taken the lease."""
+        environment = self._environment
+        while not self._ended.done():
+            age_s = environment.clock() - self._began_s
+            is_settled = self._measurer.is_proven or age_s >= _SETTLED_S
+            wait_s = renewal_s(environment.settings.lease_s)
+            try:
+                is_held = await environment.threads.lease(
+                    functools.partial(self._lease.renew, is_settled=is_settled)
+                )
+            except StoreError:
+                wait_s = min(wait_s, FIRST_RETRY_S)
+            else:
+                if self._ended.done():
+                    return
+                if not is_held:
+                    self.lose("another process has taken the lease")
+                    return
+                self._after_renewal()
+            await environment.sleep(wait_s)
+
+    def _after_renewal(self) -> None:
+        """Do what is due at intervals, now that the lease is certainly held."""
+        environment = self._environment
+        now = environment.clock()
+        # 1. Replies and updates that waited for the renewal are sent.
+        self._renewed.set()
+        if self._has_unsent_updates:
+            self._has_unsent_updates = False
+            for update in self._updates.all():
+                self._send_update(update)
+        environment.on_renewal(self._lease.record.beat)
+        self._send_map_state()
+        if self._is_closing:
+            return
+        # 2. A changing map is published at intervals.
+        if now >= self._publish_due_s:
+            self._publish_due_s = now + PUBLISH_INTERVAL_S
+            self._publisher.request(NOTE_CHANGED)
+        # 3. The worker learns that the map is not used, and a map without connections is given up.
+        if now - self._last_command_s >= _UNUSED_SHARE * environment.settings.idle_s:
+            self._set_used(is_used=False)
+        if self.users:
+            self._idle_since_s = now
+        elif now - self._idle_since_s >= environment.settings.idle_s:
+            self._idle_since_s = now
+            self._start_task(self._give_up_idle_map())
+        # 4. A version that was requested is published if the interval allows it.
+        self._start_task(self._publisher.publish_due())
+
+    def _set_used(self, *, is_used: bool) -> None:
+        """Note whether commands arrive, and notify the worker of a change."""
+        if is_used:
+            self._last_command_s = self._environment.clock()
+        if is_used != self._is_used:
+            self._is_used = is_used
+            self._environment.on_use(is_used)
+
+    async def _give_up_idle_map(self) -> None:
+        """Publish the map when the interval allows it, and release it, unless a worker connects meanwhile.
+
+        If the publication fails, the map is released, and the next map server publishes it.
+        """
+        self._publisher.request(NOTE_UNUSED)
+        while self._publisher.is_due and not self._publisher.has_failed and not self.users:
+            await self._publisher.publish_due()
+            await self._environment.sleep(renewal_s(self._environment.settings.lease_s))
+        if not self.users:
+            await self.release()
+
+    def _holds_lease(self) -> bool:
+        """Return whether no other process can have taken the map until now."""
+        return not self._ended.done() and self._lease.age_s < self._environment.settings.lease_s
+
+    async def _close(self, give_up: Callable[[], bool], end: ServiceEnd) -> None:
+        """Write what waits, change the lease by *give_up*, and end the service with *end*."""
+        if self._is_closing:
+            await asyncio.shield(self._ended)
+            return
+        self._is_closing = True
+        self._send_map_state()
+        # 1. Submitted events are written and applied.
+        await self._writer.wait_empty()
+        snapshot = await self._make_snapshot()
+        if end == "released":
+            # 2. A snapshot makes the start of the next map server fast.
+            if snapshot.position > self._snapshot_position:
+                await self._write_snapshot(snapshot)
+            # 3. A requested version is published early, because the next map server may start late.
+            await asyncio.wait(
+                {asyncio.ensure_future(self._publisher.publish_now())}, timeout=_MAX_FINAL_PUBLICATION_S
+            )
+        # 4. The lease is given up, however long the store fails.
+        wait_s = FIRST_RETRY_S
+        while not self._ended.done():
+            try:
+                was_held = await self._environment.threads.lease(give_up)
+            except StoreError:
+                await self._environment.sleep(wait_s)
+                wait_s = next_retry_s(wait_s)
+            else:
+                self._end(end if was_held else "lost")
+
+    def lose(self, reason: str) -> None:
+        """End the service, because another process serves the map; *reason* is logged."""
+        self._environment.log.warning("live-map-lost", map=self._environment.map_name, reason=reason)
+        self._end("lost")
+
+    def _end(self, end: ServiceEnd) -> None:
+        if not self._ended.done():
+            self._ended.set_result(end)
+        self._renewed.set()
+
+    # --- Updates for subscribers ---
+
+    def _send_update(self, payload: dict[str, Any]) -> None:
+        """Send an update, or note that all updates are sent again after the next renewal of the lease."""
+        if self._holds_lease():
+            self._environment.send_update(payload)
+        else:
+            self._has_unsent_updates = True
+
+    def _send_map_state(self) -> None:
+        """Send size and state of the map if they changed."""
+        service_state = self._service_state()
+        for payload in self._updates.set_map(
+            keyframes=self._state.keyframes,
+            version=self._state.position,
+            server=self._lease.record.server,
+            state=service_state,
+        ):
+            if service_state == _WAITING_FOR_STORE:  # nobody can take the lease while the store fails
+                self._environment.send_update(payload)
+            else:
+                self._send_update(payload)
+
+    def _service_state(self) -> str:
+        if self._is_closing:
+            return "moving"
+        return _WAITING_FOR_STORE if self._is_waiting_for_store else "live"
+
+    def set_waiting_for_store(self, *, is_waiting: bool) -> None:
+        """Notify subscribers that the store is slow or fails, or that it works again."""
+        if is_waiting != self._is_waiting_for_store:
+            self._is_waiting_for_store = is_waiting
+            self._send_map_state()
+
+    def _name_of(self, folder: str) -> str:
+        """Return the displayed name of the robot with this `RobotId.folder`."""
+        return self._robot_names.get(folder) or shown_name(folder)
+
+    def _moving_error(self) -> MapMoving:
+        return MapMoving(
+            "the live map moves to another server",
+            hint="send the request again",
+            retry_after_ms=BUSY_RETRY_MS,
+        )
+
+    def _start_task(self, work: Coroutine[Any, Any, None]) -> None:
+        """Run *work* beside the requests; if it fails, the service ends."""
+        task = asyncio.get_running_loop().create_task(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._on_task_end)
+
+    def _on_task_end(self, task: asyncio.Task[None]) -> None:
+        self._tasks.discard(task)
+        if not task.cancelled() and task.exception() is not None:
+            self._environment.log.error(
+                "live-owner-defect", map=self._environment.map_name, error=repr(task.exception())
+            )
+            self._end("defect")

@@ -1,0 +1,203 @@
+"""Measure loop closures of new keyframes and optimise the whole pose graph, while the map goes on.
+
+A keyframe is acknowledged before its loop closures are measured.  The results enter the log of the map as
+events of their own, so that a replay of the log measures nothing.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import functools
+import io
+import socket
+import time
+from collections import deque
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import numpy as np
+
+from rse_pf.child.start import ChildPlan, how_ended, start_child
+from rse_pf.errors import Crashed
+from rse_pf.geometry import Array
+from rse_pf.ipc import encode_message, receive
+from rse_pf.live_map.events import Event
+from rse_pf.live_map.measure import merge_measurements
+from rse_pf.server.live_map.map_server.environment import GraphOptimiser, MapServerThreads, Urgency
+from rse_pf.server.live_map.map_server.state import MapState
+from rse_pf.server.log import JsonLog
+from rse_pf.slam.optimise import OptimiseOptions, optimise_graph
+from rse_pf.slam.pose_graph import PoseGraph
+
+__all__ = [
+    "KeyframeMeasurer",
+    "choose_candidate_count",
+    "optimise_in_child",
+    "optimise_in_process",
+    "run_optimisation",
+]
+
+_CONCURRENT_MEASUREMENTS = 2
+"""Number of threads that measure loop closures: they share the candidates of one keyframe, or measure one
+keyframe each while more keyframes wait."""
+_SHORT_QUEUE = 4
+"""With at most this number of waiting keyframes, each keyframe is compared with all candidates that the map
+chooses."""
+_CANDIDATES_WITH_LONG_QUEUE = 6
+"""Number of candidates with which a keyframe is compared while 5 to 8 keyframes wait for measurement."""
+_CANDIDATES_WITH_VERY_LONG_QUEUE = 4
+"""Number of candidates with which a keyframe is compared while more than 8 keyframes wait for measurement."""
+_OPTIMISATION_NICE = 10
+"""Niceness of the child process that optimises a whole graph: keyframes and poses have priority."""
+_MAX_OPTIMISATION_S = 120.0
+"""Seconds after which the child process that optimises a whole graph is killed."""
+_GRAPH_FIELDS = ("T_world_pose", "a", "b", "T_a_b", "information", "robust", "ids")
+"""Fields of `PoseGraph`, all arrays, that are sent to the child process."""
+
+
+def choose_candidate_count(waiting: int) -> int | None:
+    """Return with how many candidates a keyframe is compared while *waiting* other keyframes wait.
+
+    None stands for the map's own limit.  Fewer candidates let a map server that is behind catch up.  A replay
+    does not depend on this number, because the measured loop closures are in the log.
+    """
+    if waiting <= _SHORT_QUEUE:
+        return None
+    return _CANDIDATES_WITH_LONG_QUEUE if waiting <= 2 * _SHORT_QUEUE else _CANDIDATES_WITH_VERY_LONG_QUEUE
+
+
+class KeyframeMeasurer:
+    """Measures the loop closures of keyframes in their order, and optimises the whole graph when none waits.
+
+    All methods are called in the event loop.
+    """
+
+    def __init__(
+        self,
+        state: MapState,
+        threads: MapServerThreads,
+        submit: Callable[[Event], Any],
+        *,
+        optimise: GraphOptimiser,
+        json_log: JsonLog,
+        map_name: str,
+    ) -> None:
+        """Queue the keyframes that the previous map server has not measured; `run` begins with them.
+
+        Args:
+            state: The map.
+            threads: Threads of the map server.
+            submit: Queues an event for the log.
+            optimise: Optimises the whole pose graph; called in a thread.
+            json_log: Log of the server.
+            map_name: Name of the map in lines of *json_log*.
+        """
+        self._state = state
+        self._threads = threads
+        self._submit = submit
+        self._optimise = optimise
+        self._json_log = json_log
+        self._map_name = map_name
+        self._waiting = deque(state.unmeasured)
+        self._has_work = asyncio.Event()
+        self._has_work.set()
+        self._needs_optimisation = False
+        self._has_measured = False
+
+    @property
+    def is_proven(self) -> bool:
+        """Whether keyframes were measured and none is left that could still kill the process."""
+        return self._has_measured and not self._state.unmeasured
+
+    def add_keyframes(self, keyframes: Iterable[int]) -> None:
+        """Queue keyframes, by their ids, for measurement."""
+        self._waiting.extend(keyframes)
+        self._has_work.set()
+
+    def request_optimisation(self) -> None:
+        """Optimise the whole pose graph as soon as no keyframe waits."""
+        self._needs_optimisation = True
+        self._has_work.set()
+
+    async def run(self) -> None:
+        """Measure and optimise until cancelled."""
+        await asyncio.gather(*(self._work() for _ in range(_CONCURRENT_MEASUREMENTS)))
+
+    async def _work(self) -> None:
+        while True:
+            await self._has_work.wait()
+            if self._waiting:
+                await self._measure_keyframe(self._waiting.popleft())
+            elif self._needs_optimisation:
+                self._needs_optimisation = False
+                await self._optimise_graph()
+            else:
+                self._has_work.clear()
+
+    async def _measure_keyframe(self, keyframe: int) -> None:
+        waiting = len(self._waiting)
+        parts = 1 if waiting else _CONCURRENT_MEASUREMENTS
+        # 1. The thread of the map chooses the candidates and copies what is compared.
+        prepare = functools.partial(
+            self._state.prepare_measurement, keyframe, parts, choose_candidate_count(waiting)
+        )
+        measurements = await self._threads.compute(Urgency.MEASURE, prepare)
+        # 2. Other threads match and solve.
+        begun = [self._threads.match(measure) for measure in measurements]
+        # 3. The result enters the log.
+        self._submit(merge_measurements(keyframe, [await measured for measured in begun]))
+        self._has_measured = True
+
+    async def _optimise_graph(self) -> None:
+        prepare = functools.partial(self._state.prepare_optimisation, self._optimise)
+        optimise = await self._threads.compute(Urgency.BACKGROUND, prepare)
+        optimised = await self._threads.match(optimise)
+        if optimised is None:
+            self._json_log.warning("live-optimisation-failed", map=self._map_name)
+        else:
+            self._submit(optimised)
+
+
+def optimise_in_process(graph: PoseGraph, options: OptimiseOptions) -> Array:
+    """Optimise a pose graph in the calling process and return its ``(n, 4, 4)`` poses.
+
+    Raises:
+        MissingExtra: gtsam is not installed.
+    """
+    return optimise_graph(graph, options).T_world_pose
+
+
+def optimise_in_child(graph: PoseGraph, options: OptimiseOptions) -> Array:
+    """Optimise a pose graph in a child process of low priority and return its ``(n, 4, 4)`` poses.
+
+    gtsam holds Python's interpreter lock (GIL) while it optimises, so in the map server's own process no
+    keyframe could be applied meanwhile.  The poses are equal to the bit to those of `optimise_in_process`.
+
+    Raises:
+        Crashed: The child process failed; its error output is in the log of the server.
+        TimeoutError: The optimisation took longer than 120 s.
+    """
+    buffer = io.BytesIO()
+    np.savez(buffer, cauchy=options.cauchy, **{name: getattr(graph, name) for name in _GRAPH_FIELDS})
+    plan = ChildPlan(target=f"{__name__}:run_optimisation", name="rse-pf fit", nice=_OPTIMISATION_NICE)
+    child = start_child(plan)
+    try:
+        child.say(buffer.getvalue())
+        reply = receive(child.connection, time.monotonic() + _MAX_OPTIMISATION_S)
+    finally:
+        exit_code = child.kill()
+    if reply is None:
+        raise Crashed(
+            f"the optimisation of a whole live map ended with {how_ended(exit_code)}",
+            hint="read the error output of the process in the log of the server",
+        )
+    poses: Array = np.frombuffer(reply, dtype="<f8").reshape(graph.T_world_pose.shape)
+    return poses
+
+
+def run_optimisation(parent: socket.socket) -> None:
+    """Read one pose graph from the *parent* process, optimise it and send its poses back."""
+    with np.load(io.BytesIO(receive(parent)), allow_pickle=False) as fields:
+        graph = PoseGraph(**{name: fields[name] for name in _GRAPH_FIELDS})
+        poses = optimise_in_process(graph, OptimiseOptions(cauchy=float(fields["cauchy"])))
+    parent.sendall(encode_message(np.ascontiguousarray(poses, dtype="<f8").tobytes()))

@@ -1,0 +1,330 @@
+"""Publish versions of a live map to the registry of maps, and remove old ones that nobody asked for.
+
+Two versions are at least ``live.publish_pause_s`` apart.  The time of the last version is read from the
+registry, so the interval also holds across a change of the map server.  A new map server does not know
+whether the one before published the newest state; it publishes once, and the registry keeps equal versions
+only once.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import dataclasses
+import functools
+from collections.abc import Callable, Sequence
+
+from rse_pf.errors import (
+    BadMessage,
+    BadRequest,
+    Busy,
+    Conflict,
+    LimitExceeded,
+    NotFound,
+    RsePfError,
+    StoreError,
+)
+from rse_pf.live_map.versions import PointSource, as_internal_error
+from rse_pf.maps.format import UP_FIELD, MapVersion, encode_map
+from rse_pf.maps.registry import MapOrigin, MapRecord, MapRegistry
+from rse_pf.maps.removal import superseded
+from rse_pf.object_store import digest_of
+from rse_pf.server.live_map.map_server.environment import MapServerEnvironment, Urgency
+from rse_pf.server.live_map.map_server.state import MapState
+from rse_pf.wire.live_map import LiveStart
+
+__all__ = ["NOTE_ALL_LEFT", "NOTE_CHANGED", "NOTE_UNUSED", "Publisher", "read_start_version"]
+
+NOTE_ALL_LEFT = "the last robot left"  # note of a version that is published when all robots have left
+NOTE_CHANGED = "live map"  # note of a version that is published at intervals while the map changes
+NOTE_UNUSED = (
+    "nobody used the live map"  # note of a version that is published before an unused map is released
+)
+_AUTOMATIC_NOTES = (NOTE_ALL_LEFT, NOTE_CHANGED, NOTE_UNUSED)
+"""Notes of versions that nobody asked for, which may be removed automatically."""
+_AUTHOR_PREFIX = "live map on "
+"""Begin of the author of each version of a live map; the id of the backend server follows."""
+_QUOTA_DIVISOR = 4
+"""The automatic versions of one map take at most the tenant's storage quota divided by this number."""
+_MAX_REMOVED_AT_ONCE = 10
+"""Largest number of old versions that are removed after a publication, so that the publication ends soon,
+also when the server drains."""
+_MAX_WAIT_S = 10.0
+"""Longest time in seconds for which a request for a version waits until ``live.publish_pause_s`` has passed;
+a request that would wait longer is refused with Busy."""
+_FIRST_RETRY_S = 5.0
+"""Seconds after which a failed publication is tried again for the first time; the wait doubles each time."""
+_MAX_RETRY_S = 600.0
+"""Longest wait in seconds before a failed publication is tried again: encoding a large map takes seconds."""
+_NOTHING_PUBLISHED = -1  # no state of the map has this number of changes
+_MAX_COMMIT_TRIES = 5
+"""How often a version is committed again after another process has moved the head of the map."""
+
+
+class Publisher:
+    """Publishes one live map; its methods are called in the event loop."""
+
+    def __init__(self, state: MapState, environment: MapServerEnvironment, *, server: str) -> None:
+        """Publish nothing yet.
+
+        Args:
+            state: The map.
+            environment: Environment of its map server; its account is charged before a version is written.
+            server: Id of the backend server, which versions name in their author.
+        """
+        self._state = state
+        self._environment = environment
+        self._author = _AUTHOR_PREFIX + server
+        self._threads = environment.threads
+        self._clock = environment.clock
+        self._map_name = environment.map_name
+        self._min_interval_s = environment.settings.publish_pause_s
+        self._lock = asyncio.Lock()  # one publication at a time
+        self._source_up: tuple[str, list[float] | None] = "", None  # source version: its vector of up
+        self._published_changes = _NOTHING_PUBLISHED
+        self._last_record: MapRecord | None = None
+        self._next_allowed_s: float | None = None
+        self._due_note = ""
+        self.has_failed = False
+        """Whether the due version could not be published when its time had come; it stays due."""
+        self._retry_s = _FIRST_RETRY_S
+        self._retry_at_s = float("-inf")
+
+    @property
+    def is_due(self) -> bool:
+        """Whether a version was requested by `request` and the map has changed since the last version."""
+        return bool(self._due_note) and self._is_changed
+
+    async def publish(self, note: str, freed_bytes: int = 0) -> MapRecord:
+        """Publish the map and return the record of the version; an unchanged map is not published again.
+
+        Args:
+            note: Reason, which is stored with the version.
+            freed_bytes: Bytes of the map's log that are deleted after the version is written, and therefore
+                do not count for the quota.
+
+        Raises:
+            QuotaExceeded, StoreFull: The version does not fit into the storage of the tenant.
+            Busy: The version would have to wait for more than 10 s until ``live.publish_pause_s`` has passed;
+                ``retry_after_ms`` says when to ask again.
+            NotFound: The map has no keyframes.
+        """
+        async with self._lock:
+            if not self._state.keyframes:
+                raise NotFound(
+                    f"the live map {self._map_name!r} has no keyframes", hint="drive a robot in it first"
+                )
+            if self._last_record is not None and not self._is_changed:
+                return self._last_record
+            wait_s = await self._seconds_until_allowed()
+            if wait_s > _MAX_WAIT_S:
+                raise Busy(
+                    f"the live map {self._map_name!r} was published less than "
+                    f"{self._min_interval_s:.0f} s ago",
+                    hint=f"ask again in {wait_s:.0f} s, or lower live.publish_pause_s",
+                    retry_after_ms=1e3 * wait_s,
+                )
+            if wait_s > 0:
+                await self._environment.sleep(wait_s)
+            return await self._publish(note, freed_bytes)
+
+    def request(self, note: str) -> None:
+        """Let `publish_due` publish the map, with this *note*, if the map has changed."""
+        if not self.is_due:
+            self.has_failed = False
+        self._due_note = note
+
+    async def publish_due(self) -> None:
+        """Publish the version that `request` asked for, if the interval since the last version has passed.
+
+        After an error, the version stays due and is tried again with exponential back-off.
+        """
+        if not self.is_due or self._lock.locked() or self._clock() < self._retry_at_s:
+            return
+        with contextlib.suppress(StoreError):  # the registry cannot be read; the next call tries again
+            if await self._seconds_until_allowed() <= 0:
+                await self.publish_now()
+
+    async def publish_now(self) -> None:
+        """Publish the version that `request` asked for without waiting for the interval.
+
+        An error is logged, and the version stays due.
+        """
+        if not self.is_due:
+            return
+        try:
+            async with self._lock:
+                if self._is_changed:
+                    await self._publish(self._due_note)
+        except RsePfError as error:
+            self._environment.log.warning("live-publish-failed", map=self._map_name, error=error.message)
+            self.has_failed = True
+            self._retry_at_s = self._clock() + self._retry_s
+            self._retry_s = min(_MAX_RETRY_S, 2 * self._retry_s)
+
+    @property
+    def _is_changed(self) -> bool:
+        return self._state.keyframes > 0 and self._state.changes != self._published_changes
+
+    async def _publish(self, note: str, freed_bytes: int = 0) -> MapRecord:
+        environment, background = self._environment, self._threads.background
+        changes = self._state.changes
+        # 1. The version is made: keyframes, point cloud, and the vector of up.
+        version = await self._make_version()
+        version = await background(functools.partial(self._add_source_up, version))
+        # 2. The tenant is charged and the version becomes the head of the map.
+        origin = MapOrigin(parent=None, author=self._author, created_s=environment.wall_clock(), note=note)
+        charge = functools.partial(environment.account.reserve, freed=freed_bytes)
+        commit = functools.partial(_commit_version, environment.maps, self._map_name, version, origin, charge)
+        record = await background(commit)
+        self._next_allowed_s = self._clock() + self._min_interval_s
+        self._published_changes, self._last_record = changes, record
+        self.has_failed, self._retry_s = False, _FIRST_RETRY_S
+        environment.log.info("live-map-published", map=self._map_name, id=record.id, number=record.number)
+        # 3. Old automatic versions are removed.
+        try:
+            removed = await background(self._remove_old_versions)
+        except RsePfError as error:  # the next publication removes them
+            environment.log.warning("live-versions-not-removed", map=self._map_name, error=error.message)
+        else:
+            if removed:
+                environment.log.info("live-versions-removed", map=self._map_name, removed=removed)
+        return record
+
+    async def _make_version(self) -> MapVersion:
+        """Return the map as a version with its point cloud.
+
+        If a robot is forgotten while its points are read, the version is made again without them.
+        """
+        compute, live_map = self._threads.compute, self._state.live_map
+        environment, objects = self._environment, self._environment.objects
+
+        def make() -> tuple[MapVersion, tuple[PointSource, ...], list[tuple[str, str]]]:
+            version = live_map.to_version()
+            if environment.settings.images:
+                provenance = {**version.provenance, **live_map.image_references(version)}
+                version = dataclasses.replace(version, provenance=provenance)
+            return version, live_map.point_sources(version), live_map.deletable_objects
+
+        while True:
+            version, sources, forgotten = await compute(Urgency.BACKGROUND, make)
+            await self._threads.background(functools.partial(objects.delete_of_forgotten, forgotten))
+            if not sources:
+                return version
+            cloud = await self._threads.background(functools.partial(objects.build_cloud, sources))
+            if await compute(Urgency.BACKGROUND, lambda: live_map.deletable_objects) == forgotten:
+                break
+        environment.log.info(
+            "live-cloud",
+            map=self._map_name,
+            points=len(cloud.points),
+            keyframes=cloud.keyframes,
+            missing=cloud.missing,
+        )
+        return dataclasses.replace(version, points=cloud.points, colours=cloud.colours)
+
+    def _add_source_up(self, version: MapVersion) -> MapVersion:
+        """Copy the vector of up from the version that the map started from, whose axes the map keeps.
+
+        Blocks on the object store.  If the source version was removed, *version* is returned unchanged.
+
+        Raises:
+            StoreError: The store fails.
+        """
+        source = str(version.provenance.get("from", ""))
+        if self._source_up[0] != source:
+            up = None
+            with contextlib.suppress(NotFound, BadRequest, BadMessage, LimitExceeded):
+                name, _, number = source.partition("@")
+                up = self._environment.maps.load(name, number).up
+            self._source_up = source, None if up is None else up.tolist()
+        if self._source_up[1] is None:
+            return version
+        return dataclasses.replace(version, provenance={**version.provenance, UP_FIELD: self._source_up[1]})
+
+    def _remove_old_versions(self) -> int:
+        """Remove the oldest automatic versions, at most ten, and return their number; blocks on the store.
+
+        ``live.keep_versions`` of them are kept, and no more than fit into a quarter of the tenant's quota.
+
+        Raises:
+            Busy, StoreError: The removal is not complete; the next publication goes on.
+        """
+        keep, account = self._environment.settings.keep_versions, self._environment.account
+        if not keep:
+            return 0
+        max_bytes = account.quota_bytes() / _QUOTA_DIVISOR
+
+        def choose(records: Sequence[MapRecord], head: str) -> list[MapRecord]:
+            old = superseded(records, head, keep=keep, most_bytes=max_bytes, counts=_is_automatic)
+            return old[:_MAX_REMOVED_AT_ONCE]
+
+        removed = self._environment.maps.remove(self._map_name, choose)
+        for record in removed:
+            account.release(record.size)
+        return len(removed)
+
+    async def _seconds_until_allowed(self) -> float:
+        """Return the seconds until the next version may be published; negative if it may be now."""
+        if self._next_allowed_s is None:
+            age_s = await self._threads.background(self._newest_version_age_s)
+            self._next_allowed_s = self._clock() + max(0.0, self._min_interval_s - max(0.0, age_s))
+        return self._next_allowed_s - self._clock()
+
+    def _newest_version_age_s(self) -> float:
+        """Return the age of the newest version in the registry, infinity if there is none; blocks."""
+        try:
+            return self._environment.wall_clock() - self._environment.maps.head(self._map_name).created_s
+        except NotFound:
+            return float("inf")
+
+
+def _is_automatic(record: MapRecord) -> bool:
+    return record.author.startswith(_AUTHOR_PREFIX) and record.note in _AUTOMATIC_NOTES
+
+
+def _commit_version(
+    maps: MapRegistry, name: str, version: MapVersion, origin: MapOrigin, charge: Callable[[int], None]
+) -> MapRecord:
+    """Make *version* the head of the map *name* in the registry; an equal head stays and is returned.
+
+    Blocks on the object store.  The parent in *origin* is replaced by the present head.
+
+    Raises:
+        QuotaExceeded, StoreFull: *charge* refuses the bytes that the version adds to the store.
+        Conflict: Another process moved the head during each of five tries.
+        InternalError: The registry refuses the version as invalid.
+        StoreError: The store fails.
+    """
+    with as_internal_error("the live map cannot be published"):
+        data = encode_map(version)
+        digest = digest_of(data)
+        for tries_left in reversed(range(_MAX_COMMIT_TRIES)):
+            try:
+                head: MapRecord | None = maps.head(name)
+            except NotFound:
+                head = None
+            if head is not None and head.digest == digest:
+                return head
+            origin = dataclasses.replace(origin, parent=None if head is None else head.id)
+            try:
+                return maps.commit_charged(name, data, origin, charge=charge)
+            except Conflict:
+                if not tries_left:
+                    raise
+    raise AssertionError("the last try returns or raises")
+
+
+def read_start_version(maps: MapRegistry, request: LiveStart) -> tuple[MapVersion, str]:
+    """Read the version from which a live map starts; return it with its full name ``MAP@ID``.
+
+    Blocks on the object store.
+
+    Raises:
+        InternalError: The version is damaged.
+        NotFound: The registry has no such map or version.
+    """
+    name, version = request.source_version()
+    record = maps.record(name, version)
+    with as_internal_error(f"{name}@{record.id} cannot be read"):
+        return maps.load(name, record.id), f"{name}@{record.id}"

@@ -1,0 +1,281 @@
+"""Serve the connections of workers to a map server: requests, replies and updates over TLS.
+
+A message is a MessagePack list with its length in front (`rse_pf.ipc`):
+
+1. The worker sends ``hello`` with a token within a few seconds, else its connection is closed.
+2. The map server answers ``welcome``, or ``refused`` and closes the connection.
+3. The worker sends any number of ``request``, ``watch`` (send updates) and ``unwatch``.
+4. The map server replies to each request with ``answer``, ``refused`` or ``again`` (the map moves), in any
+   order, and sends ``update`` and ``beat`` (the lease was renewed).
+5. The map server sends ``moving`` when it gives the map up.
+
+A worker that reads slowly gets only the newest update of each key.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import socket
+import ssl
+from collections.abc import Callable
+from typing import Any
+
+from rse_pf.errors import InternalError, RsePfError
+from rse_pf.identity import RobotId
+from rse_pf.ipc import FrameReader, encode_message
+from rse_pf.server.live_map.connection_security import MAX_MESSAGE_BYTES
+from rse_pf.server.live_map.map_server.map_server import MapMoving, MapServer
+from rse_pf.silent_connections import BACKLOG, FIRST_REQUEST_S, TlsListener
+
+__all__ = ["WorkerConnections", "listen"]
+
+_READ_BYTES = 1 << 18  # largest number of bytes in one read of a socket
+_MAX_CONCURRENT_REQUESTS = 256
+"""Number of unanswered requests of one worker; further ones stay in its socket, so that memory is bounded."""
+_FLUSH_S = 2.0
+"""Seconds for which a map server that ends waits until workers have read their last messages."""
+
+
+def listen(host: str, ports: range) -> socket.socket:
+    """Return a socket that listens on *host*, on the first free port of *ports*; port 0 is any free port.
+
+    Raises:
+        OSError: No port of *ports* is free.
+    """
+    last_error: OSError | None = None
+    for port in ports:
+        try:
+            return socket.create_server((host, port), backlog=BACKLOG)
+        except OSError as error:
+            last_error = error
+    assert last_error is not None
+    raise last_error
+
+
+class WorkerConnections:
+    """All connections of workers to one map server; all methods are called in the event loop."""
+
+    def __init__(
+        self,
+        map_server: MapServer,
+        *,
+        check_token: Callable[[bytes], None],
+        on_defect: Callable[[BaseException], None],
+    ) -> None:
+        """Prepare to serve connections; `open` begins to accept them.
+
+        Args:
+            map_server: Answers the requests.
+            check_token: Raises Unauthorized for a token that is not valid for this map server now.
+            on_defect: Called with each unexpected exception.
+        """
+        self._map_server = map_server
+        self._check_token = check_token
+        self._on_defect = on_defect
+        self._connections: set[_WorkerConnection] = set()
+        self._listener: TlsListener | None = None
+
+    def open(
+        self, listener: socket.socket, context: ssl.SSLContext, *, hello_s: float = FIRST_REQUEST_S
+    ) -> None:
+        """Accept connections on the listening socket *listener*.
+
+        A connection without a complete ``hello`` after *hello_s* seconds is closed.
+        """
+        self._listener = TlsListener(listener, context, self._serve, seconds=hello_s)
+        self._listener.open()
+
+    def send_update(self, payload: dict[str, Any]) -> None:
+        """Send an update to every worker that has subscribers of the map."""
+        for connection in self._connections:
+            if connection.is_watching:
+                connection.send_update(payload)
+
+    def send_renewal(self, number: int) -> None:
+        """Send the *number* of the newest renewal of the lease to every worker."""
+        for connection in self._connections:
+            connection.send_renewal(number)
+
+    async def close(self) -> None:
+        """Stop accepting, wait at most 2 s for running requests, and send ``moving`` to every worker."""
+        if self._listener is not None:
+            self._listener.close()
+        if self._connections:
+            finishing = [asyncio.ensure_future(connection.finish()) for connection in self._connections]
+            await asyncio.wait(finishing, timeout=_FLUSH_S)
+
+    async def _serve(
+        self,
+        reader: asyncio.StreamReader,
+        writer: asyncio.StreamWriter,
+        mark_authenticated: Callable[[], object],
+    ) -> None:
+        connection = _WorkerConnection(self._map_server, writer, self._on_defect)
+        connection.start()
+        try:
+            frames = FrameReader(MAX_MESSAGE_BYTES)
+            token, messages = await _read_hello(reader, frames)
+            self._check_token(token)
+            mark_authenticated()
+            connection.send(["welcome"])
+            self._connections.add(connection)
+            self._map_server.users += 1
+            try:
+                await connection.serve(reader, frames, messages)
+            finally:
+                self._map_server.users -= 1
+                self._connections.discard(connection)
+        except RsePfError as error:
+            connection.send(["refused", 0, *_error_fields(error)])
+            with contextlib.suppress(asyncio.TimeoutError):
+                await asyncio.wait_for(connection.flush(), _FLUSH_S)
+        except (OSError, asyncio.TimeoutError):  # the peer has disconnected, or is not a worker
+            pass
+        finally:
+            connection.close()
+
+
+class _WorkerConnection:
+    """The connection of one worker."""
+
+    def __init__(
+        self,
+        map_server: MapServer,
+        writer: asyncio.StreamWriter,
+        on_defect: Callable[[BaseException], None],
+    ) -> None:
+        self.is_watching = False
+        """Whether the worker has subscribers of the map."""
+        self._map_server = map_server
+        self._writer = writer
+        self._on_defect = on_defect
+        self._messages: list[Any] = []
+        self._updates: dict[str, dict[str, Any]] = {}  # newest unsent update of each key
+        self._renewal: int | None = None  # newest unsent renewal
+        self._has_unsent = asyncio.Event()
+        self._is_flushed = asyncio.Event()
+        self._request_slots = asyncio.Semaphore(_MAX_CONCURRENT_REQUESTS)
+        self._tasks: set[asyncio.Future[None]] = set()
+
+    def start(self) -> None:
+        """Begin to write queued messages to the socket."""
+        self._tasks.add(asyncio.ensure_future(self._write_messages()))
+
+    def send(self, message: list[Any]) -> None:
+        """Queue *message* for the socket."""
+        self._messages.append(message)
+        self._is_flushed.clear()
+        self._has_unsent.set()
+
+    def send_renewal(self, number: int) -> None:
+        """Queue the number of a renewal, in place of an older one that was not written yet."""
+        self._renewal = number
+        self._has_unsent.set()
+
+    def send_update(self, payload: dict[str, Any]) -> None:
+        """Queue an update, in place of an older one of its key that was not written yet."""
+        key = f"{payload['kind']}/{payload.get('robot', '')}"
+        self._updates.pop(key, None)
+        self._updates[key] = payload
+        self._is_flushed.clear()
+        self._has_unsent.set()
+
+    async def flush(self) -> None:
+        """Wait until all queued messages and updates are written to the socket."""
+        await self._is_flushed.wait()
+
+    async def finish(self) -> None:
+        """Wait until all running requests are answered, then send ``moving``."""
+        for _ in range(_MAX_CONCURRENT_REQUESTS):
+            await self._request_slots.acquire()
+        self.send(["moving"])
+        await self._is_flushed.wait()
+
+    def close(self) -> None:
+        """Cancel running requests and close the socket."""
+        for task in self._tasks:
+            task.cancel()
+        self._writer.close()
+
+    async def serve(self, reader: asyncio.StreamReader, frames: FrameReader, messages: list[Any]) -> None:
+        """Handle *messages*, which came with the hello, and all later ones until the worker disconnects."""
+        while True:
+            for message in messages:
+                await self._handle(message)
+            data = await reader.read(_READ_BYTES)
+            if not data:
+                return
+            messages = list(frames.feed(data))
+
+    async def _handle(self, message: list[Any]) -> None:
+        match message:
+            case ["request", int(number), [str(), str(), str()] as robot, str(operation), bytes(request)]:
+                await self._request_slots.acquire()
+                task = asyncio.ensure_future(self._answer(number, RobotId(*robot), operation, request))
+                self._tasks.add(task)
+                task.add_done_callback(self._tasks.discard)
+            case ["watch"]:
+                self.is_watching = True
+                for payload in self._map_server.current_updates():
+                    self.send_update(payload)
+            case ["unwatch"]:
+                self.is_watching = False
+                self._updates.clear()
+
+    async def _answer(self, number: int, robot: RobotId, operation: str, request: bytes) -> None:
+        """Send the reply to the request *number*, whatever happens: the worker waits for it."""
+        try:
+            self.send(["answer", number, await self._map_server.answer(robot, operation, request)])
+        except MapMoving:
+            self.send(["again", number])
+        except RsePfError as error:
+            self.send(["refused", number, *_error_fields(error)])
+        except Exception as error:  # noqa: BLE001  a defect
+            self._on_defect(error)
+            refused = InternalError(
+                "the map server failed on this request", hint="read the traceback in the server's log"
+            )
+            self.send(["refused", number, *_error_fields(refused)])
+        finally:
+            self._request_slots.release()
+
+    async def _write_messages(self) -> None:
+        with contextlib.suppress(OSError):
+            while True:
+                await self._has_unsent.wait()
+                self._has_unsent.clear()
+                messages = [*self._messages, *(["update", payload] for payload in self._updates.values())]
+                if self._renewal is not None:
+                    messages.append(["beat", self._renewal])
+                self._renewal = None
+                self._messages.clear()
+                self._updates.clear()
+                self._writer.write(b"".join(map(encode_message, messages)))
+                await self._writer.drain()
+                if not self._has_unsent.is_set():
+                    self._is_flushed.set()
+
+
+async def _read_hello(reader: asyncio.StreamReader, frames: FrameReader) -> tuple[bytes, list[Any]]:
+    """Return the token of the first message, and the messages that came with it.
+
+    Raises:
+        ConnectionResetError: The peer disconnected, or the first message is not ``hello``.
+        RsePfError: The peer sent malformed bytes.
+    """
+    while True:
+        data = await reader.read(_READ_BYTES)
+        if not data:
+            raise ConnectionResetError
+        messages = list(frames.feed(data))
+        if messages:
+            match messages[0]:
+                case ["hello", bytes(token)]:
+                    return token, messages[1:]
+            raise ConnectionResetError
+
+
+def _error_fields(error: RsePfError) -> list[Any]:
+    """Return the fields of an error in the message ``refused``."""
+    return [error.code, error.message, error.hint, error.retry_after_ms]
