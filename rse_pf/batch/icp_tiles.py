@@ -16,7 +16,7 @@ from rse_pf.errors import BadRequest
 from rse_pf.geometry import Array, inverse, transform
 from rse_pf.slam.cloud_deform import find_observers
 from rse_pf.slam.consistency import LoopClosure
-from rse_pf.slam.icp import IcpOptions, align
+from rse_pf.slam.icp import IcpOptions, align_clouds
 from rse_pf.slam.links import Atlas
 from rse_pf.slam.relative_pose import RelativePoseOptions
 
@@ -56,7 +56,7 @@ def align_tiles(
         near = _within(target, low - options.reach_m, TILE_M + 2.0 * options.reach_m)
         inside = _within(moved, low, TILE_M)
         try:
-            found = align(target[near], source[inside], T_one_other, options)
+            found = align_clouds(target[near], source[inside], T_one_other, options)
         except BadRequest:  # too few points are left after thinning
             refused["few-points"] += 1
             continue

@@ -37,7 +37,7 @@ from rse_pf.slam.optimise import (
     robust_cost,
 )
 from rse_pf.slam.ply import Colours, Points
-from rse_pf.slam.pose_graph import PoseGraph, components
+from rse_pf.slam.pose_graph import PoseGraph, connected_components
 
 __all__ = ["BatchMerge", "BatchMergeResult", "strongest"]
 
@@ -331,7 +331,7 @@ class BatchMerge:
             T_world_pose=found,
             cost_before=robust_cost(graph, graph.T_world_pose, options.cauchy) if len(graph.a) else 0.0,
             cost_after=robust_cost(graph, found, options.cauchy) if len(graph.a) else 0.0,
-            components=len(np.unique(components(len(of_map), graph.a, graph.b))),
+            components=len(np.unique(connected_components(len(of_map), graph.a, graph.b))),
         )
 
     def _optimising(self, graph: PoseGraph, options: OptimiseOptions) -> Part:

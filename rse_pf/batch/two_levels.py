@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rse_pf.geometry import Array, adjoint, inverse
-from rse_pf.slam.pose_graph import PoseGraph, components
+from rse_pf.slam.pose_graph import PoseGraph, connected_components
 
 __all__ = ["graph_between", "graphs_within", "poses_of_levels", "stacked"]
 
@@ -53,7 +53,7 @@ def graph_between(graph: PoseGraph, of_map: Rows, T_world_pose: Array) -> tuple[
         T_world_pose: ``(n, 4, 4)``, the poses after each map was optimised by itself.
     """
     inner = of_map[graph.a] == of_map[graph.b]
-    root = components(len(of_map), graph.a[inner], graph.b[inner])
+    root = connected_components(len(of_map), graph.a[inner], graph.b[inner])
     _, body = np.unique(root, return_inverse=True)
     body = body.ravel().astype(np.int64)
     outer = body[graph.a] != body[graph.b]

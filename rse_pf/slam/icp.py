@@ -1,7 +1,7 @@
-"""Align two overlapping clouds, from an initial guess to the pose between them.
+"""Align two overlapping point clouds by generalised ICP, starting from an initial pose.
 
-A pose that fits worse than the guess, overlaps too little, or is not constrained by the surfaces is refused;
-the answer is then the guess, with the reason.
+The refined pose is rejected if it fits worse than the initial pose, if the clouds overlap too little, or if
+their surfaces do not constrain it.  The result is then the initial pose, with the reason.
 """
 
 from __future__ import annotations
@@ -15,28 +15,37 @@ import numpy as np
 import numpy.typing as npt
 
 from rse_pf.errors import BadRequest, MissingExtra
-from rse_pf.geometry import Array as Matrix
-from rse_pf.geometry import pose_difference, transform
+from rse_pf.geometry import Array, pose_difference, transform
 
-__all__ = ["CloudAlignment", "IcpOptions", "align", "load_small_gicp"]
+__all__ = ["CloudAlignment", "IcpOptions", "align_clouds", "load_small_gicp"]
 
-_MIN_POINTS = 100
-_NEIGHBOURS = 20
+_MIN_POINTS = 100  # points of a thinned cloud, and correspondences, that an alignment needs
+_NEIGHBOURS = 20  # nearest points from which the normal and covariance of a point are estimated
 _MIN_GAIN = 0.02
-"""A pose must fit better than the guess by this share, unless it is almost equal to it."""
-_UNMOVED_M, _UNMOVED_DEG = 0.002, 0.1
-_STEP_M, _STEP_RAD = 1e-4, 1e-4
-"""The solver ends when a step is smaller than both."""
-_MAX_MISFIT = 0.2
-"""Mean distance, as a share of the reach, above which surfaces do not fit."""
+"""Share by which the mean distance between the clouds must become smaller, for the refined pose to be
+accepted if it differs from the initial one."""
+_UNCHANGED_M = 0.002  # translation in metres up to which a refined pose counts as equal to the initial one
+_UNCHANGED_DEG = 0.1  # rotation in degrees up to which a refined pose counts as equal to the initial one
+_CONVERGED_M = 1e-4  # translation in metres of a step below which the solver has converged
+_CONVERGED_RAD = 1e-4  # rotation in radians of a step below which the solver has converged
+_MAX_MISFIT_SHARE = 0.2
+"""Mean distance between the clouds, as a share of the correspondence distance, above which their surfaces do
+not fit."""
+_MIN_CONSTRAINT = 0.004
+"""Smallest eigenvalue of the constraint matrix at which surfaces determine all six degrees of freedom of a
+pose: a plane has 0, the corner of a room about 0.1."""
 
 
 class IcpOptions(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """How to align; it travels with a command.
+    """Options of an alignment, which a command contains.
 
-    ``voxel_m`` thins both clouds; ``reach_m`` is the largest distance at which two points may be one;
-    ``max_motion_m`` and ``max_motion_deg`` bound how far from the guess an answer is believed;
-    ``min_overlap`` is the share of the source that must find the target.
+    Attributes:
+        voxel_m: Edge of the voxels to which both clouds are thinned, 1e-3..10 m.
+        reach_m: Largest distance between corresponding points, voxel_m..100 m.
+        max_iterations: Iterations of the solver in each of its two stages, 1..1000.
+        min_overlap: Share of the source points that need a correspondence, 0.05..1.
+        max_motion_m: Largest translation from the initial pose to an accepted one.
+        max_motion_deg: Largest rotation from the initial pose to an accepted one, up to 180.
 
     Raises:
         BadRequest: A number is out of its range.
@@ -50,24 +59,35 @@ class IcpOptions(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     max_motion_deg: float = 15.0
 
     def __post_init__(self) -> None:
-        within = (
-            1e-3 <= self.voxel_m <= 10.0 and self.voxel_m <= self.reach_m <= 100.0
-            and 1 <= self.max_iterations <= 1000 and 0.05 <= self.min_overlap <= 1.0
-            and self.max_motion_m > 0 and 0 < self.max_motion_deg <= 180
-        )  # fmt: skip
-        if not within:
+        is_within = (
+            1e-3 <= self.voxel_m <= 10.0
+            and self.voxel_m <= self.reach_m <= 100.0
+            and 1 <= self.max_iterations <= 1000
+            and 0.05 <= self.min_overlap <= 1.0
+            and self.max_motion_m > 0
+            and 0 < self.max_motion_deg <= 180
+        )
+        if not is_within:
             raise BadRequest("an option of icp is out of its range", hint="leave it out for the default")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class CloudAlignment:
-    """A pose between two clouds, and its evidence.
+    """The pose between two clouds, and how well it fits.
 
-    ``verdict`` is ``ok``, or ``refused`` with a *reason* (worse, poor-fit, little-overlap, sliding,
-    jumped, not-converged); ``T_target_source`` ``(4, 4)`` then is the guess.
+    Attributes:
+        T_target_source: ``(4, 4)``, metres; the initial pose if the verdict is ``refused``.
+        verdict: ``ok`` or ``refused``.
+        reason: Why the refined pose was rejected, "" if it was accepted.  "worse": it fits worse than the
+            initial pose; "poor-fit": the surfaces do not fit; "little-overlap"; "sliding": the surfaces do
+            not constrain the pose; "jumped": it is too far from the initial pose; "not-converged".
+        overlap: Share of the source points with a correspondence, at the refined pose.
+        misfit_before_m: Mean distance of source points to the target's surface at the initial pose.
+        misfit_after_m: Mean distance of source points to the target's surface at the refined pose.
+        iterations: Iterations of the solver in both stages.
     """
 
-    T_target_source: Matrix
+    T_target_source: Array
     verdict: str
     reason: str
     overlap: float
@@ -76,33 +96,31 @@ class CloudAlignment:
     iterations: int
 
 
-def align(
-    target: Matrix, source: Matrix, T_target_source: Matrix, options: IcpOptions | None = None
+def align_clouds(
+    target: Array, source: Array, T_target_source: Array, options: IcpOptions | None = None
 ) -> CloudAlignment:
-    """Refine the pose of *source* in the frame of *target*; deterministic, one thread.
+    """Refine the pose of *source* in the frame of *target* by generalised ICP; deterministic, in one thread.
 
-    Generalised ICP with a decreasing reach.  The fit is not measured by the solver but by the mean
-    distance of the thinned source points to the planes of their nearest target points, each limited to
-    *reach_m*, so that points without correspondence make the fit worse.
+    The fit of a pose is not measured by the cost of the solver.  It is the mean distance of the thinned
+    source points to the tangent planes of their nearest target points, where a point without correspondence
+    counts as ``reach_m``, so that losing correspondences makes the fit worse.
 
     Args:
         target: ``(n, 3)`` metres.
         source: ``(m, 3)`` metres.
-        T_target_source: ``(4, 4)``, the initial guess.
-        options: ``None`` means the defaults.
-
-    Returns:
-        The refined pose, or the guess with the reason why no better one was found.
+        T_target_source: ``(4, 4)``, the initial pose.
+        options: None means the defaults.
 
     Raises:
-        BadRequest: Too few points are left after thinning.
+        BadRequest: Fewer than 100 points are left of a cloud after thinning.
         MissingExtra: small_gicp is not installed.
 
     Source:
-        Segal, Haehnel and Thrun, RSS 2009, by small_gicp (Koide 2024).
+        Segal, Haehnel and Thrun, "Generalized-ICP", RSS 2009; implementation small_gicp (Koide 2024).
     """
     options = options or IcpOptions()
     gicp = load_small_gicp()
+    # 1. Thin both clouds and estimate the normals and covariances of their points.
     target_cloud, target_tree = gicp.preprocess_points(
         np.ascontiguousarray(target), options.voxel_m, num_neighbors=_NEIGHBOURS, num_threads=1
     )
@@ -115,20 +133,31 @@ def align(
             f"{count} points are left of a cloud thinned to {options.voxel_m:g} m, not {_MIN_POINTS}",
             hint="send more points, in metres, or a smaller voxel_m",
         )
-    fit = _FitMeasure(target_cloud, target_tree, source_cloud, options.reach_m)
-    before = fit(T_target_source)
-    pose, iterations, converged = T_target_source, 0, False
+    surfaces = _Surfaces(target_cloud, target_tree, source_cloud, options.reach_m)
+    before = surfaces.measure_fit(T_target_source)
+    # 2. Refine the pose with the whole correspondence distance, then with a smaller one.
+    pose, iterations, has_converged = T_target_source, 0, False
     for reach_m in (options.reach_m, max(options.reach_m / 3.0, 2.0 * options.voxel_m)):
-        found = gicp.align(
-            target_cloud, source_cloud, target_tree, init_T_target_source=pose, registration_type="GICP",
-            max_correspondence_distance=reach_m, num_threads=1, max_iterations=options.max_iterations,
-            rotation_epsilon=_STEP_RAD, translation_epsilon=_STEP_M,
-        )  # fmt: skip
-        pose, converged = np.asarray(found.T_target_source), bool(found.converged)
-        iterations += int(found.iterations)
-    after = fit(pose) if np.isfinite(pose).all() else _Fit(0.0, math.inf)
-    reason = "" if converged else "not-converged"
-    reason = reason or _refusal(T_target_source, pose, before, after, fit.constraint(pose), options)
+        result = gicp.align(
+            target_cloud,
+            source_cloud,
+            target_tree,
+            init_T_target_source=pose,
+            registration_type="GICP",
+            max_correspondence_distance=reach_m,
+            num_threads=1,
+            max_iterations=options.max_iterations,
+            rotation_epsilon=_CONVERGED_RAD,
+            translation_epsilon=_CONVERGED_M,
+        )
+        pose, has_converged = np.asarray(result.T_target_source), bool(result.converged)
+        iterations += int(result.iterations)
+    # 3. Accept the pose only if it fits better and is constrained.
+    after = surfaces.measure_fit(pose) if np.isfinite(pose).all() else _Fit(0.0, math.inf)
+    reason = "" if has_converged else "not-converged"
+    reason = reason or _rejection(
+        T_target_source, pose, before, after, surfaces.measure_constraint(pose), options
+    )
     return CloudAlignment(
         T_target_source=T_target_source if reason else pose,
         verdict="refused" if reason else "ok",
@@ -146,8 +175,8 @@ class _Fit:
     misfit_m: float
 
 
-class _FitMeasure:
-    """Measures how well a pose fits, by distances to planes, without the weights of the solver."""
+class _Surfaces:
+    """Two thinned clouds, between which distances to tangent planes are measured at any pose."""
 
     def __init__(self, target: Any, tree: Any, source: Any, reach_m: float) -> None:
         self._points = np.asarray(target.points())[:, :3]
@@ -155,62 +184,65 @@ class _FitMeasure:
         self._source = np.asarray(source.points())[:, :3]
         self._tree, self._reach_m = tree, reach_m
 
-    def __call__(self, T_target_source: Matrix) -> _Fit:
-        near, distance, _, _ = self._matched(T_target_source)
-        misfit = np.where(near, distance, self._reach_m)
-        return _Fit(float(near.mean()), float(misfit.mean()))
+    def measure_fit(self, T_target_source: Array) -> _Fit:
+        """Return the share of source points with a correspondence, and the mean point-to-plane distance."""
+        has_match, distance, _, _ = self._correspondences(T_target_source)
+        distance = np.where(has_match, distance, self._reach_m)
+        return _Fit(float(has_match.mean()), float(distance.mean()))
 
-    def constraint(self, T_target_source: Matrix) -> float:
-        """Return how well the surfaces constrain the direction of motion that they constrain least.
+    def measure_constraint(self, T_target_source: Array) -> float:
+        """Return how well the surfaces constrain the least constrained motion: 0 if they can slide or turn.
 
-        The smallest eigenvalue of the mean outer product of ``(normal, lever x normal)``, with the
-        lever in units of the cloud's own size: 0 where the clouds may slide or turn freely.
+        The measure is the smallest eigenvalue of the mean outer product of ``(normal, lever x normal)``,
+        where levers are divided by their mean length.
 
         Source:
-            Gelfand et al., Geometrically stable sampling for the ICP algorithm, 3DIM 2003.
+            Gelfand et al., "Geometrically stable sampling for the ICP algorithm", 3DIM 2003.
         """
-        near, _, moved, normals = self._matched(T_target_source)
-        if near.sum() < _MIN_POINTS:
+        has_match, _, points, normals = self._correspondences(T_target_source)
+        if has_match.sum() < _MIN_POINTS:
             return 0.0
-        lever = moved[near] - moved[near].mean(axis=0)
+        lever = points[has_match] - points[has_match].mean(axis=0)
         lever /= np.linalg.norm(lever, axis=1).mean()
-        rows = np.hstack([normals[near], np.cross(lever, normals[near])])
+        rows = np.hstack([normals[has_match], np.cross(lever, normals[has_match])])
         return float(np.linalg.eigvalsh(rows.T @ rows / len(rows))[0])
 
-    def _matched(self, T_target_source: Matrix) -> tuple[npt.NDArray[np.bool_], Matrix, Matrix, Matrix]:
-        moved = transform(T_target_source, self._source)
-        found, squared = self._tree.batch_nearest_neighbor_search(moved, num_threads=1)
-        nearest = np.asarray(found, dtype=np.int64)
-        near = (nearest >= 0) & (np.asarray(squared) <= self._reach_m**2)
+    def _correspondences(self, T_target_source: Array) -> tuple[npt.NDArray[np.bool_], Array, Array, Array]:
+        """Return for each source point: whether it has a correspondence, and the distance to its tangent
+        plane.
+
+        The last two arrays are the source points in the target's frame and the normals of the planes.
+        """
+        points = transform(T_target_source, self._source)
+        indices, squared_distances = self._tree.batch_nearest_neighbor_search(points, num_threads=1)
+        nearest = np.asarray(indices, dtype=np.int64)
+        has_match = (nearest >= 0) & (np.asarray(squared_distances) <= self._reach_m**2)
         nearest = np.where(nearest >= 0, nearest, 0)
         normals = self._normals[nearest]
-        distance = np.abs(np.einsum("ij,ij->i", moved - self._points[nearest], normals))
-        return near, distance, moved, normals
+        distance = np.abs(np.einsum("ij,ij->i", points - self._points[nearest], normals))
+        return has_match, distance, points, normals
 
 
-_MIN_CONSTRAINT = 0.004
-"""Smallest eigenvalue at which surfaces constrain a pose; a plane has 0, a corner about 0.1."""
-
-
-def _refusal(
-    guess: Matrix, pose: Matrix, before: _Fit, after: _Fit, constraint: float, options: IcpOptions
+def _rejection(
+    initial: Array, pose: Array, before: _Fit, after: _Fit, constraint: float, options: IcpOptions
 ) -> str:
+    """Return the reason to reject a refined *pose*, "" if it is accepted."""
     if after.overlap < options.min_overlap:
         return "little-overlap"
-    if after.misfit_m > _MAX_MISFIT * options.reach_m:
+    if after.misfit_m > _MAX_MISFIT_SHARE * options.reach_m:
         return "poor-fit"
     if constraint < _MIN_CONSTRAINT:
         return "sliding"
-    moved_m, turned_deg = pose_difference(pose, guess)
-    if moved_m > options.max_motion_m or turned_deg > options.max_motion_deg:
+    moved_m, rotated_deg = pose_difference(pose, initial)
+    if moved_m > options.max_motion_m or rotated_deg > options.max_motion_deg:
         return "jumped"
-    if moved_m <= _UNMOVED_M and turned_deg <= _UNMOVED_DEG:
+    if moved_m <= _UNCHANGED_M and rotated_deg <= _UNCHANGED_DEG:
         return "" if after.misfit_m <= before.misfit_m * (1.0 + _MIN_GAIN) else "worse"
     return "" if after.misfit_m < before.misfit_m * (1.0 - _MIN_GAIN) else "worse"
 
 
 def load_small_gicp() -> Any:
-    """Return small_gicp; raises MissingExtra."""
+    """Import and return the module small_gicp; raises MissingExtra if it is not installed."""
     try:
         import small_gicp
     except ImportError as error:

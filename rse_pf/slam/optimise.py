@@ -1,6 +1,6 @@
-"""Fit the poses of a whole pose graph to its edges.
+"""Optimise a whole pose graph with GTSAM, with a robust kernel on loop closures.
 
-The same graph gives the same poses, which never fit worse than the given ones.
+The same graph gives the same poses, and the result never has a higher cost than the given poses.
 """
 
 from __future__ import annotations
@@ -15,31 +15,31 @@ import numpy.typing as npt
 from rse_pf.errors import BadRequest, MissingExtra
 from rse_pf.geometry import Array
 from rse_pf.service import Report
-from rse_pf.slam.pose_graph import PoseGraph, components
+from rse_pf.slam.pose_graph import PoseGraph, connected_components
 
-__all__ = [
-    "OptimiseOptions",
-    "OptimisedGraph",
-    "ignore_progress",
-    "optimise_graph",
-    "robust_cost",
-]  # fmt: skip
+__all__ = ["OptimiseOptions", "OptimisedGraph", "ignore_progress", "optimise_graph", "robust_cost"]
 
 Rows = npt.NDArray[np.int64]
 
 _ANCHOR_SIGMA = 1e-6
-_RELATIVE_CHANGE = 1e-7
+"""Standard deviation in metres and radians of the prior that fixes the first pose of each component: small
+enough to hold it, and large enough for a well conditioned linear system."""
+_RELATIVE_COST_CHANGE = 1e-7  # relative decrease of the cost below which Levenberg-Marquardt has converged
+_GTSAM_ORDER = np.ix_([3, 4, 5, 0, 1, 2], [3, 4, 5, 0, 1, 2])
+"""Index that reorders a 6x6 matrix of twists (translation, rotation) to GTSAM's (rotation, translation)."""
 
 
 def ignore_progress(done: float, what: str) -> None:
-    """Do nothing with the progress."""
+    """Do nothing: a `Report` for callers who do not want to know the progress."""
 
 
 class OptimiseOptions(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """How to optimise; it travels with a command.
+    """Options of the optimisation, which a command contains.
 
-    ``cauchy`` is the width of the Cauchy kernel on loop and merge edges, in standard deviations of an
-    edge's residual; 0 means least squares.
+    Attributes:
+        cauchy: Width of the Cauchy kernel on loop and merge edges, in standard deviations of the residual of
+            an edge; 0 means least squares.
+        max_iterations: Iterations of Levenberg-Marquardt from each start, 1..1000.
 
     Raises:
         BadRequest: A number is out of its range.
@@ -59,7 +59,14 @@ class OptimiseOptions(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=T
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class OptimisedGraph:
-    """Poses ``(n, 4, 4)`` with the robust cost before and after."""
+    """The optimised poses of a graph.
+
+    Attributes:
+        T_world_pose: ``(n, 4, 4)``, metres.
+        cost_before: The robust cost at the given poses.
+        cost_after: The robust cost at the optimised poses, at most ``cost_before``.
+        components: The number of connected components of the graph.
+    """
 
     T_world_pose: Array
     cost_before: float
@@ -74,65 +81,74 @@ def optimise_graph(
     report: Report = ignore_progress,
     chordal: bool = True,
 ) -> OptimisedGraph:
-    """Return the poses of *graph* that fit its edges best.
+    """Return the poses of *graph* that minimise its robust cost, see `robust_cost`.
 
-    Minimises ``sum of squares of odometry + sum of cauchy**2 log(1 + squares / cauchy**2)`` of the
-    other edges by Levenberg-Marquardt, once from the given poses and once from poses whose rotations
-    the chordal relaxation found, and keeps the better.  The pose with the smallest row number of each
-    connected component stays fixed.  With *chordal* False only the given poses are a start.
+    Levenberg-Marquardt runs from the given poses, and again from poses whose rotations come from the chordal
+    relaxation; the poses with the lowest cost are returned.  The pose with the smallest row of each connected
+    component stays fixed.
+
+    Args:
+        graph: The pose graph.
+        options: None means the defaults.
+        report: Called with the progress.
+        chordal: Whether the chordal start is tried; it exists for connected graphs only.
 
     Raises:
-        MissingExtra: gtsam is not installed.
+        MissingExtra: GTSAM is not installed.
         Cancelled: *report* raised it.
 
     Source:
-        Dellaert and Kaess, Factor Graphs for Robot Perception (2017); chordal start after Carlone et
-        al., ICRA 2015.
+        Dellaert and Kaess, "Factor Graphs for Robot Perception", 2017; chordal relaxation: Carlone et al.,
+        "Initialization Techniques for 3D SLAM", ICRA 2015.
     """
     options = options or OptimiseOptions()
-    gtsam = _gtsam()
-    part = components(len(graph.T_world_pose), graph.a, graph.b)
-    anchors = np.unique(part)
+    gtsam = _load_gtsam()
+    # 1. Find the poses that stay fixed, and the cost to improve on.
+    anchors = np.unique(connected_components(len(graph.T_world_pose), graph.a, graph.b))
     cost_before = robust_cost(graph, graph.T_world_pose, options.cauchy)
-    best, best_cost = graph.T_world_pose, cost_before
+    best_poses, best_cost = graph.T_world_pose, cost_before
     if not len(graph.a):
         return OptimisedGraph(
-            T_world_pose=best, cost_before=0.0, cost_after=0.0, components=len(anchors)
-        )  # fmt: skip
+            T_world_pose=best_poses, cost_before=0.0, cost_after=0.0, components=len(anchors)
+        )
+    # 2. Minimise the cost from each start, and keep the best poses.
     report(0.0, "from the given poses")
-    for share, start in ((0.1, None), (0.5, "chordal"))[: 2 if chordal else 1]:
-        report(share, "from the given poses" if start is None else "from the chordal start")
-        poses = graph.T_world_pose if start is None else _chordal(gtsam, graph, anchors)
-        found = None if poses is None else _minimise(gtsam, graph, poses, anchors, options)
-        if found is None:
+    for share, is_chordal in ((0.1, False), (0.5, True))[: 2 if chordal else 1]:
+        report(share, "from the chordal start" if is_chordal else "from the given poses")
+        start = _chordal_poses(gtsam, graph, anchors) if is_chordal else graph.T_world_pose
+        poses = None if start is None else _minimise(gtsam, graph, start, anchors, options)
+        if poses is None:
             continue
-        cost = robust_cost(graph, found, options.cauchy)
-        if np.isfinite(found).all() and cost < best_cost:
-            best, best_cost = found, cost
+        cost = robust_cost(graph, poses, options.cauchy)
+        if np.isfinite(poses).all() and cost < best_cost:
+            best_poses, best_cost = poses, cost
     report(1.0, "optimised")
     return OptimisedGraph(
-        T_world_pose=best, cost_before=cost_before, cost_after=best_cost, components=len(anchors)
-    )  # fmt: skip
+        T_world_pose=best_poses, cost_before=cost_before, cost_after=best_cost, components=len(anchors)
+    )
 
 
 def robust_cost(graph: PoseGraph, T_world_pose: Array, cauchy: float) -> float:
-    """Return what `optimise_graph` minimises, at *T_world_pose*."""
+    """Return the cost of the poses *T_world_pose* ``(n, 4, 4)`` of *graph*.
+
+    It is the sum of the squared Mahalanobis norms r^2 of the residuals of odometry edges, and of
+    ``cauchy^2 log(1 + r^2 / cauchy^2)`` of the other edges; of r^2 for these, too, if *cauchy* is 0.
+    """
     squares = graph.squared_residuals(T_world_pose)
     if cauchy > 0:
         squares = np.where(graph.robust, cauchy**2 * np.log1p(squares / cauchy**2), squares)
     return float(squares.sum())
 
 
-def _factors(gtsam: Any, graph: PoseGraph, anchors: Rows, cauchy: float) -> Any:
-    """Return the graph for gtsam, whose twists are (phi, rho)."""
-    swap = [3, 4, 5, 0, 1, 2]
+def _make_factors(gtsam: Any, graph: PoseGraph, anchors: Rows, cauchy: float) -> Any:
+    """Return GTSAM's factor graph: priors on the anchors, and a between factor for each edge."""
     factors = gtsam.NonlinearFactorGraph()
-    tight = gtsam.noiseModel.Isotropic.Sigma(6, _ANCHOR_SIGMA)
+    anchor_noise = gtsam.noiseModel.Isotropic.Sigma(6, _ANCHOR_SIGMA)
     for row in anchors.tolist():
-        factors.add(gtsam.PriorFactorPose3(row, gtsam.Pose3(graph.T_world_pose[row]), tight))
+        factors.add(gtsam.PriorFactorPose3(row, gtsam.Pose3(graph.T_world_pose[row]), anchor_noise))
     kernel = gtsam.noiseModel.mEstimator.Cauchy(cauchy) if cauchy > 0 else None
     for k, (a, b) in enumerate(zip(graph.a.tolist(), graph.b.tolist(), strict=True)):
-        noise = gtsam.noiseModel.Gaussian.Information(graph.information[k][np.ix_(swap, swap)])
+        noise = gtsam.noiseModel.Gaussian.Information(graph.information[k][_GTSAM_ORDER])
         if kernel is not None and graph.robust[k]:
             noise = gtsam.noiseModel.Robust.Create(kernel, noise)
         factors.add(gtsam.BetweenFactorPose3(a, b, gtsam.Pose3(graph.T_a_b[k]), noise))
@@ -142,34 +158,34 @@ def _factors(gtsam: Any, graph: PoseGraph, anchors: Rows, cauchy: float) -> Any:
 def _minimise(
     gtsam: Any, graph: PoseGraph, T_world_pose: Array, anchors: Rows, options: OptimiseOptions
 ) -> Array | None:
-    """Return the best poses from *T_world_pose* on, None where the linear systems have no solution."""
+    """Return the poses that Levenberg-Marquardt reaches from *T_world_pose*; None if it fails."""
     values = gtsam.Values()
     for row, T in enumerate(T_world_pose):
         values.insert(row, gtsam.Pose3(T))
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setMaxIterations(options.max_iterations)
-    parameters.setRelativeErrorTol(_RELATIVE_CHANGE)
+    parameters.setRelativeErrorTol(_RELATIVE_COST_CHANGE)
     try:
-        factors = _factors(gtsam, graph, anchors, options.cauchy)
-        found = gtsam.LevenbergMarquardtOptimizer(factors, values, parameters).optimize()
-    except RuntimeError:  # raised for an indeterminate system
+        factors = _make_factors(gtsam, graph, anchors, options.cauchy)
+        optimised = gtsam.LevenbergMarquardtOptimizer(factors, values, parameters).optimize()
+    except RuntimeError:  # GTSAM raises it for an indeterminate linear system.
         return None
-    return np.array([found.atPose3(row).matrix() for row in range(len(T_world_pose))])
+    return np.array([optimised.atPose3(row).matrix() for row in range(len(T_world_pose))])
 
 
-def _chordal(gtsam: Any, graph: PoseGraph, anchors: Rows) -> Array | None:
-    """Return poses from the chordal relaxation of the rotations, None if there is none."""
+def _chordal_poses(gtsam: Any, graph: PoseGraph, anchors: Rows) -> Array | None:
+    """Return poses from the chordal relaxation of the rotations, None if the graph has none."""
     if len(anchors) > 1:
         return None
     try:
-        values = gtsam.InitializePose3.initialize(_factors(gtsam, graph, anchors, 0.0))
-    except RuntimeError:  # raised for a graph without loops
+        values = gtsam.InitializePose3.initialize(_make_factors(gtsam, graph, anchors, 0.0))
+    except RuntimeError:  # GTSAM raises it for a graph without loops.
         return None
     poses = np.array([values.atPose3(row).matrix() for row in range(len(graph.T_world_pose))])
     return poses if np.isfinite(poses).all() else None
 
 
-def _gtsam() -> Any:
+def _load_gtsam() -> Any:
     try:
         import gtsam
     except ImportError as error:

@@ -1,9 +1,8 @@
-"""Pose graphs: poses, measured relative poses between them, their misfit, and their g2o text.
+"""Represent pose graphs, measure how well poses fit their edges, and read and write them as g2o text.
 
-A graph is validated once, in its constructor.
-
-Residual of edge *k* between poses *a* and *b*: ``log(inverse(T_a_b) @ inverse(T_world_a) @ T_world_b)``,
-a twist ``(rho metres, phi radians)``; ``information`` is the inverse covariance of that twist.
+The residual of an edge between the poses *a* and *b* is ``log(inverse(T_a_b) @ inverse(T_world_a) @
+T_world_b)``, a twist (translation in metres, rotation in radians); ``information`` is the inverse covariance
+of this twist.
 """
 
 from __future__ import annotations
@@ -19,38 +18,39 @@ from rse_pf.geometry import Array, from_quaternion, inverse, log_se3, rigid_many
 
 __all__ = [
     "PoseGraph",
-    "components",
+    "connected_components",
     "g2o_edge",
     "g2o_vertex",
     "is_positive_definite",
-    "misfit",
     "read_g2o",
     "write_g2o",
 ]
 
 _UPPER = np.triu_indices(6)
-_MAX_ID = 2**53
-_MAX_M, _MAX_INFORMATION = 1e9, 1e18
-"""Larger numbers overflow in what optimises a graph."""
+_MAX_ID = 2**53  # largest id of a vertex in g2o text: JSON and float64 hold it exactly
+_MAX_COORDINATE_M = 1e9  # largest coordinate of a pose in metres; larger ones overflow in the optimiser
+_MAX_INFORMATION = 1e18  # largest number of an information matrix; larger ones overflow in the optimiser
+_MAX_ASYMMETRY = 1e-6  # largest difference from symmetry, as a share of a matrix's largest number
 _FROM_G2O = np.diag([1.0, 1.0, 1.0, 0.5, 0.5, 0.5])
-"""g2o's rotation error is the vector part of a quaternion, half of phi."""
+"""Derivative of g2o's error (translation, vector part of a quaternion) by our twist: the vector part of a
+quaternion is half of a small rotation vector."""
 _TO_G2O = np.linalg.inv(_FROM_G2O)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PoseGraph:
-    """*n* poses and *m* edges between them.
+    """A pose graph of *n* poses and *m* edges, which is validated when it is made.
 
     Attributes:
         T_world_pose: ``(n, 4, 4)``, metres.
-        a, b: ``(m,)`` row numbers of the poses that an edge connects.
-        T_a_b: ``(m, 4, 4)``, the measured relative poses.
-        information: ``(m, 6, 6)``, symmetric, positive definite, of the twist (metres, radians).
-        robust: ``(m,)``, whether an edge may be an outlier (loops and merges) or not (odometry).
-        ids: ``(n,)``, the names of the poses in a file or request.
+        a, b: ``(m,)``, the rows of the two poses of each edge.
+        T_a_b: ``(m, 4, 4)``, the measured relative poses, metres.
+        information: ``(m, 6, 6)``, symmetric and positive definite, of the twist (metres, radians).
+        robust: ``(m,)``, whether an edge may be an outlier (loop closures) or not (odometry).
+        ids: ``(n,)``, the ids of the poses in a file or a command.
 
     Raises:
-        BadRequest: Shapes do not agree, an edge connects a pose to itself or to an unknown one, a number is
+        BadRequest: Shapes do not agree, an edge connects a pose with itself or an unknown pose, a number is
             not finite, a matrix is not a rotation, or an information matrix is not positive definite.
     """
 
@@ -64,78 +64,87 @@ class PoseGraph:
 
     def __post_init__(self) -> None:
         n, m = len(self.T_world_pose), len(self.a)
-        shapes = (
-            self.T_world_pose.shape == (n, 4, 4) and self.ids.shape == (n,) and n > 0
+        has_right_shapes = (
+            self.T_world_pose.shape == (n, 4, 4)
+            and self.ids.shape == (n,)
+            and n > 0
             and self.b.shape == self.a.shape == self.robust.shape == (m,)
-            and self.T_a_b.shape == (m, 4, 4) and self.information.shape == (m, 6, 6)
-        )  # fmt: skip
-        if not shapes:
-            raise BadRequest("the shapes of the pose graph do not agree", hint="send one row for each edge")
+            and self.T_a_b.shape == (m, 4, 4)
+            and self.information.shape == (m, 6, 6)
+        )
+        if not has_right_shapes:
+            raise BadRequest(
+                f"the shapes of the pose graph of {n} poses and {m} edges do not agree",
+                hint="send at least one pose, and one row for each edge in each array",
+            )
         if m and (min(self.a.min(), self.b.min()) < 0 or max(self.a.max(), self.b.max()) >= n):
             raise BadRequest(f"an edge names a pose that is not one of 0..{n - 1}", hint="send all poses")
         if (self.a == self.b).any():
-            raise BadRequest("an edge connects a pose to itself", hint="leave it out")
+            raise BadRequest("an edge connects a pose to itself", hint="leave this edge out")
         if len(np.unique(self.ids)) != n:
             raise BadRequest("two poses have one id", hint="give each pose its own id")
-        # Frozen from here on.
+        # This class is frozen.
         object.__setattr__(self, "T_world_pose", _checked_poses("a pose", self.T_world_pose))
         object.__setattr__(self, "T_a_b", _checked_poses("an edge", self.T_a_b))
         if not is_positive_definite(self.information):
             raise BadRequest(
-                "an information matrix is not symmetric and positive definite", hint="invert a covariance"
+                "an information matrix is not symmetric and positive definite",
+                hint="send the inverses of the covariances of the edges",
             )
 
     def chi2(self, T_world_pose: Array | None = None) -> float:
-        """Return the sum of squared residuals, each weighted with its information."""
+        """Return the sum of the squared Mahalanobis norms of all residuals.
+
+        Args:
+            T_world_pose: ``(n, 4, 4)``; None means the poses of this graph.
+        """
         poses = self.T_world_pose if T_world_pose is None else T_world_pose
         return float(self.squared_residuals(poses).sum())
 
     def squared_residuals(self, T_world_pose: Array) -> Array:
-        """Return the ``(m,)`` squared Mahalanobis norms of the residuals at *T_world_pose*."""
-        predicted = inverse(T_world_pose[self.a]) @ T_world_pose[self.b]
-        return misfit(self.T_a_b, predicted, self.information)
-
-
-def misfit(measured: Array, predicted: Array, information: Array) -> Array:
-    """Return the ``(m,)`` squared Mahalanobis norms between ``(m, 4, 4)`` poses."""
-    error = log_se3(inverse(measured) @ predicted)
-    squares: Array = np.einsum("mi,mij,mj->m", error, information, error)
-    return squares
+        """Return the squared Mahalanobis norms ``(m,)`` of the residuals at *T_world_pose* ``(n, 4, 4)``."""
+        T_a_b = inverse(T_world_pose[self.a]) @ T_world_pose[self.b]
+        residuals = log_se3(inverse(self.T_a_b) @ T_a_b)
+        squares: Array = np.einsum("mi,mij,mj->m", residuals, self.information, residuals)
+        return squares
 
 
 def is_positive_definite(information: Array) -> bool:
-    """Say whether ``(m, 6, 6)`` matrices are symmetric, positive definite and not absurdly large."""
+    """Return whether all matrices ``(m, 6, 6)`` are symmetric, positive definite and at most 1e18."""
     if not len(information):
         return True
     if not (np.abs(information) <= _MAX_INFORMATION).all():
         return False
-    scale = np.abs(information).max(axis=(1, 2))
-    skewed = np.abs(information - np.swapaxes(information, 1, 2)).max(axis=(1, 2)) > 1e-6 * scale
-    return not skewed.any() and bool((np.linalg.eigvalsh(information)[:, 0] > 0).all())
+    largest = np.abs(information).max(axis=(1, 2))
+    asymmetry = np.abs(information - np.swapaxes(information, 1, 2)).max(axis=(1, 2))
+    is_symmetric = not (asymmetry > _MAX_ASYMMETRY * largest).any()
+    return is_symmetric and bool((np.linalg.eigvalsh(information)[:, 0] > 0).all())
 
 
-def components(n: int, a: npt.NDArray[np.int64], b: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    """Return for each of *n* poses the smallest row number of its connected component."""
-    root = list(range(n))
+def connected_components(n: int, a: npt.NDArray[np.int64], b: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    """Return for each pose the smallest row of its connected component, ``(n,)``, by union-find.
 
-    def find(i: int) -> int:
-        while root[i] != i:
-            root[i] = root[root[i]]
-            i = root[i]
+    Args:
+        n: The number of poses.
+        a: ``(m,)``, the row of the first pose of each edge.
+        b: ``(m,)``, the row of the second pose of each edge.
+    """
+    parent = list(range(n))
+
+    def find_root(i: int) -> int:
+        while parent[i] != i:
+            parent[i] = parent[parent[i]]
+            i = parent[i]
         return i
 
-    for one, other in zip(a.tolist(), b.tolist(), strict=True):
-        one, other = find(one), find(other)
-        root[max(one, other)] = min(one, other)
-    return np.array([find(i) for i in range(n)], dtype=np.int64)
+    for edge_a, edge_b in zip(a.tolist(), b.tolist(), strict=True):
+        root_a, root_b = find_root(edge_a), find_root(edge_b)
+        parent[max(root_a, root_b)] = min(root_a, root_b)
+    return np.array([find_root(i) for i in range(n)], dtype=np.int64)
 
 
 def write_g2o(graph: PoseGraph) -> str:
-    """Return *graph* as g2o text (``VERTEX_SE3:QUAT``, ``EDGE_SE3:QUAT``).
-
-    The rotation error of g2o is the vector part of a quaternion, so the information matrices are written
-    for ``phi / 2``.
-    """
+    """Return *graph* as g2o text with lines ``VERTEX_SE3:QUAT`` and ``EDGE_SE3:QUAT``."""
     lines = [g2o_vertex(name, T) for name, T in zip(graph.ids.tolist(), graph.T_world_pose, strict=True)]
     ids_a, ids_b = graph.ids[graph.a].tolist(), graph.ids[graph.b].tolist()
     lines += [
@@ -146,12 +155,15 @@ def write_g2o(graph: PoseGraph) -> str:
 
 
 def g2o_vertex(name: int, T_world_pose: Array) -> str:
-    """Return the line of g2o for the pose of this id."""
+    """Return the g2o line of the pose *T_world_pose* ``(4, 4)`` with the id *name*."""
     return f"VERTEX_SE3:QUAT {name} {_join(_pose_numbers(T_world_pose))}"
 
 
 def g2o_edge(a: int, b: int, T_a_b: Array, information: Array) -> str:
-    """Return the line of g2o for an edge between the poses with ids *a* and *b*.
+    """Return the g2o line of an edge between the poses with the ids *a* and *b*.
+
+    The rotational error of g2o is the vector part of a quaternion, half of our rotation vector, and the
+    information matrix is converted to it.
 
     Args:
         a: The id of the first pose.
@@ -164,64 +176,70 @@ def g2o_edge(a: int, b: int, T_a_b: Array, information: Array) -> str:
 
 
 def read_g2o(text: str) -> PoseGraph:
-    """Return the graph of g2o *text*; edges between consecutive ids are odometry.
+    """Return the pose graph of g2o *text*; edges between consecutive ids are odometry.
 
     Raises:
         BadRequest: A line is not one of ``VERTEX_SE3:QUAT``, ``EDGE_SE3:QUAT`` and ``FIX``, or has the wrong
-            numbers; the message has the line number.
+            numbers; the message has the line number.  Or the graph is invalid, see `PoseGraph`.
     """
+    # 1. Read the lines.
     vertices: dict[int, Array] = {}
     edges: list[tuple[int, int, Array, Array]] = []
-    for number, tag, words in _lines(text):
+    for number, tag, words in _tagged_lines(text):
         try:
             if tag == "VERTEX_SE3:QUAT":
-                vertices[_id(words[0])] = _pose(words[1:])
+                vertices[_parse_id(words[0])] = _parse_pose(words[1:])
             elif tag == "EDGE_SE3:QUAT":
                 information = np.zeros((6, 6))
-                information[_UPPER] = _information(words[9:])
+                information[_UPPER] = _parse_information(words[9:])
                 information = np.triu(information) + np.triu(information, 1).T
-                edges.append((_id(words[0]), _id(words[1]), _pose(words[2:9]), information))
+                edge_ids = _parse_id(words[0]), _parse_id(words[1])
+                edges.append((*edge_ids, _parse_pose(words[2:9]), information))
             elif tag != "FIX":
                 raise ValueError(f"{tag[:40]!r} is not a 3-D pose or edge")
         except (ValueError, IndexError) as error:
             raise BadRequest(f"g2o, line {number}: {error}", hint="send 3-D pose graphs only") from error
-    row = {name: i for i, name in enumerate(vertices)}
-    missing = next((name for a, b, _, _ in edges for name in (a, b) if name not in row), None)
+    # 2. Replace the ids in edges by the rows of the poses.
+    row_of_id = {name: row for row, name in enumerate(vertices)}
+    missing = next((name for a, b, _, _ in edges for name in (a, b) if name not in row_of_id), None)
     if missing is not None:
         raise BadRequest(f"g2o: an edge names vertex {missing}, which is missing", hint="send all vertices")
     m = len(edges)
     ids = np.array(list(vertices), dtype=np.int64)
-    a = np.array([row[edge[0]] for edge in edges], dtype=np.int64)
-    b = np.array([row[edge[1]] for edge in edges], dtype=np.int64)
+    a = np.array([row_of_id[edge[0]] for edge in edges], dtype=np.int64)
+    b = np.array([row_of_id[edge[1]] for edge in edges], dtype=np.int64)
+    # 3. Convert the information matrices to our twist.
+    g2o_information = np.array([edge[3] for edge in edges]).reshape(m, 6, 6)
     return PoseGraph(
         T_world_pose=np.array(list(vertices.values())).reshape(-1, 4, 4),
         a=a,
         b=b,
         T_a_b=np.array([edge[2] for edge in edges]).reshape(m, 4, 4),
-        information=_FROM_G2O @ np.array([edge[3] for edge in edges]).reshape(m, 6, 6) @ _FROM_G2O,
+        information=_FROM_G2O @ g2o_information @ _FROM_G2O,
         robust=np.abs(ids[a] - ids[b]) != 1,
         ids=ids,
     )
 
 
-def _lines(text: str) -> Iterator[tuple[int, str, list[str]]]:
+def _tagged_lines(text: str) -> Iterator[tuple[int, str, list[str]]]:
+    """Yield number, first word and further words of each line that is not empty and no comment."""
     for number, line in enumerate(text.splitlines(), start=1):
         words = line.split()
         if words and not words[0].startswith("#"):
             yield number, words[0], words[1:]
 
 
-def _id(word: str) -> int:
+def _parse_id(word: str) -> int:
     number = int(word)
     if abs(number) > _MAX_ID:
-        raise ValueError("an id is not within 53 bits")
+        raise ValueError(f"the id {word[:40]} is not within +-2**53")
     return number
 
 
-def _information(words: list[str]) -> list[float]:
+def _parse_information(words: list[str]) -> list[float]:
     numbers = [float(word) for word in words]
     if not all(abs(value) <= _MAX_INFORMATION for value in numbers):
-        raise ValueError(f"a number of the information is not within {_MAX_INFORMATION:g}")
+        raise ValueError(f"a number of the information is not within +-{_MAX_INFORMATION:g}")
     return numbers
 
 
@@ -233,10 +251,11 @@ def _join(values: Array) -> str:
     return " ".join(f"{value:.17g}" for value in values)
 
 
-def _pose(words: list[str]) -> Array:
+def _parse_pose(words: list[str]) -> Array:
+    """Return the pose of the seven numbers x y z qx qy qz qw; raises ValueError."""
     numbers = [float(word) for word in words]
-    if len(numbers) != 7 or not all(abs(value) <= _MAX_M for value in numbers):
-        raise ValueError(f"a pose is x y z qx qy qz qw, each of at most {_MAX_M:g}")
+    if len(numbers) != 7 or not all(abs(value) <= _MAX_COORDINATE_M for value in numbers):
+        raise ValueError(f"a pose is x y z qx qy qz qw, each within +-{_MAX_COORDINATE_M:g}")
     if np.linalg.norm(numbers[3:]) < 1e-6:
         raise ValueError("a quaternion is zero")
     T = np.eye(4)
@@ -245,11 +264,12 @@ def _pose(words: list[str]) -> Array:
     return T
 
 
-def _checked_poses(what: str, T: Array) -> Array:
-    made = rigid_many(T, _MAX_M)
-    if made is None:
+def _checked_poses(subject: str, T: Array) -> Array:
+    """Return poses with orthonormal rotations; raises BadRequest about *subject* if a matrix is no pose."""
+    poses = rigid_many(T, _MAX_COORDINATE_M)
+    if poses is None:
         raise BadRequest(
-            f"{what} is not a rigid motion, or has a matrix that is not a rotation",
+            f"{subject} is not a rigid motion, or has a matrix that is not a rotation",
             hint="send (4, 4) matrices of finite numbers with at least three decimals",
         )
-    return made
+    return poses

@@ -10,7 +10,7 @@ from default_cases import first_by_default
 
 from rse_pf.errors import BadRequest
 from rse_pf.geometry import Array, exp_se3, pose_difference
-from rse_pf.slam.icp import IcpOptions, align
+from rse_pf.slam.icp import IcpOptions, align_clouds
 from tests.synthetic_maps import make_room as full_room
 
 pytest.importorskip("small_gicp", reason="the extra maps is not installed")
@@ -35,7 +35,7 @@ def test_recovers_five_centimetres_and_three_degrees_between_overlapping_clouds(
     target, source = make_room(seed), make_room(seed + 100)
     source = source[source[:, 0] < 2.6]
 
-    found = align(target, source, offset(seed, 0.05, 3.0))
+    found = align_clouds(target, source, offset(seed, 0.05, 3.0))
 
     metres, degrees = pose_difference(found.T_target_source, np.eye(4))
     assert found.verdict == "ok", found.reason
@@ -47,7 +47,7 @@ def test_recovers_five_centimetres_and_three_degrees_between_overlapping_clouds(
 def test_clouds_that_may_slide_on_their_surfaces_are_refused(walls: int) -> None:
     start = offset(1, 0.03, 1.0)
 
-    found = align(make_room(1, walls=walls), make_room(2, walls=walls), start)
+    found = align_clouds(make_room(1, walls=walls), make_room(2, walls=walls), start)
 
     assert (found.verdict, found.reason) == ("refused", "sliding")
     np.testing.assert_array_equal(found.T_target_source, start)
@@ -56,7 +56,7 @@ def test_clouds_that_may_slide_on_their_surfaces_are_refused(walls: int) -> None
 def test_clouds_that_hardly_overlap_are_refused_with_the_start() -> None:
     far = exp_se3([3.0, 3.0, 3.0, 0.0, 0.0, 0.0])
 
-    found = align(make_room(1), make_room(2), far)
+    found = align_clouds(make_room(1), make_room(2), far)
 
     assert found.verdict == "refused"
     assert found.reason in ("little-overlap", "not-converged")
@@ -70,7 +70,7 @@ def test_an_answer_called_ok_is_never_farther_from_the_truth_than_its_start(seed
     target, source = make_room(seed), make_room(seed + 50)
     source = source[source[:, 1] < rng.uniform(1.0, 4.0)]
 
-    found = align(target, source, start)
+    found = align_clouds(target, source, start)
 
     before, after = pose_difference(start, np.eye(4)), pose_difference(found.T_target_source, np.eye(4))
     assert after[0] <= before[0] + 1e-3
@@ -78,7 +78,7 @@ def test_an_answer_called_ok_is_never_farther_from_the_truth_than_its_start(seed
 
 
 def test_a_jump_beyond_the_limit_is_refused() -> None:
-    found = align(make_room(1), make_room(2), offset(3, 0.08, 1.0), IcpOptions(max_motion_m=0.02))
+    found = align_clouds(make_room(1), make_room(2), offset(3, 0.08, 1.0), IcpOptions(max_motion_m=0.02))
 
     assert (found.verdict, found.reason) == ("refused", "jumped")
 
@@ -86,11 +86,11 @@ def test_a_jump_beyond_the_limit_is_refused() -> None:
 def test_the_same_clouds_give_the_same_pose() -> None:
     target, source, start = make_room(1), make_room(2), offset(3, 0.05, 3.0)
 
-    first, second = align(target, source, start), align(target, source, start)
+    first, second = align_clouds(target, source, start), align_clouds(target, source, start)
 
     np.testing.assert_array_equal(first.T_target_source, second.T_target_source)
 
 
 def test_too_few_points_are_refused_with_the_number() -> None:
     with pytest.raises(BadRequest, match="points are left"):
-        align(full_room(1)[:50], make_room(2), np.eye(4))
+        align_clouds(full_room(1)[:50], make_room(2), np.eye(4))

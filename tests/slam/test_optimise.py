@@ -10,7 +10,7 @@ import pytest
 from rse_pf.errors import BadRequest, Cancelled
 from rse_pf.geometry import Array, exp_se3, inverse, log_se3
 from rse_pf.slam.optimise import OptimiseOptions, optimise_graph
-from rse_pf.slam.pose_graph import PoseGraph, components, read_g2o, write_g2o
+from rse_pf.slam.pose_graph import PoseGraph, connected_components, read_g2o, write_g2o
 from tests.synthetic_maps import make_sphere
 
 pytest.importorskip("gtsam", reason="the extra maps is not installed")
@@ -72,7 +72,7 @@ def test_each_connected_component_keeps_its_first_pose() -> None:
 
     found = optimise_graph(graph)
 
-    assert components(5, graph.a, graph.b).tolist() == [0, 0, 2, 2, 2]
+    assert connected_components(5, graph.a, graph.b).tolist() == [0, 0, 2, 2, 2]
     assert found.components == 2
     np.testing.assert_allclose(found.T_world_pose[:, 0, 3], [0, 1, 9, 10, 11], atol=1e-6)
 

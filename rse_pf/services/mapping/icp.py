@@ -8,7 +8,7 @@ import numpy as np
 from rse_pf.errors import BadRequest, LimitExceeded
 from rse_pf.geometry import rigid
 from rse_pf.service import Registry
-from rse_pf.slam.icp import IcpOptions, align, load_small_gicp
+from rse_pf.slam.icp import IcpOptions, align_clouds, load_small_gicp
 from rse_pf.wire.arrays import Array, reshaped
 
 __all__ = ["IcpReply", "IcpRequest", "register"]
@@ -59,7 +59,7 @@ def register(registry: Registry) -> None:
         guess = rigid(numbers.reshape(4, 4)) if numbers.size == 16 else None
         if guess is None:
             raise BadRequest("T_target_source is not a rigid motion", hint="send 16 numbers, row-major")
-        found = align(target, source, guess, request.options)
+        found = align_clouds(target, source, guess, request.options)
         return IcpReply(
             T_target_source=found.T_target_source.ravel(),
             verdict=found.verdict,
