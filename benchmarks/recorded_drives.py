@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from client_sdk.datasets import Dataset, open_dataset
 from client_sdk.frontend import Frame, FrontEndOptions, PoseQuery, TrackedFrame, extract
-from client_sdk.mapping import MapOptions, PointMap
+from client_sdk.point_map import MapOptions, PointMap
 from client_sdk.tracking.monocular_tracker import MonocularTracker
 from client_sdk.tracking.tracker import Tracker
 from rse_pf.errors import PnpError

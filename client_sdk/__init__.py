@@ -21,12 +21,13 @@ if TYPE_CHECKING:
     from client_sdk.live import BlockingLiveMapper, Correction, LiveMapper, LiveOptions, OtherRobot
     from client_sdk.map_merge import merge_maps
     from client_sdk.mapper import BlockingMapper, Mapper
-    from client_sdk.mapping import MapOptions, PointMap, Trajectory
     from client_sdk.monocular.scale import MarkerScale, OdometryScale
     from client_sdk.offloading.offload_policy import CloudFirst
+    from client_sdk.point_map import MapOptions, PointMap
     from client_sdk.robot import Robot, connect
     from client_sdk.tracking.monocular_tracker import MonocularOptions
     from client_sdk.tracking.tracker import Tracker
+    from client_sdk.trajectory import Trajectory
     from client_sdk.transfer.background_upload import BackgroundUploader
     from client_sdk.transfer.data_client import DataClient, DataOptions
 
@@ -85,20 +86,20 @@ _HOMES = {
     "FrontEndOptions": "frontend",
     "LiveMapper": "live",
     "LiveOptions": "live",
-    "MapOptions": "mapping",
+    "MapOptions": "point_map",
     "Mapper": "mapper",
     "MarkerScale": "monocular.scale",
     "MonocularOptions": "tracking.monocular_tracker",
     "OdometryScale": "monocular.scale",
     "OtherRobot": "live",
-    "PointMap": "mapping",
+    "PointMap": "point_map",
     "PoseAnswer": "commands.answer_types",
     "PoseQuery": "frontend",
     "Robot": "robot",
     "Stats": "commands.traffic_stats",
     "TrackedFrame": "frontend",
     "Tracker": "tracking.tracker",
-    "Trajectory": "mapping",
+    "Trajectory": "trajectory",
     "Updates": "commands.subscriptions",
     "connect": "robot",
     "connect_blocking": "blocking_robot",

@@ -37,8 +37,8 @@ from client_sdk.commands.answer_types import PoseAnswer
 from client_sdk.frontend import Features, Frame, FrontEndOptions, PoseQuery, TrackedFrame
 from client_sdk.imu.estimator import ImuEstimator, ImuScale, level_start_pose
 from client_sdk.imu.samples import ImuSamples
-from client_sdk.mapping import MapOptions, PointMap, Trajectory, write_ply, write_trajectory
 from client_sdk.monocular.scale import MarkerScale, OdometryScale
+from client_sdk.point_map import MapOptions, PointMap, write_ply
 from client_sdk.slots import FeaturesFunction, LoopsFunction, MotionFunction, OptimiserFunction, Slots
 from client_sdk.source_facts import DepthFacts, SourceFacts, check_source, median_depth_m
 from client_sdk.tracking.monocular_tracker import MonocularOptions, MonocularTracker
@@ -51,6 +51,7 @@ from client_sdk.tracking.segments import (
 )
 from client_sdk.tracking.stereo_adjustment import StereoAdjustment
 from client_sdk.tracking.tracker import Tracker
+from client_sdk.trajectory import Trajectory, write_trajectory
 from rse_pf.errors import ConfigurationError, RsePfError, UsageError
 from rse_pf.geometry import Array, Camera
 from rse_pf.maps.format import UP, UP_FIELD, Keyframe, MapVersion, encode_map

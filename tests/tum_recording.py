@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from client_sdk.frontend import Frame
-from client_sdk.mapping import Trajectory, write_trajectory
+from client_sdk.trajectory import Trajectory, write_trajectory
 
 __all__ = ["write_tum"]
 

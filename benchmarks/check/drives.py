@@ -13,8 +13,8 @@ import numpy as np
 from client_sdk.datasets import open_dataset
 from client_sdk.frontend import Frame
 from client_sdk.imu.samples import ImuModel
-from client_sdk.mapping import Trajectory
 from client_sdk.simulator import loop_trajectory, make_world, render_along, render_pairs
+from client_sdk.trajectory import Trajectory
 from rse_pf.geometry import Array, exp_se3, inverse
 from tests.client_sdk.imu.inertial_drive import InertialDrive, Motion
 

@@ -31,9 +31,9 @@ from benchmarks.frame.registry import Bar, benchmark
 from benchmarks.frame.statistics import percentile
 from client_sdk import frontend, mapping
 from client_sdk.frontend import Features, Frame, FrontEndOptions
-from client_sdk.mapping import Trajectory
 from client_sdk.simulator import SIMULATED_CAMERA, render_frames, true_trajectory
 from client_sdk.tracking import tracker
+from client_sdk.trajectory import Trajectory
 from rse_pf.config import PlatformSettings
 from rse_pf.experiments.demo.run import DemoOptions, RobotSpec, run_demo
 from rse_pf.experiments.results.records import read_commands

@@ -34,8 +34,8 @@ from benchmarks.frame.statistics import percentile
 from benchmarks.recorded_drives import truth_of
 from client_sdk.datasets import open_dataset
 from client_sdk.frontend import Frame, FrontEndOptions, extract
-from client_sdk.mapping import Trajectory
 from client_sdk.simulator import make_world, render_along, true_trajectory
+from client_sdk.trajectory import Trajectory
 from client_sdk.transfer.data_client import DataClient
 from rse_pf.geometry import Array, Camera, exp_se3, pose_difference
 from rse_pf.images import load_opencv

@@ -29,11 +29,11 @@ from benchmarks.frame.report import say
 from benchmarks.recorded_drives import RED_KITCHEN, track
 from client_sdk.datasets import Dataset, open_dataset
 from client_sdk.frontend import Frame, TrackedFrame
-from client_sdk.mapping import Trajectory
 from client_sdk.simulator import SIMULATED_CAMERA, true_trajectory
 from client_sdk.simulator.camera import Painter, add_depth_noise, add_image_noise
 from client_sdk.simulator.world import make_world
 from client_sdk.tracking.tracker import Join, Tracker
+from client_sdk.trajectory import Trajectory
 from rse_pf.experiments.results.trajectory_error import ate_m, motion_errors
 from rse_pf.geometry import Array, inverse
 

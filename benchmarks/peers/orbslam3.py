@@ -30,9 +30,9 @@ from benchmarks.frame.registry import Recordings, benchmark
 from benchmarks.frame.report import say
 from client_sdk.datasets import CameraChoice, associate_stamps
 from client_sdk.frontend import load_opencv
-from client_sdk.mapping import Trajectory, read_trajectory
 from client_sdk.rigs.benchmark_files import read_euroc_camera
 from client_sdk.rigs.intrinsics import Intrinsics, read_intrinsics
+from client_sdk.trajectory import Trajectory, read_trajectory
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError
 from rse_pf.experiments.compare.configurations import Configuration, configurations_of

@@ -45,7 +45,6 @@ from client_sdk.bags.stereo import pair_of
 from client_sdk.bags.stream import ImageStream
 from client_sdk.frontend import Frame, load_opencv
 from client_sdk.image_map import ImageMap, map_to_pinhole
-from client_sdk.mapping import Trajectory
 from client_sdk.rigs.imu_track import ImuTrack, with_imu
 from client_sdk.rigs.rectification import Rectification
 from client_sdk.rigs.rig import Rig, RigCamera
@@ -61,6 +60,7 @@ from client_sdk.source_facts import (
     check_source,
     median_depth_m,
 )
+from client_sdk.trajectory import Trajectory
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Array, Camera, Lens, inverse
 

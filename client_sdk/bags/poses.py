@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from client_sdk.mapping import Trajectory
+from client_sdk.trajectory import Trajectory
 from rse_pf.geometry import Array, from_quaternion, inverse
 
 __all__ = ["PoseTopic", "TransformTree"]

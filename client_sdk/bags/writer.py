@@ -16,7 +16,7 @@ import numpy.typing as npt
 from client_sdk.auto_close import Closing
 from client_sdk.bags.message_maker import MessageMaker
 from client_sdk.bags.message_types import PATH, POINT_CLOUD, POSE, TF
-from client_sdk.mapping import Trajectory
+from client_sdk.trajectory import Trajectory
 from rse_pf.errors import MissingExtra, UsageError
 
 __all__ = ["BagKind", "BagWriter", "write_map_bag"]

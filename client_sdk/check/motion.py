@@ -22,8 +22,8 @@ import numpy.typing as npt
 from client_sdk.check.findings import CannotTell, FaultKind, Finding
 from client_sdk.imu.checks import RateCheck, check_rates, find_sample_trouble
 from client_sdk.imu.history import ImuHistory
-from client_sdk.mapping import Trajectory, read_trajectory
 from client_sdk.source_facts import stamps_in_seconds
+from client_sdk.trajectory import Trajectory, read_trajectory
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Array, from_quaternion, inverse, log_se3, rotation_angle_deg, to_quaternion
 

@@ -10,10 +10,10 @@ from typing import Literal
 from client_sdk.datasets.images import readable
 from client_sdk.datasets.thinning import Thinning, median_interval_s
 from client_sdk.frontend import Frame
-from client_sdk.mapping import Trajectory
 from client_sdk.rigs.imu_track import ImuTrack, with_imu
 from client_sdk.rigs.stereo_pair_checks import check_stereo_pairs, choose_pairs
 from client_sdk.source_facts import Doubt, DoubtLog
+from client_sdk.trajectory import Trajectory
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Array, Camera
 

@@ -24,7 +24,6 @@ from client_sdk.datasets.images import check_size, probe, read_colour, read_dept
 from client_sdk.datasets.rig_recordings import CameraChoice, is_euroc, is_kitti, open_euroc, open_kitti
 from client_sdk.frontend import Frame
 from client_sdk.image_map import map_to_pinhole
-from client_sdk.mapping import Trajectory, read_trajectory
 from client_sdk.rigs.folder_camera import find_folder_camera
 from client_sdk.rigs.intrinsics import Intrinsics
 from client_sdk.rigs.rig import Rig
@@ -42,6 +41,7 @@ from client_sdk.source_facts import (
     some_names,
     stamps_in_seconds,
 )
+from client_sdk.trajectory import Trajectory, read_trajectory
 from rse_pf.errors import UsageError
 from rse_pf.files import check_exists, read_regular_file
 from rse_pf.geometry import Camera, Lens

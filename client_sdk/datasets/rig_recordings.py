@@ -18,7 +18,6 @@ from client_sdk.datasets.dataset import Dataset
 from client_sdk.datasets.images import check_size, image_files, probe, read_colour
 from client_sdk.frontend import Frame, load_opencv
 from client_sdk.image_map import map_to_pinhole
-from client_sdk.mapping import Trajectory
 from client_sdk.rigs.benchmark_files import (
     read_euroc_camera,
     read_euroc_imu,
@@ -42,6 +41,7 @@ from client_sdk.source_facts import (
     some_names,
     stamps_in_seconds,
 )
+from client_sdk.trajectory import Trajectory
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Array, from_quaternion
 

@@ -42,10 +42,11 @@ from client_sdk.live.monocular_odometry import MonocularOdometry
 from client_sdk.live.options import LiveOptions
 from client_sdk.live.relocaliser import Relocaliser
 from client_sdk.mapper import AskPose, Mapper
-from client_sdk.mapping import MapOptions, PointMap, Trajectory
+from client_sdk.point_map import MapOptions, PointMap
 from client_sdk.slots import FeaturesFunction, LoopsFunction, MotionFunction
 from client_sdk.tracking.monocular_tracker import MonocularTracker, SeenKeyframe
 from client_sdk.tracking.segments import add_to_cloud
+from client_sdk.trajectory import Trajectory
 from rse_pf.errors import BadMessage, BadRequest, RsePfError, UnsupportedProtocol, UsageError
 from rse_pf.geometry import Array, Camera, pose_difference
 from rse_pf.maps.descriptors import DescriptorKind

@@ -12,10 +12,10 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from client_sdk.frontend import Frame
-from client_sdk.mapping import Trajectory
 from client_sdk.simulator.camera import Painter, add_depth_noise, add_image_noise
 from client_sdk.simulator.world import ROOM_M, ROOMS, World, make_world
 from client_sdk.stereo.view import StereoView
+from client_sdk.trajectory import Trajectory
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Array, Camera
 

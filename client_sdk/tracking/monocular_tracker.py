@@ -23,7 +23,6 @@ from client_sdk.frontend import (
     describe,
     round_for_wire,
 )
-from client_sdk.mapping import Trajectory
 from client_sdk.monocular.bundle import adjust
 from client_sdk.monocular.two_view import TwoViewStart, start_from_two_views
 from client_sdk.slots import Slots
@@ -32,6 +31,7 @@ from client_sdk.tracking.landmark_map import MIN_SHARED, LandmarkLimits, Landmar
 from client_sdk.tracking.place import place_of
 from client_sdk.tracking.queries import Answer, OneQuery, Steps
 from client_sdk.tracking.tracker import Join
+from client_sdk.trajectory import Trajectory
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Array, inverse, pose_difference, rigid, scaled, transform
 from rse_pf.maps.descriptors import ORB, DescriptorKind

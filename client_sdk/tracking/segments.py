@@ -12,11 +12,12 @@ import numpy as np
 import numpy.typing as npt
 
 from client_sdk.frontend import Features, Frame, TrackedFrame
-from client_sdk.mapping import MapOptions, PointMap, Trajectory
+from client_sdk.point_map import MapOptions, PointMap
 from client_sdk.stereo.depth import with_offset
 from client_sdk.tracking.monocular_tracker import MonocularTracker
 from client_sdk.tracking.stereo_adjustment import MOST_KEYFRAMES, StereoAdjustment
 from client_sdk.tracking.tracker import Join
+from client_sdk.trajectory import Trajectory
 from rse_pf.geometry import Array, Camera, inverse, rigid, transform
 from rse_pf.maps.format import Keyframe
 
@@ -63,7 +64,7 @@ class SegmentRecord:
         """Add all of another segment."""
         self.stamps_s += other.stamps_s
         self.poses += [_moved(T_own_other, pose) for pose in other.poses]
-        self.cloud.take(other.cloud, T_own_other)
+        self.cloud.add_map(other.cloud, T_own_other)
         self.keyframes += [
             replace(keyframe, T_world_camera=_moved(T_own_other, keyframe.T_world_camera))
             for keyframe in other.keyframes

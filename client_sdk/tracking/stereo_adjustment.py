@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from client_sdk.mapping import Trajectory
 from client_sdk.tracking.keyframe_map import NO_LANDMARK, KeyframeMap, between
+from client_sdk.trajectory import Trajectory
 from rse_pf.errors import DegenerateGeometry
 from rse_pf.geometry import Array, inverse
 from rse_pf.slam.self_calibration import (

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from client_sdk import DataClient, connect, merge_maps
 from client_sdk.cameras import open_camera
-from client_sdk.mapping import write_ply
+from client_sdk.point_map import write_ply
 from rse_pf.errors import RsePfError
 from rse_pf.maps.format import decode_map
 

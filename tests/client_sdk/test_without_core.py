@@ -10,7 +10,7 @@ import numpy as np
 from rse_pf import native
 native.find_library = lambda: None
 import client_sdk
-from client_sdk.mapping import PointMap
+from client_sdk.point_map import PointMap
 from rse_pf.errors import MissingExtra
 from rse_pf.pnp import solve_pnp
 from rse_pf.pnp.problems import KINECT

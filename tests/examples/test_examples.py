@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from client_sdk.mapping import read_ply, read_trajectory
+from client_sdk.point_map import read_ply
+from client_sdk.trajectory import read_trajectory
 from tests.client_sdk.delaying_proxy import DelayingProxy
 from tests.examples.conftest import ExamplePlatform, Program
 from tests.examples.example_page import REPOSITORY

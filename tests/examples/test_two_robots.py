@@ -6,7 +6,7 @@ import re
 
 import pytest
 
-from client_sdk.mapping import read_ply
+from client_sdk.point_map import read_ply
 from tests.examples.conftest import ExamplePlatform
 
 for _package in ("cv2", "gtsam"):

@@ -17,8 +17,8 @@ import pytest
 
 from client_sdk.cameras import open_camera, read_intrinsics, write_intrinsics
 from client_sdk.datasets import associate_stamps, open_dataset
-from client_sdk.mapping import read_trajectory
 from client_sdk.rigs.intrinsics import Intrinsics
+from client_sdk.trajectory import read_trajectory
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Camera
 

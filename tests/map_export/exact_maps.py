@@ -55,9 +55,10 @@ def points_map(
 def world_map() -> MapVersion:
     """Return the map of a drive through the rendered world at its true poses, z up, which it does not say."""
     from client_sdk.frontend import FrontEndOptions, extract
-    from client_sdk.mapping import PointMap, Trajectory
+    from client_sdk.point_map import PointMap
     from client_sdk.simulator.drive import render_along, true_trajectory
     from client_sdk.simulator.world import make_world
+    from client_sdk.trajectory import Trajectory
 
     truth = true_trajectory(WORLD["robot"], WORLD["robots"], WORLD["frames"], WORLD["seed"])
     rows = np.arange(0, len(truth), 6)

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from client_sdk.mapping import read_trajectory
+from client_sdk.trajectory import read_trajectory
 from rse_pf.config import PlatformSettings
 from rse_pf.local.control.platform import LocalPlatform
 from tests.client_sdk.bags.recorded_bags import write_recording

@@ -20,7 +20,7 @@ from rse_pf.terminal import at_work, counted, show
 
 if TYPE_CHECKING:
     from client_sdk.bags import BagKind, BagOptions
-    from client_sdk.mapping import Trajectory
+    from client_sdk.trajectory import Trajectory
     from rse_pf.maps.format import MapVersion
 
 __all__ = ["BAG_ACTIONS", "add_bag_actions", "export_bag", "run_bags"]
@@ -143,7 +143,8 @@ def _to_bag(args: argparse.Namespace) -> int:
     require("map to-bag")
     kind = _kind(args.out, args.format)
     from client_sdk.bags import write_map_bag
-    from client_sdk.mapping import read_ply, read_trajectory
+    from client_sdk.point_map import read_ply
+    from client_sdk.trajectory import read_trajectory
 
     folders = _robot_folders(args.source)
     paths = [(path.name if path != args.source else "robot", read_trajectory(path / "trajectory.txt"))
@@ -168,7 +169,7 @@ def export_bag(file: Path, version: MapVersion) -> int:
     """
     require("map to-bag")
     from client_sdk.bags import write_map_bag
-    from client_sdk.mapping import Trajectory
+    from client_sdk.trajectory import Trajectory
 
     paths = []
     for robot in sorted({keyframe.robot for keyframe in version.keyframes}):

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from client_sdk.datasets import Dataset
     from client_sdk.frontend import Frame
     from client_sdk.mapper import Mapper
-    from client_sdk.mapping import Trajectory
+    from client_sdk.trajectory import Trajectory
     from rse_pf.geometry import Array
 
 __all__ = [

@@ -12,7 +12,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from client_sdk.mapping import write_trajectory
+from client_sdk.trajectory import write_trajectory
 from rse_pf.experiments.results.trajectory_error import Accuracy
 
 __all__ = ["evo_ate_cm", "evo_command"]

@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from client_sdk.frontend import load_opencv
-from client_sdk.mapping import write_trajectory
 from client_sdk.source_facts import unresolved
+from client_sdk.trajectory import write_trajectory
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import CommandFailed, UsageError
 from rse_pf.experiments.compare.configurations import Configuration

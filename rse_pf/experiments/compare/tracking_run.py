@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from client_sdk.mapper import Mapper
-from client_sdk.mapping import Trajectory
+from client_sdk.trajectory import Trajectory
 from rse_pf.errors import RsePfError, UsageError
 from rse_pf.experiments.compare.configurations import Configuration, failure_line
 from rse_pf.experiments.compare.recordings import Drive

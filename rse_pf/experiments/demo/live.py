@@ -13,7 +13,7 @@ from typing import Any
 
 from client_sdk.frontend import TrackedFrame
 from client_sdk.live import LiveMapper
-from client_sdk.mapping import Trajectory, write_trajectory
+from client_sdk.trajectory import Trajectory, write_trajectory
 from client_sdk.transfer.data_client import DataClient
 from rse_pf.config import SessionSettings
 from rse_pf.errors import RsePfError

@@ -15,7 +15,8 @@ from pathlib import Path
 from typing import Any
 
 from client_sdk.commands.answer_types import Answer, decode_reply
-from client_sdk.mapping import Trajectory, write_ply, write_trajectory
+from client_sdk.point_map import write_ply
+from client_sdk.trajectory import Trajectory, write_trajectory
 from client_sdk.transfer.data_client import DataClient
 from rse_pf.config import SessionSettings
 from rse_pf.errors import CommandFailed, NotFound

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from client_sdk.mapping import read_ply
+from client_sdk.point_map import read_ply
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import CommandFailed
 from rse_pf.experiments.child_process import (

@@ -13,7 +13,8 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from client_sdk.mapping import Trajectory, read_ply, read_trajectory, write_trajectory
+from client_sdk.point_map import read_ply
+from client_sdk.trajectory import Trajectory, read_trajectory, write_trajectory
 from rse_pf.config import PlatformSettings
 from rse_pf.experiments.demo.run import DemoOptions, run_demo
 from rse_pf.experiments.paper.harness import policy_parameters

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from client_sdk.mapping import Trajectory
+from client_sdk.trajectory import Trajectory
 from rse_pf.experiments.plots.map_image import COLOURS, SCALES_M, fitting, pillow
 from rse_pf.geometry import Array
 from rse_pf.terminal import printable

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from client_sdk.mapping import Trajectory, read_trajectory
+from client_sdk.trajectory import Trajectory, read_trajectory
 from rse_pf.errors import RsePfError, UsageError
 from rse_pf.experiments.results.map_error import move_frames
 from rse_pf.experiments.results.markdown import number, table

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from client_sdk.mapping import Trajectory
+from client_sdk.trajectory import Trajectory
 from rse_pf.errors import UsageError
 from rse_pf.experiments.results.markdown import table
 from rse_pf.experiments.results.trajectory_error import align, match_truth

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from client_sdk.mapping import Trajectory
+from client_sdk.trajectory import Trajectory
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Array, body_poses, inverse, pose_difference
 

@@ -15,7 +15,8 @@ import client_sdk
 from client_sdk.bags import BagKind, BagWriter
 from client_sdk.bags.bag_file import open_bag_file
 from client_sdk.bags.message_types import CAMERA_INFO, IMAGE, PATH, POINT_CLOUD, POSE, TF
-from client_sdk.mapping import Trajectory, read_trajectory, write_ply, write_trajectory
+from client_sdk.point_map import write_ply
+from client_sdk.trajectory import Trajectory, read_trajectory, write_trajectory
 from rse_pf.cli.main import main
 from rse_pf.geometry import Camera
 from rse_pf.maps.format import Keyframe, MapVersion, encode_map

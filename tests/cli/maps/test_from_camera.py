@@ -18,8 +18,9 @@ import client_sdk
 from client_sdk.commands.answer_types import PoseAnswer
 from client_sdk.frontend import TrackedFrame
 from client_sdk.mapper import Mapper, ask_robot
-from client_sdk.mapping import Trajectory, read_ply, read_trajectory, write_trajectory
+from client_sdk.point_map import read_ply
 from client_sdk.rigs.intrinsics import Intrinsics, write_intrinsics
+from client_sdk.trajectory import Trajectory, read_trajectory, write_trajectory
 from rse_pf.accounts import set_own_quota
 from rse_pf.cli.main import main
 from rse_pf.cli.maps import from_camera

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from client_sdk.mapping import Trajectory, write_trajectory
+from client_sdk.trajectory import Trajectory, write_trajectory
 from rse_pf.cli.main import main
 from rse_pf.config import PlatformSettings
 from rse_pf.local.processes import ProcessMark, mark_of

@@ -16,7 +16,7 @@ from client_sdk.check.motion import (
 )
 from client_sdk.imu.history import ImuHistory
 from client_sdk.imu.samples import ImuModel
-from client_sdk.mapping import Trajectory
+from client_sdk.trajectory import Trajectory
 from rse_pf.geometry import Array, exp_se3, from_quaternion, to_quaternion
 from tests.client_sdk.imu.inertial_drive import InertialDrive, Motion, SimulatedImu
 

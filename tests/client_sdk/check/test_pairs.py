@@ -14,9 +14,9 @@ from client_sdk.check.motion import MotionReference
 from client_sdk.check.observer import DriveObserver
 from client_sdk.check.pairs import judge_pairs
 from client_sdk.frontend import Frame, TrackedFrame
-from client_sdk.mapping import Trajectory
 from client_sdk.stereo.view import StereoView
 from client_sdk.tracking.stereo_adjustment import StereoAdjustment
+from client_sdk.trajectory import Trajectory
 from rse_pf.geometry import Array, Camera, exp_se3
 
 pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")

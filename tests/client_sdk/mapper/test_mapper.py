@@ -18,10 +18,11 @@ from client_sdk.commands.answer_types import PoseAnswer
 from client_sdk.datasets import open_dataset
 from client_sdk.frontend import Frame, FrontEndOptions, PoseQuery, TrackedFrame
 from client_sdk.mapper import BlockingMapper, Mapper
-from client_sdk.mapping import Trajectory, read_ply, read_trajectory, write_trajectory
 from client_sdk.monocular.scale import OdometryScale
+from client_sdk.point_map import read_ply
 from client_sdk.robot import Robot, connect
 from client_sdk.tracking.monocular_tracker import MonocularOptions, MonocularTracker
+from client_sdk.trajectory import Trajectory, read_trajectory, write_trajectory
 from rse_pf.errors import Busy, MissingExtra, UsageError
 from rse_pf.experiments.results.trajectory_error import accuracy
 from rse_pf.geometry import exp_se3

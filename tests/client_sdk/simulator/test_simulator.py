@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from client_sdk.frontend import PoseQuery
-from client_sdk.mapping import Trajectory
 from client_sdk.simulator import (
     SIMULATED_CAMERA,
     frames_to_overlap,
@@ -16,6 +15,7 @@ from client_sdk.simulator import (
 from client_sdk.simulator.camera import Painter, add_depth_noise
 from client_sdk.simulator.world import DEPTH_M, DOOR_Y_M, HEIGHT_M, ROOM_M, make_world
 from client_sdk.tracking.tracker import Tracker
+from client_sdk.trajectory import Trajectory
 from rse_pf.errors import UsageError
 from rse_pf.experiments.results.trajectory_error import accuracy
 from rse_pf.geometry import pose_difference, transform

@@ -11,11 +11,11 @@ import pytest
 
 from client_sdk.datasets.rig_recordings import open_kitti
 from client_sdk.frontend import Frame, PoseQuery, TrackedFrame
-from client_sdk.mapping import Trajectory
 from client_sdk.tracking.keyframe_map import NO_LANDMARK
 from client_sdk.tracking.landmark_map import LandmarkMap, ViewFeatures
 from client_sdk.tracking.monocular_tracker import MonocularOptions, MonocularTracker
 from client_sdk.tracking.place import place_of
+from client_sdk.trajectory import Trajectory
 from rse_pf.errors import UsageError
 from rse_pf.experiments.results.trajectory_error import accuracy
 from rse_pf.geometry import Array, Camera, exp_se3, inverse, pose_difference, transform

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from client_sdk.mapping import MapOptions, PointMap
+from client_sdk.point_map import MapOptions, PointMap
 from client_sdk.tracking.segments import SeenPoints, SegmentRecord
 from client_sdk.tracking.stereo_adjustment import MOST_KEYFRAMES, StereoAdjustment
 

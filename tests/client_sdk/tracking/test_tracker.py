@@ -10,8 +10,8 @@ import pytest
 
 from client_sdk.datasets import open_dataset
 from client_sdk.frontend import Frame, FrontEndOptions, PoseQuery, TrackedFrame
-from client_sdk.mapping import Trajectory
 from client_sdk.tracking.tracker import Tracker
+from client_sdk.trajectory import Trajectory
 from rse_pf.errors import UsageError
 from rse_pf.experiments.results.trajectory_error import accuracy
 from rse_pf.geometry import Array, inverse, pose_difference

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from client_sdk.mapping import Trajectory, read_trajectory
+from client_sdk.trajectory import Trajectory, read_trajectory
 from rse_pf.config import PlatformSettings
 from rse_pf.experiments.compare import evo_figures, run
 from rse_pf.experiments.compare.configurations import configurations_of

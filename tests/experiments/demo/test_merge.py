@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from client_sdk.mapping import Trajectory, read_ply, read_trajectory
+from client_sdk.point_map import read_ply
+from client_sdk.trajectory import Trajectory, read_trajectory
 from rse_pf.errors import CommandFailed
 from rse_pf.experiments.demo.merge import MAP_FILE, MERGED_MAP, print_tenths, write_merged
 from rse_pf.maps.format import MapVersion, decode_map, encode_map

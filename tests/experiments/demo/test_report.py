@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from client_sdk.mapping import Trajectory
+from client_sdk.trajectory import Trajectory
 from rse_pf.experiments.demo.report import advice, closing_lines, is_lost, make_report
 from rse_pf.experiments.demo.robot import RobotFinished, _is_metric
 from rse_pf.experiments.results.records import CommandRecord

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from client_sdk.mapping import Trajectory
+from client_sdk.trajectory import Trajectory
 from rse_pf.experiments.plots.map_image import COLOURS
 from rse_pf.experiments.plots.trajectory_image import _TRUTH, DrawnPath, Panel, draw_trajectories, pieces
 

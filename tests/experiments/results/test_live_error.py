@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from client_sdk.mapping import Trajectory, write_trajectory
+from client_sdk.trajectory import Trajectory, write_trajectory
 from rse_pf.errors import UsageError
 from rse_pf.experiments.results.live_error import (
     LIVE_RECORDS,

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from client_sdk.mapping import Trajectory, write_trajectory
+from client_sdk.trajectory import Trajectory, write_trajectory
 from rse_pf.errors import UsageError
 from rse_pf.experiments.results.live_error import LIVE_RECORDS, TRUTH
 from rse_pf.experiments.results.live_faults import fault_rows, live_fault_figures

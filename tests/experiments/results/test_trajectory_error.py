@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from client_sdk.mapping import Trajectory, read_trajectory
+from client_sdk.trajectory import Trajectory, read_trajectory
 from rse_pf.errors import UsageError
 from rse_pf.experiments.results.trajectory_error import (
     accuracy,

@@ -10,7 +10,8 @@ from typing import Any
 
 import pytest
 
-from client_sdk.mapping import read_ply, read_trajectory
+from client_sdk.point_map import read_ply
+from client_sdk.trajectory import read_trajectory
 from rse_pf.maps.registry import MapRegistry
 from rse_pf.object_store import DirectoryStore
 
