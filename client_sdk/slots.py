@@ -33,7 +33,7 @@ from client_sdk.monocular.bundle import Bundle
 from rse_pf.errors import BadRequest, UsageError
 from rse_pf.geometry import Array, Camera, rigid
 from rse_pf.maps.descriptors import MAX_DESCRIPTOR_SIZE, ORB, DescriptorKind, Descriptors
-from rse_pf.slam.places import PlaceVector
+from rse_pf.slam.place_recognition import PlaceVector
 
 __all__ = [
     "CheckedFeatures",

@@ -24,7 +24,7 @@ from rse_pf.slam.keyframe import (
     make_features,
 )
 from rse_pf.slam.localise import LocalisationCandidate, localise
-from rse_pf.slam.places import place_vector
+from rse_pf.slam.place_recognition import place_vector
 from tests.synthetic_maps import make_world
 
 __all__ = ["live"]

@@ -1,4 +1,4 @@
-"""Train the vocabulary of `rse_pf.slam.places` from rendered worlds, and write it to its file.
+"""Train the vocabulary of `rse_pf.slam.place_recognition` from rendered worlds, and write it to its file.
 
 No recording takes part, so the package carries nobody's images.  The worlds' seeds are used by no test and no
 benchmark.  It needs the package faiss-cpu, and takes about two minutes on one core:
@@ -21,7 +21,7 @@ from client_sdk.simulator import SIMULATED_CAMERA, true_trajectory
 from client_sdk.simulator.camera import Painter, add_depth_noise, add_image_noise
 from client_sdk.simulator.world import make_world
 from rse_pf.maps.descriptors import ORB, Descriptors
-from rse_pf.slam.places import PARTS, PLACE_WORDS_FILE, WORDS
+from rse_pf.slam.place_recognition import DIRECTIONS, VOCABULARY_FILE, WORDS
 
 WORLDS = range(101, 107)
 FRAMES, EACH = 410, 8
@@ -33,11 +33,11 @@ MAX_TRAINING, KMEANS_ITERATIONS = 20_000, 12
 def main() -> None:
     """Render, train and write."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--out", type=Path, default=PLACE_WORDS_FILE)
+    parser.add_argument("--out", type=Path, default=VOCABULARY_FILE)
     out = parser.parse_args().out
     views = [view for world in WORLDS for view in rendered_views(world)]
     words = train_words(views)
-    data = _int8(words, 1.0) + _int8(directions_of(views, words, PARTS), None)
+    data = _int8(words, 1.0) + _int8(directions_of(views, words, DIRECTIONS), None)
     out.write_bytes(data)
     print(f"{out}: {len(data)} bytes from {len(views)} views, sha256 {hashlib.sha256(data).hexdigest()}")
 

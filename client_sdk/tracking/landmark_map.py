@@ -17,7 +17,7 @@ from client_sdk.tracking.keyframe_map import NO_LANDMARK, Landmarks
 from client_sdk.tracking.place import Place
 from rse_pf.geometry import Array, Camera, exp_se3, inverse, log_se3, scaled, transform
 from rse_pf.maps.descriptors import Descriptors
-from rse_pf.slam.places import PlaceVector
+from rse_pf.slam.place_recognition import PlaceVector
 from rse_pf.slam.tracking import ImageFeatures, NearLimits
 from rse_pf.slam.triangulation import parallax_deg, reprojection_errors, triangulate
 

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from client_sdk.slots import LoopsSlot
 from rse_pf.maps.descriptors import Descriptors
-from rse_pf.slam.places import PlaceVector, place_vector
+from rse_pf.slam.place_recognition import PlaceVector, place_vector
 
 __all__ = ["Place", "place_of"]
 

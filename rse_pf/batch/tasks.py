@@ -31,7 +31,7 @@ from rse_pf.slam.links import (
     measure_pairs,
 )
 from rse_pf.slam.optimise import OptimiseOptions, optimise_graph
-from rse_pf.slam.places import PLACE_NUMBERS, PlaceIndex, place_vector
+from rse_pf.slam.place_recognition import PLACE_VECTOR_SIZE, PlaceIndex, place_vector
 from rse_pf.slam.pose_graph import PoseGraph
 
 __all__ = [
@@ -118,7 +118,7 @@ def _vectors(store: ObjectStore, part: Part) -> PartResult:
     """Describe each keyframe of a map by a vector."""
     atlas = _atlas(store, part, 1)
     vectors = [place_vector(keyframe.descriptors) for keyframe in atlas.keyframes]
-    return PartResult(arrays={"vectors": np.array(vectors, dtype=np.float32).reshape(-1, PLACE_NUMBERS)})
+    return PartResult(arrays={"vectors": np.array(vectors, dtype=np.float32).reshape(-1, PLACE_VECTOR_SIZE)})
 
 
 def _pairs(store: ObjectStore, part: Part) -> PartResult:
@@ -127,7 +127,7 @@ def _pairs(store: ObjectStore, part: Part) -> PartResult:
     of_map = np.concatenate([np.full(len(each), which) for which, each in enumerate(vectors)])
     stacked = np.concatenate(vectors)
     pairs = candidate_pairs(
-        PlaceIndex.of(stacked),
+        PlaceIndex.from_vectors(stacked),
         of_map,
         np.arange(len(stacked)),
         _options(part),

@@ -15,7 +15,7 @@ import numpy as np
 
 from rse_pf.errors import BadRequest, message_of
 from rse_pf.live_map.graph import Graph
-from rse_pf.slam.places import PLACE_NUMBERS, PlaceIndex
+from rse_pf.slam.place_recognition import PLACE_VECTOR_SIZE, PlaceIndex
 
 __all__ = ["FeatureParts", "SnapshotParts"]
 
@@ -84,7 +84,7 @@ class FeatureParts:
                 for i, keyframe, vector in rows:
                     if held[i]:
                         graph.set_data(i, keyframe)
-                        places.add(i, np.frombuffer(vector, dtype="<f4", count=PLACE_NUMBERS))
+                        places.add(i, np.frombuffer(vector, dtype="<f4", count=PLACE_VECTOR_SIZE))
                 if (number + 1) * _KEYFRAMES <= len(graph):
                     parts._full[number] = name, frozenset(i for i, _, _ in rows)
         except (msgspec.MsgspecError, KeyError, IndexError, ValueError) as error:

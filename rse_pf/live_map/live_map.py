@@ -72,7 +72,7 @@ from rse_pf.maps.format import MapVersion
 from rse_pf.slam.keyframe import SentKeyframe, check_odometry_range, decode_keyframe
 from rse_pf.slam.localise import LocalisationOptions, Localised, localise, spread_candidates
 from rse_pf.slam.optimise import OptimiseOptions, optimise_graph
-from rse_pf.slam.places import PlaceIndex
+from rse_pf.slam.place_recognition import PlaceIndex, place_vector
 from rse_pf.slam.pose_graph import PoseGraph
 
 __all__ = ["LiveMap"]
@@ -316,7 +316,7 @@ class LiveMap:
         aligned = np.flatnonzero(graph.held & self._aligned_mask())
         most = self.options.candidates
         # More are looked at, so that a second place that looks alike is compared, too.
-        found = self._places.nearest(PlaceIndex.vector(view.features.descriptors), 6 * most, aligned)
+        found = self._places.nearest(place_vector(view.features.descriptors), 6 * most, aligned)
         chosen = [
             (self._stored(i), graph.T[i].copy(), graph.segment_of(i).scale)
             for i in spread_candidates(found, graph.T, most)
@@ -397,7 +397,7 @@ class LiveMap:
             ),
             row, T_odom, T, way,
         )  # fmt: skip
-        self._places.add(i, PlaceIndex.vector(keyframe.features.descriptors))
+        self._places.add(i, place_vector(keyframe.features.descriptors))
         graph.next_numbers[event.robot] = event.number + 1
         graph.newest[event.robot] = row
         if graph.root < 0 and segment.is_metric:
@@ -520,7 +520,7 @@ class LiveMap:
                 data=start.data,
             )  # fmt: skip
             i = graph.add(row, 0, T_map_camera, T_map_camera, 0.0)
-            self._places.add(i, PlaceIndex.vector(keyframe.features.descriptors))
+            self._places.add(i, place_vector(keyframe.features.descriptors))
             outcomes.append(Added(id=i))
         information = np.array([matrix_of(link.information, 6, 6) for link in event.links]).reshape(-1, 6, 6)
         for link, each_link, variances in zip(

@@ -21,7 +21,7 @@ from rse_pf.maps.format import Keyframe, MapVersion
 from rse_pf.service import Report
 from rse_pf.slam.consistency import LinkEnds, LoopClosure, OdometryNoise, consistent, fits_prediction
 from rse_pf.slam.optimise import ignore_progress
-from rse_pf.slam.places import PlaceIndex, place_vector
+from rse_pf.slam.place_recognition import PlaceIndex, place_vector
 from rse_pf.slam.relative_pose import (
     RelativePoseOptions,
     landmarks_of_keyframe,
@@ -138,7 +138,7 @@ def propose_links(atlas: Atlas, options: MergeOptions, report: Report = ignore_p
             f"up to {most} pairs of keyframes are above {_MAX_PAIRS}",
             hint="merge fewer maps at once, or ask for fewer candidates",
         )
-    index = PlaceIndex.of(place_vector(keyframe.descriptors) for keyframe in atlas.keyframes)
+    index = PlaceIndex.from_vectors(place_vector(keyframe.descriptors) for keyframe in atlas.keyframes)
     pairs = candidate_pairs(index, atlas.of_map, atlas.order, options)
     links, failed = measure_pairs(
         atlas, pairs, options, lambda done, what: report(0.1 + 0.7 * done, what)

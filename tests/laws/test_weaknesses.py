@@ -64,7 +64,7 @@ NO_SECRETS: Mapping[tuple[str, str], str] = {
     ("tests/audit/test_entry.py", "JSON Web Token"): "made up, to be looked for in the audit log",
     ("tests/config/test_settings.py", "Secret Keyword"): "the name of a file",
     ("tests/test_identity.py", "Base64 High Entropy String"): "the example of RFC 8037",
-    ("tests/slam/test_places.py", "Hex High Entropy String"): "the digest of a vector",
+    ("tests/slam/test_place_recognition.py", "Hex High Entropy String"): "the digest of a vector",
     (
         "examples/robots/object_recognition_service/requests/photo.json",
         "Base64 High Entropy String",

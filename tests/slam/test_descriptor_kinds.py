@@ -34,7 +34,7 @@ from rse_pf.slam.keyframe import (
     max_features,
 )
 from rse_pf.slam.links import Atlas
-from rse_pf.slam.places import place_vector
+from rse_pf.slam.place_recognition import place_vector
 from rse_pf.slam.tracking import ImageFeatures, NearLimits, SoughtFeatures, distinct_distances, match_near
 from rse_pf.wire import Command, Failure, Result
 from tests.live_map.generated_drives import GeneratedWorld, circle

@@ -24,7 +24,7 @@ from rse_pf.maps.descriptors import (
 )
 from rse_pf.maps.format import Keyframe, MapLimits, MapVersion, decode_map
 from rse_pf.service import Registry
-from rse_pf.slam.places import PlaceIndex, place_vector
+from rse_pf.slam.place_recognition import PlaceIndex, place_vector
 from rse_pf.slam.relative_pose import View, landmarks_of_keyframe, measure_pose
 from rse_pf.wire.arrays import Array, reshaped
 
@@ -120,7 +120,9 @@ class MapIndex:
         self.keyframes = tuple(keyframes)
         self.kind = common_kind((keyframe.kind for keyframe in self.keyframes), "the map")
         self.T_map_keyframe = np.array([keyframe.T_world_camera for keyframe in self.keyframes])
-        self._places = PlaceIndex.of(place_vector(keyframe.descriptors) for keyframe in self.keyframes)
+        self._places = PlaceIndex.from_vectors(
+            place_vector(keyframe.descriptors) for keyframe in self.keyframes
+        )
 
     def nearest(
         self, descriptors: Descriptors, count: int, within: Within | None = None

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from rse_pf.errors import BadRequest
-from rse_pf.slam.places import PLACE_NUMBERS, PLACE_WORDS_FILE, PlaceIndex, place_vector
+from rse_pf.slam.place_recognition import PLACE_VECTOR_SIZE, VOCABULARY_FILE, PlaceIndex, place_vector
 from tests.synthetic_maps import make_world
 
 
 def unit_vectors(n: int, seed: int = 1):
-    vectors = np.random.default_rng(seed).normal(size=(n, PLACE_NUMBERS)).astype(np.float32)
+    vectors = np.random.default_rng(seed).normal(size=(n, PLACE_VECTOR_SIZE)).astype(np.float32)
     return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 
@@ -25,13 +25,13 @@ def index_of(vectors, ids=None) -> PlaceIndex:
 
 
 def test_the_vocabulary_is_small_enough_for_the_package():
-    assert PLACE_WORDS_FILE.stat().st_size == 32 * 256 + 256 * 16
+    assert VOCABULARY_FILE.stat().st_size == 32 * 256 + 256 * 16
 
 
 def test_a_vector_has_length_one_and_that_of_an_empty_view_is_zero():
     descriptors = np.random.default_rng(2).integers(0, 256, (700, 32), dtype=np.uint8)
 
-    assert place_vector(descriptors).shape == (PLACE_NUMBERS,)
+    assert place_vector(descriptors).shape == (PLACE_VECTOR_SIZE,)
     assert np.linalg.norm(place_vector(descriptors)) == pytest.approx(1.0, abs=1e-6)
     assert not place_vector(descriptors[:0]).any()
 
