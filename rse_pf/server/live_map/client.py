@@ -6,6 +6,7 @@ The client keeps one `MapConnection` for each map in use, and the map-server pro
 from __future__ import annotations
 
 import asyncio
+import functools
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -68,7 +69,6 @@ class LiveMapClient:
         self._settings = settings
         self._on_update = on_update
         self._connections: dict[tuple[str, str], MapConnection] = {}  # by tenant and map name
-        self._key: bytes | None = None
         self._threads = ThreadPoolExecutor(_STORE_THREADS, thread_name_prefix="live-link")
         self._pool = MapServerPool(
             lambda at_low_priority: start_map_server(
@@ -83,7 +83,7 @@ class LiveMapClient:
             server_id=server_id,
             log=log,
             call=lambda act: asyncio.get_running_loop().run_in_executor(self._threads, act),
-            key=self._read_key,
+            key=functools.cache(lambda: internal_key(store)),
             pool=self._pool,
             clock=time.monotonic,
             wall_clock=time.time,
@@ -189,12 +189,6 @@ class LiveMapClient:
     def _remove(self, connection: MapConnection) -> None:
         self._connections.pop((connection.tenant, connection.map_name), None)
         self._update_spare()
-
-    def _read_key(self) -> bytes:
-        """Return the key that signs tokens between servers, which is read from the store once; blocks."""
-        if self._key is None:
-            self._key = internal_key(self._store)
-        return self._key
 
     def _read_maps(self, tenant: str) -> list[dict[str, Any]]:
         """Return the fields of ``live-list`` for each map of *tenant* that has a lease; blocks."""

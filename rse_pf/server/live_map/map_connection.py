@@ -144,8 +144,6 @@ class MapConnection:
         """Whether robots of this worker subscribe to the map."""
         self.may_start = False
         """Whether a map server is started for these subscribers."""
-        self.process: MapServerProcess | None = None
-        """Process of this worker that claims or serves the map."""
         self._context = context
         self._on_update = on_update
         self._on_end = on_end
@@ -304,7 +302,6 @@ class MapConnection:
             server=self._context.server_id,
             known=self._lease.known,
         )
-        self.process = process
         silent_s, began_s = self._lease.unchanged_s, self._context.clock()
         has_won = await process.claim(order)
         self._context.log.info(
@@ -323,8 +320,6 @@ class MapConnection:
         if process.epoch is not None:
             self._dead_epoch = process.epoch
             self._context.log.info("live-owner-ended", map=self.map_name, epoch=process.epoch, code=exit_code)
-        if self.process is process:
-            self.process = None
         self._wake.set()
 
     # --- Talking with the map server ---

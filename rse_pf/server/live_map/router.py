@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import math
 import traceback
+from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -52,7 +53,7 @@ from rse_pf.wire.live_map import (
     map_of_topic,
 )
 
-__all__ = ["LIVE_LIST", "LIVE_SERVICES", "InvalidRequestCounter", "LiveMapRouter"]
+__all__ = ["LIVE_LIST", "LIVE_SERVICES", "LiveMapRouter"]
 
 LIVE_LIST = "live-list"
 """Name of the service that lists the live maps of the tenant; the worker answers it from the store."""
@@ -98,10 +99,6 @@ class InvalidRequestCounter:
 
     def __init__(self) -> None:
         self._by_robot: dict[RobotId, _InvalidRequests] = {}
-
-    def __len__(self) -> int:
-        """Return the number of robots with a count."""
-        return len(self._by_robot)
 
     def count(self, robot: RobotId, now: float) -> None:
         """Count one invalid request of *robot* at the monotonic time *now* in seconds."""
@@ -149,8 +146,8 @@ class LiveMapRouter(CommandQueue):
         self._invalid_requests = InvalidRequestCounter()
         self._tasks: dict[asyncio.Task[None], QueuedCommand] = {}
         self._waiting_bytes = 0
-        self._waiting_bytes_of_tenant: dict[str, int] = {}
-        self._waiting_of_robot: dict[RobotId, int] = {}  # number of commands
+        self._waiting_bytes_of_tenant: Counter[str] = Counter()
+        self._waiting_of_robot: Counter[RobotId] = Counter()  # number of commands
         self._subscriptions = Subscriptions(
             loop=context.loop,
             log=context.log,
@@ -169,7 +166,7 @@ class LiveMapRouter(CommandQueue):
 
     def backlog(self, queued: QueuedCommand) -> QueueBacklog:
         """Return the number of commands to live maps by the robot of *queued* that have no answer yet."""
-        return QueueBacklog(self._waiting_of_robot.get(queued.robot, 0))
+        return QueueBacklog(self._waiting_of_robot[queued.robot])
 
     # --- Commands of robots and operators ---
 
@@ -178,7 +175,7 @@ class LiveMapRouter(CommandQueue):
         tenant = queued.robot.tenant
         try:
             self._check_not_blocked(queued.robot, now)
-            tenant_bytes = self._waiting_bytes_of_tenant.get(tenant, 0) + queued.size_bytes
+            tenant_bytes = self._waiting_bytes_of_tenant[tenant] + queued.size_bytes
             worker_bytes = self._waiting_bytes + queued.size_bytes
             if tenant_bytes > _MAX_WAITING_BYTES_PER_TENANT or worker_bytes > _MAX_WAITING_BYTES:
                 raise Busy(
@@ -197,7 +194,7 @@ class LiveMapRouter(CommandQueue):
         self._tasks[task] = queued
         self._waiting_bytes = worker_bytes
         self._waiting_bytes_of_tenant[tenant] = tenant_bytes
-        self._waiting_of_robot[queued.robot] = self._waiting_of_robot.get(queued.robot, 0) + 1
+        self._waiting_of_robot[queued.robot] += 1
         task.add_done_callback(self._on_answered)
 
     def _prepare_request(self, queued: QueuedCommand, now: float) -> Callable[[], Any]:
@@ -267,14 +264,9 @@ class LiveMapRouter(CommandQueue):
     def _on_answered(self, task: asyncio.Task[None]) -> None:
         """Subtract an answered command from the numbers of waiting commands and bytes."""
         queued = self._tasks.pop(task)
-        tenant = queued.robot.tenant
         self._waiting_bytes -= queued.size_bytes
-        self._waiting_bytes_of_tenant[tenant] -= queued.size_bytes
-        if not self._waiting_bytes_of_tenant[tenant]:
-            del self._waiting_bytes_of_tenant[tenant]
-        remaining = self._waiting_of_robot.pop(queued.robot) - 1
-        if remaining:
-            self._waiting_of_robot[queued.robot] = remaining
+        _subtract(self._waiting_bytes_of_tenant, queued.robot.tenant, queued.size_bytes)
+        _subtract(self._waiting_of_robot, queued.robot, 1)
 
     def _answer_failure(self, queued: QueuedCommand, error: RsePfError) -> None:
         self._answer(queued, failure_of(error, queued.command, server=self._context.server_id))
@@ -382,6 +374,13 @@ class LiveMapRouter(CommandQueue):
         self.close()
         await asyncio.gather(*self._tasks, return_exceptions=True)
         await self._client.close()
+
+
+def _subtract(counter: Counter[Any], key: Any, number: int) -> None:
+    """Subtract *number* from the count of *key*, and remove a count of 0, so that memory stays bounded."""
+    counter[key] -= number
+    if not counter[key]:
+        del counter[key]
 
 
 def _find_scope_error(claims: Claims | None, scope: str, map_name: str) -> RsePfError | None:

@@ -29,11 +29,9 @@ from rse_pf.live_map.outcomes import Outcome
 from rse_pf.object_store import ObjectStore, digest_of
 from rse_pf.server.live_map.map_server.environment import (
     FIRST_RETRY_S,
-    MapServerThreads,
-    Sleep,
+    MapServerEnvironment,
     next_retry_s,
 )
-from rse_pf.server.log import JsonLog
 
 __all__ = [
     "BUSY_RETRY_MS",
@@ -362,36 +360,27 @@ class LogWriter:
     def __init__(
         self,
         log: LiveLog,
+        environment: MapServerEnvironment,
         *,
         apply_entry: Callable[[int, list[SubmittedEvent]], Awaitable[None]],
         on_waiting: Callable[[bool], None],
         on_lost: Callable[[str], None],
-        threads: MapServerThreads,
-        sleep: Sleep,
-        json_log: JsonLog,
-        map_name: str,
     ) -> None:
         """Write nothing until `run` is called.
 
         Args:
             log: Log of the map.
+            environment: Environment of the map server.
             apply_entry: Called with the number and the events of each entry when it is durable; applies the
                 events to the map and sets the result of each ``applied``.
             on_waiting: Called with True when the store is slow or fails, with False when it works again.
             on_lost: Called with a reason when another process has taken the map over.
-            threads: Threads of the map server; one of them writes entries.
-            sleep: Waits for a number of seconds.
-            json_log: Log of the server.
-            map_name: Name of the map in lines of *json_log*.
         """
         self._log = log
+        self._environment = environment
         self._apply_entry = apply_entry
         self._on_waiting = on_waiting
         self._on_lost = on_lost
-        self._threads = threads
-        self._sleep = sleep
-        self._json_log = json_log
-        self._map_name = map_name
         self._queue: deque[SubmittedEvent] = deque()
         self._has_events = asyncio.Event()
         self._outstanding: set[asyncio.Future[list[Outcome]]] = set()
@@ -469,11 +458,12 @@ class LogWriter:
         Raises:
             StoreFull: There is no space for the keyframes of *batch*, and the entry was not stored.
         """
+        environment = self._environment
         data = encode_events([submitted.event for submitted in batch])
         has_keyframes = any(isinstance(submitted.event, KeyframeAdded) for submitted in batch)
         wait_s = FIRST_RETRY_S
         while True:
-            write = asyncio.ensure_future(self._threads.store(lambda: self._log.write_entry(data)))
+            write = asyncio.ensure_future(environment.threads.store(lambda: self._log.write_entry(data)))
             try:
                 await asyncio.wait({write}, timeout=SLOW_STORE_S)
                 self._on_waiting(not write.done())
@@ -484,9 +474,9 @@ class LogWriter:
             except StoreError as error:
                 if isinstance(error, StoreFull) and has_keyframes and await self._is_entry_missing():
                     raise
-                self._json_log.warning("live-log-retry", map=self._map_name, error=error.message)
+                environment.log.warning("live-log-retry", map=environment.map_name, error=error.message)
                 self._on_waiting(wait_s > FIRST_RETRY_S)
-                await self._sleep(wait_s)
+                await environment.sleep(wait_s)
                 wait_s = next_retry_s(wait_s)
             else:
                 self._on_waiting(False)
@@ -495,7 +485,7 @@ class LogWriter:
     async def _is_entry_missing(self) -> bool:
         """Return whether the next entry certainly does not exist, so that it may get another content."""
         try:
-            return not await self._threads.store(self._log.has_next_entry)
+            return not await self._environment.threads.store(self._log.has_next_entry)
         except StoreError:
             return False
 

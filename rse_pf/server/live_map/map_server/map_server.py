@@ -140,22 +140,12 @@ class MapServer:
         self._updates = MapUpdates(self._name_of)
         self._writer = LogWriter(
             log,
+            environment,
             apply_entry=self.apply_entry,
+            on_waiting=self.set_waiting_for_store,
             on_lost=self.lose,
-            on_waiting=lambda is_waiting: self.set_waiting_for_store(is_waiting=is_waiting),
-            threads=environment.threads,
-            sleep=environment.sleep,
-            json_log=environment.log,
-            map_name=environment.map_name,
         )
-        self._measurer = KeyframeMeasurer(
-            state,
-            environment.threads,
-            self._writer.submit,
-            optimise=environment.optimise,
-            json_log=environment.log,
-            map_name=environment.map_name,
-        )
+        self._measurer = KeyframeMeasurer(state, environment, self._writer.submit)
         self._publisher = Publisher(state, environment, server=lease.record.server)
         self._additions: dict[tuple[str, int], asyncio.Task[None]] = {}  # by robot and keyframe number
         self._present_robots: dict[str, None] = {}
@@ -167,14 +157,10 @@ class MapServer:
         self._is_closing = False
         self._idle_since_s = self._began_s = environment.clock()
         self._publish_due_s = self._began_s + PUBLISH_INTERVAL_S
-        self._is_used, self._last_command_s = False, float("-inf")
+        self._is_used = False
+        self._last_command_s = float("-inf")
         self._ended: asyncio.Future[ServiceEnd] = asyncio.get_running_loop().create_future()
         self._tasks: set[asyncio.Task[None]] = set()
-
-    @property
-    def is_closing(self) -> bool:
-        """Whether the map is being given up, or was given up or lost."""
-        return self._ended.done() or self._is_closing
 
     def current_updates(self) -> list[dict[str, Any]]:
         """Return the updates for a new subscriber; none while another process may hold the lease."""
@@ -212,7 +198,7 @@ class MapServer:
             MapMoving: The map is being given up, or is lost.
             RsePfError: The request is refused.
         """
-        if self.is_closing:
+        if self._is_closing or self._ended.done():
             raise self._moving_error()
         self._robot_names[robot.folder] = robot.name
         self._set_used(is_used=True)
@@ -313,7 +299,7 @@ class MapServer:
             reservation = asyncio.ensure_future(self._environment.threads.store(reserve))
             await asyncio.wait({reservation}, timeout=SLOW_STORE_S)
             if not reservation.done():
-                self.set_waiting_for_store(is_waiting=True)
+                self.set_waiting_for_store(True)
             try:
                 await reservation
             except StoreFull:
@@ -668,7 +654,7 @@ class MapServer:
             return "moving"
         return _WAITING_FOR_STORE if self._is_waiting_for_store else "live"
 
-    def set_waiting_for_store(self, *, is_waiting: bool) -> None:
+    def set_waiting_for_store(self, is_waiting: bool) -> None:
         """Notify subscribers that the store is slow or fails, or that it works again."""
         if is_waiting != self._is_waiting_for_store:
             self._is_waiting_for_store = is_waiting

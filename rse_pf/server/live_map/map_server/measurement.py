@@ -23,9 +23,8 @@ from rse_pf.geometry import Array
 from rse_pf.ipc import encode_message, receive
 from rse_pf.live_map.events import Event
 from rse_pf.live_map.measure import merge_measurements
-from rse_pf.server.live_map.map_server.environment import GraphOptimiser, MapServerThreads, Urgency
+from rse_pf.server.live_map.map_server.environment import MapServerEnvironment, Urgency
 from rse_pf.server.live_map.map_server.state import MapState
-from rse_pf.server.log import JsonLog
 from rse_pf.slam.optimise import OptimiseOptions, optimise_graph
 from rse_pf.slam.pose_graph import PoseGraph
 
@@ -75,29 +74,20 @@ class KeyframeMeasurer:
     def __init__(
         self,
         state: MapState,
-        threads: MapServerThreads,
+        environment: MapServerEnvironment,
         submit: Callable[[Event], Any],
-        *,
-        optimise: GraphOptimiser,
-        json_log: JsonLog,
-        map_name: str,
     ) -> None:
         """Queue the keyframes that the previous map server has not measured; `run` begins with them.
 
         Args:
             state: The map.
-            threads: Threads of the map server.
+            environment: Environment of the map server.
             submit: Queues an event for the log.
-            optimise: Optimises the whole pose graph; called in a thread.
-            json_log: Log of the server.
-            map_name: Name of the map in lines of *json_log*.
         """
         self._state = state
-        self._threads = threads
+        self._environment = environment
+        self._threads = environment.threads
         self._submit = submit
-        self._optimise = optimise
-        self._json_log = json_log
-        self._map_name = map_name
         self._waiting = deque(state.unmeasured)
         self._has_work = asyncio.Event()
         self._has_work.set()
@@ -149,11 +139,11 @@ class KeyframeMeasurer:
         self._has_measured = True
 
     async def _optimise_graph(self) -> None:
-        prepare = functools.partial(self._state.prepare_optimisation, self._optimise)
+        prepare = functools.partial(self._state.prepare_optimisation, self._environment.optimise)
         optimise = await self._threads.compute(Urgency.BACKGROUND, prepare)
         optimised = await self._threads.match(optimise)
         if optimised is None:
-            self._json_log.warning("live-optimisation-failed", map=self._map_name)
+            self._environment.log.warning("live-optimisation-failed", map=self._environment.map_name)
         else:
             self._submit(optimised)
 

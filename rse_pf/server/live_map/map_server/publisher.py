@@ -56,7 +56,6 @@ _FIRST_RETRY_S = 5.0
 """Seconds after which a failed publication is tried again for the first time; the wait doubles each time."""
 _MAX_RETRY_S = 600.0
 """Longest wait in seconds before a failed publication is tried again: encoding a large map takes seconds."""
-_NOTHING_PUBLISHED = -1  # no state of the map has this number of changes
 _MAX_COMMIT_TRIES = 5
 """How often a version is committed again after another process has moved the head of the map."""
 
@@ -81,7 +80,7 @@ class Publisher:
         self._min_interval_s = environment.settings.publish_pause_s
         self._lock = asyncio.Lock()  # one publication at a time
         self._source_up: tuple[str, list[float] | None] = "", None  # source version: its vector of up
-        self._published_changes = _NOTHING_PUBLISHED
+        self._published_changes: int | None = None  # value of MapState.changes in the last version
         self._last_record: MapRecord | None = None
         self._next_allowed_s: float | None = None
         self._due_note = ""

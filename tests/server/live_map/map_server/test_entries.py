@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Awaitable, Callable
+from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
@@ -44,10 +45,14 @@ def keyframe(number: int) -> Event:
 
 def writer(taker: Taker) -> LogWriter:
     store = cast(Any, Store())
+    environment = SimpleNamespace(threads=store, sleep=asyncio.sleep)
     return LogWriter(
-        store, apply_entry=taker.apply_entry, on_waiting=lambda is_waiting: None, on_lost=lambda reason: None,
-        threads=store, sleep=asyncio.sleep, json_log=cast(Any, None), map_name="m",
-    )  # fmt: skip
+        store,
+        cast(Any, environment),
+        apply_entry=taker.apply_entry,
+        on_waiting=lambda is_waiting: None,
+        on_lost=lambda reason: None,
+    )
 
 
 async def test_an_entry_holds_no_more_than_four_mebibytes() -> None:

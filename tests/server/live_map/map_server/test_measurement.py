@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import TypeVar
 
 import numpy as np
@@ -74,10 +75,10 @@ def test_the_more_keyframes_wait_the_fewer_others_each_is_compared_with() -> Non
 
 async def test_waiting_keyframes_are_measured_two_at_a_time_and_one_alone_by_both_threads() -> None:
     live_map, threads, taken = NotingMap(), HeldThreads(), list[Event]()
-    measuring = KeyframeMeasurer(
-        MapState(live_map, 0), threads, taken.append, optimise=optimise_in_process, map_name="warehouse",
-        json_log=FakeLog(),
-    )  # fmt: skip
+    environment = SimpleNamespace(
+        threads=threads, optimise=optimise_in_process, map_name="warehouse", log=FakeLog()
+    )
+    measuring = KeyframeMeasurer(MapState(live_map, 0), environment, taken.append)
     working = asyncio.ensure_future(measuring.run())
     measuring.add_keyframes(range(20))
     await settle()
