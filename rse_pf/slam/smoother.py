@@ -1,7 +1,7 @@
-"""Fit some dozens of poses to their edges by robust Gauss-Newton, the others held.
+"""Fit a window of some dozens of poses to their edges by robust Gauss-Newton, with all other poses fixed.
 
-Pure numbers, by one thread and in a fixed order: the same numbers give the same bytes.
-`rse_pf.slam.optimise` fits a whole graph.
+The computation is dense, in one thread and in a fixed order, so that equal inputs give equal bytes.
+`rse_pf.slam.optimise` fits a whole pose graph with GTSAM instead.
 """
 
 from __future__ import annotations
@@ -17,25 +17,36 @@ __all__ = ["ScaleTerms", "SmoothedPoses", "smooth"]
 
 Rows = npt.NDArray[np.int64]
 
-_ITERATIONS = 6
-_CONVERGED_M, _CONVERGED_RAD = 6e-3, 6e-3
-_LITTLE = 1e-3
-"""Share of the cost below which another step is not worth its time; after steps below 6 mm and 6 mrad the
-next one is ten times shorter, and the next keyframe's smoothing makes it."""
+_MAX_ITERATIONS = 6  # Gauss-Newton steps of one call of `smooth`
+_MAX_STEP_TRIALS = 4  # lengths of a Gauss-Newton step that are tried until the cost does not increase
+_STEP_REDUCTION = 0.25  # factor by which a Gauss-Newton step that increases the cost is shortened
+_CONVERGED_M = 6e-3
+"""Largest translation in metres of a step after which no further step is made: the next step would be ten
+times shorter, and the next keyframe's call of `smooth` makes it."""
+_CONVERGED_RAD = 6e-3  # largest rotation in radians of a step after which no further step is made, likewise
+_MIN_RELATIVE_DECREASE = (
+    1e-3  # relative decrease of the cost below which a further step is not worth its time
+)
+_MAX_ROTATION_STEP_RAD = (
+    0.5  # a step is shortened to this rotation, beyond which its linearisation is invalid
+)
 _DAMPING = 1e-6
-"""Of the diagonal; a free pose without an edge to a held one stays where it is."""
+"""Share of the diagonal of the normal equations that is added to the diagonal, with a millionth: a free pose
+without an edge then stays where it is."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ScaleTerms:
-    """Scales that are fitted with the poses: each multiplies the lengths of some edges.
+    """Unknown scales that are fitted together with the poses; a scale multiplies the translations of some
+    edges.
 
     Attributes:
-        count: The number *k* of scales; the logarithm of each begins at 0.
+        count: The number *k* of scales; the logarithm of each scale starts at 0.
         of_edge: ``(m,)``, the scale of each edge's translation, -1 for none.
-        plus, minus: ``(m,)``, the scales whose difference of logarithms an edge measures, -1 for none.
-        difference: ``(m,)``, the measured one,
-        information: and its inverse variance; 0 where an edge measures none.
+        plus: ``(m,)``, the first of two scales whose ratio an edge measures, -1 for a scale fixed at 1.
+        minus: ``(m,)``, the second of these two scales, -1 for a scale fixed at 1.
+        difference: ``(m,)``, the measured logarithm of the first scale less that of the second one.
+        information: ``(m,)``, the inverse variance of this difference; 0 where an edge measures no ratio.
     """
 
     count: int
@@ -50,9 +61,11 @@ class ScaleTerms:
 class SmoothedPoses:
     """The result of `smooth`.
 
-    ``T`` ``(n, 4, 4)``; ``squares`` ``(m,)`` the squared Mahalanobis norm of each edge's residual;
-    ``covariances`` ``(w, 6, 6)`` of the wanted poses, of twists on the right of a pose, given the held ones;
-    ``log_scales`` ``(k,)``.
+    Attributes:
+        T: ``(n, 4, 4)``, all poses, metres.
+        squares: ``(m,)``, the squared Mahalanobis norm of the residual of each edge.
+        covariances: ``(w, 6, 6)`` of the wanted poses, of twists on their right, given the fixed poses.
+        log_scales: ``(k,)``, the natural logarithms of the fitted scales.
     """
 
     T: Array
@@ -62,84 +75,106 @@ class SmoothedPoses:
 
 
 def smooth(
-    T: Array, free: int, a: Rows, b: Rows, T_a_b: Array, information: Array, robust: npt.NDArray[np.bool_],
-    *, cauchy: float, wanted: Rows | None = None, scales: ScaleTerms | None = None,
-) -> SmoothedPoses:  # fmt: skip
-    """Fit the first *free* of the poses to the edges; the others are held.
+    T: Array,
+    free: int,
+    a: Rows,
+    b: Rows,
+    T_a_b: Array,
+    information: Array,
+    robust: npt.NDArray[np.bool_],
+    *,
+    cauchy: float,
+    wanted: Rows | None = None,
+    scales: ScaleTerms | None = None,
+) -> SmoothedPoses:
+    """Fit the first *free* poses to the edges, and keep the other poses fixed.
 
-    Minimises ``sum of squares`` of the edges that are not robust, and the sum of
-    ``cauchy**2 log(1 + squares / cauchy**2)`` of the others.
+    Minimises the sum of squared Mahalanobis norms r^2 of the residuals of odometry edges, and of
+    ``cauchy^2 log(1 + r^2 / cauchy^2)`` of robust edges, by iteratively reweighted Gauss-Newton.
 
     Args:
-        T: ``(n, 4, 4)`` poses, metres.
-        free: How many of them may move; at least 1.
-        a, b: ``(m,)`` row numbers of the poses of each edge.
-        T_a_b: ``(m, 4, 4)``, measured.
-        information: ``(m, 6, 6)``, of the twist (metres, radians).
-        robust: ``(m,)``, whether the edge may be wrong.
-        cauchy: Width of the kernel, standard deviations.
-        wanted: Rows of free poses whose covariance is asked for.
-        scales: Fitted with the poses, if there are any.
+        T: ``(n, 4, 4)``, the poses, metres.
+        free: The number of poses that may move; at least 1.
+        a: ``(m,)``, the row in *T* of the first pose of each edge.
+        b: ``(m,)``, the row in *T* of the second pose of each edge.
+        T_a_b: ``(m, 4, 4)``, the measured relative poses.
+        information: ``(m, 6, 6)``, the inverse covariances of the twists (metres, radians).
+        robust: ``(m,)``, whether an edge may be an outlier.
+        cauchy: Width of the Cauchy kernel in standard deviations, above 0.
+        wanted: Rows of free poses whose covariances are returned; None means none.
+        scales: Scales that are fitted together with the poses; None means none.
 
     Source:
-        Dellaert and Kaess, Factor Graphs for Robot Perception (2017), chapter 6.
+        Dellaert and Kaess, "Factor Graphs for Robot Perception", 2017, chapter 6.
     """
+    # 1. Evaluate the residuals at the given poses.
     T = T.copy()
-    back = inverse(T_a_b)
+    T_b_a_measured = inverse(T_a_b)
     log_scales = np.zeros(0 if scales is None else scales.count)
-    T_a_b_now, error, squares = _residuals(T, a, b, back, information)
+    T_a_b_now, error, squares = _residuals(T, a, b, T_b_a_measured, information)
     if scales is not None:
         squares = squares + _scale_squares(scales, log_scales)
     cost = _cost(squares, robust, cauchy)
+    # 2. Prepare the right sides that give columns of the inverse matrix: the covariances.
     wanted = np.empty(0, dtype=np.int64) if wanted is None else wanted
     size = 6 * free + len(log_scales)
-    units = np.zeros((size, 6 * len(wanted)))
-    units[(6 * wanted[:, None] + np.arange(6)).ravel(), np.arange(6 * len(wanted))] = 1.0
+    unit_vectors = np.zeros((size, 6 * len(wanted)))
+    unit_vectors[(6 * wanted[:, None] + np.arange(6)).ravel(), np.arange(6 * len(wanted))] = 1.0
     solved: Array = np.empty((size, 1 + 6 * len(wanted)))
-    for _ in range(_ITERATIONS):
-        weights = _weights(squares, robust, cauchy)
+    for _ in range(_MAX_ITERATIONS):
+        # 3. Solve the reweighted normal equations.
+        weights = _cauchy_weights(squares, robust, cauchy)
         H, gradient = _normal_equations(T_a_b_now, free, a, b, error, information, weights)
         if scales is not None:
-            now = _Edges(a, b, T_a_b_now, back, error, information, weights)
-            H, gradient = _with_scales(H, gradient, scales, log_scales, now)
-        solved = np.linalg.solve(H, np.column_stack([-gradient, units])).astype(np.float64, copy=False)
-        step, stretch = _bounded(solved[: 6 * free, 0].reshape(free, 6)), solved[6 * free :, 0]
-        for _ in range(4):
-            moved = T.copy()
-            moved[:free] = _orthonormal(T[:free] @ exp_se3(step))
-            new_back = back if scales is None else _stretched_back(back, scales, stretch)
-            T_moved, new_error, new_squares = _residuals(moved, a, b, new_back, information)
+            edges = _LinearisedEdges(a, b, T_a_b_now, T_b_a_measured, error, information, weights)
+            H, gradient = _add_scales(H, gradient, scales, log_scales, edges)
+        right = np.column_stack([-gradient, unit_vectors])
+        solved = np.linalg.solve(H, right).astype(np.float64, copy=False)
+        step = _limit_rotation(solved[: 6 * free, 0].reshape(free, 6))
+        scale_step = solved[6 * free :, 0]
+        # 4. Shorten the step until the cost does not increase; stop if no length helps.
+        for _ in range(_MAX_STEP_TRIALS):
+            new_T = T.copy()
+            new_T[:free] = _orthonormalise(T[:free] @ exp_se3(step))
+            new_measured = T_b_a_measured if scales is None else _rescale(T_b_a_measured, scales, scale_step)
+            new_T_a_b, new_error, new_squares = _residuals(new_T, a, b, new_measured, information)
             if scales is not None:
-                new_squares = new_squares + _scale_squares(scales, log_scales + stretch)
+                new_squares = new_squares + _scale_squares(scales, log_scales + scale_step)
             new_cost = _cost(new_squares, robust, cauchy)
             if new_cost <= cost:
                 break
-            step, stretch = 0.25 * step, 0.25 * stretch
+            step, scale_step = _STEP_REDUCTION * step, _STEP_REDUCTION * scale_step
         else:
             break
-        little = cost - new_cost <= _LITTLE * cost
-        T, T_a_b_now, error, squares, cost = moved, T_moved, new_error, new_squares, new_cost
-        back, log_scales = new_back, log_scales + stretch
-        moved_m, turned_rad = np.abs(step[:, :3]).max(), np.abs(step[:, 3:]).max()
-        if little or (moved_m < _CONVERGED_M and turned_rad < _CONVERGED_RAD):
+        # 5. Take the step, and stop after convergence.
+        has_small_decrease = cost - new_cost <= _MIN_RELATIVE_DECREASE * cost
+        T, T_a_b_now, error, squares, cost = new_T, new_T_a_b, new_error, new_squares, new_cost
+        T_b_a_measured, log_scales = new_measured, log_scales + scale_step
+        largest_m, largest_rad = np.abs(step[:, :3]).max(), np.abs(step[:, 3:]).max()
+        if has_small_decrease or (largest_m < _CONVERGED_M and largest_rad < _CONVERGED_RAD):
             break
+    # 6. Pick the covariances out of the last solution.
     rows = 6 * wanted[:, None] + np.arange(6)
     columns = 1 + 6 * np.arange(len(wanted))[:, None] + np.arange(6)
     return SmoothedPoses(
-        T=T, squares=squares, covariances=solved[rows[:, :, None], columns[:, None, :]],
+        T=T,
+        squares=squares,
+        covariances=solved[rows[:, :, None], columns[:, None, :]],
         log_scales=log_scales,
-    )  # fmt: skip
+    )
 
 
-def _residuals(T: Array, a: Rows, b: Rows, back: Array, information: Array) -> tuple[Array, Array, Array]:
-    """Return ``T_a_b`` by the poses, its twist from the measured one, and the squared norm of that."""
+def _residuals(
+    T: Array, a: Rows, b: Rows, T_b_a_measured: Array, information: Array
+) -> tuple[Array, Array, Array]:
+    """Return for each edge ``T_a_b`` by the poses, the residual twist, and its squared Mahalanobis norm."""
     T_a_b = inverse(T[a]) @ T[b]
-    error = log_se3(back @ T_a_b)
+    error = log_se3(T_b_a_measured @ T_a_b)
     weighted = (information @ error[:, :, None])[:, :, 0]
     return T_a_b, error, (error * weighted).sum(axis=1)
 
 
-def _weights(squares: Array, robust: npt.NDArray[np.bool_], cauchy: float) -> Array:
+def _cauchy_weights(squares: Array, robust: npt.NDArray[np.bool_], cauchy: float) -> Array:
     return np.where(robust, 1.0 / (1.0 + squares / cauchy**2), 1.0)
 
 
@@ -150,122 +185,137 @@ def _cost(squares: Array, robust: npt.NDArray[np.bool_], cauchy: float) -> float
 def _normal_equations(
     T_a_b: Array, free: int, a: Rows, b: Rows, error: Array, information: Array, weights: Array
 ) -> tuple[Array, Array]:
-    """Return the matrix ``(6 f, 6 f)`` and the gradient ``(6 f,)`` of the free poses."""
-    J_b = np.eye(6) + 0.5 * _small_adjoints(error)
+    """Return the damped matrix ``(6 f, 6 f)`` and the gradient ``(6 f,)`` of the *f* free poses.
+
+    The unknowns are twists on the right of the poses; their Jacobians are first-order approximations
+    for small residuals.
+    """
+    # 1. Compute the Jacobians of the residuals and their products.
+    J_b = np.eye(6) + 0.5 * _adjoint_twists(error)
     J_a = -J_b @ adjoint(inverse(T_a_b))
     J = np.concatenate([J_a, J_b], axis=2)
     WJ = (weights[:, None, None] * information) @ J
     blocks = np.swapaxes(J, 1, 2) @ WJ
-    slopes = (np.swapaxes(WJ, 1, 2) @ error[:, :, None])[:, :, 0]
-    # Sums over the edges of a pose are products with ones and zeros, for the sake of time.
+    gradients = (np.swapaxes(WJ, 1, 2) @ error[:, :, None])[:, :, 0]
+    # 2. Sum the diagonal blocks of each pose; products with 0 and 1 are faster than np.add.at.
     poses = np.arange(free)[:, None]
-    at_a, at_b = (a == poses).astype(np.float64), (b == poses).astype(np.float64)
-    own = at_a @ blocks[:, :6, :6].reshape(-1, 36) + at_b @ blocks[:, 6:, 6:].reshape(-1, 36)
-    both = np.flatnonzero((a < free) & (b < free))
-    across = 36 * (a[both] * free + b[both])[:, None] + np.arange(36)
-    summed = np.bincount(across.ravel(), weights=blocks[both, :6, 6:].ravel(), minlength=36 * free * free)
-    # It counts in integers where there is nothing to add.
+    is_a, is_b = (a == poses).astype(np.float64), (b == poses).astype(np.float64)
+    diagonal_blocks = is_a @ blocks[:, :6, :6].reshape(-1, 36) + is_b @ blocks[:, 6:, 6:].reshape(-1, 36)
+    # 3. Sum the blocks of edges between two free poses.
+    both_free = np.flatnonzero((a < free) & (b < free))
+    elements = 36 * (a[both_free] * free + b[both_free])[:, None] + np.arange(36)
+    summed = np.bincount(
+        elements.ravel(), weights=blocks[both_free, :6, 6:].ravel(), minlength=36 * free * free
+    )
+    # Without an edge np.bincount returns integers.
     half: Array = summed.astype(np.float64, copy=False).reshape(free, free, 6, 6)
-    half[np.arange(free), np.arange(free)] = 0.5 * own.reshape(free, 6, 6)
+    # 4. Assemble the symmetric matrix from the blocks of one half and half of the diagonal blocks.
+    half[np.arange(free), np.arange(free)] = 0.5 * diagonal_blocks.reshape(free, 6, 6)
     flat = np.ascontiguousarray(half.transpose(0, 2, 1, 3)).reshape(6 * free, 6 * free)
     H = flat + flat.T
     diagonal = np.arange(6 * free)
     H[diagonal, diagonal] += _DAMPING * (H[diagonal, diagonal] + 1.0)
-    return H, (at_a @ slopes[:, :6] + at_b @ slopes[:, 6:]).reshape(-1)
+    return H, (is_a @ gradients[:, :6] + is_b @ gradients[:, 6:]).reshape(-1)
 
 
-def _stretched_back(back: Array, scales: ScaleTerms, stretch: Array) -> Array:
-    """Return the inverse measured poses after the logarithms of the scales grew by *stretch*."""
-    lengths = np.where(scales.of_edge >= 0, np.exp(stretch)[scales.of_edge], 1.0)
-    return scaled(back, lengths)
+def _rescale(T_b_a_measured: Array, scales: ScaleTerms, scale_step: Array) -> Array:
+    """Return the inverse measured poses after the logarithms of the scales grew by *scale_step* ``(k,)``."""
+    factors = np.where(scales.of_edge >= 0, np.exp(scale_step)[scales.of_edge], 1.0)
+    return scaled(T_b_a_measured, factors)
 
 
-def _scale_differences(scales: ScaleTerms, log_scales: Array) -> Array:
-    """Return ``(m,)`` by how much the scales differ from what each edge measured."""
-    here = np.where(scales.plus >= 0, log_scales[scales.plus], 0.0)
-    there = np.where(scales.minus >= 0, log_scales[scales.minus], 0.0)
-    return here - there - scales.difference
+def _scale_residuals(scales: ScaleTerms, log_scales: Array) -> Array:
+    """Return ``(m,)``: the difference of two log scales less the difference that the edge measured."""
+    plus = np.where(scales.plus >= 0, log_scales[scales.plus], 0.0)
+    minus = np.where(scales.minus >= 0, log_scales[scales.minus], 0.0)
+    return plus - minus - scales.difference
 
 
 def _scale_squares(scales: ScaleTerms, log_scales: Array) -> Array:
-    squares: Array = scales.information * _scale_differences(scales, log_scales) ** 2
+    squares: Array = scales.information * _scale_residuals(scales, log_scales) ** 2
     return squares
 
 
 @dataclass(frozen=True, slots=True)
-class _Edges:
-    """The edges at the poses of one iteration, as `_residuals` and `_weights` return them."""
+class _LinearisedEdges:
+    """The edges at the poses of one iteration, with the results of `_residuals` and `_cauchy_weights`."""
 
     a: Rows
     b: Rows
     T_a_b: Array
-    back: Array
+    T_b_a_measured: Array
     error: Array
     information: Array
     weights: Array
 
 
-def _with_scales(
-    H: Array, gradient: Array, scales: ScaleTerms, log_scales: Array, edges: _Edges
+def _add_scales(
+    H: Array, gradient: Array, scales: ScaleTerms, log_scales: Array, edges: _LinearisedEdges
 ) -> tuple[Array, Array]:
-    """Return matrix and gradient of the poses with those of the scales behind.
+    """Return the normal equations of the poses, extended by the unknown log scales as last unknowns.
 
-    A scale that grows by d moves the measured pose by its own translation times d: in its own frame by
-    ``-back`` of it, and the error the other way.
+    If a log scale grows by d, the measured pose of its edges moves by d times its own translation.  In the
+    frame of this pose that is ``-d`` times the translation of the inverse pose, and the residual moves by the
+    opposite.
     """
     poses, k = len(gradient), scales.count
     error, weights = edges.error, edges.weights
-    grown = np.zeros((poses + k, poses + k))
-    grown[:poses, :poses] = H
-    slopes = np.concatenate([gradient, np.zeros(k)])
+    extended_H = np.zeros((poses + k, poses + k))
+    extended_H[:poses, :poses] = H
+    extended_gradient = np.concatenate([gradient, np.zeros(k)])
+    # 1. Compute the Jacobians of the residuals of scaled edges by their scale.
     rows = np.flatnonzero(scales.of_edge >= 0)
-    of_scale = poses + scales.of_edge[rows]
-    small = _small_adjoints(error[rows])
-    J_b = np.eye(6) + 0.5 * small
-    along = np.zeros((len(rows), 6))
-    along[:, :3] = -edges.back[rows, :3, 3]
-    J_s = -((np.eye(6) - 0.5 * small) @ along[:, :, None])[:, :, 0]
+    scale_columns = poses + scales.of_edge[rows]
+    twists = _adjoint_twists(error[rows])
+    J_b = np.eye(6) + 0.5 * twists
+    motion = np.zeros((len(rows), 6))
+    motion[:, :3] = -edges.T_b_a_measured[rows, :3, 3]
+    J_s = -((np.eye(6) - 0.5 * twists) @ motion[:, :, None])[:, :, 0]
+    # 2. Add the diagonal and the gradient of the scales.
     WJ = weights[rows, None] * (edges.information[rows] @ J_s[:, :, None])[:, :, 0]
-    np.add.at(grown, (of_scale, of_scale), (J_s * WJ).sum(axis=1))
-    np.add.at(slopes, of_scale, (WJ * error[rows]).sum(axis=1))
+    np.add.at(extended_H, (scale_columns, scale_columns), (J_s * WJ).sum(axis=1))
+    np.add.at(extended_gradient, scale_columns, (WJ * error[rows]).sum(axis=1))
+    # 3. Add the blocks between scales and free poses.
     J_a = -J_b @ adjoint(inverse(edges.T_a_b[rows]))
     for ends, J in ((edges.a[rows], J_a), (edges.b[rows], J_b)):
-        inside = np.flatnonzero(6 * ends < poses)
-        crossed = (np.swapaxes(J[inside], 1, 2) @ WJ[inside, :, None])[:, :, 0]
-        columns = 6 * ends[inside, None] + np.arange(6)
-        np.add.at(grown, (columns, of_scale[inside, None]), crossed)
-        np.add.at(grown, (of_scale[inside, None], columns), crossed)
-    weighted = weights * scales.information
-    off = weighted * _scale_differences(scales, log_scales)
+        is_free = np.flatnonzero(6 * ends < poses)
+        block = (np.swapaxes(J[is_free], 1, 2) @ WJ[is_free, :, None])[:, :, 0]
+        pose_columns = 6 * ends[is_free, None] + np.arange(6)
+        np.add.at(extended_H, (pose_columns, scale_columns[is_free, None]), block)
+        np.add.at(extended_H, (scale_columns[is_free, None], pose_columns), block)
+    # 4. Add the measured ratios of scales.
+    information = weights * scales.information
+    weighted_residuals = information * _scale_residuals(scales, log_scales)
     for ends, sign in ((scales.plus, 1.0), (scales.minus, -1.0)):
-        known = ends >= 0
-        np.add.at(grown, (poses + ends[known], poses + ends[known]), weighted[known])
-        np.add.at(slopes, poses + ends[known], sign * off[known])
+        is_fitted = ends >= 0
+        columns = poses + ends[is_fitted]
+        np.add.at(extended_H, (columns, columns), information[is_fitted])
+        np.add.at(extended_gradient, columns, sign * weighted_residuals[is_fitted])
     both = np.flatnonzero((scales.plus >= 0) & (scales.minus >= 0))
-    for one, other in ((scales.plus, scales.minus), (scales.minus, scales.plus)):
-        np.add.at(grown, (poses + one[both], poses + other[both]), -weighted[both])
+    for first, second in ((scales.plus, scales.minus), (scales.minus, scales.plus)):
+        np.add.at(extended_H, (poses + first[both], poses + second[both]), -information[both])
     diagonal = poses + np.arange(k)
-    grown[diagonal, diagonal] += _DAMPING * (grown[diagonal, diagonal] + 1.0)
-    return grown, slopes
+    extended_H[diagonal, diagonal] += _DAMPING * (extended_H[diagonal, diagonal] + 1.0)
+    return extended_H, extended_gradient
 
 
-def _bounded(step: Array) -> Array:
-    """Return the step, shortened where a rotation is beyond what a linear step means."""
-    largest = float(np.abs(step[:, 3:]).max())
-    return step * (0.5 / largest) if largest > 0.5 else step
+def _limit_rotation(step: Array) -> Array:
+    """Return the twists *step* ``(f, 6)``, all shortened alike so that no rotation is above 0.5 rad."""
+    largest_rad = float(np.abs(step[:, 3:]).max())
+    return step * (_MAX_ROTATION_STEP_RAD / largest_rad) if largest_rad > _MAX_ROTATION_STEP_RAD else step
 
 
-def _orthonormal(T: Array) -> Array:
-    """Return poses whose rotations are orthonormal again, by one Newton step of the polar form."""
+def _orthonormalise(T: Array) -> Array:
+    """Return poses whose rotations are orthonormal again, by one Newton step of the polar decomposition."""
     R = T[:, :3, :3]
     T = T.copy()
     T[:, :3, :3] = 1.5 * R - 0.5 * R @ np.swapaxes(R, 1, 2) @ R
     return T
 
 
-def _small_adjoints(xi: Array) -> Array:
-    """Return ``(n, 6, 6)``: the commutator with a twist, for the first order of a Jacobian."""
-    small = np.zeros((len(xi), 6, 6))
-    small[:, :3, :3] = small[:, 3:, 3:] = skew(xi[:, 3:])
-    small[:, :3, 3:] = skew(xi[:, :3])
-    return small
+def _adjoint_twists(xi: Array) -> Array:
+    """Return ``(n, 6, 6)``: the adjoint representation ad(xi) of the twists *xi* ``(n, 6)``."""
+    ad = np.zeros((len(xi), 6, 6))
+    ad[:, :3, :3] = ad[:, 3:, 3:] = skew(xi[:, 3:])
+    ad[:, :3, 3:] = skew(xi[:, :3])
+    return ad

@@ -414,7 +414,7 @@ def test_a_version_of_a_live_map_keeps_its_kind_and_starts_another_one() -> None
 
     assert version.kind == again.kind == SIFT
     with pytest.raises(BadRequest, match="features of kind sift"):
-        again.judge(added("b", 0, ORB))
+        again.check_keyframe(added("b", 0, ORB))
 
 
 def test_a_live_map_of_orb_is_as_before() -> None:
