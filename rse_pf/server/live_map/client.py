@@ -68,7 +68,7 @@ class LiveMapClient:
         self._store = store
         self._settings = settings
         self._on_update = on_update
-        self._connections: dict[tuple[str, str], MapConnection] = {}  # by tenant and map name
+        self._connections: dict[tuple[str, str], MapConnection] = {}  # keyed by tenant and map name
         self._threads = ThreadPoolExecutor(_STORE_THREADS, thread_name_prefix="live-link")
         self._pool = MapServerPool(
             lambda at_low_priority: start_map_server(
@@ -137,7 +137,7 @@ class LiveMapClient:
         self._update_spare()
 
     def unwatch(self, tenant: str, map_name: str) -> None:
-        """End the updates of a map; does nothing for an unknown map."""
+        """End the updates of a live map for this worker; does nothing if the worker does not use the map."""
         connection = self._connections.get((tenant, map_name))
         if connection is not None:
             connection.set_watched(False)
@@ -153,7 +153,7 @@ class LiveMapClient:
 
     @property
     def processes(self) -> list[MapServerProcess]:
-        """The processes of this worker that claim or serve a map."""
+        """Map-server processes of this worker that claim or serve a map; the spare is not among them."""
         return self._pool.in_use
 
     async def close(self) -> None:
@@ -182,7 +182,7 @@ class LiveMapClient:
         return connection
 
     def _update_spare(self) -> None:
-        """Keep a spare process while some map may need a process of this worker."""
+        """Keep a spare process while some map may need a map server of this worker; kill it otherwise."""
         is_used = any(connection.may_need_process for connection in self._connections.values())
         self._pool.set_used(is_used=is_used)
 

@@ -42,7 +42,7 @@ MAX_MESSAGE_BYTES = 4 << 20
 """Largest message in bytes between a worker and a map server; longer ones are refused before decoding."""
 TOKEN_S = 30.0
 """Validity in seconds of the token with which a worker opens a connection to a map server."""
-_KEY_BYTES = 32  # length of the signing key: as long as the output of SHA-256
+_KEY_BYTES = 32  # length of the key that signs tokens: that of the output of SHA-256
 _TLS_VERSION = ssl.TLSVersion.TLSv1_3
 
 
@@ -80,7 +80,7 @@ def internal_key(store: ObjectStore) -> bytes:
         key = secrets.token_bytes(_KEY_BYTES)
         try:
             store.compare_and_swap(INTERNAL_KEY, None, key)
-        except Conflict:  # another server has stored its key first
+        except Conflict:  # another server has stored a key meanwhile, which all servers use
             key = store.get(INTERNAL_KEY)
     if len(key) != _KEY_BYTES:
         raise StoreError(

@@ -162,12 +162,12 @@ class MapLease:
             clock: Returns monotonic time in seconds.
         """
         self.record = LeaseRecord(state="starting", owner=owner, epoch=0, server=server)
-        """The record as this process wrote it last, also after another process has replaced it."""
+        """The lease record as this process wrote it last, also after another process has replaced it."""
         self._lease = Lease(store, name, decode_lease, clock)
 
     @property
     def age_s(self) -> float:
-        """Seconds since the last successful write began; until that time nobody else had taken the map."""
+        """Seconds since the last successful write of the lease began; this process held the lease then."""
         return self._lease.age_s
 
     def claim(self, known: bytes | None) -> bool:
@@ -247,12 +247,12 @@ class MapLease:
         return self._is_held and self._write(record)
 
     def _write(self, record: LeaseRecord) -> bool:
-        """Replace the last known record by compare-and-swap; return False if another process was first."""
+        """Replace the known lease by *record*; return False if another process changed the lease first."""
         while not self._lease.write(record):
             if not self._is_held:
                 return False
-            # Only this process writes records with its name: an earlier write succeeded, but its reply was
-            # lost.  The compare-and-swap is repeated against that record.
+            # The stored record has the name of this process, so an earlier write has succeeded although its
+            # reply was lost.  The compare-and-swap is repeated against that record.
         self.record = record
         return True
 

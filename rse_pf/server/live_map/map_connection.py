@@ -54,7 +54,7 @@ from rse_pf.wire.live_map import SHOW, KeyframeRequest, LiveRequest, LiveStart
 
 __all__ = ["ConnectionContext", "MapConnection", "can_begin_map"]
 
-_READ_BYTES = 1 << 18  # largest number of bytes in one read of a socket
+_READ_BYTES = 1 << 18  # largest number of bytes that one read of a socket returns
 _CONNECT_TIMEOUT_S = 1.0
 """Seconds within which a map server must accept a connection, and then answer the hello."""
 _POLL_S = 0.1
@@ -64,7 +64,7 @@ _RECONNECT_S = 0.02
 _IDLE_POLL_S = 1.0
 """Seconds between two reads of the lease of a map that has no map server and needs none."""
 _LINGER_S = 10.0
-"""Seconds for which the connection of a map is kept after its last request."""
+"""Seconds for which a worker keeps its connection to a map server after the last request or subscriber."""
 _PREPARE_SHARE = 0.66
 """Share of ``live.lease_s`` without a renewal after which a worker starts a process, so that the process has
 imported its modules when the lease expires."""
@@ -103,7 +103,7 @@ class ConnectionContext:
 
 @dataclass(slots=True, eq=False)
 class _PendingRequest:
-    """A request that has no reply yet; the reply or the error is set on ``future``."""
+    """A request to the map server without a reply; the reply or the error is set on ``future``."""
 
     robot: RobotId
     operation: str
@@ -151,8 +151,10 @@ class MapConnection:
         self._request_numbers = itertools.count(1)
         self._pending: dict[int, _PendingRequest] = {}
         self._writer: asyncio.StreamWriter | None = None
-        self._dead_epoch: int | None = None  # epoch of a map server whose process has certainly ended
-        self._reached_owner = ""  # name of the last map server that answered our hello
+        self._dead_epoch: int | None = (
+            None  # epoch of the last map server whose process is known to have exited
+        )
+        self._reached_owner = ""  # name of the last map server that accepted the token of this worker
         self._newest_map_update: dict[str, Any] = {}
         self._last_use_s = context.clock()
         self._is_closed = False
@@ -217,14 +219,14 @@ class MapConnection:
 
     async def close(self) -> None:
         """Close the connection; requests without a reply fail with Busy."""
-        # The flag is needed, too: before Python 3.12, a wait that ends may swallow the cancellation.
+        # The flag ends the task even if `asyncio.wait_for` swallows the cancellation (Python before 3.12).
         self._is_closed = True
         self._task.cancel()
         with contextlib.suppress(asyncio.CancelledError):
             await self._task
         self._refuse_all("this server is shutting down")
 
-    # --- Finding or starting the map server ---
+    # --- Finding the map server of the map, or starting one ---
 
     async def _run(self) -> None:
         try:
@@ -247,7 +249,7 @@ class MapConnection:
             self._refuse_requests_without_map(is_stopped=record is not None)
             if not any(can_begin_map(pending.request) for pending in self._pending.values()):
                 if self._context.settings.warm_standby:
-                    self._prepare_spare()  # robots subscribe seconds before their first keyframe
+                    self._prepare_spare()  # subscribers send the first keyframe within seconds
                 await self._pause(_IDLE_POLL_S)
                 return
         # 2. A map server whose process has certainly ended counts as silent for the whole lease.
@@ -261,20 +263,20 @@ class MapConnection:
             await self._pause(_IDLE_POLL_S)
         elif action == "claim":
             await self._claim_map()
-        # 4. A map server that listens is used until the connection or its lease ends.
+        # 4. A map server that accepts connections is used until its connection or its lease ends.
         elif action == "connect" and record is not None:
             if await self._use_map_server(record):
                 await asyncio.sleep(_RECONNECT_S)
             elif record.epoch != self._dead_epoch:
                 self._prepare_spare()
                 await self._pause(_POLL_S)
-        # 5. A map server that is starting, or dead and not replaceable yet, is waited for.
+        # 5. A starting map server is waited for, and so is the time at which a dead one may be replaced.
         else:
             self._send_state("moving")
             await self._pause(_POLL_S)
 
     async def _claim_map(self) -> None:
-        """Let a process of this worker claim the map, unless another process is first."""
+        """Let a map-server process of this worker claim the map, unless another process claims it first."""
         pool, is_watched_only = self._context.pool, not self._pending
         # 1. The process must be ready.  While it imports, another process may claim the map, so the lease is
         # read again before the next try.
@@ -322,7 +324,7 @@ class MapConnection:
             self._context.log.info("live-owner-ended", map=self.map_name, epoch=process.epoch, code=exit_code)
         self._wake.set()
 
-    # --- Talking with the map server ---
+    # --- Messages between this worker and the map server ---
 
     async def _use_map_server(self, record: LeaseRecord) -> bool:
         """Connect to the map server and pass requests on until the connection or its lease ends.
@@ -388,12 +390,12 @@ class MapConnection:
         except (OSError, asyncio.TimeoutError, Unauthorized) as error:
             self._context.log.warning("live-link-failed", map=self.map_name, why=str(error)[:200])
         finally:
-            if not is_welcome:  # also if the task is cancelled, or the key cannot be read
+            if not is_welcome:  # the connection is closed after every failure, also after a cancellation
                 writer.close()
         return None
 
     async def _receive(self, record: LeaseRecord, reader: asyncio.StreamReader, frames: FrameReader) -> None:
-        """Handle messages until the connection ends, or the map server gives the map up or is replaceable."""
+        """Handle messages of the map server until it disconnects, gives the map up, or may be replaced."""
         prepare_after_s = _PREPARE_SHARE * self._context.settings.lease_s
         read: asyncio.Task[bytes] | None = None
         try:
@@ -463,14 +465,17 @@ class MapConnection:
         self._send(["request", number, list(pending.robot), pending.operation, request])
 
     def _send(self, message: list[Any]) -> None:
-        """Send *message* if there is a connection; requests are sent again with the next connection."""
+        """Send *message* if there is a connection to the map server; the next one gets all requests again."""
         if self._writer is not None:
             self._writer.write(encode_message(message))
 
-    # --- Answers of the worker itself, while the map has no map server ---
+    # --- Answers that this worker gives itself while the map has no map server ---
 
     def _refuse_requests_without_map(self, *, is_stopped: bool) -> None:
-        """Answer the requests that do not begin a map: with an empty ``live-show``, or with an error."""
+        """Answer the requests to a map that does not exist or was stopped, except those that begin the map.
+
+        ``live-show`` gets a reply without robots; other requests fail with NotFound or Conflict.
+        """
         for pending in self._pending.values():
             if pending.future.done() or can_begin_map(pending.request):
                 continue
@@ -492,7 +497,7 @@ class MapConnection:
                 )
 
     def _refuse_all(self, reason: str) -> None:
-        """Let all requests without a reply fail with Busy."""
+        """Let all requests to this map that have no reply fail with Busy; *reason* is part of the message."""
         for pending in self._pending.values():
             pending.refuse(
                 Busy(
@@ -503,14 +508,14 @@ class MapConnection:
             )
 
     def _send_state(self, state: str) -> None:
-        """Send subscribers the *state* of the map in an update of the worker, unless they know it."""
+        """Send the subscribers of this worker the *state* of the map, unless they received it last."""
         if self.is_watched and self._newest_map_update.get("state") != state:
             self._newest_map_update = {**(self._newest_map_update or _EMPTY_MAP_UPDATE), "state": state}
             self._on_update(self._newest_map_update)
 
     @property
     def _needs_map_server(self) -> bool:
-        """Whether a request waits, or a subscriber for whom a map server is started."""
+        """Whether a request waits for the map, or a subscriber for whom a map server may be started."""
         return bool(self._pending) or self.may_start
 
     def _prepare_spare(self) -> None:
@@ -528,7 +533,7 @@ class MapConnection:
         return read_record(self._context.store, self._lease.name)
 
     async def _pause(self, seconds: float) -> None:
-        """Wait for *seconds*, or until a request or a subscriber arrives."""
+        """Wait for *seconds*, or until a request or subscriber arrives or a process of this worker exits."""
         self._wake.clear()
         with contextlib.suppress(asyncio.TimeoutError):
             await asyncio.wait_for(self._wake.wait(), seconds)
@@ -561,7 +566,7 @@ def _show_reply_without_map(robot: RobotId) -> dict[str, Any]:
 
 
 async def _read_messages(reader: asyncio.StreamReader, frames: FrameReader) -> list[Any]:
-    """Read until at least one message is complete; raises ConnectionResetError at the end of the stream."""
+    """Return the next messages of the map server, at least one; raises ConnectionResetError at the end."""
     while True:
         data = await reader.read(_READ_BYTES)
         if not data:

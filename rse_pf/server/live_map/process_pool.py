@@ -39,7 +39,7 @@ _MAX_MEMORY_BYTES = 2 << 30
 """Memory limit of one map server's process; a process that needs more exits, and its map is taken over."""
 _SPARE_IMPORT_NICE = 10
 """Additional niceness of a spare process while it imports modules, because nobody waits for it."""
-_READ_BYTES = 1 << 16  # largest number of bytes in one read of a process's socket
+_READ_BYTES = 1 << 16  # largest number of bytes that one read of a process's socket returns
 _SPARE_DELAY_S = 3.0
 """Seconds after a process was taken until the next spare is started: the takeover needs the processors."""
 _RESERVATION_S = 3.0
@@ -116,28 +116,28 @@ class MapServerProcess:
         self._reader: asyncio.Task[None]
 
     def start_reading(self) -> MapServerProcess:
-        """Begin to read the messages of the process, and return this object."""
+        """Start the task that reads the messages of the map server's process, and return this object."""
         self._reader = asyncio.get_running_loop().create_task(self._read())
         return self
 
     @property
     def pid(self) -> int:
-        """Process id."""
+        """Process id of the map server."""
         return self._process.pid
 
     def assign(self, tenant: str, *, is_watched_only: bool) -> None:
-        """Let the process work for a map of *tenant*; its CPU time counts for the tenant from now on."""
+        """Assign the process to a map of *tenant*, for which its CPU time counts from now on."""
         self.tenant = tenant
         self.unused_since_s = self._clock() if is_watched_only else None
         self._cpu_before_map_s = cpu_seconds(self.pid)
 
     def cpu_s(self) -> float:
-        """Return the CPU seconds that it and its exited children used for its map; 0 if it has exited."""
+        """Return the CPU seconds of the process and its exited children for its map; 0 after its exit."""
         return max(0.0, cpu_seconds(self.pid) - self._cpu_before_map_s)
 
     @property
     def is_ready(self) -> bool:
-        """Whether it has imported its modules, or has exited."""
+        """Whether the process has imported its modules and waits for an order, or has exited."""
         return self._ready.done()
 
     async def wait_ready(self, timeout_s: float) -> None:
@@ -160,7 +160,7 @@ class MapServerProcess:
         self._process.say({"do": "release"})
 
     def kill(self) -> None:
-        """Kill the process, which serves no map."""
+        """Kill the process at once; called only for a process that serves no map."""
         self._reader.cancel()
         self._finish()
 
@@ -187,7 +187,7 @@ class MapServerProcess:
                 self._outcome.set_result("lost")
 
     def _finish(self) -> None:
-        """Kill the process if it still runs, reap it, and notify all that wait for it."""
+        """Kill the process if it still runs, reap it, and complete the futures that wait for it."""
         if self.exited.done():
             return
         self.final_cpu_s = self.cpu_s()
@@ -225,9 +225,9 @@ class MapServerPool:
         self._max_processes = max_processes
         self._keeps_spare = keeps_spare
         self._clock = clock
-        self._reserved_for = ""  # tenant for which a process is given up
+        self._reserved_for = ""  # tenant for whose map a process was freed
         self._reserved_until_s = float("-inf")
-        self._wanted_until_s = float("-inf")  # a map that is used needs a process until then
+        self._wanted_until_s = float("-inf")  # until then, a map that gets commands may ask again
         self._in_use: dict[MapServerProcess, None] = {}
         self._cpu_s_of_exited: defaultdict[str, float] = defaultdict(float)
         self._spare: MapServerProcess | None = None
@@ -235,7 +235,7 @@ class MapServerPool:
 
     @property
     def in_use(self) -> list[MapServerProcess]:
-        """The processes that claim or serve a map."""
+        """Map-server processes that claim or serve a map, in the order in which they were taken."""
         return list(self._in_use)
 
     def cpu_by_tenant(self) -> dict[str, float]:
@@ -247,7 +247,7 @@ class MapServerPool:
 
     @property
     def is_freeing_process(self) -> bool:
-        """Whether a process gives its map up, so that another map gets one soon."""
+        """Whether a map server is giving its map up, so that another map can have a process soon."""
         return not self.is_draining and any(process.is_releasing for process in self._in_use)
 
     def take(
@@ -269,7 +269,7 @@ class MapServerPool:
         """
         now = self._clock()
         in_use_by_tenant = Counter(process.tenant for process in self._in_use)
-        # 1. A map that is only watched yields to a map that was refused within the last seconds.
+        # 1. A map that is only watched gets none while a map that gets commands may ask again.
         if is_watched_only and now < self._wanted_until_s:
             return None
         # 2. A reserved process is not for a tenant that holds more than the one for which it is reserved.
@@ -294,7 +294,7 @@ class MapServerPool:
         return process
 
     def prepare_spare(self, *, at_low_priority: bool = False) -> MapServerProcess | None:
-        """Return the spare, which is started if there is none; None if all processes are in use."""
+        """Return the spare process, which is started if there is none; None if the pool is full or drains."""
         if self._spare is None and len(self._in_use) < self._max_processes and not self.is_draining:
             started = self._start_process(at_low_priority)
             self._spare = MapServerProcess(started, self._clock).start_reading()
@@ -309,14 +309,14 @@ class MapServerPool:
             self.kill_spare()
 
     def release_all(self) -> None:
-        """Take no further map, and order all processes to give their maps up."""
+        """Start no further process, and order all map servers of the pool to give their maps up."""
         self.is_draining = True
         self.kill_spare()
         for process in self.in_use:
             process.release()
 
     def kill_spare(self) -> None:
-        """Kill the spare, and start no other one."""
+        """Kill the spare process, and cancel the timer that would start another one."""
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
@@ -344,7 +344,7 @@ class MapServerPool:
             released = min(
                 unused, key=lambda process: (process not in of_larger_tenants, process.unused_since_s)
             )
-        elif of_larger_tenants:  # the newest process of the tenant that holds most
+        elif of_larger_tenants:  # of the tenant with most processes, the newest is chosen
             released = max(reversed(of_larger_tenants), key=lambda process: in_use_by_tenant[process.tenant])
         else:
             return

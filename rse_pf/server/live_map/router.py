@@ -76,15 +76,15 @@ _SERVICES_WITH_BLAME = (KEYFRAME, RELOCALISE)
 """Services for which an invalid-request error of the map server counts against the robot.  Errors of other
 services may come from the state of the map, for example of one that cannot be published."""
 _MAX_INVALID_REQUESTS = 10
-"""Number of invalid requests within `_WINDOW_S` after which live maps are closed to a robot.  A robot with a
-matching SDK sends none."""
+"""Number of invalid requests in 60 s after which live maps are closed to a robot.  A robot with a matching
+SDK sends none."""
 _WINDOW_S = 60.0
-"""Seconds over which invalid requests of a robot are counted."""
+"""Length in seconds of the time window in which the invalid requests of a robot are counted."""
 _BLOCKED_S = 60.0
 """Seconds for which live maps are closed to a robot that sent too many invalid requests."""
 _MAX_COUNTED_ROBOTS = 4096
-"""Largest number of robots whose invalid requests are counted, to bound memory; the oldest count is dropped
-first."""
+"""Largest number of robots whose invalid requests a worker counts, to bound memory; the count of the robot
+whose last invalid request is oldest is dropped first."""
 
 
 @dataclass(slots=True)
@@ -147,7 +147,7 @@ class LiveMapRouter(CommandQueue):
         self._tasks: dict[asyncio.Task[None], QueuedCommand] = {}
         self._waiting_bytes = 0
         self._waiting_bytes_of_tenant: Counter[str] = Counter()
-        self._waiting_of_robot: Counter[RobotId] = Counter()  # number of commands
+        self._waiting_of_robot: Counter[RobotId] = Counter()  # number of commands without an answer
         self._subscriptions = Subscriptions(
             loop=context.loop,
             log=context.log,
@@ -157,7 +157,7 @@ class LiveMapRouter(CommandQueue):
 
     @property
     def held(self) -> int:
-        """Number of commands without an answer."""
+        """Number of commands to live maps that have no answer yet."""
         return len(self._tasks)
 
     def offers(self, service: str) -> bool:
@@ -171,7 +171,7 @@ class LiveMapRouter(CommandQueue):
     # --- Commands of robots and operators ---
 
     def submit(self, queued: QueuedCommand, now: float) -> None:
-        """Pass a command to the map server of its map; the answer follows later, a error at once."""
+        """Pass a command to the map server of its map; a command that is refused is answered at once."""
         tenant = queued.robot.tenant
         try:
             self._check_not_blocked(queued.robot, now)
@@ -226,7 +226,7 @@ class LiveMapRouter(CommandQueue):
         }
 
     async def _answer_command(self, queued: QueuedCommand, request: Callable[[], Any]) -> None:
-        """Send the request of a command and answer the command by its deadline."""
+        """Await *request*, which sends the request of a command, and answer the command by its deadline."""
         started_s = self._monotonic()
         command, server = queued.command, self._context.server_id
         queued.started_s = started_s
@@ -262,7 +262,7 @@ class LiveMapRouter(CommandQueue):
             self._answer(queued, result)
 
     def _on_answered(self, task: asyncio.Task[None]) -> None:
-        """Subtract an answered command from the numbers of waiting commands and bytes."""
+        """Subtract a command that was answered from the counts of waiting commands and bytes."""
         queued = self._tasks.pop(task)
         self._waiting_bytes -= queued.size_bytes
         _subtract(self._waiting_bytes_of_tenant, queued.robot.tenant, queued.size_bytes)
@@ -304,7 +304,7 @@ class LiveMapRouter(CommandQueue):
         checked_claims = connection.claims
 
         def find_error() -> RsePfError | None:
-            """Check the scope again if the robot has renewed its token since the last check."""
+            """Return an error if the robot has a new token without the right to read the map, else None."""
             nonlocal checked_claims
             if connection.claims is checked_claims:
                 return None
@@ -365,7 +365,7 @@ class LiveMapRouter(CommandQueue):
         self._client.give_up()
 
     def close(self) -> None:
-        """Cancel all commands that have no answer."""
+        """Cancel all commands to live maps that have no answer yet; they stay unanswered."""
         for task in list(self._tasks):
             task.cancel()
 

@@ -43,7 +43,7 @@ _UPDATE_WITHOUT_MAP_SERVER = {"kind": "map", "keyframes": 0, "version": 0, "owne
 
 @dataclass(eq=False, slots=True)
 class _MapUpdate:
-    """The payload of an update, and its encoding for binary (True) and text (False) codecs, made once."""
+    """The payload of an update, with its encodings for the binary codec (True) and for JSON (False)."""
 
     payload: dict[str, Any]
     encoded: dict[bool, msgspec.Raw | None] = field(default_factory=dict)
@@ -51,13 +51,15 @@ class _MapUpdate:
 
 @dataclass(eq=False, slots=True)
 class _WatchedMap:
-    """A map with at least one subscription."""
+    """A live map to which at least one robot of this worker subscribes."""
 
     tenant: str
     name: str
-    updates: dict[str, _MapUpdate] = field(default_factory=dict)  # the newest by key, the oldest first
+    updates: dict[str, _MapUpdate] = field(
+        default_factory=dict
+    )  # the newest update of each key, the oldest first
     subscriptions: dict[_Subscription, None] = field(default_factory=dict)
-    starters: set[_Subscription] = field(default_factory=set)  # those for which a map server is started
+    starters: set[_Subscription] = field(default_factory=set)  # subscriptions that may start a map server
 
 
 @dataclass(eq=False, slots=True)
@@ -100,16 +102,16 @@ class Subscriptions:
         self._log = log
         self._watch = watch
         self._unwatch = unwatch
-        self._maps: dict[tuple[str, str], _WatchedMap] = {}  # by tenant and name
+        self._maps: dict[tuple[str, str], _WatchedMap] = {}  # keyed by tenant and map name
         self._by_subscriber: dict[Subscriber, dict[int, _Subscription]] = {}
-        self._due: dict[_Subscription, None] = {}  # those with unsent updates, in their order
-        self._slow: dict[_Subscription, None] = {}  # those whose socket was full
-        self._has_round = False  # a round of sending is scheduled
-        self._has_slow_retry = False  # a retry for slow subscribers is scheduled
+        self._due: dict[_Subscription, None] = {}  # subscriptions that the next round serves
+        self._slow: dict[_Subscription, None] = {}  # subscriptions whose socket was full
+        self._has_round = False  # whether the next round of sending is scheduled
+        self._has_slow_retry = False  # whether a retry for subscriptions with a full socket is scheduled
         self._last_round_s = float("-inf")
 
     def __len__(self) -> int:
-        """Return the number of subscriptions."""
+        """Return the number of subscriptions of this worker to live maps."""
         return sum(len(subscriptions) for subscriptions in self._by_subscriber.values())
 
     def begin(
@@ -156,7 +158,10 @@ class Subscriptions:
             self._set_starter(subscription, is_starter=False)
 
     def _set_starter(self, subscription: _Subscription, *, is_starter: bool, notify: bool = True) -> None:
-        """Note whether a map server is started for a subscription, and *notify* `watch` if that matters."""
+        """Set whether a map server may be started for a subscription.
+
+        If that changes whether one may be started for the map, ``watch`` is called again if *notify* is set.
+        """
         watched_map = subscription.map
         had_starters = bool(watched_map.starters)
         if is_starter:
@@ -184,7 +189,7 @@ class Subscriptions:
             self._unwatch(watched_map.tenant, watched_map.name)
 
     def end_all(self, subscriber: Subscriber) -> None:
-        """End all subscriptions of a connection that was closed."""
+        """End all subscriptions of a robot whose connection was closed."""
         for identity in list(self._by_subscriber.get(subscriber, ())):
             self.end(subscriber, identity)
 

@@ -57,13 +57,13 @@ _T = TypeVar("_T")
 
 
 class Urgency(enum.IntEnum):
-    """Order of the work that waits for the thread of the map; smaller values are done first."""
+    """Priority of work in the thread that holds the map; work with a smaller value is done first."""
 
-    APPLY = 0  # apply durable entries of the log to the map
-    VALIDATE = 1  # validate keyframes before they are logged
-    ANSWER = 2  # answer requests that read the map
-    MEASURE = 3  # choose the candidates of loop closures
-    BACKGROUND = 4  # prepare versions and the optimisation of the whole graph
+    APPLY = 0  # events of durable log entries are applied to the map
+    VALIDATE = 1  # keyframes are validated before they are logged
+    ANSWER = 2  # requests that only read the map are answered
+    MEASURE = 3  # candidates for loop closures of a keyframe are chosen
+    BACKGROUND = 4  # versions and the optimisation of the whole graph are prepared
 
 
 class MapServerThreads:
@@ -107,7 +107,7 @@ class MapServerThreads:
         return asyncio.shield(asyncio.wrap_future(future))
 
     def match(self, act: Callable[[], _T]) -> Awaitable[_T]:
-        """Call *act*, which matches keyframes or optimises a copy of the graph, while the map may change."""
+        """Call *act* in one of three threads for matching; *act* works on copies of data of the map."""
         return self._run(self._matching, act)
 
     def store(self, act: Callable[[], _T]) -> Awaitable[_T]:
@@ -131,12 +131,12 @@ class MapServerThreads:
 
 
 def _lower_thread_priority() -> None:
-    """Raise the niceness of the calling thread only: Linux has a niceness for each thread."""
+    """Set the niceness of the calling thread to 10; on Linux each thread has a niceness of its own."""
     os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _BACKGROUND_NICE)
 
 
 def next_retry_s(wait_s: float) -> float:
-    """Return the wait before the next try of a failing store: twice the last wait *wait_s*, at most 1 s."""
+    """Return the seconds until the next try of a failing object store: twice the last wait, at most 1 s."""
     return min(_MAX_RETRY_S, 2 * wait_s)
 
 

@@ -67,10 +67,10 @@ class KeyframeObjects:
     """
 
     def __init__(self, store: ObjectStore, account: TenantAccount) -> None:
-        """Prepare to read from *store*; the sizes of deleted objects are credited to *account*."""
+        """Use the object store *store* and the tenant's *account*, which is credited for deleted objects."""
         self._store = store
         self._account = account
-        self._cache: dict[str, bytes] = {}  # content of objects, by object name
+        self._cache: dict[str, bytes] = {}  # encoded points, keyed by object name
         self._cached_bytes = 0
         self._culled: deque[tuple[str, str]] = deque()
         self._deletions: Counter[tuple[str, str]] = Counter()
@@ -144,7 +144,10 @@ class KeyframeObjects:
             self.delete([self._culled.popleft()])
 
     def _read_points(self, source: PointSource, old_cache: dict[str, bytes]) -> tuple[Array, Colours] | None:
-        """Return the points of one keyframe in its camera frame (m) with colours; None if there are none."""
+        """Return the points (m, in the camera frame) and colours of one keyframe, or None if unreadable.
+
+        *old_cache* has the objects that were read for the last cloud, by object name.
+        """
         digest, size_bytes = source.reference.digest, source.reference.size
         name = f"objects/{source.robot}/{digest}"
         data = old_cache.get(name)
@@ -175,7 +178,9 @@ def _select_evenly(sources: Sequence[PointSource]) -> list[PointSource]:
         rows_by_robot.setdefault(source.robot, []).append(row)
     selected: list[int] = []
     robots_left = len(rows_by_robot)
-    for rows in sorted(rows_by_robot.values(), key=len):  # a small share leaves more for the next robots
+    for rows in sorted(
+        rows_by_robot.values(), key=len
+    ):  # what a robot with few keyframes leaves is shared by the others
         share = (_MAX_SOURCES - len(selected)) // robots_left
         picks = np.linspace(0, len(rows) - 1, min(share, len(rows))).astype(np.int64)
         selected += [rows[pick] for pick in picks]

@@ -45,21 +45,24 @@ __all__ = [
     "entries_between_snapshots",
 ]
 
-_MIN_ENTRIES_BETWEEN_SNAPSHOTS = 40  # of a small map: a restart applies so many in 0.1 to 0.2 s
-_MAX_ENTRIES_BETWEEN_SNAPSHOTS = 200  # of a large map: a restart applies so many in 0.4 to 0.8 s
+_MIN_ENTRIES_BETWEEN_SNAPSHOTS = 40
+"""Log entries between two snapshots of a small map; a restart applies them again in less than 0.2 s."""
+_MAX_ENTRIES_BETWEEN_SNAPSHOTS = 200
+"""Log entries between two snapshots of a large map; a restart applies them again in less than 0.8 s."""
 _ENTRIES_PER_KEYFRAME = 0.25
-"""Entries between two snapshots for each keyframe of the map: a snapshot costs more in a larger map, so it is
-written less often."""
+"""Log entries between two snapshots for each keyframe in the map: a snapshot of a larger map costs more, so
+snapshots are written less often."""
 _SNAPSHOTS_KEPT = 2
-"""Number of snapshots that are kept: if the newest is damaged, a restart uses the one before."""
+"""Number of snapshots of a map that are kept: if the newest is damaged, a restart uses the one before."""
 _MAX_ENTRY_EVENTS = 64
-"""Largest number of events in one entry, so that applying an entry does not delay other requests for long."""
+"""Largest number of events in one log entry; it bounds the time for which an entry occupies the map."""
 _MAX_ENTRY_BYTES = 4 << 20
-"""Largest size in bytes of the keyframes in one entry that has more than one event."""
+"""Largest total size in bytes of the keyframes that share one log entry; it bounds the time of a write."""
 _MAX_QUEUED_EVENTS = 1024
-"""Number of events that may wait for the store before further keyframes are refused with Busy."""
+"""Number of events that may wait for the object store; beyond it, keyframes are refused with Busy."""
 SLOW_STORE_S = 1.0
-"""Seconds after which a write counts as slow; robots are then sent the state "waiting for the store"."""
+"""Seconds after which a write to the object store counts as slow, and robots are sent the state "waiting for
+the store"."""
 BUSY_RETRY_MS = 200.0
 """Milliseconds after which a robot sends a request again that a live map refused as busy."""
 
@@ -88,10 +91,10 @@ class LogEntry(msgspec.Struct, frozen=True, array_like=True):
 
 
 class _StoredSnapshot(msgspec.Struct, frozen=True, array_like=True):
-    digest: str  # SHA-256 of head
+    digest: str  # SHA-256 of the head, by which a damaged snapshot is recognised
     unmeasured: tuple[int, ...]
     head: bytes
-    parts: dict[str, str] = {}  # name of a part: name of its object below features/
+    parts: dict[str, str] = {}  # names of the objects below features/, keyed by the name of the part
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -229,7 +232,9 @@ class LiveLog:
         try:
             self._store.compare_and_swap(name, None, data)
         except Conflict as error:
-            if self._store.get(name) != data:  # equal if an earlier call wrote it and its reply was lost
+            if (
+                self._store.get(name) != data
+            ):  # if equal, an earlier call wrote the entry and its reply was lost
                 raise LeaseLost(f"entry {number} of the log was written by another map server") from error
         self.position = number
         return number
@@ -261,7 +266,7 @@ class LiveLog:
             else:
                 parts[name] = f"{self._epoch:09d}-{name}"
                 self._store.put(f"{self._part_prefix}{parts[name]}", data)
-        # 2. The head follows.
+        # 2. The head of the snapshot is written.
         stored = _StoredSnapshot(digest_of(snapshot.head), snapshot.unmeasured, snapshot.head, parts)
         self._store.put(self._snapshot_name(snapshot.position), _encode(stored))
         # 3. Older snapshots are deleted, then the parts and the entries that only they needed.
@@ -297,7 +302,7 @@ class LiveLog:
         self._delete_parts_except_of([])
 
     def _delete_parts_except_of(self, snapshots: list[int]) -> None:
-        """Delete the parts of this and earlier epochs that none of the *snapshots*, by number, needs."""
+        """Delete the parts that no snapshot with a number in *snapshots* needs, except parts of later epochs."""
         needed: set[str] = set()
         for number in snapshots:
             with contextlib.suppress(NotFound, msgspec.MsgspecError):
@@ -332,7 +337,7 @@ class LiveLog:
 
 
 def _number_in(name: str) -> int:
-    """Return the number at the end of the object name of an entry or a snapshot."""
+    """Return the number of a log entry or snapshot, which its object name ends with."""
     return int(name.rpartition("/")[2])
 
 
@@ -404,7 +409,7 @@ class LogWriter:
                 retry_after_ms=BUSY_RETRY_MS,
             )
         submitted = SubmittedEvent(event, size_bytes, asyncio.get_running_loop().create_future())
-        # Reading the exception keeps asyncio from logging it if nobody awaits the future.
+        # asyncio logs an exception that nobody reads; a request that was cancelled does not read it.
         submitted.applied.add_done_callback(lambda future: future.cancelled() or future.exception())
         self._outstanding.add(submitted.applied)
         submitted.applied.add_done_callback(self._outstanding.discard)
@@ -418,13 +423,13 @@ class LogWriter:
             await asyncio.wait(set(self._outstanding))
 
     def refuse_all(self, make_error: Callable[[], RsePfError]) -> None:
-        """Set a new error of *make_error* on the future of each event that is not applied yet."""
+        """Fail all events that are not applied yet with an error made by *make_error*."""
         for future in list(self._outstanding):
             if not future.done():
                 future.set_exception(make_error())
 
     async def run(self) -> None:
-        """Write queued events until cancelled."""
+        """Write queued events to the log, and have them applied, until this task is cancelled."""
         while True:
             await self._has_events.wait()
             batch = self._next_batch()
@@ -483,7 +488,7 @@ class LogWriter:
                 return position
 
     async def _is_entry_missing(self) -> bool:
-        """Return whether the next entry certainly does not exist, so that it may get another content."""
+        """Return whether the log certainly has no next entry, so that other events may be written there."""
         try:
             return not await self._environment.threads.store(self._log.has_next_entry)
         except StoreError:
@@ -491,7 +496,7 @@ class LogWriter:
 
 
 def _refuse_keyframes(batch: list[SubmittedEvent], error: StoreFull) -> list[SubmittedEvent]:
-    """Set *error* on the keyframes of *batch*, which robots send again, and return its other events."""
+    """Fail the keyframes of *batch* with *error*, so that robots send them again; return the other events."""
     for submitted in batch:
         if isinstance(submitted.event, KeyframeAdded) and not submitted.applied.done():
             submitted.applied.set_exception(error)

@@ -131,12 +131,12 @@ class MapServer:
             lease: Lease of the map, which this process has claimed.
         """
         self.users = 0
-        """Number of connections of workers; maintained by `WorkerConnections`."""
+        """Number of connected workers, which `WorkerConnections` maintains; a map without any is given up."""
         self._environment = environment
         self._state = state
         self._log = log
         self._lease = lease
-        self._robot_names: dict[str, str] = {}  # by RobotId.folder
+        self._robot_names: dict[str, str] = {}  # displayed names, keyed by RobotId.folder
         self._updates = MapUpdates(self._name_of)
         self._writer = LogWriter(
             log,
@@ -147,7 +147,8 @@ class MapServer:
         )
         self._measurer = KeyframeMeasurer(state, environment, self._writer.submit)
         self._publisher = Publisher(state, environment, server=lease.record.server)
-        self._additions: dict[tuple[str, int], asyncio.Task[None]] = {}  # by robot and keyframe number
+        self._additions: dict[tuple[str, int], asyncio.Task[None]] = {}  # running additions of
+        # keyframes, keyed by RobotId.folder and keyframe number
         self._present_robots: dict[str, None] = {}
         self._renewed = asyncio.Event()
         self._snapshot_position = 0
@@ -163,7 +164,7 @@ class MapServer:
         self._tasks: set[asyncio.Task[None]] = set()
 
     def current_updates(self) -> list[dict[str, Any]]:
-        """Return the updates for a new subscriber; none while another process may hold the lease."""
+        """Return the newest updates for a new subscriber; none while another process may hold the lease."""
         return self._updates.all() if self._holds_lease() else []
 
     async def run(self) -> ServiceEnd:
@@ -234,7 +235,7 @@ class MapServer:
                 return await self._reply_to_map_request(robot, operation)
 
     async def _reply_to_map_request(self, robot: RobotId, operation: str) -> dict[str, Any]:
-        """Do an operation whose request contains only the name of the map: leave, publish or stop."""
+        """Do ``live-leave``, ``live-publish`` or ``live-stop``, whose requests have the same fields."""
         if operation == LEAVE:
             return await self._leave(robot)
         if operation == PUBLISH:
@@ -247,7 +248,7 @@ class MapServer:
             robot=robot.folder, segment=request.segment, number=request.number, data=request.keyframe
         )
         key = event.robot, event.number
-        addition = self._additions.get(key)  # present if the robot has sent the keyframe twice
+        addition = self._additions.get(key)  # not None if the robot sends the keyframe again
         if addition is None:
             self._present_robots[event.robot] = None
             addition = self._additions[key] = asyncio.ensure_future(self._add_keyframe(event))
@@ -304,7 +305,7 @@ class MapServer:
                 await reservation
             except StoreFull:
                 raise
-            except StoreError:  # the store fails: the entry waits for it, and is charged later
+            except StoreError:  # the log entry waits until the store works, and is counted then
                 pass
         self._bytes_since_snapshot += size_bytes
 
@@ -329,7 +330,10 @@ class MapServer:
         return {}
 
     async def _forget_robot(self, request: LiveForget) -> dict[str, Any]:
-        """Remove what a robot contributed under each of its enrolments; raises NotFound if it did not."""
+        """Remove all that a robot contributed to the map; raises NotFound if it contributed nothing.
+
+        A robot that was enrolled several times under one name is removed completely.
+        """
         contributors = await self._environment.threads.compute(
             Urgency.ANSWER, lambda: list(self._state.live_map.contributors)
         )
@@ -352,14 +356,17 @@ class MapServer:
             await threads.background(functools.partial(objects.delete_of_forgotten, forgotten))
 
     async def _delete_objects_of_culled(self, culled: list[tuple[str, str]]) -> None:
-        """Delete points and images of culled keyframes; if that fails, they stay as long as their robot."""
+        """Delete stored points and images of culled keyframes; an error of the store is ignored."""
         with contextlib.suppress(StoreError):
             await self._environment.threads.background(
                 functools.partial(self._environment.objects.delete_of_culled, culled)
             )
 
     async def _delete_objects_of_forgotten_at_start(self) -> None:
-        """Delete what the previous map server may have left; if the store fails, a publication deletes it."""
+        """Delete objects of forgotten robots that the previous map server did not delete.
+
+        An error of the store is ignored, because each publication tries again.
+        """
         with contextlib.suppress(StoreError):
             await self._delete_objects_of_forgotten()
 
@@ -391,7 +398,7 @@ class MapServer:
         if self._state.keyframes:
             freed_bytes = await background(self._log.charged_bytes)
             record = await self._publisher.publish("the live map was stopped", freed_bytes)
-        # 2. The lease says where the map was stopped.
+        # 2. The lease is given up, and states the position of the log at which the map was stopped.
         await self._close(lambda: self._lease.stop(self._log.position), "stopped")
         # 3. The log is deleted; entries that stay after an error are ignored by the next map server.
         with contextlib.suppress(StoreError):
@@ -425,10 +432,10 @@ class MapServer:
         # 3. Objects of keyframes that the map dropped as redundant are deleted.
         if culled:
             self._start_task(self._delete_objects_of_culled(culled))
-        # 4. Subscribers get the updates that changed.
+        # 4. Subscribers are sent the alignments and poses that changed.
         for update in updates:
             self._send_update(update)
-        # 5. A snapshot is written after some entries.
+        # 5. A snapshot is written if enough entries were applied since the last one.
         if self._state.is_snapshot_due:
             self._start_task(self._write_snapshot(await self._make_snapshot()))
 
@@ -473,7 +480,7 @@ class MapServer:
                 )
 
     def _complete_events(self, batch: list[SubmittedEvent], applied: AppliedEntry) -> None:
-        """Set the result of each event of an entry, and request the measurements that follow from it."""
+        """Complete the futures of the events of an entry, and queue its keyframes for measurement."""
         for submitted, outcomes, defect in zip(batch, applied.outcomes, applied.defects, strict=True):
             if defect is not None:
                 self._environment.log.error(
@@ -661,7 +668,7 @@ class MapServer:
             self._send_map_state()
 
     def _name_of(self, folder: str) -> str:
-        """Return the displayed name of the robot with this `RobotId.folder`."""
+        """Return the name that is displayed for the robot with the `RobotId.folder` *folder*."""
         return self._robot_names.get(folder) or shown_name(folder)
 
     def _moving_error(self) -> MapMoving:
@@ -672,7 +679,7 @@ class MapServer:
         )
 
     def _start_task(self, work: Coroutine[Any, Any, None]) -> None:
-        """Run *work* beside the requests; if it fails, the service ends."""
+        """Run *work* as a task of this map server; an unexpected exception ends the service as a defect."""
         task = asyncio.get_running_loop().create_task(work)
         self._tasks.add(task)
         task.add_done_callback(self._on_task_end)

@@ -96,11 +96,11 @@ class KeyframeMeasurer:
 
     @property
     def is_proven(self) -> bool:
-        """Whether keyframes were measured and none is left that could still kill the process."""
+        """Whether keyframes were measured and none is unmeasured, so that none killed this process."""
         return self._has_measured and not self._state.unmeasured
 
     def add_keyframes(self, keyframes: Iterable[int]) -> None:
-        """Queue keyframes, by their ids, for measurement."""
+        """Queue the keyframes with these ids for the measurement of their loop closures."""
         self._waiting.extend(keyframes)
         self._has_work.set()
 
@@ -110,7 +110,7 @@ class KeyframeMeasurer:
         self._has_work.set()
 
     async def run(self) -> None:
-        """Measure and optimise until cancelled."""
+        """Measure queued keyframes and do requested optimisations until this task is cancelled."""
         await asyncio.gather(*(self._work() for _ in range(_CONCURRENT_MEASUREMENTS)))
 
     async def _work(self) -> None:
@@ -132,9 +132,9 @@ class KeyframeMeasurer:
             self._state.prepare_measurement, keyframe, parts, choose_candidate_count(waiting)
         )
         measurements = await self._threads.compute(Urgency.MEASURE, prepare)
-        # 2. Other threads match and solve.
+        # 2. Threads for matching estimate the relative poses.
         begun = [self._threads.match(measure) for measure in measurements]
-        # 3. The result enters the log.
+        # 3. The measured loop closures are queued for the log.
         self._submit(merge_measurements(keyframe, [await measured for measured in begun]))
         self._has_measured = True
 

@@ -28,7 +28,7 @@ Payload = dict[str, Any]
 _MAX_PATH_POINTS = 4_000
 """Largest number of keyframe positions in the reply of ``live-show``: they are about 100 kB of JSON, of the
 256 KiB that a message may have."""
-_UPPER_TRIANGLE = np.triu_indices(6)  # of the 6 x 6 covariance of a pose
+_UPPER_TRIANGLE = np.triu_indices(6)  # row and column indices of the upper triangle of a 6 x 6 covariance
 _FIELDS_NOT_COMPARED = ("cause", "version")
 """Fields of an update in which a change alone is not sent to robots."""
 
@@ -142,10 +142,10 @@ class MapUpdates:
     """
 
     def __init__(self, name_of: Callable[[str], str]) -> None:
-        """Begin without updates; *name_of* returns the displayed name of a robot, given its folder."""
+        """Begin without updates; *name_of* returns the displayed name of a robot by its `RobotId.folder`."""
         self._name_of = name_of
         self._newest: dict[str, Payload] = {}
-        self._alignments: dict[str, Alignment] = {}  # by folder of the robot
+        self._alignments: dict[str, Alignment] = {}  # keyed by RobotId.folder
 
     def all(self) -> list[Payload]:
         """Return the newest update of each key, that of the key ``map`` first."""
@@ -190,7 +190,7 @@ class MapUpdates:
         return changed
 
     def add_pose(self, event: KeyframeAdded) -> list[Payload]:
-        """Set the pose of a robot to that of its new keyframe, if the keyframe's segment is aligned."""
+        """Set the update ``pose/ROBOT`` to the pose of a new keyframe if its segment is aligned."""
         alignment = self._alignments.get(event.robot)
         if alignment is None or not alignment.aligned or alignment.segment != event.segment:
             return []
@@ -208,7 +208,7 @@ class MapUpdates:
         )
 
     def has_segment(self, event: KeyframeAdded) -> bool:
-        """Return whether the alignment of the robot is that of the segment of its keyframe."""
+        """Return whether the last alignment of a keyframe's robot belongs to the segment of the keyframe."""
         alignment = self._alignments.get(event.robot)
         return alignment is not None and alignment.segment == event.segment
 
@@ -227,7 +227,7 @@ class MapUpdates:
         return [payload] if is_new else []
 
     def _replace(self, payload: Payload) -> list[Payload]:
-        """Replace the update of the payload's key; return the payload unless the old one says the same."""
+        """Store *payload* as the newest update of its key; return a list with it if it must be sent."""
         key = f"{payload['kind']}/{payload['robot']}"
         before = self._newest.get(key)
         self._newest[key] = payload

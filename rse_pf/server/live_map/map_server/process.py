@@ -65,7 +65,7 @@ from rse_pf.server.log import JsonLog
 
 __all__ = ["advertised_address", "run"]
 
-_READ_BYTES = 1 << 16  # largest number of bytes in one read of the worker's socket
+_READ_BYTES = 1 << 16  # largest number of bytes that one read of the worker's socket returns
 _RETRY_S = 0.1
 """Seconds between two tries of a failing object store while the map is claimed and restored."""
 _SWITCH_INTERVAL_S = 0.0005
@@ -106,7 +106,7 @@ def run(worker: socket.socket) -> None:
 
     This function never returns after an order: it exits the process with code 0, or with 1 after an error.
     """
-    # 1. Settings, imports and certificate.
+    # 1. The process reads the settings, imports its modules and makes its certificate.
     start = receive(worker)
     if start is None:
         return
@@ -143,7 +143,7 @@ def run(worker: socket.socket) -> None:
     except Exception:  # noqa: BLE001  standard error goes to the log of the server
         traceback.print_exc()
     finally:
-        os._exit(exit_code)  # without waiting for threads, which may be blocked by the store
+        os._exit(exit_code)  # a normal exit would wait for threads that are blocked by the store
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -224,7 +224,11 @@ class _MapServerProcess:
             await asyncio.sleep(renewal_s(lease_s))
 
     async def _take_over(self) -> tuple[MapState, LiveLog]:
-        """Restore the map from its log; raises LeaseLost."""
+        """Restore the map from its log, and write the log entry that excludes the previous map server.
+
+        Raises:
+            LeaseLost: Another process has taken the map over meanwhile.
+        """
         record = self._lease.record
         log = LiveLog(
             self._store,
@@ -281,7 +285,7 @@ class _MapServerProcess:
             self._worker.sendall(encode_message(["lost"]))
             return
         self._worker.sendall(encode_message(["serving", self._lease.record.epoch]))
-        # 3. Requests are answered.
+        # 3. Requests are answered until the service ends.
         release_order = asyncio.ensure_future(self._release_on_order(map_server))
         end = await map_server.run()
         release_order.cancel()
@@ -314,12 +318,12 @@ class _MapServerProcess:
         )
 
     def _send_use(self, is_used: bool) -> None:
-        """Send the worker whether the map is used, because it may need this process for another map."""
-        with contextlib.suppress(OSError):  # the worker has exited, and this process follows
+        """Send the worker whether the map gets commands; the worker may need this process for another map."""
+        with contextlib.suppress(OSError):  # the worker has exited, and Linux kills this process
             self._worker.sendall(encode_message(["used", is_used]))
 
     async def _release_on_order(self, map_server: MapServer) -> None:
-        """Release the map when the worker orders it."""
+        """Read orders of the worker, and release the map when it orders that."""
         self._worker.setblocking(False)
         frames = FrameReader(_READ_BYTES)
         while data := await asyncio.get_running_loop().sock_recv(self._worker, _READ_BYTES):
@@ -329,7 +333,11 @@ class _MapServerProcess:
     async def _retry(
         self, run_in_thread: Callable[[Callable[[], _T]], Awaitable[_T]], act: Callable[[], _T]
     ) -> _T:
-        """Return the result of *act*, which is repeated while the store fails; raises LeaseLost."""
+        """Return the result of *act*, called in a thread and repeated while the object store fails.
+
+        Raises:
+            LeaseLost: Another process has taken the map over.
+        """
         while True:
             try:
                 return await run_in_thread(act)

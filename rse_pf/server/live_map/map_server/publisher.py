@@ -61,7 +61,7 @@ _MAX_COMMIT_TRIES = 5
 
 
 class Publisher:
-    """Publishes one live map; its methods are called in the event loop."""
+    """Publishes versions of one live map; all methods are called in the event loop."""
 
     def __init__(self, state: MapState, environment: MapServerEnvironment, *, server: str) -> None:
         """Publish nothing yet.
@@ -78,9 +78,10 @@ class Publisher:
         self._clock = environment.clock
         self._map_name = environment.map_name
         self._min_interval_s = environment.settings.publish_pause_s
-        self._lock = asyncio.Lock()  # one publication at a time
-        self._source_up: tuple[str, list[float] | None] = "", None  # source version: its vector of up
-        self._published_changes: int | None = None  # value of MapState.changes in the last version
+        self._lock = asyncio.Lock()  # held during a publication
+        self._source_up: tuple[str, list[float] | None] = "", None  # name of the version that the map
+        # started from, and its vector of up
+        self._published_changes: int | None = None  # MapState.changes at the last publication
         self._last_record: MapRecord | None = None
         self._next_allowed_s: float | None = None
         self._due_note = ""
@@ -140,7 +141,7 @@ class Publisher:
         """
         if not self.is_due or self._lock.locked() or self._clock() < self._retry_at_s:
             return
-        with contextlib.suppress(StoreError):  # the registry cannot be read; the next call tries again
+        with contextlib.suppress(StoreError):  # the next call reads the registry again
             if await self._seconds_until_allowed() <= 0:
                 await self.publish_now()
 
@@ -183,7 +184,7 @@ class Publisher:
         # 3. Old automatic versions are removed.
         try:
             removed = await background(self._remove_old_versions)
-        except RsePfError as error:  # the next publication removes them
+        except RsePfError as error:  # the next publication removes the old versions
             environment.log.warning("live-versions-not-removed", map=self._map_name, error=error.message)
         else:
             if removed:

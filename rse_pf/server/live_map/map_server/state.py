@@ -121,7 +121,7 @@ class MapState:
 
     @property
     def is_snapshot_due(self) -> bool:
-        """Whether `entries_between_snapshots` entries were applied since the last snapshot."""
+        """Whether `entries_between_snapshots` log entries were applied since the last snapshot was made."""
         return self.position - self._snapshot_position >= entries_between_snapshots(self.keyframes)
 
     def make_snapshot(self, stored_parts: Collection[str]) -> MapSnapshot:
@@ -133,7 +133,7 @@ class MapState:
         )
 
     def digest(self) -> str:
-        """Return the SHA-256 in hex of the state of the map."""
+        """Return the SHA-256 in hex of the complete state of the map, by which replays are compared."""
         return self.live_map.digest()
 
     def _apply_event(self, event: Event) -> tuple[list[Outcome], Exception | None]:

@@ -30,7 +30,7 @@ from rse_pf.silent_connections import BACKLOG, FIRST_REQUEST_S, TlsListener
 
 __all__ = ["WorkerConnections", "listen"]
 
-_READ_BYTES = 1 << 18  # largest number of bytes in one read of a socket
+_READ_BYTES = 1 << 18  # largest number of bytes that one read of a worker's socket returns
 _MAX_CONCURRENT_REQUESTS = 256
 """Number of unanswered requests of one worker; further ones stay in its socket, so that memory is bounded."""
 _FLUSH_S = 2.0
@@ -98,7 +98,10 @@ class WorkerConnections:
             connection.send_renewal(number)
 
     async def close(self) -> None:
-        """Stop accepting, wait at most 2 s for running requests, and send ``moving`` to every worker."""
+        """Accept no more connections, answer the running requests, and send ``moving`` to every worker.
+
+        After 2 s the rest is given up.
+        """
         if self._listener is not None:
             self._listener.close()
         if self._connections:
@@ -137,7 +140,7 @@ class WorkerConnections:
 
 
 class _WorkerConnection:
-    """The connection of one worker."""
+    """The connection of one worker to this map server: a queue of messages and the requests in progress."""
 
     def __init__(
         self,
@@ -151,30 +154,30 @@ class _WorkerConnection:
         self._writer = writer
         self._on_defect = on_defect
         self._messages: list[Any] = []
-        self._updates: dict[str, dict[str, Any]] = {}  # newest unsent update of each key
-        self._renewal: int | None = None  # newest unsent renewal
+        self._updates: dict[str, dict[str, Any]] = {}  # updates that were not written yet, by key
+        self._renewal: int | None = None  # renewal of the lease that was not written yet
         self._has_unsent = asyncio.Event()
         self._is_flushed = asyncio.Event()
         self._request_slots = asyncio.Semaphore(_MAX_CONCURRENT_REQUESTS)
         self._tasks: set[asyncio.Future[None]] = set()
 
     def start(self) -> None:
-        """Begin to write queued messages to the socket."""
+        """Start the task that writes queued messages to the worker's socket."""
         self._tasks.add(asyncio.ensure_future(self._write_messages()))
 
     def send(self, message: list[Any]) -> None:
-        """Queue *message* for the socket."""
+        """Queue *message* to be written to the worker's socket."""
         self._messages.append(message)
         self._is_flushed.clear()
         self._has_unsent.set()
 
     def send_renewal(self, number: int) -> None:
-        """Queue the number of a renewal, in place of an older one that was not written yet."""
+        """Queue the number of a renewal of the lease; it replaces an older one that was not written yet."""
         self._renewal = number
         self._has_unsent.set()
 
     def send_update(self, payload: dict[str, Any]) -> None:
-        """Queue an update, in place of an older one of its key that was not written yet."""
+        """Queue an update; it replaces an older update of the same key that was not written yet."""
         key = f"{payload['kind']}/{payload.get('robot', '')}"
         self._updates.pop(key, None)
         self._updates[key] = payload
@@ -186,14 +189,14 @@ class _WorkerConnection:
         await self._is_flushed.wait()
 
     async def finish(self) -> None:
-        """Wait until all running requests are answered, then send ``moving``."""
+        """Wait until the requests of the worker are answered, and send ``moving``: the map is given up."""
         for _ in range(_MAX_CONCURRENT_REQUESTS):
             await self._request_slots.acquire()
         self.send(["moving"])
         await self._is_flushed.wait()
 
     def close(self) -> None:
-        """Cancel running requests and close the socket."""
+        """Cancel the requests of the worker and close its socket."""
         for task in self._tasks:
             task.cancel()
         self._writer.close()
@@ -224,7 +227,7 @@ class _WorkerConnection:
                 self._updates.clear()
 
     async def _answer(self, number: int, robot: RobotId, operation: str, request: bytes) -> None:
-        """Send the reply to the request *number*, whatever happens: the worker waits for it."""
+        """Answer the request *number* of the worker; every exception is sent to it as a refusal."""
         try:
             self.send(["answer", number, await self._map_server.answer(robot, operation, request)])
         except MapMoving:
@@ -277,5 +280,5 @@ async def _read_hello(reader: asyncio.StreamReader, frames: FrameReader) -> tupl
 
 
 def _error_fields(error: RsePfError) -> list[Any]:
-    """Return the fields of an error in the message ``refused``."""
+    """Return code, message, hint and retry time (ms) of *error*, which the message ``refused`` ends with."""
     return [error.code, error.message, error.hint, error.retry_after_ms]
