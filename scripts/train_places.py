@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from client_sdk.frontend import Frame, FrontEndOptions, extract
 from client_sdk.simulator import SIMULATED_CAMERA, true_trajectory
-from client_sdk.simulator.camera import Painter, add_depth_noise, add_image_noise
+from client_sdk.simulator.renderer import Renderer, add_depth_noise, add_image_noise
 from client_sdk.simulator.world import make_world
 from rse_pf.maps.descriptors import ORB, Descriptors
 from rse_pf.slam.place_recognition import DIRECTIONS, VOCABULARY_FILE, WORDS
@@ -45,7 +45,7 @@ def main() -> None:
 def rendered_views(seed: int) -> list[Descriptors]:
     """Return the descriptors with depth of the frames of one world."""
     poses = true_trajectory(0, 1, FRAMES, seed).T_world_camera
-    painter, options = Painter(make_world(seed), SIMULATED_CAMERA), FrontEndOptions()
+    painter, options = Renderer(make_world(seed), SIMULATED_CAMERA), FrontEndOptions()
     views = []
     for row in range(0, FRAMES, EACH):
         rng = np.random.default_rng([seed, row])

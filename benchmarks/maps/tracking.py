@@ -30,7 +30,7 @@ from benchmarks.recorded_drives import RED_KITCHEN, track
 from client_sdk.datasets import Dataset, open_dataset
 from client_sdk.frontend import Frame, TrackedFrame
 from client_sdk.simulator import SIMULATED_CAMERA, true_trajectory
-from client_sdk.simulator.camera import Painter, add_depth_noise, add_image_noise
+from client_sdk.simulator.renderer import Renderer, add_depth_noise, add_image_noise
 from client_sdk.simulator.world import make_world
 from client_sdk.tracking.tracker import Join, Tracker
 from client_sdk.trajectory import Trajectory
@@ -92,7 +92,7 @@ def hard_drive(motion: Trajectory, first_s: float, seed: int, *, rate_hz: float 
     truth = Trajectory(stamps_s, origin @ motion.at(first_s + stamps_s))
 
     def frames() -> Iterator[Frame]:
-        painter = Painter(make_world(seed), SIMULATED_CAMERA)
+        painter = Renderer(make_world(seed), SIMULATED_CAMERA)
         for row, stamp_s in enumerate(stamps_s):
             rng = np.random.default_rng([seed, 99, row])
             _, depth_m, cosine = painter.draw(truth.T_world_camera[row])

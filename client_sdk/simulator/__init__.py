@@ -1,6 +1,8 @@
-"""A rendered world for robots without a camera: exact poses and a Kinect's noise.
+"""Render a furnished world for robots without a camera: exact poses, and images with the noise of a Kinect.
 
-Rendering and trajectories belong here; reading recordings belongs to `datasets`.
+1. `world` makes the rooms and their furniture as textured rectangles.
+2. `drive` makes the trajectories of robots through the rooms, and yields their frames.
+3. `renderer` draws images and exact depths, and adds the noise of the sensors.
 """
 
 from client_sdk.simulator.drive import (

@@ -1,7 +1,7 @@
-"""Rendered frames with exact poses, for robots without a recording.
+"""Make exact trajectories through the simulated world, and yield the rendered frames of robots on them.
 
-Robots follow one loop through three furnished rooms, or as many as are asked for; each starts at a different
-point of it, so their maps overlap.  The same arguments give the same frames.  No image library is needed.
+All robots follow one closed loop through the furnished rooms, each from another start, so that their maps
+overlap.  The same arguments give the same frames.  No image library is needed.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from client_sdk.frontend import Frame
-from client_sdk.simulator.camera import Painter, add_depth_noise, add_image_noise
+from client_sdk.simulator.renderer import Renderer, add_depth_noise, add_image_noise
 from client_sdk.simulator.world import ROOM_M, ROOMS, World, make_world
 from client_sdk.stereo.view import StereoView
 from client_sdk.trajectory import Trajectory
@@ -20,43 +20,74 @@ from rse_pf.errors import UsageError
 from rse_pf.geometry import Array, Camera
 
 __all__ = [
-    "RATE_HZ", "SIMULATED_CAMERA", "STEP_M", "frames_to_overlap", "loop_trajectory", "render_along",
-    "render_frames", "render_pairs", "true_trajectory",
-]  # fmt: skip
+    "RATE_HZ",
+    "SIMULATED_CAMERA",
+    "STEP_M",
+    "frames_to_overlap",
+    "loop_trajectory",
+    "render_along",
+    "render_frames",
+    "render_pairs",
+    "true_trajectory",
+]
 
-RATE_HZ = 5.0
-"""The paper's frame rate (Sect. 6.2)."""
-STEP_M = 0.068
-"""Distance between frames: a robot that drives at 0.34 m/s."""
-_OVERLAP_M = 0.6
-"""Path that a robot drives beyond the start of the next one, so that their maps can be merged."""
+RATE_HZ = 5.0  # frames per second of a rendered drive, as in the paper's experiments (Sect. 6.2)
+STEP_M = 0.068  # distance between the camera positions of two frames: a robot that drives at 0.34 m/s
 SIMULATED_CAMERA = Camera(fx=525.0, fy=525.0, cx=319.5, cy=239.5, width=640, height=480)
+"""Intrinsics of the rendered images: the nominal ones of a Kinect."""
+_OVERLAP_M = 0.6  # distance that a robot drives beyond the start of the next robot, so that their maps merge
+_LUMA_WEIGHTS = (0.299, 0.587, 0.114)  # weights of red, green and blue in a grey image (ITU-R BT.601)
+_EYE_HEIGHT_M = 1.25  # mean height of the camera above the floor
+_LOOK_AHEAD_M = 1.0  # the camera looks at the point of the loop that is so far ahead
+_SWAY_M = 1.7  # length of the path in which the swaying of the camera repeats
+_PATH_STEP_M = 0.01  # distance between the points that describe the loop
+_SMOOTHING_POINTS = 45  # points on either side over which the corners of the loop are averaged, twice
 
-# Corners of the loop through all doors, from the left wall of a room: on the way there and back, past its
-# table if it has one, and around the middle of the last and the first room.
-_THERE_M = ((1.4, 1.75), (2.5, 1.65), (3.6, 1.75)), ((1.3, 1.35), (2.5, 1.0), (3.7, 1.35))
-_BACK_M = ((3.6, 2.8), (2.5, 2.9), (1.4, 2.8)), ((3.7, 3.2), (2.5, 3.45), (1.3, 3.2))
-_LAST_M = ((1.3, 1.35), (2.5, 1.0), (3.6, 1.4), (3.95, 2.3), (3.6, 3.2), (2.5, 3.45), (1.3, 3.2))
-_FIRST_M = ((3.7, 3.2), (2.5, 3.45), (1.4, 3.2), (1.05, 2.3), (1.4, 1.4), (2.5, 1.0), (3.7, 1.35))
-_IN_M, _OUT_M = (0.0, 2.05), (0.0, 2.55)
+# Corners of the loop in metres, from the left wall of a room and from the front wall of all rooms.
+_Corners = tuple[tuple[float, float], ...]
+_WAY_THERE_WITHOUT_TABLE: _Corners = ((1.4, 1.75), (2.5, 1.65), (3.6, 1.75))
+_WAY_THERE_WITH_TABLE: _Corners = ((1.3, 1.35), (2.5, 1.0), (3.7, 1.35))
+_WAY_BACK_WITHOUT_TABLE: _Corners = ((3.6, 2.8), (2.5, 2.9), (1.4, 2.8))
+_WAY_BACK_WITH_TABLE: _Corners = ((3.7, 3.2), (2.5, 3.45), (1.3, 3.2))
+_AROUND_LAST_ROOM: _Corners = (
+    (1.3, 1.35), (2.5, 1.0), (3.6, 1.4), (3.95, 2.3), (3.6, 3.2), (2.5, 3.45), (1.3, 3.2),
+)  # fmt: skip
+_AROUND_FIRST_ROOM: _Corners = (
+    (3.7, 3.2), (2.5, 3.45), (1.4, 3.2), (1.05, 2.3), (1.4, 1.4), (2.5, 1.0), (3.7, 1.35),
+)  # fmt: skip
+_DOOR_ON_WAY_THERE = (0.0, 2.05)
+_DOOR_ON_WAY_BACK = (0.0, 2.55)
 
 
 def render_frames(robot: int, robots: int, frames: int, seed: int, rooms: int = ROOMS) -> Iterator[Frame]:
-    """Yield the frames of robot 0, 1, ... of *robots*; frame *i* is seen from ``true_trajectory[i]``.
+    """Yield the RGB-D frames of one robot of a fleet; frame i is at pose i of `true_trajectory`.
+
+    Args:
+        robot: Number of the robot, from 0.
+        robots: Number of robots, whose starts are spread evenly over the loop.
+        frames: Number of frames.
+        seed: Seed of the world's textures, of the camera's swaying and of the sensor noise.
+        rooms: Number of rooms in a row, 2 or more.
 
     Raises:
-        UsageError: The robot is not one of *robots*, or there are no frames.
+        UsageError: The robot is not one of *robots*, there are no frames, or fewer than 2 rooms.
     """
     truth = true_trajectory(robot, robots, frames, seed, rooms)
     yield from render_along(truth, make_world(seed, rooms), (seed, robots, robot))
 
 
 def render_along(truth: Trajectory, world: World, noise: Sequence[int]) -> Iterator[Frame]:
-    """Yield the frames of a camera on *truth* in *world*; the numbers *noise* seed that of its sensor."""
-    painter = Painter(world, SIMULATED_CAMERA)
+    """Yield the RGB-D frames of a simulated Kinect on a trajectory.
+
+    Args:
+        truth: Pose and time stamp of each frame.
+        world: The world to draw.
+        noise: Numbers of which, with the number of the frame, the sensor noise is seeded.
+    """
+    renderer = Renderer(world, SIMULATED_CAMERA)
     for row in range(len(truth)):
         rng = np.random.default_rng([*noise, row])
-        colour, depth_m, cosine = painter.draw(truth.T_world_camera[row])
+        colour, depth_m, cosine = renderer.draw(truth.T_world_camera[row])
         yield Frame(
             timestamp_s=float(truth.timestamps_s[row]),
             rgb=add_image_noise(colour, rng),
@@ -66,104 +97,132 @@ def render_along(truth: Trajectory, world: World, noise: Sequence[int]) -> Itera
 
 
 def render_pairs(truth: Trajectory, world: World, noise: Sequence[int], baseline_m: float) -> Iterator[Frame]:
-    """Yield the frames of a rectified stereo camera whose left one is on *truth*, as `render_along`."""
-    painter, right = Painter(world, SIMULATED_CAMERA), np.eye(4)
-    right[0, 3] = baseline_m
+    """Yield the frames of a rectified stereo camera whose left camera is on a trajectory.
+
+    Args:
+        truth: Pose of the left camera and time stamp of each frame.
+        world: The world to draw.
+        noise: Numbers of which, with the number of the frame, the image noise is seeded.
+        baseline_m: Distance from the left camera to the right one.
+    """
+    renderer, T_left_right = Renderer(world, SIMULATED_CAMERA), np.eye(4)
+    T_left_right[0, 3] = baseline_m
     for row in range(len(truth)):
-        rng, pose = np.random.default_rng([*noise, row]), truth.T_world_camera[row]
-        left, beside = (add_image_noise(painter.draw(T)[0], rng) for T in (pose, pose @ right))
-        # Weights of brightness after ITU-R BT.601.
-        gray = np.rint(beside @ np.array([0.299, 0.587, 0.114])).astype(np.uint8)
+        rng, T_world_left = np.random.default_rng([*noise, row]), truth.T_world_camera[row]
+        left = add_image_noise(renderer.draw(T_world_left)[0], rng)
+        right = add_image_noise(renderer.draw(T_world_left @ T_left_right)[0], rng)
+        right_gray = np.rint(right @ np.array(_LUMA_WEIGHTS)).astype(np.uint8)
         yield Frame(
             timestamp_s=float(truth.timestamps_s[row]),
             rgb=left,
             depth_m=np.zeros(left.shape[:2], dtype=np.float32),
             camera=SIMULATED_CAMERA,
-            stereo=StereoView(gray, baseline_m),
+            stereo=StereoView(right_gray, baseline_m),
         )
 
 
 def true_trajectory(robot: int, robots: int, frames: int, seed: int, rooms: int = ROOMS) -> Trajectory:
-    """Return the exact ``T_world_camera`` of `render_frames`; the world's z axis points up.
+    """Return the exact poses ``T_world_camera`` of `render_frames`, which has the same arguments.
 
-    Robots are spread evenly over the loop, which in three rooms is about 28 m long; a robot takes 6.8 cm and
-    at most 4 degrees from one frame to the next, so 80 frames are a path of 5.4 m.
+    The z axis of the world points up.  From frame to frame a robot moves by 6.8 cm and rotates by at most 4
+    degrees; in three rooms the loop is about 28 m long.
 
     Raises:
-        UsageError: The robot is not one of *robots*, or there are no frames, or less than two rooms.
+        UsageError: The robot is not one of *robots*, there are no frames, or fewer than 2 rooms.
     """
     if not 0 <= robot < robots or frames < 1:
         raise UsageError(
             f"robot {robot} of {robots} with {frames} frames cannot be rendered",
             hint="count robots from 0, and ask for one frame or more",
         )
-    return loop_trajectory(_loop(rooms)[1] * robot / robots, frames, seed, rooms)
+    return loop_trajectory(_make_loop(rooms)[1] * robot / robots, frames, seed, rooms)
 
 
 def loop_trajectory(
     begin_m: float, frames: int, seed: int, rooms: int = ROOMS, *, step_m: float = STEP_M
 ) -> Trajectory:
-    """Return *frames* exact poses ``T_world_camera`` on the loop, from *begin_m* on.
+    """Return exact poses ``T_world_camera`` on the loop, with time stamps 0.2 s apart from 0 on.
 
-    The loop begins at the door of room 1, and leads through each of the rooms before the last one in 5 m.
+    The loop begins at the door between rooms 0 and 1, leads through each room before the last one in 5 m,
+    then around the last room, back through the others, and around room 0.
+
+    Args:
+        begin_m: Distance along the loop at which the first pose lies; the loop is closed.
+        frames: Number of poses.
+        seed: Seed of the phase of the camera's swaying.
+        rooms: Number of rooms in a row.
+        step_m: Distance along the loop between two poses.
+
+    Raises:
+        UsageError: There are fewer than 2 rooms.
     """
-    path, length_m = _loop(rooms)
-    phase = float(np.random.default_rng([seed, 7]).uniform(0.0, 2.0 * np.pi))
-    poses = np.array([_pose_at(path, length_m, begin_m + step_m * row, phase) for row in range(frames)])
+    path, length_m = _make_loop(rooms)
+    phase_rad = float(np.random.default_rng([seed, 7]).uniform(0.0, 2.0 * np.pi))
+    poses = np.array([_pose_at(path, length_m, begin_m + step_m * row, phase_rad) for row in range(frames)])
     return Trajectory(np.arange(frames) / RATE_HZ, poses)
 
 
 def frames_to_overlap(robots: int, rooms: int = ROOMS) -> int:
-    """Return the frames with which each robot reaches the start of the next one, and drives past it.
+    """Return how many frames a robot needs to reach the start of the next robot and drive 0.6 m past it.
 
-    One robot alone reaches its own start.
+    A single robot reaches its own start.
     """
-    return math.ceil((_loop(rooms)[1] / robots + _OVERLAP_M) / STEP_M)
+    return math.ceil((_make_loop(rooms)[1] / robots + _OVERLAP_M) / STEP_M)
 
 
-def _corners(rooms: int) -> list[tuple[float, float]]:
-    """Return the corners of the loop through a number of rooms."""
+def _make_loop(rooms: int) -> tuple[Array, float]:
+    """Return the closed loop as ``(n, 2)`` points x and y, one centimetre apart, and its length in metres."""
+    path = _resample(np.array(_loop_corners(rooms)))[0]
+    for _ in range(2):
+        path = _resample(_smooth(path))[0]
+    return _resample(path)
+
+
+def _loop_corners(rooms: int) -> list[tuple[float, float]]:
+    """Return the corners x and y of the loop through a number of rooms, in metres."""
     if rooms < 2:
-        raise UsageError(f"a loop needs two rooms, not {rooms}", hint="ask for two rooms or more")
-    between, last = range(1, rooms - 1), rooms - 1
-    there = [(room, (_IN_M, *_THERE_M[room % 2 == 0])) for room in between]
-    back = [(room, (*_BACK_M[room % 2 == 0], _OUT_M)) for room in reversed(between)]
-    parts = [*there, (last, (_IN_M, *_LAST_M, _OUT_M)), *back, (0, _FIRST_M)]
+        raise UsageError(f"a loop needs 2 rooms or more, not {rooms}", hint="ask for two rooms or more")
+    parts: list[tuple[int, _Corners]] = []
+    for room in range(1, rooms - 1):
+        way = _WAY_THERE_WITH_TABLE if room % 2 == 0 else _WAY_THERE_WITHOUT_TABLE
+        parts.append((room, (_DOOR_ON_WAY_THERE, *way)))
+    parts.append((rooms - 1, (_DOOR_ON_WAY_THERE, *_AROUND_LAST_ROOM, _DOOR_ON_WAY_BACK)))
+    for room in reversed(range(1, rooms - 1)):
+        way = _WAY_BACK_WITH_TABLE if room % 2 == 0 else _WAY_BACK_WITHOUT_TABLE
+        parts.append((room, (*way, _DOOR_ON_WAY_BACK)))
+    parts.append((0, _AROUND_FIRST_ROOM))
     return [(round(room * ROOM_M + x, 2), y) for room, corners in parts for x, y in corners]
 
 
-def _loop(rooms: int) -> tuple[Array, float]:
-    """Return the closed path as ``(n, 2)`` points one centimetre apart, and its length."""
-    corners = np.array(_corners(rooms))
-    path = _resample(corners, 0.01)[0]
-    for _ in range(2):
-        path = _resample(_smooth(path, 45), 0.01)[0]
-    return _resample(path, 0.01)
-
-
-def _resample(corners: Array, step_m: float) -> tuple[Array, float]:
-    closed = np.vstack((corners, corners[:1]))
+def _resample(points: Array) -> tuple[Array, float]:
+    """Return points one centimetre apart on a closed path ``(n, 2)``, and its length in metres."""
+    closed = np.vstack((points, points[:1]))
     along = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1))))
-    positions = np.linspace(0.0, along[-1], round(along[-1] / step_m), endpoint=False)
-    points = np.column_stack([np.interp(positions, along, closed[:, axis]) for axis in range(2)])
-    return points, float(along[-1])
+    distances = np.linspace(0.0, along[-1], round(along[-1] / _PATH_STEP_M), endpoint=False)
+    resampled = np.column_stack([np.interp(distances, along, closed[:, axis]) for axis in range(2)])
+    return resampled, float(along[-1])
 
 
-def _smooth(path: Array, half: int) -> Array:
-    """Return the running mean over *half* points to either side of a closed path."""
+def _smooth(path: Array) -> Array:
+    """Return the moving average of a closed path ``(n, 2)`` over 45 points on either side."""
+    half = _SMOOTHING_POINTS
     window = np.ones(2 * half + 1) / (2 * half + 1)
-    around = np.vstack((path[-half:], path, path[:half]))
-    return np.column_stack([np.convolve(around[:, axis], window, mode="valid") for axis in range(2)])
+    extended = np.vstack((path[-half:], path, path[:half]))
+    return np.column_stack([np.convolve(extended[:, axis], window, mode="valid") for axis in range(2)])
 
 
-def _pose_at(path: Array, length_m: float, travelled_m: float, phase: float) -> Array:
-    """Return the pose at a distance along the loop: looking ahead, slightly down, swaying a little."""
-    position, ahead = (_point(path, length_m, travelled_m + more) for more in (0.0, 1.0))
+def _pose_at(path: Array, length_m: float, distance_m: float, phase_rad: float) -> Array:
+    """Return ``T_world_camera`` ``(4, 4)`` at a distance along the loop.
+
+    The camera looks 1 m ahead and 7 degrees down, and sways a little in height, pitch and roll.
+    """
+    position = _point_at(path, length_m, distance_m)
+    ahead = _point_at(path, length_m, distance_m + _LOOK_AHEAD_M)
     yaw = np.arctan2(*(ahead - position)[::-1])
-    wave = 2.0 * np.pi * travelled_m / 1.7 + phase
-    pitch = np.radians(-7.0 + 1.2 * np.sin(0.6 * wave))
-    roll = np.radians(0.8 * np.sin(0.8 * wave))
-    height_m = 1.25 + 0.02 * np.sin(wave)
+    sway = 2.0 * np.pi * distance_m / _SWAY_M + phase_rad
+    pitch = np.radians(-7.0 + 1.2 * np.sin(0.6 * sway))
+    roll = np.radians(0.8 * np.sin(0.8 * sway))
+    height_m = _EYE_HEIGHT_M + 0.02 * np.sin(sway)
     forward = np.array([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), np.sin(pitch)])
     level_right = np.array([np.sin(yaw), -np.cos(yaw), 0.0])
     level_down = np.cross(forward, level_right)
@@ -174,9 +233,10 @@ def _pose_at(path: Array, length_m: float, travelled_m: float, phase: float) -> 
     return pose
 
 
-def _point(path: Array, length_m: float, travelled_m: float) -> Array:
-    place = (travelled_m % length_m) / length_m * len(path)
-    low = int(place) % len(path)
-    share = place - int(place)
-    point: Array = (1.0 - share) * path[low] + share * path[(low + 1) % len(path)]
+def _point_at(path: Array, length_m: float, distance_m: float) -> Array:
+    """Return the point x and y at a distance along a closed path, interpolated between its points."""
+    index = (distance_m % length_m) / length_m * len(path)
+    low = int(index) % len(path)
+    fraction = index - int(index)
+    point: Array = (1.0 - fraction) * path[low] + fraction * path[(low + 1) % len(path)]
     return point

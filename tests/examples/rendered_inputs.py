@@ -10,7 +10,7 @@ import numpy as np
 
 from client_sdk.cameras import Intrinsics, write_intrinsics
 from client_sdk.simulator import true_trajectory
-from client_sdk.simulator.camera import Painter, add_depth_noise, add_image_noise
+from client_sdk.simulator.renderer import Renderer, add_depth_noise, add_image_noise
 from client_sdk.simulator.world import make_world
 from rse_pf.geometry import Array, Camera
 
@@ -29,7 +29,7 @@ _LARGER = 4
 
 def write_video(path: Path, frames: int) -> None:
     """Write a video of a camera that moves to the right by `STEP_M` a frame, before a wall with pictures."""
-    painter = Painter(make_world(_SEED), SMALL)
+    painter = Renderer(make_world(_SEED), SMALL)
     pose = np.eye(4)
     pose[:3, :3] = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]).T  # right, down, forward
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), 10.0, (SMALL.width, SMALL.height))
@@ -44,7 +44,7 @@ def write_video(path: Path, frames: int) -> None:
 
 def write_drives(folders: list[Path], frames: int) -> None:
     """Write one folder of images with depth for each of some robots that follow each other."""
-    painter = Painter(make_world(_SEED), SMALL)
+    painter = Renderer(make_world(_SEED), SMALL)
     for number, folder in enumerate(folders):
         for name in ("rgb", "depth"):
             (folder / name).mkdir(parents=True)

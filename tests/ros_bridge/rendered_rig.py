@@ -12,7 +12,7 @@ import numpy.typing as npt
 from client_sdk.frontend import load_opencv
 from client_sdk.rigs.intrinsics import Intrinsics
 from client_sdk.rigs.rig import RigCamera, RigImu
-from client_sdk.simulator.camera import Painter, add_image_noise
+from client_sdk.simulator.renderer import Renderer, add_image_noise
 from client_sdk.simulator.world import World
 from rse_pf.geometry import Array, Camera, exp_se3
 
@@ -68,7 +68,7 @@ class _LensPainter:
         wide = Camera(
             fx=camera.fx, fy=camera.fx, cx=width / 2 - 0.5, cy=height / 2 - 0.5, width=width, height=height
         )
-        self._painter = Painter(world, wide)
+        self._painter = Renderer(world, wide)
         places = (rays * camera.fx + [wide.cx, wide.cy]).astype(np.float32)
         self._places = places.reshape(camera.height, camera.width, 2)
 

@@ -7,7 +7,7 @@ import numpy.typing as npt
 import pytest
 
 from client_sdk.simulator import SIMULATED_CAMERA, make_world, true_trajectory
-from client_sdk.simulator.camera import Painter, add_image_noise
+from client_sdk.simulator.renderer import Renderer, add_image_noise
 from rse_pf.errors import BadRequest
 from rse_pf.geometry import Array
 from rse_pf.pnp import DepthNoise
@@ -22,7 +22,7 @@ F_BASELINE = SIMULATED_CAMERA.fx * BASELINE_M
 @pytest.fixture(scope="module")
 def pair() -> tuple[Gray, Gray, Array]:
     """A rendered pair, and the true disparities of the left image, 0 where there is no depth."""
-    painter, right, rng = Painter(make_world(3), SIMULATED_CAMERA), np.eye(4), np.random.default_rng(4)
+    painter, right, rng = Renderer(make_world(3), SIMULATED_CAMERA), np.eye(4), np.random.default_rng(4)
     right[0, 3] = BASELINE_M
     pose = true_trajectory(0, 1, 3, 3).T_world_camera[2]
     colour, depth_m, _ = painter.draw(pose)

@@ -12,7 +12,7 @@ import pytest
 from client_sdk.frontend import Frame, TrackedFrame
 from client_sdk.live import LiveMapper, LiveOptions
 from client_sdk.live.monocular_odometry import MonocularOdometry
-from client_sdk.simulator.camera import add_image_noise
+from client_sdk.simulator.renderer import add_image_noise
 from client_sdk.tracking.monocular_tracker import SeenKeyframe
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Array, exp_se3, inverse, pose_difference, scaled

@@ -13,7 +13,7 @@ import pytest
 from client_sdk.datasets import Dataset, open_dataset
 from client_sdk.frontend import Frame
 from client_sdk.rigs.stereo_pair_checks import check_stereo_pairs
-from client_sdk.simulator.camera import Painter
+from client_sdk.simulator.renderer import Renderer
 from client_sdk.simulator.world import make_world
 from client_sdk.stereo.view import StereoView
 from rse_pf.errors import UsageError
@@ -31,7 +31,7 @@ STEP_S = 0.1
 @pytest.fixture(scope="module")
 def drive() -> list[Frame]:
     """Twelve pairs of a rendered room; the camera nods, so that rows move."""
-    painter = Painter(make_world(3), CAMERA)
+    painter = Renderer(make_world(3), CAMERA)
     right = np.eye(4)
     right[0, 3] = BASELINE_M
     start = np.array(
@@ -52,7 +52,7 @@ def drive() -> list[Frame]:
     return frames
 
 
-def gray(painter: Painter, pose: Array) -> np.ndarray:
+def gray(painter: Renderer, pose: Array) -> np.ndarray:
     colour = painter.draw(pose)[0]
     return cv2.cvtColor(np.clip(colour, 0, 255).astype(np.uint8), cv2.COLOR_RGB2GRAY)
 

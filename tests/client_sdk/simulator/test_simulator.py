@@ -12,7 +12,7 @@ from client_sdk.simulator import (
     render_frames,
     true_trajectory,
 )
-from client_sdk.simulator.camera import Painter, add_depth_noise
+from client_sdk.simulator.renderer import Renderer, add_depth_noise
 from client_sdk.simulator.world import DEPTH_M, DOOR_Y_M, HEIGHT_M, ROOM_M, make_world
 from client_sdk.tracking.tracker import Tracker
 from client_sdk.trajectory import Trajectory
@@ -23,8 +23,8 @@ from rse_pf.pnp import PnpOptions, solve_pnp
 
 
 @pytest.fixture(scope="module")
-def painter() -> Painter:
-    return Painter(make_world(0), SIMULATED_CAMERA)
+def painter() -> Renderer:
+    return Renderer(make_world(0), SIMULATED_CAMERA)
 
 
 def test_the_same_arguments_give_the_same_frames_and_another_seed_others():
@@ -80,7 +80,7 @@ def test_robots_that_merge_drive_past_the_start_of_the_next_one(robots: int):
             assert np.linalg.norm(own[frames // 2 :] - seen, axis=1).min() < 0.1
 
 
-def test_every_ray_ends_on_a_surface_of_the_world(painter: Painter):
+def test_every_ray_ends_on_a_surface_of_the_world(painter: Renderer):
     pose = true_trajectory(0, 1, 1, 0).T_world_camera[0]
 
     _, depth_m, _ = painter.draw(pose)
@@ -94,7 +94,7 @@ def test_every_ray_ends_on_a_surface_of_the_world(painter: Painter):
     assert (points < [3 * ROOM_M + 0.001, DEPTH_M + 0.001, HEIGHT_M + 0.001]).all()
 
 
-def test_a_wall_is_as_far_away_as_it_is(painter: Painter):
+def test_a_wall_is_as_far_away_as_it_is(painter: Renderer):
     pose = np.eye(4)
     pose[:3, :3] = [[0, 0, -1], [1, 0, 0], [0, -1, 0]]  # looking along -x; x of the image is +y
     pose[:3, 3] = [1.0, 1.5, 0.5]
