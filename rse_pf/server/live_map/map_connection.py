@@ -151,10 +151,10 @@ class MapConnection:
         self._request_numbers = itertools.count(1)
         self._pending: dict[int, _PendingRequest] = {}
         self._writer: asyncio.StreamWriter | None = None
-        self._dead_epoch: int | None = (
-            None  # epoch of the last map server whose process is known to have exited
-        )
-        self._reached_owner = ""  # name of the last map server that accepted the token of this worker
+        # Epoch of the last map server of this map whose process is known to have exited.
+        self._dead_epoch: int | None = None
+        # Name of the last map server that accepted the token of this worker.
+        self._reached_owner = ""
         self._newest_map_update: dict[str, Any] = {}
         self._last_use_s = context.clock()
         self._is_closed = False

@@ -302,7 +302,7 @@ class LiveLog:
         self._delete_parts_except_of([])
 
     def _delete_parts_except_of(self, snapshots: list[int]) -> None:
-        """Delete the parts that no snapshot with a number in *snapshots* needs, except parts of later epochs."""
+        """Delete the parts of this and earlier epochs that no snapshot with a number in *snapshots* needs."""
         needed: set[str] = set()
         for number in snapshots:
             with contextlib.suppress(NotFound, msgspec.MsgspecError):

@@ -147,8 +147,8 @@ class MapServer:
         )
         self._measurer = KeyframeMeasurer(state, environment, self._writer.submit)
         self._publisher = Publisher(state, environment, server=lease.record.server)
-        self._additions: dict[tuple[str, int], asyncio.Task[None]] = {}  # running additions of
-        # keyframes, keyed by RobotId.folder and keyframe number
+        # Keyframes that are being added, keyed by RobotId.folder and keyframe number.
+        self._additions: dict[tuple[str, int], asyncio.Task[None]] = {}
         self._present_robots: dict[str, None] = {}
         self._renewed = asyncio.Event()
         self._snapshot_position = 0

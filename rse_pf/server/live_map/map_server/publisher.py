@@ -35,11 +35,12 @@ from rse_pf.wire.live_map import LiveStart
 
 __all__ = ["NOTE_ALL_LEFT", "NOTE_CHANGED", "NOTE_UNUSED", "Publisher", "read_start_version"]
 
-NOTE_ALL_LEFT = "the last robot left"  # note of a version that is published when all robots have left
-NOTE_CHANGED = "live map"  # note of a version that is published at intervals while the map changes
-NOTE_UNUSED = (
-    "nobody used the live map"  # note of a version that is published before an unused map is released
-)
+NOTE_ALL_LEFT = "the last robot left"
+"""Note of a version that is published because all robots have left the live map."""
+NOTE_CHANGED = "live map"
+"""Note of a version that is published at an interval because the live map has changed."""
+NOTE_UNUSED = "nobody used the live map"
+"""Note of a version that is published because the live map is not used and is given up."""
 _AUTOMATIC_NOTES = (NOTE_ALL_LEFT, NOTE_CHANGED, NOTE_UNUSED)
 """Notes of versions that nobody asked for, which may be removed automatically."""
 _AUTHOR_PREFIX = "live map on "
@@ -79,8 +80,8 @@ class Publisher:
         self._map_name = environment.map_name
         self._min_interval_s = environment.settings.publish_pause_s
         self._lock = asyncio.Lock()  # held during a publication
-        self._source_up: tuple[str, list[float] | None] = "", None  # name of the version that the map
-        # started from, and its vector of up
+        # Name of the version that the map started from, and the up direction in that version.
+        self._source_up: tuple[str, list[float] | None] = "", None
         self._published_changes: int | None = None  # MapState.changes at the last publication
         self._last_record: MapRecord | None = None
         self._next_allowed_s: float | None = None
@@ -169,7 +170,7 @@ class Publisher:
     async def _publish(self, note: str, freed_bytes: int = 0) -> MapRecord:
         environment, background = self._environment, self._threads.background
         changes = self._state.changes
-        # 1. The version is made: keyframes, point cloud, and the vector of up.
+        # 1. The version is made: keyframes, point cloud, and the up direction.
         version = await self._make_version()
         version = await background(functools.partial(self._add_source_up, version))
         # 2. The tenant is charged and the version becomes the head of the map.
@@ -224,7 +225,7 @@ class Publisher:
         return dataclasses.replace(version, points=cloud.points, colours=cloud.colours)
 
     def _add_source_up(self, version: MapVersion) -> MapVersion:
-        """Copy the vector of up from the version that the map started from, whose axes the map keeps.
+        """Copy the up direction from the version that the map started from, whose axes the map keeps.
 
         Blocks on the object store.  If the source version was removed, *version* is returned unchanged.
 
