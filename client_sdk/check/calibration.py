@@ -20,7 +20,12 @@ from client_sdk.check.keyframes import FLIPS, KeyframeStore, Tracks, tracks_of
 from client_sdk.check.zooms import judge_zooms
 from rse_pf.errors import DegenerateGeometry
 from rse_pf.geometry import Array, Camera, inverse, log_so3
-from rse_pf.slam.self_calibration import UNKNOWNS, Calibrated, adjust_with_calibration, deviations_of_parts
+from rse_pf.slam.self_calibration import (
+    UNKNOWNS,
+    Calibrated,
+    adjust_with_calibration,
+    estimate_part_deviations,
+)
 
 __all__ = ["CalibrationJudgement", "judge_calibration"]
 
@@ -92,7 +97,7 @@ def judge_calibration(store: KeyframeStore) -> CalibrationJudgement:
     zoom = judge_zooms(zoomed, times_s, found)
     findings = [] if zoom.finding is None else [zoom.finding]
     found = zoomed if findings else found
-    parts = np.zeros(len(UNKNOWNS)) if findings else deviations_of_parts(model.observed, found, free)
+    parts = np.zeros(len(UNKNOWNS)) if findings else estimate_part_deviations(model.observed, found, free)
     causes = _causes(reading, has_depth=store.has_depth, is_one_camera=not findings)
     measured = _measured(found, parts, reading, causes)
     explanation = explain(measured)

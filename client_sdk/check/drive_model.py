@@ -12,7 +12,7 @@ from client_sdk.check.keyframes import FLIPS, Keyframe, Tracks
 from rse_pf.errors import PnpError
 from rse_pf.geometry import Array, Camera, inverse, transform
 from rse_pf.pnp import PnpOptions, solve_pnp
-from rse_pf.slam.self_calibration import DriveObservations, triangulated
+from rse_pf.slam.self_calibration import DriveObservations, triangulate_landmarks
 
 __all__ = ["DepthReading", "DriveModel", "best_reading", "drive_model", "nearest_delay"]
 
@@ -123,7 +123,7 @@ def drive_model(
         depths_dev_m=np.sqrt(variances[kept]), rates_m_s=rates[kept],
         twists_s=np.array([keyframes[row].twist_s for row in rows]),
     )  # fmt: skip
-    points = triangulated(observed, poses[rows], len(seen))
+    points = triangulate_landmarks(observed, poses[rows], len(seen))
     return DriveModel(
         rows=rows, observed=observed, T_camera_world=poses[rows], points_world=points, score=score
     )

@@ -132,7 +132,7 @@ def _moved(zooms: Array, times_s: Array, common: Calibrated, zoomed: Calibrated)
     if _DEVIATIONS * deviation <= _TOLD:
         return ZoomJudgement(hint=hint)
     low, high = float(rates.min()) * span_s, float(rates.max()) * span_s
-    errors = "of depth or of the lens" if common.has_metres else "of the lens or its distortion"
+    errors = "of depth or of the lens" if common.has_metric_scale else "of the lens or its distortion"
     reason = f"{len(zooms)} views do not tell more"
     if between > _MAINLY * own:
         reason = (
@@ -156,4 +156,4 @@ def _rates(zooms: Array, times_s: Array) -> Array:
 def _cost(common: Calibrated, zoomed: Calibrated) -> float:
     """Return how far apart the two paths are after alignment, root mean square in metres."""
     at, there = (inverse(each.T_camera_world)[:, :3, 3] for each in (common, zoomed))
-    return rms_after_alignment(at, there - at, has_metres=common.has_metres)
+    return rms_after_alignment(at, there - at, has_metric_scale=common.has_metric_scale)

@@ -20,7 +20,7 @@ from rse_pf.slam.self_calibration import (
     Calibrated,
     DriveObservations,
     adjust_with_calibration,
-    triangulated,
+    triangulate_landmarks,
 )
 
 __all__ = ["MOST_KEYFRAMES", "StereoAdjustment", "adjust_stereo"]
@@ -87,7 +87,7 @@ def adjust_stereo(known: KeyframeMap, f_baseline: float) -> StereoAdjustment | N
         return None
     T = inverse(np.array([known.pose(row) for row in range(len(known))]))
     found: Calibrated | None = None
-    points = triangulated(observed, T, len(numbers))
+    points = triangulate_landmarks(observed, T, len(numbers))
     try:
         for _ in range(_ROUNDS):
             observed = _with_noise(observed, T, points, f_baseline)

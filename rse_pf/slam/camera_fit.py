@@ -1,7 +1,7 @@
-"""Compare the camera that a photo is said to have with the one that its matches fit best.
+"""Check the stated camera of a photo: fit a camera to the matches of the photo, and compare both.
 
-A pose that is wrong compensates most of a wrong focal length or principal point, so that the reprojection
-error stays below any fixed limit.  Self-calibration, which adjusts camera and pose together, shows it.
+A wrong pose compensates most of a wrong focal length or principal point, so that the reprojection error does
+not show that the camera is wrong.  Self-calibration, which adjusts camera and pose together, does.
 """
 
 from __future__ import annotations
@@ -15,27 +15,41 @@ from rse_pf.geometry import Array, Camera, adjoint, exp_se3, inverse, transform
 
 __all__ = ["CameraFit", "fit_camera"]
 
-_ITERATIONS = 16
-_FIRST_SCALES_PX = (16.0, 32.0)  # of the loss: matches count that a camera 20 or 40 % off misses
-_LAST_SCALE_PX = 2.0  # of the loss: the noise of ORB's corners
-_SCALE_SHRINK = 0.75  # of the scale at each iteration
-_FOCAL_DEVIATION = 0.2  # of the logarithm of the focal length, before anything is seen
-_CENTRE_DEVIATION = 0.1  # of the principal point, as a share of the width, before anything is seen
-_SHUTTER_DEVIATION_PX = 20.0  # of how far a rolling shutter moves the last row against the first
-_NEAREST_M = 0.05  # points that a step puts nearer, or behind the camera, count as this far
-_LEAST_VARIANCE_PX2 = 0.1  # of a pixel, however well all matches fit
-_COMMON_ERRORS = 5.0  # times the variance of independent errors, since matches share keyframes; measured
-_LEAST_EIGENVALUE = 1e-9  # of information whose diagonal is 1: less is not invertible
-_DEPTH_DEVIATION = 0.01  # of the depth of a map's point, as a share of it; that of a Kinect at 6 m
+_ITERATIONS = 16  # Gauss-Newton steps, while the scale of the loss shrinks from its first to its last value
+_FIRST_SCALES_PX = (16.0, 32.0)
+"""Scales of the loss with which two fits begin, px, of which the better one is used: large enough for matches
+that a focal length which is wrong by 20 or 40 % moves by that much."""
+_LAST_SCALE_PX = 2.0  # scale of the loss at the end, px: the noise of ORB corners
+_SCALE_SHRINK = 0.75  # factor of the scale of the loss after each step
+_LOG_FOCAL_DEVIATION = 0.2
+"""Prior standard deviation of the logarithm of the focal length over the stated one."""
+_CENTRE_DEVIATION = 0.1  # prior standard deviation of the principal point, as a share of the image width
+_SHUTTER_DEVIATION_PX = 20.0
+"""Prior standard deviation, px, of the shift between the first and the last row of an image that a rolling
+shutter and the motion of the camera cause."""
+_MIN_DEPTH_M = 0.05  # depth of a point in the camera: projections of nearer points use this depth
+_MIN_VARIANCE_PX2 = 0.1  # variance of a pixel, px^2, however well all matches fit
+_CORRELATION_FACTOR = 5.0
+"""Measured ratio of the variance of a pose to that for independent errors: matches of one keyframe share the
+errors of its points, and one pixel may match several keyframes."""
+_MIN_EIGENVALUE = 1e-9  # of an information matrix scaled to a diagonal of 1: below it, rounding decides
+_DEPTH_DEVIATION = 0.01  # relative standard deviation of the depth of a map point: that of a Kinect at 6 m
+_CAMERA_PARAMETERS = slice(6, 11)
+"""Columns of the camera among the 11 parameters: logarithm of the focal length, principal point (2), shift by
+a rolling shutter (2); the first six are the twist of the pose."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class CameraFit:
-    """The pose ``T_map_camera`` ``(4, 4)`` that the adjusted camera has.
+    """The pose and the focal length that fit the matches of a photo best, with their uncertainty.
 
-    ``covariance`` ``(6, 6)`` is of the twist (metres, radians) on its left.  ``log_focal`` is the logarithm
-    of the adjusted focal length over the given one.  The standard deviations are of this logarithm, of the
-    position and of the direction of the camera.
+    Attributes:
+        T_map_camera: ``(4, 4)``, m, pose with the fitted camera.
+        covariance: ``(6, 6)`` of the twist (m, rad) on the left of the pose.
+        log_focal: Logarithm of the fitted focal length over the stated one.
+        log_focal_deviation: Standard deviation of that logarithm.
+        position_deviation_m: Standard deviation of the position of the camera, over all axes.
+        turn_deviation_deg: Standard deviation of the rotation of the camera, over all axes.
     """
 
     T_map_camera: Array
@@ -49,123 +63,164 @@ class CameraFit:
 def fit_camera(
     points_map: Array, origins_map: Array, pixels: Array, T_map_camera: Array, camera: Camera
 ) -> CameraFit:
-    """Adjust pose, focal length and principal point to all matches, whether they agreed with the pose or not.
+    """Fit pose, focal length, principal point and rolling shutter to all matches, inliers and outliers.
 
-    A rolling shutter is adjusted, too: else a quick turn looks like another camera.  Errors of the points of
-    a keyframe are common to their matches, and a pixel may match several keyframes, so that all variances
-    are larger than those of independent errors.  Before a flat wall only errors of the depths make points
-    leave their plane, and seem to determine the camera: the information that they feign is left out.
+    The rolling shutter is fitted because a quick rotation during the exposure otherwise looks like another
+    camera.
 
     Args:
-        points_map: ``(n, 3)`` metres, n at least 6.
-        origins_map: ``(n, 3)`` metres, where the cameras were that measured the points.
-        pixels: ``(n, 2)``, undistorted as the given camera says.
-        T_map_camera: ``(4, 4)``, the pose that was found with the given camera.
-        camera: The given camera.
+        points_map: ``(n, 3)`` m, matched points of the map, at least 6.
+        origins_map: ``(n, 3)`` m, positions of the cameras that measured the points.
+        pixels: ``(n, 2)``, pixels of the photo, undistorted by the stated camera.
+        T_map_camera: ``(4, 4)`` m, pose that was computed with the stated camera.
+        camera: The stated camera.
 
     Source:
-        Gauss-Newton on Geman-McClure's loss whose scale shrinks, as in Yang et al., Graduated Non-Convexity
-        for Robust Spatial Perception, 2020.  The information is corrected as in Fuller, Measurement Error
-        Models, 1987, Sect. 2.2.
+        Gauss-Newton on the Geman-McClure loss with a shrinking scale: Yang et al., Graduated Non-Convexity
+        for Robust Spatial Perception, 2020.  Correction of the information for noise of the points: Fuller,
+        Measurement Error Models, 1987, Sect. 2.2.
     """
-    deviations = [_FOCAL_DEVIATION, *[_CENTRE_DEVIATION * camera.width] * 2, *[_SHUTTER_DEVIATION_PX] * 2]
-    prior = np.square(1.0 / np.array(deviations))
-    starts = [_adjust(points_map, pixels, T_map_camera, camera, prior, scale) for scale in _FIRST_SCALES_PX]
-    found = min(starts, key=lambda each: each.cost)
-    longer_map = points_map + _DEPTH_DEVIATION * (points_map - origins_map)
-    change_by_depth = found.slopes_of(longer_map, pixels, camera)[0] - found.slopes
-    weights = found.weights[:, None, None]
-    information = (found.slopes * weights).reshape(-1, 11).T @ found.slopes.reshape(-1, 11)
-    feigned = (change_by_depth * weights).reshape(-1, 11).T @ change_by_depth.reshape(-1, 11)
-    squares_px2 = float(found.weights @ np.square(found.errors).sum(axis=1))
-    variance_px2 = max(_LEAST_VARIANCE_PX2, squares_px2 / (2.0 * float(found.weights.sum())))
-    covariance = _covariance_of(information, feigned, _COMMON_ERRORS * variance_px2, prior)
+    # 1. Fit twice from different scales of the loss; the lower cost wins.
+    deviations = [
+        _LOG_FOCAL_DEVIATION,
+        *[_CENTRE_DEVIATION * camera.width] * 2,
+        *[_SHUTTER_DEVIATION_PX] * 2,
+    ]
+    prior_information = np.square(1.0 / np.array(deviations))
+    fits = [
+        _adjust(points_map, pixels, T_map_camera, camera, prior_information, scale_px)
+        for scale_px in _FIRST_SCALES_PX
+    ]
+    fit = min(fits, key=lambda fit: fit.cost)
+    # 2. Information of the matches, and the part of it that errors of the points' depths feign: before a flat
+    #    wall, only these errors make points leave their plane, and seem to determine the camera.
+    shifted_map = points_map + _DEPTH_DEVIATION * (points_map - origins_map)
+    jacobian_change = fit.jacobian_and_errors(shifted_map, pixels, camera)[0] - fit.jacobian
+    weights = fit.weights[:, None, None]
+    information = (fit.jacobian * weights).reshape(-1, 11).T @ fit.jacobian.reshape(-1, 11)
+    feigned = (jacobian_change * weights).reshape(-1, 11).T @ jacobian_change.reshape(-1, 11)
+    # 3. Covariance, with the variance of a pixel from the errors that remain.
+    squares_px2 = float(fit.weights @ np.square(fit.errors_px).sum(axis=1))
+    variance_px2 = max(_MIN_VARIANCE_PX2, squares_px2 / (2.0 * float(fit.weights.sum())))
+    covariance = _covariance_of(information, feigned, _CORRELATION_FACTOR * variance_px2, prior_information)
     variances = np.diag(covariance)
-    T_adjusted = inverse(found.T_camera_map)
-    # The inverse of exp(xi) T has the twist -Ad(inverse(T)) xi on its left.
-    to_map = adjoint(T_adjusted)
+    # 4. From the twist left of T_camera_map to that left of T_map_camera: the inverse of exp(xi) T has the
+    # twist -Ad(inverse(T)) xi on its left.
+    T_fitted = inverse(fit.T_camera_map)
+    adjoint_to_map = adjoint(T_fitted)
     return CameraFit(
-        T_map_camera=T_adjusted,
-        covariance=to_map @ covariance[:6, :6] @ to_map.T,
-        log_focal=float(found.change[0]),
+        T_map_camera=T_fitted,
+        covariance=adjoint_to_map @ covariance[:6, :6] @ adjoint_to_map.T,
+        log_focal=float(fit.camera_change[0]),
         log_focal_deviation=math.sqrt(variances[6]),
         position_deviation_m=math.sqrt(variances[:3].sum()),
         turn_deviation_deg=math.degrees(math.sqrt(variances[3:6].sum())),
     )
 
 
-class _Adjusted:
-    """A pose and a camera with the errors that they leave.
+class _Fit:
+    """A pose and a camera, with the errors and the weights of all matches.
 
-    ``change`` is the logarithm of the focal length's ratio, and the steps of the principal point and of a
-    rolling shutter, px.  ``errors`` ``(n, 2)`` and ``slopes`` ``(n, 2, 11)`` are of the pixels, ``weights``
-    ``(n,)`` and ``cost`` those of the loss.
+    Attributes:
+        T_camera_map: ``(4, 4)``, m.
+        camera_change: ``(5,)``: logarithm of the focal length over the stated one, shift of the principal
+            point (px), shift between the first and the last row by a rolling shutter (px).
+        jacobian: ``(n, 2, 11)``, derivative of the projected pixels by twist and camera.
+        errors_px: ``(n, 2)``, matched pixels minus projected ones.
+        weights: ``(n,)``, weights of the Geman-McClure loss.
+        cost: The loss of all matches, px^2.
     """
 
     def __init__(
-        self, points_map: Array, pixels: Array, camera: Camera, T_camera_map: Array, change: Array,
+        self,
+        points_map: Array,
+        pixels: Array,
+        camera: Camera,
+        T_camera_map: Array,
+        camera_change: Array,
         scale_px: float,
-    ) -> None:  # fmt: skip
-        self.T_camera_map, self.change = T_camera_map, change
-        self.slopes, self.errors = self.slopes_of(points_map, pixels, camera)
-        ratios = np.square(self.errors).sum(axis=1) / scale_px**2
+    ) -> None:
+        self.T_camera_map, self.camera_change = T_camera_map, camera_change
+        self.jacobian, self.errors_px = self.jacobian_and_errors(points_map, pixels, camera)
+        ratios = np.square(self.errors_px).sum(axis=1) / scale_px**2
         self.weights = (1.0 + ratios) ** -2.0
         self.cost = scale_px**2 * float((ratios / (1.0 + ratios)).sum())
 
-    def slopes_of(self, points_map: Array, pixels: Array, camera: Camera) -> tuple[Array, Array]:
-        """Return how pixels move, and their errors, if the points were these."""
+    def jacobian_and_errors(self, points_map: Array, pixels: Array, camera: Camera) -> tuple[Array, Array]:
+        """Return Jacobian ``(n, 2, 11)`` and errors ``(n, 2)``, px, for points ``(n, 3)`` of the map."""
         points = transform(self.T_camera_map, points_map)
-        depths = np.maximum(points[:, 2], _NEAREST_M)
+        depths = np.maximum(points[:, 2], _MIN_DEPTH_M)
         rays = points[:, :2] / depths[:, None]
-        focal = np.array([camera.fx, camera.fy]) * np.exp(self.change[0])
-        row = pixels[:, 1:] / camera.height - 0.5
-        errors = pixels - focal * rays - [camera.cx, camera.cy] - self.change[1:3] - row * self.change[3:]
-        return _slopes(rays, depths, focal, row[:, 0]), errors
+        focal = np.array([camera.fx, camera.fy]) * np.exp(self.camera_change[0])
+        row_fractions = pixels[:, 1:] / camera.height - 0.5
+        errors_px = pixels - focal * rays - [camera.cx, camera.cy]
+        errors_px = errors_px - self.camera_change[1:3] - row_fractions * self.camera_change[3:]
+        return _projection_jacobian(rays, depths, focal, row_fractions[:, 0]), errors_px
 
 
 def _adjust(
-    points_map: Array, pixels: Array, T_map_camera: Array, camera: Camera, prior: Array, first_scale_px: float
-) -> _Adjusted:
-    """Return pose and camera after the scale of the loss has shrunk from its first to its last value."""
-    T_camera_map, change, scale_px = inverse(T_map_camera), np.zeros(5), first_scale_px
+    points_map: Array,
+    pixels: Array,
+    T_map_camera: Array,
+    camera: Camera,
+    prior_information: Array,
+    first_scale_px: float,
+) -> _Fit:
+    """Return pose and camera after Gauss-Newton steps on a loss whose scale shrinks to `_LAST_SCALE_PX`."""
+    T_camera_map, camera_change, scale_px = inverse(T_map_camera), np.zeros(5), first_scale_px
     for _ in range(_ITERATIONS):
-        # The prior is weak while the scale is large, so that a wrong camera can be left.
-        pull = _COMMON_ERRORS * (_LAST_SCALE_PX / scale_px) ** 2 * prior
-        now = _Adjusted(points_map, pixels, camera, T_camera_map, change, scale_px)
-        weighted = (now.slopes * now.weights[:, None, None]).reshape(-1, 11)
-        information = weighted.T @ now.slopes.reshape(-1, 11)
-        information[range(6, 11), range(6, 11)] += pull
-        gradient = weighted.T @ now.errors.ravel()
-        gradient[6:] -= pull * change
+        # The prior is weak while the scale is large, so that the fit can leave a wrong camera.
+        prior = _CORRELATION_FACTOR * (_LAST_SCALE_PX / scale_px) ** 2 * prior_information
+        fit = _Fit(points_map, pixels, camera, T_camera_map, camera_change, scale_px)
+        weighted = (fit.jacobian * fit.weights[:, None, None]).reshape(-1, 11)
+        information = weighted.T @ fit.jacobian.reshape(-1, 11)
+        information[range(6, 11), range(6, 11)] += prior
+        gradient = weighted.T @ fit.errors_px.ravel()
+        gradient[_CAMERA_PARAMETERS] -= prior * camera_change
         step = np.linalg.solve(information + 1e-9 * np.diag(np.diag(information)), gradient)
         T_camera_map = exp_se3(step[:6]) @ T_camera_map
-        change = change + step[6:]
+        camera_change = camera_change + step[_CAMERA_PARAMETERS]
         scale_px = max(_LAST_SCALE_PX, _SCALE_SHRINK * scale_px)
-    return _Adjusted(points_map, pixels, camera, T_camera_map, change, _LAST_SCALE_PX)
+    return _Fit(points_map, pixels, camera, T_camera_map, camera_change, _LAST_SCALE_PX)
 
 
-def _covariance_of(information: Array, feigned: Array, variance_px2: float, prior: Array) -> Array:
-    """Return the covariance that information per squared pixel, less that which is *feigned*, leaves.
+def _covariance_of(
+    information: Array, feigned: Array, variance_px2: float, prior_information: Array
+) -> Array:
+    """Return the covariance ``(11, 11)`` of pose and camera.
 
-    The prior is that of the camera, which is all that remains where the rest is feigned.
+    Args:
+        information: ``(11, 11)``, information of the matches for pixels of variance 1.
+        feigned: ``(11, 11)``, information that noise of the points feigns, which is subtracted.
+        variance_px2: Variance of a pixel, px^2.
+        prior_information: ``(5,)``, prior information on the camera: all that is left if the rest is feigned.
     """
+    # 1. Scale to a diagonal of 1, subtract, and keep the result positive definite.
     scale = 1.0 / np.sqrt(np.diag(information))
     values, vectors = np.linalg.eigh((information - feigned) * np.outer(scale, scale))
-    true = (vectors * np.maximum(values, _LEAST_EIGENVALUE)) @ vectors.T / np.outer(scale, scale)
-    true /= variance_px2
-    true[range(6, 11), range(6, 11)] += prior
-    covariance: Array = np.linalg.inv(true)
+    corrected = (vectors * np.maximum(values, _MIN_EIGENVALUE)) @ vectors.T / np.outer(scale, scale)
+    # 2. Add the prior, and invert.
+    corrected /= variance_px2
+    corrected[range(6, 11), range(6, 11)] += prior_information
+    covariance: Array = np.linalg.inv(corrected)
     return covariance
 
 
-def _slopes(rays: Array, depths: Array, focal: Array, row: Array) -> Array:
-    """Return ``(n, 2, 11)``: how pixels move with the twist left of T_camera_map, and with the camera."""
+def _projection_jacobian(rays: Array, depths: Array, focal: Array, row_fractions: Array) -> Array:
+    """Return the derivatives ``(n, 2, 11)`` of pixels by the twist left of T_camera_map and by the camera.
+
+    Args:
+        rays: ``(n, 2)``, points of the camera frame divided by their depth.
+        depths: ``(n,)``, m.
+        focal: ``(2,)``, focal lengths, px.
+        row_fractions: ``(n,)``, rows of the pixels, -0.5 at the top and 0.5 at the bottom of the image.
+    """
     x, y = rays.T
-    slopes = np.zeros((len(rays), 2, 11))
-    across = (1.0 / depths, np.zeros_like(x), -x / depths, -x * y, 1.0 + x * x, -y, x)
-    down = (np.zeros_like(x), 1.0 / depths, -y / depths, -1.0 - y * y, x * y, x, y)
-    slopes[:, 0, :7] = focal[0] * np.stack(across, axis=1)
-    slopes[:, 1, :7] = focal[1] * np.stack(down, axis=1)
-    slopes[:, 0, 7] = slopes[:, 1, 8] = 1.0
-    slopes[:, 0, 9] = slopes[:, 1, 10] = row
-    return slopes
+    jacobian = np.zeros((len(rays), 2, 11))
+    of_x = (1.0 / depths, np.zeros_like(x), -x / depths, -x * y, 1.0 + x * x, -y, x)
+    of_y = (np.zeros_like(x), 1.0 / depths, -y / depths, -1.0 - y * y, x * y, x, y)
+    jacobian[:, 0, :7] = focal[0] * np.stack(of_x, axis=1)
+    jacobian[:, 1, :7] = focal[1] * np.stack(of_y, axis=1)
+    jacobian[:, 0, 7] = jacobian[:, 1, 8] = 1.0
+    jacobian[:, 0, 9] = jacobian[:, 1, 10] = row_fractions
+    return jacobian

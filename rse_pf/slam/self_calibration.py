@@ -1,7 +1,8 @@
-"""Adjust the keyframes of a drive together with the calibration of their camera.
+"""Self-calibration: bundle adjustment of the keyframes of a drive together with the errors of their
+calibration.
 
-Gauss-Newton over poses, landmarks and calibration with robust weights; landmarks are eliminated by the Schur
-complement.  What a value means for a user, and which matches are believed, is decided elsewhere.
+Levenberg-Marquardt over poses, landmarks and calibration with Cauchy weights; landmarks are eliminated by the
+Schur complement.  Matches are selected, and results are explained to the user, in `client_sdk.check`.
 """
 
 from __future__ import annotations
@@ -20,56 +21,77 @@ __all__ = [
     "Calibrated",
     "DriveObservations",
     "adjust_with_calibration",
-    "deviations_of_parts",
+    "estimate_part_deviations",
     "rms_after_alignment",
-    "triangulated",
+    "triangulate_landmarks",
 ]
 
 Rows = npt.NDArray[np.int64]
 
 UNKNOWNS = ("fx", "fy", "cx", "cy", "k1", "offset", "delay", "readout", "curve")
-"""Logarithms of the ratios of focal lengths, pixels, radial distortion, metres that depth is too large and
-seconds that it is late, seconds from the first row of a rolling shutter to the last, and metres that depth is
-too large for each square metre of it."""
+"""Names of the nine errors of a calibration that an adjustment can estimate, in the order of all arrays
+``(9,)``:
+
+- ``fx``, ``fy``: logarithm of the true focal length over the set one
+- ``cx``, ``cy``: true minus set principal point, px
+- ``k1``: first coefficient of a radial distortion that remains after undistortion
+- ``offset``: metres that measured depth is too large
+- ``delay``: seconds by which depth lags: it shows an earlier moment than colours of the same time stamp
+- ``readout``: seconds from the exposure of the first to that of the last row of a rolling shutter
+- ``curve``: metres that measured depth is too large for each square metre of depth
+"""
 PRIOR = np.array([0.15, 0.15, 40.0, 40.0, 0.15, 0.15, 0.3, 0.02, 0.01])
-"""Standard deviations of the unknowns before the drive is seen."""
-_ZOOM_PRIOR = 0.15
-_CAUCHY = 2.0
+"""Prior standard deviations of `UNKNOWNS`, in their units: typical errors of calibrations."""
+_ZOOM_PRIOR = 0.15  # prior standard deviation of the logarithm of the focal length of one keyframe
+_CAUCHY_SCALE = 2.0  # of the Cauchy loss, in standard deviations of a residual: larger residuals lose weight
 _ITERATIONS = 12  # steps of an adjustment
-_ZOOM_ITERATIONS = 6  # steps with a focal length for each keyframe, which begin near the solution
-_CONVERGED = 1e-4  # the adjustment ends when a step lowers the cost by less than this share
+_ZOOM_ITERATIONS = 6  # steps of an adjustment with a focal length for each keyframe, begun near the solution
+_RESCALE_ITERATIONS = (1, 4)  # steps after which the noise is estimated again from the residuals
+_MIN_CONVERGED_ITERATION = 4  # the adjustment may end early only after this step, when the noise is estimated
+_CONVERGED_SHARE = 1e-4  # an adjustment ends when a step lowers the cost by less than this share
 _FIRST_DAMPING = 1e-4  # Levenberg-Marquardt's share of the diagonal: nearly Gauss-Newton at first
-_MOST_DAMPING = 1e4  # the adjustment ends when a step with more damping does not lower the cost
-_NEAR_M = 0.02
-_BEHIND = 1e3
-_BLOCKS = 6  # stretches of a drive whose errors are taken as correlated
-_CELLS = 6  # columns and rows of the image whose errors are taken as correlated
-_MAD = 1.4826
-_MOST_PARTS = 4  # parts of a drive that are adjusted by themselves
-_LEAST_OF_PART = 6  # keyframes of a part
-_MOST_TURN_RAD = 0.5  # largest rotation of a keyframe in one step; exp_se3 is far from linear beyond it
-_MEAN_INFORMATION = 1e8  # of the mean of all zooms, which holds it at 0
-_SAMPLES = 8
-_POSE_INFORMATION = 1.0  # of each pose, far below that of a drive: fixes position, and scale without metres
-_POINT_INFORMATION = 1e-3  # of each landmark, far below that of one pixel
+_MIN_DAMPING = 1e-9  # Levenberg-Marquardt's share of the diagonal is not lowered below this
+_MAX_DAMPING = 1e4  # an adjustment ends when a step with more damping than this does not lower the cost
+_MIN_DEPTH_M = 0.02  # depth of a landmark in a camera: projections of nearer landmarks use this depth
+_BEHIND_COST = 1e3  # cost of a landmark nearer than this, or behind the camera: far above that of an outlier
+_TIME_BLOCKS = 6  # consecutive parts of a drive within which errors count as correlated
+_IMAGE_CELLS = 6  # columns, and rows, of image regions within which errors count as correlated
+_MAD_TO_SIGMA = 1.4826  # standard deviation of normal noise over its median absolute deviation
+_MIN_PIXEL_FACTOR = 0.05  # smallest ratio of the noise of pixels to their stated deviations
+_MIN_DEPTH_FACTOR = 0.1  # smallest ratio of the noise of depths to their stated deviations
+_MIN_DEPTHS = 20  # depths of a drive above which their noise is estimated from residuals
+_MAX_PARTS = 4  # parts of a drive that are adjusted alone to see whether they agree
+_MIN_PART_KEYFRAMES = 6  # keyframes of such a part
+_MAX_STEP_RAD = 0.5  # rotation of a keyframe in one step: the linearisation does not hold beyond it
+_ZOOM_MEAN_INFORMATION = 1e8
+"""Information on the mean of the focal lengths of keyframes, which is held at 0, since ``fx`` and ``fy``
+already describe the common focal length."""
+_NOISE_SAMPLES = 8  # random perturbations of a drive from which the uncertainty of its path is computed
+_POSE_INFORMATION = 1.0
+"""Information added to each number of a pose, far below that of a drive: fixes the gauge, which is position
+and orientation of the world, and its scale without depth."""
+_POINT_INFORMATION = 1e-3  # information added to each landmark, 1/m^2, far below that of one pixel
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class DriveObservations:
-    """Landmarks and where keyframes see them.
+    """What the *k* keyframes of a drive observe of *l* landmarks: *n* pixels, some of them with a depth.
 
     Attributes:
-        camera: Intrinsics as they are set.
-        keyframes: ``(n,)``, row of the keyframe of each observation.
-        landmarks: ``(n,)``, row of its landmark; a keyframe sees one at most once.
-        pixels: ``(n, 2)``.
-        pixels_px: ``(n,)`` deviations of the pixels.
-        depths_m: ``(n,)`` along the optical axis, NaN where there is none.
-        depths_dev_m: ``(n,)`` deviations of the depths; not read where there is none.
-        rates_m_s: ``(n,)``, how the depth at the pixel changes with time; 0 where that is not known.
-        twists_s: ``(k, 6)``, how the pose of each keyframe changes in a second, as a twist on its left; 0
-            where that is not known.
-        curve_dev_per_m: Deviation of the unknown ``curve`` before the drive is seen.
+        camera: The intrinsics that the drive was recorded with.
+        keyframes: ``(n,)``, index of the keyframe of each observation.
+        landmarks: ``(n,)``, index of its landmark; a keyframe observes a landmark at most once.
+        pixels: ``(n, 2)``, undistorted pixels.
+        pixels_px: ``(n,)``, standard deviations of the pixels, px.
+        depths_m: ``(n,)``, depths along the optical axis; NaN without a depth.
+        depths_dev_m: ``(n,)``, standard deviations of the depths; not read without a depth.
+        rates_m_s: ``(n,)``, change of the depth at the pixel with time, m/s; 0 where it is not known.
+        twists_s: ``(k, 6)``, motion of each keyframe: the twist in a second (m, rad) on the left of
+            ``T_camera_world``; 0 where it is not known.
+        curve_dev_per_m: Prior standard deviation of the unknown ``curve``.
+
+    Raises:
+        BadRequest: The arrays of observations have different lengths.
     """
 
     camera: Camera
@@ -85,32 +107,34 @@ class DriveObservations:
 
     def __post_init__(self) -> None:
         n = len(self.keyframes)
-        shapes = (
-            self.landmarks.shape, self.pixels_px.shape, self.depths_m.shape, self.depths_dev_m.shape,
-            self.rates_m_s.shape,
-        )  # fmt: skip
-        if shapes != ((n,),) * 5 or self.pixels.shape != (n, 2):
+        columns = (self.landmarks, self.pixels_px, self.depths_m, self.depths_dev_m, self.rates_m_s)
+        if any(column.shape != (n,) for column in columns) or self.pixels.shape != (n, 2):
             raise BadRequest(
-                "observations of different numbers of rows", hint="give one row for each observation"
+                f"the arrays of {n} observations have the shapes "
+                f"{[self.pixels.shape, *(column.shape for column in columns)]}",
+                hint="give one row for each observation",
             )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Calibrated:
-    """The result of `adjust_with_calibration`.
+    """A drive of *k* keyframes and *l* landmarks after `adjust_with_calibration`.
 
     Attributes:
-        values: ``(9,)`` of `UNKNOWNS`; those that were not free are 0.
-        covariance: ``(9, 9)`` of the values, inflated to what the residuals show.
-        zooms: ``(k,)`` logarithms of the focal length of each keyframe beside the common one.
-        zooms_covariance: ``(k, k)``.
-        T_camera_world: ``(k, 4, 4)``.
-        points_world: ``(l, 3)``.
-        bends_m: ``(9, k, 3)``, how the keyframes' positions move where an unknown is held one too large.
-        noise_m: How well the drive tells its positions: root mean square after alignment.
-        cost: Robust sum of squares.
-        has_metres: Whether depths tell the scale; else paths are compared up to scale.
-        pixel_factor, depth_factor: Residuals against the deviations of the observations.
+        values: ``(9,)``, errors of the calibration, see `UNKNOWNS`; those that were not estimated keep the
+            value with which the adjustment began.
+        covariance: ``(9, 9)`` of the values, inflated where residuals are correlated.
+        zooms: ``(k,)``, logarithm of the focal length of each keyframe over the common one.
+        zooms_covariance: ``(k, k)`` of the zooms; 0 if they were not estimated.
+        T_camera_world: ``(k, 4, 4)``, adjusted poses, metres.
+        points_world: ``(l, 3)``, adjusted landmarks, metres.
+        bends_m: ``(9, k, 3)``, derivative of the keyframes' positions by each error of the calibration: by
+            how much the path bends if an unknown is held one unit too large.
+        noise_m: Uncertainty of the path: root mean square of its random error after alignment.
+        cost: The robust sum of squares at the end.
+        has_metric_scale: Whether depths determine the metric scale; else paths are compared up to scale.
+        pixel_factor: Noise of the pixels over their stated standard deviations.
+        depth_factor: Noise of the depths over their stated standard deviations.
     """
 
     values: Array
@@ -122,96 +146,123 @@ class Calibrated:
     bends_m: Array
     noise_m: float
     cost: float
-    has_metres: bool
+    has_metric_scale: bool
     pixel_factor: float
     depth_factor: float
 
     @property
     def deviations(self) -> Array:
-        """``(9,)`` standard deviations of the values."""
+        """The standard deviations ``(9,)`` of the values, in the units of `UNKNOWNS`."""
         deviations: Array = np.sqrt(np.diag(self.covariance))
         return deviations
 
     def bend_m(self, error: Array) -> float:
-        """Return how far a calibration that is wrong by *error* ``(9,)`` bends the drive, after alignment."""
+        """Return how far a calibration that is wrong by *error* ``(9,)`` bends the path, m.
+
+        That is the root mean square change of the keyframes' positions after alignment of both paths.
+        """
         moved = np.tensordot(error, self.bends_m, axes=1)
-        return rms_after_alignment(inverse(self.T_camera_world)[:, :3, 3], moved, has_metres=self.has_metres)
+        return rms_after_alignment(
+            inverse(self.T_camera_world)[:, :3, 3], moved, has_metric_scale=self.has_metric_scale
+        )
 
 
-def triangulated(observed: DriveObservations, T_camera_world: Array, count: int) -> Array:
-    """Return ``(count, 3)`` landmarks from depths where there are some, and from rays elsewhere."""
+def triangulate_landmarks(observed: DriveObservations, T_camera_world: Array, count: int) -> Array:
+    """Return the positions of *count* landmarks ``(count, 3)``, m, by linear least squares.
+
+    Each observation pulls its landmark to its ray, and to the point at its depth if it has one.
+
+    Args:
+        observed: Observations of the landmarks.
+        T_camera_world: ``(k, 4, 4)``, poses of the keyframes.
+        count: Number of landmarks.
+    """
     camera, T = observed.camera, T_camera_world[observed.keyframes]
     rays = camera.back_project(observed.pixels, np.ones(len(T)))
     rotated = np.einsum("nji,nj->ni", T[:, :3, :3], rays)
     centres = -np.einsum("nji,nj->ni", T[:, :3, :3], T[:, :3, 3])
     has_depth = np.isfinite(observed.depths_m)
-    weight = np.where(has_depth, np.square(observed.depths_dev_m, where=has_depth, out=np.ones(len(T))), 1.0)
-    points = centres + np.nan_to_num(observed.depths_m)[:, None] * rotated
+    variances = np.where(
+        has_depth, np.square(observed.depths_dev_m, where=has_depth, out=np.ones(len(T))), 1.0
+    )
+    points_at_depth = centres + np.nan_to_num(observed.depths_m)[:, None] * rotated
     unit = rotated / np.linalg.norm(rotated, axis=1, keepdims=True)
-    across = np.eye(3) - unit[:, :, None] * unit[:, None, :]
-    A = _summed(across, observed.landmarks, count)
-    b = _summed(np.einsum("nij,nj->ni", across, centres), observed.landmarks, count)
-    near: Array = np.where(has_depth, 1.0 / weight, 0.0)
-    A += _summed(near[:, None, None] * np.eye(3), observed.landmarks, count)
-    b += _summed(near[:, None] * points, observed.landmarks, count)
-    found = np.linalg.solve(A + 1e-9 * np.eye(3), b[:, :, None])[:, :, 0]
-    return found.astype(np.float64, copy=False)
+    across_ray = np.eye(3) - unit[:, :, None] * unit[:, None, :]
+    A = _sum_by_index(across_ray, observed.landmarks, count)
+    b = _sum_by_index(np.einsum("nij,nj->ni", across_ray, centres), observed.landmarks, count)
+    depth_weights: Array = np.where(has_depth, 1.0 / variances, 0.0)
+    A += _sum_by_index(depth_weights[:, None, None] * np.eye(3), observed.landmarks, count)
+    b += _sum_by_index(depth_weights[:, None] * points_at_depth, observed.landmarks, count)
+    points = np.linalg.solve(A + 1e-9 * np.eye(3), b[:, :, None])[:, :, 0]
+    return points.astype(np.float64, copy=False)
 
 
 def adjust_with_calibration(
-    observed: DriveObservations, T_camera_world: Array, points_world: Array, free: tuple[str, ...],
-    *, zooms: bool = False, values: Array | None = None,
-) -> Calibrated:  # fmt: skip
-    """Return poses, landmarks and calibration that agree best with pixels and depths.
+    observed: DriveObservations,
+    T_camera_world: Array,
+    points_world: Array,
+    free: tuple[str, ...],
+    *,
+    zooms: bool = False,
+    values: Array | None = None,
+) -> Calibrated:
+    """Adjust poses, landmarks and calibration until they agree best with the observed pixels and depths.
 
-    A pixel is ``f e^(a + zoom) x (1 + k1 r^2) + c + d``; a measured depth is
-    ``z + offset + curve z^2 - rate * delay``.
+    The model of a pixel is ``f e^(fx + zoom) x (1 + k1 r^2) + c + cx`` for the point ``(x, y, 1)`` of the
+    camera frame with ``r^2 = x^2 + y^2``, moved by the rolling shutter.  The model of a measured depth is ``z
+    + offset + curve z^2 - rate * delay``.
 
     Args:
-        observed: Of all keyframes.
-        T_camera_world: ``(k, 4, 4)``, where the adjustment begins.
-        points_world: ``(l, 3)``, as `triangulated` returns them.
-        free: Which of `UNKNOWNS` are adjusted; the others are 0.
-        zooms: Whether each keyframe has a focal length of its own.
-        values: ``(9,)``, where the calibration begins; None for 0.
+        observed: The observations of all keyframes.
+        T_camera_world: ``(k, 4, 4)``, poses with which the adjustment begins.
+        points_world: ``(l, 3)``, landmarks with which the adjustment begins, see `triangulate_landmarks`.
+        free: The `UNKNOWNS` that are estimated; the others keep their values.
+        zooms: Whether a focal length is estimated for each keyframe.
+        values: ``(9,)``, errors of the calibration with which the adjustment begins; None for 0.
 
     Raises:
+        BadRequest: *free* names an unknown that does not exist.
         DegenerateGeometry: The linear system has no solution.
 
     Source:
-        Triggs et al., "Bundle Adjustment - A Modern Synthesis", 2000, Sect. 6; deviations by the sandwich of
-        White, Econometrica 1980, over stretches of the drive.
+        Triggs et al., "Bundle Adjustment - A Modern Synthesis", 2000, Sect. 6; covariances by the sandwich
+        estimator of White, Econometrica 1980, over clusters of residuals.
     """
-    unknown = set(free) - set(UNKNOWNS)
-    if unknown:
-        raise BadRequest(f"no unknown named {sorted(unknown)}", hint=f"choose of {', '.join(UNKNOWNS)}")
-    system = _System(observed, len(T_camera_world), len(points_world), free, zooms=zooms)
-    begin = np.zeros(len(UNKNOWNS)) if values is None else values
-    state = _State(T_camera_world.copy(), points_world.copy(), begin.copy(), np.zeros(system.k))
+    unknown_names = set(free) - set(UNKNOWNS)
+    if unknown_names:
+        raise BadRequest(f"no unknown named {sorted(unknown_names)}", hint=f"choose of {', '.join(UNKNOWNS)}")
+    system = _DriveSystem(observed, len(T_camera_world), len(points_world), free, zooms=zooms)
+    first_values = np.zeros(len(UNKNOWNS)) if values is None else values
+    state = _State(
+        T_camera_world.copy(), points_world.copy(), first_values.copy(), np.zeros(len(T_camera_world))
+    )
 
     damping = _FIRST_DAMPING
-    system.rescale(state)
+    system.estimate_noise(state)
     cost = system.cost(state)
     try:
         for iteration in range(_ZOOM_ITERATIONS if zooms else _ITERATIONS):
+            # 1. Take the first step of growing damping that lowers the cost.
             system.linearise(state)
-            moved, moved_cost = state, np.inf
-            while damping <= _MOST_DAMPING:
-                moved = system.step(state, damping)
-                moved_cost = system.cost(moved)
-                if moved_cost < cost:
+            next_state, next_cost = state, np.inf
+            while damping <= _MAX_DAMPING:
+                next_state = system.step(state, damping)
+                next_cost = system.cost(next_state)
+                if next_cost < cost:
                     break
                 damping *= 10.0
-            if not moved_cost < cost:
+            if not next_cost < cost:
                 break
-            is_done = cost - moved_cost < _CONVERGED * cost
-            state, cost, damping = moved, moved_cost, max(damping * 0.1, 1e-9)
-            if iteration in (1, 4):
-                system.rescale(state)
+            is_converged = cost - next_cost < _CONVERGED_SHARE * cost
+            state, cost, damping = next_state, next_cost, max(damping * 0.1, _MIN_DAMPING)
+            # 2. Estimate the noise again at fixed steps, so that the weights of outliers fit.
+            if iteration in _RESCALE_ITERATIONS:
+                system.estimate_noise(state)
                 cost = system.cost(state)
-            elif is_done and iteration > 4:
+            elif is_converged and iteration > _MIN_CONVERGED_ITERATION:
                 break
-        system.rescale(state)
+        # 3. Compute covariances at the solution.
+        system.estimate_noise(state)
         system.linearise(state)
         return system.result(state)
     except np.linalg.LinAlgError as error:
@@ -221,38 +272,46 @@ def adjust_with_calibration(
         ) from error
 
 
-def deviations_of_parts(observed: DriveObservations, found: Calibrated, free: tuple[str, ...]) -> Array:
-    """Return ``(9,)`` deviations of the calibration from how far parts of a drive disagree about it.
+def estimate_part_deviations(
+    observed: DriveObservations, adjusted: Calibrated, free: tuple[str, ...]
+) -> Array:
+    """Return how far parts of a drive disagree about the calibration, as standard deviations ``(9,)``.
 
-    Parts that are adjusted by themselves disagree by more than their own deviations where the model lacks
-    something, such as errors of depth that change with the scene.  0 where there are too few keyframes.
+    Parts that are adjusted alone disagree by more than their own deviations where the model lacks an effect,
+    such as errors of depth that change with the scene.  The result is 0 where a drive has too few keyframes
+    for two parts, and for unknowns that are not in *free*.
 
     Args:
-        observed: As it was adjusted.
-        found: The result for the whole drive.
-        free: As it was adjusted.
+        observed: The observations of the whole drive.
+        adjusted: The result of `adjust_with_calibration` for the whole drive.
+        free: The `UNKNOWNS` that were estimated.
     """
-    k = len(found.T_camera_world)
-    count = min(_MOST_PARTS, k // _LEAST_OF_PART)
+    keyframe_count = len(adjusted.T_camera_world)
+    part_count = min(_MAX_PARTS, keyframe_count // _MIN_PART_KEYFRAMES)
     values, variances = [], []
-    for part in range(count if count > 1 else 0):
-        rows = np.arange(k * part // count, k * (part + 1) // count)
+    for part in range(part_count if part_count > 1 else 0):
+        keyframes = np.arange(keyframe_count * part // part_count, keyframe_count * (part + 1) // part_count)
         try:
-            own = adjust_with_calibration(*_part_of(observed, found, rows), free, values=found.values)
+            adjusted_part = adjust_with_calibration(
+                *_select_keyframes(observed, adjusted, keyframes), free, values=adjusted.values
+            )
         except DegenerateGeometry:
             continue
-        values.append(own.values)
-        variances.append(np.diag(own.covariance))
-    total: Array = np.zeros(len(UNKNOWNS))
+        values.append(adjusted_part.values)
+        variances.append(np.diag(adjusted_part.covariance))
+    deviations: Array = np.zeros(len(UNKNOWNS))
     if len(values) < 2:
-        return total
-    at = [UNKNOWNS.index(name) for name in free]
-    total[at] = disagreement(np.array(values)[:, at], np.array(variances)[:, at])
-    return total
+        return deviations
+    indices = [UNKNOWNS.index(name) for name in free]
+    deviations[indices] = disagreement(np.array(values)[:, indices], np.array(variances)[:, indices])
+    return deviations
 
 
 def disagreement(values: Array, variances: Array) -> Array:
-    """Return by what parts disagree beyond their ``(p, n)`` variances: the ``(n,)`` deviation of the mean.
+    """Return the standard deviation ``(n,)`` of the mean of *p* estimates that their variances do not
+    explain.
+
+    *values* and *variances* are ``(p, n)``: *n* quantities, each estimated *p* times.
 
     Source:
         DerSimonian and Laird, Controlled Clinical Trials 1986, Sect. 2: the variance between studies.
@@ -265,303 +324,390 @@ def disagreement(values: Array, variances: Array) -> Array:
     return deviations
 
 
-def _part_of(
-    observed: DriveObservations, found: Calibrated, rows: Rows
+def _select_keyframes(
+    observed: DriveObservations, adjusted: Calibrated, keyframes: Rows
 ) -> tuple[DriveObservations, Array, Array]:
-    """Return what some keyframes see of the landmarks that two of them share, with where these are."""
-    numbers = np.full(len(found.T_camera_world), -1)
-    numbers[rows] = np.arange(len(rows))
-    kept = numbers[observed.keyframes] >= 0
-    kept &= np.bincount(observed.landmarks[kept], minlength=len(found.points_world))[observed.landmarks] > 1
-    seen, landmarks = np.unique(observed.landmarks[kept], return_inverse=True)
-    own = replace(
-        observed, keyframes=numbers[observed.keyframes[kept]], landmarks=landmarks,
-        pixels=observed.pixels[kept], pixels_px=observed.pixels_px[kept], depths_m=observed.depths_m[kept],
-        depths_dev_m=observed.depths_dev_m[kept], rates_m_s=observed.rates_m_s[kept],
-        twists_s=observed.twists_s[rows],
-    )  # fmt: skip
-    return own, found.T_camera_world[rows], found.points_world[seen]
+    """Return observations, poses and landmarks of *keyframes*, as far as two of them share a landmark."""
+    new_index = np.full(len(adjusted.T_camera_world), -1)
+    new_index[keyframes] = np.arange(len(keyframes))
+    is_selected = new_index[observed.keyframes] >= 0
+    observation_counts = np.bincount(observed.landmarks[is_selected], minlength=len(adjusted.points_world))
+    is_selected &= observation_counts[observed.landmarks] > 1
+    selected_landmarks, landmarks = np.unique(observed.landmarks[is_selected], return_inverse=True)
+    selected = replace(
+        observed,
+        keyframes=new_index[observed.keyframes[is_selected]],
+        landmarks=landmarks,
+        pixels=observed.pixels[is_selected],
+        pixels_px=observed.pixels_px[is_selected],
+        depths_m=observed.depths_m[is_selected],
+        depths_dev_m=observed.depths_dev_m[is_selected],
+        rates_m_s=observed.rates_m_s[is_selected],
+        twists_s=observed.twists_s[keyframes],
+    )
+    return selected, adjusted.T_camera_world[keyframes], adjusted.points_world[selected_landmarks]
 
 
 @dataclass(frozen=True, slots=True)
 class _State:
-    T: Array
+    """The estimates of an adjustment.
+
+    They are poses ``(k, 4, 4)``, landmarks ``(l, 3)``, errors of the calibration ``(9,)``, and zooms
+    ``(k,)``.
+    """
+
+    T_camera_world: Array
     points: Array
     values: Array
     zooms: Array
 
 
-class _System:
-    """The normal equations of a drive, with observations in the order of their landmarks."""
+class _DriveSystem:
+    """The normal equations of a drive, with observations in the order of their landmarks.
+
+    The parameters of the equations are those of all keyframes, one after the other (a twist on the left of
+    ``T_camera_world``, and a zoom if zooms are estimated), and then the free unknowns of the calibration.
+    """
 
     def __init__(
         self,
         observed: DriveObservations,
-        keyframes: int,
-        landmarks: int,
+        keyframe_count: int,
+        landmark_count: int,
         free: tuple[str, ...],
         *,
         zooms: bool,
     ) -> None:
         self._free = np.flatnonzero([name in free for name in UNKNOWNS])
         self._priors = np.append(PRIOR[:-1], observed.curve_dev_per_m)
-        self._c, self._m = 7 if zooms else 6, len(self._free)
+        self._keyframe_count, self._landmark_count = keyframe_count, landmark_count
+        self._keyframe_size = 7 if zooms else 6
+        self._poses_size = self._keyframe_size * keyframe_count
+        # 1. Observations, sorted by landmark.
         order = np.argsort(observed.landmarks, kind="stable")
-        self.k, self.l = keyframes, landmarks
+        self.camera = observed.camera
         self.keyframes, self.landmarks = observed.keyframes[order], observed.landmarks[order]
         self.pixels, self.pixels_px = observed.pixels[order], observed.pixels_px[order]
         self.has_depth = np.isfinite(observed.depths_m[order])
         self.depths_m = np.where(self.has_depth, observed.depths_m[order], 0.0)
         self.depths_dev_m = np.where(self.has_depth, observed.depths_dev_m[order], 1.0)
         self.rates_m_s = np.where(self.has_depth, observed.rates_m_s[order], 0.0)
-        self.camera = observed.camera
+        # 2. Motion of the camera during the exposure of the rows of an image.
         twists = observed.twists_s[self.keyframes]
-        self.rates, self.turns = twists[:, :3], twists[:, 3:]
-        self.moments = self.pixels[:, 1:] / self.camera.height - 0.5
+        self._velocities, self._angular_rates = twists[:, :3], twists[:, 3:]
+        self._row_fractions = self.pixels[:, 1:] / self.camera.height - 0.5
+        # 3. Noise over stated deviations, and the arrays of the normal equations.
         self.pixel_factor = self.depth_factor = 1.0
-        self._of_keyframe = [np.flatnonzero(self.keyframes == row) for row in range(keyframes)]
-        size = self._c * keyframes + self._m
-        # What no keyframe sees of a landmark stays 0 in E from one step to the next.
+        self._observations_of_keyframe = [np.flatnonzero(self.keyframes == k) for k in range(keyframe_count)]
+        size = self._poses_size + len(self._free)
+        # Entries of E for keyframes that do not observe a landmark are 0 and are never written.
         self._equations = NormalEquations(
-            np.zeros((size, size)), np.zeros(size), np.zeros((landmarks, 3, size)),
-            np.zeros((landmarks, 3, 3)), np.zeros((landmarks, 3)),
-        )  # fmt: skip
-        columns = self._c * self.keyframes[:, None, None] + np.arange(self._c)
-        self._seen_at = self.landmarks[:, None, None], np.arange(3)[:, None], columns
+            np.zeros((size, size)),
+            np.zeros(size),
+            np.zeros((landmark_count, 3, size)),
+            np.zeros((landmark_count, 3, 3)),
+            np.zeros((landmark_count, 3)),
+        )
+        columns = self._keyframe_size * self.keyframes[:, None, None] + np.arange(self._keyframe_size)
+        self._E_indices = self.landmarks[:, None, None], np.arange(3)[:, None], columns
 
     def residuals(self, state: _State) -> tuple[Array, Array]:
-        """Return ``(n, 3)`` residuals of pixel and depth in their units, and points in the camera."""
-        T = state.T[self.keyframes]
-        seen = np.einsum("nij,nj->ni", T[:, :3, :3], state.points[self.landmarks]) + T[:, :3, 3]
-        z = np.maximum(seen[:, 2], _NEAR_M)
+        """Return residuals ``(n, 3)`` and points of the camera frame ``(n, 3)``, m.
+
+        A residual is model minus observation: two pixels, and metres of depth (0 without a depth).
+        """
+        T = state.T_camera_world[self.keyframes]
+        points_camera = np.einsum("nij,nj->ni", T[:, :3, :3], state.points[self.landmarks]) + T[:, :3, 3]
+        z = np.maximum(points_camera[:, 2], _MIN_DEPTH_M)
         a, b, cx, cy, k1, offset, delay, readout, curve = state.values
-        x, y = seen[:, 0] / z, seen[:, 1] / z
-        bent = 1.0 + k1 * (x * x + y * y)
+        x, y = points_camera[:, 0] / z, points_camera[:, 1] / z
+        radial = 1.0 + k1 * (x * x + y * y)
         zoom = np.exp(state.zooms[self.keyframes])
         residual = np.empty((len(z), 3))
         residual[:, 0] = (
-            self.camera.fx * np.exp(a) * zoom * x * bent + self.camera.cx + cx - self.pixels[:, 0]
+            self.camera.fx * np.exp(a) * zoom * x * radial + self.camera.cx + cx - self.pixels[:, 0]
         )
         residual[:, 1] = (
-            self.camera.fy * np.exp(b) * zoom * y * bent + self.camera.cy + cy - self.pixels[:, 1]
+            self.camera.fy * np.exp(b) * zoom * y * radial + self.camera.cy + cy - self.pixels[:, 1]
         )
         if readout:
-            later = seen + readout * self.moments * (self.rates + np.cross(self.turns, seen))
-            later_z = np.maximum(later[:, 2], _NEAR_M)
-            residual[:, 0] += self.camera.fx * (later[:, 0] / later_z - x)
-            residual[:, 1] += self.camera.fy * (later[:, 1] / later_z - y)
+            # A row is exposed before or after the middle one, when the camera has moved.
+            motion = self._velocities + np.cross(self._angular_rates, points_camera)
+            exposed = points_camera + readout * self._row_fractions * motion
+            exposed_z = np.maximum(exposed[:, 2], _MIN_DEPTH_M)
+            residual[:, 0] += self.camera.fx * (exposed[:, 0] / exposed_z - x)
+            residual[:, 1] += self.camera.fy * (exposed[:, 1] / exposed_z - y)
         residual[:, 2] = np.where(
             self.has_depth,
-            seen[:, 2] + offset + curve * seen[:, 2] ** 2 - self.rates_m_s * delay - self.depths_m,
+            points_camera[:, 2]
+            + offset
+            + curve * points_camera[:, 2] ** 2
+            - self.rates_m_s * delay
+            - self.depths_m,
             0.0,
         )
-        return residual, seen
+        return residual, points_camera
 
-    def _scales(self) -> Array:
-        return np.stack(
-            [
-                1.0 / (self.pixel_factor * self.pixels_px), 1.0 / (self.pixel_factor * self.pixels_px),
-                np.where(self.has_depth, 1.0 / (self.depth_factor * self.depths_dev_m), 0.0),
-            ],
-            axis=1,
-        )  # fmt: skip
+    def _inverse_deviations(self) -> Array:
+        """Return the inverses ``(n, 3)`` of the standard deviations of pixel and depth; 0 without a depth."""
+        pixel = 1.0 / (self.pixel_factor * self.pixels_px)
+        depth = np.where(self.has_depth, 1.0 / (self.depth_factor * self.depths_dev_m), 0.0)
+        return np.stack([pixel, pixel, depth], axis=1)
 
-    def rescale(self, state: _State) -> None:
-        """Take the deviations of pixels and depths from their residuals."""
+    def estimate_noise(self, state: _State) -> None:
+        """Set the noise of pixels and depths from the median absolute deviation of their residuals."""
         residual, _ = self.residuals(state)
-        pixels = np.abs(residual[:, :2] / self.pixels_px[:, None])
-        self.pixel_factor = max(0.05, _MAD * float(np.median(pixels)))
-        if self.has_depth.sum() > 20:
-            depths = np.abs(residual[:, 2] / self.depths_dev_m)[self.has_depth]
-            self.depth_factor = max(0.1, _MAD * float(np.median(depths)))
+        pixel_ratios = np.abs(residual[:, :2] / self.pixels_px[:, None])
+        self.pixel_factor = max(_MIN_PIXEL_FACTOR, _MAD_TO_SIGMA * float(np.median(pixel_ratios)))
+        if self.has_depth.sum() > _MIN_DEPTHS:
+            depth_ratios = np.abs(residual[:, 2] / self.depths_dev_m)[self.has_depth]
+            self.depth_factor = max(_MIN_DEPTH_FACTOR, _MAD_TO_SIGMA * float(np.median(depth_ratios)))
 
     def cost(self, state: _State) -> float:
-        residual, seen = self.residuals(state)
-        whitened = np.square(residual * self._scales())
+        """Return the Cauchy loss of all residuals plus the costs of the priors."""
+        residual, points_camera = self.residuals(state)
+        whitened = np.square(residual * self._inverse_deviations())
         squares = np.stack([whitened[:, :2].sum(axis=1), whitened[:, 2]])
-        each = _CAUCHY**2 * np.log1p(squares / _CAUCHY**2)
-        each[0] = np.where(seen[:, 2] > _NEAR_M, each[0], _BEHIND)
+        losses = _CAUCHY_SCALE**2 * np.log1p(squares / _CAUCHY_SCALE**2)
+        losses[0] = np.where(points_camera[:, 2] > _MIN_DEPTH_M, losses[0], _BEHIND_COST)
         priors = ((state.values / self._priors) ** 2).sum() + ((state.zooms / _ZOOM_PRIOR) ** 2).sum()
-        return float(each.sum() + priors)
+        return float(losses.sum() + priors)
 
     def linearise(self, state: _State) -> None:
-        """Take weighted Jacobians and residuals."""
-        residual, seen = self.residuals(state)
-        z = np.maximum(seen[:, 2], _NEAR_M)
+        """Compute the weighted Jacobians and residuals at *state*, and the normal equations from them."""
+        # 1. Derivatives of pixel and depth by the point in the camera frame.
+        residual, points_camera = self.residuals(state)
+        z = np.maximum(points_camera[:, 2], _MIN_DEPTH_M)
         n = len(z)
         a, b, _, _, k1 = state.values[:5]
-        x, y = seen[:, 0] / z, seen[:, 1] / z
+        x, y = points_camera[:, 0] / z, points_camera[:, 1] / z
         r2 = x * x + y * y
-        bent = 1.0 + k1 * r2
+        radial = 1.0 + k1 * r2
         zoom = np.exp(state.zooms[self.keyframes])
         fx, fy = self.camera.fx * np.exp(a) * zoom, self.camera.fy * np.exp(b) * zoom
         J_xy = np.empty((n, 2, 2))
-        J_xy[:, 0, 0], J_xy[:, 0, 1] = fx * (bent + 2 * k1 * x * x), fx * 2 * k1 * x * y
-        J_xy[:, 1, 0], J_xy[:, 1, 1] = fy * 2 * k1 * x * y, fy * (bent + 2 * k1 * y * y)
-        J_seen = np.zeros((n, 3, 3))
-        J_seen[:, :2, :2] = J_xy / z[:, None, None]
-        J_seen[:, :2, 2] = -(J_xy @ np.stack([x, y], axis=1)[:, :, None])[:, :, 0] / z[:, None]
-        J_seen[:, 2, 2] = 1.0 + 2.0 * state.values[8] * seen[:, 2]
-        J_c = np.zeros((n, 3, 7))
-        J_c[:, :, :3] = J_seen
-        J_c[:, :, 3:6] = -J_seen @ skew(seen)
-        J_v = np.zeros((n, 3, len(UNKNOWNS)))
-        J_v[:, 0, 0], J_v[:, 1, 1] = fx * x * bent, fy * y * bent
-        J_c[:, 0, 6], J_c[:, 1, 6] = J_v[:, 0, 0], J_v[:, 1, 1]
-        J_v[:, 0, 2] = J_v[:, 1, 3] = 1.0
-        J_v[:, 0, 4], J_v[:, 1, 4] = fx * x * r2, fy * y * r2
-        moving = self.moments * (self.rates + np.cross(self.turns, seen))
-        J_v[:, :2, 7] = (J_seen[:, :2] @ moving[:, :, None])[:, :, 0]
-        J_v[:, 2, 5], J_v[:, 2, 6], J_v[:, 2, 8] = 1.0, -self.rates_m_s, seen[:, 2] ** 2
-        scales = self._scales()
-        whitened = residual * scales
-        pixel = 1.0 / (1.0 + (whitened[:, :2] ** 2).sum(axis=1) / _CAUCHY**2)
-        depth = 1.0 / (1.0 + whitened[:, 2] ** 2 / _CAUCHY**2)
-        in_front = seen[:, 2] > _NEAR_M
-        weights = np.sqrt(np.stack([pixel, pixel, depth], axis=1) * in_front[:, None])
-        rows = (weights * scales)[:, :, None]
-        J_p = (J_seen @ state.T[self.keyframes, :3, :3]) * rows
-        self._J = J_c[:, :, : self._c] * rows, J_v[:, :, self._free] * rows, J_p
-        self._r = whitened * weights
-        self._normal()
+        J_xy[:, 0, 0], J_xy[:, 0, 1] = fx * (radial + 2 * k1 * x * x), fx * 2 * k1 * x * y
+        J_xy[:, 1, 0], J_xy[:, 1, 1] = fy * 2 * k1 * x * y, fy * (radial + 2 * k1 * y * y)
+        J_camera = np.zeros((n, 3, 3))
+        J_camera[:, :2, :2] = J_xy / z[:, None, None]
+        J_camera[:, :2, 2] = -(J_xy @ np.stack([x, y], axis=1)[:, :, None])[:, :, 0] / z[:, None]
+        J_camera[:, 2, 2] = 1.0 + 2.0 * state.values[8] * points_camera[:, 2]
+        # 2. Derivatives by pose and zoom of the keyframe, and by the unknowns of the calibration.
+        J_keyframe = np.zeros((n, 3, 7))
+        J_keyframe[:, :, :3] = J_camera
+        J_keyframe[:, :, 3:6] = -J_camera @ skew(points_camera)
+        J_values = np.zeros((n, 3, len(UNKNOWNS)))
+        J_values[:, 0, 0], J_values[:, 1, 1] = fx * x * radial, fy * y * radial
+        J_keyframe[:, 0, 6], J_keyframe[:, 1, 6] = J_values[:, 0, 0], J_values[:, 1, 1]
+        J_values[:, 0, 2] = J_values[:, 1, 3] = 1.0
+        J_values[:, 0, 4], J_values[:, 1, 4] = fx * x * r2, fy * y * r2
+        motion = self._row_fractions * (self._velocities + np.cross(self._angular_rates, points_camera))
+        J_values[:, :2, 7] = (J_camera[:, :2] @ motion[:, :, None])[:, :, 0]
+        J_values[:, 2, 5], J_values[:, 2, 6] = 1.0, -self.rates_m_s
+        J_values[:, 2, 8] = points_camera[:, 2] ** 2
+        # 3. Weights of the Cauchy loss; points behind the camera have none.
+        inverse_deviations = self._inverse_deviations()
+        whitened = residual * inverse_deviations
+        pixel_weights = 1.0 / (1.0 + (whitened[:, :2] ** 2).sum(axis=1) / _CAUCHY_SCALE**2)
+        depth_weights = 1.0 / (1.0 + whitened[:, 2] ** 2 / _CAUCHY_SCALE**2)
+        is_in_front = points_camera[:, 2] > _MIN_DEPTH_M
+        weights = np.stack([pixel_weights, pixel_weights, depth_weights], axis=1) * is_in_front[:, None]
+        roots = np.sqrt(weights)
+        rows = (roots * inverse_deviations)[:, :, None]
+        J_points = (J_camera @ state.T_camera_world[self.keyframes, :3, :3]) * rows
+        self._J = (
+            J_keyframe[:, :, : self._keyframe_size] * rows,
+            J_values[:, :, self._free] * rows,
+            J_points,
+        )
+        self._r = whitened * roots
+        # 4. The normal equations.
+        self._set_equations()
 
-    def _normal(self) -> None:
-        J_c, J_v, J_p = self._J
-        c, m, split = self._c, self._m, self._c * self.k
+    def _set_equations(self) -> None:
+        J_keyframe, J_values, J_points = self._J
+        size, poses_size, landmark_count = self._keyframe_size, self._poses_size, self._landmark_count
         equations = self._equations
         H, g, E = equations.H, equations.g, equations.E
         H[:], g[:] = 0.0, 0.0
-        for row, own in enumerate(self._of_keyframe):
-            at = slice(c * row, c * row + c)
-            stacked, others = J_c[own].reshape(-1, c), J_v[own].reshape(-1, m)
-            r = self._r[own].ravel()
-            H[at, at] = stacked.T @ stacked
-            H[at, split:] = stacked.T @ others
-            H[split:, at] = H[at, split:].T
-            H[split:, split:] += others.T @ others
-            g[at] = stacked.T @ r
-            g[split:] += others.T @ r
-        J_pt = J_p.transpose(0, 2, 1)
-        E[self._seen_at] = J_pt @ J_c
-        E[:, :, split:] = _summed(J_pt @ J_v, self.landmarks, self.l)
-        equations.H_landmarks = _summed(J_pt @ J_p, self.landmarks, self.l)
-        equations.g_landmarks = _summed((J_pt @ self._r[:, :, None])[:, :, 0], self.landmarks, self.l)
+        for keyframe, observations in enumerate(self._observations_of_keyframe):
+            block = slice(size * keyframe, size * keyframe + size)
+            J_own = J_keyframe[observations].reshape(-1, size)
+            J_shared = J_values[observations].reshape(-1, len(self._free))
+            r = self._r[observations].ravel()
+            H[block, block] = J_own.T @ J_own
+            H[block, poses_size:] = J_own.T @ J_shared
+            H[poses_size:, block] = H[block, poses_size:].T
+            H[poses_size:, poses_size:] += J_shared.T @ J_shared
+            g[block] = J_own.T @ r
+            g[poses_size:] += J_shared.T @ r
+        J_points_T = J_points.transpose(0, 2, 1)
+        E[self._E_indices] = J_points_T @ J_keyframe
+        E[:, :, poses_size:] = _sum_by_index(J_points_T @ J_values, self.landmarks, landmark_count)
+        equations.H_landmarks = _sum_by_index(J_points_T @ J_points, self.landmarks, landmark_count)
+        equations.g_landmarks = _sum_by_index(
+            (J_points_T @ self._r[:, :, None])[:, :, 0], self.landmarks, landmark_count
+        )
 
-    def _reduced(self, damping: float) -> ReducedEquations:
-        """Return the equations of poses and calibration, with priors."""
-        reduced = self._equations.reduce(damping, self._prior(), _POINT_INFORMATION)
-        if self._c == 7:
-            # The mean of the zooms is the common focal length's.
-            zoom = 7 * np.arange(self.k) + 6
-            reduced.S[np.ix_(zoom, zoom)] += _MEAN_INFORMATION / self.k
+    def _reduce(self, damping: float) -> ReducedEquations:
+        """Return the equations of keyframes and calibration without landmarks, with all priors."""
+        reduced = self._equations.reduce(damping, self._prior_information(), _POINT_INFORMATION)
+        if self._keyframe_size == 7:
+            zoom_columns = 7 * np.arange(self._keyframe_count) + 6
+            reduced.S[np.ix_(zoom_columns, zoom_columns)] += _ZOOM_MEAN_INFORMATION / self._keyframe_count
         return reduced
 
-    def _prior(self) -> Array:
-        own = np.full((self.k, self._c), _POSE_INFORMATION)
-        own[:, 6:] = 1.0 / _ZOOM_PRIOR**2
-        return np.concatenate([own.ravel(), 1.0 / self._priors[self._free] ** 2])
+    def _prior_information(self) -> Array:
+        """Return the information of the priors of all parameters, the diagonal of a matrix."""
+        of_keyframes = np.full((self._keyframe_count, self._keyframe_size), _POSE_INFORMATION)
+        of_keyframes[:, 6:] = 1.0 / _ZOOM_PRIOR**2
+        return np.concatenate([of_keyframes.ravel(), 1.0 / self._priors[self._free] ** 2])
 
     def step(self, state: _State, damping: float) -> _State:
-        """Return the state after one damped step."""
-        reduced = self._reduced(damping)
-        k, c = self.k, self._c
-        now = np.zeros((k, c))
-        now[:, 6:] = state.zooms[:, None]
-        pull = self._prior() * np.concatenate([now.ravel(), state.values[self._free]])
-        d = np.linalg.solve(reduced.S, reduced.right - pull)
-        own = d[: c * k].reshape(k, c)
-        limit = min(1.0, _MOST_TURN_RAD / max(float(np.abs(own[:, 3:6]).max()), 1e-12))
+        """Return the state after a Levenberg-Marquardt step, shortened to `_MAX_STEP_RAD`."""
+        # 1. Solve for keyframes and calibration; priors pull zooms and values to 0.
+        reduced = self._reduce(damping)
+        keyframe_values = np.zeros((self._keyframe_count, self._keyframe_size))
+        keyframe_values[:, 6:] = state.zooms[:, None]
+        parameters = np.concatenate([keyframe_values.ravel(), state.values[self._free]])
+        d = np.linalg.solve(reduced.S, reduced.right - self._prior_information() * parameters)
+        # 2. Shorten the whole step if a keyframe would rotate too far.
+        of_keyframes = d[: self._poses_size].reshape(self._keyframe_count, self._keyframe_size)
+        factor = min(1.0, _MAX_STEP_RAD / max(float(np.abs(of_keyframes[:, 3:6]).max()), 1e-12))
+        # 3. Apply the step to keyframes, landmarks, values and zooms.
         values = state.values.copy()
-        values[self._free] += limit * d[c * k :]
+        values[self._free] += factor * d[self._poses_size :]
         return _State(
-            exp_se3(limit * own[:, :6]) @ state.T,
-            state.points + limit * self._equations.landmark_steps(reduced, d),
+            exp_se3(factor * of_keyframes[:, :6]) @ state.T_camera_world,
+            state.points + factor * self._equations.landmark_steps(reduced, d),
             values,
-            state.zooms + limit * own[:, 6] if c == 7 else state.zooms,
+            state.zooms + factor * of_keyframes[:, 6] if self._keyframe_size == 7 else state.zooms,
         )
 
     def result(self, state: _State) -> Calibrated:
-        """Return the state with its deviations."""
-        reduced = self._reduced(0.0)
-        S, P = reduced.S, reduced.landmark_covariance
-        k, c, m, split = self.k, self._c, self._m, self._c * self.k
-        whole: Array = np.linalg.inv(S).astype(np.float64, copy=False)
-        rows = np.arange(split, split + m)
-        if c == 7:
-            rows = np.concatenate([rows, 7 * np.arange(k) + 6])
-        own = whole[rows][:, rows]
-        growth = np.sqrt(self._inflation(whole[rows], P, np.diag(own)))
-        own = own * growth[:, None] * growth[None]
+        """Return the solution *state* with its covariances; `linearise` must have been called with it."""
+        # 1. Covariance of the calibration and the zooms, inflated for correlated residuals.
+        reduced = self._reduce(0.0)
+        S, landmark_covariance = reduced.S, reduced.landmark_covariance
+        count, size, poses_size = self._keyframe_count, self._keyframe_size, self._poses_size
+        free_count = len(self._free)
+        inverse_S: Array = np.linalg.inv(S).astype(np.float64, copy=False)
+        parameters = np.arange(poses_size, poses_size + free_count)
+        if size == 7:
+            parameters = np.concatenate([parameters, 7 * np.arange(count) + 6])
+        estimated = inverse_S[parameters][:, parameters]
+        inflation = self._variance_inflation(inverse_S[parameters], landmark_covariance, np.diag(estimated))
+        factors = np.sqrt(inflation)
+        estimated = estimated * factors[:, None] * factors[None]
         covariance: Array = np.zeros((len(UNKNOWNS), len(UNKNOWNS)))
-        zooms_covariance: Array = np.zeros((k, k))
-        covariance[np.ix_(self._free, self._free)] = own[:m, :m]
-        if c == 7:
-            zooms_covariance = own[m:, m:]
-        # Held one too large, an unknown moves the poses by this.
-        pulled = -np.linalg.solve(S[:split, :split], S[:split, split:]).reshape(k, c, m)
-        # The centre -R^T t moves by -R^T rho with a twist (rho, phi) on the left.
-        slopes = -state.T[:, :3, :3].transpose(0, 2, 1)
-        bends = np.zeros((len(UNKNOWNS), k, 3))
-        bends[self._free] = np.einsum("kij,kjv->vki", slopes, pulled[:, :3])
+        covariance[np.ix_(self._free, self._free)] = estimated[:free_count, :free_count]
+        zooms_covariance: Array = (
+            estimated[free_count:, free_count:] if size == 7 else np.zeros((count, count))
+        )
+        # 2. Motion of the poses if an unknown is held one unit too large.
+        pose_slopes = -np.linalg.solve(S[:poses_size, :poses_size], S[:poses_size, poses_size:])
+        pose_slopes = pose_slopes.reshape(count, size, free_count)
+        # The camera centre -R^T t moves by -R^T rho with a twist (rho, phi) on the left of the pose.
+        rho_to_centre = -state.T_camera_world[:, :3, :3].transpose(0, 2, 1)
+        bends_m = np.zeros((len(UNKNOWNS), count, 3))
+        bends_m[self._free] = np.einsum("kij,kjv->vki", rho_to_centre, pose_slopes[:, :3])
         return Calibrated(
-            values=state.values, covariance=covariance, zooms=state.zooms, zooms_covariance=zooms_covariance,
-            T_camera_world=state.T, points_world=state.points, bends_m=bends,
-            noise_m=self._noise(state, whole[:split, :split], slopes), cost=self.cost(state),
-            has_metres=self._has_metres(), pixel_factor=self.pixel_factor, depth_factor=self.depth_factor,
-        )  # fmt: skip
+            values=state.values,
+            covariance=covariance,
+            zooms=state.zooms,
+            zooms_covariance=zooms_covariance,
+            T_camera_world=state.T_camera_world,
+            points_world=state.points,
+            bends_m=bends_m,
+            noise_m=self._path_noise_m(state, inverse_S[:poses_size, :poses_size], rho_to_centre),
+            cost=self.cost(state),
+            has_metric_scale=self._has_metric_scale(),
+            pixel_factor=self.pixel_factor,
+            depth_factor=self.depth_factor,
+        )
 
-    def _inflation(self, rows: Array, P: Array, variances: Array) -> Array:
-        """Return by how much variances grow where errors of one stretch of the drive go together."""
-        k, split = self.k, self._c * self.k
-        of_points = np.einsum("lar,lab->rlb", self._equations.E @ rows.T, P)
-        of_cameras = rows[:, :split].reshape(len(rows), k, self._c)
-        pull_c, pull_v, pull_p = ((J.transpose(0, 2, 1) @ self._r[:, :, None])[:, :, 0] for J in self._J)
-        moved = pull_v @ rows[:, split:].T
-        for column in range(len(rows)):
-            moved[:, column] += (of_cameras[column, self.keyframes] * pull_c).sum(axis=1)
-            moved[:, column] -= (of_points[column, self.landmarks] * pull_p).sum(axis=1)
-        across, down = self.camera.width / _CELLS, self.camera.height / _CELLS
-        cells = (np.clip(self.pixels // (across, down), 0, _CELLS - 1) @ (1, _CELLS)).astype(np.int64)
-        grown = np.ones(len(rows))
-        for clusters, count in (
-            (self.landmarks, self.l), (self.keyframes * min(_BLOCKS, k) // k, min(_BLOCKS, k)),
-            (cells, _CELLS**2),
-        ):  # fmt: skip
-            squares = (_summed(moved, clusters, count) ** 2).sum(axis=0) * count / max(1, count - 1)
-            grown += np.maximum(squares / np.maximum(variances, 1e-30) - 1.0, 0.0)
-        return grown
+    def _variance_inflation(self, rows: Array, landmark_covariance: Array, variances: Array) -> Array:
+        """Return the factors ``(p,)`` by which correlated residuals make *p* variances larger.
 
-    def _has_metres(self) -> bool:
+        Residuals of one landmark, of one part of the drive and of one region of the image are correlated.
+        The sandwich estimator (White 1980) over each of these clusters replaces the variances that hold for
+        independent residuals, where it is larger.
+
+        Args:
+            rows: ``(p, m)``, rows of the inverse of the reduced equations, one for each parameter.
+            landmark_covariance: ``(l, 3, 3)``, covariances of the landmarks for fixed keyframes.
+            variances: ``(p,)``, variances of the parameters with independent residuals.
+        """
+        # 1. Influence (n, p) of each observation on each parameter.
+        by_points = np.einsum("lar,lab->rlb", self._equations.E @ rows.T, landmark_covariance)
+        by_keyframes = rows[:, : self._poses_size].reshape(
+            len(rows), self._keyframe_count, self._keyframe_size
+        )
+        g_keyframe, g_values, g_points = (
+            (J.transpose(0, 2, 1) @ self._r[:, :, None])[:, :, 0] for J in self._J
+        )
+        influence = g_values @ rows[:, self._poses_size :].T
+        for parameter in range(len(rows)):
+            influence[:, parameter] += (by_keyframes[parameter, self.keyframes] * g_keyframe).sum(axis=1)
+            influence[:, parameter] -= (by_points[parameter, self.landmarks] * g_points).sum(axis=1)
+        # 2. Clusters: landmarks, consecutive parts of the drive, and regions of the image.
+        cell_size = self.camera.width / _IMAGE_CELLS, self.camera.height / _IMAGE_CELLS
+        cells = np.clip(self.pixels // cell_size, 0, _IMAGE_CELLS - 1) @ (1, _IMAGE_CELLS)
+        block_count = min(_TIME_BLOCKS, self._keyframe_count)
+        clusterings = (
+            (self.landmarks, self._landmark_count),
+            (self.keyframes * block_count // self._keyframe_count, block_count),
+            (cells.astype(np.int64), _IMAGE_CELLS**2),
+        )
+        # 3. The excess of the variance over each kind of clusters is added.
+        inflation = np.ones(len(rows))
+        for clusters, count in clusterings:
+            sums = _sum_by_index(influence, clusters, count)
+            clustered = (sums**2).sum(axis=0) * count / max(1, count - 1)
+            inflation += np.maximum(clustered / np.maximum(variances, 1e-30) - 1.0, 0.0)
+        return inflation
+
+    def _has_metric_scale(self) -> bool:
         return bool(self.has_depth.any())
 
-    def _noise(self, state: _State, covariance: Array, slopes: Array) -> float:
-        values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
+    def _path_noise_m(self, state: _State, poses_covariance: Array, rho_to_centre: Array) -> float:
+        """Return the root mean square error of the path, m, by draws from the covariance of the poses."""
+        values, vectors = np.linalg.eigh(0.5 * (poses_covariance + poses_covariance.T))
         root = vectors * np.sqrt(np.maximum(values, 0.0))
-        drawn = root @ np.random.default_rng(3).standard_normal((len(root), _SAMPLES))
-        moved = np.einsum("kij,kjs->ski", slopes, drawn.reshape(self.k, self._c, _SAMPLES)[:, :3])
-        positions = inverse(state.T)[:, :3, 3]
-        metres = self._has_metres()
-        squares = [rms_after_alignment(positions, each, has_metres=metres) ** 2 for each in moved]
+        drawn = root @ np.random.default_rng(3).standard_normal((len(root), _NOISE_SAMPLES))
+        twists = drawn.reshape(self._keyframe_count, self._keyframe_size, _NOISE_SAMPLES)
+        moved = np.einsum("kij,kjs->ski", rho_to_centre, twists[:, :3])
+        positions = inverse(state.T_camera_world)[:, :3, 3]
+        has_metric_scale = self._has_metric_scale()
+        squares = [
+            rms_after_alignment(positions, sample, has_metric_scale=has_metric_scale) ** 2 for sample in moved
+        ]
         return float(np.sqrt(np.mean(squares)))
 
 
-def rms_after_alignment(positions: Array, moved: Array, *, has_metres: bool) -> float:
-    """Return the root mean square of ``(k, 3)`` small motions *moved* of ``(k, 3)`` *positions*, metres.
+def rms_after_alignment(positions: Array, moved: Array, *, has_metric_scale: bool) -> float:
+    """Return the root mean square of small displacements *moved* ``(k, 3)`` of a path after alignment, m.
 
-    The best small motion of all of them is taken away before, and a scale where there are no metres.
+    The small rigid motion of the whole path that fits the displacements best is subtracted before, together
+    with a change of scale if *has_metric_scale* is False.
+
+    Args:
+        positions: ``(k, 3)``, positions of the path, m.
+        moved: ``(k, 3)``, their displacements, m.
+        has_metric_scale: Whether the path has a metric scale.
     """
-    at = positions - positions.mean(axis=0)
-    J = np.concatenate([np.tile(np.eye(3), (len(at), 1, 1)), -skew(at)], axis=2).reshape(-1, 6)
-    if not has_metres:
-        J = np.column_stack([J, at.ravel()])
+    centred = positions - positions.mean(axis=0)
+    J = np.concatenate([np.tile(np.eye(3), (len(centred), 1, 1)), -skew(centred)], axis=2).reshape(-1, 6)
+    if not has_metric_scale:
+        J = np.column_stack([J, centred.ravel()])
     flat = moved.reshape(-1)
-    left = flat - J @ np.linalg.lstsq(J, flat, rcond=None)[0]
-    return float(np.sqrt((left**2).sum() / len(at)))
+    remaining = flat - J @ np.linalg.lstsq(J, flat, rcond=None)[0]
+    return float(np.sqrt((remaining**2).sum() / len(centred)))
 
 
-def _summed(values: Array, rows: Rows, count: int) -> Array:
-    """Return sums of ``(n, ...)`` values over equal rows, ``(count, ...)``."""
+def _sum_by_index(values: Array, indices: Rows, count: int) -> Array:
+    """Return the sums ``(count, ...)`` of those values ``(n, ...)`` that have the same index ``(n,)``."""
     flat = values.reshape(len(values), -1)
-    total = np.stack([np.bincount(rows, column, count) for column in flat.T], axis=1)
-    summed: Array = total.astype(np.float64, copy=False).reshape(count, *values.shape[1:])
-    return summed
+    total = np.stack([np.bincount(indices, column, count) for column in flat.T], axis=1)
+    sums: Array = total.astype(np.float64, copy=False).reshape(count, *values.shape[1:])
+    return sums

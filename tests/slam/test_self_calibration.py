@@ -15,7 +15,7 @@ from rse_pf.slam.self_calibration import (
     DriveObservations,
     adjust_with_calibration,
     disagreement,
-    triangulated,
+    triangulate_landmarks,
 )
 
 CAMERA = Camera(fx=500.0, fy=500.0, cx=320.0, cy=240.0, width=640, height=480)
@@ -71,7 +71,9 @@ def made(
 def adjusted(seed: int, values: Array, **options: object) -> Calibrated:
     observed, T = made(seed, values)
     near = exp_se3(0.005 * np.random.default_rng(seed).standard_normal((VIEWS, 6))) @ T
-    return adjust_with_calibration(observed, near, triangulated(observed, near, POINTS), UNKNOWNS, **options)  # type: ignore[arg-type]
+    return adjust_with_calibration(
+        observed, near, triangulate_landmarks(observed, near, POINTS), UNKNOWNS, **options
+    )  # type: ignore[arg-type]
 
 
 def planted() -> Array:
@@ -107,7 +109,7 @@ def test_a_good_calibration_is_found_good() -> None:
 def test_what_is_not_free_stays_and_has_no_deviation() -> None:
     observed, T = made(1, planted())
 
-    found = adjust_with_calibration(observed, T, triangulated(observed, T, POINTS), ("fx", "k1"))
+    found = adjust_with_calibration(observed, T, triangulate_landmarks(observed, T, POINTS), ("fx", "k1"))
 
     held = [row for row, name in enumerate(UNKNOWNS) if name not in ("fx", "k1")]
     assert not found.values[held].any()
@@ -119,7 +121,9 @@ def test_each_view_gets_its_focal_length() -> None:
     zooms -= zooms.mean()
     observed, T = made(2, np.zeros(len(UNKNOWNS)), zooms=zooms)
 
-    found = adjust_with_calibration(observed, T, triangulated(observed, T, POINTS), UNKNOWNS, zooms=True)
+    found = adjust_with_calibration(
+        observed, T, triangulate_landmarks(observed, T, POINTS), UNKNOWNS, zooms=True
+    )
 
     deviations = np.sqrt(np.diag(found.zooms_covariance))
     assert (np.abs(found.zooms - zooms) < 4.0 * deviations + 0.003).all()
@@ -130,16 +134,16 @@ def test_without_depth_the_focal_length_comes_from_the_rays() -> None:
     observed, T = made(4, values, has_depth=False)
 
     found = adjust_with_calibration(
-        observed, T, triangulated(observed, T, POINTS), ("fx", "fy", "cx", "cy", "k1")
+        observed, T, triangulate_landmarks(observed, T, POINTS), ("fx", "fy", "cx", "cy", "k1")
     )
 
     assert abs(found.values[0] - 0.05) < 3.5 * found.deviations[0] < 0.03
-    assert not found.has_metres
+    assert not found.has_metric_scale
 
 
 def test_the_bend_of_a_wrong_focal_length_is_what_an_adjustment_with_it_shows() -> None:
     observed, T = made(5, np.zeros(len(UNKNOWNS)))
-    points = triangulated(observed, T, POINTS)
+    points = triangulate_landmarks(observed, T, POINTS)
     free = adjust_with_calibration(observed, T, points, UNKNOWNS)
     wrong = replace(observed, camera=Camera(fx=510.0, fy=500.0, cx=320.0, cy=240.0, width=640, height=480))
     others = tuple(name for name in UNKNOWNS if name != "fx")
@@ -165,7 +169,7 @@ def test_what_does_not_fit_is_refused_in_one_line() -> None:
     observed, T = made(7, planted())
     with pytest.raises(BadRequest, match="no unknown named"):
         adjust_with_calibration(observed, T, np.zeros((POINTS, 3)), ("zoom",))
-    with pytest.raises(BadRequest, match="different numbers of rows"):
+    with pytest.raises(BadRequest, match="observations have the shapes"):
         replace(observed, pixels=observed.pixels[:3])
 
 

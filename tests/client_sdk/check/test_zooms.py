@@ -23,7 +23,7 @@ def adjusted(zooms: Array, deviation: float) -> Calibrated:
     return Calibrated(
         values=np.zeros(n), covariance=np.zeros((n, n)), zooms=zooms,
         zooms_covariance=deviation**2 * np.eye(VIEWS), T_camera_world=T, points_world=np.zeros((1, 3)),
-        bends_m=np.zeros((n, VIEWS, 3)), noise_m=0.0, cost=0.0, has_metres=True, pixel_factor=1.0,
+        bends_m=np.zeros((n, VIEWS, 3)), noise_m=0.0, cost=0.0, has_metric_scale=True, pixel_factor=1.0,
         depth_factor=1.0,
     )  # fmt: skip
 
@@ -83,7 +83,7 @@ def test_the_cost_is_the_distance_of_the_paths_after_alignment() -> None:
 def test_a_drive_without_depth_does_not_blame_depth() -> None:
     common, times_s = adjusted(np.zeros(VIEWS), 0.01), np.arange(VIEWS) / 2.0
     reasons = [
-        judge_zooms(adjusted(WANDERING, 0.001), times_s, replace(common, has_metres=has))
+        judge_zooms(adjusted(WANDERING, 0.001), times_s, replace(common, has_metric_scale=has))
         .cannot_tell[0]
         .reason
         for has in (True, False)
