@@ -1,6 +1,8 @@
-"""Merge maps: propose loop closures, select consistent ones, align the maps, optimise, deform the clouds.
+"""Merge maps of several robots: find loop closures, reject outliers, align the maps, optimise, deform the
+clouds.
 
-A pure function of the maps and the options; `merge` is the service.
+`merge_versions` is a function of the maps and the options alone; `rse_pf.services.mapping.merge` is the
+service that robots call, and `rse_pf.batch` runs the same steps in several processes.
 """
 
 from __future__ import annotations
@@ -18,7 +20,7 @@ import numpy.typing as npt
 from rse_pf.budget import PROVENANCE, check_msgpack
 from rse_pf.errors import BadRequest, LimitExceeded
 from rse_pf.geometry import Array, inverse, median_pose
-from rse_pf.maps.format import UP_FIELD, Edge, MapVersion
+from rse_pf.maps.format import UP_FIELD, Edge, EdgeKind, MapVersion
 from rse_pf.service import Report
 from rse_pf.slam.cloud_deform import deform_clouds
 from rse_pf.slam.consistency import LoopClosure, OdometryNoise
@@ -50,13 +52,25 @@ __all__ = [
     "propose_links",
 ]
 
-_DRIFT = OdometryNoise(step_m=0.007, step_deg=0.5)
-"""The drift of a tracker with depth; whether a loop may be true is judged by the larger default."""
+_STEP_NOISE = OdometryNoise(step_m=0.007, step_deg=0.5)
+"""Standard deviations of the motion between two consecutive keyframes of a tracker with depth, for which a
+map has no edge; the test whether a loop closure is consistent uses the larger default of `OdometryNoise`."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class MergedMap:
-    """The result of `merge_versions`: the map, the joined and not joined maps, and the refused links."""
+    """The result of `merge_versions`.
+
+    Attributes:
+        version: The merged map, in the world of the first map.
+        joined: Indices of the maps that are part of it.
+        not_joined: Index of each other map, with a sentence why.
+        refused: The number of rejected pairs of keyframes, by the indices of their two maps and the reason.
+        loops: The number of accepted loop closures within a map.
+        merges: The number of accepted loop closures between two maps.
+        cost_before: The robust cost of the pose graph before the optimisation.
+        cost_after: The robust cost of the pose graph after it.
+    """
 
     version: MapVersion
     joined: tuple[int, ...]
@@ -68,23 +82,30 @@ class MergedMap:
     cost_after: float
 
 
+def _group_by_maps(
+    atlas: Atlas, loop_closures: Sequence[LoopClosure]
+) -> dict[tuple[int, int], list[LoopClosure]]:
+    """Return the loop closures by the indices of the two maps that they connect."""
+    groups: dict[tuple[int, int], list[LoopClosure]] = {}
+    for closure in loop_closures:
+        groups.setdefault(maps_of(atlas, closure.a, closure.b), []).append(closure)
+    return groups
+
+
 def _select(
     atlas: Atlas, proposals: LoopProposals, options: MergeOptions
 ) -> tuple[list[LoopClosure], Refused]:
-    """Return the links that agree, for each pair of maps, and the reasons for refusing the others."""
-    refused = Counter(proposals.failed)
-    groups: dict[tuple[int, int], list[LoopClosure]] = {}
-    for link in proposals.links:
-        groups.setdefault(maps_of(atlas, link.a, link.b), []).append(link)
+    """Return the consistent loop closures of each pair of maps, and the counts of rejected ones by reason."""
+    rejected = Counter(proposals.failed)
     accepted: list[LoopClosure] = []
-    for pair, links in sorted(groups.items()):
-        rows, reasons = agreeing_links(pair, links, atlas.T_world_camera, atlas.order, options)
-        accepted += [links[row] for row in rows]
-        refused.update(reasons)
-    return accepted, Counter({key: count for key, count in refused.items() if count})
+    for pair, closures in sorted(_group_by_maps(atlas, proposals.links).items()):
+        rows, reasons = agreeing_links(pair, closures, atlas.T_world_camera, atlas.order, options)
+        accepted += [closures[row] for row in rows]
+        rejected.update(reasons)
+    return accepted, Counter({key: count for key, count in rejected.items() if count})
 
 
-def _no_alignments(atlas: Atlas, placed: Array, links: Sequence[LoopClosure]) -> list[LoopClosure]:
+def _align_nothing(atlas: Atlas, T_world_camera: Array, accepted: Sequence[LoopClosure]) -> list[LoopClosure]:
     return []
 
 
@@ -93,32 +114,37 @@ def _optimise(graph: PoseGraph, of_map: npt.NDArray[np.int64], options: Optimise
 
 
 def _deform(
-    versions: Sequence[MapVersion], atlas: Atlas, poses: Array, rows: npt.NDArray[np.int64]
+    versions: Sequence[MapVersion], atlas: Atlas, T_world_camera: Array, rows: npt.NDArray[np.int64]
 ) -> tuple[Points, Colours]:
-    return deform_clouds(versions, atlas.of_map, atlas.keyframes, poses, rows)
+    return deform_clouds(versions, atlas.of_map, atlas.keyframes, T_world_camera, rows)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MergeSteps:
-    """The steps of a merge that take long; `rse_pf.batch` runs them in several processes.
+    """The functions of a merge that take long; `rse_pf.batch` replaces them to use several processes.
 
     Attributes:
-        propose: Returns measured links.
-        select: Returns the links that agree, and how many were refused by maps and reason.
-        align: Returns further links, found by aligning clouds with all maps at their ``(n, 4, 4)`` places.
-        optimise: Returns the poses of the graph; its second argument is the map of each pose.
-        deform: Returns the cloud of the maps of ``rows`` for the new ``(n, 4, 4)`` poses.
+        propose: Returns the measured loop closures.
+        select: Returns the consistent loop closures, and the counts of rejected ones by maps and reason.
+        align: Returns further loop closures from aligning point clouds, given the poses ``(n, 4, 4)`` of all
+            keyframes in the world of the first map and the accepted loop closures; by default none.
+        optimise: Returns the optimised poses of a graph; its second argument is the map of each pose.
+        deform: Returns the merged point cloud for the new poses ``(n, 4, 4)``; its last argument has the rows
+            of the keyframes that are part of the merged map.
     """
 
     propose: Callable[[Atlas, MergeOptions, Report], LoopProposals] = propose_links
     select: Callable[[Atlas, LoopProposals, MergeOptions], tuple[list[LoopClosure], Refused]] = field(
         default=_select
     )
-    align: Callable[[Atlas, Array, Sequence[LoopClosure]], list[LoopClosure]] = _no_alignments
+    align: Callable[[Atlas, Array, Sequence[LoopClosure]], list[LoopClosure]] = _align_nothing
     optimise: Callable[[PoseGraph, npt.NDArray[np.int64], OptimiseOptions], OptimisedGraph] = _optimise
     deform: Callable[[Sequence[MapVersion], Atlas, Array, npt.NDArray[np.int64]], tuple[Points, Colours]] = (
         _deform
     )
+
+
+_IN_THIS_PROCESS = MergeSteps()
 
 
 def merge_versions(
@@ -126,197 +152,229 @@ def merge_versions(
     options: MergeOptions | None = None,
     *,
     report: Report = ignore_progress,
-    propose: Callable[[Atlas, MergeOptions, Report], LoopProposals] | None = None,
-    steps: MergeSteps | None = None,
+    steps: MergeSteps = _IN_THIS_PROCESS,
 ) -> MergedMap:
-    """Merge *versions* into one map in the world frame of the first.
+    """Merge *versions* into one map in the world of the first one.
 
     Args:
         versions: Maps with at least one keyframe each.
-        options: ``None`` means the defaults.
-        report: Called with the progress; may raise Cancelled.
-        propose: Proposes links; None means the first of *steps*.
-        steps: The steps that take long; None means the functions of this package, in this process.
+        options: None means the defaults.
+        report: Called with the progress; it may raise Cancelled.
+        steps: The functions of the steps that take long.
 
     Raises:
-        MissingExtra: gtsam or the native core is not installed.
+        BadRequest: The maps have descriptors of different kinds, or a map has an edge whose information is
+            not positive definite.
+        LimitExceeded: More than 700,000 pairs of keyframes would be compared.
+        MissingExtra: GTSAM or the native core is not installed.
         Cancelled: *report* raised it.
     """
     options = options or MergeOptions()
     atlas = Atlas.of(versions)
-    steps = steps or MergeSteps()
-    proposals = (propose or steps.propose)(atlas, options, report)
-    accepted, refused = steps.select(atlas, proposals, options)
-    report(0.8, f"{len(accepted)} of {len(proposals.links)} links agree")
-    placed, joined = _place(atlas, accepted, len(versions))
-    kept = [link for link in accepted if {int(atlas.of_map[link.a]), int(atlas.of_map[link.b])} <= joined]
+    # 1. Propose loop closures by place recognition and PnP, and reject inconsistent ones.
+    proposals = steps.propose(atlas, options, report)
+    accepted, rejected = steps.select(atlas, proposals, options)
+    report(0.8, f"{len(accepted)} of {len(proposals.links)} loop closures are consistent")
+    # 2. Move every map that is connected with the first one into its world.
+    T_world_camera, joined = _align_maps(atlas, accepted)
+    used = [c for c in accepted if {int(atlas.of_map[c.a]), int(atlas.of_map[c.b])} <= joined]
     rows = np.flatnonzero(np.isin(atlas.of_map, sorted(joined)))
-    odometry = _odometry(atlas, versions, joined)
-    kept += steps.align(atlas, placed, kept)
-    graph = _graph(atlas, placed, rows, odometry, kept)
-    found = steps.optimise(graph, atlas.of_map[rows], OptimiseOptions(cauchy=options.cauchy))
+    # 3. Optimise the pose graph of odometry edges and loop closures.
+    odometry = _odometry_edges(atlas, versions, joined)
+    used += steps.align(atlas, T_world_camera, used)
+    graph = _make_graph(atlas, T_world_camera, rows, odometry, used)
+    optimised = steps.optimise(graph, atlas.of_map[rows], OptimiseOptions(cauchy=options.cauchy))
     report(0.95, "optimised")
-    poses = placed.copy()
-    poses[rows] = found.T_world_pose
-    points, colours = steps.deform(versions, atlas, poses, rows)
-    version = _version(atlas, versions, poses, rows, odometry, kept, points, colours)
+    T_world_camera = T_world_camera.copy()
+    T_world_camera[rows] = optimised.T_world_pose
+    # 4. Let the point clouds follow their keyframes, and build the map.
+    points, colours = steps.deform(versions, atlas, T_world_camera, rows)
+    version = _make_version(atlas, versions, T_world_camera, rows, odometry, used, points, colours)
     report(1.0, "merged")
-    merges = sum(atlas.of_map[link.a] != atlas.of_map[link.b] for link in kept)
+    merges = sum(atlas.of_map[closure.a] != atlas.of_map[closure.b] for closure in used)
     return MergedMap(
         version=version,
         joined=tuple(sorted(joined)),
         not_joined=tuple(
-            (which, _reason_not_joined(which, joined, proposals, refused, options))
-            for which in range(len(versions)) if which not in joined
+            (map_index, _why_not_joined(map_index, joined, rejected, options))
+            for map_index in range(len(versions))
+            if map_index not in joined
         ),
-        refused=refused,
-        loops=len(kept) - int(merges),
+        refused=rejected,
+        loops=len(used) - int(merges),
         merges=int(merges),
-        cost_before=found.cost_before,
-        cost_after=found.cost_after,
-    )  # fmt: skip
+        cost_before=optimised.cost_before,
+        cost_after=optimised.cost_after,
+    )
 
 
-def _place(atlas: Atlas, links: Sequence[LoopClosure], maps: int) -> tuple[Array, set[int]]:
-    """Transform every map that is connected to map 0 into its world frame, pairs with most links first.
+def _align_maps(atlas: Atlas, accepted: Sequence[LoopClosure]) -> tuple[Array, set[int]]:
+    """Move each map that loop closures connect with map 0 into its world, most loop closures first.
 
-    The pose of a map is the median of those that the links of a pair propose: the one that differs least
-    from the others, so that rotations need no average.
+    The pose of a map is the median of the poses that its loop closures give: the pose that differs least from
+    the others, so that rotations need no averaging.
+
+    Returns:
+        The poses ``(n, 4, 4)`` of all keyframes, those of unconnected maps unchanged, and the indices of the
+        connected maps.
     """
-    placed = atlas.T_world_camera.copy()
+    T_world_camera = atlas.T_world_camera.copy()
     joined = {0}
-    groups: dict[tuple[int, int], list[LoopClosure]] = {}
-    for link in links:
-        one, other = maps_of(atlas, link.a, link.b)
-        if one != other:
-            groups.setdefault((one, other), []).append(link)
+    groups = {pair: group for pair, group in _group_by_maps(atlas, accepted).items() if pair[0] != pair[1]}
     while True:
         open_pairs = [pair for pair in groups if len(joined & set(pair)) == 1]
         if not open_pairs:
-            return placed, joined
-        pair = max(open_pairs, key=lambda each: (len(groups[each]), (-each[0], -each[1])))
-        new = pair[0] if pair[1] in joined else pair[1]
-        T_world_new = median_pose(
-            np.array([_proposed(atlas, placed, link, new) for link in groups[pair]])
-        )  # fmt: skip
-        rows = atlas.of_map == new
-        placed[rows] = T_world_new @ atlas.T_world_camera[rows]
-        joined.add(new)
+            return T_world_camera, joined
+        pair = max(open_pairs, key=lambda pair: (len(groups[pair]), (-pair[0], -pair[1])))
+        new_map = pair[0] if pair[1] in joined else pair[1]
+        T_world_map = median_pose(
+            np.array([_proposed_pose(atlas, T_world_camera, closure, new_map) for closure in groups[pair]])
+        )
+        rows = atlas.of_map == new_map
+        T_world_camera[rows] = T_world_map @ atlas.T_world_camera[rows]
+        joined.add(new_map)
 
 
-def _proposed(atlas: Atlas, placed: Array, link: LoopClosure, new: int) -> Array:
-    old, other, T_old_other = link.a, link.b, link.T_a_b
-    if atlas.of_map[link.a] == new:
-        old, other, T_old_other = link.b, link.a, inverse(link.T_a_b)
-    T_world_new: Array = placed[old] @ T_old_other @ inverse(atlas.T_world_camera[other])
-    return T_world_new
+def _proposed_pose(atlas: Atlas, T_world_camera: Array, closure: LoopClosure, new_map: int) -> Array:
+    """Return the pose of map *new_map* in the world of map 0 that one loop closure gives, ``(4, 4)``."""
+    joined_row, new_row, T_joined_new = closure.a, closure.b, closure.T_a_b
+    if atlas.of_map[closure.a] == new_map:
+        joined_row, new_row, T_joined_new = closure.b, closure.a, inverse(closure.T_a_b)
+    T_world_map: Array = T_world_camera[joined_row] @ T_joined_new @ inverse(atlas.T_world_camera[new_row])
+    return T_world_map
 
 
-def _odometry(
+def _odometry_edges(
     atlas: Atlas, versions: Sequence[MapVersion], joined: set[int]
-) -> list[tuple[LoopClosure, str]]:
-    """Return the edges of the maps; consecutive keyframes without one get their relative pose."""
-    edges: list[tuple[LoopClosure, str]] = []
-    known: set[tuple[int, int]] = set()
-    for which in sorted(joined):
-        _check_information(which, versions[which])
-        for edge in versions[which].edges:
-            a, b = atlas.row_of[which, edge.a], atlas.row_of[which, edge.b]
+) -> list[tuple[LoopClosure, EdgeKind]]:
+    """Return the edges of the joined maps with their kinds.
+
+    Consecutive keyframes of a robot without an edge get one from their poses.
+
+    Raises:
+        BadRequest: The information of an edge is not positive definite.
+    """
+    edges: list[tuple[LoopClosure, EdgeKind]] = []
+    connected: set[tuple[int, int]] = set()
+    # 1. Take over the edges of the maps.
+    for map_index in sorted(joined):
+        _check_information(map_index, versions[map_index])
+        for edge in versions[map_index].edges:
+            a, b = atlas.row_of[map_index, edge.a], atlas.row_of[map_index, edge.b]
             edges.append((LoopClosure(a=a, b=b, T_a_b=edge.T_a_b, information=edge.information), edge.kind))
-            known.add((min(a, b), max(a, b)))
-    spread = np.array([_DRIFT.step_m] * 3 + [math.radians(_DRIFT.step_deg)] * 3)
+            connected.add((min(a, b), max(a, b)))
+    # 2. Connect consecutive keyframes.
+    deviations = np.array([_STEP_NOISE.step_m] * 3 + [math.radians(_STEP_NOISE.step_deg)] * 3)
     for a in range(len(atlas.keyframes) - 1):
         b = a + 1
-        same = atlas.of_map[a] == atlas.of_map[b] and atlas.keyframes[a].robot == atlas.keyframes[b].robot
-        if same and int(atlas.of_map[a]) in joined and (a, b) not in known:
+        is_same_drive = (
+            atlas.of_map[a] == atlas.of_map[b] and atlas.keyframes[a].robot == atlas.keyframes[b].robot
+        )
+        if is_same_drive and int(atlas.of_map[a]) in joined and (a, b) not in connected:
             T_a_b = inverse(atlas.T_world_camera[a]) @ atlas.T_world_camera[b]
-            edges.append((LoopClosure(a=a, b=b, T_a_b=T_a_b, information=np.diag(spread**-2.0)), "odometry"))
+            information = np.diag(deviations**-2.0)
+            edges.append((LoopClosure(a=a, b=b, T_a_b=T_a_b, information=information), "odometry"))
     return edges
 
 
-def _check_information(which: int, version: MapVersion) -> None:
-    """Name the map whose edges cannot be optimised; raises BadRequest."""
-    every = np.array([edge.information for edge in version.edges]).reshape(-1, 6, 6)
-    if is_positive_definite(every):
+def _check_information(map_index: int, version: MapVersion) -> None:
+    """Raise BadRequest if the information of an edge of a map is not positive definite."""
+    information = np.array([edge.information for edge in version.edges]).reshape(-1, 6, 6)
+    if is_positive_definite(information):
         return
     edge = next(edge for edge in version.edges if not is_positive_definite(edge.information[None]))
     raise BadRequest(
-        f"map {which} (the first is 0): the information of edge {edge.a}-{edge.b} is not symmetric and "
+        f"map {map_index} (the first is 0): the information of edge {edge.a}-{edge.b} is not symmetric and "
         "positive definite",
         hint="leave that map out",
     )
 
 
-def _graph(
+def _make_graph(
     atlas: Atlas,
-    placed: Array,
+    T_world_camera: Array,
     rows: npt.NDArray[np.int64],
-    odometry: Sequence[tuple[LoopClosure, str]],
-    links: Sequence[LoopClosure],
+    odometry: Sequence[tuple[LoopClosure, EdgeKind]],
+    loop_closures: Sequence[LoopClosure],
 ) -> PoseGraph:
-    place = np.full(len(atlas.keyframes), -1)
-    place[rows] = np.arange(len(rows))
-    every = [link for link, _ in odometry] + list(links)
+    """Return the pose graph of the keyframes *rows*; only odometry edges are taken as free of outliers."""
+    graph_row = np.full(len(atlas.keyframes), -1)
+    graph_row[rows] = np.arange(len(rows))
+    edges = [edge for edge, _ in odometry] + list(loop_closures)
+    robust = [kind != "odometry" for _, kind in odometry] + [True] * len(loop_closures)
     return PoseGraph(
-        T_world_pose=placed[rows],
-        a=place[np.array([link.a for link in every], dtype=np.int64)],
-        b=place[np.array([link.b for link in every], dtype=np.int64)],
-        T_a_b=np.array([link.T_a_b for link in every]).reshape(-1, 4, 4),
-        information=np.array([link.information for link in every]).reshape(-1, 6, 6),
-        robust=np.array([kind != "odometry" for _, kind in odometry] + [True] * len(links), dtype=np.bool_),
+        T_world_pose=T_world_camera[rows],
+        a=graph_row[np.array([edge.a for edge in edges], dtype=np.int64)],
+        b=graph_row[np.array([edge.b for edge in edges], dtype=np.int64)],
+        T_a_b=np.array([edge.T_a_b for edge in edges]).reshape(-1, 4, 4),
+        information=np.array([edge.information for edge in edges]).reshape(-1, 6, 6),
+        robust=np.array(robust, dtype=np.bool_),
         ids=np.arange(len(rows)),
     )
 
 
-def _version(
+def _make_version(
     atlas: Atlas,
     versions: Sequence[MapVersion],
-    poses: Array,
+    T_world_camera: Array,
     rows: npt.NDArray[np.int64],
-    odometry: Sequence[tuple[LoopClosure, str]],
-    links: Sequence[LoopClosure],
+    odometry: Sequence[tuple[LoopClosure, EdgeKind]],
+    loop_closures: Sequence[LoopClosure],
     points: Points,
     colours: Colours,
 ) -> MapVersion:
-    """Return the merged map; ids are row numbers, the provenance has the original map and id of each."""
-    place = {int(row): number for number, row in enumerate(rows)}
-    keyframes = tuple(
-        replace(atlas.keyframes[row], id=place[row], T_world_camera=poses[row]) for row in place
-    )
-    edges = [(link, kind) for link, kind in odometry]
-    edges += [(link, "loop" if atlas.of_map[link.a] == atlas.of_map[link.b] else "merge") for link in links]
+    """Return the merged map.
+
+    Its keyframes are numbered from 0; the provenance has the original map and id of each of them.
+    """
+    new_id = {int(row): number for number, row in enumerate(rows)}
+    edges = list(odometry)
+    for closure in loop_closures:
+        is_within_map = atlas.of_map[closure.a] == atlas.of_map[closure.b]
+        edges.append((closure, "loop" if is_within_map else "merge"))
     return MapVersion(
-        keyframes=keyframes,
+        keyframes=tuple(
+            replace(atlas.keyframes[row], id=new_id[row], T_world_camera=T_world_camera[row])
+            for row in new_id
+        ),
         edges=tuple(
             Edge(
-                a=place[link.a],
-                b=place[link.b],
-                T_a_b=link.T_a_b,
-                information=link.information,
-                kind="odometry" if kind == "odometry" else "loop" if kind == "loop" else "merge",
+                a=new_id[edge.a],
+                b=new_id[edge.b],
+                T_a_b=edge.T_a_b,
+                information=edge.information,
+                kind=kind,
             )
-            for link, kind in edges
+            for edge, kind in edges
         ),
         points=points,
         colours=colours,
-        provenance=_provenance(
+        provenance=_make_provenance(
             versions,
-            [[int(atlas.of_map[row]), atlas.keyframes[row].id] for row in place],
+            [[int(atlas.of_map[row]), atlas.keyframes[row].id] for row in new_id],
             versions[int(atlas.of_map[rows[0]])].up,
         ),
     )
 
 
-def _provenance(versions: Sequence[MapVersion], origins: list[list[int]], up: Array | None) -> dict[str, Any]:
-    """Return the provenance with those of *versions*, whose own parents are left out where it is too long.
+def _make_provenance(
+    versions: Sequence[MapVersion], origins: list[list[int]], up: Array | None
+) -> dict[str, Any]:
+    """Return the provenance of the merged map, with those of the merged maps as far as they fit.
 
-    *up* is that of the map whose world is kept.
+    If the whole provenance is longer than a map may have, the parents of *versions* are left out, then all
+    provenances of *versions*.
+
+    Args:
+        versions: The merged maps.
+        origins: For each keyframe the index of its map and its id there.
+        up: The ``(3,)`` direction against gravity in the world of the merged map, if it is known.
     """
-    known: dict[str, Any] = {} if up is None else {UP_FIELD: up.tolist()}
-    whole: list[Mapping[str, Any]] = [dict(version.provenance) for version in versions]
-    short = [{name: each[name] for name in each if name != "parents"} for each in whole]
-    for parents in (whole, short):
-        provenance = {"made_by": "merge", "from": origins, **known, "parents": parents}
+    up_field: dict[str, Any] = {} if up is None else {UP_FIELD: up.tolist()}
+    complete: list[Mapping[str, Any]] = [dict(version.provenance) for version in versions]
+    shortened = [{name: fields[name] for name in fields if name != "parents"} for fields in complete]
+    for parents in (complete, shortened):
+        provenance = {"made_by": "merge", "from": origins, **up_field, "parents": parents}
         encoded = msgspec.msgpack.encode(provenance)
         try:
             check_msgpack(encoded, PROVENANCE)
@@ -324,22 +382,22 @@ def _provenance(versions: Sequence[MapVersion], origins: list[list[int]], up: Ar
             continue
         if len(encoded) <= PROVENANCE.wire_bytes:
             return provenance
-    return {"made_by": "merge", "from": origins, **known}
+    return {"made_by": "merge", "from": origins, **up_field}
 
 
-def _reason_not_joined(
-    which: int,
+def _why_not_joined(
+    map_index: int,
     joined: set[int],
-    proposals: LoopProposals,
-    refused: Mapping[tuple[int, int, str], int],
+    rejected: Mapping[tuple[int, int, str], int],
     options: MergeOptions,
 ) -> str:
-    tried: Counter[str] = Counter()
-    for (one, other, reason), count in refused.items():
-        if which in (one, other) and one != other:
-            tried[reason] += count
-    reasons = ", ".join(f"{count} {reason}" for reason, count in sorted(tried.items()) if count)
+    """Return why a map is not part of the merged map: a sentence for the user, with the counts of reasons."""
+    counts: Counter[str] = Counter()
+    for (first_map, second_map, reason), count in rejected.items():
+        if map_index in (first_map, second_map) and first_map != second_map:
+            counts[reason] += count
+    reasons = ", ".join(f"{count} {reason}" for reason, count in sorted(counts.items()) if count)
     return (
-        f"fewer than {options.min_links} views shared with maps {sorted(joined)} agree "
+        f"fewer than {options.min_links} consistent loop closures with maps {sorted(joined)} "
         f"({reasons or 'no candidates'})"
     )

@@ -19,6 +19,7 @@ from rse_pf.slam.map_merge import (
     LoopProposals,
     MergedMap,
     MergeOptions,
+    MergeSteps,
     merge_versions,
     propose_links,
 )
@@ -108,7 +109,10 @@ def test_wrong_loops_are_refused_and_do_not_deform_the_map(seed: int) -> None:
     maps, truths = two_robots()
     truth = np.concatenate(truths)
 
-    clean, wrong = merged_without_wrong_links(), merge_versions(maps, propose=planted(0.1, seed))
+    clean, wrong = (
+        merged_without_wrong_links(),
+        merge_versions(maps, steps=MergeSteps(propose=planted(0.1, seed))),
+    )
 
     assert wrong.joined == (0, 1)
     assert rmse_m(wrong, truth) <= max(1.1 * rmse_m(clean, truth), rmse_m(clean, truth) + 0.005)
@@ -134,7 +138,7 @@ def test_a_single_wrong_link_joins_nothing() -> None:
         across = [link for link in links.links if (link.a < 13) != (link.b < 13)]
         return LoopProposals(links=tuple(across[:1]), failed=links.failed)
 
-    merged = merge_versions(maps, propose=propose)
+    merged = merge_versions(maps, steps=MergeSteps(propose=propose))
 
     assert merged.joined == (0,)
     assert "too-few-agree" in merged.not_joined[0][1]
