@@ -70,7 +70,8 @@ typedef struct rse_pf_pnp_result {
     int64_t mirrored_inliers;    /* inliers of the best pose of the reflected points; 0 where that was not tested */
     double rmse_px;              /* root mean square reprojection error of the inliers, pixels */
     double second_pose_rmse_px;  /* the same of the second pose of a planar scene; 0 where there is no second pose */
-    double width_to_length;      /* smallest width over length (0: a line) that led to the refusal */
+    double width_to_length;      /* width over length (0: a line) of all points or pixels where there is no consensus,
+                                    else of the inlier pixels */
     double radius_px;            /* root mean square distance of the inlier pixels from their centroid */
     double inlier_width_to_length; /* width over length of the inlier pixels in the image */
     double log10_false_alarms;   /* log10 of the expected number of random poses that fit as well */

@@ -23,7 +23,8 @@ from rse_pf.cli.extras import EXTRAS, VERBS_NEED, modules_of
 from rse_pf.cli.packages import Defect, find_defect
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import ConfigurationError, MissingExtra
-from rse_pf.native import load_core, open_solver
+from rse_pf.native import load_core
+from rse_pf.pnp.native_solver import open_solver
 from rse_pf.terminal import show
 
 __all__ = ["Finding", "add_arguments", "check_machine", "report", "run"]

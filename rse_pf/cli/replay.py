@@ -195,7 +195,7 @@ def _show_report(report: CommandReport) -> None:
     if report.rules:
         show("", "rules of the evidence:")
         for rule in report.rules:
-            says = "kept" if rule.is_kept else ("REFUSES" if rule.refuses else "WEAK")
+            says = "kept" if rule.is_satisfied else ("REFUSES" if rule.refuses else "WEAK")
             relation = "at least" if rule.at_least else "at most"
             unit = f" {rule.unit}" if rule.unit else ""
             show(

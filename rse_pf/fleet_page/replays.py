@@ -106,7 +106,7 @@ def replay_document(report: CommandReport) -> dict[str, Any]:
             f"{rule.name}: {rule.about}: {rule.measured:.4g} {rule.unit}, not "
             f"{'at least' if rule.at_least else 'at most'} {rule.limit:.4g}"
             for rule in report.rules
-            if not rule.is_kept
+            if not rule.is_satisfied
         ),
         *(f"{attempt.name}: {attempt.verdict}, {attempt.inliers} inliers" for attempt in tried),
     ]

@@ -1,6 +1,8 @@
-"""Perspective-n-point: problems, engines, and the solver with its evidence.
+"""The perspective-n-point problem: estimate a camera pose from 3-D to 2-D matches, some of them wrong.
 
-Estimating one camera pose belongs here; the messages of the service ``pnp`` belong to `rse_pf.services`.
+`solver` is the entry point; it calls one of two `engines`, of which `native_solver` is the native core.
+`rules` lists why a pose is weak or refused, `depth_refinement` adds measured depths, and `problems` makes
+test data.  The messages of the service ``pnp`` are in `rse_pf.services.pnp`.
 """
 
 from rse_pf.pnp.depth_refinement import DepthNoise, refine_with_depth

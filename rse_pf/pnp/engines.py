@@ -1,7 +1,7 @@
-"""Two robust PnP engines behind one contract: the native core, and the paper's ``solvePnPRansac`` of OpenCV.
+"""The two robust PnP engines: the native core, and OpenCV's ``solvePnPRansac``, which the paper used.
 
-The native core judges the poses of both.  Engines are deterministic (fixed seeds, one thread) and raise no
-exceptions of their libraries.
+The native core measures the evidence of the poses of both.  Engines are deterministic (fixed seeds, one
+thread), and raise errors of this package only.
 """
 
 from __future__ import annotations
@@ -11,10 +11,10 @@ from functools import cache, lru_cache
 
 import numpy as np
 
-from rse_pf import native
 from rse_pf.errors import BadRequest, ConfigurationError, MissingExtra
 from rse_pf.geometry import Array, Camera
-from rse_pf.pnp.options import PnpOptions, WeakLimits
+from rse_pf.pnp.native_solver import Evidence, NativeOptions, native_solver
+from rse_pf.pnp.options import MIN_CORRESPONDENCES, PnpOptions, WeakLimits
 
 __all__ = [
     "ENGINES",
@@ -24,16 +24,20 @@ __all__ = [
     "native_options",
 ]
 
-# Refinements of the opencv engine, each on the inliers of the previous one.
+# Most refinements of a pose by OpenCV, each over the inliers of the refinement before; they end earlier if
+# the inliers stay the same.
 _MAX_REFINEMENTS = 4
-# Largest coordinate that OpenCV gets; the native core refuses larger ones, and those that are not finite.
+# Largest coordinate (metres or pixels) that OpenCV receives; the native core refuses larger and non-finite
+# numbers.
 _MAX_ABS = 1e6
 
-Engine = Callable[[Array, Array, Camera, PnpOptions, WeakLimits], native.Evidence]
-"""``(points_world (n, 3), pixels (n, 2), camera, options, weak)`` to a pose with its evidence; ``n >= 4``.
+Engine = Callable[[Array, Array, Camera, PnpOptions, WeakLimits], Evidence]
+"""A function of ``(points_world, pixels, camera, options, weak)`` that returns a pose with its evidence.
+
+The points are ``(n, 3)`` metres, the pixels ``(n, 2)``; ``n >= 4``.
 
 Raises:
-    BadRequest: A number is not finite or absurd.
+    BadRequest: A number is not finite or beyond 1e6.
 """
 
 
@@ -41,9 +45,9 @@ def engine_for(name: str) -> Engine:
     """Return the engine called *name*.
 
     Raises:
-        BadRequest: There is none.
-        MissingExtra: Its library is not installed.
-        ConfigurationError: Its library does not fit.
+        BadRequest: There is no engine of this name.
+        MissingExtra: The library of the engine is not installed.
+        ConfigurationError: The native core cannot be loaded, or has another version.
     """
     make = ENGINES.get(name)
     if make is None:
@@ -52,15 +56,15 @@ def engine_for(name: str) -> Engine:
 
 
 def available_engines() -> tuple[str, ...]:
-    """Return the names of the engines whose libraries are installed and fit."""
-    found = []
+    """Return the names of the engines whose libraries are installed and can be loaded."""
+    names = []
     for name, make in ENGINES.items():
         try:
             make()
         except ConfigurationError:
             continue
-        found.append(name)
-    return tuple(found)
+        names.append(name)
+    return tuple(names)
 
 
 @cache
@@ -70,36 +74,44 @@ def _opencv_engine() -> Engine:
     except ImportError as error:
         raise MissingExtra("opencv-python-headless", "vision") from error
     cv2.setNumThreads(1)
-    solver = native.native_solver()
+    solver = native_solver()
 
-    def propose(points_world: Array, pixels: Array, camera: Camera, options: PnpOptions) -> Array | None:
-        """RANSAC with P3P, then Levenberg-Marquardt on the inliers (RSE-PF paper, Sect. 6.1)."""
+    def estimate(points_world: Array, pixels: Array, camera: Camera, options: PnpOptions) -> Array | None:
+        """Return the ``(4, 4)`` pose of OpenCV, None if it finds none (RSE-PF paper, Sect. 6.1)."""
         matrix = camera.matrix
         cv2.setRNGSeed(0)
         try:
-            found, rotation, translation, inliers = cv2.solvePnPRansac(
-                points_world, pixels, matrix, None,
-                iterationsCount=options.max_iterations, reprojectionError=options.inlier_px,
-                confidence=options.confidence, flags=cv2.SOLVEPNP_P3P,
-            )  # fmt: skip
-            if not found or inliers is None or len(inliers) < 4:
+            # 1. RANSAC with P3P.
+            has_pose, rotation, translation, inliers = cv2.solvePnPRansac(
+                points_world,
+                pixels,
+                matrix,
+                None,
+                iterationsCount=options.max_iterations,
+                reprojectionError=options.inlier_px,
+                confidence=options.confidence,
+                flags=cv2.SOLVEPNP_P3P,
+            )
+            if not has_pose or inliers is None or len(inliers) < MIN_CORRESPONDENCES:
                 return None
             rows = inliers[:, 0]
-            # EPnP, which ends solvePnPRansac, may converge to the wrong one of a plane's two minima.
-            found, better, shift = cv2.solvePnP(
+            # 2. SQPnP over the inliers: EPnP, the last step of solvePnPRansac, may converge to the wrong one
+            # of the two minima of a planar scene.
+            has_global, global_rotation, global_translation = cv2.solvePnP(
                 points_world[rows], pixels[rows], matrix, None, flags=cv2.SOLVEPNP_SQPNP
             )
-            if found:
-                rotation, translation = better, shift
+            if has_global:
+                rotation, translation = global_rotation, global_translation
+            # 3. Levenberg-Marquardt over the inliers, until they stay the same.
             for _ in range(_MAX_REFINEMENTS):
                 rotation, translation = cv2.solvePnPRefineLM(
                     points_world[rows], pixels[rows], matrix, None, rotation, translation
                 )
                 projected, _ = cv2.projectPoints(points_world, rotation, translation, matrix, None)
                 error = projected[:, 0] - pixels
-                agree = (error * error).sum(axis=1) <= options.inlier_px**2
-                before, rows = rows, np.flatnonzero(agree)
-                if len(rows) < 4 or np.array_equal(before, rows):
+                is_inlier = (error * error).sum(axis=1) <= options.inlier_px**2
+                previous_rows, rows = rows, np.flatnonzero(is_inlier)
+                if len(rows) < MIN_CORRESPONDENCES or np.array_equal(previous_rows, rows):
                     break
             pose: Array = np.vstack([np.hstack([cv2.Rodrigues(rotation)[0], translation]), [0, 0, 0, 1]])
         except cv2.error:
@@ -108,22 +120,22 @@ def _opencv_engine() -> Engine:
 
     def solve(
         points_world: Array, pixels: Array, camera: Camera, options: PnpOptions, weak: WeakLimits
-    ) -> native.Evidence:
-        """Judge the pose that OpenCV proposes."""
+    ) -> Evidence:
+        """Return the pose of OpenCV with the evidence of the native core."""
         pose = None
         if np.abs(points_world).max() <= _MAX_ABS and np.abs(pixels).max() <= _MAX_ABS:
-            pose = propose(points_world, pixels, camera, options)
+            pose = estimate(points_world, pixels, camera, options)
         if pose is None:
-            pose = np.full((4, 4), np.nan)  # which agrees with no match
-        return solver.judge(points_world, pixels, camera, native_options(options, weak), pose)
+            pose = np.full((4, 4), np.nan)  # A pose without inliers, which the native core refuses.
+        return solver.evaluate(points_world, pixels, camera, native_options(options, weak), pose)
 
     return solve
 
 
 @lru_cache(maxsize=64)
-def native_options(options: PnpOptions, weak: WeakLimits) -> native.NativeOptions:
-    """Return *options* and *weak* as the native core takes them."""
-    return native.NativeOptions(
+def native_options(options: PnpOptions, weak: WeakLimits) -> NativeOptions:
+    """Return the options of the native core that equal *options* and *weak*."""
+    return NativeOptions(
         inlier_px=options.inlier_px,
         confidence=options.confidence,
         max_iterations=options.max_iterations,
@@ -137,13 +149,13 @@ def native_options(options: PnpOptions, weak: WeakLimits) -> native.NativeOption
 
 @cache
 def _native_engine() -> Engine:
-    solver = native.native_solver()
+    solver = native_solver()
 
     def solve(
         points_world: Array, pixels: Array, camera: Camera, options: PnpOptions, weak: WeakLimits
-    ) -> native.Evidence:
-        """LO-RANSAC with P3P, then robust refinement (``native/src/robust.hpp``)."""
-        return solver.judge(points_world, pixels, camera, native_options(options, weak))
+    ) -> Evidence:
+        """Run LO-RANSAC with P3P, then a robust refinement (``native/src/robust.hpp``)."""
+        return solver.evaluate(points_world, pixels, camera, native_options(options, weak))
 
     return solve
 
@@ -152,3 +164,4 @@ ENGINES: dict[str, Callable[[], Engine]] = {
     "native": _native_engine,
     "opencv": _opencv_engine,
 }
+"""For each name of an engine the function that loads its library and returns the engine."""

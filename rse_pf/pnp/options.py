@@ -1,4 +1,5 @@
-"""Options of a PnP request, such as the iterations of RANSAC, and the limits below which a pose is weak."""
+"""Options of a PnP request, such as the number of RANSAC samples, and the limits beyond which a pose is
+weak."""
 
 from __future__ import annotations
 
@@ -10,10 +11,15 @@ import msgspec
 
 from rse_pf.errors import BadRequest
 
-__all__ = ["PnpOptions", "WeakLimits"]
+__all__ = ["MIN_CORRESPONDENCES", "PnpOptions", "WeakLimits", "require_within"]
+
+MIN_CORRESPONDENCES = 4
+"""Fewest correspondences of a pose: three have up to four poses (P3P), and a fourth one decides between
+them."""
 
 
-def _within(name: str, value: float, low: float, high: float) -> None:
+def require_within(name: str, value: float, low: float, high: float) -> None:
+    """Raise BadRequest unless *value* of the option *name* is in the closed interval from *low* to *high*."""
     if not low <= value <= high:
         raise BadRequest(
             f"{name} = {value:g} is not within {low:g}..{high:g}", hint="leave it out for the default"
@@ -21,7 +27,14 @@ def _within(name: str, value: float, low: float, high: float) -> None:
 
 
 class PnpOptions(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """How to solve; it travels with a command.
+    """Options of a ``pnp`` command, which a robot may send with it.
+
+    Attributes:
+        engine: Name of the solver; None for the server's default.
+        inlier_px: Largest reprojection error of an inlier, pixels.
+        max_iterations: Most samples that RANSAC draws.
+        min_iterations: Fewest samples that RANSAC draws.
+        confidence: RANSAC stops when it has drawn a sample of inliers only with this probability.
 
     Raises:
         BadRequest: A number is out of its range.
@@ -34,18 +47,23 @@ class PnpOptions(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     confidence: float = 0.999
 
     def __post_init__(self) -> None:
-        _within("inlier_px", self.inlier_px, 1e-3, 100.0)
-        _within("max_iterations", self.max_iterations, 1, 100_000)
-        _within("min_iterations", self.min_iterations, 1, 100_000)
-        _within("confidence", self.confidence, 1e-6, 1.0 - 1e-9)
+        require_within("inlier_px", self.inlier_px, 1e-3, 100.0)
+        require_within("max_iterations", self.max_iterations, 1, 100_000)
+        require_within("min_iterations", self.min_iterations, 1, 100_000)
+        require_within("confidence", self.confidence, 1e-6, 1.0 - 1e-9)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WeakLimits:
-    """Limits below which a pose is weak: inliers, inlier ratio; above which: standard deviations.
+    """Limits beyond which a pose is weak instead of ok.
 
-    Fewer independent inliers than half of *inliers* are weak, too.  Three standard deviations are 0.1 m
-    and 2 degrees, which the benchmarks use as the limit of a correct pose.
+    Attributes:
+        inliers: Fewest inliers; and twice the fewest independent inliers.
+        inlier_ratio: Smallest share of the correspondences that are inliers.
+        translation_m: Largest standard deviation of the translation, metres.
+        rotation_rad: Largest standard deviation of the rotation, radians.
+
+    The benchmarks call a pose correct within 0.1 m and 2 degrees, which are three standard deviations.
     """
 
     inliers: int = 12

@@ -1,4 +1,4 @@
-"""Seeded PnP problems with known poses, for tests and benchmarks; equal arguments give equal problems."""
+"""Random PnP problems with known poses, for tests and benchmarks; equal arguments give equal problems."""
 
 from __future__ import annotations
 
@@ -20,20 +20,48 @@ __all__ = [
 ]
 
 KINECT = Camera(fx=518.86, fy=519.47, cx=325.58, cy=253.74, width=640, height=480)
-"""The colour camera of NYU Depth V2 (its toolbox's calibration)."""
+"""Intrinsics of the colour camera of NYU Depth V2, a Kinect, from the calibration of its toolbox."""
 
-_MIN_DEPTH_M, _MAX_DEPTH_M, _BORDER_PX = 0.8, 6.0, 8.0
+_MIN_DEPTH_M = 0.8  # nearest point of a problem, metres: the shortest range of a Kinect
+_MAX_DEPTH_M = 6.0  # farthest point of a problem, metres: the size of a room
+_BORDER_PX = 8.0  # pixels along the border of the image without points, so that noise keeps them inside
 
 DEGENERATE = (
-    "collinear", "noisy-collinear", "strayed-collinear", "coincident", "same-pixel", "line-of-sight",
-    "duplicated", "noise", "behind", "mirrored", "corner", "nan", "infinite", "huge",
-)  # fmt: skip
-"""Kinds of correspondences that fix no pose; for ``duplicated``, four wrong ones are repeated."""
+    "collinear",
+    "noisy-collinear",
+    "strayed-collinear",
+    "coincident",
+    "same-pixel",
+    "line-of-sight",
+    "duplicated",
+    "noise",
+    "behind",
+    "mirrored",
+    "corner",
+    "nan",
+    "infinite",
+    "huge",
+)
+"""Kinds of correspondences that determine no pose, for `make_degenerate`.
+
+``strayed-collinear`` is a line with one tenth of outliers; ``duplicated`` repeats four wrong correspondences
+with pixel noise; ``noise`` has random pixels; ``behind`` has points behind the camera; ``corner`` has all
+pixels within 5 px.
+"""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PnpProblem:
-    """Correspondences and their true pose."""
+    """Correspondences with their true pose.
+
+    Attributes:
+        points_world: ``(n, 3)``, metres, world frame.
+        pixels: ``(n, 2)``; row *i* observes point *i*.
+        camera: Intrinsics.
+        T_camera_world: ``(4, 4)``, the true pose.
+        is_inlier: ``(n,)``, whether the pixel is the projection of the point with noise, and not a random
+            pixel.
+    """
 
     points_world: Array
     pixels: Array
@@ -51,9 +79,15 @@ def make_problem(
     depth_noise: bool = False,
     camera: Camera = KINECT,
 ) -> PnpProblem:
-    """Return *n* correspondences of a room-sized scene, *outlier_ratio* of them uniformly wrong.
+    """Make a PnP problem with points 0.8 to 6 m in front of the camera.
 
-    Points lie 0.8 to 6 m before the camera; with *depth_noise* they carry a Kinect's error.
+    Args:
+        seed: Seed of the random generator.
+        n: Number of correspondences.
+        noise_px: Standard deviation of the pixel noise.
+        outlier_ratio: Share of the correspondences whose pixel is random.
+        depth_noise: Whether the points carry the depth error of a Kinect.
+        camera: Intrinsics.
 
     Source:
         Depth error after Nguyen et al., 3DIMPVT 2012.
@@ -61,26 +95,35 @@ def make_problem(
     rng = np.random.default_rng(seed)
     T_camera_world = exp_se3(np.concatenate([rng.uniform(-2, 2, 3), rng.normal(size=3) * 0.6]))
     size = np.array([camera.width, camera.height], dtype=np.float64)
-    exact = rng.uniform(_BORDER_PX, size - _BORDER_PX, (n, 2))
+    exact_pixels = rng.uniform(_BORDER_PX, size - _BORDER_PX, (n, 2))
     depth_m = rng.uniform(_MIN_DEPTH_M, _MAX_DEPTH_M, n)
-    measured_m = depth_m
-    if depth_noise:
-        measured_m = _with_depth_noise(rng, depth_m)
-    points_world = transform(inverse(T_camera_world), camera.back_project(exact, measured_m))
-    pixels = exact + rng.normal(size=(n, 2)) * noise_px
-    wrong = rng.permutation(n)[: round(outlier_ratio * n)]
-    pixels[wrong] = rng.uniform(0, size, (len(wrong), 2))
+    measured_m = _add_depth_noise(rng, depth_m) if depth_noise else depth_m
+    points_world = transform(inverse(T_camera_world), camera.back_project(exact_pixels, measured_m))
+    pixels = exact_pixels + rng.normal(size=(n, 2)) * noise_px
+    outliers = rng.permutation(n)[: round(outlier_ratio * n)]
+    pixels[outliers] = rng.uniform(0, size, (len(outliers), 2))
     is_inlier = np.ones(n, dtype=np.bool_)
-    is_inlier[wrong] = False
+    is_inlier[outliers] = False
     return PnpProblem(
-        points_world=points_world, pixels=pixels, camera=camera, T_camera_world=T_camera_world,
+        points_world=points_world,
+        pixels=pixels,
+        camera=camera,
+        T_camera_world=T_camera_world,
         is_inlier=is_inlier,
-    )  # fmt: skip
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class TwoViews:
-    """Matches of two depth images, rounded as they are sent; *depths_m* is 0 where there is none."""
+    """Correspondences of two depth images with their true relative pose, rounded as a ``pnp`` command is.
+
+    Attributes:
+        points_reference: ``(n, 3)``, metres, in the frame of the first camera, which measured them.
+        pixels: ``(n, 2)``, in the second image.
+        depths_m: ``(n,)``, depths that the second camera measured at these pixels; 0 where there is none.
+        camera: Intrinsics of both images.
+        T_camera_reference: ``(4, 4)``, the true pose, which maps the first camera's frame to the second's.
+    """
 
     points_reference: Array
     pixels: Array
@@ -92,35 +135,46 @@ class TwoViews:
 def make_two_views(
     *, seed: int, n: int = 150, noise_px: float = 1.0, outlier_ratio: float = 0.2, missing_ratio: float = 0.1
 ) -> TwoViews:
-    """Return matches of two views some 0.2 m apart, both with pixel noise and a Kinect's depth error.
+    """Make correspondences of two depth images taken about 0.2 m apart, with the noise of a Kinect in both.
 
-    Points lie 1.5 to 4.5 m before the first camera; *missing_ratio* of the second one's depths are missing.
+    Points lie 1.5 to 4.5 m in front of the first camera.
+
+    Args:
+        seed: Seed of the random generator.
+        n: Number of correspondences.
+        noise_px: Standard deviation of the pixel noise in both images.
+        outlier_ratio: Share of the correspondences whose second pixel and depth are random.
+        missing_ratio: Share of the depths in the second image that are missing.
     """
     rng = np.random.default_rng(seed)
     T = exp_se3(np.concatenate([rng.uniform(-0.17, 0.17, 3), rng.normal(size=3) * 0.08]))
-    exact, depth_m = rng.uniform(60.0, [580.0, 420.0], (n, 2)), rng.uniform(1.5, 4.5, n)
-    seen = transform(T, KINECT.back_project(exact, depth_m))
-    noisy = exact + rng.normal(size=(n, 2)) * noise_px
-    points = KINECT.back_project(noisy, _with_depth_noise(rng, depth_m))
-    pixels = KINECT.project(seen) + rng.normal(size=(n, 2)) * noise_px
-    depths_m = _with_depth_noise(rng, seen[:, 2])
-    wrong = rng.permutation(n)[: round(outlier_ratio * n)]
-    pixels[wrong] = rng.uniform(0.0, [KINECT.width, KINECT.height], (len(wrong), 2))
-    depths_m[wrong] = rng.uniform(1.0, 5.0, len(wrong))
+    exact_pixels, depth_m = rng.uniform(60.0, [580.0, 420.0], (n, 2)), rng.uniform(1.5, 4.5, n)
+    points_camera = transform(T, KINECT.back_project(exact_pixels, depth_m))
+    noisy_pixels = exact_pixels + rng.normal(size=(n, 2)) * noise_px
+    points = KINECT.back_project(noisy_pixels, _add_depth_noise(rng, depth_m))
+    pixels = KINECT.project(points_camera) + rng.normal(size=(n, 2)) * noise_px
+    depths_m = _add_depth_noise(rng, points_camera[:, 2])
+    outliers = rng.permutation(n)[: round(outlier_ratio * n)]
+    pixels[outliers] = rng.uniform(0.0, [KINECT.width, KINECT.height], (len(outliers), 2))
+    depths_m[outliers] = rng.uniform(1.0, 5.0, len(outliers))
     depths_m[rng.random(n) < missing_ratio] = 0.0
     return TwoViews(
-        points_reference=np.round(points, 4), pixels=np.round(pixels, 2), depths_m=np.round(depths_m, 3),
-        camera=KINECT, T_camera_reference=T,
-    )  # fmt: skip
+        points_reference=np.round(points, 4),
+        pixels=np.round(pixels, 2),
+        depths_m=np.round(depths_m, 3),
+        camera=KINECT,
+        T_camera_reference=T,
+    )
 
 
-def _with_depth_noise(rng: np.random.Generator, depth_m: Array) -> Array:
-    noisy: Array = depth_m + rng.normal(size=len(depth_m)) * (0.0012 + 0.0019 * (depth_m - 0.4) ** 2)
-    return noisy
+def _add_depth_noise(rng: np.random.Generator, depth_m: Array) -> Array:
+    """Add the noise of a Kinect (Nguyen et al. 2012, eq. 5) to depths in metres."""
+    noisy_m: Array = depth_m + rng.normal(size=len(depth_m)) * (0.0012 + 0.0019 * (depth_m - 0.4) ** 2)
+    return noisy_m
 
 
 def make_degenerate(kind: str, *, seed: int, n: int = 100, camera: Camera = KINECT) -> PnpProblem:
-    """Return correspondences that fix no pose; *kind* is one of `DEGENERATE`."""
+    """Make correspondences that determine no pose; *kind* is one of `DEGENERATE`."""
     rng = np.random.default_rng(seed)
     problem = make_problem(seed=seed, n=n, noise_px=0.5, outlier_ratio=0.0, camera=camera)
     T, points, pixels = problem.T_camera_world, problem.points_world, problem.pixels
@@ -145,7 +199,9 @@ def make_degenerate(kind: str, *, seed: int, n: int = 100, camera: Camera = KINE
             ray = camera.back_project(pixels[:1], np.ones(1))
             points = transform(inverse(T), ray * np.linspace(1, 5, n)[:, None])
             pixels = pixels[:1] + rng.normal(size=(n, 2)) * 0.5
-        case "noise":  # of another stream: that of the seed has made the right pixels
+        case "noise":
+            # Another random stream: that of the seed would repeat the numbers from which `make_problem` made
+            # the pixels.
             pixels = np.random.default_rng([seed, 1]).uniform(0, [camera.width, camera.height], (n, 2))
         case "behind":
             T = np.diag([-1.0, -1.0, 1.0, 1.0]) @ T
@@ -164,6 +220,9 @@ def make_degenerate(kind: str, *, seed: int, n: int = 100, camera: Camera = KINE
         case _:
             raise ValueError(f"unknown kind {kind!r}")
     return PnpProblem(
-        points_world=points, pixels=pixels, camera=camera, T_camera_world=T,
+        points_world=points,
+        pixels=pixels,
+        camera=camera,
+        T_camera_world=T,
         is_inlier=np.zeros(n, dtype=np.bool_),
-    )  # fmt: skip
+    )

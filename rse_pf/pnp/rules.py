@@ -1,7 +1,7 @@
-"""The rules by which the native core calls a pose weak or refuses it, with measured values and limits.
+"""The rules by which the native core refuses a pose or calls it weak, with measured values and limits.
 
-``native/src/solve.hpp`` applies them in this order, and the first rule that refuses gives the error; the
-replay of a recording shows them all.
+``native/src/solve.hpp`` applies these rules in this order, and the first rule that refuses a pose determines
+the error. This module only lists them, for the replay of a recorded pose.
 """
 
 from __future__ import annotations
@@ -11,32 +11,38 @@ import math
 import msgspec
 import numpy as np
 
-from rse_pf.native import COLLINEAR, Evidence
-from rse_pf.pnp.options import WeakLimits
+from rse_pf.pnp.native_solver import MIN_WIDTH_TO_LENGTH, Evidence
+from rse_pf.pnp.options import MIN_CORRESPONDENCES, WeakLimits
 
-__all__ = ["MATCHES_OF_A_POSE", "Rule", "rules_of"]
+__all__ = ["Rule", "evaluate_rules"]
 
-MATCHES_OF_A_POSE = 4  # a pose of three matches has no witness
-_MAX_LOG10_FALSE_ALARMS = -5.0  # log10 of the false alarms at which chance is ruled out
-_NEARLY_COLLINEAR = 0.1  # width over length of matches below which a pose is weak
-_SAME_FIT = 9.0  # difference of squared errors, in units of the noise, below which two poses fit alike
-_SIMILAR_FIT = (
-    40.0  # difference of squared errors, in units of the noise, below which two poses nearly fit alike
+# The five limits are those of native/src/evidence.hpp and native/src/solve.hpp, and change together with
+# them.
+_MAX_LOG10_FALSE_ALARMS = (
+    -5.0
+)  # largest log10 of the expected number of random poses that fit as well as an accepted one
+_WEAK_WIDTH_TO_LENGTH = 0.1  # width over length of the inliers in the image below which a pose is weak
+# Increase of squared errors to a plane's second pose, in pixel variances, below which a pose is refused.
+_EQUAL_FIT = 9.0
+# Increase of squared errors to a plane's second pose, in pixel variances, below which a pose is weak.
+_SIMILAR_FIT = 40.0
+_MIN_VARIANCE_PX2 = (
+    0.01  # smallest pixel variance (px^2): messages are rounded, and four points may fit by luck
 )
-_NOISE_FLOOR_PX2 = 0.01  # smallest variance of a pixel
 
 
 class Rule(msgspec.Struct, frozen=True, kw_only=True):
-    """One rule about a pose.
+    """One rule about a pose, with the measured value and its limit.
 
     Attributes:
-        name: The reason or the code that it gives.
-        about: What is measured, in words.
-        measured: Its value.
-        limit: The value that is still good.
-        unit: Of both.
-        at_least: Whether the value has to reach the limit, or must not exceed it.
-        refuses: Whether a pose that breaks it is refused, or called weak.
+        name: Error code of a rule that refuses poses, or reason of a weak pose.
+        about: The measured quantity, in words.
+        measured: Measured value.
+        limit: Last value that satisfies the rule.
+        unit: Unit of both values; empty for a number without unit.
+        at_least: Whether the limit is the smallest value that satisfies the rule; otherwise it is the
+            largest.
+        refuses: Whether a pose that violates the rule is refused; otherwise it is weak.
     """
 
     name: str
@@ -48,91 +54,116 @@ class Rule(msgspec.Struct, frozen=True, kw_only=True):
     refuses: bool = False
 
     @property
-    def is_kept(self) -> bool:
-        """Whether the pose keeps the rule."""
+    def is_satisfied(self) -> bool:
+        """Whether the measured value is on the right side of the limit."""
         return self.measured >= self.limit if self.at_least else self.measured <= self.limit
 
     @property
     def margin(self) -> float:
-        """How many times better than the limit the value is; below 1 the rule is broken."""
+        """How many times better than its limit the measured value is; below 1 the rule is violated."""
         if self.measured == self.limit:
             return 1.0
-        good, bad = (self.measured, self.limit) if self.at_least else (self.limit, self.measured)
+        larger, smaller = (self.measured, self.limit) if self.at_least else (self.limit, self.measured)
         if self.limit < 0:
-            good, bad = -bad, -good
-        return math.inf if bad == 0 else max(0.0, good / bad)
+            larger, smaller = -smaller, -larger
+        return math.inf if smaller == 0 else max(0.0, larger / smaller)
 
 
-def rules_of(matches: int, found: Evidence | None, *, inlier_px: float, weak: WeakLimits) -> tuple[Rule, ...]:
-    """Return the rules about a pose in their order.
+def evaluate_rules(
+    correspondences: int, evidence: Evidence | None, *, inlier_px: float, weak: WeakLimits
+) -> tuple[Rule, ...]:
+    """Return the rules about a pose in the order in which the native core applies them.
+
+    Without enough correspondences or inliers, only the first rules can be measured.
 
     Args:
-        matches: How many were given.
-        found: The pose with its evidence; None for fewer matches than a pose needs.
-        inlier_px: Largest error of an inlier.
-        weak: Where a pose stops being ``ok``.
+        correspondences: Number of correspondences of the request.
+        evidence: The pose with its evidence; None for fewer correspondences than a pose needs.
+        inlier_px: Largest reprojection error of an inlier, pixels.
+        weak: Limits beyond which a pose is weak.
     """
-    too_few = _refusing("too-few", "matches", matches, MATCHES_OF_A_POSE)
-    if found is None:
+    too_few = _refusing("too-few", "matches", correspondences, MIN_CORRESPONDENCES)
+    if evidence is None:
         return (too_few,)
-    count = len(found.inliers)
-    consensus = _refusing("no-consensus", "inliers", count, MATCHES_OF_A_POSE)
-    if count < MATCHES_OF_A_POSE:
-        return (
-            too_few,
-            consensus,
-            _refusing("degenerate", "width over length of all matches", found.thinness, COLLINEAR),
+    inliers = len(evidence.inliers)
+    consensus = _refusing("no-consensus", "inliers", inliers, MIN_CORRESPONDENCES)
+    if inliers < MIN_CORRESPONDENCES:
+        shape = _refusing(
+            "degenerate", "width over length of all matches", evidence.width_to_length, MIN_WIDTH_TO_LENGTH
         )
+        return (too_few, consensus, shape)
+    width_to_length = evidence.inlier_width_to_length
     return (
         too_few,
         consensus,
         Rule(
-            name="no-consensus", about="log10 of the poses that chance would give",
-            measured=found.log10_false_alarms, limit=_MAX_LOG10_FALSE_ALARMS, at_least=False, refuses=True,
+            name="no-consensus",
+            about="log10 of the expected random poses that fit as well",
+            measured=evidence.log10_false_alarms,
+            limit=_MAX_LOG10_FALSE_ALARMS,
+            at_least=False,
+            refuses=True,
         ),
-        _refusing("degenerate", "width over length of the inliers", found.inlier_thinness, COLLINEAR),
+        _refusing("degenerate", "width over length of the inliers", width_to_length, MIN_WIDTH_TO_LENGTH),
         _refusing(
-            "degenerate", "distance of the inliers from their centre", found.radius_px, inlier_px, unit="px"
+            "degenerate",
+            "rms distance of the inlier pixels from their centroid",
+            evidence.radius_px,
+            inlier_px,
+            unit="px",
         ),
-        _weak("few-inliers", "inliers", count, weak.inliers),
-        _weak("low-inlier-ratio", "share of the matches that agree", count / matches, weak.inlier_ratio),
+        _weak("few-inliers", "inliers", inliers, weak.inliers),
         _weak(
-            "nearly-collinear", "width over length of the inliers", found.inlier_thinness, _NEARLY_COLLINEAR
+            "low-inlier-ratio",
+            "share of the matches that are inliers",
+            inliers / correspondences,
+            weak.inlier_ratio,
         ),
-        _weak("clustered", "inliers in places of their own", found.independent, weak.inliers / 2),
-        *_constraint_rules(found, weak),
-        *_ambiguity_rules(found),
-    )  # fmt: skip
+        _weak("nearly-collinear", "width over length of the inliers", width_to_length, _WEAK_WIDTH_TO_LENGTH),
+        _weak(
+            "clustered", "inliers, neighbours counted once", evidence.independent_inliers, weak.inliers / 2
+        ),
+        *_constraint_rules(evidence, weak),
+        *_ambiguity_rules(evidence),
+    )
 
 
-def _constraint_rules(found: Evidence, weak: WeakLimits) -> tuple[Rule, ...]:
-    """Return the rules about how well the inliers fix the pose."""
-    variances = found.covariance.diagonal()
-    if not (np.isfinite(found.covariance).all() and (variances > 0.0).all()):
-        return (_refusing("degenerate", "motions of the camera that the matches fix", 5, 6),)
+def _constraint_rules(evidence: Evidence, weak: WeakLimits) -> tuple[Rule, ...]:
+    """Return the rules about the covariance of the pose."""
+    variances = evidence.covariance.diagonal()
+    if not (np.isfinite(evidence.covariance).all() and (variances > 0.0).all()):
+        return (_refusing("degenerate", "motions of the camera that the inliers constrain", 5, 6),)
     return (
         Rule(
-            name="poorly-constrained", about="standard deviation of the position", unit="m", at_least=False,
-            measured=math.sqrt(variances[:3].sum()), limit=weak.translation_m,
+            name="poorly-constrained",
+            about="standard deviation of the position",
+            unit="m",
+            at_least=False,
+            measured=math.sqrt(variances[:3].sum()),
+            limit=weak.translation_m,
         ),
         Rule(
-            name="poorly-constrained", about="standard deviation of the rotation", unit="deg", at_least=False,
-            measured=math.degrees(math.sqrt(variances[3:].sum())), limit=math.degrees(weak.rotation_rad),
+            name="poorly-constrained",
+            about="standard deviation of the rotation",
+            unit="deg",
+            at_least=False,
+            measured=math.degrees(math.sqrt(variances[3:].sum())),
+            limit=math.degrees(weak.rotation_rad),
         ),
-    )  # fmt: skip
+    )
 
 
-def _ambiguity_rules(found: Evidence) -> tuple[Rule, ...]:
-    """Return the rules that compare the pose with the second pose of a plane by a likelihood ratio."""
-    if not found.other_rmse_px:
+def _ambiguity_rules(evidence: Evidence) -> tuple[Rule, ...]:
+    """Return the rules that compare the pose with the second pose of a planar scene by a likelihood ratio."""
+    if not evidence.second_pose_rmse_px:
         return ()
-    count = len(found.inliers)
-    squares_px2 = count * found.rmse_px**2
-    variance_px2 = max(squares_px2 / max(1, 2 * count - 6), _NOISE_FLOOR_PX2)
-    difference = (count * found.other_rmse_px**2 - squares_px2) / variance_px2
-    about = "how much worse the second pose of a plane fits, in units of the noise"
+    inliers = len(evidence.inliers)
+    squares_px2 = inliers * evidence.rmse_px**2
+    variance_px2 = max(squares_px2 / max(1, 2 * inliers - 6), _MIN_VARIANCE_PX2)
+    difference = (inliers * evidence.second_pose_rmse_px**2 - squares_px2) / variance_px2
+    about = "increase of squared errors to a plane's second pose, in variances"
     return (
-        _refusing("degenerate", about, difference, _SAME_FIT),
+        _refusing("degenerate", about, difference, _EQUAL_FIT),
         _weak("ambiguous", about, difference, _SIMILAR_FIT),
     )
 

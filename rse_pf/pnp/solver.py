@@ -1,4 +1,4 @@
-"""`solve_pnp`: one camera pose with its evidence, or a typed error if there is no reliable pose."""
+"""`solve_pnp`: estimate one camera pose with its covariance and verdict, or raise a typed error."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ import numpy.typing as npt
 from rse_pf.errors import BadRequest, TooFewCorrespondences
 from rse_pf.geometry import Array, Camera
 from rse_pf.pnp.engines import engine_for
-from rse_pf.pnp.options import PnpOptions, WeakLimits
-from rse_pf.pnp.rules import MATCHES_OF_A_POSE
+from rse_pf.pnp.options import MIN_CORRESPONDENCES, PnpOptions, WeakLimits
 
 __all__ = ["PnpSolution", "solve_pnp"]
 
 
 class PnpSolution(msgspec.Struct, frozen=True, kw_only=True, eq=False):
-    """A pose and its evidence.
+    """An accepted camera pose.
 
     Attributes:
-        T_camera_world: ``(4, 4)``, maps world points (metres) into the camera's frame.
-        inliers: Sorted row numbers of the correspondences that agree.
-        rmse_px: Root mean square reprojection error over the inliers.
+        T_camera_world: ``(4, 4)``, maps world points (metres) to the camera frame.
+        inliers: Ascending row numbers of the inliers among the correspondences.
+        rmse_px: Root mean square reprojection error of the inliers.
         covariance: ``(6, 6)`` of the twist xi = (rho metres, phi radians) in
             ``T_true = exp_se3(xi) @ T_camera_world``.
-        verdict: ``ok``, or ``weak`` with a *reason*: few-inliers, low-inlier-ratio, clustered,
-            nearly-collinear, ambiguous, poorly-constrained.
-        engine: Which engine proposed it.
+        verdict: ``ok``, or ``weak`` for a pose that may be wrong or imprecise.
+        reason: Why the pose is weak: few-inliers, low-inlier-ratio, clustered, nearly-collinear, ambiguous or
+            poorly-constrained; empty for a pose that is ok.
+        engine: Name of the engine that estimated the pose, such as ``native``.
     """
 
     T_camera_world: Array
@@ -53,48 +53,48 @@ def solve_pnp(
     default_engine: str = "native",
     weak: WeakLimits = _DEFAULT_LIMITS,
 ) -> PnpSolution:
-    """Estimate the camera pose from 3-D to 2-D matches, some of which are wrong.
+    """Estimate the camera pose from 3-D to 2-D correspondences, some of which are wrong.
 
-    Finds ``T_camera_world`` such that every inlier *i* satisfies
-    ``pixels[i] ~ camera.project(T_camera_world @ points_world[i])`` within
-    ``options.inlier_px``.  The same request gives the same pose on every server.
+    Find ``T_camera_world`` such that ``camera.project(T_camera_world @ points_world[i])`` lies within
+    ``options.inlier_px`` of ``pixels[i]`` for every inlier *i*.  Equal requests give equal poses on every
+    server.
 
     Args:
         points_world: ``(n, 3)``, metres, world frame; ``n >= 4``, not all on one line.
         pixels: ``(n, 2)``, undistorted pixels; row *i* observes row *i* of *points_world*.
         camera: Intrinsics of the image the pixels come from.
-        options: RANSAC settings; ``None`` means the defaults.
-        default_engine: The engine when *options* names none.
-        weak: Where a pose stops being ``ok``.
+        options: Options of RANSAC; None for the defaults.
+        default_engine: Name of the engine where *options* names none: ``native`` or ``opencv``.
+        weak: Limits beyond which a pose is weak instead of ok.
 
     Raises:
         TooFewCorrespondences: ``n < 4``.
-        BadRequest: Shapes do not fit, or a number is not finite or absurd.
-        DegenerateGeometry: The points lie on one line or coincide, or two poses fit alike.
-        NoConsensus: No pose agrees with more correspondences than chance would give.
+        BadRequest: Shapes do not fit, a number is not finite or beyond 1e6, or there is no such engine.
+        DegenerateGeometry: The inliers do not determine one pose, such as points on a line.
+        NoConsensus: No pose has more inliers than a random pose would have.
         MissingExtra: The engine is not installed.
 
     Source:
         RSE-PF paper, Sect. 6.1 and Fig. 6; minimal solver after Gao et al. 2003, its ref. [13].
     """
     options = options or _DEFAULT_OPTIONS
-    points_world, pixels = _checked(points_world, pixels)
+    points_world, pixels = _validate(points_world, pixels)
     engine = options.engine or default_engine
-    found = engine_for(engine)(points_world, pixels, camera, options, weak)
-    if found.refusal is not None:
-        raise found.refusal
+    evidence = engine_for(engine)(points_world, pixels, camera, options, weak)
+    if evidence.refusal is not None:
+        raise evidence.refusal
     return PnpSolution(
-        T_camera_world=found.T_camera_world,
-        inliers=found.inliers,
-        rmse_px=found.rmse_px,
-        covariance=found.covariance,
-        verdict="weak" if found.reason else "ok",
-        reason=found.reason,
+        T_camera_world=evidence.T_camera_world,
+        inliers=evidence.inliers,
+        rmse_px=evidence.rmse_px,
+        covariance=evidence.covariance,
+        verdict="weak" if evidence.reason else "ok",
+        reason=evidence.reason,
         engine=engine,
     )
 
 
-def _checked(points_world: Array, pixels: Array) -> tuple[Array, Array]:
+def _validate(points_world: Array, pixels: Array) -> tuple[Array, Array]:
     try:
         points = np.ascontiguousarray(points_world, dtype=np.float64)
         pixels = np.ascontiguousarray(pixels, dtype=np.float64)
@@ -105,9 +105,9 @@ def _checked(points_world: Array, pixels: Array) -> tuple[Array, Array]:
             f"points {points.shape} and pixels {pixels.shape} are not (n, 3) and (n, 2)",
             hint="send one pixel for each point",
         )
-    if len(points) < MATCHES_OF_A_POSE:
+    if len(points) < MIN_CORRESPONDENCES:
         raise TooFewCorrespondences(
-            f"got {len(points)} correspondences, a pose needs at least {MATCHES_OF_A_POSE}",
+            f"got {len(points)} correspondences, a pose needs at least {MIN_CORRESPONDENCES}",
             hint="loosen the matcher, or skip this frame",
         )
     return points, pixels

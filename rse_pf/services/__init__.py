@@ -1,4 +1,6 @@
-"""Services: functions from one typed request to one typed reply.
+"""Services that robots call: functions of one typed request that return one typed reply.
 
-Algorithms that robots call belong here; transport, scheduling and isolation do not.
+`builtin` lists the services of every server, which are adapters of the algorithms in `rse_pf.pnp` and
+`rse_pf.slam`; `custom` holds those of users.  Transport, scheduling and isolation are in `rse_pf.wire` and
+`rse_pf.server`.
 """

@@ -15,7 +15,8 @@ def builtin_services(settings: PlatformSettings) -> Registry:
     registry = Registry()
     pnp.register(registry, settings.pnp)
     echo.register(registry)
-    # Optional packages are imported by the first command: a server without them answers missing-extra.
+    # These services import optional packages at their first command; without them they answer
+    # `missing-extra`.
     for service in (icp, place, localise, merge, optimise, wifi):
         service.register(registry)
     return registry

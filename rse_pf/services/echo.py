@@ -1,4 +1,4 @@
-"""The echo service: measures the cost of the platform, without any computation."""
+"""The service ``echo``: return the request, to measure the cost of the platform without a computation."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ __all__ = ["EchoReply", "EchoRequest", "register"]
 
 
 class EchoRequest(msgspec.Struct, frozen=True, kw_only=True):
-    """Anything that travels in a message."""
+    """Any value that a message can carry."""
 
     value: Any = None
 
 
 class EchoReply(msgspec.Struct, frozen=True, kw_only=True):
-    """The same value."""
+    """The value of the request."""
 
     value: Any = None
 
 
 def register(registry: Registry) -> None:
-    """Add ``echo`` to *registry*."""
+    """Add the service ``echo`` to *registry*."""
 
     @registry.service("echo", cheap=True)
     def echo(request: EchoRequest) -> EchoReply:
-        """Return what was sent."""
+        """Return the value of the request."""
         return EchoReply(value=request.value)

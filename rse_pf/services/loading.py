@@ -1,4 +1,4 @@
-"""Load the registry of services from its name, ``module:function``."""
+"""Load the services of a server by the name of the function that makes their registry."""
 
 from __future__ import annotations
 
@@ -13,7 +13,15 @@ __all__ = ["load_services"]
 
 
 def load_services(name: str, settings: PlatformSettings) -> Registry:
-    """Return the registry that ``module:function`` returns for *settings*; raises ConfigurationError."""
+    """Return the registry of services that the function *name* makes of *settings*.
+
+    Args:
+        name: ``module:function``, such as ``rse_pf.services.builtin:builtin_services``.
+        settings: Settings of the platform.
+
+    Raises:
+        ConfigurationError: There is no such module or function.
+    """
     module, _, function = name.partition(":")
     try:
         make: Callable[[PlatformSettings], Registry] = getattr(importlib.import_module(module), function)

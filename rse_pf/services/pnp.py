@@ -1,6 +1,6 @@
-"""The perspective-n-point service: from the matches of one frame to one camera pose with its evidence.
+"""The service ``pnp``: compute the camera pose of one image from 3-D to 2-D correspondences.
 
-It is stateless in the sense of the paper (Sect. 3.3): the request holds all that is needed.
+The service is stateless in the sense of the paper (Sect. 3.3): a request holds all data of its computation.
 """
 
 from __future__ import annotations
@@ -12,34 +12,38 @@ import numpy.typing as npt
 from rse_pf.config import PnpSettings
 from rse_pf.errors import BadRequest, LimitExceeded, TooFewCorrespondences
 from rse_pf.geometry import Camera
-from rse_pf.native import native_solver
 from rse_pf.pnp import DepthNoise, PnpOptions, PnpSolution, refine_with_depth, solve_pnp
 from rse_pf.pnp.engines import native_options
-from rse_pf.pnp.options import WeakLimits
+from rse_pf.pnp.native_solver import native_solver
+from rse_pf.pnp.options import MIN_CORRESPONDENCES, WeakLimits
 from rse_pf.service import Registry
 from rse_pf.wire.arrays import Array, reshaped
 
 __all__ = ["PnpReply", "PnpRequest", "make_request", "register"]
 
 _UPPER = np.triu_indices(6)
+"""Row and column numbers of the upper triangle of a 6x6 covariance, by rows."""
 _FLAT_UPPER = 6 * _UPPER[0] + _UPPER[1]
-_POINT_DECIMALS = 4
-_PIXEL_DECIMALS = 2
-_DEPTH_DECIMALS = 3
+"""Indices of the upper triangle in a flattened 6x6 covariance."""
+_POINT_DECIMALS = 4  # decimals of a coordinate in metres: 0.1 mm, below the noise of a depth camera
+_PIXEL_DECIMALS = 2  # decimals of a pixel coordinate: 0.01 px, below the noise of features
+_DEPTH_DECIMALS = 3  # decimals of a depth in metres: 1 mm, as depth cameras write
 _WEAK_LIMITS = WeakLimits()
-# Matches of one command; more cost time, and do not make the pose better.
-MAX_CORRESPONDENCES = 5000
+MAX_CORRESPONDENCES = 5000  # most correspondences of a command: more take time and do not improve the pose
 
 
 class PnpRequest(msgspec.Struct, frozen=True, kw_only=True):
-    """Correspondences of one image.
+    """Correspondences of one image, the payload of a ``pnp`` command.
 
-    ``points_world`` holds ``3n`` metres, world frame, row after row; ``pixels`` holds ``2n``
-    undistorted pixels in the same order.
-
-    ``depths_m``, which may be left out, holds the ``n`` depths that a depth camera measured at the pixels,
-    0 where there is none; the pose is then refined by the noise of both images.  The world frame of such a
-    request is the camera that measured the points.  ``depth_noise`` is that of both depth cameras.
+    Attributes:
+        camera: Intrinsics of the image.
+        points_world: ``3n`` coordinates of ``n`` points, metres, world frame, row by row.
+        pixels: ``2n`` undistorted pixel coordinates in the same order.
+        options: Options of RANSAC; None for the server's defaults.
+        depths_m: Optional ``n`` depths that a depth camera measured at the pixels, metres; 0 where there is
+            none. The pose is then refined with them, and the world frame is that of the camera that measured
+            the points.
+        depth_noise: Noise of both depth cameras; used with *depths_m* only.
     """
 
     camera: Camera
@@ -51,11 +55,18 @@ class PnpRequest(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class PnpReply(msgspec.Struct, frozen=True, kw_only=True):
-    """A pose and what speaks for it.
+    """An accepted camera pose, the payload of the result of a ``pnp`` command.
 
-    ``T_camera_world`` holds 16 numbers, row-major; ``inliers`` sorted row numbers;
-    ``covariance`` the 21 numbers of the upper triangle, row after row, of the ``(6, 6)``
-    covariance of the twist (metres, then radians) on the left of the pose.
+    Attributes:
+        T_camera_world: 16 numbers, a row-major 4x4 matrix that maps world points (metres) to the camera
+            frame.
+        inliers: Ascending row numbers of the inliers.
+        rmse_px: Root mean square reprojection error of the inliers.
+        covariance: 21 numbers, the upper triangle by rows of the ``(6, 6)`` covariance of the twist (metres,
+            radians) that multiplies the pose on the left.
+        verdict: ``ok`` or ``weak``.
+        reason: Why the pose is weak; empty for a pose that is ok.
+        engine: Name of the engine that estimated the pose.
     """
 
     T_camera_world: Array
@@ -68,7 +79,7 @@ class PnpReply(msgspec.Struct, frozen=True, kw_only=True):
 
     @classmethod
     def of(cls, solution: PnpSolution) -> PnpReply:
-        """Return *solution* as a reply."""
+        """Return the reply that carries *solution*."""
         return cls(
             T_camera_world=solution.T_camera_world.ravel(),
             inliers=solution.inliers.astype(np.uint32),
@@ -80,7 +91,7 @@ class PnpReply(msgspec.Struct, frozen=True, kw_only=True):
         )
 
     def solution(self) -> PnpSolution:
-        """Return the reply as the solver's type."""
+        """Return the pose of the reply as a `PnpSolution`, with a full covariance matrix."""
         covariance = np.zeros((6, 6))
         covariance[_UPPER] = self.covariance
         covariance.T[_UPPER] = self.covariance
@@ -105,35 +116,44 @@ def make_request(
     depth_noise: DepthNoise | None = None,
     binary: bool = False,
 ) -> PnpRequest:
-    """Return the request of ``(n, 3)`` points and ``(n, 2)`` pixels, rounded for the wire.
+    """Return a request whose numbers are rounded, so that its JSON text is short.
 
-    Rounds to 0.1 mm and 0.01 px, which is a third of the bytes and moves a pose by about
-    0.02 mm, and the ``(n,)`` *depths_m*, if there are any, to 1 mm; *binary* makes the arrays float32.
+    Points are rounded to 0.1 mm and pixels to 0.01 px, which leaves a third of the bytes and moves a pose by
+    about 0.02 mm.
+
+    Args:
+        points_world: ``(n, 3)``, metres, world frame.
+        pixels: ``(n, 2)``, undistorted pixels.
+        camera: Intrinsics of the image.
+        options: Options of RANSAC; None for the server's defaults.
+        depths_m: ``(n,)``, depths measured at the pixels, rounded to 1 mm; None for a request without depths.
+        depth_noise: Noise of the depth cameras; None for that of a Kinect.
+        binary: Whether arrays are float32, for the codec ``bin``, instead of float64.
     """
-    kind = np.float32 if binary else np.float64
+    dtype = np.float32 if binary else np.float64
     return PnpRequest(
         camera=camera,
-        points_world=np.round(np.asarray(points_world, dtype=np.float64), _POINT_DECIMALS).astype(kind),
-        pixels=np.round(np.asarray(pixels, dtype=np.float64), _PIXEL_DECIMALS).astype(kind),
+        points_world=np.round(np.asarray(points_world, dtype=np.float64), _POINT_DECIMALS).astype(dtype),
+        pixels=np.round(np.asarray(pixels, dtype=np.float64), _PIXEL_DECIMALS).astype(dtype),
         options=options,
         depths_m=(
             msgspec.UNSET
             if depths_m is None
-            else np.round(np.asarray(depths_m, dtype=np.float64), _DEPTH_DECIMALS).astype(kind)
+            else np.round(np.asarray(depths_m, dtype=np.float64), _DEPTH_DECIMALS).astype(dtype)
         ),
         depth_noise=msgspec.UNSET if depth_noise is None else depth_noise,
     )
 
 
 def register(registry: Registry, settings: PnpSettings) -> None:
-    """Add ``pnp`` to *registry*, with the limits and the engine of *settings*.
+    """Add the service ``pnp`` to *registry*, with the iteration limit and the default engine of *settings*.
 
     Raises:
-        MissingExtra: The native core is not installed.
+        MissingExtra: The native core, which every engine needs, is not installed.
     """
-    solver = native_solver()  # which every engine needs: a missing core is reported before the first command
+    solver = native_solver()
     defaults = PnpOptions(max_iterations=settings.max_iterations)
-    own_iterations = PnpOptions().max_iterations
+    unset_iterations = PnpOptions().max_iterations
 
     @registry.service("pnp", cheap=True)
     def pnp(request: PnpRequest) -> PnpReply:
@@ -141,8 +161,9 @@ def register(registry: Registry, settings: PnpSettings) -> None:
         points_world, pixels = request.points_world, request.pixels
         _check_sizes(points_world, pixels)
         options = request.options or defaults
-        if options is not defaults and options.max_iterations == own_iterations:
-            # The robot left it out, so the limit of the server holds.
+        if options is not defaults and options.max_iterations == unset_iterations:
+            # A robot that leaves max_iterations out sends the default value: the limit of the server replaces
+            # it.
             options = msgspec.structs.replace(options, max_iterations=defaults.max_iterations)
         if options.max_iterations > settings.max_iterations:
             raise LimitExceeded(
@@ -152,13 +173,17 @@ def register(registry: Registry, settings: PnpSettings) -> None:
         engine = options.engine or settings.engine
         depths_m = None if request.depths_m is msgspec.UNSET else request.depths_m
         if engine == "native" and depths_m is None:
-            # As `solve_pnp`, in the arrays of the reply: most commands are answered here.
-            found = solver.solve(points_world, pixels, request.camera, native_options(options, _WEAK_LIMITS))
+            # The fast path of most commands: the same pose as `solve_pnp`, without conversions of arrays.
+            pose = solver.solve(points_world, pixels, request.camera, native_options(options, _WEAK_LIMITS))
             return PnpReply(
-                T_camera_world=found.T_camera_world, inliers=found.inliers, rmse_px=found.rmse_px,
-                covariance=found.covariance, verdict="weak" if found.reason else "ok", reason=found.reason,
+                T_camera_world=pose.T_camera_world,
+                inliers=pose.inliers,
+                rmse_px=pose.rmse_px,
+                covariance=pose.covariance,
+                verdict="weak" if pose.reason else "ok",
+                reason=pose.reason,
                 engine=engine,
-            )  # fmt: skip
+            )
         points_world, pixels = points_world.reshape(-1, 3), pixels.reshape(-1, 2)
         solution = solve_pnp(points_world, pixels, request.camera, options, default_engine=engine)
         if depths_m is not None:
@@ -168,9 +193,13 @@ def register(registry: Registry, settings: PnpSettings) -> None:
 
 
 def _check_sizes(points_world: Array, pixels: Array) -> None:
-    """Raise an error unless the arrays hold 4 to `MAX_CORRESPONDENCES` points and pixels."""
+    """Raise an error unless the arrays hold equally many points and pixels, at most `MAX_CORRESPONDENCES`."""
     n = pixels.size // 2
-    if 4 <= n <= MAX_CORRESPONDENCES and points_world.size == 3 * n and pixels.size == 2 * n:
+    if (
+        MIN_CORRESPONDENCES <= n <= MAX_CORRESPONDENCES
+        and points_world.size == 3 * n
+        and pixels.size == 2 * n
+    ):
         return
     points_world, pixels = reshaped("points_world", points_world, 3), reshaped("pixels", pixels, 2)
     n = len(points_world)
@@ -178,9 +207,9 @@ def _check_sizes(points_world: Array, pixels: Array) -> None:
         raise LimitExceeded(
             f"{n} correspondences are above {MAX_CORRESPONDENCES}", hint="send the best matches only"
         )
-    if n < 4:
+    if n < MIN_CORRESPONDENCES:
         raise TooFewCorrespondences(
-            f"got {n} correspondences, a pose needs at least 4",
+            f"got {n} correspondences, a pose needs at least {MIN_CORRESPONDENCES}",
             hint="loosen the matcher, or skip this frame",
         )
     raise BadRequest(

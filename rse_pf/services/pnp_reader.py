@@ -1,7 +1,8 @@
-"""Read `pnp` commands to requests at once, without a Python object for each number.
+"""A fast decoder of ``pnp`` commands, which makes no Python object of each number.
 
-Only what the SDK sends is read here: known fields, and arrays of short decimal numbers or of raw bytes.  Any
-other message is left to the codec, which reads the messages of all services and words the errors.
+The decoder accepts the messages that our SDKs send: known fields, and arrays of short decimal numbers or of
+raw bytes. For any other message it returns None; the codec then decodes the message, as that of any service,
+or reports the error.
 """
 
 from __future__ import annotations
@@ -17,8 +18,8 @@ from msgspec.msgpack import Ext
 
 from rse_pf.errors import RsePfError
 from rse_pf.geometry import Camera
-from rse_pf.native import native_solver
 from rse_pf.pnp import DepthNoise, PnpOptions
+from rse_pf.pnp.native_solver import native_solver
 from rse_pf.service import Registry
 from rse_pf.services.pnp import PnpRequest
 from rse_pf.wire import Command
@@ -26,15 +27,16 @@ from rse_pf.wire.arrays import Array, decode_hook, extension_hook
 
 __all__ = ["pnp_reader"]
 
-Part = TypeVar("Part")
+Value = TypeVar("Value")
 
-# Only here is the name of the service sought: clients of ours write it before the payload.
 _HEAD_BYTES = 128
+"""Bytes at the start of a message in which the name ``pnp`` must stand: our SDKs write it before the
+payload."""
 _UNREADABLE = (msgspec.DecodeError, RecursionError, ValueError, TypeError, IndexError, RsePfError)
 
 
 class _Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The fields of `Camera`, whose checks are made once for each camera (`_checked`)."""
+    """The fields of `Camera` without its checks, which `_validated` makes once for each camera."""
 
     fx: float
     fy: float
@@ -59,6 +61,8 @@ class _Request(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
 
 
 class _TextRequest(_Request, kw_only=True, forbid_unknown_fields=True):
+    """A JSON request without its lists of numbers; a string holds one character, the number of its list."""
+
     points_world: str
     pixels: str
     depths_m: str | UnsetType | None = UNSET
@@ -81,22 +85,30 @@ class _BinaryCommand(Command, frozen=True, kw_only=True, tag="command", forbid_u
 
 
 def pnp_reader(registry: Registry, codec: str) -> Callable[[bytes | bytearray], Command | None] | None:
-    """Return what reads the `pnp` commands of the encoding *codec*, None if *registry* has no such service.
+    """Return a function that decodes ``pnp`` commands of the encoding *codec*.
 
-    It returns a command with a `PnpRequest` as its payload, None for what it does not read.  What another
-    process computes, or another service of this name, gets its payload as the robot sent it.
+    The function returns a command with a `PnpRequest` as its payload, or None for a message that the codec
+    must decode.
+
+    Args:
+        registry: Services of the server.
+        codec: ``bin``, or a codec whose messages are JSON.
+
+    Returns:
+        The function.  None if *registry* has no service ``pnp``, or one of a user or of another process,
+        which receives its payload as the robot sent it.
 
     Raises:
         MissingExtra: The native core is not installed.
     """
-    is_own = any(
-        each.name == "pnp"
-        and each.request_type is PnpRequest
-        and each.kind == "stateless"
-        and not each.limited
-        for each in registry
+    is_builtin = any(
+        service.name == "pnp"
+        and service.request_type is PnpRequest
+        and service.kind == "stateless"
+        and not service.limited
+        for service in registry
     )
-    if not is_own:
+    if not is_builtin:
         return None
     decode_text = msgspec.json.Decoder(_TextCommand).decode
     decode_binary = msgspec.msgpack.Decoder(_BinaryCommand).decode
@@ -108,13 +120,13 @@ def pnp_reader(registry: Registry, codec: str) -> Callable[[bytes | bytearray], 
         text, lists = cut
         try:
             command = decode_text(text)
-            parts = command.payload
-            points_world, pixels = lists[ord(parts.points_world)], lists[ord(parts.pixels)]
-            depths_m = parts.depths_m
-            found = lists[ord(depths_m)] if isinstance(depths_m, str) else depths_m
-            if len(lists) != 2 + isinstance(depths_m, str):
-                return None  # one of them is in another field
-            return _command(command, points_world, pixels, found)
+            request = command.payload
+            points_world, pixels = lists[ord(request.points_world)], lists[ord(request.pixels)]
+            depths = request.depths_m
+            depths_m = lists[ord(depths)] if isinstance(depths, str) else depths
+            if len(lists) != 2 + isinstance(depths, str):
+                return None  # A list of numbers stands in another field.
+            return _make_command(command, points_world, pixels, depths_m)
         except _UNREADABLE:
             return None
 
@@ -123,46 +135,53 @@ def pnp_reader(registry: Registry, codec: str) -> Callable[[bytes | bytearray], 
             return None
         try:
             command = decode_binary(data)
-            parts = command.payload
-            depths_m = parts.depths_m
+            request = command.payload
+            depths_m = request.depths_m
             if depths_m:
-                depths_m = decode_hook(np.ndarray, _numbers(depths_m))  # the solver looks at the others
-            return _command(command, _numbers(parts.points_world), _numbers(parts.pixels), depths_m)
+                # The hook refuses numbers that are not finite; for points and pixels the solver does.
+                depths_m = decode_hook(np.ndarray, _decode_array(depths_m))
+            points_world, pixels = _decode_array(request.points_world), _decode_array(request.pixels)
+            return _make_command(command, points_world, pixels, depths_m)
         except _UNREADABLE:
             return None
 
     return read_binary if codec == "bin" else read_text
 
 
-def _command(
+def _make_command(
     command: _TextCommand | _BinaryCommand,
     points_world: Array,
     pixels: Array,
     depths_m: Array | UnsetType | None,
 ) -> Command:
-    """Return *command* with the arrays of its request."""
-    parts = command.payload
-    options, noise = parts.options, parts.depth_noise
+    """Return *command* with a `PnpRequest` of the arrays as its payload."""
+    fields = command.payload
+    options, noise = fields.options, fields.depth_noise
     request = PnpRequest(
-        camera=_checked(parts.camera, Camera),
+        camera=_validated(fields.camera, Camera),
         points_world=points_world,
         pixels=pixels,
-        options=None if options is None else _checked(options, PnpOptions),
+        options=None if options is None else _validated(options, PnpOptions),
         depths_m=depths_m,
-        depth_noise=_checked(noise, DepthNoise) if isinstance(noise, _Noise) else noise,
+        depth_noise=_validated(noise, DepthNoise) if isinstance(noise, _Noise) else noise,
     )
     return Command(
-        id=command.id, service="pnp", payload=request, stream=command.stream, seq=command.seq,
-        keep=command.keep, deadline_ms=command.deadline_ms, trace=command.trace,
-    )  # fmt: skip
+        id=command.id,
+        service="pnp",
+        payload=request,
+        stream=command.stream,
+        seq=command.seq,
+        keep=command.keep,
+        deadline_ms=command.deadline_ms,
+        trace=command.trace,
+    )
 
 
-def _numbers(extension: Ext) -> Array:
-    """Return the raw numbers of *extension*."""
+def _decode_array(extension: Ext) -> Array:
     return extension_hook(extension.code, memoryview(extension.data))
 
 
 @lru_cache(maxsize=256)
-def _checked(parts: Any, kind: Callable[..., Part]) -> Part:
-    """Return *parts* as *kind*; a robot sends the same camera with every frame."""
-    return kind(**msgspec.structs.asdict(parts))
+def _validated(fields: Any, kind: Callable[..., Value]) -> Value:
+    """Return a *kind* with the values of *fields*; cached, since a robot's frames have the same camera."""
+    return kind(**msgspec.structs.asdict(fields))

@@ -23,6 +23,7 @@ from rse_pf.errors import (
     TooFewCorrespondences,
     UsageError,
 )
+from rse_pf.pnp.native_solver import native_solver
 from rse_pf.pnp.problems import make_degenerate, make_problem
 from rse_pf.services.builtin import builtin_services
 from rse_pf.services.echo import EchoReply
@@ -153,7 +154,7 @@ async def test_a_frame_without_a_pose_is_no_reason_to_solve_it_again():
 async def test_a_robot_without_the_native_core_is_told_what_to_install(monkeypatch):
     async with FakePlatform() as platform:
         monkeypatch.setattr(native, "find_library", lambda: None)
-        native.native_solver.cache_clear()
+        native_solver.cache_clear()
         with pytest.raises(MissingExtra, match="the native core") as told:
             await connect(platform, offload=client_sdk.CloudFirst()).__aenter__()
         assert "rse-pf[vision]" in told.value.hint

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from rse_pf.native import open_solver
+from rse_pf.pnp.native_solver import open_solver
 
 pytestmark = pytest.mark.slow
 

@@ -8,7 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from rse_pf.native import native_solver
+from rse_pf.pnp.native_solver import native_solver
 
 
 def test_the_core_has_the_version_of_the_platform(repository: Path) -> None:

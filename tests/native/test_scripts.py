@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from rse_pf.native import native_solver, open_solver
+from rse_pf.pnp.native_solver import native_solver, open_solver
 
 COMPILER = """#!/bin/sh
 # Stands in for a compiler: writes what -o names.

@@ -42,7 +42,7 @@ def log10_false_alarms(n: int, inliers: int, largest2: float, camera: Any) -> fl
     return math.log10(samples) + (inliers - 3) * math.log10(share)
 
 
-def independent(pixels: Array, camera: Any) -> int:
+def count_independent(pixels: Array, camera: Any) -> int:
     """Count pixels in the same or in adjacent cells (40 across) once, unless 24 cells are occupied."""
     cells = set(map(tuple, (pixels * (40 / camera.width)).astype(int).tolist()))
     if len(cells) >= 24:
@@ -54,7 +54,7 @@ def independent(pixels: Array, camera: Any) -> int:
     return len(alone)
 
 
-def thinness(rows: Array) -> float:
+def width_to_length(rows: Array) -> float:
     """Return width over length, both without the farthest fifth of the rows."""
     centred = rows - rows.mean(axis=0)
     along = (centred @ np.linalg.eigh(centred.T @ centred)[1][:, -1]) ** 2
@@ -103,12 +103,12 @@ def second_squares(T: Array, points: Array, pixels: Array, camera: Any) -> float
 
 
 def evidence(T: Array, points: Array, pixels: Array, camera: Any, inlier_px: float) -> Any:
-    """Return the figures of a pose that agrees with four or more of the rows."""
+    """Return the evidence of the pose *T*, which has at least four inliers."""
     p, projected, residual, error2 = seen(T, points, pixels, camera)
     rows = np.flatnonzero(error2 <= inlier_px**2)
     n, k = len(points), len(rows)
     p, projected, residual, error2 = p[rows], projected[rows], residual[rows], error2[rows]
-    places = independent(projected, camera)
+    independent = count_independent(projected, camera)
     inverse_depth = 1 / p[:, 2]
     other = None
     if inverse_depth.std() / inverse_depth.mean() < 0.08:
@@ -117,11 +117,11 @@ def evidence(T: Array, points: Array, pixels: Array, camera: Any, inlier_px: flo
     return SimpleNamespace(
         inliers=rows,
         rmse_px=math.sqrt(error2.mean()),
-        independent=places,
-        log10_false_alarms=log10_false_alarms(n - k + places, places, error2.max(), camera),
+        independent_inliers=independent,
+        log10_false_alarms=log10_false_alarms(n - k + independent, independent, error2.max(), camera),
         is_chance=log10_false_alarms(n, k, error2.max(), camera) > -5.0,
-        inlier_thinness=thinness(projected),
+        inlier_width_to_length=width_to_length(projected),
         radius_px=math.sqrt(projected.var(axis=0).sum()),
         covariance=max(error2.sum() / max(1, 2 * k - 6), 0.01) * np.linalg.inv(information),
-        other_rmse_px=0.0 if other is None else math.sqrt(other / k),
+        second_pose_rmse_px=0.0 if other is None else math.sqrt(other / k),
     )

@@ -1,4 +1,4 @@
-"""The native solver beside PoseLib as version 0.1.0 used it: problems, outcomes, and what is compared."""
+"""Compare the native solver with PoseLib, the engine of version 0.1.0, on the same random problems."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ import msgspec
 import numpy as np
 import pytest
 
-from rse_pf import native
 from rse_pf.errors import RsePfError
 from rse_pf.experiments.results.summary import percentiles
 from rse_pf.geometry import Array, Camera, exp_se3, inverse, pose_difference, transform
 from rse_pf.pnp import PnpOptions, WeakLimits, engines, solve_pnp
+from rse_pf.pnp.native_solver import Evidence, native_solver
 from rse_pf.pnp.problems import DEGENERATE, KINECT, make_degenerate, make_problem
 
 EVERY = pytest.mark.parametrize("engine", ["native", "opencv"])
@@ -28,7 +28,7 @@ OLD = "poselib of 0.1.0"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Case:
-    """One problem; ``T_camera_world`` is None where the truth is not known."""
+    """A PnP problem; ``T_camera_world`` is None where the correspondences determine no pose."""
 
     kind: str
     points_world: Array
@@ -38,7 +38,7 @@ class Case:
 
 
 def case(number: int) -> Case:
-    """Return one of endlessly many problems of all kinds; equal numbers give equal problems."""
+    """Return problem *number*: a room, a plane, a line or few points; equal numbers give equal problems."""
     kind, seed = KINDS[number % len(KINDS)], number // len(KINDS)
     rng = np.random.default_rng(number)
     if kind == "room":
@@ -71,19 +71,19 @@ def case(number: int) -> Case:
 
 
 def degenerate(number: int) -> Case:
-    """Return correspondences that fix no pose."""
+    """Return degenerate problem *number*, whose correspondences determine no pose."""
     kind = DEGENERATE[number % len(DEGENERATE)]
     problem = make_degenerate(kind, seed=number // len(DEGENERATE), n=(20, 100)[number % 2])
     return Case(kind, problem.points_world, problem.pixels, None)
 
 
 def old_engine() -> engines.Engine:
-    """Return PoseLib with the settings of version 0.1.0: three times the trials."""
-    import poselib  # the reference of this comparison
+    """Return an engine that estimates poses with PoseLib, as version 0.1.0 did."""
+    import poselib
 
     def solve(
         points_world: Array, pixels: Array, camera: Camera, options: PnpOptions, weak: WeakLimits
-    ) -> native.Evidence:
+    ) -> Evidence:
         model = {
             "model": "PINHOLE", "width": camera.width, "height": camera.height,
             "params": [camera.fx, camera.fy, camera.cx, camera.cy],
@@ -96,14 +96,14 @@ def old_engine() -> engines.Engine:
         pose = np.eye(4)
         pose[:3] = poselib.estimate_absolute_pose(pixels, points_world, model, ransac, {})[0].Rt
         limits = engines.native_options(options, weak)
-        return native.native_solver().judge(points_world, pixels, camera, limits, pose)
+        return native_solver().evaluate(points_world, pixels, camera, limits, pose)
 
     return solve
 
 
 @contextlib.contextmanager
 def references() -> Iterator[None]:
-    """Let `solve_pnp` know PoseLib as 0.1.0 used it."""
+    """Register the engine of PoseLib for `solve_pnp`, and remove it at exit."""
     engines.ENGINES[OLD] = old_engine
     try:
         yield
@@ -111,15 +111,15 @@ def references() -> Iterator[None]:
         del engines.ENGINES[OLD]
 
 
-def accepted(found: native.Evidence) -> native.Evidence:
-    """Return an accepted pose; raise the error of a refused one."""
-    if found.refusal is not None:
-        raise found.refusal
-    return found
+def accepted(evidence: Evidence) -> Evidence:
+    """Return *evidence* of an accepted pose; raise the error of a refused pose."""
+    if evidence.refusal is not None:
+        raise evidence.refusal
+    return evidence
 
 
 def outcome(work: Callable[[], Any]) -> tuple[str, str, Any]:
-    """Return the verdict or the error's name, its text, and the solution."""
+    """Return the verdict or the name of the error, the text of the error, and the solution or None."""
     try:
         solution = work()
     except RsePfError as error:
@@ -127,26 +127,26 @@ def outcome(work: Callable[[], Any]) -> tuple[str, str, Any]:
     return (f"weak: {solution.reason}" if solution.reason else "ok"), "", solution
 
 
-def same_bytes(one: native.Evidence | None, other: native.Evidence | None) -> bool:
-    """Say whether two results of the library are equal to the last bit."""
-    if one is None or other is None:
-        return one is other
+def same_bytes(first: Evidence | None, second: Evidence | None) -> bool:
+    """Return whether two results of the native solver are equal to the last bit."""
+    if first is None or second is None:
+        return first is second
     return all(
-        np.asarray(getattr(one, name)).tobytes() == np.asarray(getattr(other, name)).tobytes()
-        for name in native.Evidence.__struct_fields__
+        np.asarray(getattr(first, name)).tobytes() == np.asarray(getattr(second, name)).tobytes()
+        for name in Evidence.__struct_fields__
         if name not in ("reason", "refusal")
     )
 
 
-def judgements(each: Case) -> tuple[tuple[str, str, Any], ...]:
-    """Return the outcomes of PoseLib, of the library, and of the library without AVX2."""
-    solver, limits = native.native_solver(), engines.native_options(OPTIONS, LIMITS)
+def solve_with_all(problem: Case) -> tuple[tuple[str, str, Any], ...]:
+    """Return the outcomes of PoseLib, of the native solver, and of the native solver without AVX2."""
+    solver, limits = native_solver(), engines.native_options(OPTIONS, LIMITS)
     narrow = msgspec.structs.replace(limits, lanes="portable")
-    points, pixels, camera = each.points_world, each.pixels, each.camera
+    points, pixels, camera = problem.points_world, problem.pixels, problem.camera
     return (
         outcome(lambda: solve_pnp(points, pixels, camera, OPTIONS, default_engine=OLD)),
-        outcome(lambda: accepted(solver.judge(points, pixels, camera, limits))),
-        outcome(lambda: accepted(solver.judge(points, pixels, camera, narrow))),
+        outcome(lambda: accepted(solver.evaluate(points, pixels, camera, limits))),
+        outcome(lambda: accepted(solver.evaluate(points, pixels, camera, narrow))),
     )
 
 
@@ -160,7 +160,7 @@ def compare(cases: Iterator[Case]) -> dict[str, Any]:
     errors_mm: dict[str, list[float]] = {"poselib": [], "native": []}
     lanes_differ = 0
     for problem in cases:
-        old, ours, without_avx2 = judgements(problem)
+        old, ours, without_avx2 = solve_with_all(problem)
         lanes_differ += ours[:2] != without_avx2[:2] or not same_bytes(ours[2], without_avx2[2])
         row = tally.setdefault(problem.kind, Counter())
         row["n"] += 1
@@ -187,12 +187,12 @@ def compare(cases: Iterator[Case]) -> dict[str, Any]:
 
 
 def mean_normalised_error(problems: int, outlier_ratio: float) -> float:
-    """Return the mean of the squared errors in units of the covariance; 6 if it is honest."""
-    solver, limits = native.native_solver(), engines.native_options(OPTIONS, LIMITS)
+    """Return the mean normalised estimation error squared (NEES); 6 for a correct covariance."""
+    solver, limits = native_solver(), engines.native_options(OPTIONS, LIMITS)
     errors2 = []
     for seed in range(problems):
         p = make_problem(seed=seed, n=100, outlier_ratio=outlier_ratio)
-        solution = solver.judge(p.points_world, p.pixels, KINECT, limits)
+        solution = solver.evaluate(p.points_world, p.pixels, KINECT, limits)
         D = p.T_camera_world @ inverse(solution.T_camera_world)
         turn = [D[2, 1] - D[1, 2], D[0, 2] - D[2, 0], D[1, 0] - D[0, 1]]
         xi = np.array([*D[:3, 3], *(0.5 * np.array(turn))])

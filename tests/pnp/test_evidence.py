@@ -5,27 +5,27 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rse_pf import native
 from rse_pf.geometry import Array
 from rse_pf.pnp import PnpOptions, WeakLimits
 from rse_pf.pnp.engines import native_options
+from rse_pf.pnp.native_solver import Evidence, native_solver
 from rse_pf.pnp.problems import KINECT, make_problem
 
 OPTIONS = native_options(PnpOptions(), WeakLimits())
 
 
-def evidence_at(pixels: Array) -> native.Evidence:
+def evidence_at(pixels: Array) -> Evidence:
     """Return the evidence of a right pose for points that project to *pixels*."""
     pixels = np.asarray(pixels, dtype=np.float64)
     points = KINECT.back_project(pixels, np.linspace(2.0, 4.0, len(pixels)))
-    return native.native_solver().judge(points, pixels, KINECT, OPTIONS, np.eye(4))
+    return native_solver().evaluate(points, pixels, KINECT, OPTIONS, np.eye(4))
 
 
 def test_points_behind_the_camera_agree_with_no_pose() -> None:
     problem = make_problem(seed=1, n=100, outlier_ratio=0.0)
     turned = np.diag([-1.0, 1.0, -1.0, 1.0]) @ problem.T_camera_world
 
-    found = native.native_solver().judge(problem.points_world, problem.pixels, KINECT, OPTIONS, turned)
+    found = native_solver().evaluate(problem.points_world, problem.pixels, KINECT, OPTIONS, turned)
 
     assert not len(found.inliers)
 
@@ -36,19 +36,19 @@ def test_copies_of_one_correspondence_count_once() -> None:
 
     copies = four[rng.integers(0, 4, 200)] + rng.normal(size=(200, 2))
 
-    assert evidence_at(copies).independent == 4
+    assert evidence_at(copies).independent_inliers == 4
 
 
 def test_scattered_correspondences_all_count() -> None:
     pixels = np.random.default_rng(0).uniform(0, [640, 480], (200, 2))
 
-    assert evidence_at(pixels).independent == 200
+    assert evidence_at(pixels).independent_inliers == 200
 
 
 def test_cells_on_a_corner_are_one_place() -> None:
     corner = np.array([[15.9, 15.9], [16.1, 15.9], [15.9, 16.1], [16.1, 16.1]])
 
-    assert evidence_at(corner).independent == 1
+    assert evidence_at(corner).independent_inliers == 1
 
 
 @pytest.mark.parametrize("strays", [0, 2, 4])
@@ -57,11 +57,11 @@ def test_a_few_outliers_do_not_make_a_line_wide(strays: int) -> None:
     pixels = np.column_stack([np.linspace(50, 600, 60), np.linspace(100, 400, 60)]) + rng.normal(size=(60, 2))
     pixels[:strays] = rng.uniform(0, [640, 480], (strays, 2))
 
-    assert evidence_at(pixels).inlier_thinness < 0.05
+    assert evidence_at(pixels).inlier_width_to_length < 0.05
 
 
 def test_a_filled_image_is_wide_and_one_place_has_no_width() -> None:
     pixels = np.random.default_rng(0).uniform(0, [640, 480], (200, 2))
 
-    assert evidence_at(pixels).inlier_thinness > 0.15
-    assert evidence_at(np.ones((20, 2))).inlier_thinness == pytest.approx(0.0, abs=1e-6)
+    assert evidence_at(pixels).inlier_width_to_length > 0.15
+    assert evidence_at(np.ones((20, 2))).inlier_width_to_length == pytest.approx(0.0, abs=1e-6)

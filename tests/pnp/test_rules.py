@@ -5,24 +5,24 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rse_pf import native
 from rse_pf.errors import BadRequest
 from rse_pf.geometry import Array
 from rse_pf.pnp import PnpOptions, WeakLimits, available_engines
 from rse_pf.pnp.engines import engine_for, native_options
+from rse_pf.pnp.native_solver import Evidence, native_solver
 from rse_pf.pnp.problems import DEGENERATE, PnpProblem, make_degenerate, make_problem
-from rse_pf.pnp.rules import Rule, rules_of
+from rse_pf.pnp.rules import Rule, evaluate_rules
 
 OPTIONS, LIMITS = PnpOptions(), WeakLimits()
 
 
-def rules(problem: PnpProblem, found: native.Evidence | None) -> tuple[Rule, ...]:
-    return rules_of(len(problem.pixels), found, inlier_px=OPTIONS.inlier_px, weak=LIMITS)
+def rules(problem: PnpProblem, found: Evidence | None) -> tuple[Rule, ...]:
+    return evaluate_rules(len(problem.pixels), found, inlier_px=OPTIONS.inlier_px, weak=LIMITS)
 
 
-def judged(problem: PnpProblem, T_camera_world: Array) -> native.Evidence:
+def evidence_of(problem: PnpProblem, T_camera_world: Array) -> Evidence:
     limits = native_options(OPTIONS, LIMITS)
-    return native.native_solver().judge(
+    return native_solver().evaluate(
         problem.points_world, problem.pixels, problem.camera, limits, T_camera_world
     )
 
@@ -49,7 +49,7 @@ def test_the_rules_that_a_pose_breaks_are_the_reason_of_its_verdict(engine: str)
             found = engine_for(engine)(problem.points_world, problem.pixels, problem.camera, OPTIONS, LIMITS)
         except BadRequest:
             continue
-        broken = [rule for rule in rules(problem, found) if not rule.is_kept]
+        broken = [rule for rule in rules(problem, found) if not rule.is_satisfied]
         if found.refusal is not None:
             refused += 1
             # Whether the world is mirrored is no figure of the pose.
@@ -69,9 +69,9 @@ def test_the_rules_that_a_pose_breaks_are_the_reason_of_its_verdict(engine: str)
 def test_without_a_pose_the_rules_say_why() -> None:
     problem = make_problem(seed=1, n=20, outlier_ratio=0.0)
 
-    found = judged(problem, np.full((4, 4), np.nan))
+    found = evidence_of(problem, np.full((4, 4), np.nan))
 
-    assert [(rule.name, rule.is_kept) for rule in rules(problem, found)] == [
+    assert [(rule.name, rule.is_satisfied) for rule in rules(problem, found)] == [
         ("too-few", True), ("no-consensus", False), ("degenerate", True),
     ]  # fmt: skip
 
@@ -79,7 +79,7 @@ def test_without_a_pose_the_rules_say_why() -> None:
 def test_three_matches_break_the_only_rule_about_them() -> None:
     problem = make_problem(seed=1, n=3, outlier_ratio=0.0)
 
-    assert [(rule.name, rule.is_kept) for rule in rules(problem, None)] == [("too-few", False)]
+    assert [(rule.name, rule.is_satisfied) for rule in rules(problem, None)] == [("too-few", False)]
 
 
 def test_a_refused_pose_shows_the_rules_behind_the_first_that_refuses() -> None:
@@ -90,5 +90,5 @@ def test_a_refused_pose_shows_the_rules_behind_the_first_that_refuses() -> None:
     shown = rules(problem, found)
 
     assert found.refusal is not None
-    assert next(rule.name for rule in shown if not rule.is_kept) == "no-consensus"
+    assert next(rule.name for rule in shown if not rule.is_satisfied) == "no-consensus"
     assert {"few-inliers", "clustered", "poorly-constrained"} <= {rule.name for rule in shown}

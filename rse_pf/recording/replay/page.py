@@ -231,11 +231,11 @@ def _rules(rules: Sequence[Rule]) -> str:
         return ""
     rows = []
     for rule in rules:
-        says = "kept" if rule.is_kept else ("refuses" if rule.refuses else "weak")
+        says = "kept" if rule.is_satisfied else ("refuses" if rule.refuses else "weak")
         relation = "at least" if rule.at_least else "at most"
         rows.append(
             [
-                f'<span class="{"good" if rule.is_kept else "bad"}">{says}</span>',
+                f'<span class="{"good" if rule.is_satisfied else "bad"}">{says}</span>',
                 _text(rule.name),
                 _text(rule.about),
                 f"{_number(rule.measured)} {_text(rule.unit)}",

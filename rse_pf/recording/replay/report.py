@@ -11,10 +11,11 @@ import numpy.typing as npt
 
 from rse_pf.errors import RsePfError
 from rse_pf.geometry import Array, pose_difference, transform
-from rse_pf.native import Evidence, native_solver
 from rse_pf.pnp import PnpOptions, WeakLimits
 from rse_pf.pnp.engines import engine_for, native_options
-from rse_pf.pnp.rules import MATCHES_OF_A_POSE, Rule, rules_of
+from rse_pf.pnp.native_solver import Evidence, native_solver
+from rse_pf.pnp.options import MIN_CORRESPONDENCES
+from rse_pf.pnp.rules import Rule, evaluate_rules
 from rse_pf.recording.reader import RecordedCommand
 from rse_pf.recording.replay.picture import match_picture
 from rse_pf.recording.replay.solving import Again, Overrides, Resolver, pnp_reply
@@ -232,8 +233,8 @@ def _problem(command: RecordedCommand, resolver: Resolver, pose: PnpReply | None
         inliers = np.empty(0, dtype=np.intp) if found is None else found.inliers
         T_camera_world = None if found is None or not inliers.size else found.T_camera_world
     rules: tuple[Rule, ...] = ()
-    if found is not None or n < MATCHES_OF_A_POSE:
-        rules = rules_of(n, found, inlier_px=options.inlier_px, weak=_LIMITS)
+    if found is not None or n < MIN_CORRESPONDENCES:
+        rules = evaluate_rules(n, found, inlier_px=options.inlier_px, weak=_LIMITS)
     return _Problem(
         points=points, pixels=pixels, request=request, options=options,
         T_camera_world=T_camera_world, inliers=inliers,
@@ -245,13 +246,13 @@ def _evidence(
     points_world: Array, pixels: Array, request: PnpRequest, options: PnpOptions, pose: Array | str
 ) -> Evidence | None:
     """Return the evidence of a recorded pose or of that of an engine, None for input that has no pose."""
-    if len(pixels) < MATCHES_OF_A_POSE:
+    if len(pixels) < MIN_CORRESPONDENCES:
         return None
     try:
         if isinstance(pose, str):
             return engine_for(pose)(points_world, pixels, request.camera, options, _LIMITS)
         limits = native_options(options, _LIMITS)
-        return native_solver().judge(points_world, pixels, request.camera, limits, pose)
+        return native_solver().evaluate(points_world, pixels, request.camera, limits, pose)
     except RsePfError:
         return None
 

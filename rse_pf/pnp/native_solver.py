@@ -1,0 +1,455 @@
+"""The PnP solver of the native core: correspondences to a pose with its evidence in one call of C++ code.
+
+``native/include/rse_pf_native.h`` describes the C interface, whose structs are packed here by hand: a
+``ctypes.Structure`` would take longer than the call itself needs for few correspondences.  Equal requests
+give equal bytes.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import struct
+import threading
+from collections.abc import Callable
+from functools import cache, lru_cache
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from rse_pf.errors import BadRequest, DegenerateGeometry, NoConsensus, RsePfError
+from rse_pf.geometry import Array, Camera
+from rse_pf.native import PART_ABIS, address_of, aligned, load_core, load_part
+
+__all__ = [
+    "MIN_WIDTH_TO_LENGTH",
+    "AcceptedPose",
+    "Evidence",
+    "NativeOptions",
+    "NativeSolver",
+    "native_solver",
+    "open_solver",
+]
+
+MIN_WIDTH_TO_LENGTH = 0.02
+"""Smallest width over length of the inliers in the image of an accepted pose; 0 is a line.  The native core
+applies this limit (``kCollinear`` in ``native/src/solve.hpp``); here the value only appears in error
+messages."""
+
+_FLAGS = {"avx512": 0, "avx2": 4, "portable": 1}
+"""Flag of a request for the widest vector instructions that the core may use."""
+
+# --- Layout of rse_pf_pnp_request ---
+_HEAD = struct.Struct("=IIq")  # abi, flags, rows
+_ARRAYS = struct.Struct("=QQ")  # addresses of points_world and pixels
+_POINTER = struct.Struct("=Q")  # address of T_camera_world
+_BODY = struct.Struct("=Qddddiiddiidddd")  # T_camera_world, then intrinsics, image size and options
+_BODY_AT = _HEAD.size + _ARRAYS.size  # byte offset of _BODY
+_REQUEST_BYTES = _BODY_AT + _BODY.size
+
+# --- Layout of rse_pf_pnp_result ---
+_RESULT = struct.Struct("=iiqqqdddddd")  # the fields of _ResultHead
+_POSE_AT = _RESULT.size  # byte offset of T_camera_world
+_COVARIANCE_AT = _POSE_AT + 16 * 8  # byte offset of covariance
+_UPPER_AT = _COVARIANCE_AT + 36 * 8  # byte offset of upper_triangle
+_RESULT_BYTES = _UPPER_AT + 22 * 4
+
+# --- Layout of rse_pf_lists ---
+_LISTS_HEAD = struct.Struct("=Qq")  # address of numbers, room
+_LIST_ENDS = struct.Struct("=qqqq")  # count, ends of three lists
+_REST_AT = _LISTS_HEAD.size + _LIST_ENDS.size  # byte offset of rest
+_MAX_REST_BYTES = 1024  # size of rest, RSE_PF_MAX_REST of the C header
+
+_FIRST_ROWS = (
+    512  # correspondences for which the first arrays of a thread have room; longer requests enlarge them
+)
+_MAX_NUMBERS = (
+    30_000  # numbers of a JSON text: a command of 5,000 matches has 3 + 2 + 1 numbers a match with depth
+)
+
+_REASONS = (
+    "",
+    "few-inliers",
+    "low-inlier-ratio",
+    "nearly-collinear",
+    "clustered",
+    "poorly-constrained",
+    "ambiguous",
+)
+"""Reasons why a pose is weak, by the number of ``enum rse_pf_pnp_reason``; empty for a pose that is not
+weak."""
+
+_EVERYWHERE = "match points all over the image, or skip this frame"
+_REFUSALS: dict[int, tuple[type[RsePfError], str, str]] = {
+    2: (
+        BadRequest,
+        "points_world holds a number that is not finite or is beyond 1e+06",
+        "leave such rows out",
+    ),
+    3: (
+        BadRequest,
+        "pixels holds a number that is not finite or is beyond 1e+06",
+        "leave such rows out",
+    ),
+    4: (
+        NoConsensus,
+        "the best pose has {inliers} inliers within {inlier_px:g} px among {rows} correspondences, "
+        "no more than a random pose would have",
+        "tighten the matcher, or skip this frame",
+    ),
+    5: (
+        DegenerateGeometry,
+        "the inliers lie on one line or coincide (width/length {width_to_length:.3f} is below "
+        "{min_width_to_length})",
+        _EVERYWHERE,
+    ),
+    6: (
+        DegenerateGeometry,
+        "the {inliers} inliers lie in {independent_inliers} places of the image, and may be copies of each "
+        "other",
+        _EVERYWHERE,
+    ),
+    7: (
+        DegenerateGeometry,
+        "the inliers lie {radius_px:.1f} px (rms) around their centroid in the image, less than the limit "
+        "of {inlier_px:g} px for an inlier",
+        _EVERYWHERE,
+    ),
+    8: (
+        DegenerateGeometry,
+        "the inliers leave some motion of the camera unconstrained",
+        "match more of the scene",
+    ),
+    9: (
+        DegenerateGeometry,
+        "two poses fit equally well (reprojection errors {rmse_px:.2f} and {second_pose_rmse_px:.2f} px)",
+        "match points that do not lie in one far plane",
+    ),
+    10: (
+        DegenerateGeometry,
+        "{mirrored_inliers} points are inliers behind the camera or mirrored, and only {inliers} as they are",
+        "check the handedness of the world frame and the sign of the depth",
+    ),
+    11: (
+        BadRequest,
+        "no memory for {rows} correspondences",
+        "send the best matches only",
+    ),
+}
+"""Error class, message and hint for each status of ``enum rse_pf_pnp_status`` that refuses a pose."""
+_BAD_REQUEST = (BadRequest, "the options or sizes of the request do not fit", "leave the options out")
+_STATUSES_WITHOUT_EVIDENCE = (
+    1,
+    2,
+    3,
+    11,
+)  # statuses of requests that the core refuses before it computes anything
+
+
+class NativeOptions(msgspec.Struct, frozen=True, kw_only=True):
+    """Options of the native solver, and the limits beyond which a pose is weak.
+
+    Attributes:
+        lanes: Widest vector instructions that the core may use; the choice changes no byte of a result.
+
+    The other fields are those of `rse_pf.pnp.PnpOptions` and, with the prefix ``weak_``, of
+    `rse_pf.pnp.WeakLimits`.
+    """
+
+    inlier_px: float
+    confidence: float
+    max_iterations: int
+    min_iterations: int
+    weak_inliers: float
+    weak_inlier_ratio: float
+    weak_translation_m: float
+    weak_rotation_rad: float
+    lanes: Literal["avx512", "avx2", "portable"] = "avx512"
+
+
+class Evidence(msgspec.Struct, frozen=True, kw_only=True, eq=False):
+    """A camera pose with the measurements by which it is accepted, called weak, or refused.
+
+    Attributes:
+        T_camera_world: ``(4, 4)``, maps world points (metres) to the camera frame.
+        inliers: Ascending row numbers of the inliers.
+        rmse_px: Root mean square reprojection error of the inliers.
+        covariance: ``(6, 6)`` of the twist (metres, radians) that multiplies the pose on the left.
+        reason: Why the pose is weak, such as ``few-inliers``; empty for a pose that is not.
+        independent_inliers: Number of inliers when neighbours in the image count once.
+        log10_false_alarms: log10 of the expected number of random poses that have as many independent
+            inliers.
+        width_to_length: Width over length by which the rule about collinear matches decides: that of all
+            matches, in space or in the image, where a random pose would have as many inliers; otherwise that
+            of the inliers.
+        inlier_width_to_length: Width over length of the inliers in the image; 0 is a line.
+        radius_px: Root mean square distance of the inlier pixels from their centroid.
+        second_pose_rmse_px: Reprojection error of the second pose of a planar scene; 0 without a second pose.
+        refusal: Error of the first rule that refuses the pose; None for an accepted pose.
+    """
+
+    T_camera_world: Array
+    inliers: npt.NDArray[np.intp]
+    rmse_px: float
+    covariance: Array
+    reason: str
+    independent_inliers: int
+    log10_false_alarms: float
+    width_to_length: float
+    inlier_width_to_length: float
+    radius_px: float
+    second_pose_rmse_px: float
+    refusal: RsePfError | None
+
+
+class AcceptedPose(NamedTuple):
+    """A pose that no rule refuses, in the arrays of a ``pnp`` reply.
+
+    Attributes:
+        T_camera_world: ``(16,)``, a row-major 4x4 matrix.
+        inliers: Ascending row numbers of the inliers, uint32.
+        rmse_px: Root mean square reprojection error of the inliers.
+        covariance: ``(21,)`` float32, the upper triangle by rows of the ``(6, 6)`` covariance.
+        reason: Why the pose is weak; empty for a pose that is not.
+    """
+
+    T_camera_world: Array
+    inliers: npt.NDArray[np.uint32]
+    rmse_px: float
+    covariance: npt.NDArray[np.float32]
+    reason: str
+
+
+class _ResultHead(NamedTuple):
+    """The numbers of rse_pf_pnp_result in the order of the C struct."""
+
+    status: int
+    reason: int
+    inliers: int
+    independent_inliers: int
+    mirrored_inliers: int
+    rmse_px: float
+    second_pose_rmse_px: float
+    width_to_length: float
+    radius_px: float
+    inlier_width_to_length: float
+    log10_false_alarms: float
+
+
+class _Buffers(threading.local):
+    """Request, result and arrays of one thread; to look up a caller's addresses would take longer."""
+
+    def __init__(self) -> None:
+        request, result = np.zeros(_REQUEST_BYTES, dtype=np.uint8), np.zeros(_RESULT_BYTES, dtype=np.uint8)
+        self.request = memoryview(request)  # type: ignore[arg-type]
+        self.result = memoryview(result)  # type: ignore[arg-type]
+        self.request_address, self.result_address = address_of(request), address_of(result)
+        self.pose = result[_POSE_AT:_COVARIANCE_AT].view(np.float64)
+        self.covariance = result[_COVARIANCE_AT:_UPPER_AT].view(np.float64).reshape(6, 6)
+        self.upper_triangle = result[_UPPER_AT:].view(np.float32)[:21]
+        self.allocate(_FIRST_ROWS)
+
+    def allocate(self, rows: int) -> None:
+        """Replace the arrays by arrays for *rows* correspondences."""
+        points_world, pixels = np.empty(3 * rows), np.empty(2 * rows)
+        inliers = np.empty(rows, dtype=np.uint32)
+        # All allocations come first: if one fails, the request keeps the addresses of the old arrays.
+        _ARRAYS.pack_into(self.request, _HEAD.size, address_of(points_world), address_of(pixels))
+        self.points_world, self.pixels = points_world, pixels
+        self.inliers, self.inliers_address, self.rows = inliers, address_of(inliers), rows
+
+
+class _ListBuffers(threading.local):
+    """The rse_pf_lists of one thread, with memory for the numbers."""
+
+    def __init__(self) -> None:
+        self.numbers = np.empty(_MAX_NUMBERS)
+        lists = np.zeros(_REST_AT + _MAX_REST_BYTES, dtype=np.uint8)
+        self.lists = memoryview(lists)  # type: ignore[arg-type]
+        self.lists_address = address_of(lists)
+        self.rest = self.lists[_REST_AT:]
+        _LISTS_HEAD.pack_into(self.lists, 0, address_of(self.numbers), _MAX_NUMBERS)
+
+
+@lru_cache(maxsize=256)
+def _pack_body(camera: Camera, options: NativeOptions) -> bytes:
+    return _BODY.pack(
+        0,
+        camera.fx,
+        camera.fy,
+        camera.cx,
+        camera.cy,
+        camera.width,
+        camera.height,
+        options.inlier_px,
+        options.confidence,
+        options.max_iterations,
+        min(options.min_iterations, options.max_iterations),
+        options.weak_inliers,
+        options.weak_inlier_ratio,
+        options.weak_translation_m,
+        options.weak_rotation_rad,
+    )
+
+
+class NativeSolver:
+    """The PnP solver of one loaded library; any thread may call it."""
+
+    def __init__(
+        self,
+        solve_function: Callable[[int, int, int], None],
+        cut_function: Callable[[bytes, int, int], int],
+        lanes: str,
+    ) -> None:
+        self._solve_function, self._cut_function = solve_function, cut_function
+        self._buffers, self._lists = _Buffers(), _ListBuffers()
+        self.lanes = lanes
+        """Widest vector instructions that the core uses here: ``avx512``, ``avx2`` or ``portable``."""
+
+    def solve(
+        self, points_world: Array, pixels: Array, camera: Camera, options: NativeOptions
+    ) -> AcceptedPose:
+        """Estimate a camera pose, and raise an error if a rule refuses it.
+
+        Args:
+            points_world: ``(3n,)`` or ``(n, 3)``, metres, world frame; ``n >= 4``.
+            pixels: ``(2n,)`` or ``(n, 2)``, undistorted pixels.
+            camera: Intrinsics of the image that the pixels come from.
+            options: Options of RANSAC, and limits of weak poses.
+
+        Raises:
+            BadRequest: Sizes do not fit, or a number is not finite or beyond 1e6.
+            NoConsensus: No pose has more inliers than a random pose would have.
+            DegenerateGeometry: The inliers do not determine one pose.
+        """
+        result, inliers = self._call(points_world, pixels, camera, options, None)
+        if result[0]:
+            raise _solver_error(_ResultHead(*result), pixels.size // 2, options)
+        buffers = self._buffers
+        return AcceptedPose(
+            buffers.pose.copy(), inliers, result[5], buffers.upper_triangle.copy(), _REASONS[result[1]]
+        )
+
+    def evaluate(
+        self,
+        points_world: Array,
+        pixels: Array,
+        camera: Camera,
+        options: NativeOptions,
+        T_camera_world: Array | None = None,
+    ) -> Evidence:
+        """Return a camera pose with its evidence, also where a rule refuses the pose.
+
+        Args:
+            points_world: As in `solve`.
+            pixels: As in `solve`.
+            camera: As in `solve`.
+            options: As in `solve`.
+            T_camera_world: ``(4, 4)``, the pose whose evidence is wanted; None to estimate a pose.
+
+        Raises:
+            BadRequest: Sizes do not fit, or a number is not finite or beyond 1e6.
+        """
+        pose = None if T_camera_world is None else aligned(T_camera_world, np.float64)
+        if pose is not None and pose.shape != (4, 4):
+            raise BadRequest(f"the pose {pose.shape} is not (4, 4)", hint="give T_camera_world")
+        numbers, inliers = self._call(points_world, pixels, camera, options, pose)
+        result = _ResultHead(*numbers)
+        refusal = _solver_error(result, pixels.size // 2, options) if result.status else None
+        if refusal is not None and result.status in _STATUSES_WITHOUT_EVIDENCE:
+            raise refusal
+        buffers = self._buffers
+        return Evidence(
+            T_camera_world=buffers.pose.reshape(4, 4).copy() if pose is None else pose,
+            inliers=inliers.astype(np.intp),
+            rmse_px=result.rmse_px,
+            covariance=buffers.covariance.copy(),
+            reason=_REASONS[result.reason],
+            independent_inliers=result.independent_inliers,
+            log10_false_alarms=result.log10_false_alarms,
+            width_to_length=result.width_to_length,
+            inlier_width_to_length=result.inlier_width_to_length,
+            radius_px=result.radius_px,
+            second_pose_rmse_px=result.second_pose_rmse_px,
+            refusal=refusal,
+        )
+
+    def _call(
+        self, points_world: Array, pixels: Array, camera: Camera, options: NativeOptions, pose: Array | None
+    ) -> tuple[tuple[Any, ...], npt.NDArray[np.uint32]]:
+        """Return the numbers of `_ResultHead` and the inliers; pose and covariance stay in the buffers."""
+        n = pixels.size // 2
+        if points_world.size != 3 * n or pixels.size != 2 * n:
+            raise BadRequest(
+                f"points {points_world.shape} and pixels {pixels.shape} are not (n, 3) and (n, 2)",
+                hint="send one pixel for each point",
+            )
+        buffers = self._buffers
+        if n > buffers.rows:
+            buffers.allocate(n)
+        buffers.points_world[: 3 * n] = points_world if points_world.ndim == 1 else points_world.reshape(-1)
+        buffers.pixels[: 2 * n] = pixels if pixels.ndim == 1 else pixels.reshape(-1)
+        _HEAD.pack_into(buffers.request, 0, PART_ABIS["native"], _FLAGS[options.lanes], n)
+        buffers.request[_BODY_AT:] = _pack_body(camera, options)
+        if pose is not None:
+            _POINTER.pack_into(buffers.request, _BODY_AT, address_of(pose))
+        self._solve_function(buffers.request_address, buffers.inliers_address, buffers.result_address)
+        result = _RESULT.unpack_from(buffers.result)
+        return result, buffers.inliers[: result[2]].copy()
+
+    def cut_lists(self, text: bytes) -> tuple[memoryview, list[Array]] | None:
+        """Move the lists of numbers out of a JSON text, so that a JSON parser makes no object of each number.
+
+        Returns:
+            The text in which the string ``"\\u000K"`` stands in the place of list K, valid until the next
+            call of this thread, and the lists.  None where the text must be parsed as usual: it has more than
+            three lists, or a list of something else than numbers; a number has more than 15 digits or an
+            exponent; the text has a backslash, or more than 1,024 bytes besides the lists.
+        """
+        buffers = self._lists
+        size = self._cut_function(text, len(text), buffers.lists_address)
+        if size < 0:
+            return None
+        count, *ends = _LIST_ENDS.unpack_from(buffers.lists, _LISTS_HEAD.size)
+        numbers = buffers.numbers[: ends[count - 1]].copy()
+        starts = (0, *ends)
+        return buffers.rest[:size], [numbers[starts[i] : ends[i]] for i in range(count)]
+
+
+def _solver_error(result: _ResultHead, rows: int, options: NativeOptions) -> RsePfError:
+    kind, message, hint = _REFUSALS.get(result.status, _BAD_REQUEST)
+    values = {
+        **result._asdict(),
+        "rows": rows,
+        "inlier_px": options.inlier_px,
+        "min_width_to_length": MIN_WIDTH_TO_LENGTH,
+    }
+    return kind(message.format_map(values), hint=hint)
+
+
+def open_solver(path: Path) -> NativeSolver:
+    """Load the PnP solver of the library at *path*.
+
+    Raises:
+        ConfigurationError: The library cannot be loaded, or has another version.
+    """
+    solve, cut, lanes = load_part(
+        path, "native", PART_ABIS["native"], "rse_pf_pnp_solve", "rse_pf_cut_lists", "rse_pf_native_lanes"
+    )
+    lanes.restype = ctypes.c_char_p
+    cut.argtypes, cut.restype = (ctypes.c_char_p, ctypes.c_int64, ctypes.c_void_p), ctypes.c_int64
+    solve.argtypes, solve.restype = (ctypes.c_void_p, ctypes.c_void_p, ctypes.c_void_p), None
+    return NativeSolver(solve, cut, lanes().decode())
+
+
+@cache
+def native_solver() -> NativeSolver:
+    """Return the PnP solver of the installed native core, which is loaded once in a process.
+
+    Raises:
+        MissingExtra: The native core is not installed.
+        ConfigurationError: The native core cannot be loaded, or has another version.
+    """
+    return load_core(open_solver)
