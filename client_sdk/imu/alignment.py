@@ -40,12 +40,15 @@ _BIASES = slice(9, 15)
 _GYRO_BIAS_PRIOR_RAD_S = 0.1  # standard deviation of the gyroscope's bias before anything is measured
 _ACCEL_BIAS_PRIOR_M_S2 = 0.2  # standard deviation of the accelerometer's bias before anything is measured
 _HUBER_WIDTH = 3.0  # root mean square of a residual's three whitened axes from which on the loss is linear
-_CERTAIN_DEVIATIONS = 10.0  # standard deviations of a linear estimate from which on its error is certain
-_MAX_ITERATIONS = 12  # accepted steps of Levenberg-Marquardt
-_CONVERGED_FRACTION = 1e-4  # a step that lowers the cost by less than this fraction is the last one
-_FIRST_DAMPING = 1e-5  # damping of the first step; bad steps multiply it by 10, good ones divide it by 10
-_MIN_DAMPING = 1e-9  # smallest damping of a step
-_MAX_DAMPING = 1e8  # damping at which the search for a better step ends
+_CERTAIN_DEVIATIONS = 10.0
+"""Standard deviations by which the linear solution must contradict a sensor to refuse it."""
+_MAX_ITERATIONS = 12  # largest number of accepted Levenberg-Marquardt steps of one alignment
+_CONVERGED_FRACTION = 1e-4
+"""Levenberg-Marquardt ends with a step that lowers the cost by less than this fraction."""
+_FIRST_DAMPING = 1e-5
+"""Levenberg-Marquardt damping of the first step; bad steps multiply it by 10, good ones by 0.1."""
+_MIN_DAMPING = 1e-9  # smallest Levenberg-Marquardt damping of a step
+_MAX_DAMPING = 1e8  # Levenberg-Marquardt damping above which the search for a better step is given up
 _COVARIANCE_FLOOR = 1e-14  # added to variances of preintegrated motions, so that they have a Cholesky factor
 
 

@@ -28,35 +28,42 @@ MAX_GRAVITY_ERROR_M_S2 = 0.6
 """Largest error of the magnitude of gravity, in m/s^2, that the bias of a sound accelerometer may cause:
 three standard deviations (0.2 m/s^2) of such a bias."""
 
-# Limits of `find_sample_trouble`
-_MIN_SAMPLES = 100  # samples before anything is said about them: half a second at 200 Hz
-_MAX_MISSING_FRACTION = 0.05  # samples that may be missing between those that arrived
-_MAX_SATURATED_FRACTION = 0.01  # samples that may be at the end of the sensor's range
+# Limits of the samples alone, see `find_sample_trouble`
+_MIN_SAMPLES = 100  # IMU samples before faults are sought in them: half a second at 200 Hz
+_MAX_MISSING_FRACTION = 0.05  # fraction of an IMU's samples that may be missing
+_MAX_SATURATED_FRACTION = 0.01  # fraction of an IMU's samples that may be at the end of the sensor's range
 _SATURATION = 0.999  # fraction of the sensor's range from which on a sample counts as saturated
 _MIN_IN_G = 0.7  # mean magnitude from which on an accelerometer probably states its values in g
 _MAX_IN_G = 1.3  # mean magnitude up to which an accelerometer probably states its values in g
 _MIN_MEAN_ACCEL = 0.7  # smallest plausible mean magnitude of an accelerometer, as a multiple of gravity
-_MAX_MEAN_ACCEL = 1.5  # largest plausible one: a drone or a hand shakes, but not by this much on average
+_MAX_MEAN_ACCEL = 1.5  # largest plausible mean magnitude of an accelerometer, as a multiple of gravity
 _REST_S = 0.5  # length of the time windows in which an IMU is tested for being stationary
-_MIN_REST_WINDOWS = 3  # stationary windows before the magnitude of gravity is taken from them
+_MIN_REST_WINDOWS = 3  # stationary windows that are needed to measure the magnitude of gravity in them
 _REST_NOISE_FACTOR = 3.0  # multiple of its white noise by which a stationary sensor may scatter
 _REST_GYRO_RAD_S = 0.02  # standard deviation that a stationary gyroscope may have besides its noise
 _REST_ACCEL_M_S2 = 0.1  # standard deviation that a stationary accelerometer may have besides its noise
 
-# Limits of `check_rates`
-_MIN_INTERVALS = 30  # intervals between poses before rates are compared
-_MAX_INTERVAL_S = 0.5  # longest interval between poses: over longer ones the mean rate says little
+# Limits of the comparison with the camera, see `check_rates`
+_MIN_INTERVALS = 30  # intervals between poses that are needed to compare the rates of gyroscope and camera
+_MAX_INTERVAL_S = 0.5  # longest interval between two poses whose mean rate is compared with the gyroscope
 _MIN_RATE_SPREAD_RAD_S = 0.04
 """Smallest standard deviation of the camera's rates about its second most turned axis, in rad/s: slower
 rotations, or rotations about one axis, do not tell the axes of the gyroscope apart."""
-_MAX_OFFSET_S = 0.1  # time offsets between the clocks of IMU and camera are sought up to this, either way
-_OFFSET_STEP_S = 0.002  # step of this search; the best offset is interpolated between steps
-_MIN_OFFSET_S = 0.003  # smallest change of the offset that is applied: the estimate is no better than that
-_MAX_USABLE_OFFSET_S = 0.06  # a larger offset between the clocks is reported as a fault, not corrected
-_OUTLIER_FACTOR = 4.0  # rates that differ by more than this multiple of the median difference are left out
-_MAX_UNEXPLAINED = 0.5  # largest part of the camera's rates that a rotation may leave unexplained
-_MIN_DEGREES_RATIO = 40.0  # ratio of the rates from which on the gyroscope states degrees (57.3 per rad)
-_MAX_RATE_RATIO = 1.25  # largest ratio of the rates, either way, of a gyroscope in rad/s
+_MAX_OFFSET_S = 0.1
+"""Largest time offset between the clocks of IMU and camera that is sought, in either direction."""
+_OFFSET_STEP_S = 0.002
+"""Step of the search for the time offset between IMU and camera; the best is interpolated."""
+_MIN_OFFSET_S = 0.003
+"""Smallest change of the time offset that is applied: the estimate is no better than that."""
+_MAX_USABLE_OFFSET_S = 0.06
+"""A larger offset between the clocks of IMU and camera is a fault, and not corrected."""
+_OUTLIER_FACTOR = 4.0
+"""Multiple of the median difference of the two rates from which on an interval is left out."""
+_MAX_UNEXPLAINED = 0.5
+"""Largest part of the camera's rates (root mean square) that the gyroscope does not explain."""
+_MIN_DEGREES_RATIO = 40.0
+"""Gyroscope rates divided by camera rates from which on the gyroscope states degrees."""
+_MAX_RATE_RATIO = 1.25  # largest ratio of the rates of gyroscope and camera, either way, of a sound gyroscope
 _MAX_AXES_ERROR_DEG = 8.0  # largest angle between the gyroscope's axes and those that T_imu_camera states
 
 

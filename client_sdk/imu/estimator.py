@@ -19,21 +19,21 @@ from rse_pf.slam.inertial import InertialMotion, KeyframeImu, upright_rotation
 
 __all__ = ["ImuEstimator", "ImuScale", "level_start_pose"]
 
-_POSE_STEP_S = 0.2  # distance in time of the poses that are aligned: their noise is small against the motion
-_MAX_POSES = 150  # newest poses that are aligned, those of the last 30 seconds
-_MIN_POSES = 8  # poses below which no alignment is tried
-_RETRY_S = 0.5  # time between alignments while gravity or scale are not known well enough
-_REPEAT_S = 2.0  # time between alignments afterwards, which follow the biases
+_POSE_STEP_S = 0.2  # smallest time between the tracked poses that are aligned with the IMU
+_MAX_POSES = 150  # newest poses that are aligned with the IMU, those of the last 30 seconds
+_MIN_POSES = 8  # poses that an alignment with the IMU needs
+_RETRY_S = 0.5  # time between two IMU alignments while gravity or scale are not known well enough
+_REPEAT_S = 2.0  # time between two IMU alignments once gravity and scale are known; biases still change
 _POSE_NOISE_PX = 0.33  # standard deviation of a tracked pose, as the shift in pixels that it causes
 _MAX_SCALE_DEVIATION = 0.015  # largest relative standard deviation of a scale that is used
-_MAX_GRAVITY_DEVIATION_RAD = math.radians(0.5)  # largest standard deviation of a direction of gravity in use
+_MAX_GRAVITY_DEVIATION_RAD = math.radians(0.5)  # largest standard deviation of gravity's direction in use
 _MAX_MISFIT = 12.0  # misfit of an alignment (1: the noise is as stated) from which on it is not used
 _MAX_MISFITS_IN_A_ROW = 3
 """Alignments in a row above the largest misfit after which the IMU is not used any more: a single one may be
 the fault of a wrong pose."""
 _MAX_BIAS_CHANGE_RAD_S = 0.005  # change of the gyroscope's bias from which on a motion is preintegrated again
-_MAX_CACHED_MOTIONS = 4 * _MAX_POSES  # preintegrated motions that are kept for the next alignment
-_RATE_CHECK_S = 20.0  # newest poses whose rotations are compared with the gyroscope
+_MAX_CACHED_MOTIONS = 4 * _MAX_POSES  # preintegrated motions that are kept for later IMU alignments
+_RATE_CHECK_S = 20.0  # seconds of newest poses whose rotations are compared with the gyroscope
 _MAX_MOTION_S = 10.0  # longest motion between keyframes that is sent: longer ones are too uncertain to help
 _MIN_GRAVITY_DEVIATION_RAD = 1e-3  # smallest standard deviation of gravity that a keyframe states
 _MAX_STATIONARY_ERROR = 0.25

@@ -26,7 +26,9 @@ __all__ = ["AlignedBy", "Alignments", "Correction", "CorrectionStream", "OtherRo
 
 _NO_ANSWER = "the map has not answered yet"  # reason of a segment that no update of the map has named
 _UPPER_TRIANGLE = np.triu_indices(6)
-_MAX_CORRECTIONS = 1000  # corrections that are kept for a reader that falls behind; the oldest are dropped
+"""Rows and columns of the 21 numbers of a 6x6 covariance that a message contains."""
+_MAX_CORRECTIONS = 1000
+"""Corrections that are kept for a reader that falls behind; its oldest ones are dropped."""
 
 AlignedBy = Literal["map", "relocalisation", "nothing"]
 """Source of an alignment: loop closures of the map, one keyframe that the map localised, or none."""
@@ -287,7 +289,7 @@ class CorrectionStream:
             self._readers.remove(reader)
 
 
-_UNALIGNED = SegmentAlignment()
+_UNALIGNED = SegmentAlignment()  # alignment of a segment that the map has not named yet
 
 
 def _parse_pose(numbers: Any) -> Array:

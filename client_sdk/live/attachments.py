@@ -44,23 +44,24 @@ __all__ = ["Attachments", "BackgroundUploader", "EncodedAttachments", "StoreObje
 StoreObject = Callable[[bytes], Awaitable[str]]
 """Function that stores bytes as an object of the robot and returns their digest; it may raise RsePfError."""
 
-_BURST_S = 2.0  # seconds of the rate limit that a robot which sent nothing may spend on its next keyframe
+_BURST_S = 2.0  # seconds of the byte rate that a robot can save up for the attachments of its next keyframe
 _BYTES_PER_POINT = 4.5  # mean size of an encoded point after zlib, to turn a byte budget into a point count
-_MIN_POINTS = 400  # points of a keyframe, about 2 kB, that are sent even when the byte budget is spent
-_JPEG_QUALITY = 85  # of 100, for the images of keyframes
+_MIN_POINTS = 400  # points of a keyframe, about 2 kB, that are encoded even when the byte budget is spent
+_JPEG_QUALITY = 85  # JPEG quality, 0 to 100, of the images of keyframes
 
 _MIN_POINT_DEPTH_M = 0.3  # nearer readings of a depth camera are not sent, as in the robot's own cloud
 _MAX_POINT_DEPTH_M = 3.5  # farther readings are not sent: a depth camera is off by centimetres there
-_VOXEL_M = 0.01  # edge of the voxels of which each sends one point, so that near surfaces take few bytes
+_VOXEL_M = 0.01  # edge of a voxel: a keyframe sends one point for each, so that near surfaces take few bytes
 _MAX_DEPTH_STEP = 0.05
 """Largest difference between the depths of a pixel and of its four neighbours, as a fraction of its depth: a
 pixel with a larger one lies between two surfaces, and its depth may belong to neither."""
 
-_REQUEST_BYTES = 1_000  # added to each object for the rate limit: head and token of the request, and answer
-_MAX_WAITING_BYTES = 16 << 20  # objects that wait in memory; above it the oldest are dropped
-_MAX_QUIET_WAIT_S = 1.0  # longest wait of an object for poses and keyframes, which could else block it
-_FIRST_PAUSE_S = 0.5  # pause after the first failed upload; it doubles with each failure
-_MAX_PAUSE_S = 30.0  # longest pause between failed uploads
+_REQUEST_BYTES = 1_000  # bytes of request head, token and answer that the rate limit counts for each object
+_MAX_WAITING_BYTES = 16 << 20  # objects that wait in memory for their upload; above it the oldest are dropped
+_MAX_QUIET_WAIT_S = 1.0
+"""An upload waits no longer for poses and keyframes, which could else block it for ever."""
+_FIRST_PAUSE_S = 0.5  # pause after the first failed upload of an object; it doubles with each failure
+_MAX_PAUSE_S = 30.0  # longest pause between two attempts to upload an object
 _OBJECT_REFUSALS = (LimitExceeded, BadRequest, UsageError)
 """Errors with which one object is refused for good: it is dropped, and the next one is tried."""
 _ALL_REFUSALS = (Forbidden, Unauthorized, QuotaExceeded)

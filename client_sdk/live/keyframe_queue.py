@@ -28,8 +28,8 @@ __all__ = ["KeyframeQueue", "NumberOffset", "QueuedKeyframe", "choose_number_off
 _KEYFRAME_SUFFIX = ".keyframe"
 _STATE_FILE = "state.json"
 _LOCK_FILE = ".lock"
-_MAX_MEMORY_BYTES = 64 << 20  # keyframes that a queue without a folder holds: about 2,000 of 34 kB
-_MAX_FOLDER_BYTES = 1 << 30  # keyframes that a queue in a folder holds: about 30,000 of 34 kB
+_MAX_MEMORY_BYTES = 64 << 20  # encoded keyframes that may wait in memory: about 2,000 keyframes of 34 kB
+_MAX_FOLDER_BYTES = 1 << 30  # encoded keyframes that may wait in a folder: about 30,000 keyframes of 34 kB
 
 
 @dataclass(frozen=True, slots=True)

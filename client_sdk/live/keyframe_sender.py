@@ -37,10 +37,11 @@ from rse_pf.wire.live_map import KeyframeKept, KeyframeRequest
 
 __all__ = ["REFUSALS", "KeyframeSender", "LiveRobot", "RobotInMap", "fetch_robot_in_map", "make_request"]
 
-_MAX_POSE_WAIT_S = 1.0  # a keyframe waits so long for open pose queries, so that endless ones cannot block it
+_MAX_POSE_WAIT_S = 1.0  # a keyframe waits no longer for open pose queries, which could else block it for ever
 _FIRST_PAUSE_S = 0.1  # pause after the first failed attempt to send a keyframe; it doubles with each failure
-_MAX_PAUSE_S = 1.0  # longest pause between attempts: a server that comes back gets the keyframe within 1 s
-_REFUSED_PAUSE_S = 5.0  # pause after an error that only an operator can end, such as a missing scope
+_MAX_PAUSE_S = 1.0
+"""Longest pause between attempts to send a keyframe, so that a server that returns gets it soon."""
+_REFUSED_PAUSE_S = 5.0  # pause of the keyframe sender after an error that only an operator can end
 REFUSALS = (Forbidden, Unauthorized, UnknownService)
 """Errors with which every keyframe of the robot is refused until an operator changes a right or a setting."""
 _KEYFRAME_REFUSALS = (BadRequest, LimitExceeded, InvalidCamera)

@@ -67,9 +67,9 @@ _JOIN_REFUSALS = (*REFUSALS, BadRequest, UnsupportedProtocol)
 _RESUBSCRIBE_PAUSE_S = 1.0  # pause before the robot subscribes to the map's updates again after a failure
 _LEAVE_DEADLINE_S = 1.0  # deadline of the call that leaves the map, so that a lost connection delays no exit
 _NEVER = 1_000_000_000
-"""Lost frames after which the tracker begins a segment of its own: never, because `LiveMapper` must begin
-each segment and tell the map."""
-_MAX_SENT_RECORDS = 100_000  # times of acknowledged keyframes that are kept for measurements; a few MB
+"""Number of lost frames after which the tracker begins a segment by itself, which it must never do in a live
+map: `LiveMapper` begins each segment, and numbers it for the map."""
+_MAX_SENT_RECORDS = 100_000  # acknowledged keyframes whose times are kept for measurements
 
 
 @dataclass(frozen=True, slots=True)

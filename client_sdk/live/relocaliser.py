@@ -16,13 +16,14 @@ from rse_pf.wire.live_map import LiveRelocalise, RelocaliseReply
 __all__ = ["Relocaliser"]
 
 _MAX_FAST_FAILURES = 6
-"""Replies in a row that found no place, after which the robot asks less often: no other robot seems to have
-been here, and the map compares every keyframe with the others anyway."""
-_SLOW_FACTOR = 4.0  # the pause between relocalisations becomes so many times as long after these replies
+"""Relocalisations in a row that found no place, after which the robot asks less often: no other robot seems
+to have been there, and the map compares each keyframe with the others anyway."""
+_SLOW_FACTOR = 4.0
+"""Factor of the pause between relocalisations after six replies in a row that found no place."""
 
 
 class Relocaliser:
-    """Run one relocalisation at a time, with a pause between two."""
+    """Ask a live map where keyframes were made: one keyframe at a time, with a pause between two calls."""
 
     def __init__(
         self,

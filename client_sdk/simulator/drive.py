@@ -38,10 +38,11 @@ SIMULATED_CAMERA = Camera(fx=525.0, fy=525.0, cx=319.5, cy=239.5, width=640, hei
 _OVERLAP_M = 0.6  # distance that a robot drives beyond the start of the next robot, so that their maps merge
 _LUMA_WEIGHTS = (0.299, 0.587, 0.114)  # weights of red, green and blue in a grey image (ITU-R BT.601)
 _EYE_HEIGHT_M = 1.25  # mean height of the camera above the floor
-_LOOK_AHEAD_M = 1.0  # the camera looks at the point of the loop that is so far ahead
+_LOOK_AHEAD_M = 1.0  # the camera looks at the point of the loop that is this far ahead
 _SWAY_M = 1.7  # length of the path in which the swaying of the camera repeats
 _PATH_STEP_M = 0.01  # distance between the points that describe the loop
-_SMOOTHING_POINTS = 45  # points on either side over which the corners of the loop are averaged, twice
+_SMOOTHING_POINTS = 45
+"""Points, 1 cm apart, on either side over which the loop is averaged to round its corners."""
 
 # Corners of the loop in metres, from the left wall of a room and from the front wall of all rooms.
 _Corners = tuple[tuple[float, float], ...]

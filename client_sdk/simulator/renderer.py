@@ -25,16 +25,16 @@ _MIP_BIAS = 0.7  # added to a mip level before it is truncated: 0.5 would round,
 _MIN_MIP_COSINE = 0.05  # smallest cosine of incidence for the choice of the mip level, to limit its blur
 _MAX_MIP_LEVELS = 12  # levels of a texture of 2048 texels, the largest that is supported
 
-# Light
-_LAMP_BELOW_CEILING_M = 0.35  # the lamp of each room hangs so far below the middle of its ceiling
+# Brightness of the surfaces in a room
+_LAMP_BELOW_CEILING_M = 0.35  # distance of each room's lamp from the middle of the ceiling, downwards
 _AMBIENT = 0.68  # brightness of a surface without its lamp, where 1 is the colour of the texture
 _LAMP = 0.62  # brightness that the lamp adds at distance 0
-_LAMP_FALLOFF = 0.12  # per square metre of distance: the lamp's light is divided by 1 + this times the square
-_CORNER_SHADE = 0.28  # darkening at the edge of a face, where surfaces meet
-_CORNER_FALLOFF = 70.0  # per square metre of distance from the edge, as for the lamp
+_LAMP_FALLOFF = 0.12  # per square metre: a lamp's light is divided by 1 + this times the squared distance
+_CORNER_SHADE = 0.28  # darkening at the edges of a face, where surfaces meet: 0 is none, 1 is black
+_CORNER_FALLOFF = 70.0  # per square metre: that darkening is divided by 1 + this times the squared distance
 _FACING_LIGHT = 0.06  # part of the light that only a surface facing the camera reflects
 
-# Depth sensor (Kinect)
+# Depths and images of a Kinect
 _DISPARITY_M_PX = 0.075 * 580.0  # baseline times focal length of a Kinect: disparity in px times depth in m
 _DISPARITY_STEPS = 8.0  # a Kinect measures disparities in steps of 1/8 px
 _MIN_DEPTH_M = 0.4  # a Kinect measures no nearer depths

@@ -30,7 +30,7 @@ DEPTH_M = 4.6  # extent of all rooms along y
 HEIGHT_M = 2.6  # height of the ceiling
 ROOMS = 3  # rooms of the world, unless another number is asked for
 DOOR_Y_M = (1.55, 3.05)  # y of the left and of the right side of each door
-_DOOR_HEIGHT_M = 2.1
+_DOOR_HEIGHT_M = 2.1  # height of the doors
 _WALL_M = 0.12  # thickness of the walls between rooms
 
 # Width of a texel in metres, for the textures of walls and furniture
@@ -79,7 +79,7 @@ _MOTIFS: tuple[Callable[[_Image, _Image], _Image], ...] = (
 )
 _MOTIF_CELL_PX = 64  # texels between the motifs of a wallpaper, before each is moved at random
 _MOTIF_REACH_PX = 40  # texels around the centre of a motif that are drawn; the largest motif has 26
-_POSTER_SHAPES = 26  # discs and bars of a poster
+_POSTER_SHAPES = 26  # number of discs and bars that are drawn on a poster
 _DRAWN_SIZES = 1.06
 """Half the side of the square of texels that is drawn for a disc or bar of a poster, in sizes of the shape:
 the corners of a bar of half-length 1 and half-width 1/3 are sqrt(1 + 1/9) = 1.054 from its centre."""

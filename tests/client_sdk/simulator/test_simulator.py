@@ -65,7 +65,7 @@ def test_ten_rooms_have_a_loop_through_all_doors_past_all_tables():
     assert not at_table[rooms % 2 == 0].any()
     assert ((at[at_door, 1] > DOOR_Y_M[0] + 0.2) & (at[at_door, 1] < DOOR_Y_M[1] - 0.2)).all()
     assert at_door.any()
-    with pytest.raises(UsageError, match="needs two rooms"):
+    with pytest.raises(UsageError, match="needs 2 rooms or more"):
         true_trajectory(0, 1, 5, 0, 1)
 
 
