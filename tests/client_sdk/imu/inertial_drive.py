@@ -17,22 +17,21 @@ from rse_pf.geometry import Array, exp_so3, right_jacobian_so3
 __all__ = ["GRAVITY", "InertialDrive", "Motion", "SimulatedImu"]
 
 GRAVITY: Array = np.array([0.0, 0.0, -9.81])
-_STARTS_S = 1.0
-"""A drone that starts at rest begins within this time."""
-_WAVES = 3
-_MARGIN_S = 0.5
+_ACCELERATION_S = 1.0  # time in which a stationary drone reaches its full motion
+_WAVES = 3  # sines of which each coordinate of the motion is the sum
+_MARGIN_S = 0.5  # time before and after a drive in which the IMU has samples, too
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Motion:
-    """How a camera moves.
+    """Size and speed of a camera's motion.
 
     Attributes:
-        reach_m: Its positions stay about so near.
-        turn_rad: Its orientations stay about so near to the first one.
-        slowest_hz: Of its waves.
-        fastest_hz: Of its waves.
-        rests_s: It stands still for so long at first, and then moves off within a second.
+        reach_m: Approximate largest distance from the origin.
+        turn_rad: Approximate largest rotation against the first orientation.
+        slowest_hz: Lowest frequency of the motion.
+        fastest_hz: Highest frequency of the motion.
+        rests_s: Time for which the camera is stationary before it accelerates within a second.
     """
 
     reach_m: float = 1.0
@@ -43,7 +42,7 @@ class Motion:
 
 
 class InertialDrive:
-    """The motion of a camera and of the IMU that is mounted beside it."""
+    """Exact motion of a camera and of the IMU that is mounted with it."""
 
     def __init__(self, model: ImuModel, motion: Motion, seed: int) -> None:
         self.model, self.motion = model, motion
@@ -74,11 +73,14 @@ class InertialDrive:
         R, position, *_ = self.imu_state(stamps_s)
         T = np.tile(np.eye(4), (len(stamps_s), 1, 1))
         T[:, :3, :3], T[:, :3, 3] = R, position
-        made: Array = T @ self.model.T_imu_camera
-        return made
+        T_world_camera: Array = T @ self.model.T_imu_camera
+        return T_world_camera
 
     def _waves(self, stamps_s: Array, which: int) -> tuple[Array, Array, Array]:
-        """Return the sums of waves ``(n, 3)`` with their first two derivatives; 0 while the camera rests."""
+        """Return positions (*which* = 0) or rotation vectors (1) ``(n, 3)``, and their first two derivatives.
+
+        All are 0 while the camera is stationary.
+        """
         w = 2.0 * np.pi * self._hz[which]
         angles = stamps_s[:, None, None] * w + self._phase[which]
         size = self._size[which]
@@ -88,17 +90,18 @@ class InertialDrive:
         if self.motion.rests_s <= 0.0:
             return value, first, second
         # 10 x^3 - 15 x^4 + 6 x^5 has no velocity and no acceleration at both of its ends.
-        x = np.clip((stamps_s - self.motion.rests_s) / _STARTS_S, 0.0, 1.0)[:, None]
+        x = np.clip((stamps_s - self.motion.rests_s) / _ACCELERATION_S, 0.0, 1.0)[:, None]
         s = x**3 * (10.0 - 15.0 * x + 6.0 * x**2)
-        ds = 30.0 * x**2 * (1.0 - x) ** 2 / _STARTS_S
-        dds = 60.0 * x * (1.0 - x) * (1.0 - 2.0 * x) / _STARTS_S**2
+        ds = 30.0 * x**2 * (1.0 - x) ** 2 / _ACCELERATION_S
+        dds = 60.0 * x * (1.0 - x) * (1.0 - 2.0 * x) / _ACCELERATION_S**2
         return s * value, ds * value + s * first, dds * value + 2.0 * ds * first + s * second
 
 
 class SimulatedImu:
-    """The IMU of a drive, with white noise and biases that walk.
+    """Samples of an IMU in a drive, with white noise and randomly walking biases.
 
-    ``timestamps_s`` is on the camera's clock; ``bias_gyro`` and ``bias_accel`` the true ``(n, 3)`` ones.
+    ``timestamps_s`` ``(n,)`` is on the camera's clock; ``bias_gyro`` (rad/s) and ``bias_accel`` (m/s^2) are
+    the true biases ``(n, 3)``.
     """
 
     def __init__(
@@ -108,11 +111,11 @@ class SimulatedImu:
         """Measure the drive from half a second before its begin to half a second after its end.
 
         Args:
-            drive: What moves.
-            duration_s: Of the drive.
-            seed: Of noise and biases.
-            bias_gyro: ``(3,)`` at the begin; None draws one of about 0.02 rad/s.
-            bias_accel: ``(3,)`` at the begin; None draws one of about 0.05 m/s^2.
+            drive: Motion that is measured.
+            duration_s: Duration of the drive.
+            seed: Seed of noise and biases.
+            bias_gyro: First bias ``(3,)`` of the gyroscope; None draws one of about 0.02 rad/s.
+            bias_accel: First bias ``(3,)`` of the accelerometer; None draws one of about 0.05 m/s^2.
             is_exact: Whether there is neither noise nor bias.
         """
         rng = np.random.default_rng([seed, 72])

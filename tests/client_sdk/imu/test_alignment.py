@@ -26,7 +26,7 @@ DEPTH_M, STEP_S = 3.0, 0.2
 
 @dataclass
 class Aligned:
-    """What was found in a drive, and the truth of it, in the world of the poses."""
+    """Estimated alignment of a drive, and the true scale, direction of gravity and biases."""
 
     found: ImuAlignment | None
     scale: float
@@ -70,7 +70,7 @@ def aligned(seed: int, duration_s: float, *, noise: float = 1.0, motion: Motion 
     )  # fmt: skip
 
 
-def test_without_noise_all_is_found():
+def test_scale_and_gravity_are_exact_without_noise():
     drive = aligned(4, 6.0, noise=0.0)
 
     assert drive.scale_error < 1e-3
@@ -78,7 +78,7 @@ def test_without_noise_all_is_found():
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_with_noise_all_is_found_within_its_deviations(seed):
+def test_errors_with_noise_agree_with_the_standard_deviations(seed):
     drive = aligned(seed, 8.0)
 
     assert drive.found is not None
@@ -90,7 +90,7 @@ def test_with_noise_all_is_found_within_its_deviations(seed):
     assert 0.8 < drive.found.misfit < 1.25
 
 
-def test_a_drone_that_starts_at_rest_gets_its_metres_when_it_has_moved():
+def test_a_stationary_drone_gets_its_scale_after_it_has_moved():
     at_rest = Motion(rests_s=4.0)
     standing, moving = aligned(2, 4.0, motion=at_rest), aligned(2, 9.0, motion=at_rest)
 

@@ -30,7 +30,7 @@ def samples(begin_s: float = 1.0, end_s: float = 1.4, **options) -> ImuSamples:
 
 
 @pytest.mark.parametrize("interval", [(1.0, 1.05), (1.0, 1.4), (0.7013, 1.9027)])
-def test_it_agrees_with_the_exact_motion(interval):
+def test_preintegration_agrees_with_the_exact_motion(interval):
     R, p, v, _, _ = DRIVE.imu_state(np.array(interval))
     dt = interval[1] - interval[0]
 
@@ -44,7 +44,7 @@ def test_it_agrees_with_the_exact_motion(interval):
 
 
 def errors_between(made, other):
-    """The error of *other* beside *made*: rotation vector on the right, velocity, position."""
+    """Return the difference of *other* from *made* ``(9,)``: rotation vector, velocity, position."""
     turned = log_so3((made.delta_rotation.T @ other.delta_rotation)[None])[0]
     return np.concatenate(
         [

@@ -1,4 +1,4 @@
-"""Samples and models of an IMU that can be none are refused in one line."""
+"""Invalid samples and models of an IMU are refused in one line."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the tests of a robot in a live map share."""
+"""Fixtures of the tests of a robot in a live map."""
 
 from __future__ import annotations
 
@@ -9,5 +9,5 @@ from tests.client_sdk.live.fake_live_map import FakeLiveRobot
 
 @pytest.fixture
 def robot() -> FakeLiveRobot:
-    """A robot whose platform is a few lines."""
+    """A connected robot whose platform is simulated, without a map yet."""
     return FakeLiveRobot()

@@ -1,4 +1,4 @@
-"""A robot whose platform is a few lines: it keeps keyframes by number, and tells what the test says."""
+"""A robot whose platform stores keyframes in a list, and publishes the updates that a test gives it."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ __all__ = ["FakeLiveRobot", "alignment", "solve", "solved"]
 def alignment(
     robot: str, T_map_odom: Array | None, *, segment: int = 0, reason: str = "", scale: float | None = None
 ) -> dict[str, Any]:
-    """Return the payload of an alignment; None is none."""
+    """Return the payload of an update ``alignment/ROBOT``; None for the pose means that it is not aligned."""
     return {
         **({} if scale is None else {"scale": scale}),
         "kind": "alignment", "robot": robot, "segment": segment, "aligned": T_map_odom is not None,
@@ -34,30 +34,36 @@ def alignment(
 
 
 def solved(query: PoseQuery) -> PnpSolution:
-    """Return the pose as the PnP service finds it."""
-    found = query.correspondences
+    """Return the pose of a query as the PnP service solves it."""
+    correspondences = query.correspondences
     options = PnpOptions(inlier_px=query.inlier_px, max_iterations=query.max_iterations)
-    solution = solve_pnp(found.points_world, found.pixels, query.camera, options)
-    if found.depths_m.any():
-        solution = refine_with_depth(solution, found.points_world, found.pixels, found.depths_m, query.camera)
+    solution = solve_pnp(correspondences.points_world, correspondences.pixels, query.camera, options)
+    if correspondences.depths_m.any():
+        solution = refine_with_depth(
+            solution,
+            correspondences.points_world,
+            correspondences.pixels,
+            correspondences.depths_m,
+            query.camera,
+        )
     return solution
 
 
 async def solve(query: PoseQuery) -> PoseAnswer:
-    """Answer as the PnP service does."""
+    """Answer a pose query as the PnP service does."""
     return PoseAnswer(
         solution=solved(query), source="cloud", server="s1", round_trip_ms=3.0, queue_ms=0.0, compute_ms=1.0
     )
 
 
 class FakeLiveRobot:
-    """The robot ``me`` and its platform; `kept` are the keyframes that its map has."""
+    """The robot ``me`` and its platform; ``kept`` are the keyframes that its map has acknowledged."""
 
     def __init__(self) -> None:
         self.connected = True
         self.kept: list[KeyframeRequest] = []
         self.before_answer: Callable[[str], None] = lambda service: None
-        """Called before a service answers; may raise."""
+        """Called with the name of a service before the service answers; may raise the error of the call."""
         self.lose_answer = False
         self.asked: list[str] = []
         self.relocalised: dict[str, Any] = {"verdict": "none", "reason": "nothing alike"}
@@ -70,7 +76,7 @@ class FakeLiveRobot:
         self, service: str, request: Any, reply_type: Any = None, *,
         deadline_s: float | None = None, keep: bool = False,
     ) -> Answer:  # fmt: skip
-        """Answer as the platform would."""
+        """Answer a call as the platform would; raises RsePfError while the robot is not connected."""
         self.asked.append(service)
         await asyncio.sleep(0)
         try:
@@ -89,20 +95,20 @@ class FakeLiveRobot:
         )  # fmt: skip
 
     async def subscribe(self, topic: str) -> AsyncIterator[tuple[str, Any]]:
-        """Yield what `tell` was given."""
+        """Yield the updates that `publish` was given."""
         assert topic == "live/lab"
         while True:
             yield await self._updates.get()
 
-    def tell(self, key: str, payload: Any) -> None:
-        """Push an update."""
+    def publish(self, key: str, payload: Any) -> None:
+        """Publish an update of the map to the robot."""
         self._updates.put_nowait((key, payload))
 
-    async def until(self, true: Callable[[], bool]) -> None:
-        """Wait until *true*, looking after each call."""
+    async def until(self, condition: Callable[[], bool]) -> None:
+        """Wait until *condition* returns True, for 10 s at most; it is tested after each call."""
 
         async def wait() -> None:
-            while not true():
+            while not condition():
                 self.changed.clear()
                 try:
                     await asyncio.wait_for(self.changed.wait(), 0.02)
@@ -112,7 +118,7 @@ class FakeLiveRobot:
         await asyncio.wait_for(wait(), 10.0)
 
     def restart_map(self) -> None:
-        """Begin the map anew, as after ``live-stop``."""
+        """Start the map again, empty, as after ``live-stop``."""
         self.kept.clear()
 
     def _show(self, request: Any) -> Any:
@@ -121,7 +127,7 @@ class FakeLiveRobot:
         you = {
             "robot": "me",
             "number": len(self.kept),
-            "segment": max((each.segment for each in self.kept), default=-1) + 1,
+            "segment": max((request.segment for request in self.kept), default=-1) + 1,
         }
         return {
             "keyframes": len(self.kept) + self.foreign_keyframes,

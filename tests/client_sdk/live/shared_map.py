@@ -1,4 +1,4 @@
-"""Robots whose platform is one live map in this process: links are measured at once, alignments told."""
+"""Robots whose platform is one live map in this process, which measures loop closures at once."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class SharedMap:
         return made
 
     def add(self, name: str, request: Any) -> None:
-        """Take a keyframe, and tell all robots what has changed."""
+        """Add a keyframe to the map, and publish all alignments to all robots."""
         live_map = self.live_map
         outcomes = live_map.apply(
             KeyframeAdded(robot=name, segment=request.segment, number=request.number, data=request.keyframe)
@@ -48,7 +48,7 @@ class SharedMap:
                 "covariance": None, "scale": alignment.scale,
             }  # fmt: skip
             for robot in self.robots.values():
-                robot.tell(f"alignment/{alignment.robot}", payload)
+                robot.publish(f"alignment/{alignment.robot}", payload)
 
 
 class SharingRobot(FakeLiveRobot):

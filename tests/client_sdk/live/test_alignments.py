@@ -1,4 +1,4 @@
-"""What a robot knows of a live map, update by update."""
+"""Alignments of a robot in a live map, as updates and relocalisations change them."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def test_only_a_change_of_the_alignment_is_a_correction(known: Alignments) -> No
     first = known.apply_update("alignment/me", alignment("me", FIRST, segment=3))
     again = known.apply_update("alignment/me", alignment("me", FIRST, segment=3))
     second = known.apply_update("alignment/me", alignment("me", SECOND, segment=3))
-    lost = known.apply_update("alignment/me", alignment("me", None, segment=3, reason="a link was removed"))
+    lost = known.apply_update("alignment/me", alignment("me", None, segment=3, reason="a closure is gone"))
 
     assert first is not None
     assert again is None
@@ -34,10 +34,10 @@ def test_only_a_change_of_the_alignment_is_a_correction(known: Alignments) -> No
     np.testing.assert_array_equal(second.after, SECOND)
     assert lost is not None
     assert lost.after is None
-    assert known.get(0).reason == "a link was removed"
+    assert known.get(0).reason == "a closure is gone"
 
 
-def test_a_relocalisation_never_replaces_what_the_map_found(known: Alignments) -> None:
+def test_a_relocalisation_never_replaces_an_alignment_of_the_map(known: Alignments) -> None:
     known.apply_update("alignment/me", alignment("me", FIRST, segment=3))
 
     late = known.apply_relocalisation(
@@ -48,7 +48,7 @@ def test_a_relocalisation_never_replaces_what_the_map_found(known: Alignments) -
     np.testing.assert_array_equal(known.get(0).T_map_odom, FIRST)
 
 
-def test_segments_of_an_earlier_run_and_of_others_are_not_mine(known: Alignments) -> None:
+def test_segments_of_earlier_runs_and_of_other_robots_are_ignored(known: Alignments) -> None:
     assert known.apply_update("alignment/me", alignment("me", FIRST, segment=2)) is None
     assert known.apply_update("alignment/other", alignment("other", FIRST, segment=3)) is None
     assert known.get(0).by == "nothing"
@@ -63,7 +63,7 @@ def test_a_damaged_pose_changes_nothing(known: Alignments) -> None:
     assert known.get(0).by == "nothing"
 
 
-def test_a_relocalisation_with_a_scale_places_the_keyframe_where_it_says(known: Alignments) -> None:
+def test_a_relocalisation_with_a_scale_gives_the_keyframe_the_pose_of_the_reply(known: Alignments) -> None:
     pose = exp_se3([2.0, 1.0, 0, 0, 0, 0.4])
     reply = RelocaliseReply(verdict="ok", T_map_camera=SECOND.ravel(), scale=0.25)
 
@@ -73,7 +73,7 @@ def test_a_relocalisation_with_a_scale_places_the_keyframe_where_it_says(known: 
 
 
 @pytest.mark.parametrize("scale", [0.0, -1.0, float("nan"), float("inf")])
-def test_an_absurd_scale_changes_nothing(known: Alignments, scale: float) -> None:
+def test_an_invalid_scale_changes_nothing(known: Alignments, scale: float) -> None:
     with pytest.raises(BadMessage, match="a scale"):
         known.apply_update("alignment/me", {**alignment("me", FIRST, segment=3), "scale": scale})
 

@@ -1,4 +1,4 @@
-"""A live map from the side of one robot: keyframes up, alignments down, and every fault between them."""
+"""A robot in a live map: it sends keyframes, applies alignments, and survives faults of both."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def times_s(robot: FakeLiveRobot) -> list[float]:
     return [decode_keyframe(request.keyframe).timestamp_s for request in robot.kept]
 
 
-async def test_a_keyframe_each_10_cm_is_kept_by_the_map_in_order(robot: FakeLiveRobot) -> None:
+async def test_a_keyframe_every_10_cm_is_acknowledged_by_the_map_in_order(robot: FakeLiveRobot) -> None:
     async with live_map(robot) as mapper:
         await drive(mapper, range(9))
         await robot.until(lambda: mapper.keyframes_waiting == 0)
@@ -88,7 +88,7 @@ async def test_keyframes_have_the_strongest_features_wherever_they_are(robot: Fa
     assert not by_robot.is_spread
 
 
-async def test_the_robots_own_cloud_is_made_of_its_keyframes_beside_its_frames(robot: FakeLiveRobot) -> None:
+async def test_the_robots_own_cloud_is_made_of_its_keyframes_only(robot: FakeLiveRobot) -> None:
     async with live_map(robot) as mapper:
         await drive(mapper, range(1))
     of_one = len(mapper.map)
@@ -125,13 +125,13 @@ def test_the_largest_keyframe_takes_at_most_34_kb_in_every_codec(codec: str) -> 
     assert 30_000 < len(message) <= 34_000
 
 
-async def test_an_alignment_is_an_event_before_a_pose_uses_it(robot: FakeLiveRobot) -> None:
+async def test_a_correction_is_published_before_a_pose_uses_it(robot: FakeLiveRobot) -> None:
     async with live_map(robot) as mapper:
-        heard: list[Correction] = []
+        received: list[Correction] = []
 
         async def listen() -> None:
             async for correction in mapper.corrections():
-                heard.append(correction)
+                received.append(correction)
                 robot.changed.set()
 
         listening = asyncio.create_task(listen())
@@ -141,14 +141,14 @@ async def test_an_alignment_is_an_event_before_a_pose_uses_it(robot: FakeLiveRob
         assert mapper.reason
         await robot.until(lambda: len(robot.kept) == 1 and robot.asked[-1] == "live-show")
 
-        robot.tell("alignment/me", alignment("me", T_MAP_ODOM))
-        await robot.until(lambda: len(heard) == 1)
+        robot.publish("alignment/me", alignment("me", T_MAP_ODOM))
+        await robot.until(lambda: len(received) == 1)
         third, fourth = await drive(mapper, range(2, 4))
 
-        assert heard[0].before is None
-        assert heard[0].cause == ("other", 3)
-        assert heard[0].by == "map"
-        np.testing.assert_array_equal(heard[0].after, T_MAP_ODOM)
+        assert received[0].before is None
+        assert received[0].cause == ("other", 3)
+        assert received[0].by == "map"
+        np.testing.assert_array_equal(received[0].after, T_MAP_ODOM)
         assert (third.corrected, fourth.corrected) == (True, False)
         assert third.T_world_camera is not None
         assert second.T_world_camera is not None
@@ -165,16 +165,16 @@ async def test_an_alignment_is_an_event_before_a_pose_uses_it(robot: FakeLiveRob
 async def test_others_and_the_state_of_the_map_are_known(robot: FakeLiveRobot) -> None:
     async with live_map(robot) as mapper:
         pose = {"kind": "pose", "robot": "r2", "segment": 0, "timestamp_s": 4.0}
-        robot.tell("pose/r2", {**pose, "T_map_camera": T_MAP_ODOM.ravel().tolist()})
-        robot.tell("alignment/r3", alignment("r3", None, reason="too few links"))
-        robot.tell("map", {"kind": "map", "keyframes": 9, "version": 12, "owner": "o", "state": "moving"})
+        robot.publish("pose/r2", {**pose, "T_map_camera": T_MAP_ODOM.ravel().tolist()})
+        robot.publish("alignment/r3", alignment("r3", None, reason="too few closures"))
+        robot.publish("map", {"kind": "map", "keyframes": 9, "version": 12, "owner": "o", "state": "moving"})
         await robot.until(lambda: mapper.state == "moving")
 
         np.testing.assert_allclose(mapper.others["r2"].T_map_camera, T_MAP_ODOM)
-        assert mapper.others["r3"].reason == "too few links"
+        assert mapper.others["r3"].reason == "too few closures"
         assert (mapper.map_keyframes, mapper.version, mapper.map_server) == (9, 12, "o")
 
-        robot.tell("pose/r2", {"robot": "r2"})  # damaged: told, and nothing else
+        robot.publish("pose/r2", {"robot": "r2"})  # damaged: reported, and nothing changes
         await robot.until(lambda: "bad-message" in mapper.trouble)
         assert "r2" in mapper.others
         robot.connected = False
@@ -272,13 +272,13 @@ async def test_a_program_that_starts_again_without_a_spool_asks_for_its_numbers(
     assert [(each.number, each.segment) for each in robot.kept] == [(0, 0), (1, 0), (2, 1), (3, 1)]
 
 
-async def test_a_map_that_begins_anew_gets_new_numbers_and_old_alignments_are_forgotten(
+async def test_a_map_that_was_started_again_gets_new_numbers_and_ends_old_alignments(
     robot: FakeLiveRobot,
 ) -> None:
     async with live_map(robot) as mapper:
         await drive(mapper, range(5))
         await robot.until(lambda: len(robot.kept) == 2)
-        robot.tell("alignment/me", alignment("me", T_MAP_ODOM))
+        robot.publish("alignment/me", alignment("me", T_MAP_ODOM))
         await robot.until(lambda: mapper.aligned)
 
         robot.restart_map()
@@ -289,12 +289,12 @@ async def test_a_map_that_begins_anew_gets_new_numbers_and_old_alignments_are_fo
 
         assert again.segment == 1
         assert [(each.number, each.segment) for each in robot.kept] == [(0, 0)]
-        robot.tell("alignment/me", alignment("me", T_MAP_ODOM, segment=0))
+        robot.publish("alignment/me", alignment("me", T_MAP_ODOM, segment=0))
         await robot.until(lambda: mapper.aligned)
         assert len(mapper.map_trajectory) == 1  # the first segment was of the old map
 
 
-async def test_a_platform_that_cannot_look_up_places_is_named_until_the_robot_is_aligned(
+async def test_a_failed_relocalisation_is_reported_until_the_robot_is_aligned(
     robot: FakeLiveRobot,
 ) -> None:
     robot.foreign_keyframes = 50
@@ -305,12 +305,12 @@ async def test_a_platform_that_cannot_look_up_places_is_named_until_the_robot_is
         await drive(mapper, range(3, 5))
         assert mapper.trouble == "missing-extra: gtsam is not installed: it is in the extra 'maps'"
 
-        robot.tell("alignment/me", alignment("me", T_MAP_ODOM))
+        robot.publish("alignment/me", alignment("me", T_MAP_ODOM))
         await robot.until(lambda: mapper.aligned)
         assert not mapper.trouble
 
 
-async def test_a_lost_robot_begins_a_segment_and_asks_where_it_is(robot: FakeLiveRobot) -> None:
+async def test_a_lost_robot_begins_a_segment_and_is_relocalised(robot: FakeLiveRobot) -> None:
     robot.foreign_keyframes = 50
     T_map_camera = exp_se3([5.0, 0, 0, 0, 0, 0])
     async with live_map(robot) as mapper:
@@ -339,12 +339,12 @@ async def test_a_lost_robot_begins_a_segment_and_asks_where_it_is(robot: FakeLiv
         assert placed.T_map_camera is not None
         np.testing.assert_allclose(placed.T_map_camera[:3, 3], [5 + STEP_M, 0, 0], atol=0.01)
 
-        robot.tell("alignment/me", alignment("me", None, segment=1, reason="too few links"))
-        robot.tell("alignment/me", alignment("me", T_MAP_ODOM, segment=1))
+        robot.publish("alignment/me", alignment("me", None, segment=1, reason="too few closures"))
+        robot.publish("alignment/me", alignment("me", T_MAP_ODOM, segment=1))
         await robot.until(lambda: mapper.aligned_by == "map")  # what the map found wins
 
 
-async def test_a_robot_that_is_told_to_relocalise_asks_with_its_next_keyframe(robot: FakeLiveRobot) -> None:
+async def test_relocalise_sends_the_next_keyframe_without_a_pause(robot: FakeLiveRobot) -> None:
     robot.foreign_keyframes = 50
     patient = replace(QUICK, relocalise_s=3600.0, keyframe_m=0.01)
     async with LiveMapper(robot, "lab", ask=solve, live=patient) as mapper:
@@ -358,7 +358,7 @@ async def test_a_robot_that_is_told_to_relocalise_asks_with_its_next_keyframe(ro
         await robot.until(lambda: robot.asked.count("live-relocalise") == 2)
 
 
-async def test_a_covered_lens_begins_no_segment_and_the_robot_finds_its_place_itself(
+async def test_a_covered_lens_begins_no_segment_and_tracking_continues_after_it(
     robot: FakeLiveRobot,
 ) -> None:
     async with live_map(robot) as mapper:
@@ -371,7 +371,7 @@ async def test_a_covered_lens_begins_no_segment_and_the_robot_finds_its_place_it
         np.testing.assert_allclose(back.T_world_camera[:3, 3], [2 * STEP_M, 0, 0], atol=0.02)
 
 
-async def test_a_robot_that_asks_in_vain_asks_more_rarely_until_its_next_segment(
+async def test_relocalisations_without_a_place_become_less_frequent_until_the_next_segment(
     robot: FakeLiveRobot,
 ) -> None:
     robot.foreign_keyframes = 50
@@ -394,18 +394,20 @@ async def test_an_ambiguous_place_ends_a_relocalisation(robot: FakeLiveRobot) ->
     async with live_map(robot) as mapper:
         await drive(mapper, range(1))
         await robot.until(lambda: mapper.aligned)
-        robot.tell("alignment/me", alignment("me", None, reason="ambiguous: two places look alike"))
+        robot.publish("alignment/me", alignment("me", None, reason="ambiguous: two places look alike"))
         await robot.until(lambda: not mapper.aligned)
 
         assert mapper.reason == "ambiguous: two places look alike"
 
 
-async def test_a_busy_map_is_asked_again_and_a_refused_keyframe_leaves_no_gap(robot: FakeLiveRobot) -> None:
+async def test_a_busy_map_gets_the_keyframe_again_and_a_refused_one_leaves_no_gap(
+    robot: FakeLiveRobot,
+) -> None:
     async with live_map(robot) as mapper:
         robot.before_answer = failing(Busy("moving", retry_after_ms=1.0), "live-keyframe", 1)
         await drive(mapper, range(1))
         await robot.until(lambda: len(robot.kept) == 1)
-        robot.before_answer = failing(BadRequest("garbage"), "live-keyframe", 1)
+        robot.before_answer = failing(BadRequest("malformed keyframe"), "live-keyframe", 1)
         await drive(mapper, range(1, 9))
         await robot.until(lambda: mapper.keyframes_waiting == 0)
 
@@ -414,14 +416,14 @@ async def test_a_busy_map_is_asked_again_and_a_refused_keyframe_leaves_no_gap(ro
         assert mapper.report()["live"]["keyframes_refused"] == 1
 
 
-async def test_a_robot_without_the_right_is_told_at_once(robot: FakeLiveRobot) -> None:
+async def test_a_robot_without_the_scope_gets_the_error_when_it_joins(robot: FakeLiveRobot) -> None:
     robot.before_answer = failing(Forbidden("no scope maps:live/lab"), "live-show", 1)
     with pytest.raises(Forbidden, match="maps:live/lab"):
         async with live_map(robot):
             pass
 
 
-async def test_a_keyframe_waits_while_a_pose_is_asked_for(robot: FakeLiveRobot) -> None:
+async def test_a_keyframe_waits_while_a_pose_query_is_open(robot: FakeLiveRobot) -> None:
     order: list[str] = []
     asked, answer = asyncio.Event(), asyncio.Event()
 
@@ -453,7 +455,7 @@ def test_a_program_without_asyncio_uses_the_same_mapper() -> None:
         with BlockingLiveMapper(live_map(robot), loop.run_until_complete) as blocking:
             blocking.track(frame_at(0, depth=True))
             loop.run_until_complete(robot.until(lambda: len(robot.kept) == 1))
-            robot.tell("alignment/me", alignment("me", T_MAP_ODOM))
+            robot.publish("alignment/me", alignment("me", T_MAP_ODOM))
             corrections = blocking.corrections()
             assert next(corrections).by == "map"
             assert blocking.track(frame_at(1, depth=True)).corrected
@@ -468,7 +470,7 @@ async def test_a_map_that_is_not_joined_is_refused(robot: FakeLiveRobot) -> None
         await mapper.track(frame_at(0, depth=True))
 
 
-def test_a_full_spool_drops_the_newest_and_a_damaged_one_is_told(tmp_path: Path) -> None:
+def test_a_small_spool_opens_empty_and_a_damaged_one_is_refused(tmp_path: Path) -> None:
     queue = KeyframeQueue(tmp_path, max_bytes=10)
     queue.open()
     assert queue.next_index == 0

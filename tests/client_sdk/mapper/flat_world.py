@@ -1,4 +1,4 @@
-"""Three textured planes before a camera that moves sideways: pictures and depth that are exact."""
+"""Three textured planes in front of a camera that moves sideways, with exact images and depths."""
 
 from __future__ import annotations
 

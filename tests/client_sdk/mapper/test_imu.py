@@ -55,7 +55,7 @@ def test_gravity_points_along_minus_z_from_the_first_frame_on():
     assert mapper.report()["imu"] == "not used yet"
 
 
-def test_a_start_that_the_user_gave_stays():
+def test_a_start_pose_of_the_user_is_kept():
     start = exp_se3(np.array([1.0, 2.0, 3.0, 0.1, 0.2, 0.3]))
 
     done = drive(Mapper(ask=solve, T_world_start=start), range(2), depth=True)
@@ -85,7 +85,7 @@ def test_frames_are_tracked_on_in_a_world_that_was_turned():
 
 @pytest.fixture
 def leaning_first(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let the first samples tell a false gravity, and the motion the true one after the fourth frame."""
+    """Let the first samples give a wrong gravity, and the alignment the true one from the fourth frame on."""
     monkeypatch.setattr(ImuEstimator, "stationary_gravity", lambda imu: np.array([0.0, 9.0, 4.0]))
     monkeypatch.setattr(ImuEstimator, "is_due", lambda imu, timestamp_s: timestamp_s > 0.25)
     monkeypatch.setattr(ImuEstimator, "align", align_by_first_pose)
@@ -99,7 +99,7 @@ def align_by_first_pose(imu: Any, timestamps_s: Array, poses: Array, depth: floa
 
 
 @pytest.mark.usefixtures("leaning_first")
-def test_a_turn_of_the_world_is_told_so_that_poses_before_it_compare():
+def test_a_rotation_of_the_world_is_returned_with_the_frame():
     done = drive(Mapper(ask=solve), range(6), depth=True)
 
     turns = [each.T_new_old for each in done if each.T_new_old is not None]

@@ -59,7 +59,7 @@ def test_frames_with_depth_give_metric_poses_and_a_dense_map() -> None:
     assert (done[3].source, done[3].round_trip_ms) == ("cloud", 3.0)
 
 
-def test_a_frame_that_nobody_answers_is_lost_with_the_reason_and_the_next_one_is_tracked() -> None:
+def test_a_frame_without_an_answer_is_lost_with_the_reason_and_the_next_frame_is_tracked() -> None:
     async def refuses_once(query: PoseQuery) -> PoseAnswer:
         if query.timestamp_s == pytest.approx(0.1):
             raise Busy("the server is busy")
@@ -75,7 +75,7 @@ def test_a_frame_that_nobody_answers_is_lost_with_the_reason_and_the_next_one_is
     assert mapper.report()["lost_because"] == {"busy: the server is busy": 1}
 
 
-def test_a_robot_that_cannot_ask_at_all_says_so_and_may_go_on() -> None:
+def test_a_configuration_error_of_the_solver_is_raised_and_tracking_can_continue() -> None:
     fails = True
 
     async def ask(query: PoseQuery) -> PoseAnswer:
@@ -131,7 +131,7 @@ def zoomed(frame: Frame) -> Frame:
         (zoomed, "of another camera"),
     ],
 )
-def test_an_odd_frame_is_refused_with_a_hint_and_the_drive_goes_on(
+def test_an_invalid_frame_is_refused_with_a_hint_and_the_drive_continues(
     change: Callable[[Frame], Frame], expected: str
 ) -> None:
     mapper = Mapper(ask=solve)
@@ -193,7 +193,7 @@ def test_a_lost_camera_without_depth_is_found_again_where_it_was() -> None:
     assert mapper.lost_frames == 1
 
 
-def test_a_cut_without_depth_saves_the_second_place_apart(tmp_path: Path) -> None:
+def test_a_second_place_without_depth_is_saved_as_a_separate_segment(tmp_path: Path) -> None:
     mapper = Mapper(
         ask=solve, scale=OdometryScale(first_m=0.2), monocular=MonocularOptions(segment_after=3)
     )  # fmt: skip
@@ -226,7 +226,7 @@ def test_saves_files_that_other_programs_read(tmp_path: Path) -> None:
         mapper.save(tmp_path / "out" / "map.ply")
 
 
-def test_the_blocking_twin_gives_the_same() -> None:
+def test_the_blocking_mapper_gives_the_same_results() -> None:
     mapper = BlockingMapper(Mapper(ask=solve))
 
     done = [mapper.track(frame_at(row, depth=True)) for row in range(2)]

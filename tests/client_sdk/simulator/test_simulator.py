@@ -23,7 +23,7 @@ from rse_pf.pnp import PnpOptions, solve_pnp
 
 
 @pytest.fixture(scope="module")
-def painter() -> Renderer:
+def renderer() -> Renderer:
     return Renderer(make_world(0), SIMULATED_CAMERA)
 
 
@@ -80,10 +80,10 @@ def test_robots_that_merge_drive_past_the_start_of_the_next_one(robots: int):
             assert np.linalg.norm(own[frames // 2 :] - seen, axis=1).min() < 0.1
 
 
-def test_every_ray_ends_on_a_surface_of_the_world(painter: Renderer):
+def test_every_ray_ends_on_a_surface_of_the_world(renderer: Renderer):
     pose = true_trajectory(0, 1, 1, 0).T_world_camera[0]
 
-    _, depth_m, _ = painter.draw(pose)
+    _, depth_m, _ = renderer.draw(pose)
 
     assert (depth_m > 0).mean() > 0.9999
     rows, columns = np.nonzero(depth_m[::7, ::7] > 0)
@@ -94,12 +94,12 @@ def test_every_ray_ends_on_a_surface_of_the_world(painter: Renderer):
     assert (points < [3 * ROOM_M + 0.001, DEPTH_M + 0.001, HEIGHT_M + 0.001]).all()
 
 
-def test_a_wall_is_as_far_away_as_it_is(painter: Renderer):
+def test_the_depth_of_a_wall_is_exact(renderer: Renderer):
     pose = np.eye(4)
     pose[:3, :3] = [[0, 0, -1], [1, 0, 0], [0, -1, 0]]  # looking along -x; x of the image is +y
     pose[:3, 3] = [1.0, 1.5, 0.5]
 
-    _, depth_m, cosine = painter.draw(pose)
+    _, depth_m, cosine = renderer.draw(pose)
 
     assert depth_m[240, 320] == pytest.approx(1.0, abs=1e-5)
     assert cosine[240, 320] == pytest.approx(1.0, abs=1e-4)
@@ -122,7 +122,7 @@ def test_depth_noise_has_the_size_that_the_model_says():
         assert 0.001 < 1 - seen.mean() < 0.003
 
 
-def test_depth_has_holes_beside_edges_at_grazing_angles_and_out_of_range():
+def test_depth_has_holes_at_edges_at_grazing_angles_and_out_of_range():
     truth = np.full((100, 100), 2.0, np.float32)
     truth[:, 50:] = 3.0
     truth[0], truth[1] = 0.39, 6.1

@@ -1,4 +1,4 @@
-"""Points beside keyframes: which are chosen, when they are sent, and what happens where they cannot be."""
+"""Attachments of keyframes: the choice of points, and their upload with its rate limits and failures."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ NO_FEATURES = extract(frame_at(0, depth=True), FrontEndOptions())
 
 
 class Objects:
-    """The objects of a robot, and why none can be stored."""
+    """An object store in memory; ``error`` is raised instead of storing, if it is set."""
 
     def __init__(self) -> None:
         self.held: dict[str, bytes] = {}
@@ -93,7 +93,7 @@ async def test_each_keyframe_refers_to_points_that_the_robot_stores(robot: FakeL
     assert mapper.report()["live"]["points"]["sent"] == 3
 
 
-async def test_points_wait_while_a_pose_is_asked_for(robot: FakeLiveRobot) -> None:
+async def test_points_wait_while_a_pose_query_is_open(robot: FakeLiveRobot) -> None:
     objects, is_asked, may_answer = Objects(), asyncio.Event(), asyncio.Event()
     may_answer.set()
 
@@ -120,7 +120,7 @@ async def test_points_wait_while_a_pose_is_asked_for(robot: FakeLiveRobot) -> No
         await robot.until(lambda: len(objects.held) == 2)
 
 
-async def test_keyframes_that_follow_fast_have_fewer_points_within_the_share_of_the_link(
+async def test_keyframes_that_follow_fast_have_fewer_points_within_the_rate_limit(
     robot: FakeLiveRobot,
 ) -> None:
     objects = Objects()
@@ -137,7 +137,7 @@ async def test_keyframes_that_follow_fast_have_fewer_points_within_the_share_of_
 
 
 @pytest.mark.parametrize("error", [Forbidden("no scope data:write"), ConnectError("no data service")])
-async def test_a_robot_that_cannot_store_points_maps_and_leaves_as_before(
+async def test_a_robot_that_cannot_store_points_still_maps_and_leaves(
     robot: FakeLiveRobot, error: Exception
 ) -> None:
     objects = Objects()
@@ -188,7 +188,7 @@ async def test_an_image_is_stored_where_operator_and_robot_want_it(
     assert {each.digest for each in images} == set(objects.held)
 
 
-async def test_keyframes_whose_images_do_not_fit_the_share_of_the_link_have_none(
+async def test_keyframes_beyond_the_rate_limit_of_images_have_none(
     robot: FakeLiveRobot,
 ) -> None:
     objects = Objects()
@@ -202,7 +202,7 @@ async def test_keyframes_whose_images_do_not_fit_the_share_of_the_link_have_none
         assert [each is not None for each in images] == [True, False, False]
 
 
-async def test_a_store_function_that_raises_is_reported_and_asked_again(
+async def test_a_store_function_that_raises_is_reported_and_called_again(
     robot: FakeLiveRobot, caplog: pytest.LogCaptureFixture
 ) -> None:
     objects = Objects()

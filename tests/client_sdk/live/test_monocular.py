@@ -1,4 +1,4 @@
-"""A robot with one lens in a live map: settled keyframes up, its metres down."""
+"""A monocular robot in a live map: it sends settled keyframes, and receives its metric scale."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ async def drive(mapper: LiveMapper, rows: range) -> list[TrackedFrame]:
     return [await mapper.track(lens(row)) for row in rows]
 
 
-async def test_settled_keyframes_of_one_lens_are_sent_in_one_unit(robot: FakeLiveRobot) -> None:
+async def test_settled_monocular_keyframes_are_sent_with_one_scale(robot: FakeLiveRobot) -> None:
     async with live_map(robot) as mapper:
         done = await drive(mapper, range(24))
         await robot.until(lambda: mapper.keyframes_waiting == 0)
@@ -70,16 +70,18 @@ async def test_settled_keyframes_of_one_lens_are_sent_in_one_unit(robot: FakeLiv
         assert abs(unit_m * np.median(ratios) - 1.0) < 0.1  # the tracker's own unit drifts by 6 %
 
 
-async def test_its_poses_in_the_map_are_metres_once_the_map_tells_the_scale(robot: FakeLiveRobot) -> None:
+async def test_monocular_poses_are_metric_once_the_map_has_sent_the_scale(
+    robot: FakeLiveRobot,
+) -> None:
     async with live_map(robot) as mapper:
         before = (await drive(mapper, range(14)))[-1]
         assert (before.T_map_camera, mapper.metres_per_unit) == (None, None)
         assert mapper.scale == "up to scale"
         await robot.until(lambda: mapper.keyframes_waiting == 0 and robot.asked.count("live-show") > 1)
-        robot.tell("alignment/me", alignment("me", None, reason="up to scale: alone"))
+        robot.publish("alignment/me", alignment("me", None, reason="up to scale: alone"))
         await robot.until(lambda: mapper.reason == "up to scale: alone")
 
-        robot.tell("alignment/me", alignment("me", T_MAP_ODOM, scale=0.25))
+        robot.publish("alignment/me", alignment("me", T_MAP_ODOM, scale=0.25))
         await robot.until(lambda: mapper.aligned)
         one, two = await drive(mapper, range(14, 16))
 
@@ -106,7 +108,9 @@ async def test_a_first_frame_without_the_depth_that_was_promised_is_refused(robo
         assert (await mapper.track(frame_at(0, depth=True))).status == "starting"
 
 
-async def test_a_tracker_that_changes_its_unit_changes_none_that_was_sent(robot: FakeLiveRobot) -> None:
+async def test_a_tracker_that_changes_its_scale_changes_no_sent_keyframe(
+    robot: FakeLiveRobot,
+) -> None:
     async with live_map(robot) as mapper:
         done = await drive(mapper, range(14))
         tracker = mapper._mapper.monocular_tracker
@@ -122,11 +126,11 @@ async def test_a_tracker_that_changes_its_unit_changes_none_that_was_sent(robot:
     assert min(depths) > 0.8 * max(depths)
 
 
-async def test_another_segment_has_another_unit_until_the_map_tells_it(robot: FakeLiveRobot) -> None:
+async def test_another_segment_has_no_metric_scale_until_the_map_has_sent_one(robot: FakeLiveRobot) -> None:
     async with live_map(robot) as mapper:
         await drive(mapper, range(14))
         await robot.until(lambda: mapper.keyframes_waiting == 0 and robot.asked.count("live-show") > 1)
-        robot.tell("alignment/me", alignment("me", T_MAP_ODOM, scale=0.25))
+        robot.publish("alignment/me", alignment("me", T_MAP_ODOM, scale=0.25))
         await robot.until(lambda: mapper.aligned)
 
         elsewhere = [await mapper.track(foreign(lens(row, 5.0 + row / 10))) for row in range(24)]
@@ -142,7 +146,7 @@ async def test_another_segment_has_another_unit_until_the_map_tells_it(robot: Fa
         times_s = [decode_keyframe(each.keyframe).timestamp_s for each in robot.kept]
         assert segments == [int(stamp_s >= 5.0) for stamp_s in times_s]
 
-        robot.tell("alignment/me", alignment("me", np.eye(4), segment=1, scale=3.0))
+        robot.publish("alignment/me", alignment("me", np.eye(4), segment=1, scale=3.0))
         await robot.until(lambda: mapper.aligned)
         last = await mapper.track(foreign(lens(24, 7.4)))
         assert last.corrected
@@ -150,7 +154,7 @@ async def test_another_segment_has_another_unit_until_the_map_tells_it(robot: Fa
         np.testing.assert_allclose(last.T_map_camera, scaled(last.T_world_camera, 3.0))
 
 
-async def test_it_asks_for_its_place_with_such_keyframes_and_takes_the_scale(robot: FakeLiveRobot) -> None:
+async def test_monocular_keyframes_are_relocalised_with_the_scale_of_the_reply(robot: FakeLiveRobot) -> None:
     robot.foreign_keyframes = 5
     T_map_camera = exp_se3([0.3, 0.1, 0.2, 0.0, 0.1, 0.0])
     robot.relocalised = {"verdict": "ok", "T_map_camera": T_map_camera.ravel().tolist(), "scale": 0.5}
@@ -165,7 +169,7 @@ async def test_it_asks_for_its_place_with_such_keyframes_and_takes_the_scale(rob
 
 
 class MovingTracker:
-    """A tracker whose keyframes the test moves; one metre is `unit` units."""
+    """A tracker whose keyframes the test moves; one metre is ``unit`` units of length."""
 
     def __init__(self) -> None:
         self.segment, self.unit = 0, 1.0
@@ -227,7 +231,7 @@ def test_an_odometry_keeps_its_unit_and_its_sent_poses_through_adjustments() -> 
 
 
 @pytest.mark.parametrize(("scale", "begins"), [(1.02, False), (1 / 1.02, False), (1.05, True), (0.9, True)])
-def test_a_loop_that_changes_the_unit_ends_an_odometry(scale: float, begins: bool) -> None:
+def test_a_loop_closure_that_changes_the_scale_ends_an_odometry(scale: float, begins: bool) -> None:
     tracker: Any = MovingTracker()
     odometry = MonocularOdometry(tracker)
     tracker.poses = [at(number) for number in range(5)]
@@ -244,7 +248,7 @@ def test_a_loop_that_changes_the_unit_ends_an_odometry(scale: float, begins: boo
     assert len(sent) == 3
 
 
-def test_a_segment_that_is_known_goes_on_with_its_next_keyframes() -> None:
+def test_an_older_segment_continues_with_its_next_keyframes() -> None:
     tracker: Any = MovingTracker()
     odometry = MonocularOdometry(tracker)
     old = tracker.poses = [at(number) for number in range(5)]
@@ -268,8 +272,8 @@ def test_a_segment_that_is_known_goes_on_with_its_next_keyframes() -> None:
     assert odometry.start_if_broken()
 
 
-async def test_one_lens_gets_its_metres_within_3_percent_from_a_robot_with_depth() -> None:
-    """Two robots drive one way; the one with a lens is three frames ahead."""
+async def test_a_monocular_robot_gets_its_scale_within_3_percent_from_a_robot_with_depth() -> None:
+    """Two robots drive the same way; the monocular robot is three frames ahead."""
     count, ahead = 22, 3
 
     def noisy(row: int, *, depth: bool) -> Frame:

@@ -1,4 +1,4 @@
-"""An IMU beside tracked poses: metres, gravity and turns; a bad one is named in one line and not used."""
+"""An IMU and tracked poses: scale, gravity, rotations; a faulty IMU is reported in one line and not used."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ SEED = 6
 
 @dataclass
 class Driven:
-    """What an IMU told beside tracked poses, frame by frame; ``scales`` holds None while none is known."""
+    """Estimates of an IMU in a drive; ``scales`` has one entry per estimate, None while it is not known."""
 
     inertial: ImuEstimator
     drive: InertialDrive
@@ -68,7 +68,7 @@ def driven(
     return Driven(inertial, drive, imu, scales, stamps, T)
 
 
-def test_metres_come_once_they_are_known_and_improve():
+def test_the_scale_is_returned_once_it_is_known_and_improves():
     made = driven()
 
     assert made.inertial.trouble == ""
@@ -78,7 +78,7 @@ def test_metres_come_once_they_are_known_and_improve():
     assert made.inertial.gravity_m_s2[2] / 9.81 == pytest.approx(-1.0, abs=1e-4)
 
 
-def test_a_drone_at_rest_waits_for_its_metres():
+def test_a_stationary_drone_has_no_scale():
     made = driven(9.0, motion=Motion(rests_s=4.0))
     before = sum(scale is not None for scale in driven(4.0, motion=Motion(rests_s=4.0)).scales)
 
@@ -86,7 +86,7 @@ def test_a_drone_at_rest_waits_for_its_metres():
     assert made.scale_error < 0.02
 
 
-def test_the_gyroscope_tells_how_the_camera_turns():
+def test_the_gyroscope_predicts_the_rotation_of_the_camera():
     made = driven()
     T = made.drive.T_world_camera(np.array([7.5, 7.55]))
 
@@ -143,7 +143,7 @@ def thinned(samples: ImuSamples) -> ImuSamples:
         ),
     ],
 )
-def test_a_bad_imu_is_named_in_one_line_and_not_used(change, line):
+def test_a_faulty_imu_is_reported_in_one_line_and_not_used(change, line):
     made = driven(change=change)
 
     assert made.inertial.trouble
@@ -156,7 +156,7 @@ def test_a_bad_imu_is_named_in_one_line_and_not_used(change, line):
 @pytest.mark.parametrize("factor", [0.9, 1.1])
 @pytest.mark.parametrize("rests_s", [0.0, 4.0])
 @pytest.mark.parametrize("seed", [3, 6])
-def test_an_accelerometer_with_a_wrong_scale_is_named(factor, rests_s, seed, monkeypatch):
+def test_an_accelerometer_with_a_wrong_scale_is_reported(factor, rests_s, seed, monkeypatch):
     monkeypatch.setitem(globals(), "SEED", seed)
     made = driven(change=lambda s: replace(s, accel=factor * s.accel), motion=Motion(rests_s=rests_s))
 
@@ -179,7 +179,7 @@ def test_an_accelerometer_with_a_usual_bias_is_used(rests_s):
     assert made.scale_error < 0.015
 
 
-def test_a_transposed_mount_is_named():
+def test_an_inverted_mounting_is_reported():
     made = driven(change=lambda s: replace(s, model=replace(MODEL, T_imu_camera=inverse(MODEL.T_imu_camera))))
 
     assert "T_imu_camera says" in made.inertial.trouble
