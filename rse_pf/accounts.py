@@ -30,7 +30,7 @@ import msgspec
 from rse_pf.config import DataSettings
 from rse_pf.errors import Busy, Conflict, NotFound, QuotaExceeded, StoreError, StoreFull
 from rse_pf.identity import RobotId
-from rse_pf.maps.charges import charged_to
+from rse_pf.maps.charges import sum_charges
 from rse_pf.object_store import (
     MIN_CHARGE_BYTES,
     DirectoryStore,
@@ -445,7 +445,7 @@ class Accounts:
         if now - account.counted_s >= self._recount_s:
             total = self._store.usage(f"objects/{robot.folder}/")
             total += _uploads(self._store, f"{robot.folder}/", self._check)
-            account.stored = total + charged_to(self._store, robot, self._check)
+            account.stored = total + sum_charges(self._store, robot, self._check)
             account.counted_s = now
 
     def _check_robot(self, robot: RobotId, used: Usage, charge: Usage, max_bytes: float | None) -> None:

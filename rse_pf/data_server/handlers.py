@@ -55,7 +55,7 @@ from rse_pf.maps.charges import charge_name
 from rse_pf.maps.describe import MapSummary
 from rse_pf.maps.photos import PhotoLens
 from rse_pf.maps.registry import MapContent, MapOrigin, MapRecord, MapRegistry
-from rse_pf.maps.removal import freed_bytes, superseded
+from rse_pf.maps.removal import choose_superseded, count_freed_bytes
 from rse_pf.object_store import DirectoryStore, ObjectStore, PresigningStore
 
 __all__ = ["Handler", "Handlers", "MapWork"]
@@ -305,7 +305,7 @@ class Handlers:
 
         def work() -> list[MapRecord]:
             maps = self._maps(claims)
-            removed = maps.remove(path["name"], functools.partial(superseded, keep=keep))
+            removed = maps.remove(path["name"], functools.partial(choose_superseded, keep=keep))
             tenant, accounts = claims.robot.tenant, self.objects.accounts
             accounts.forget_all(tenant)
             for record in removed:
@@ -313,7 +313,7 @@ class Handlers:
             return removed
 
         removed = await self.threads.run(claims.robot, work)
-        return json_reply(200, Pruned(removed=len(removed), freed_bytes=freed_bytes(removed)))
+        return json_reply(200, Pruned(removed=len(removed), freed_bytes=count_freed_bytes(removed)))
 
     async def show_version(self, request: HttpRequest, claims: Claims, path: dict[str, str]) -> HttpReply:
         """Show a version."""

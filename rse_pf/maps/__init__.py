@@ -1,4 +1,4 @@
-"""Maps that robots share: their format, the registry of versions, and files for other programs.
+"""Store the maps that robots share: their file format, the registry of their versions, and backups.
 
-Algorithms that build or join maps belong to `rse_pf.slam`; HTTP belongs to `rse_pf.data_server`.
+Algorithms that build or merge maps are in `rse_pf.slam`; HTTP requests are served by `rse_pf.data_server`.
 """

@@ -233,7 +233,7 @@ def restore_backup(
             f"maps exist and have another head: {', '.join(others)}"[:300],
             hint="--overwrite sets their heads to those of the backup; their other versions stay",
         )
-    missing = {name: maps.missing(name, records) for name, records in backup.records.items()}
+    missing = {name: maps.missing_versions(name, records) for name, records in backup.records.items()}
     added = [record for records in missing.values() for record in records]
     if added:
         check_room(sum(charge_of(record.size) + MIN_CHARGE_BYTES for record in added))

@@ -1,7 +1,8 @@
-"""Versions of maps count for the robot that committed them, although they belong to its tenant.
+"""Count versions of maps against the quota of the robot that committed them.
 
-``charges/TENANT/ROBOT/MAP/VERSION.SIZE`` is an empty object that says so; SIZE is what the version added to
-the store, in bytes.
+A map belongs to a tenant, but each of its versions counts for a robot.  The empty object
+``charges/TENANT/ROBOT/MAP/VERSION.SIZE`` records this; SIZE is the number of bytes that the version added to
+the store.
 """
 
 from __future__ import annotations
@@ -11,32 +12,46 @@ from collections.abc import Callable, Collection
 from rse_pf.identity import RobotId
 from rse_pf.object_store import ObjectStore, Usage, charge_of
 
-__all__ = ["charge_name", "charged_to", "remove_charges"]
+__all__ = ["charge_name", "remove_charges", "sum_charges"]
 
 
 def charge_name(robot: RobotId, map_name: str, version: str, size: int) -> str:
-    """Return the name of the object that charges *robot* with *size* bytes for a version of a map."""
+    """Return the name of the object that counts a version of a map for *robot*.
+
+    Args:
+        robot: The robot that committed the version.
+        map_name: Name of the map.
+        version: Id of the version.
+        size: Bytes that the version added to the store.
+    """
     return f"charges/{robot.folder}/{map_name}/{version}.{size}"
 
 
-def charged_to(store: ObjectStore, robot: RobotId, check: Callable[[], None] = lambda: None) -> Usage:
-    """Return what the versions that *robot* committed count for.
+def sum_charges(store: ObjectStore, robot: RobotId, check: Callable[[], None] = lambda: None) -> Usage:
+    """Return number and charged bytes of all versions of maps that *robot* committed.
 
     Args:
-        store: Where maps and charges lie.
-        robot: Who committed them.
-        check: Called between two reads; ends the work by the error that it raises.
+        store: The store of the maps.
+        robot: The robot.
+        check: Called before each object; an error that it raises stops the work.
     """
-    objects = charged = 0
+    objects = charged_bytes = 0
     for info in store.list(f"charges/{robot.folder}/"):
         check()
         objects += 1
-        charged += charge_of(int(info.name.rpartition(".")[2]))
-    return Usage(objects, charged)
+        charged_bytes += charge_of(int(info.name.rpartition(".")[2]))
+    return Usage(objects, charged_bytes)
 
 
 def remove_charges(store: ObjectStore, tenant: str, map_name: str, versions: Collection[str]) -> None:
-    """Charge no robot any longer with *versions* of a map, by their ids; *tenant* is the folder."""
+    """Stop counting versions of a map for any robot.
+
+    Args:
+        store: The store of the maps.
+        tenant: Folder of the tenant.
+        map_name: Name of the map.
+        versions: Ids of the versions.
+    """
     for robot in store.folders(f"charges/{tenant}/"):
         prefix = f"charges/{tenant}/{robot}/{map_name}/"
         for info in store.list(prefix):

@@ -1,6 +1,7 @@
-"""Say what a map holds without keeping it: bytes in, counts out.
+"""Count what an encoded map contains.
 
-A stranger's map is described in a process with limits only (`rse_pf.child.limited`).
+The bytes of a robot are untrusted: a data server decodes them in a child process with limits, see
+`rse_pf.child.limited`.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ __all__ = ["MapSummary", "describe_map"]
 
 
 class MapSummary(msgspec.Struct, frozen=True, kw_only=True):
-    """What a map holds: numbers of keyframes, edges and points, and whose keyframes they are."""
+    """Numbers of keyframes, edges and points of a map, and the names of the robots of its keyframes."""
 
     keyframes: int
     edges: int
@@ -20,22 +21,22 @@ class MapSummary(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def describe_map(data: bytes, max_bytes: int) -> MapSummary:
-    """Return the counts of an encoded map.
+    """Return the summary of an encoded map.
 
     Args:
-        data: What `encode_map` returned, or a stranger's bytes.
-        max_bytes: Size of the inflated map.
+        data: The bytes that `rse_pf.maps.format.encode_map` returned; they may come from an untrusted robot.
+        max_bytes: The largest size of the decompressed map.
 
     Raises:
         BadRequest: The bytes are not a map.
-        LimitExceeded: The map holds more than a map may.
+        LimitExceeded: The map has too many keyframes, features or edges.
     """
-    from rse_pf.maps.format import decode_map  # numpy, which a data server never needs
+    from rse_pf.maps.format import decode_map  # Imports numpy, which a data server does without.
 
-    decoded = decode_map(data, max_bytes)
+    version = decode_map(data, max_bytes)
     return MapSummary(
-        keyframes=len(decoded.keyframes),
-        edges=len(decoded.edges),
-        points=len(decoded.points),
-        robots=tuple(sorted({keyframe.robot for keyframe in decoded.keyframes})),
+        keyframes=len(version.keyframes),
+        edges=len(version.edges),
+        points=len(version.points),
+        robots=tuple(sorted({keyframe.robot for keyframe in version.keyframes})),
     )

@@ -1,4 +1,4 @@
-"""The record of one version of a map."""
+"""Define the record that the registry stores for each version of a map."""
 
 from __future__ import annotations
 
@@ -10,7 +10,21 @@ __all__ = ["MapRecord"]
 
 
 class MapRecord(msgspec.Struct, frozen=True, kw_only=True):
-    """What is stored about a version beside the map; the sha256 of the record is the version's id."""
+    """The record of a version of a map, stored as JSON; its sha256 is the id of the version.
+
+    Attributes:
+        digest: The sha256 of the encoded map, in hexadecimal digits.
+        size: Bytes of the encoded map.
+        parent: Id of the version that was the head before; None for the first version.
+        number: 1 for the first version, else that of the parent plus 1.
+        author: Who committed the version.
+        created_s: When it was committed, Unix seconds.
+        note: What the author says about it.
+        keyframes: Number of keyframes.
+        edges: Number of edges of the pose graph.
+        points: Number of points of the cloud.
+        robots: Names of the robots of the keyframes.
+    """
 
     digest: str
     size: int
@@ -26,5 +40,5 @@ class MapRecord(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def id(self) -> str:
-        """The id of this version."""
+        """The id of the version: the sha256 of this record, in hexadecimal digits."""
         return digest_of(msgspec.json.encode(self))

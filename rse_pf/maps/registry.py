@@ -1,11 +1,12 @@
-"""The map registry: versions that never change, a head that moves by compare-and-swap.
+"""The registry of maps: versions never change, and the head of a map moves by compare-and-swap.
 
-A commit writes the map, then its record, then the head, each durable before the next; a crash in between
-leaves the old head and, at most, an object without a reference.  Every version that a head refers to is
-complete, and only one of two robots moves a head.  A version that was removed is gone as a whole; its id may
-still be the parent of another.
+A commit writes the map, then its record, then the head, and each write is durable before the next one begins.
+A crash between two writes leaves the old head and at most an object that nothing refers to.  Every version
+that a head refers to is complete, and of two commits with the same parent only one succeeds.  A removed
+version is gone with its bytes; its id may still be the parent of another version.
 
-Layout: ``maps/TENANT/NAME/blobs/DIGEST``, ``.../versions/ID`` (ID is the sha256 of the record), ``.../head``.
+Objects in the store: ``maps/TENANT/NAME/blobs/DIGEST`` (encoded maps), ``maps/TENANT/NAME/versions/ID``
+(records; the id is the sha256 of the record) and ``maps/TENANT/NAME/head`` (the id of the head).
 """
 
 from __future__ import annotations
@@ -26,33 +27,51 @@ from rse_pf.errors import BadRequest, Busy, Conflict, LimitExceeded, NotFound, S
 from rse_pf.maps.charges import remove_charges
 from rse_pf.maps.describe import MapSummary, describe_map
 from rse_pf.maps.record import MapRecord
-from rse_pf.maps.removal import HELD, MOST_S, REMOVING, Marks
+from rse_pf.maps.removal import HELD, MAX_REMOVAL_S, REMOVING, Marks
 from rse_pf.object_store import ObjectStore, digest_of, name_segment
 
-if TYPE_CHECKING:  # importing numpy takes a third of a data server's start, and only maps need it
+if TYPE_CHECKING:  # Importing numpy takes a third of a data server's start, and only decoding a map needs it.
     from rse_pf.maps.format import Keyframe, MapVersion
 
-__all__ = ["MapContent", "MapDiff", "MapOrigin", "MapRecord", "MapRegistry", "difference"]
+__all__ = ["MapContent", "MapDiff", "MapOrigin", "MapRecord", "MapRegistry", "compare_versions"]
 
+IMAGES_FIELD = "images"
+"""Field of a live map's provenance: the sha256 of the image of each keyframe, by robot and id."""
 _NAME = re.compile(r"[a-z0-9][a-z0-9-]{0,63}")
 _ID = re.compile(r"[0-9a-f]{64}")
 _ROBOT = re.compile(r"[A-Za-z0-9][A-Za-z0-9._=-]*")
-_MIN_ID = 6
-_JPEG, _MAX_IMAGE_BYTES = b"\xff\xd8\xff", 64 << 20
-IMAGES_FIELD = "images"
-"""Field of the provenance of a live map: digests of images, by robot's folder and id of the keyframe."""
-_MAX_MAPS, _MAX_VERSIONS = 10_000, 10_000
-"""Of one tenant, and of one map: all of them are read when somebody asks for a list."""
-_PIECE_BYTES = 1 << 20
+_MIN_ID_DIGITS = 6  # hexadecimal digits that are enough to name a version by the beginning of its id
+_JPEG_MAGIC = b"\xff\xd8\xff"  # the first bytes of a JPEG file
+_MAX_IMAGE_BYTES = 64 << 20  # size of a stored image of a keyframe; a larger object is not read
+_MAX_MAPS = 10_000  # maps of one tenant, all of which are read when somebody lists them
+_MAX_VERSIONS = 10_000  # versions of one map, all of which are read when somebody lists them
+_CHUNK_BYTES = 1 << 20  # bytes of an object that are in memory at once while it is copied: 1 MiB
 _REMOVED_AT_ONCE = 50
-"""So many are marked, and then removed, within `MOST_S` also in a slow store."""
-# A keyframe that moved less has not moved: messages are rounded to more than this.
-_MOVED_M, _MOVED_DEG = 1e-3, 0.05
+"""Versions that are marked and then removed together: also a slow store removes this number within a minute,
+after which a removal stops."""
+_MIN_MOTION_M = 1e-3
+"""Translation of a keyframe between two versions in metres that counts as a motion; poses in messages are
+rounded to less."""
+_MIN_ROTATION_DEG = 0.05
+"""Rotation of a keyframe between two versions in degrees that counts as a motion; poses in messages are
+rounded to less."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MapDiff:
-    """What differs between two versions; keyframes by id, edges as ``(a, b, kind)``."""
+    """The differences between two versions of a map.
+
+    Attributes:
+        added: Ids of the keyframes that only the newer version has.
+        removed: Ids of the keyframes that only the older version has.
+        moved: Ids of the keyframes that moved by more than 1 mm or 0.05 degrees.
+        largest_move_m: The largest translation of a keyframe that both versions have.
+        largest_turn_deg: The largest rotation of a keyframe that both versions have.
+        edges_added: Edges that only the newer version has, as (id, id, kind).
+        edges_removed: Edges that only the older version has, as (id, id, kind).
+        points_before: Number of points in the older version.
+        points_after: Number of points in the newer version.
+    """
 
     added: tuple[int, ...]
     removed: tuple[int, ...]
@@ -66,7 +85,7 @@ class MapDiff:
 
 
 class MapContent(NamedTuple):
-    """Which bytes a version is."""
+    """The sha256 (hexadecimal) and the size in bytes of an encoded map."""
 
     digest: str
     size: int
@@ -74,7 +93,14 @@ class MapContent(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MapOrigin:
-    """Where a version comes from: the head that its maker last read, who made it, when (Unix) and why."""
+    """Who makes a version, and from which one.
+
+    Attributes:
+        parent: Id of the head that the author last read; None if there was no map.
+        author: Who makes the version.
+        created_s: Unix seconds.
+        note: What the author says about it.
+    """
 
     parent: str | None
     author: str
@@ -83,7 +109,10 @@ class MapOrigin:
 
 
 class MapRegistry:
-    """The maps of one tenant in one store.  Blocking."""
+    """The maps of one tenant in one store.  Its methods block.
+
+    A version is named by its id, by six or more digits of the beginning of its id, or by ``head``.
+    """
 
     def __init__(
         self,
@@ -95,15 +124,16 @@ class MapRegistry:
         check: Callable[[], None] = lambda: None,
         wall_clock: Callable[[], float] = time.time,
     ) -> None:
-        """Make a registry.
+        """Make a registry, and read nothing yet.
 
         Args:
-            store: Where the maps lie.
-            tenant: Whose maps.
-            max_bytes: Size of a map when it is decoded.
-            on_change: Gets ``map.commit``, ``map.head``, ``map.remove`` or ``map.restore``, map and version.
-            check: Called between two reads of long work; ends the work by the error that it raises.
-            wall_clock: Unix seconds.
+            store: The store of the maps.
+            tenant: The tenant whose maps these are.
+            max_bytes: The largest size of a decompressed map.
+            on_change: Called after a change with ``map.commit``, ``map.head``, ``map.remove`` or
+                ``map.restore``, the name of the map and the record of the version.
+            check: Called between two reads in long work; an error that it raises stops the work.
+            wall_clock: Returns Unix seconds.
         """
         self._store, self._wall_clock = store, wall_clock
         self._on_change = on_change
@@ -117,32 +147,34 @@ class MapRegistry:
         return list(self.heads())
 
     def heads(self) -> dict[str, str]:
-        """Return the id of the newest version of each map, by its name, sorted."""
-        found = {}
+        """Return the ids of the heads of all maps by the names of the maps, sorted by name."""
+        heads = {}
         for name in self._store.folders(self._prefix):
             self._check()
             head = self._head(name) if _NAME.fullmatch(name) else None
             if head is not None:
-                found[name] = head
-        return found
+                heads[name] = head
+        return heads
 
     def commit(
         self, name: str, data: bytes, *, parent: str | None, author: str, created_s: float, note: str = ""
     ) -> MapRecord:
-        """Make *data* (of `encode_map`) the next version and the head of map *name*.
+        """Make *data* the next version of map *name*, and its head.
 
         Args:
-            name: Lower-case letters, digits and hyphens.
-            data: The map.
-            parent: The head that the caller last read; None for the first version.
-            author: Who made it.
+            name: Name of the map: 1 to 64 lower-case letters, digits and hyphens.
+            data: The bytes that `encode_map` returned.
+            parent: Id of the head that the caller last read; None for the first version.
+            author: Who made the version.
             created_s: Unix seconds.
-            note: What was done.
+            note: What the author says about it.
 
         Raises:
-            BadRequest: *data* is not a map, or *name* not a valid name.
-            Conflict: The head is not *parent*: read it, merge, and commit again.
-            StoreError: The head did not change.
+            BadRequest: *data* is not a map, or *name* is not a valid name.
+            Conflict: The head is not *parent*: read the head, merge, and commit again.
+            LimitExceeded: The tenant has too many maps, or the map too many versions.
+            Busy: The same bytes are being removed.
+            StoreError: The store failed; the head did not change.
         """
         origin = MapOrigin(parent=parent, author=author, created_s=created_s, note=note)
         return self.commit_charged(name, data, origin, charge=lambda size: None)
@@ -150,16 +182,26 @@ class MapRegistry:
     def commit_charged(
         self, name: str, data: bytes, origin: MapOrigin, *, charge: Callable[[int], None]
     ) -> MapRecord:
-        """Do the same as `commit`; *charge* gets how many bytes are added before they are written.
+        """Commit as `commit` does, and charge the bytes that this adds to the store.
+
+        Args:
+            name: Name of the map.
+            data: The bytes that `encode_map` returned.
+            origin: Who makes the version, and from which one.
+            charge: Called with the number of added bytes before they are written; may refuse them by an
+            error.
 
         Raises:
-            As `commit`, and what *charge* raises to refuse the bytes.
+            As `commit`, and the errors of *charge*.
         """
         return self._commit(
-            name, describe_map(data, self._max_bytes), MapContent(digest_of(data), len(data)), origin,
+            name,
+            describe_map(data, self._max_bytes),
+            MapContent(digest_of(data), len(data)),
+            origin,
             write=lambda blob: self._store.put(blob, data),
-            charged=lambda record, size: _charged(charge, size),
-        )  # fmt: skip
+            charged=lambda record, size: _charge_once(charge, size),
+        )
 
     def commit_object(
         self,
@@ -170,35 +212,42 @@ class MapRegistry:
         origin: MapOrigin,
         charged: Callable[[MapRecord, int], AbstractContextManager[None]],
     ) -> MapRecord:
-        """Make an object of the store the next version, as `commit` does, without holding it in memory.
+        """Commit an object of the store as `commit` does, without holding it in memory.
 
         Args:
-            name: Of the map.
-            source: Name of the object.
-            summary: What the map holds, from `rse_pf.maps.describe`.
+            name: Name of the map.
+            source: Name of the object that holds the encoded map.
+            summary: The summary of the map that `rse_pf.maps.describe.describe_map` returned.
             content: Digest and size of the object.
-            origin: Where the version comes from.
-            charged: Returns the context in which the version is written, for its record and the bytes that
-                it adds to the store; refuses it by an error.
+            origin: Who makes the version, and from which one.
+            charged: Returns the context in which the version is written, given its record and the bytes that
+                it adds to the store; may refuse the version by an error.
 
         Raises:
-            As `commit`, and what *charged* raises.
+            As `commit`, and the errors of *charged*.
         """
 
-        def pieces() -> Iterator[bytes]:
+        def read_chunks() -> Iterator[bytes]:
             hashed = hashlib.sha256()
-            for start in range(0, content.size, _PIECE_BYTES):
+            for start in range(0, content.size, _CHUNK_BYTES):
                 self._check()
-                piece = self._store.get_range(source, start, _PIECE_BYTES)
-                hashed.update(piece)
-                yield piece
+                chunk = self._store.get_range(source, start, _CHUNK_BYTES)
+                hashed.update(chunk)
+                yield chunk
             if hashed.hexdigest() != content.digest:
-                raise StoreError("the bytes are not those of the digest", hint="store the object again")
+                raise StoreError(
+                    f"the sha256 of the object {source} is not {content.digest}",
+                    hint="store the object again",
+                )
 
         return self._commit(
-            name, summary, content, origin,
-            write=lambda blob: self._store.put_pieces(blob, pieces()), charged=charged,
-        )  # fmt: skip
+            name,
+            summary,
+            content,
+            origin,
+            write=lambda blob: self._store.put_pieces(blob, read_chunks()),
+            charged=charged,
+        )
 
     def _commit(
         self,
@@ -212,18 +261,27 @@ class MapRegistry:
     ) -> MapRecord:
         digest, parent = content.digest, origin.parent
         base = self._base(name)
+        # 1. Check that the head is the parent, and make the record.
         if self._head(name) != parent:
-            raise _moved(name)
-        before = self.record(name, parent) if parent is not None else None
-        self._check_counts(base, is_new=before is None)
+            raise _head_moved(name)
+        parent_record = self.record(name, parent) if parent is not None else None
+        self._check_counts(base, is_new=parent_record is None)
         record = MapRecord(
-            digest=digest, size=content.size, parent=None if before is None else before.id,
-            number=1 if before is None else before.number + 1,
-            author=origin.author, created_s=origin.created_s, note=origin.note,
-            keyframes=summary.keyframes, edges=summary.edges, points=summary.points, robots=summary.robots,
-        )  # fmt: skip
+            digest=digest,
+            size=content.size,
+            parent=None if parent_record is None else parent_record.id,
+            number=1 if parent_record is None else parent_record.number + 1,
+            author=origin.author,
+            created_s=origin.created_s,
+            note=origin.note,
+            keyframes=summary.keyframes,
+            edges=summary.edges,
+            points=summary.points,
+            robots=summary.robots,
+        )
+        # 2. Charge and write the map and the record, then move the head.
         self._marks(name).check(digest)
-        is_new = not self._holds(f"{base}blobs/{digest}")
+        is_new = not self._exists(f"{base}blobs/{digest}")
         with charged(record, content.size if is_new else 0):
             self._put_version(name, record, write, is_new=is_new)
             self._swap(name, parent, record.id)
@@ -233,10 +291,16 @@ class MapRegistry:
     def _put_version(
         self, name: str, record: MapRecord, write: Callable[[str], None], *, is_new: bool
     ) -> None:
-        """Store a record, and the bytes of its version if they are new.
+        """Write a record, and the bytes of its version if they are not in the store yet.
+
+        Args:
+            name: Name of the map.
+            record: The record.
+            write: Writes the bytes of the version to the object with the given name.
+            is_new: Whether the bytes are not in the store yet.
 
         Raises:
-            Busy: Another process removes these bytes.
+            Busy: Another process removes these bytes; the record is removed again.
         """
         blob = f"{self._base(name)}blobs/{record.digest}"
         version = f"{self._base(name)}versions/{record.id}"
@@ -248,19 +312,21 @@ class MapRegistry:
         except Busy:
             self._store.delete(version)
             raise
-        if not self._holds(blob):  # a removal that did not see the record has ended: none removes it now
+        # A removal that had read the records before this one was written may have removed the bytes.  It has
+        # ended, since its mark is gone, and no later removal overlooks the record.
+        if not self._exists(blob):
             write(blob)
 
-    def missing(self, name: str, records: Sequence[MapRecord]) -> list[MapRecord]:
-        """Return those of *records* that are no whole versions of map *name*: lost or damaged ones."""
-        found = []
+    def missing_versions(self, name: str, records: Sequence[MapRecord]) -> list[MapRecord]:
+        """Return those of *records* whose versions of map *name* are missing or damaged in the store."""
+        missing = []
         for record in records:
             self._check()
             try:
                 self.data(name, record.id)
             except StoreError:
-                found.append(record)
-        return found
+                missing.append(record)
+        return missing
 
     def restore(
         self,
@@ -272,20 +338,21 @@ class MapRegistry:
         read: Callable[[MapRecord], bytes],
         charge: Callable[[int], None],
     ) -> None:
-        """Store versions that were backed up, and set the head.
+        """Write versions from a backup, and set the head.
 
         Args:
-            name: Of the map, which may exist.
-            records: Of versions that are missing; their bytes are written in any case.
-            head: Id of a version that is there then.
-            expected: The present head, None if there is none.
+            name: Name of the map, which may exist.
+            records: Records of the versions to write; their bytes are written again if they exist.
+            head: Id of the new head, which is one of *records* or exists.
+            expected: Id of the present head; None if there is no map.
             read: Returns the bytes of a version.
-            charge: Gets how many bytes are added before they are written.
+            charge: Called with the size of each version before it is written; may refuse it by an error.
 
         Raises:
             Conflict: The head is not *expected*.
-            Busy: A version is being removed.
-            StoreError: The head did not change; and what *charge* raises to refuse the bytes.
+            LimitExceeded: The tenant has too many maps, or the map too many versions.
+            Busy: The bytes of a version are being removed.
+            StoreError: The store failed; the head did not change.
         """
         self._check_counts(self._base(name), is_new=expected is None)
         for record in records:
@@ -301,7 +368,7 @@ class MapRegistry:
             self._on_change("map.restore", name, self.record(name, head))
 
     def _check_counts(self, base: str, *, is_new: bool) -> None:
-        """Raise LimitExceeded if the tenant has no place for another map, or the map for another version."""
+        """Raise LimitExceeded if the map has too many versions, or the tenant too many maps."""
         versions = self._store.usage(f"{base}versions/").objects
         if versions >= _MAX_VERSIONS:
             raise LimitExceeded(
@@ -314,7 +381,7 @@ class MapRegistry:
                 f"the tenant has {maps} maps, the limit is {_MAX_MAPS}", hint="commit to an existing map"
             )
 
-    def _holds(self, name: str) -> bool:
+    def _exists(self, name: str) -> bool:
         try:
             self._store.head(name)
         except NotFound:
@@ -322,43 +389,63 @@ class MapRegistry:
         return True
 
     def head(self, name: str) -> MapRecord:
-        """Return the record of the head; raises NotFound."""
+        """Return the record of the head; raises NotFound if there is no map *name*."""
         head = self._head(name)
         while head is not None:
             try:
                 return self.record(name, head)
             except NotFound:
-                before, head = head, self._head(name)
-                if head == before:
-                    raise  # else it was removed when another version was the head
+                # The head may have moved after it was read, and the old version may have been removed.
+                missing, head = head, self._head(name)
+                if head == missing:
+                    raise
         raise NotFound(f"there is no map {name!r}", hint="see rse-pf map list")
 
     def record(self, name: str, version: str) -> MapRecord:
-        """Return a version's record by its id or an unambiguous beginning of it; ``head`` is the newest."""
+        """Return the record of a version.
+
+        Args:
+            name: Name of the map.
+            version: Its id, an unambiguous beginning of its id, or ``head``.
+
+        Raises:
+            NotFound: There is no such map or version.
+            StoreError: The record is damaged.
+        """
         if version == "head":
             return self.head(name)
         prefix = f"{self._base(name)}versions/"
         if not _ID.fullmatch(version):
-            version = self._whole_id(prefix, version)
+            version = self._complete_id(prefix, version)
         raw = self._store.get(prefix + version)
         if digest_of(raw) != version:
             raise StoreError(f"the record {version} is damaged", hint="restore it from a backup")
         return msgspec.json.decode(raw, type=MapRecord)
 
     def versions(self, name: str) -> list[MapRecord]:
-        """Return all versions, oldest first, including those that are not ancestors of the head."""
+        """Return the records of all versions, oldest first, including those that are no ancestors of the
+        head.
+
+        Raises:
+            NotFound: There is no map *name*.
+        """
         prefix = f"{self._base(name)}versions/"
-        found = []
+        records = []
         for info in self._store.list(prefix):
             self._check()
-            with contextlib.suppress(NotFound):  # it was removed meanwhile
-                found.append(self.record(name, info.name.removeprefix(prefix)))
-        if not found:
+            with contextlib.suppress(NotFound):  # Another process has removed this version meanwhile.
+                records.append(self.record(name, info.name.removeprefix(prefix)))
+        if not records:
             raise NotFound(f"there is no map {name!r}", hint="see rse-pf map list")
-        return sorted(found, key=lambda record: (record.number, record.created_s, record.id))
+        return sorted(records, key=lambda record: (record.number, record.created_s, record.id))
 
     def data(self, name: str, version: str = "head") -> bytes:
-        """Return the bytes of a version, checked by their digest."""
+        """Return the encoded map of a version.
+
+        Raises:
+            NotFound: There is no such map or version.
+            StoreError: The bytes do not have the sha256 of the record.
+        """
         record = self.record(name, version)
         raw = self._store.get(self.blob_name(name, record))
         if digest_of(raw) != record.digest:
@@ -366,60 +453,72 @@ class MapRegistry:
         return raw
 
     def blob_name(self, name: str, record: MapRecord) -> str:
-        """Return the name of a version's bytes in the store."""
+        """Return the name of the object that holds the encoded map of a version."""
         return f"{self._base(name)}blobs/{record.digest}"
 
     def load(self, name: str, version: str = "head") -> MapVersion:
-        """Return a version as a value."""
+        """Read and decode a version.
+
+        Raises:
+            NotFound: There is no such map or version.
+            StoreError: The bytes are damaged.
+            BadRequest, LimitExceeded: The bytes are not a map, or larger than the limits.
+        """
         from rse_pf.maps.format import decode_map
 
         return decode_map(self.data(name, version), self._max_bytes)
 
     def images(self, version: MapVersion) -> Iterator[tuple[Keyframe, bytes]]:
-        """Yield keyframes of *version* with the images that its provenance names, of robots of the tenant.
+        """Yield keyframes of *version* with the JPEG files that its provenance refers to.
 
-        A robot may have written what is named: an object that is no JPEG, or has another digest, is left out,
-        as one that is gone.
+        A robot may have written the provenance and the objects.  So images of other tenants, objects that are
+        no JPEG or have another digest, and objects that do not exist are left out.
         """
-        named = version.provenance.get(IMAGES_FIELD)
+        references = version.provenance.get(IMAGES_FIELD)
         keyframes = {str(keyframe.id): keyframe for keyframe in version.keyframes}
-        for folder, digests in named.items() if isinstance(named, dict) else ():
+        for folder, digests in references.items() if isinstance(references, dict) else ():
             tenant, _, robot = str(folder).partition("/")
             if tenant != name_segment(self._tenant) or not _ROBOT.fullmatch(robot):
                 continue
             for number, digest in digests.items() if isinstance(digests, dict) else ():
                 if number in keyframes and _ID.fullmatch(str(digest)):
-                    data = self._object(f"objects/{folder}/{digest}")
-                    if hashlib.sha256(data).hexdigest() == digest and data.startswith(_JPEG):
+                    data = self._read_image(f"objects/{folder}/{digest}")
+                    if hashlib.sha256(data).hexdigest() == digest and data.startswith(_JPEG_MAGIC):
                         yield keyframes[number], data
 
-    def _object(self, name: str) -> bytes:
-        """Return the object *name*, empty if there is none or it is too large for an image."""
+    def _read_image(self, name: str) -> bytes:
+        """Return the bytes of the object *name*; empty if it does not exist or is too large for an image."""
         with contextlib.suppress(NotFound):
             if self._store.head(name).size <= _MAX_IMAGE_BYTES:
                 return self._store.get(name)
         return b""
 
     def move_head(self, name: str, version: str, *, expected: str) -> MapRecord:
-        """Move the head to an existing *version*, as a rollback does.
+        """Set the head to an existing version, as a rollback does, and return its record.
+
+        Args:
+            name: Name of the map.
+            version: The new head.
+            expected: The present head.
 
         Raises:
             NotFound: There is no such version.
             Conflict: The head is not *expected*.
             Busy: The version is being removed.
         """
-        record, before = self.record(name, version), self.record(name, expected)
-        self._move_head(name, record, before.id)
+        record, expected_record = self.record(name, version), self.record(name, expected)
+        self._move_head(name, record, expected_record.id)
         self._on_change("map.head", name, record)
         return record
 
     def _move_head(self, name: str, record: MapRecord, expected: str) -> None:
-        """Move the head from the version *expected*, which need not be there, to that of *record*."""
+        """Move the head from the id *expected*, whose version may be removed, to the version of *record*."""
         marks = self._marks(name)
         mark = marks.put(HELD, record.digest)
         try:
             marks.check(record.digest)
-            self.record(name, record.id)  # else a removal that did not see the mark has ended
+            # Raises NotFound if a removal that did not see the mark has removed the version.
+            self.record(name, record.id)
             self._swap(name, expected, record.id)
         finally:
             marks.clear(mark)
@@ -427,18 +526,21 @@ class MapRegistry:
     def remove(
         self, name: str, choose: Callable[[Sequence[MapRecord], str], Sequence[MapRecord]]
     ) -> list[MapRecord]:
-        """Remove versions and return them; also finish what a removal that crashed has begun.
+        """Remove versions and return their records; also finish a removal whose process crashed.
 
-        What is the head, or shares its bytes with a version that stays, is not removed, whatever is chosen.
+        The head, and versions that share their bytes with a version that stays, are not removed even if they
+        are chosen.
 
         Args:
-            name: Of the map.
-            choose: Returns which of all versions to remove, given them and the id of the head.
+            name: Name of the map.
+            choose: Returns the records of the versions to remove, given those of all versions and the id of
+                the head; `rse_pf.maps.removal.choose_superseded` is such a function.
 
         Raises:
-            NotFound: There is no such map.
-            Busy, StoreError: What is not removed yet is removed by the next call.
+            NotFound: There is no map *name*.
+            Busy, StoreError: The store is slow or failed; the next call removes the rest.
         """
+        # 1. Collect what to remove: the chosen versions, and bytes that crashed removals have marked.
         head, records = self.head(name).id, self.versions(name)
         digests = {record.id: record.digest for record in records}
         marks = self._marks(name)
@@ -448,13 +550,15 @@ class MapRegistry:
         }
         for record in choose(records, head):
             by_digest.setdefault(record.digest, []).append(record)
+        # 2. Remove it in batches.
         removed: list[MapRecord] = []
-        waiting = list(by_digest)
-        for first in range(0, len(waiting), _REMOVED_AT_ONCE):
-            batch = {digest: by_digest[digest] for digest in waiting[first : first + _REMOVED_AT_ONCE]}
+        all_digests = list(by_digest)
+        for first in range(0, len(all_digests), _REMOVED_AT_ONCE):
+            batch = {digest: by_digest[digest] for digest in all_digests[first : first + _REMOVED_AT_ONCE]}
             for record in self._remove_batch(name, batch, digests):
                 removed.append(record)
                 self._on_change("map.remove", name, record)
+        # 3. Clear the marks of crashed processes.
         for mark in abandoned:
             marks.clear(mark.name)
         return removed
@@ -462,29 +566,39 @@ class MapRegistry:
     def _remove_batch(
         self, name: str, batch: Mapping[str, Sequence[MapRecord]], digests: dict[str, str]
     ) -> Iterator[MapRecord]:
-        """Remove the versions of *batch*, by their digests, and their bytes, and yield them.
+        """Remove the versions of a batch and their bytes, and yield the records of removed versions.
 
         Args:
-            name: Of the map.
-            batch: All versions to remove that have these bytes; none where only the bytes are left.
-            digests: Of versions by their ids; those that are read are added.
+            name: Name of the map.
+            batch: By the digest of the bytes to remove: the records of the versions to remove that have these
+                bytes; empty if a crashed removal has left only the bytes.
+            digests: Digests of versions by their ids; those of versions that are read are added.
+
+        Raises:
+            Busy: A minute is over; the rest was not removed.
         """
         base, marks = self._base(name), self._marks(name)
         began_s = self._wall_clock()
         set_marks: dict[str, str] = {}
         try:
+            # 1. Mark the bytes, and then read who uses them; commits and rollbacks do both in reverse order.
             for digest in batch:
                 set_marks[digest] = marks.put(REMOVING, digest)
             chosen = {record.id for records in batch.values() for record in records}
             held = marks.marked(HELD)
-            used = held | self._used_digests(name, digests, chosen)  # the head is read after the marks
+            used = held | self._used_digests(name, digests, chosen)
+            # 2. Remove the charges, the records and then the bytes that nobody uses.
             for digest, records in batch.items():
                 if digest in used:
                     continue
                 self._check()
-                if not 0.0 <= self._wall_clock() - began_s < MOST_S:
-                    raise Busy("the store is too slow to remove versions now", hint="remove the rest later")
-                mark = set_marks.pop(digest)  # an error leaves it, so that the next call goes on
+                if not 0.0 <= self._wall_clock() - began_s < MAX_REMOVAL_S:
+                    raise Busy(
+                        f"the store removed fewer than {len(batch)} versions in {MAX_REMOVAL_S:g} s",
+                        hint="remove the rest later",
+                    )
+                # If an error follows, this mark stays, so that the next call finishes the removal.
+                mark = set_marks.pop(digest)
                 remove_charges(self._store, self._tenant, name, {record.id for record in records})
                 for record in records:
                     self._store.delete(f"{base}versions/{record.id}")
@@ -495,15 +609,15 @@ class MapRegistry:
             for mark in set_marks.values():
                 marks.clear(mark)
 
-    def _used_digests(self, name: str, digests: dict[str, str], without: Collection[str]) -> set[str]:
-        """Return the digests of the head and of all versions but those *without*."""
+    def _used_digests(self, name: str, digests: dict[str, str], excluded: Collection[str]) -> set[str]:
+        """Return the digests of the head and of all versions except those with the ids *excluded*."""
         prefix = f"{self._base(name)}versions/"
-        ids = {info.name.removeprefix(prefix) for info in self._store.list(prefix)} - set(without)
+        ids = {info.name.removeprefix(prefix) for info in self._store.list(prefix)} - set(excluded)
         head = self._head(name)
         for version in ids | ({head} if head is not None else set()):
             self._check()
             if version not in digests:
-                with contextlib.suppress(NotFound):  # another process has just removed it
+                with contextlib.suppress(NotFound):  # Another process has just removed this version.
                     digests[version] = self.record(name, version).digest
         return {digest for version, digest in digests.items() if version in ids or version == head}
 
@@ -525,37 +639,39 @@ class MapRegistry:
             return None
 
     def _swap(self, name: str, expected: str | None, version: str) -> None:
-        known = None if expected is None else expected.encode("ascii")
+        """Set the head to *version* if it is *expected*; raises Conflict."""
+        expected_bytes = None if expected is None else expected.encode("ascii")
         try:
-            self._store.compare_and_swap(f"{self._base(name)}head", known, version.encode("ascii"))
+            self._store.compare_and_swap(f"{self._base(name)}head", expected_bytes, version.encode("ascii"))
         except Conflict as error:
-            raise _moved(name) from error
+            raise _head_moved(name) from error
 
-    def _whole_id(self, prefix: str, beginning: str) -> str:
-        if not re.fullmatch(r"[0-9a-f]{1,64}", beginning) or len(beginning) < _MIN_ID:
-            raise NotFound(f"no version {beginning[:80]!r}", hint=f"give {_MIN_ID} or more hex digits")
-        found = [info.name.removeprefix(prefix) for info in self._store.list(prefix + beginning)]
-        if len(found) != 1:
-            how_many = f"{len(found)} versions begin" if found else "no version begins"
-            raise NotFound(f"{how_many} with {beginning!r}", hint="see rse-pf map show NAME --all")
-        return found[0]
+    def _complete_id(self, folder: str, prefix: str) -> str:
+        """Return the only id in *folder* that begins with *prefix*; raises NotFound."""
+        if not re.fullmatch(r"[0-9a-f]{1,64}", prefix) or len(prefix) < _MIN_ID_DIGITS:
+            raise NotFound(f"no version {prefix[:80]!r}", hint=f"give {_MIN_ID_DIGITS} or more hex digits")
+        ids = [info.name.removeprefix(folder) for info in self._store.list(folder + prefix)]
+        if len(ids) != 1:
+            count = f"{len(ids)} versions begin" if ids else "no version begins"
+            raise NotFound(f"{count} with {prefix!r}", hint="see rse-pf map show NAME --all")
+        return ids[0]
 
 
-def difference(before: MapVersion, after: MapVersion) -> MapDiff:
-    """Return what *after* changed; a keyframe has moved if by more than 1 mm or 0.05 degrees."""
+def compare_versions(before: MapVersion, after: MapVersion) -> MapDiff:
+    """Return the differences from the version *before* to the version *after*."""
     from rse_pf.geometry import pose_difference
 
     old = {keyframe.id: keyframe.T_world_camera for keyframe in before.keyframes}
     new = {keyframe.id: keyframe.T_world_camera for keyframe in after.keyframes}
-    moves = {each: pose_difference(old[each], new[each]) for each in sorted(old.keys() & new.keys())}
+    motions = {i: pose_difference(old[i], new[i]) for i in sorted(old.keys() & new.keys())}
     old_edges = {(edge.a, edge.b, str(edge.kind)) for edge in before.edges}
     new_edges = {(edge.a, edge.b, str(edge.kind)) for edge in after.edges}
     return MapDiff(
         added=tuple(sorted(new.keys() - old.keys())),
         removed=tuple(sorted(old.keys() - new.keys())),
-        moved=tuple(each for each, (m, deg) in moves.items() if m > _MOVED_M or deg > _MOVED_DEG),
-        largest_move_m=max((m for m, _ in moves.values()), default=0.0),
-        largest_turn_deg=max((deg for _, deg in moves.values()), default=0.0),
+        moved=tuple(i for i, (m, deg) in motions.items() if m > _MIN_MOTION_M or deg > _MIN_ROTATION_DEG),
+        largest_move_m=max((m for m, _ in motions.values()), default=0.0),
+        largest_turn_deg=max((deg for _, deg in motions.values()), default=0.0),
         edges_added=tuple(sorted(new_edges - old_edges)),
         edges_removed=tuple(sorted(old_edges - new_edges)),
         points_before=len(before.points),
@@ -564,11 +680,14 @@ def difference(before: MapVersion, after: MapVersion) -> MapDiff:
 
 
 @contextlib.contextmanager
-def _charged(charge: Callable[[int], None], size: int) -> Iterator[None]:
-    """Charge the bytes once; what was charged and not written is found when they are counted again."""
+def _charge_once(charge: Callable[[int], None], size: int) -> Iterator[None]:
+    """Charge *size* bytes before they are written, and take nothing back if the write fails.
+
+    The next count of the stored bytes corrects the charge.
+    """
     charge(size)
     yield
 
 
-def _moved(name: str) -> Conflict:
+def _head_moved(name: str) -> Conflict:
     return Conflict(f"another commit moved the head of map {name!r}", hint="read it, merge, commit again")

@@ -1,13 +1,13 @@
-"""Remove versions of a map while others commit, roll back and read; nothing here knows a robot's right.
+"""Remove versions of a map safely while other processes commit, roll back and read.
 
-A mark beside the bytes of a version says that they are being removed, or that a rollback needs them.  Who
-removes sets a mark first, and then looks at the versions, the head and the marks of rollbacks.  Who commits
-or rolls back writes its record or mark first, and then looks for marks of removals.  So one of the two sees
-the other, and no head refers to bytes that were removed.
+A mark beside the bytes of a version says that a process removes these bytes, or that a rollback needs them.
+A removal first sets its mark, and then reads the records, the head and the marks of rollbacks.  A commit or a
+rollback first writes its record or mark, and then looks for marks of removals.  So at least one of two
+processes sees the other, as in Dekker's algorithm, and no head refers to removed bytes.
 
-A mark is an empty object ``maps/TENANT/NAME/blobs/DIGEST.KIND-SECONDS-TOKEN``: it needs no new folder, so
-that a full disk takes it.  A process that removes stops long before its marks count as abandoned; the next
-removal finishes what a crash has left.
+A mark is the empty object ``maps/TENANT/NAME/blobs/DIGEST.KIND-SECONDS-TOKEN``.  It needs no new folder, so
+that it can be written to a full disk.  A removal stops after `MAX_REMOVAL_S`, long before its marks count as
+abandoned after `ABANDONED_S`; the next removal finishes the work of a process that crashed.
 """
 
 from __future__ import annotations
@@ -22,18 +22,35 @@ from rse_pf.errors import Busy, StoreError
 from rse_pf.maps.record import MapRecord
 from rse_pf.object_store import MIN_CHARGE_BYTES, ObjectStore, charge_of
 
-__all__ = ["ABANDONED_S", "HELD", "MOST_S", "REMOVING", "Mark", "Marks", "freed_bytes", "superseded"]
+__all__ = [
+    "ABANDONED_S",
+    "HELD",
+    "MAX_REMOVAL_S",
+    "REMOVING",
+    "Mark",
+    "Marks",
+    "choose_superseded",
+    "count_freed_bytes",
+]
 
-HELD, REMOVING = "held", "removing"
-MOST_S, ABANDONED_S = 60.0, 600.0
-"""A removal deletes nothing more after the first time; a mark of this age is ignored and cleaned away."""
-_RETRY_MS = 1000.0
+HELD = "held"  # kind of the mark by which a rollback keeps the bytes of a version from being removed
+REMOVING = "removing"  # kind of the mark of a process that removes the bytes of a version
+MAX_REMOVAL_S = 60.0  # seconds after which a removal deletes nothing more; far less than `ABANDONED_S`
+ABANDONED_S = 600.0  # age in seconds from which a mark is ignored, since its process has crashed
+_RETRY_MS = 1000.0  # milliseconds after which a commit should be repeated whose bytes are being removed
 _MARK = re.compile(rf"(?P<digest>[0-9a-f]{{64}})\.(?P<kind>{HELD}|{REMOVING})-(?P<set_s>\d+)-[0-9a-f]+")
 
 
 @dataclass(frozen=True, slots=True)
 class Mark:
-    """A mark that is set: its name in the store, its kind, the bytes that it is about, when it was set."""
+    """A mark in the store.
+
+    Attributes:
+        name: Name of its object.
+        kind: `HELD` or `REMOVING`.
+        digest: The sha256 of the marked bytes.
+        set_s: When it was set, Unix seconds.
+    """
 
     name: str
     kind: str
@@ -42,52 +59,53 @@ class Mark:
 
 
 class Marks:
-    """The marks beside the bytes of one map.  Blocking."""
+    """The marks beside the bytes of one map.  Its methods block."""
 
     def __init__(self, store: ObjectStore, blobs: str, wall_clock: Callable[[], float]) -> None:
-        """Set no mark yet.
+        """Make an object that reads and writes marks, and write none.
 
         Args:
-            store: Where the map lies.
-            blobs: The folder of the map's bytes, which ends with a slash.
-            wall_clock: Unix seconds.
+            store: The store of the map.
+            blobs: The folder of the bytes of the map's versions, with a slash at its end.
+            wall_clock: Returns Unix seconds.
         """
         self._store, self._blobs, self._wall_clock = store, blobs, wall_clock
 
     def put(self, kind: str, digest: str) -> str:
-        """Set a mark of this process, and return its name."""
+        """Set a mark of this process on the bytes with a *digest*, and return the name of the mark."""
         name = f"{self._blobs}{digest}.{kind}-{int(self._wall_clock())}-{secrets.token_hex(8)}"
         self._store.put(name, b"")
         return name
 
     def clear(self, name: str) -> None:
-        """Remove a mark; one that the store keeps is ignored in ten minutes."""
+        """Remove a mark; if the store fails, the mark stays and is ignored after ten minutes."""
         with contextlib.suppress(StoreError):
             self._store.delete(name)
 
-    def marked(self, kind: str, beginning: str = "") -> set[str]:
-        """Return the digests with this *beginning* that processes marked which may still be at work."""
-        marks = self._list(beginning)
+    def marked(self, kind: str, prefix: str = "") -> set[str]:
+        """Return the digests with this *prefix* that have a mark of this *kind* which is not abandoned."""
+        marks = self._list(prefix)
         return {mark.digest for mark in marks if mark.kind == kind and not self._is_abandoned(mark)}
 
     def check(self, digest: str) -> None:
-        """Raise Busy if these bytes are being removed."""
+        """Raise Busy if a process removes the bytes with this *digest*."""
         if self.marked(REMOVING, digest):
             raise Busy(
-                "the same bytes are being removed from this map", hint="try again",
+                "the same bytes are being removed from this map",
+                hint="try again",
                 retry_after_ms=_RETRY_MS,
-            )  # fmt: skip
+            )
 
     def abandoned(self) -> list[Mark]:
-        """Return the marks of processes that crashed."""
+        """Return the marks older than ten minutes: those of processes that crashed."""
         return [mark for mark in self._list("") if self._is_abandoned(mark)]
 
     def _is_abandoned(self, mark: Mark) -> bool:
         return self._wall_clock() - mark.set_s > ABANDONED_S
 
-    def _list(self, beginning: str) -> list[Mark]:
-        listed = (info.name for info in self._store.list(self._blobs + beginning))
-        matches = ((name, _MARK.fullmatch(name.removeprefix(self._blobs))) for name in listed)
+    def _list(self, prefix: str) -> list[Mark]:
+        names = (info.name for info in self._store.list(self._blobs + prefix))
+        matches = ((name, _MARK.fullmatch(name.removeprefix(self._blobs))) for name in names)
         return [
             Mark(name, match["kind"], match["digest"], float(match["set_s"]))
             for name, match in matches
@@ -95,41 +113,53 @@ class Marks:
         ]
 
 
-def superseded(
-    records: Sequence[MapRecord], head: str, *, keep: int, most_bytes: float = float("inf"),
-    counts: Callable[[MapRecord], bool] = lambda record: True,
-) -> list[MapRecord]:  # fmt: skip
+def choose_superseded(
+    records: Sequence[MapRecord],
+    head: str,
+    *,
+    keep: int,
+    max_bytes: float = float("inf"),
+    is_counted: Callable[[MapRecord], bool] = lambda record: True,
+) -> list[MapRecord]:
     """Return the versions to remove so that the newest *keep* stay, oldest first.
 
-    The head stays, and what shares its bytes with a version that stays: to remove it would free nothing.
+    The head stays, and so do versions that share their bytes with one that stays, because removing them would
+    free nothing.
 
     Args:
         records: All versions of a map.
         head: Id of the head.
-        keep: How many of those that count stay, besides the head.
-        most_bytes: What those that stay may count for together; the newest one stays in any case.
-        counts: Which versions count; the others stay.
+        keep: The number of counted versions that stay besides the head.
+        max_bytes: Bytes that the counted versions that stay may be charged with together; the newest one
+            stays in any case.
+        is_counted: Returns whether a version is counted; versions that are not counted stay.
     """
-    newest_first = sorted(records, key=lambda each: (each.created_s, each.number, each.id), reverse=True)
-    counted = total = 0
-    stay = {head}
+    newest_first = sorted(
+        records, key=lambda record: (record.created_s, record.number, record.id), reverse=True
+    )
+    count = total_bytes = 0
+    kept_ids = {head}
     for record in newest_first:
-        if not counts(record):
-            stay.add(record.id)
+        if not is_counted(record):
+            kept_ids.add(record.id)
             continue
-        counted, total = counted + 1, total + _charge_of(record)
-        if counted == 1 or (counted <= keep and total <= most_bytes):
-            stay.add(record.id)
-    digests = {record.digest for record in records if record.id in stay}
-    return [each for each in reversed(newest_first) if each.id not in stay and each.digest not in digests]
+        count, total_bytes = count + 1, total_bytes + _charge_of(record)
+        if count == 1 or (count <= keep and total_bytes <= max_bytes):
+            kept_ids.add(record.id)
+    kept_digests = {record.digest for record in records if record.id in kept_ids}
+    return [
+        record
+        for record in reversed(newest_first)
+        if record.id not in kept_ids and record.digest not in kept_digests
+    ]
 
 
-def freed_bytes(removed: Sequence[MapRecord]) -> int:
-    """Return how many bytes less a tenant is charged with without these versions."""
-    sizes = {record.digest: record.size for record in removed}  # versions may share their bytes
+def count_freed_bytes(removed: Sequence[MapRecord]) -> int:
+    """Return by how many bytes the charge of a tenant decreases when the versions *removed* are gone."""
+    sizes = {record.digest: record.size for record in removed}  # Versions may share their bytes.
     return sum(map(charge_of, sizes.values())) + len(removed) * MIN_CHARGE_BYTES
 
 
 def _charge_of(record: MapRecord) -> int:
-    """Return what a version counts for: its bytes, and its record."""
+    """Return the bytes that a tenant is charged with for a version: its map and its record."""
     return charge_of(record.size) + MIN_CHARGE_BYTES

@@ -18,7 +18,7 @@ from maps.sample_maps import make_map
 from rse_pf.errors import BadRequest, Conflict, NotFound, StoreError
 from rse_pf.geometry import exp_se3
 from rse_pf.maps.format import Keyframe, MapVersion, encode_map
-from rse_pf.maps.registry import MapRegistry, difference
+from rse_pf.maps.registry import MapRegistry, compare_versions
 from rse_pf.object_store import DirectoryStore, MemoryStore
 
 
@@ -112,13 +112,13 @@ def test_a_difference_names_what_was_added_removed_and_moved() -> None:
         edges=before.edges[:1],
     )  # fmt: skip
 
-    found = difference(before, after)
+    found = compare_versions(before, after)
 
     assert (found.added, found.removed, found.moved) == ((), (20, 30), (10,))
     assert found.largest_move_m == pytest.approx(0.3)
     assert found.edges_removed == ((10, 20, "odometry"), (20, 30, "odometry"))
     assert (found.points_before, found.points_after) == (20, 0)
-    assert difference(after, before).added == (20, 30)
+    assert compare_versions(after, before).added == (20, 30)
 
 
 _KILLED = """

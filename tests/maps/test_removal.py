@@ -15,10 +15,10 @@ from maps.sample_maps import make_map
 
 from rse_pf.errors import Busy, Conflict, NotFound, StoreError, StoreFull
 from rse_pf.identity import RobotId
-from rse_pf.maps.charges import charge_name, charged_to
+from rse_pf.maps.charges import charge_name, sum_charges
 from rse_pf.maps.format import encode_map
 from rse_pf.maps.registry import MapRecord, MapRegistry
-from rse_pf.maps.removal import ABANDONED_S, MOST_S, Marks, freed_bytes, superseded
+from rse_pf.maps.removal import ABANDONED_S, MAX_REMOVAL_S, Marks, choose_superseded, count_freed_bytes
 from rse_pf.object_store import DirectoryStore, MemoryStore, ObjectInfo, ObjectStore, Usage
 
 NAME, FOLDER = "kitchen", "maps/default/kitchen/"
@@ -76,7 +76,7 @@ def commit(maps: MapRegistry, seed: int, created_s: float | None = None) -> MapR
 
 
 def prune(maps: MapRegistry, keep: int = 2) -> list[MapRecord]:
-    return maps.remove(NAME, lambda records, head: superseded(records, head, keep=keep))
+    return maps.remove(NAME, lambda records, head: choose_superseded(records, head, keep=keep))
 
 
 def assert_whole(maps: MapRegistry) -> None:
@@ -106,9 +106,9 @@ def test_the_newest_versions_stay_and_of_the_others_neither_bytes_nor_record_nor
     assert [record.number for record in maps.versions(NAME)] == [4, 5]
     assert_whole(maps)
     after = store.usage("maps/")
-    assert before.charged_bytes - after.charged_bytes == freed_bytes(removed)
+    assert before.charged_bytes - after.charged_bytes == count_freed_bytes(removed)
     assert after.objects == 5, "two maps, two records and the head; no mark"
-    assert charged_to(store, ROBOT).objects == 3, "two versions, and one of another map"
+    assert sum_charges(store, ROBOT).objects == 3, "two versions, and one of another map"
     with pytest.raises(NotFound):
         maps.record(NAME, records[0].id)
     assert prune(maps, keep=2) == []
@@ -141,9 +141,9 @@ def record(number: int, *, size: int = 10, note: str = "", digest: str = "") -> 
     [
         ({"keep": 2}, [1, 2, 3]),
         ({"keep": 9}, []),
-        ({"keep": 9, "most_bytes": 3 * 8192}, [1, 2]),
-        ({"keep": 9, "most_bytes": 1}, [1, 2, 3, 4]),
-        ({"keep": 1, "counts": lambda each: each.note == ""}, [1, 3, 4]),
+        ({"keep": 9, "max_bytes": 3 * 8192}, [1, 2]),
+        ({"keep": 9, "max_bytes": 1}, [1, 2, 3, 4]),
+        ({"keep": 1, "is_counted": lambda each: each.note == ""}, [1, 3, 4]),
         ({"keep": 2, "head": 2}, [1, 3]),
     ],
     ids=["number", "all", "bytes", "the newest always", "only some count", "the head"],
@@ -152,7 +152,7 @@ def test_versions_are_superseded_by_their_number_and_their_bytes(options: dict, 
     records = [record(number, note="asked for" if number == 2 else "") for number in range(1, 6)]
     head = records[options.pop("head", 5) - 1].id
 
-    assert [each.number for each in superseded(records, head, **options)] == numbers
+    assert [each.number for each in choose_superseded(records, head, **options)] == numbers
 
 
 def inner_commit(maps: MapRegistry) -> None:
@@ -267,11 +267,11 @@ def test_after_a_crash_at_any_step_all_is_whole_and_a_later_call_removes_the_res
     assert [each.number for each in maps.versions(NAME)] == [3, 4]
     assert_whole(maps)
     assert len([name for name in names(store) if name.startswith(FOLDER)]) == 5
-    assert charged_to(store, ROBOT).objects == 2
+    assert sum_charges(store, ROBOT).objects == 2
 
 
 def test_who_removes_stops_before_its_marks_count_as_abandoned():
-    assert MOST_S * 2 < ABANDONED_S
+    assert MAX_REMOVAL_S * 2 < ABANDONED_S
     now = [1e9]
     store = SteppedStore()
     maps = MapRegistry(store, wall_clock=lambda: now[0])
@@ -279,13 +279,13 @@ def test_who_removes_stops_before_its_marks_count_as_abandoned():
         commit(maps, seed)
 
     def pause() -> None:
-        now[0] += MOST_S
+        now[0] += MAX_REMOVAL_S
 
     def begin_at_the_first_mark(records: Sequence[MapRecord], head: str) -> list[MapRecord]:
         store.count_from_here(2, pause)
-        return superseded(records, head, keep=2)
+        return choose_superseded(records, head, keep=2)
 
-    with pytest.raises(Busy, match="too slow"):
+    with pytest.raises(Busy, match="in 60 s"):
         maps.remove(NAME, begin_at_the_first_mark)
     assert len(maps.versions(NAME)) == 4
     assert_whole(maps)
@@ -348,4 +348,4 @@ def test_versions_are_removed_from_a_disk_that_is_full(tmp_path: Path):
 def test_the_usage_of_a_record_is_what_the_store_charges():
     data = msgspec.json.encode(record(1))
 
-    assert Usage(1, freed_bytes([record(1, size=5000)])) == Usage(1, 5000 + max(4096, len(data)))
+    assert Usage(1, count_freed_bytes([record(1, size=5000)])) == Usage(1, 5000 + max(4096, len(data)))

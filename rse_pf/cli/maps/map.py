@@ -46,8 +46,8 @@ from rse_pf.cli.maps.merge_output import commit_merge, merge_progress
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import NotFound, UsageError
 from rse_pf.map_export.command import add_export_arguments, run_export
-from rse_pf.maps.registry import MapOrigin, MapRecord, MapRegistry, difference
-from rse_pf.maps.removal import freed_bytes, superseded
+from rse_pf.maps.registry import MapOrigin, MapRecord, MapRegistry, compare_versions
+from rse_pf.maps.removal import choose_superseded, count_freed_bytes
 from rse_pf.terminal import at_work, counted, format_time, show, show_json
 
 if TYPE_CHECKING:
@@ -277,7 +277,7 @@ def _merge(args: argparse.Namespace, maps: MapRegistry) -> int:
 
 
 def _diff(args: argparse.Namespace, maps: MapRegistry) -> None:
-    found = difference(maps.load(args.name, args.before), maps.load(args.name, args.after))
+    found = compare_versions(maps.load(args.name, args.before), maps.load(args.name, args.after))
     _print(
         args,
         msgspec.to_builtins(found),
@@ -303,8 +303,8 @@ def _rollback(args: argparse.Namespace, maps: MapRegistry) -> None:
 def _prune(args: argparse.Namespace, maps: MapRegistry) -> None:
     if args.keep < 1:
         raise UsageError(f"--keep {args.keep} is below 1", hint="1 keeps the head and the newest version")
-    removed = maps.remove(args.name, functools.partial(superseded, keep=args.keep))
-    freed = freed_bytes(removed)
+    removed = maps.remove(args.name, functools.partial(choose_superseded, keep=args.keep))
+    freed = count_freed_bytes(removed)
     _print(
         args,
         {"removed": [_fields(record) for record in removed], "freed_bytes": freed},

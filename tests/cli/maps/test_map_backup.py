@@ -15,10 +15,10 @@ from rse_pf.aws.storage import S3Store
 from rse_pf.cli.main import main
 from rse_pf.identity import RobotId
 from rse_pf.local.firewall import ensure_key
-from rse_pf.maps.charges import charge_name, charged_to
+from rse_pf.maps.charges import charge_name, sum_charges
 from rse_pf.maps.format import encode_map
 from rse_pf.maps.registry import MapRegistry
-from rse_pf.maps.removal import superseded
+from rse_pf.maps.removal import choose_superseded
 from rse_pf.object_store import DirectoryStore, ObjectStore, digest_of
 
 Capture = pytest.CaptureFixture[str]
@@ -86,7 +86,7 @@ def test_maps_of_one_tenant_are_restored_with_all_versions_elsewhere(
     assert "objects: 3 versions written" in said
     assert without_account(contents(lab)) == before
     assert contents(lab, "beta") == {}
-    assert charged_to(lab, ROBOT).charged_bytes == 5000
+    assert sum_charges(lab, ROBOT).charged_bytes == 5000
     assert MapRegistry(lab, "acme").load("hall").keyframes
     assert Path("acme.maps").stat().st_mode & 0o077 == 0
     assert "0 versions written" in run(capsys, "map restore acme.maps --tenant acme --name lab")
@@ -270,7 +270,7 @@ def test_a_backup_is_whole_when_a_robot_commits_and_removes_versions_before_any_
             monkeypatch.setattr(DirectoryStore, "get", get)
             commit(store, "hall", 6)
             maps = MapRegistry(store, "acme")
-            maps.remove("hall", lambda records, head: superseded(records, head, keep=1))
+            maps.remove("hall", lambda records, head: choose_superseded(records, head, keep=1))
         return get(self, name)
 
     monkeypatch.setattr(DirectoryStore, "get", late)

@@ -27,7 +27,7 @@ from rse_pf.errors import (
 from rse_pf.live_map.versions import PointSource, as_internal_error
 from rse_pf.maps.format import UP_FIELD, MapVersion, encode_map
 from rse_pf.maps.registry import MapOrigin, MapRecord, MapRegistry
-from rse_pf.maps.removal import superseded
+from rse_pf.maps.removal import choose_superseded
 from rse_pf.object_store import digest_of
 from rse_pf.server.live_map.map_server.environment import MapServerEnvironment, Urgency
 from rse_pf.server.live_map.map_server.state import MapState
@@ -257,7 +257,7 @@ class Publisher:
         max_bytes = account.quota_bytes() / _QUOTA_DIVISOR
 
         def choose(records: Sequence[MapRecord], head: str) -> list[MapRecord]:
-            old = superseded(records, head, keep=keep, most_bytes=max_bytes, counts=_is_automatic)
+            old = choose_superseded(records, head, keep=keep, max_bytes=max_bytes, is_counted=_is_automatic)
             return old[:_MAX_REMOVED_AT_ONCE]
 
         removed = self._environment.maps.remove(self._map_name, choose)
