@@ -141,7 +141,7 @@ class MapServerProcess:
         return self._ready.done()
 
     async def wait_ready(self, timeout_s: float) -> None:
-        """Wait until `is_ready`, for at most *timeout_s* seconds."""
+        """Wait at most *timeout_s* seconds until the process has imported its modules, or has exited."""
         await asyncio.wait({self._ready}, timeout=timeout_s)
 
     async def claim(self, order: ClaimOrder) -> bool:
@@ -324,7 +324,11 @@ class MapServerPool:
             self._spare.kill()
 
     def _free_process(self, tenant: str, in_use_by_tenant: Counter[str], now: float) -> None:
-        """Order a map to give up its process for a map of *tenant*, as this module's docstring describes."""
+        """Order a map server to give its map up, so that a map of *tenant* gets a process.
+
+        A map that is only watched is chosen first, of the same tenant or of one with more processes; then the
+        newest map of the tenant with most processes, if that tenant has at least two more; else none.
+        """
         self._wanted_until_s = now + _RESERVATION_S
         if self.is_freeing_process and tenant == self._reserved_for:
             self._reserved_until_s = now + _RESERVATION_S

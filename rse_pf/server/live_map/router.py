@@ -285,7 +285,7 @@ class LiveMapRouter(CommandQueue):
     # --- Subscriptions of robots to updates ---
 
     def subscribe(self, connection: Any, identity: int, topic: str) -> None:
-        """Begin the updates of the live map in *topic* (``live/MAP``), or send the robot a error.
+        """Begin the updates of the live map in *topic* (``live/MAP``), or send the robot an error.
 
         Args:
             connection: Connection of the robot.

@@ -38,7 +38,7 @@ _MAX_KEYS = 1024
 _MAX_UPDATE_BYTES = 65_536
 """Largest encoded payload of an update in bytes; a larger one is logged and not sent."""
 _UPDATE_WITHOUT_MAP_SERVER = {"kind": "map", "keyframes": 0, "version": 0, "owner": "", "state": "moving"}
-"""Payload of the key ``map`` until the map server has sent one."""
+"""Update of the key ``map`` that subscribers of a live map get until its map server has sent one."""
 
 
 @dataclass(eq=False, slots=True)

@@ -1,4 +1,4 @@
-"""A fake of the owners of live maps, and a fake connection of a robot."""
+"""A fake client of live maps, and a fake connection of a robot."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ OnUpdate = Callable[[str, str, dict[str, Any]], None]
 
 
 class FakeLiveMapClient:
-    """Owners that count a robot's keyframes, unless ``answer`` says otherwise."""
+    """A client whose maps count the keyframes of each robot, unless ``answer`` returns another reply."""
 
     def __init__(self, on_update: OnUpdate) -> None:
         self.on_update = on_update

@@ -1,4 +1,4 @@
-"""A map for tests of its owner: it numbers keyframes, and its digest depends on every event in its order."""
+"""A fake map for tests of map servers: its digest depends on every event and on their order."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _CONTENT_KIND = 1000
 
 
 class FakeMap:
-    """Keyframes with the content ``bad`` are garbage, with ``defect`` they break the map's logic."""
+    """A map without SLAM: it refuses keyframes with the content ``bad`` and raises for ``defect``."""
 
     def __init__(self) -> None:
         self._state: dict[str, Any] = {"digest": "", "keyframes": [], "numbers": {}, "segments": {}}
@@ -182,12 +182,12 @@ def keyframe_bytes(timestamp_s: float, content: bytes) -> bytes:
 
 
 def content_of(event: KeyframeAdded) -> bytes:
-    """Return what `keyframe_bytes` was given."""
+    """Return the content that was given to `keyframe_bytes`."""
     return event.keyframe.unknown_blocks[0].content
 
 
 def keyframe_request(number: int, content: bytes = b"good", segment: int = 0) -> KeyframeRequest:
-    """Return what a robot sends with keyframe *number*."""
+    """Return the request with which a robot sends keyframe *number*."""
     return KeyframeRequest(
         map="m", segment=segment, number=number, keyframe=keyframe_bytes(float(number), content)
     )

@@ -1,4 +1,4 @@
-"""Owners of a live map without processes, sockets or time: a fake map, a store in memory, a clock by hand."""
+"""Run map servers without processes, sockets and time: a fake map, a store in memory, a manual clock."""
 
 from __future__ import annotations
 
@@ -26,7 +26,16 @@ from rse_pf.server.live_map.map_server.measurement import optimise_in_process
 from rse_pf.server.live_map.map_server.state import MapState, take_over
 from tests.server.live_map.fake_map import FAKE_MAP
 
-__all__ = ["MAP", "ROBOT", "Bench", "FailingStore", "HandClock", "InlineThreads", "OwnerBench", "settle"]
+__all__ = [
+    "MAP",
+    "ROBOT",
+    "Bench",
+    "FailingStore",
+    "HandClock",
+    "InlineThreads",
+    "RunningMapServer",
+    "settle",
+]
 
 MAP, TENANT = "warehouse", "default"
 ROBOT = RobotId("default", "robot-1")
@@ -65,7 +74,7 @@ class HandClock:
 
 
 class InlineThreads:
-    """Everything is computed where it is asked for."""
+    """Threads that compute in the calling thread, at once."""
 
     async def compute(self, urgency: Urgency, act: Callable[[], _T]) -> _T:
         return act()
@@ -77,7 +86,7 @@ class InlineThreads:
 
 
 class FailingStore(MemoryStore):
-    """Fails with a probability, before a change or after it: then the change is made, but nobody is told."""
+    """Fails with a given probability, before a change or after it: then the change is made all the same."""
 
     def __init__(self, share: float = 0.0, seed: int = 0) -> None:
         super().__init__()
@@ -104,13 +113,13 @@ class FailingStore(MemoryStore):
             raise StoreError("the store fails", hint="wait")
 
 
-class OwnerBench:
-    """One owner on the bench."""
+class RunningMapServer:
+    """A running map server with all that it sent."""
 
     def __init__(self, bench: Bench, name: str) -> None:
-        self.told: list[dict[str, Any]] = []
-        self.beats: list[int] = []
-        self.used: list[bool] = []
+        self.sent_updates: list[dict[str, Any]] = []
+        self.renewals: list[int] = []
+        self.uses: list[bool] = []
         self.lease = MapLease(bench.store, LEASE, owner=name, server=name, clock=bench.clock)
         self.claimed = self.lease.claim(read_record(bench.store, LEASE))
         record = self.lease.record
@@ -134,13 +143,13 @@ class OwnerBench:
             account=account,
             objects=KeyframeObjects(bench.store, account),
             log=bench.log,
-            send_update=self.told.append,
-            on_renewal=self.beats.append,
-            on_use=self.used.append,
+            send_update=self.sent_updates.append,
+            on_renewal=self.renewals.append,
+            on_use=self.uses.append,
             optimise=optimise_in_process,
         )
-        self.owner = MapServer(context, self.state, self.log, self.lease)
-        self.run = asyncio.ensure_future(self.owner.run())
+        self.map_server = MapServer(context, self.state, self.log, self.lease)
+        self.run = asyncio.ensure_future(self.map_server.run())
 
     async def keyframe(
         self, number: int, features: bytes = b"good", robot: RobotId = ROBOT
@@ -148,20 +157,20 @@ class OwnerBench:
         from tests.server.live_map.fake_map import keyframe_request
 
         request = msgspec.msgpack.encode(keyframe_request(number, features))
-        return await self.owner.answer(robot, "live-keyframe", request)
+        return await self.map_server.answer(robot, "live-keyframe", request)
 
     async def ask(
         self, operation: str, payload: dict[str, Any] | None = None, robot: RobotId = ROBOT
     ) -> dict[str, Any]:
         request = msgspec.msgpack.encode({"map": MAP, **(payload or {})})
-        return await self.owner.answer(robot, operation, request)
+        return await self.map_server.answer(robot, operation, request)
 
     def newest(self, kind: str) -> dict[str, Any]:
-        return [payload for payload in self.told if payload["kind"] == kind][-1]
+        return [payload for payload in self.sent_updates if payload["kind"] == kind][-1]
 
 
 class Bench:
-    """A store, a clock, and the owners that a test makes."""
+    """A store and a manual clock, on which a test starts map servers one after the other."""
 
     def __init__(
         self,
@@ -191,8 +200,8 @@ class Bench:
         assert data is not None
         return decode_lease(LEASE, data)
 
-    async def own(self, name: str) -> OwnerBench:
-        made = OwnerBench(self, name)
+    async def start(self, name: str) -> RunningMapServer:
+        made = RunningMapServer(self, name)
         await settle()
         return made
 
@@ -208,6 +217,6 @@ class Bench:
 
 
 async def settle(rounds: int = 60) -> None:
-    """Let every coroutine that can go on do so."""
+    """Run all tasks of the event loop until each waits for something."""
     for _ in range(rounds):
         await asyncio.sleep(0)

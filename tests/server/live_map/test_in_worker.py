@@ -20,7 +20,7 @@ HELLO = Hello(capabilities=("updates",))
 
 
 class Worker(WorkerParts):
-    """A worker with live maps, whose owners are fake."""
+    """A worker with live maps, whose map servers are fake."""
 
     client: FakeLiveMapClient
 

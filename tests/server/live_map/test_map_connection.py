@@ -1,4 +1,4 @@
-"""How a worker finds, starts and replaces the owner of a map, with processes that are only played."""
+"""How a worker finds, starts and replaces the map server of a map, with fake processes."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ FIRST = KeyframeRequest(map="warehouse", segment=0, number=0, keyframe=b"")
 ROBOT = RobotId("default", "robot-1")
 
 
-class PlayedProcess:
-    """A process that says what the test says, and claims a map as a real one does."""
+class FakeProcess:
+    """A fake process that sends what the test wants, and claims a map as a real one does."""
 
     def __init__(self, store: MemoryStore) -> None:
         self.connection, self._theirs = socket.socketpair()
@@ -64,20 +64,20 @@ class PlayedProcess:
 
 
 class Worker:
-    """The link of one worker to one map."""
+    """One worker with its connection to one map."""
 
     def __init__(self) -> None:
         self.store = MemoryStore()
-        self.started: list[PlayedProcess] = []
-        self.told: list[dict[str, Any]] = []
+        self.started: list[FakeProcess] = []
+        self.updates: list[dict[str, Any]] = []
         self.pool = MapServerPool(self._spawn, max_processes=2, keeps_spare=False)
         context = ConnectionContext(
             store=self.store, settings=PlatformSettings().live, server_id="here", log=FakeLog(),
             call=self._call, key=lambda: b"k" * 32, pool=self.pool,
             clock=time.monotonic, wall_clock=time.time,
         )  # fmt: skip
-        self.link = MapConnection(
-            context, "default", "warehouse", on_update=self.told.append, on_end=lambda link: None
+        self.map = MapConnection(
+            context, "default", "warehouse", on_update=self.updates.append, on_end=lambda connection: None
         ).start()
 
     def lease(self) -> LeaseRecord | None:
@@ -89,13 +89,13 @@ class Worker:
         return self
 
     async def __aexit__(self, *_: object) -> None:
-        await self.link.close()
+        await self.map.close()
         self.pool.kill_spare()
         for child in self.pool.in_use:
             child.kill()
 
-    def _spawn(self, calmly: bool) -> PlayedProcess:
-        self.started.append(PlayedProcess(self.store))
+    def _spawn(self, at_low_priority: bool) -> FakeProcess:
+        self.started.append(FakeProcess(self.store))
         return self.started[-1]
 
     async def _call(self, act: Callable[[], Any]) -> Any:
@@ -109,7 +109,7 @@ async def until(is_so: Callable[[], Any]) -> None:
 
 async def test_a_process_is_started_as_soon_as_a_map_that_nobody_has_begun_is_watched() -> None:
     async with Worker() as worker:
-        worker.link.set_watched(True)
+        worker.map.set_watched(True)
         await until(lambda: worker.started)
         worker.started[0].tell("ready")
         spare = worker.pool.prepare_spare()
@@ -117,17 +117,17 @@ async def test_a_process_is_started_as_soon_as_a_map_that_nobody_has_begun_is_wa
         await until(lambda: spare.is_ready)
         assert worker.lease() is None  # the first keyframe begins the map
 
-        sent = asyncio.ensure_future(worker.link.request(ROBOT, "live-keyframe", FIRST, 5.0))
+        sent = asyncio.ensure_future(worker.map.request(ROBOT, "live-keyframe", FIRST, 5.0))
         await until(lambda: (found := worker.lease()) is not None and found.state == "serving")
         assert len(worker.started) == 1
         sent.cancel()
 
 
-async def test_an_owner_elsewhere_is_used_before_the_own_process_is_ready() -> None:
-    """Else the robots of this server wait until its own process is started, for nothing."""
+async def test_a_map_server_of_another_worker_is_used_before_the_own_process_is_ready() -> None:
+    """Otherwise the robots of this server would wait until its own process has started."""
 
     async with Worker() as worker:
-        sent = asyncio.ensure_future(worker.link.request(ROBOT, "live-keyframe", FIRST, 5.0))
+        sent = asyncio.ensure_future(worker.map.request(ROBOT, "live-keyframe", FIRST, 5.0))
         await until(lambda: worker.started)  # it never gets ready
         with socket.create_server(("127.0.0.1", 0)) as listener:
             listener.setblocking(False)
@@ -141,7 +141,7 @@ async def test_an_owner_elsewhere_is_used_before_the_own_process_is_ready() -> N
 
 
 def owner_on_a_closed_port(worker: Worker) -> None:
-    """Let another server have the lease, with a port where nobody listens."""
+    """Write a lease of another server with a port at which nobody listens."""
     elsewhere = MapLease(worker.store, LEASE, owner="b", server="there", clock=time.monotonic)
     assert elsewhere.claim(None)
     with socket.create_server(("127.0.0.1", 0)) as listener:
@@ -149,12 +149,12 @@ def owner_on_a_closed_port(worker: Worker) -> None:
     assert elsewhere.serve("127.0.0.1", port, "c")
 
 
-async def test_an_owner_whose_port_is_closed_is_replaced_at_once_by_those_who_were_connected() -> None:
+async def test_a_map_server_whose_port_is_closed_is_replaced_at_once_by_workers_that_were_connected() -> None:
     async with Worker() as worker:
         owner_on_a_closed_port(worker)
-        worker.link._reached_owner = "b"
+        worker.map._reached_owner = "b"
         began_s = time.monotonic()
-        sent = asyncio.ensure_future(worker.link.request(ROBOT, "live-keyframe", FIRST, 5.0))
+        sent = asyncio.ensure_future(worker.map.request(ROBOT, "live-keyframe", FIRST, 5.0))
         await until(lambda: worker.started)
         worker.started[0].tell("ready")
         await until(lambda: (found := worker.lease()) is not None and found.epoch == 2)
@@ -162,7 +162,7 @@ async def test_an_owner_whose_port_is_closed_is_replaced_at_once_by_those_who_we
         sent.cancel()
 
 
-async def test_a_link_that_ends_while_the_owner_has_not_reached_owner_it_closes_its_connection() -> None:
+async def test_a_connection_that_is_closed_before_its_welcome_closes_its_socket() -> None:
     async with Worker() as worker:
         is_greeted, is_gone = asyncio.Event(), asyncio.Event()
 
@@ -179,19 +179,19 @@ async def test_a_link_that_ends_while_the_owner_has_not_reached_owner_it_closes_
         elsewhere = MapLease(worker.store, LEASE, owner="b", server="there", clock=time.monotonic)
         assert elsewhere.claim(None)
         assert elsewhere.serve("127.0.0.1", server.sockets[0].getsockname()[1], certificate)
-        worker.link.set_watched(True)
+        worker.map.set_watched(True)
         await asyncio.wait_for(is_greeted.wait(), 10.0)
-        await worker.link.close()
+        await worker.map.close()
         await asyncio.wait_for(is_gone.wait(), 10.0)
         server.close()
 
 
-async def test_an_owner_whose_port_was_never_reached_keeps_its_lease() -> None:
+async def test_a_map_server_whose_port_was_never_reached_keeps_its_lease() -> None:
     """A firewall may refuse what the other servers can reach."""
 
     async with Worker() as worker:
         owner_on_a_closed_port(worker)
-        sent = asyncio.ensure_future(worker.link.request(ROBOT, "live-keyframe", FIRST, 0.3))
+        sent = asyncio.ensure_future(worker.map.request(ROBOT, "live-keyframe", FIRST, 0.3))
         await until(lambda: worker.started)
         worker.started[0].tell("ready")
         await asyncio.wait({sent})
@@ -199,29 +199,29 @@ async def test_an_owner_whose_port_was_never_reached_keeps_its_lease() -> None:
         assert decode_lease(LEASE, worker.store.get(LEASE)).epoch == 1
 
 
-async def test_who_may_only_watch_starts_no_process_and_is_told_that_the_map_is_idle() -> None:
+async def test_who_may_only_watch_starts_no_process_and_gets_the_state_idle() -> None:
     async with Worker() as worker:
         lease = MapLease(worker.store, LEASE, owner="b", server="there", clock=time.monotonic)
         assert lease.claim(None)
         assert lease.release()
-        worker.link.set_watched(True, may_start=False)
-        await until(lambda: worker.told)
-        assert worker.told[-1]["state"] == "idle"
-        assert not worker.link.may_need_process
+        worker.map.set_watched(True, may_start=False)
+        await until(lambda: worker.updates)
+        assert worker.updates[-1]["state"] == "idle"
+        assert not worker.map.may_need_process
 
-        worker.link.set_watched(True, may_start=True)
+        worker.map.set_watched(True, may_start=True)
         await until(lambda: worker.started)
         worker.started[0].tell("ready")
         await until(lambda: (found := worker.lease()) is not None and found.state == "serving")
-        assert worker.told[-1]["state"] == "moving"
+        assert worker.updates[-1]["state"] == "moving"
 
 
 async def test_who_may_only_watch_a_map_that_is_driven_in_takes_no_part_in_a_takeover() -> None:
     async with Worker() as worker:
         owner_on_a_closed_port(worker)
-        worker.link._reached_owner = "b"
-        worker.link.set_watched(True, may_start=False)
-        await until(lambda: worker.told and worker.told[-1]["state"] == "idle")
+        worker.map._reached_owner = "b"
+        worker.map.set_watched(True, may_start=False)
+        await until(lambda: worker.updates and worker.updates[-1]["state"] == "idle")
         assert worker.started == []
         assert decode_lease(LEASE, worker.store.get(LEASE)).epoch == 1
 

@@ -1,4 +1,4 @@
-"""Which map of which tenant gets one of a worker's owner processes, and which one gives it up."""
+"""Which map of which tenant gets one of a worker's map-server processes, and which map gives one up."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from rse_pf.ipc import encode_message
 from rse_pf.server.live_map.process_pool import MapServerPool, MapServerProcess
 
 
-class PlayedProcess:
-    """A process that is ready at once, and ends when it is told to release its map."""
+class FakeProcess:
+    """A fake process that is ready at once, and exits when it is ordered to release its map."""
 
     pid = 1
 
@@ -37,7 +37,7 @@ class Worker:
     def __init__(self, max_processes: int) -> None:
         self.now_s = 0.0
         self.pool = MapServerPool(
-            lambda calmly: PlayedProcess(),
+            lambda at_low_priority: FakeProcess(),
             max_processes=max_processes,
             keeps_spare=False,
             clock=lambda: self.now_s,
@@ -121,12 +121,12 @@ async def test_a_map_that_is_watched_only_takes_a_process_only_while_no_other_ma
         assert worker.take("acme", is_watched_only=True) is not None
 
 
-async def test_a_process_that_is_told_to_be_used_is_not_the_first_to_go() -> None:
+async def test_a_process_whose_map_gets_commands_is_not_the_first_to_be_released() -> None:
     async with Worker(1) as worker:
         child = worker.pool.prepare_spare()
         assert child is not None
         process = child._process
-        assert isinstance(process, PlayedProcess)
+        assert isinstance(process, FakeProcess)
         taken = worker.take("acme", is_watched_only=True)
         assert taken is child
         assert child.unused_since_s == 0.0
@@ -140,7 +140,7 @@ async def test_a_process_that_is_told_to_be_used_is_not_the_first_to_go() -> Non
         assert child.unused_since_s == 7.0
 
 
-async def test_the_processor_time_of_owners_counts_for_their_tenants_also_when_they_have_ended(
+async def test_the_cpu_time_of_map_servers_counts_for_their_tenants_also_after_their_exit(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     taken_s = [0.0]

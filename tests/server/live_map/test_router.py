@@ -1,4 +1,4 @@
-"""Commands to live maps: their rights, sizes and forms, their answers, and who is cut off."""
+"""Commands to live maps: scopes, sizes, formats and answers, and which robots are blocked."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ class Parts:
 
 
 def waiting(parts: Parts) -> int:
-    """Return how many commands of the robot *r* wait."""
+    """Return the number of commands of the robot *r* without an answer."""
     probe = QueuedCommand(None, RobotId("default", "r"), Command(id=0, service="live-show"), 0, 0.0, 1.0)
     return parts.router.backlog(probe).waiting
 
@@ -119,7 +119,7 @@ async def a_router(now: list[float] | None = None) -> AsyncIterator[Parts]:
         assert parts.client.closed
 
 
-async def test_a_keyframe_goes_to_the_owner_of_its_tenants_map_and_the_reply_comes_back() -> None:
+async def test_a_keyframe_goes_to_the_map_server_of_its_tenants_map_and_the_reply_comes_back() -> None:
     async with a_router() as parts:
         answer = await parts.ask("live-keyframe", keyframe(), connection=FakeReader("bob", tenant="acme"))
 
@@ -141,7 +141,7 @@ async def test_a_keyframe_arrives_the_same_from_json_and_from_messagepack() -> N
         assert [asked[4].number for asked in parts.client.asked] == [0, 1]
 
 
-async def test_a_keyframe_ahead_of_the_next_number_is_a_conflict_and_no_garbage() -> None:
+async def test_a_keyframe_ahead_of_the_next_number_is_a_conflict_and_no_invalid_request() -> None:
     async with a_router() as parts:
         for _ in range(20):
             answer = await parts.ask("live-keyframe", keyframe(5))
@@ -184,7 +184,7 @@ WRONG = [
 
 
 @pytest.mark.parametrize(("changes", "code"), WRONG)
-async def test_an_invalid_keyframe_is_refused_before_any_owner_sees_it(changes: Any, code: str) -> None:
+async def test_an_invalid_keyframe_is_refused_before_it_reaches_a_map_server(changes: Any, code: str) -> None:
     async with a_router() as parts:
         answer = await parts.ask("live-keyframe", keyframe(**changes))
 
@@ -273,7 +273,7 @@ async def test_a_robot_lists_the_maps_of_its_tenant_that_it_may_enter() -> None:
         assert answer.reply == {"maps": [{"name": "b"}]}
 
 
-async def test_an_owner_that_does_not_answer_ends_with_the_deadline() -> None:
+async def test_a_map_server_that_does_not_answer_is_given_up_at_the_deadline() -> None:
     async with a_router() as parts:
         parts.client.answer = lambda operation, payload: None
 
@@ -286,7 +286,7 @@ async def test_an_owner_that_does_not_answer_ends_with_the_deadline() -> None:
         assert (parts.router.held, waiting(parts)) == (0, 0)
 
 
-async def test_while_the_owner_changes_a_robot_is_told_when_to_ask_again() -> None:
+async def test_while_the_map_server_changes_a_robot_gets_the_time_to_ask_again() -> None:
     async with a_router() as parts:
         parts.client.answer = lambda *_: Busy("the owner changes", hint="wait", retry_after_ms=300.0)
 
@@ -311,7 +311,7 @@ async def test_a_defect_is_an_internal_failure_without_its_text() -> None:
         assert "secret" not in answer.message + answer.hint
 
 
-async def test_a_sender_of_garbage_loses_the_live_maps_for_a_while_and_the_others_do_not() -> None:
+async def test_a_sender_of_invalid_requests_is_blocked_for_a_while_and_the_others_are_not() -> None:
     now = [100.0]
 
     async with a_router(now) as parts:
@@ -361,7 +361,7 @@ async def test_more_bytes_than_one_worker_holds_are_busy() -> None:
 
 
 async def settled(reader: FakeReader, count: int) -> list[Update]:
-    """Return what *reader* got once it got *count* messages."""
+    """Wait until *reader* has received *count* messages, and return them."""
     deadline = time.monotonic() + 10.0
     while len(reader.written) < count:
         assert time.monotonic() < deadline
@@ -433,7 +433,7 @@ async def test_a_right_that_a_fresh_token_does_not_give_ends_the_subscription() 
         assert parts.client.unwatched == [("default", "m")]
 
 
-async def test_a_token_to_watch_a_map_subscribes_to_it_and_starts_no_owner() -> None:
+async def test_a_token_to_watch_a_map_subscribes_to_it_and_starts_no_map_server() -> None:
     async with a_router() as parts:
         viewer, driver = FakeReader("viewer"), FakeReader("driver")
         viewer.claims = claims("maps:watch/m")
@@ -456,7 +456,9 @@ async def test_a_token_to_watch_a_map_subscribes_to_it_and_starts_no_owner() -> 
         assert parts.client.unwatched == [("default", "m")]
 
 
-async def test_a_driver_whose_fresh_token_only_allows_to_watch_goes_on_reading_and_starts_no_owner() -> None:
+async def test_a_driver_whose_fresh_token_only_allows_to_watch_goes_on_reading_and_starts_no_map_server() -> (
+    None
+):
     async with a_router() as parts:
         reader = FakeReader()
         reader.claims = claims("maps:live/m")
@@ -494,7 +496,9 @@ async def test_an_error_of_the_map_never_counts_against_who_asked(service: str, 
 @pytest.mark.parametrize(
     "error", [QuotaExceeded("full"), StoreFull("full"), Busy("moves"), StoreError("down")]
 )
-async def test_a_keyframe_that_the_store_or_the_quota_refuses_is_no_garbage(error: RsePfError) -> None:
+async def test_a_keyframe_that_the_store_or_the_quota_refuses_is_no_invalid_request(
+    error: RsePfError,
+) -> None:
     async with a_router() as parts:
         parts.client.answer = lambda operation, payload: error
 
@@ -504,7 +508,7 @@ async def test_a_keyframe_that_the_store_or_the_quota_refuses_is_no_garbage(erro
             assert answer.code == error.code
 
 
-async def test_what_waits_for_owners_is_bounded_for_each_tenant() -> None:
+async def test_commands_that_wait_for_map_servers_are_bounded_for_each_tenant() -> None:
     async with a_router() as parts:
         parts.client.answer = lambda operation, payload: None
         hostile, good = FakeReader("r", tenant="acme"), FakeReader("r", tenant="rival")

@@ -1,4 +1,4 @@
-"""A live map through a real server with two workers and a real owner process: rights, tenants, updates."""
+"""A live map with a real backend server, two workers and a real map server: rights, tenants, updates."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which robot gets which value of a live map, and what a slow one costs."""
+"""Which robot gets which update of a live map, and how much memory a slow one takes."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def parts() -> Parts:
     return Parts()
 
 
-def told(reader: FakeReader) -> list[tuple[int, str]]:
+def received(reader: FakeReader) -> list[tuple[int, str]]:
     return [(each.seq, each.key) for each in reader.written if isinstance(each, Update)]
 
 
@@ -61,7 +61,7 @@ def test_a_new_subscription_gets_the_present_value_of_every_key(parts: Parts) ->
     parts.begin(late)
     parts.settle()
 
-    assert told(late) == [(1, "map"), (2, "pose/a")]
+    assert received(late) == [(1, "map"), (2, "pose/a")]
     assert poses(late) == [2.0]
     assert parts.watched == [("default", "m")]
 
@@ -93,7 +93,7 @@ def test_a_slow_reader_gets_the_newest_value_of_each_key_and_a_gap_in_the_number
     slow.unsent_bytes = 0
     parts.settle()
 
-    assert told(slow)[1:] == [(101, "pose/a"), (201, "pose/b")]
+    assert received(slow)[1:] == [(101, "pose/a"), (201, "pose/b")]
     assert poses(slow) == [99.0, -99.0]
     assert len(poses(fast)) == 200
     assert parts.all.replaced == 198
@@ -110,7 +110,7 @@ def test_a_reader_that_never_reads_costs_the_names_of_the_keys_only(parts: Parts
         parts.pose(f"robot-{step % 1500}", float(step))
     parts.settle()
 
-    assert told(reader) == [(1, "map")]
+    assert received(reader) == [(1, "map")]
     assert len(subscription.map.updates) == 1024
     assert len(subscription.unsent) <= 1024
     assert sys.getsizeof(subscription.unsent) < 100_000
@@ -126,7 +126,7 @@ def test_values_that_come_together_replace_each_other_before_they_are_sent(parts
     parts.settle()
 
     assert poses(reader) == [4.0]
-    assert told(reader)[-1][0] == 6
+    assert received(reader)[-1][0] == 6
 
 
 def test_many_readers_are_served_in_several_rounds_of_the_event_loop(parts: Parts) -> None:
@@ -139,11 +139,11 @@ def test_many_readers_are_served_in_several_rounds_of_the_event_loop(parts: Part
     parts.pose("b", 1.0)
     parts.loop.now += 0.011
     parts.loop.turn()
-    sent_at_once = sum(len(told(reader)) - 1 for reader in readers)
+    sent_at_once = sum(len(received(reader)) - 1 for reader in readers)
     parts.settle()
 
     assert sent_at_once == 200
-    assert all(len(told(reader)) == 3 for reader in readers)
+    assert all(len(received(reader)) == 3 for reader in readers)
 
 
 def test_another_tenants_map_of_the_same_name_is_another_map(parts: Parts) -> None:
@@ -192,7 +192,7 @@ def test_a_reader_that_is_slow_when_it_leaves_is_forgotten(parts: Parts) -> None
     assert poses(reader) == []
 
 
-def test_a_robot_whose_right_ends_is_told_and_gets_no_further_value(parts: Parts) -> None:
+def test_a_robot_whose_right_ends_gets_an_error_and_no_further_update(parts: Parts) -> None:
     reader = FakeReader()
     wrong: list[RsePfError] = []
     parts.begin(reader, find_error=lambda: wrong[0] if wrong else None)
@@ -204,7 +204,7 @@ def test_a_robot_whose_right_ends_is_told_and_gets_no_further_value(parts: Parts
 
     assert isinstance(reader.written[-1], Failure)
     assert (reader.written[-1].id, reader.written[-1].code) == (7, "forbidden")
-    assert told(reader) == [(1, "map")]
+    assert received(reader) == [(1, "map")]
     assert parts.watched == []
 
 
@@ -218,11 +218,11 @@ def test_a_value_that_cannot_be_sent_is_logged_once_and_left_out(parts: Parts, v
     parts.pose("a", 1.0)
     parts.settle()
 
-    assert [[key for _, key in told(reader)] for reader in readers] == [["map", "pose/a"]] * 2
+    assert [[key for _, key in received(reader)] for reader in readers] == [["map", "pose/a"]] * 2
     assert [fields["key"] for level, _, fields in parts.log.events if level == "error"] == ["odd"]
 
 
-def test_the_kernel_is_told_to_hold_back_little_of_a_subscriber(parts: Parts) -> None:
+def test_the_socket_of_a_subscriber_holds_few_unsent_bytes(parts: Parts) -> None:
     reader = FakeReader()
 
     parts.begin(reader)

@@ -232,9 +232,8 @@ class LiveLog:
         try:
             self._store.compare_and_swap(name, None, data)
         except Conflict as error:
-            if (
-                self._store.get(name) != data
-            ):  # if equal, an earlier call wrote the entry and its reply was lost
+            # An equal entry was written by an earlier call whose reply was lost.
+            if self._store.get(name) != data:
                 raise LeaseLost(f"entry {number} of the log was written by another map server") from error
         self.position = number
         return number

@@ -117,7 +117,10 @@ class MapMoving(Busy):
 
 
 class MapServer:
-    """Serves one live map; all methods are called in the event loop."""
+    """Answers requests to one live map, writes its log, and keeps its lease.
+
+    All methods are called in the event loop; the map itself is used in a thread of its own.
+    """
 
     def __init__(
         self, environment: MapServerEnvironment, state: MapState, log: LiveLog, lease: MapLease
@@ -216,7 +219,7 @@ class MapServer:
         """Write what waits and a snapshot, and give the lease up, so that any server may take the map."""
         await self._close(self._lease.release, "released")
 
-    # --- Requests of robots and operators ---
+    # --- Requests of robots and operators to the live map ---
 
     async def _reply_to(self, robot: RobotId, operation: str, data: bytes) -> dict[str, Any]:
         match decode_request(operation, data):

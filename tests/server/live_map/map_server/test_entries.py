@@ -1,4 +1,4 @@
-"""Entries of the log are bounded, and so is what waits for a store."""
+"""The size of log entries is bounded, and so is the number of events that wait for the store."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from rse_pf.server.live_map.map_server.log import LogWriter, SubmittedEvent
 
 
 class Taker:
-    """Holds no map; notes how many events each entry had."""
+    """Records how many events each entry has, and applies none."""
 
     def __init__(self) -> None:
         self.sizes: list[int] = []
@@ -27,7 +27,7 @@ class Taker:
 
 
 class Store:
-    """Writes at once, as a thread and a log do."""
+    """Stands for a thread and for a log that writes each entry at once."""
 
     def store(self, act: Callable[[], int]) -> Awaitable[int]:
         async def done() -> int:

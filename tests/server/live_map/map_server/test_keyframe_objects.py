@@ -31,7 +31,7 @@ NOWHERE = np.eye(4)
 
 
 class Account:
-    """Counts what is deleted."""
+    """Counts the bytes of deleted objects."""
 
     def __init__(self) -> None:
         self.released = 0
@@ -181,22 +181,22 @@ async def test_a_forgotten_robots_points_are_in_no_later_version_and_not_in_the_
     theirs = stored(store, OTHER, some_points(3.0))
     arriving = ObjectReference(hashlib.sha256(late).hexdigest(), len(late))
 
-    owner, maps = await bench.own("a"), MapRegistry(store, "default")
-    await owner.owner.answer(ONE, "live-keyframe", keyframe_request(0, mine))
-    await owner.owner.answer(ONE, "live-keyframe", keyframe_request(1, arriving))
-    await owner.owner.answer(OTHER, "live-keyframe", keyframe_request(0, theirs))
+    server, maps = await bench.start("a"), MapRegistry(store, "default")
+    await server.map_server.answer(ONE, "live-keyframe", keyframe_request(0, mine))
+    await server.map_server.answer(ONE, "live-keyframe", keyframe_request(1, arriving))
+    await server.map_server.answer(OTHER, "live-keyframe", keyframe_request(0, theirs))
     await settle()
-    await owner.ask("live-publish")
+    await server.ask("live-publish")
     first = maps.load(MAP, "head")
     assert np.allclose(first.points[:, 2], 2.0)
     assert (first.colours == 77).all()
 
-    await owner.ask("live-forget", {"robot": "one"})
+    await server.ask("live-forget", {"robot": "one"})
 
     with pytest.raises(NotFound):
         store.head(object_name(ONE, mine.digest))
     stored(store, ONE, late)  # it was on its way
-    await owner.ask("live-publish")
+    await server.ask("live-publish")
     assert np.allclose(maps.load(MAP, "head").points[:, 2], 3.0)
     assert not list(store.list(f"objects/{ONE.folder}/"))
     assert store.get(object_name(OTHER, theirs.digest))
@@ -210,19 +210,19 @@ async def test_a_version_names_images_where_the_operator_allows_them_and_forget_
     bench = Bench(store, implementation=LIVE_MAP, publish_pause_s=0.0, images=is_allowed)
     mine, theirs = stored(store, ONE, b"my image"), stored(store, OTHER, b"their image")
 
-    owner, maps = await bench.own("a"), MapRegistry(store, "default")
-    await owner.owner.answer(ONE, "live-keyframe", keyframe_request(0, None, mine))
-    await owner.owner.answer(OTHER, "live-keyframe", keyframe_request(0, None, theirs))
+    server, maps = await bench.start("a"), MapRegistry(store, "default")
+    await server.map_server.answer(ONE, "live-keyframe", keyframe_request(0, None, mine))
+    await server.map_server.answer(OTHER, "live-keyframe", keyframe_request(0, None, theirs))
     await settle()
-    await owner.ask("live-publish")
-    assert (await owner.ask("live-show"))["images"] is is_allowed
+    await server.ask("live-publish")
+    assert (await server.ask("live-show"))["images"] is is_allowed
     named = {"images": {ONE.folder: {"0": mine.digest}}} if is_allowed else {}
     assert maps.load(MAP, "head").provenance == {"made_by": "live", "from": "", **named}
 
-    await owner.ask("live-forget", {"robot": "one"})
+    await server.ask("live-forget", {"robot": "one"})
 
     assert not list(store.list(f"objects/{ONE.folder}/"))
-    await owner.ask("live-publish")
+    await server.ask("live-publish")
     assert ONE.folder not in maps.load(MAP, "head").provenance.get("images", {})
 
 
@@ -235,12 +235,12 @@ async def test_a_map_keeps_up_of_the_version_that_it_started_from(up: object) ->
     )
 
     async def drive(bench: Bench, start: bool) -> None:
-        owner = await bench.own("a")
+        server = await bench.start("a")
         if start:
-            await owner.ask("live-start", {"from": "origin"})
-        await owner.owner.answer(ONE, "live-keyframe", keyframe_request(0, None))
+            await server.ask("live-start", {"from": "origin"})
+        await server.map_server.answer(ONE, "live-keyframe", keyframe_request(0, None))
         await settle()
-        await owner.ask("live-publish")
+        await server.ask("live-publish")
 
     await drive(source, False)
     first = MapRegistry(source.store, "default").load(MAP, "head")
@@ -255,17 +255,17 @@ async def test_a_map_keeps_up_of_the_version_that_it_started_from(up: object) ->
     assert found is None if not isinstance(up, list) else np.allclose(found, up)
 
 
-async def test_the_next_owner_deletes_what_the_last_one_could_not() -> None:
+async def test_the_next_map_server_deletes_objects_that_the_last_one_could_not() -> None:
     store = MemoryStore()
     bench = Bench(store, implementation=LIVE_MAP, lease_s=1.5)
     mine = stored(store, ONE, some_points(2.0))
 
-    owner = await bench.own("a")
-    await owner.owner.answer(ONE, "live-keyframe", keyframe_request(0, mine))
-    await owner.ask("live-forget", {"robot": "one"})
-    stored(store, ONE, some_points(2.0))  # as if the owner had ended before it deleted anything
-    await owner.owner.release()
-    await bench.own("b")
+    server = await bench.start("a")
+    await server.map_server.answer(ONE, "live-keyframe", keyframe_request(0, mine))
+    await server.ask("live-forget", {"robot": "one"})
+    stored(store, ONE, some_points(2.0))  # as if the server had ended before it deleted anything
+    await server.map_server.release()
+    await bench.start("b")
     await settle()
 
     assert not list(store.list(f"objects/{ONE.folder}/"))
@@ -293,15 +293,15 @@ def test_a_snapshot_knows_whose_objects_are_to_be_deleted() -> None:
 async def test_live_show_has_whole_paths_in_the_map_where_they_are_asked_for() -> None:
     bench = Bench(implementation=LIVE_MAP)
 
-    owner = await bench.own("a")
+    server = await bench.start("a")
     for number in range(5):
-        await owner.owner.answer(ONE, "live-keyframe", keyframe_request(number, None))
+        await server.map_server.answer(ONE, "live-keyframe", keyframe_request(number, None))
     await settle()
-    shown = await owner.ask("live-show", {"paths": True})
-    assert "paths" not in await owner.ask("live-show")
+    shown = await server.ask("live-show", {"paths": True})
+    assert "paths" not in await server.ask("live-show")
     assert [(each["robot"], each["segment"]) for each in shown["paths"]] == [("one", 0)]
     assert np.allclose(shown["paths"][0]["points"], [[0.2 * n, 0, 0] for n in range(5)], atol=1e-3)
-    first_and_last = owner.state.live_map.paths(2)[0][2][:, 0]
+    first_and_last = server.state.live_map.paths(2)[0][2][:, 0]
     assert first_and_last[0] == 0.0
     assert abs(first_and_last[-1] - 0.8) < 1e-9
     assert len(first_and_last) == 3

@@ -1,4 +1,4 @@
-"""The lease of a live map, its log in a store, and the tokens between servers."""
+"""The lease of a live map, its log in the object store, and the tokens between servers."""
 
 from __future__ import annotations
 
@@ -88,8 +88,8 @@ def test_the_age_of_a_lease_counts_from_the_begin_of_its_last_write():
     assert lease.age_s == 2.0
 
 
-def test_a_renewal_that_the_owner_told_is_no_change_when_it_is_read_later():
-    """Else a silent owner would be found out only after twice the lease."""
+def test_a_renewal_that_the_map_server_has_sent_is_no_change_when_it_is_read_later():
+    """Otherwise the failure of a map server would be detected only after twice the lease."""
     store, clock = MemoryStore(), HandClock()
     lease, watch = leased(store, "a", clock), Lease(store, LEASE, decode_lease, clock)
     lease.claim(None)
@@ -106,7 +106,7 @@ def test_a_renewal_that_the_owner_told_is_no_change_when_it_is_read_later():
     assert watch.unchanged_s == 0.0
 
 
-def test_an_owner_that_finds_its_number_taken_is_the_owner_no_longer():
+def test_a_map_server_that_finds_its_entry_number_taken_has_lost_the_lease():
     store = MemoryStore()
     old, new = log_of(store, 1), log_of(store, 2)
     assert old.write_entry(b"one") == 1
@@ -122,7 +122,7 @@ def test_an_entry_whose_answer_was_lost_is_written_once():
     store = MemoryStore()
     log = log_of(store)
     log.write_entry(b"one")
-    log.position = 0  # nobody told it
+    log.position = 0  # as if the reply of the store was lost
 
     assert log.write_entry(b"one") == 1
 
@@ -183,7 +183,7 @@ def test_snapshots_share_their_parts_and_none_is_kept_that_no_snapshot_needs():
     assert list(store.list(FOLDER)) == []
 
 
-def test_an_old_owner_that_wakes_up_deletes_no_part_of_a_snapshot_that_the_new_one_is_writing():
+def test_an_old_map_server_deletes_no_part_of_a_snapshot_that_the_new_one_is_writing():
     store = MemoryStore()
     old = log_of(store, 1)
     old.write_snapshot(MapSnapshot(position=1, unmeasured=(), head=b"h", parts={"a": b"1", "b": b"2"}))
@@ -255,7 +255,7 @@ def test_a_name_that_would_leave_the_folder_of_the_tenant_is_refused(name: str) 
 CLAIMS = ConnectionClaims(tenant="t", map_name="m", epoch=3, certificate="c", expires_s=1000.0 + TOKEN_S)
 
 
-def test_a_token_between_servers_holds_for_its_map_its_owner_and_its_time_only():
+def test_a_token_between_servers_is_valid_for_its_map_its_map_server_and_its_time_only():
     key = internal_key(MemoryStore())
     token = make_token(key, CLAIMS)
     check_token(key, token, CLAIMS, now_s=1000.0, leeway_s=1.0)

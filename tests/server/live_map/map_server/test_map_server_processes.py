@@ -1,4 +1,4 @@
-"""Real owner processes, killed, stopped and released while a robot sends: nothing is lost or twice."""
+"""Real map-server processes, killed, paused and released: no keyframe is lost or added twice."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.system]
 
 @dataclass
 class Servers:
-    """The links of two servers, in one process and on one store."""
+    """The clients of two backend servers, in one process and on one store."""
 
     store: DirectoryStore
     a: LiveMapClient
@@ -55,7 +55,7 @@ class Servers:
     async def show(self, links: LiveMapClient) -> dict[str, Any]:
         return await links.request("default", MAP, ROBOT, "live-show", LiveMapRequest(map=MAP), PATIENT_S)
 
-    async def owner(self) -> MapServerProcess:
+    async def serving_process(self) -> MapServerProcess:
         """Return the process that serves the map; on a busy machine another one may be about to."""
         name, end_s = lease_name("default", MAP), time.monotonic() + PATIENT_S
         while time.monotonic() < end_s:
@@ -111,19 +111,19 @@ async def test_a_server_that_dies_or_stands_still_loses_no_acknowledged_keyframe
             for _ in range(12):
                 await both.send(both.b, number)
                 number += 1
-            owner = await both.owner()
+            process = await both.serving_process()
             sent = asyncio.ensure_future(both.send(both.b, number))
             await asyncio.sleep(0)
             began = time.monotonic()
-            os.kill(owner.pid, fault)
+            os.kill(process.pid, fault)
             assert (await sent)["number"] == number + 1
             number += 1
             await both.send(both.b, number)
             number += 1
             took.append(time.monotonic() - began)
             if fault == signal.SIGSTOP:
-                os.kill(owner.pid, signal.SIGCONT)
-                assert await asyncio.wait_for(asyncio.shield(owner.exited), PATIENT_S) == 0
+                os.kill(process.pid, signal.SIGCONT)
+                assert await asyncio.wait_for(asyncio.shield(process.exited), PATIENT_S) == 0
         shown = await both.show(both.b)
         assert shown["epoch"] >= 3  # more where the machine is so busy that a lease ends
         state, numbers = both.replayed()
@@ -133,7 +133,7 @@ async def test_a_server_that_dies_or_stands_still_loses_no_acknowledged_keyframe
 
 
 @pytest.mark.parametrize("attackers_drive", [False, True])
-async def test_a_tenant_that_holds_most_owners_gives_one_up_within_seconds(
+async def test_a_tenant_with_most_map_servers_gives_one_up_within_seconds(
     tmp_path: Path, attackers_drive: bool
 ) -> None:
     hostile, victim = RobotId("acme", "robot-1"), RobotId("rival", "robot-1")
@@ -192,7 +192,7 @@ def small_disk(folder: Path, size: str) -> Iterator[Path]:
         subprocess.run(["umount", folder], check=True)
 
 
-def test_one_tenant_fills_the_disk_and_is_told_so_while_the_other_ones_keyframes_are_kept(
+def test_one_tenant_fills_the_disk_and_is_refused_while_keyframes_of_the_other_are_kept(
     tmp_path: Path,
 ) -> None:
     hostile, victim = RobotId("acme", "robot-1"), RobotId("rival", "robot-1")
@@ -227,14 +227,14 @@ def test_one_tenant_fills_the_disk_and_is_told_so_while_the_other_ones_keyframes
 
 
 def listens(pid: int) -> bool:
-    """Say whether a process listens at a TCP port."""
+    """Return whether a process listens at a TCP port."""
     own = {os.readlink(path) for path in Path(f"/proc/{pid}/fd").iterdir()}
     rows = (line.split() for line in Path("/proc/net/tcp").read_text().splitlines()[1:])
     return any(row[3] == "0A" and f"socket:[{row[9]}]" in own for row in rows)
 
 
 async def test_a_process_listens_only_once_it_has_a_map(tmp_path: Path) -> None:
-    """Strangers would fill the backlog of one that does not accept, and nobody would close them."""
+    """Unauthenticated clients could fill the backlog of a process that does not accept connections."""
 
     settings = PlatformSettings.from_dict({"data": {"store": f"dir:{tmp_path}"}})
     child = MapServerProcess(start_map_server(settings, KIND)).start_reading()
@@ -264,7 +264,7 @@ async def test_a_drained_server_gives_its_maps_to_the_next_one_at_once(tmp_path:
         assert [each["state"] for each in both.updates if each["kind"] == "map"][-1] == "live"
 
 
-async def test_two_servers_that_begin_a_map_at_the_same_time_share_one_owner(tmp_path: Path) -> None:
+async def test_two_servers_that_begin_a_map_at_the_same_time_share_one_map_server(tmp_path: Path) -> None:
     async with servers(tmp_path) as both:
         other = RobotId("default", "robot-2")
         await asyncio.gather(

@@ -1,4 +1,4 @@
-"""How an owner measures keyframes: less of each while many wait, and the whole graph apart."""
+"""How a map server measures keyframes: with fewer candidates while many wait; and optimises the graph."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _T = TypeVar("_T")
 
 
 class HeldThreads:
-    """Computes at once; what looks waits until the test lets it."""
+    """Threads that compute at once, and match when the test allows it."""
 
     def __init__(self) -> None:
         self.looking: list[asyncio.Event] = []
@@ -51,7 +51,7 @@ class HeldThreads:
 
 
 class NotingMap(FakeMap):
-    """Notes how each keyframe was to be measured."""
+    """Records with which arguments each keyframe is measured."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -106,7 +106,7 @@ def test_a_graph_that_is_fitted_apart_has_the_same_poses() -> None:
 
 
 def _loop() -> PoseGraph:
-    """Return a loop whose edges are right and whose poses have drifted."""
+    """Return the pose graph of a loop with exact edges and drifted poses."""
     n = 12
     rng = np.random.default_rng(0)
     true: Array = np.array([exp_se3(np.array([0.3 * i, 0.0, 0.0, 0.0, 0.0, 0.5 * i])) for i in range(n)])

@@ -1,4 +1,4 @@
-"""When a live map is published: at most once in an interval, and never twice the same map."""
+"""When a live map is published: at most once in an interval, and an unchanged map never again."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from tests.server.live_map.map_server_bench import MAP, Bench, settle
 async def test_robots_that_leave_again_and_again_publish_one_version_in_an_interval_and_the_last_one_late():
     bench = Bench()
 
-    owner = await bench.own("a")
-    owner.owner.users = 1
+    server = await bench.start("a")
+    server.map_server.users = 1
     maps = MapRegistry(bench.store, "default")
     for number in range(20):
-        await owner.keyframe(number)
-        await owner.ask("live-leave")
+        await server.keyframe(number)
+        await server.ask("live-leave")
         await settle()
     assert [each.keyframes for each in maps.versions(MAP)] == [1]
     await bench.clock.advance(9.0)
@@ -28,7 +28,7 @@ async def test_robots_that_leave_again_and_again_publish_one_version_in_an_inter
     await bench.clock.advance(2.0)
     assert [each.keyframes for each in maps.versions(MAP)] == [1, 20]
     for _ in range(5):
-        await owner.ask("live-leave")
+        await server.ask("live-leave")
         await bench.clock.advance(11.0)
     assert len(maps.versions(MAP)) == 2, "nothing has changed"
 
@@ -36,44 +36,44 @@ async def test_robots_that_leave_again_and_again_publish_one_version_in_an_inter
 async def test_who_asks_for_a_version_waits_for_the_interval_and_all_who_ask_get_the_same_one():
     bench = Bench(publish_pause_s=5.0)
 
-    owner = await bench.own("a")
-    await owner.keyframe(0)
-    assert (await owner.ask("live-publish"))["number"] == 1
-    assert (await owner.ask("live-publish"))["number"] == 1
-    await owner.keyframe(1)
-    asked = [asyncio.ensure_future(owner.ask("live-publish")) for _ in range(3)]
+    server = await bench.start("a")
+    await server.keyframe(0)
+    assert (await server.ask("live-publish"))["number"] == 1
+    assert (await server.ask("live-publish"))["number"] == 1
+    await server.keyframe(1)
+    asked = [asyncio.ensure_future(server.ask("live-publish")) for _ in range(3)]
     await bench.clock.advance(4.0)
     assert not any(each.done() for each in asked)
     await bench.clock.advance(2.0)
     assert [(await each)["number"] for each in asked] == [2, 2, 2]
 
 
-async def test_who_would_wait_for_long_is_told_when_to_ask_again_and_the_map_goes_on():
+async def test_a_request_that_would_wait_for_long_is_refused_with_a_time_and_the_map_goes_on():
     bench = Bench(publish_pause_s=60.0)
 
-    owner = await bench.own("a")
-    await owner.keyframe(0)
-    await owner.ask("live-publish")
+    server = await bench.start("a")
+    await server.keyframe(0)
+    await server.ask("live-publish")
     await bench.clock.advance(5.0)
-    await owner.keyframe(1)
+    await server.keyframe(1)
     for operation in ("live-publish", "live-stop"):
         with pytest.raises(Busy) as refused:
-            await owner.ask(operation)
+            await server.ask(operation)
         assert refused.value.retry_after_ms == pytest.approx(55_000.0)
-    assert (await owner.keyframe(2))["number"] == 3
+    assert (await server.keyframe(2))["number"] == 3
 
 
-async def test_the_interval_counts_over_owners_and_the_same_map_is_not_published_by_the_next_one():
+async def test_the_interval_holds_across_map_servers_and_an_unchanged_map_is_not_published_again():
     bench = Bench()
 
-    first = await bench.own("a")
+    first = await bench.start("a")
     maps = MapRegistry(bench.store, "default")
     await first.keyframe(0)
     await first.ask("live-leave")
     await settle()
-    await first.owner.release()
-    second = await bench.own("b")
-    second.owner.users = 1
+    await first.map_server.release()
+    second = await bench.start("b")
+    second.map_server.users = 1
     asked = asyncio.ensure_future(second.ask("live-publish"))
     await bench.clock.advance(9.0)
     assert not asked.done()
@@ -85,35 +85,35 @@ async def test_the_interval_counts_over_owners_and_the_same_map_is_not_published
     assert maps.head(MAP).keyframes == 2
 
 
-async def test_a_drain_publishes_what_is_due_and_a_crash_leaves_it_to_the_next_owner():
+async def test_a_drain_publishes_a_due_version_and_a_crash_leaves_it_to_the_next_map_server():
     bench = Bench(idle_s=3.0)
 
     maps = MapRegistry(bench.store, "default")
-    drained = await bench.own("a")
+    drained = await bench.start("a")
     await drained.keyframe(0)
     await drained.ask("live-leave")
     await drained.keyframe(1)
     await drained.ask("live-leave")
     await settle()
     assert maps.head(MAP).keyframes == 1
-    await drained.owner.release()
+    await drained.map_server.release()
     assert maps.head(MAP).keyframes == 2
-    crashed = await bench.own("b")
-    crashed.owner.users = 1
+    crashed = await bench.start("b")
+    crashed.map_server.users = 1
     await crashed.keyframe(2)
     await crashed.ask("live-leave")
     await settle()
-    crashed.owner.lose("it crashed")
+    crashed.map_server.lose("it crashed")
     assert maps.head(MAP).keyframes == 2
     await bench.clock.advance(3.0)
-    following = await bench.own("c")
+    following = await bench.start("c")
     await bench.clock.advance(15.0)
     assert await following.run == "released"
     assert maps.head(MAP).keyframes == 3
 
 
 class FullRegistry(MemoryStore):
-    """Has no space for maps while it is full."""
+    """A store that refuses versions of maps while it is full."""
 
     is_full = False
 
@@ -124,7 +124,7 @@ class FullRegistry(MemoryStore):
 
 
 class UndeletableMaps(MemoryStore):
-    """Removes no record of a version while it is slow."""
+    """A store that refuses to delete records of versions while it is slow."""
 
     is_slow = False
 
@@ -134,17 +134,17 @@ class UndeletableMaps(MemoryStore):
         super().delete(name)
 
 
-async def test_a_version_that_cannot_be_stored_stays_due_and_who_asks_is_told_why():
+async def test_a_version_that_cannot_be_stored_stays_due_and_a_request_gets_the_reason():
     store = FullRegistry()
     bench = Bench(store, publish_pause_s=1.0)
 
-    owner = await bench.own("a")
-    owner.owner.users = 1
-    await owner.keyframe(0)
+    server = await bench.start("a")
+    server.map_server.users = 1
+    await server.keyframe(0)
     store.is_full = True
     with pytest.raises(StoreFull):
-        await owner.ask("live-publish")
-    await owner.ask("live-leave")
+        await server.ask("live-publish")
+    await server.ask("live-leave")
     await bench.clock.advance(3.0)
     with pytest.raises(NotFound):
         MapRegistry(store, "default").head(MAP)
@@ -156,15 +156,15 @@ async def test_a_version_that_cannot_be_stored_stays_due_and_who_asks_is_told_wh
 async def test_of_versions_that_nobody_asked_for_the_newest_stay_and_the_others_give_their_bytes_back():
     bench = Bench(publish_pause_s=0.0, keep_versions=3)
 
-    owner = await bench.own("a")
-    owner.owner.users = 1
+    server = await bench.start("a")
+    server.map_server.users = 1
     maps = MapRegistry(bench.store, "default")
     numbers = []
     for number in range(8):
-        await owner.keyframe(number)
+        await server.keyframe(number)
         if number == 1:
-            await owner.ask("live-publish")
-        await owner.ask("live-leave")
+            await server.ask("live-publish")
+        await server.ask("live-leave")
         await bench.clock.advance(1.0)
         numbers.append([each.number for each in maps.versions(MAP)])
     assert numbers[2] == [1, 2, 3]
@@ -176,11 +176,11 @@ async def test_of_versions_that_nobody_asked_for_the_newest_stay_and_the_others_
 async def test_an_operator_may_keep_all_versions():
     bench = Bench(publish_pause_s=0.0, keep_versions=0)
 
-    owner = await bench.own("a")
-    owner.owner.users = 1
+    server = await bench.start("a")
+    server.map_server.users = 1
     for number in range(25):
-        await owner.keyframe(number)
-        await owner.ask("live-leave")
+        await server.keyframe(number)
+        await server.ask("live-leave")
         await bench.clock.advance(1.0)
     assert len(MapRegistry(bench.store, "default").versions(MAP)) == 25
 
@@ -189,17 +189,17 @@ async def test_a_version_that_cannot_be_removed_is_no_failure_of_the_one_that_wa
     store = UndeletableMaps()
     bench = Bench(store, publish_pause_s=0.0, keep_versions=1)
 
-    owner = await bench.own("a")
-    owner.owner.users = 1
+    server = await bench.start("a")
+    server.map_server.users = 1
     maps = MapRegistry(store, "default")
     store.is_slow = True
     for number in range(3):
-        await owner.keyframe(number)
-        await owner.ask("live-leave")
+        await server.keyframe(number)
+        await server.ask("live-leave")
         await bench.clock.advance(1.0)
     assert [each.number for each in maps.versions(MAP)] == [1, 2, 3]
     store.is_slow = False
-    await owner.keyframe(3)
-    await owner.ask("live-leave")
+    await server.keyframe(3)
+    await server.ask("live-leave")
     await bench.clock.advance(1.0)
     assert [each.number for each in maps.versions(MAP)] == [4]

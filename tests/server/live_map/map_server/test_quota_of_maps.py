@@ -1,4 +1,4 @@
-"""What live maps store is charged to their tenant; who fills a store is told so, and the others go on."""
+"""The bytes of live maps are charged to their tenant; a tenant that fills a store is refused, others not."""
 
 from __future__ import annotations
 
@@ -11,22 +11,22 @@ from rse_pf.errors import Conflict, QuotaExceeded, StoreFull
 from rse_pf.identity import RobotId
 from rse_pf.maps.registry import MapRegistry
 from rse_pf.object_store import MemoryStore, ObjectStore, charge_of
-from tests.server.live_map.map_server_bench import FOLDER, MAP, Bench, OwnerBench, settle
+from tests.server.live_map.map_server_bench import FOLDER, MAP, Bench, RunningMapServer, settle
 
 OTHER = RobotId("default", "robot-2", "thumb")
 QUOTA = 1_000_000
 
 
-async def fill(owner: OwnerBench, features: bytes = bytes(20_000), *, leaves: bool = False) -> int:
+async def fill(server: RunningMapServer, features: bytes = bytes(20_000), *, leaves: bool = False) -> int:
     """Send keyframes until one is refused; return its number."""
     number = 0
     while True:
         try:
-            await owner.keyframe(number, features)
+            await server.keyframe(number, features)
         except QuotaExceeded:
             return number
         if leaves:
-            await owner.ask("live-leave")
+            await server.ask("live-leave")
         await settle()
         number += 1
         assert number < 1000
@@ -40,14 +40,14 @@ def stored(store: ObjectStore, *areas: str) -> int:
 async def test_a_tenant_fills_its_quota_with_live_maps_and_no_more(leaves: bool) -> None:
     bench = Bench(MemoryStore(), data={"tenant_quota_bytes": QUOTA}, publish_pause_s=0.0)
 
-    owner = await bench.own("a")
-    owner.owner.users = 1
-    number = await fill(owner, leaves=leaves)
+    server = await bench.start("a")
+    server.map_server.users = 1
+    number = await fill(server, leaves=leaves)
     assert number >= 5
     for more in range(20):  # a snapshot leaves room for a few
         with contextlib.suppress(QuotaExceeded, Conflict):
-            await owner.keyframe(number + more, bytes(20_000))
-        await owner.ask("live-leave")
+            await server.keyframe(number + more, bytes(20_000))
+        await server.ask("live-leave")
         await settle()
     assert stored(bench.store, "live/", "maps/") <= QUOTA
 
@@ -55,19 +55,19 @@ async def test_a_tenant_fills_its_quota_with_live_maps_and_no_more(leaves: bool)
 async def test_over_the_quota_a_map_is_shown_forgotten_and_stopped_and_then_there_is_room() -> None:
     bench = Bench(MemoryStore(), data={"tenant_quota_bytes": QUOTA})
 
-    owner = await bench.own("a")
-    owner.owner.users = 1
-    number = await fill(owner)
+    server = await bench.start("a")
+    server.map_server.users = 1
+    number = await fill(server)
     bench.store.put("objects/default/robot-1/other", bytes(QUOTA))
-    assert (await owner.ask("live-show"))["keyframes"] == number
-    assert await owner.ask("live-leave") == {}
+    assert (await server.ask("live-show"))["keyframes"] == number
+    assert await server.ask("live-leave") == {}
     await bench.clock.advance(30.0)
     bench.store.delete("objects/default/robot-1/other")
-    stopped = await owner.ask("live-stop")
+    stopped = await server.ask("live-stop")
     assert stopped["keyframes"] == number
     assert list(bench.store.list(f"{FOLDER}log/")) == []
     await bench.clock.advance(30.0)
-    new = await bench.own("b")
+    new = await bench.start("b")
     assert (await new.keyframe(0, bytes(20_000)))["number"] == 1
 
 
@@ -76,11 +76,11 @@ async def test_a_robot_that_always_drives_fills_a_quarter_of_the_quota_with_vers
         MemoryStore(), data={"tenant_quota_bytes": QUOTA}, publish_pause_s=0.0, keep_versions=1000
     )  # fmt: skip
 
-    owner = await bench.own("a")
-    owner.owner.users = 1
+    server = await bench.start("a")
+    server.map_server.users = 1
     for number in range(60):
-        await owner.keyframe(number, bytes(5_000))
-        await owner.ask("live-leave")
+        await server.keyframe(number, bytes(5_000))
+        await server.ask("live-leave")
         await bench.clock.advance(1.0)
         assert stored(bench.store, "maps/") <= QUOTA / 4 + 4096, "the versions and the head"
     assert len(MapRegistry(bench.store, "default").versions(MAP)) == 30
@@ -90,14 +90,14 @@ async def test_a_robot_that_always_drives_fills_a_quarter_of_the_quota_with_vers
 async def test_a_robot_is_forgotten_over_the_quota() -> None:
     bench = Bench(MemoryStore(), data={"tenant_quota_bytes": QUOTA})
 
-    owner = await bench.own("a")
-    await fill(owner)
-    assert (await owner.ask("live-forget", {"robot": "robot-1"}))["forgotten"] == 1
-    assert owner.state.keyframes == 0
+    server = await bench.start("a")
+    await fill(server)
+    assert (await server.ask("live-forget", {"robot": "robot-1"}))["forgotten"] == 1
+    assert server.state.keyframes == 0
 
 
 class FullLog(MemoryStore):
-    """Has no space for entries of more than 1 kB while it is full."""
+    """A store that refuses objects of more than 1 kB while it is full."""
 
     is_full = False
     writes_anyway = False
@@ -114,33 +114,33 @@ async def test_a_keyframe_that_a_full_disk_cannot_take_is_refused_and_everything
     store = FullLog()
     bench = Bench(store)
 
-    owner = await bench.own("a")
-    await owner.keyframe(0)
+    server = await bench.start("a")
+    await server.keyframe(0)
     store.is_full = True
     sent = asyncio.gather(
-        owner.keyframe(1, bytes(5000)), owner.keyframe(0, robot=OTHER), return_exceptions=True
+        server.keyframe(1, bytes(5000)), server.keyframe(0, robot=OTHER), return_exceptions=True
     )
     refused, other = await sent
     assert isinstance(refused, StoreFull)
     assert isinstance(other, StoreFull | dict)
-    assert await owner.ask("live-leave") == {}
-    assert (await owner.keyframe(0, robot=OTHER))["number"] == 1
+    assert await server.ask("live-leave") == {}
+    assert (await server.keyframe(0, robot=OTHER))["number"] == 1
     store.is_full = False
-    assert (await owner.keyframe(1, bytes(5000)))["number"] == 2
+    assert (await server.keyframe(1, bytes(5000)))["number"] == 2
     await settle()
-    assert bench.replayed().digest() == owner.state.digest()
+    assert bench.replayed().digest() == server.state.digest()
 
 
 async def test_an_entry_that_was_written_although_the_disk_was_full_is_kept() -> None:
     store = FullLog()
     bench = Bench(store)
 
-    owner = await bench.own("a")
+    server = await bench.start("a")
     store.is_full = store.writes_anyway = True
-    sent = asyncio.ensure_future(owner.keyframe(0, bytes(5000)))
+    sent = asyncio.ensure_future(server.keyframe(0, bytes(5000)))
     await settle()
     store.is_full = False
     await bench.clock.advance(2.0)
     assert (await sent)["number"] == 1
     await settle()
-    assert bench.replayed().digest() == owner.state.digest()
+    assert bench.replayed().digest() == server.state.digest()
