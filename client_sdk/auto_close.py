@@ -1,22 +1,22 @@
-"""The ``with`` statement for what has a ``close()``; how each of them is closed stands with it."""
+"""Let a ``with`` block close an object at its end; subclasses say what their `close` releases."""
 
 from __future__ import annotations
 
 from types import TracebackType
 from typing import TypeVar
 
-__all__ = ["Closing"]
+__all__ = ["AutoClose"]
 
-_Self = TypeVar("_Self", bound="Closing")
+_Self = TypeVar("_Self", bound="AutoClose")
 
 
-class Closing:
-    """Close at the end of a ``with`` block, also after an error."""
+class AutoClose:
+    """Give a class with a ``close`` method the ``with`` statement, which closes it also after an error."""
 
     __slots__ = ()
 
     def close(self) -> None:
-        """Release what is held; may be called twice."""
+        """Release files, threads or connections; may be called twice."""
         raise NotImplementedError
 
     def __enter__(self: _Self) -> _Self:
@@ -29,5 +29,5 @@ class Closing:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        """Close it."""
+        """Close this object."""
         self.close()

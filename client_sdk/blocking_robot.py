@@ -1,7 +1,7 @@
-"""The SDK for programs without asyncio: a robot whose event loop runs in a thread of its own.
+"""Offer a robot to programs without asyncio: its event loop runs in a thread, and methods wait for answers.
 
-Every method calls its namesake of `client_sdk.robot.Robot`; any number of threads may call at the same time,
-also the callables of the program, which have a thread of their own.
+Every method calls the method of `client_sdk.robot.Robot` with the same name.  Any number of threads may call
+at the same time, also functions that the program gave to the SDK; these are called in a thread of their own.
 """
 
 from __future__ import annotations
@@ -10,10 +10,10 @@ import functools
 from collections.abc import Callable, Coroutine
 from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, TypeVar
 
-from client_sdk.auto_close import Closing
+from client_sdk.auto_close import AutoClose
 from client_sdk.commands.subscriptions import BlockingUpdates, Updates
 from client_sdk.commands.traffic_stats import Stats
-from client_sdk.concurrency.event_loop_thread import LoopThread
+from client_sdk.concurrency.event_loop_thread import EventLoopThread
 from client_sdk.robot import MAX_DEADLINE_S, Robot, connect
 from rse_pf.errors import Disconnected, RsePfError, UsageError
 from rse_pf.wire import Welcome
@@ -29,7 +29,9 @@ if TYPE_CHECKING:
 
 __all__ = ["BlockingRobot", "connect_blocking"]
 
-GRACE_S = 0.5  # an answer at the deadline, or Expired, comes by itself within this time unless the loop hangs
+GRACE_S = 0.5
+"""How long a call waits after its deadline, in seconds: the event loop itself ends it unless the loop
+hangs."""
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -38,7 +40,7 @@ T = TypeVar("T")
 def _blocking(
     method: Callable[Concatenate[Robot, P], Coroutine[Any, Any, T]],
 ) -> Callable[Concatenate[BlockingRobot, P], T]:
-    """Return *method* for a `BlockingRobot`, with the same arguments and documentation."""
+    """Return *method* of `Robot` as one of `BlockingRobot`, with the same arguments and documentation."""
 
     @functools.wraps(method)
     def call(self: BlockingRobot, /, *args: P.args, **kwargs: P.kwargs) -> T:
@@ -53,7 +55,7 @@ def _blocking(
 def _blocking_mapper(
     make: Callable[Concatenate[Robot, P], Mapper],
 ) -> Callable[Concatenate[BlockingRobot, P], BlockingMapper]:
-    """Return `Robot.mapper` for a `BlockingRobot`, whose mapper runs in the robot's event loop."""
+    """Return `Robot.mapper` as a method of `BlockingRobot`; the mapper runs in the robot's event loop."""
 
     @functools.wraps(make)
     def mapper(self: BlockingRobot, /, *args: P.args, **kwargs: P.kwargs) -> BlockingMapper:
@@ -67,7 +69,7 @@ def _blocking_mapper(
 def _blocking_live_map(
     make: Callable[Concatenate[Robot, P], LiveMapper],
 ) -> Callable[Concatenate[BlockingRobot, P], BlockingLiveMapper]:
-    """Return `Robot.live_map` for a `BlockingRobot`, whose mapper runs in the robot's event loop."""
+    """Return `Robot.live_map` as a method of `BlockingRobot`; the mapper runs in the robot's event loop."""
 
     @functools.wraps(make)
     def live_map(self: BlockingRobot, /, *args: P.args, **kwargs: P.kwargs) -> BlockingLiveMapper:
@@ -78,16 +80,16 @@ def _blocking_live_map(
     return live_map
 
 
-class BlockingRobot(Closing):
-    """A `Robot` whose methods block until their answers arrive."""
+class BlockingRobot(AutoClose):
+    """One robot whose methods block until the answer has arrived; make one with `connect_blocking`."""
 
     def __init__(self, robot: Robot) -> None:
         self._robot = robot
-        self._thread = LoopThread(robot.close)
+        self._thread = EventLoopThread(robot.close)
 
     def __enter__(self) -> BlockingRobot:
-        """Connect; raises Unauthorized or ConnectError."""
-        self._thread = LoopThread(self._robot.close)
+        """Connect and return this robot; raise the errors of `Robot.__aenter__`, such as ConnectError."""
+        self._thread = EventLoopThread(self._robot.close)
         self._robot.callbacks.start_thread()
         self._thread.start()
         try:
@@ -98,9 +100,9 @@ class BlockingRobot(Closing):
         return self
 
     def close(self) -> None:
-        """Close the connection and end the threads; calls that wait end with Disconnected.
+        """Close the connections and end the threads; calls that wait end with Disconnected.
 
-        Any thread may call it, also a callable of the program, and again.
+        Any thread may call this, also a function that the program gave to the SDK, and more than once.
         """
         self._thread.close()
         self._robot.callbacks.end_thread()
@@ -112,7 +114,7 @@ class BlockingRobot(Closing):
     store_object = _blocking(Robot.store_object)
 
     def subscribe(self, topic: str) -> BlockingUpdates:
-        """Ask for the updates of *topic*; iterate over what is returned.  See `Robot.subscribe`."""
+        """Subscribe to *topic*, as `Robot.subscribe` does; iterate over the returned updates."""
 
         async def begin() -> Updates:
             return self._robot.subscribe(topic)
@@ -120,7 +122,7 @@ class BlockingRobot(Closing):
         return BlockingUpdates(self._wait(begin()), self._wait)
 
     def record_frame(self, frame: Frame, T_odom_camera: npt.NDArray[np.float64] | None = None) -> None:
-        """Record a thumbnail of *frame* and its pose by odometry, as `Robot.record_frame` does."""
+        """Add a thumbnail of *frame* and its pose by odometry to the recording, like `Robot.record_frame`."""
 
         async def record() -> None:
             self._robot.record_frame(frame, T_odom_camera)
@@ -129,17 +131,17 @@ class BlockingRobot(Closing):
 
     @property
     def connected(self) -> bool:
-        """Whether there is a connection to a server now; without one, commands wait for the next."""
+        """Whether a server is connected now; while none is, commands wait for the next connection."""
         return self._robot.connected
 
     @property
     def welcome(self) -> Welcome | None:
-        """As `Robot.welcome`."""
+        """The Welcome of the connected server: name, tenant, scopes and limits of the robot; or None."""
         return self._robot.welcome
 
     @property
     def failure(self) -> RsePfError | None:
-        """Why the robot has stopped reconnecting for good; None while it has not."""
+        """Why all servers refuse this robot now; None while they do not.  It goes on reconnecting."""
         return self._robot.failure
 
     @property
@@ -151,7 +153,10 @@ class BlockingRobot(Closing):
 
         try:
             return self._wait(snapshot())
-        except (Disconnected, UsageError):  # no other thread changes the robot now
+        except (
+            Disconnected,
+            UsageError,
+        ):  # the loop has ended, or this is its thread
             return self._robot.stats
 
     def _wait(self, work: Coroutine[Any, Any, T], limit_s: float | None = None) -> T:
@@ -161,11 +166,11 @@ class BlockingRobot(Closing):
 def _blocking_connect(make: Callable[P, Robot]) -> Callable[P, BlockingRobot]:
     @functools.wraps(make, assigned=(), updated=())
     def connect_blocking(*args: P.args, **kwargs: P.kwargs) -> BlockingRobot:
-        """Return a robot for ``with connect_blocking(url, token=...) as robot``; see `connect`."""
+        """Make a robot for ``with connect_blocking(url, token=...) as robot``; see `connect`."""
         return BlockingRobot(make(*args, **kwargs))
 
     return connect_blocking
 
 
 connect_blocking = _blocking_connect(connect)
-"""Takes the arguments of `connect`; callables of the program run in threads of their own."""
+"""Make a `BlockingRobot`; the arguments are those of `connect`."""

@@ -1,7 +1,7 @@
-"""Connect by the one file of ``rse-pf robot enrol ROBOT --out FILE``: address, authority and key of a robot.
+"""Read the enrolment file of a robot (``rse-pf robot enrol ROBOT --out FILE``): address, authority and key.
 
-``client_sdk.connect(enrolment="robot-1.enrolment")`` is all that a robot program needs; the functions here
-are for what else needs an address and a token, such as the data client.  Nothing here connects.
+``client_sdk.connect(enrolment="robot-1.enrolment")`` reads the file by itself; these functions are for
+programs that need the address or a token for other clients, such as the data client.  Nothing here connects.
 """
 
 from __future__ import annotations
@@ -18,10 +18,15 @@ __all__ = ["EnrolledRobotAccess", "read_enrolment"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EnrolledRobotAccess:
-    """How an enrolled robot connects: address, trusted authority, and where its tokens come from.
+    """How an enrolled robot connects to its platform.
 
-    ``ssl_context`` trusts the authority of the file and no other; None means the authorities of the machine.
-    ``token`` is for `client_sdk.connect`, ``fresh_token`` for `client_sdk.DataClient`; both sign a new token.
+    Attributes:
+        robot: Name of the robot.
+        url: WebSocket address of the platform.
+        ssl_context: Trusts the authority in the file and no other; None trusts the authorities of the
+        machine.
+        token: Async function for `client_sdk.connect`, which signs a new token at each call.
+        fresh_token: Function for `client_sdk.DataClient`, which signs a new token at each call.
     """
 
     robot: str
@@ -32,30 +37,31 @@ class EnrolledRobotAccess:
 
 
 def read_enrolment(path: str | Path) -> EnrolledRobotAccess:
-    """Return what the enrolment in the file *path* says.
+    """Return the content of the enrolment file *path*.
 
     Raises:
-        UsageError: The file cannot be read, others may read it, or it holds no enrolment.
+        UsageError: The file cannot be read, other users may read it, or it holds no enrolment.
         MissingExtra: The extra ``keys`` is not installed.
     """
     from rse_pf.enrolment import EnrolmentFile
 
     file = EnrolmentFile(path)
-    read = file.read()
-    file.fresh_token()  # a damaged key is found now, and not at the first connect
+    enrolment = file.read()
+    file.fresh_token()  # so that a damaged key is found now, and not at the first connect
     return EnrolledRobotAccess(
-        robot=read.robot,
-        url=read.url,
-        ssl_context=_trusting(read.authority, path) if read.authority else None,
+        robot=enrolment.robot,
+        url=enrolment.url,
+        ssl_context=_context_with_authority(enrolment.authority, path) if enrolment.authority else None,
         token=file.token,
         fresh_token=file.fresh_token,
     )
 
 
-def _trusting(authority: str, path: str | Path) -> ssl.SSLContext:
+def _context_with_authority(authority_pem: str, path: str | Path) -> ssl.SSLContext:
     try:
-        return ssl.create_default_context(cadata=authority)
+        return ssl.create_default_context(cadata=authority_pem)
     except ssl.SSLError as error:
         raise UsageError(
-            f"{path}: its authority is no certificate", hint="enrol the robot again: rse-pf robot enrol"
+            f"{path}: the authority in the file is no certificate",
+            hint="enrol the robot again: rse-pf robot enrol",
         ) from error

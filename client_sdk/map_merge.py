@@ -1,7 +1,4 @@
-"""Merge the maps of several robots by the service ``merge``, from upload to reply.
-
-It decides nothing about maps: the service does.
-"""
+"""Merge maps of several robots: upload the maps, send the command ``merge``, and fetch the reply."""
 
 from __future__ import annotations
 
@@ -28,29 +25,29 @@ async def merge_maps(
     options: MergeOptions | None = None,
     on_progress: OnProgress | None = None,
 ) -> MergeReply:
-    """Return one map of *maps*, merged by a server; the world of the first map is that of the result.
+    """Return one map of several, merged by a server; the world frame is that of the first map.
 
     Args:
-        robot: Asks for the merge, which may take minutes.
-        data: The data client of the same robot, whose objects the maps become.
+        robot: Sends the command, which may take minutes.
+        data: Data client of the same robot, as whose objects the maps are stored.
         maps: Encoded maps, such as those of `Mapper.encoded_map` or `DataClient.download_map`.
         options: None means the defaults.
-        on_progress: Called with the share that is done, and what was done last.
+        on_progress: Called with the share that is done (0..1), and the name of the step that was done last.
 
     Raises:
-        RsePfError: The typed failure of an upload, or of the command.
+        RsePfError: The typed failure of an upload, of the command, or of the download.
     """
     digests = [await asyncio.to_thread(data.upload, robot_map) for robot_map in maps]
     request: dict[str, Any] = {"maps": [{"object": digest} for digest in digests]}
     if options is not None:
         request["options"] = options
-    answer = await robot.call("merge", request, MergeReply, on_progress=on_progress or _ignore)
-    if answer.reply is None:  # it is stored as an object
+    answer = await robot.call("merge", request, MergeReply, on_progress=on_progress or _ignore_progress)
+    if answer.reply is None:  # too large for a message: it is stored as an object
         stored = await asyncio.to_thread(data.download, answer.object)
         return decode_reply(stored, MergeReply)
     reply: MergeReply = answer.reply
     return reply
 
 
-def _ignore(done: float, what: str) -> None:
-    """Take the progress of a job that nobody follows; with a callback a job has no deadline."""
+def _ignore_progress(done: float, step: str) -> None:
+    """Ignore the progress; a call with such a function has no default deadline."""

@@ -206,7 +206,7 @@ class Mapper:
             # 1. Refuse a frame that cannot follow the one before.
             self._check(frame)
             if self._recorder is not None:
-                self._recorder.frame(frame.timestamp_s, frame.rgb)
+                self._recorder.record_frame(frame.timestamp_s, frame.rgb)
             # 2. Choose the tracker with the first frame, and add the frame's IMU samples.
             tracker = self._tracker_for(frame)
             if self._imu is not None and frame.imu is not None:
@@ -435,7 +435,7 @@ class Mapper:
         points, colours = self.map.points(min_readings=self._min_readings)
         report["map_points"] = len(points)
         if self._recorder is not None:
-            self._recorder.map(points)
+            self._recorder.record_map(points)
         # 3. Write the files of segment 0, then those of the separate segments.
         is_metric = self.scale != _UP_TO_SCALE
         body = self.T_body_camera

@@ -1,4 +1,4 @@
-"""What a robot needs to record itself: the recorder, made only if one is asked for."""
+"""Make the recorder of a robot if one is requested, so that other robots do not import it."""
 
 from __future__ import annotations
 
@@ -17,7 +17,13 @@ __all__ = ["make_recorder", "sdk_version"]
 def make_recorder(
     folder: str | Path | None, thumbnails: bool, settings: SessionSettings
 ) -> RobotRecorder | None:
-    """Return a recorder that writes to *folder*, None if there is no folder."""
+    """Return a recorder of messages and frames that writes to *folder*, None if *folder* is None.
+
+    Args:
+        folder: For the recordings; made if it is missing.
+        thumbnails: Whether small pictures of frames are recorded.
+        settings: Limits of messages.
+    """
     if folder is None:
         return None
     from rse_pf.recording.robot_recorder import RobotRecorder
@@ -26,7 +32,7 @@ def make_recorder(
 
 
 def sdk_version() -> str:
-    """Return the version of this SDK, "0" where it is not installed."""
+    """Return the version of this SDK, "0" where it runs from its sources without an installation."""
     try:
         return metadata.version("rse-pf")
     except metadata.PackageNotFoundError:

@@ -1,4 +1,4 @@
-"""The robot's side of the platform: `connect`, then call services and get typed answers.
+"""Connect a robot to its platform, call services, and receive typed answers; the main module of the SDK.
 
 Every command ends with exactly one answer or one typed error, within its deadline.
 """
@@ -8,6 +8,7 @@ from __future__ import annotations
 import asyncio
 import os
 import random as random_module
+import ssl
 import time
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import replace
@@ -17,21 +18,21 @@ from typing import TYPE_CHECKING, Any
 
 from client_sdk.commands.answer_types import Answer, PoseAnswer
 from client_sdk.commands.subscriptions import RobotSubscriptions, Updates
-from client_sdk.commands.traffic_stats import Stats, StatsKeeper
-from client_sdk.concurrency.event_loop_thread import not_connected_here
-from client_sdk.concurrency.user_callbacks import Callbacks
+from client_sdk.commands.traffic_stats import Stats, TrafficCounter
+from client_sdk.concurrency.event_loop_thread import wrong_process_error
+from client_sdk.concurrency.user_callbacks import UserCallbacks
 from client_sdk.enrolment import read_enrolment
 from client_sdk.network.connect_timings import ConnectTimings
-from client_sdk.network.connection import Connection, ForRobot, OnChange
+from client_sdk.network.connection import Connection, OnChange, RobotEvent
 from client_sdk.network.dial_errors import DialError
 from client_sdk.network.handshake import Token
-from client_sdk.offloading.burst_client import Burst
+from client_sdk.offloading.burst_client import BurstClient
 from client_sdk.offloading.burst_policy import check_burst_url
-from client_sdk.offloading.command_router import Asking, Call, OnProgress
+from client_sdk.offloading.command_router import CallArguments, CommandRouter, OnProgress
 from client_sdk.offloading.local_services import LocalServices
 from client_sdk.offloading.offload_policy import CloudFirst
 from client_sdk.recording import make_recorder, sdk_version
-from client_sdk.transfer.small_objects import RobotObjects
+from client_sdk.transfer.small_objects import SmallObjectStore
 from rse_pf.config import SessionSettings
 from rse_pf.errors import Disconnected, RsePfError, UsageError, error_from_code
 from rse_pf.wire import CODECS, Failure, Welcome, as_type, make_codec
@@ -56,12 +57,12 @@ if TYPE_CHECKING:
 
 __all__ = ["MAX_DEADLINE_S", "OnProgress", "Robot", "connect"]
 
-
 MAX_DEADLINE_S = 3600.0
+"""Longest deadline of a command in seconds; messages of the protocol carry no longer one."""
 
 
 class Robot:
-    """A connected robot; make one with `connect`."""
+    """One robot: its connections, its commands, and its mappers; make one with `connect`."""
 
     def __init__(
         self,
@@ -81,33 +82,36 @@ class Robot:
         thumbnails: bool = False,
         burst_url: str | None = None,
     ) -> None:
-        """Describe a robot to be used as ``async with connect(...) as robot``, or awaited.
+        """Connect to nothing yet: use ``async with connect(...) as robot``, or await the robot.
 
-        A first connect that is refused raises.  A robot that was connected once tries for ever, whatever the
-        servers say; `failure` tells what they say.
+        A first connect that is refused raises.  A robot that was connected once reconnects for ever, whatever
+        the servers answer; `failure` holds their last refusal.
 
         Args:
-            url: ``ws://HOST:PORT/ws`` or ``wss://HOST/ws``; of several the robot uses the nearest,
-                and keeps a connection to each of the others.
-            token: The robot's token, or an async callable that gives one (a run outlives a token).
-            enrolment: File of ``rse-pf robot enrol --out``, instead of *url* and *token*; with a list of
-                addresses, these count and not the one of the file.
+            url: ``ws://HOST:PORT/ws`` or ``wss://HOST/ws``.  Of a list of addresses (regions) the robot uses
+                the one with the shortest round trip, and keeps a connection to each of the others.
+            token: The robot's token, or an async function that returns one (a run outlives a token).
+            enrolment: File of ``rse-pf robot enrol --out``, instead of *url* and *token*.  A list of
+                addresses in *url* replaces the address in the file.
             codec: ``zlib`` (the paper's), ``json`` or ``bin``.
             settings: Limits and timeouts of the platform; None means the defaults.
-            timings: How patient the robot is when it connects; None means the defaults.
-            offload: `CloudFirst` lets the robot answer itself when the cloud cannot.
-            clock: Seconds, monotonic.
-            wall_clock: Unix seconds: the clock by which *token* signs.
+            timings: Timeouts and pauses of attempts to connect; None means the defaults.
+            offload: `CloudFirst` lets the robot answer commands itself when the cloud cannot; None never
+            does.
+            clock: Monotonic seconds.
+            wall_clock: Unix seconds; the clock by which *token* signs.
             random: Source of the jitter of reconnects.
-            on_change: Called with ``link-lost``, ``refused``, ``link-back``, ``moved`` or ``stands-by``,
-                and the reason or the server.  `Stats.callback_errors` counts what it raises.
-            record: Folder for a recording of what this robot says and hears, for rse-pf replay.
-            thumbnails: Whether small pictures of the frames of its `mapper` are recorded, too.
-            burst_url: ``https://HOST/burst``, a function that answers while no server can, also before the
-                first connection; None takes the one that the servers name, and "" none.
+            on_change: Function that is called with ``link-lost`` or ``refused`` and the reason, or with
+                ``link-back``, ``moved`` or ``stands-by`` and the name of a server.  An exception of it is
+                logged and counted in `Stats.callback_errors`.
+            record: Folder for a recording of the robot's messages, for rse-pf replay; None records nothing.
+            thumbnails: Whether the recording has small pictures of the frames of the robot's `mapper`.
+            burst_url: ``https://HOST/burst``, the function that answers while no server can, also before the
+                first connection.  None takes the address that the servers name, and "" uses no function.
 
         Raises:
-            UsageError: The address or the codec cannot be used, or there are an address and an enrolment.
+            UsageError: The address or the codec cannot be used, or *enrolment* is combined with *token* or a
+                single address.
         """
         urls = [url] if isinstance(url, str) else list(url)
         is_list = not isinstance(url, str)
@@ -123,49 +127,57 @@ class Robot:
             codec=make_codec(codec, settings), settings=settings, sdk=f"rse-pf-python/{sdk_version()}"
         )
         self._recorder = make_recorder(record, thumbnails, settings)
-        self.callbacks = Callbacks(settings.ping_timeout_s)
+        self.callbacks = UserCallbacks(settings.ping_timeout_s)
         self._connection = Connection(
             urls,
             token=token,
             session=self._session,
             timings=timings or ConnectTimings(),
-            on_answer=self._take_answer,
+            on_event=self._handle_event,
             clock=clock,
             random=random,
             wall_clock=wall_clock,
             on_change=on_change,
             callbacks=self.callbacks,
-            recorder=self._recorder,
+            tap=self._recorder,
         )
         self._urls, self._enrolment = urls, enrolment
         self._offload = offload
         self._clock = clock
         self._local = None if offload is None else LocalServices(offload.registry, clock)
         self._subscriptions = RobotSubscriptions(self._session, self._connection.flush, clock)
-        self._keeper = StatsKeeper(random)
-        self._burst = Burst(
-            codec=self._session.codec, read_token=self._read_token, clock=clock, random=random,
-            own=lambda: (self._connection.url, self._connection.dialler.ssl_context),
-            max_answer_bytes=settings.max_message_bytes, url=check_burst_url(burst_url, urls[0]),
-        )  # fmt: skip
-        self._asking = Asking(
-            session=self._session, flush=self._connection.flush, keeper=self._keeper, clock=clock,
-            offload=offload, local=self._local, burst=self._burst, callbacks=self.callbacks,
-        )  # fmt: skip
-        self._objects = RobotObjects(
-            self._read_token, lambda: (self._connection.url, self._connection.dialler.ssl_context)
+        self._counter = TrafficCounter(random)
+        self._burst = BurstClient(
+            codec=self._session.codec,
+            read_token=self._read_token,
+            read_access=self._read_access,
+            clock=clock,
+            random=random,
+            max_answer_bytes=settings.max_message_bytes,
+            url=check_burst_url(burst_url, urls[0]),
         )
-        self._open = False
+        self._router = CommandRouter(
+            session=self._session,
+            flush=self._connection.flush,
+            counter=self._counter,
+            clock=clock,
+            policy=offload,
+            local=self._local,
+            burst=self._burst,
+            callbacks=self.callbacks,
+        )
+        self._objects = SmallObjectStore(self._read_token, self._read_access)
+        self._is_open = False
         self._process = os.getpid()
 
     async def __aenter__(self) -> Robot:
-        """Connect; with an offload or a *burst_url*, return also while no server answers.
+        """Connect and return this robot; with *offload* or *burst_url* also while no server answers.
 
         Raises:
             Unauthorized: The token is missing, wrong or expired.
-            ConnectError: No server answers, and nobody stands in for one.
-            MissingExtra: There is an offload, and no solver for it.
-            UsageError: The file of the enrolment cannot be used.
+            ConnectError: No server answers, and there is neither *offload* nor *burst_url*.
+            MissingExtra: There is *offload*, and no solver is installed.
+            UsageError: The enrolment file cannot be used.
         """
         try:
             if self._recorder is not None:
@@ -173,17 +185,17 @@ class Robot:
             if self._enrolment is not None:
                 access = read_enrolment(self._enrolment)
                 urls = self._urls if self._urls != [""] else [access.url]
-                self._connection.use(urls, access.token, access.ssl_context)
+                self._connection.set_access(urls, access.token, access.ssl_context)
             if self._local is not None:
                 await self._local.prepare()
             await self._connection.open(
                 may_be_down=self._offload is not None or self._burst.address is not None
             )
-            self._asking.hear_welcome()
+            self._router.read_welcome()
         except BaseException:
             await self.close()
             raise
-        self._open, self._process = True, os.getpid()
+        self._is_open, self._process = True, os.getpid()
         return self
 
     async def __aexit__(
@@ -192,25 +204,25 @@ class Robot:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        """Close the connection; unanswered commands end with Disconnected."""
+        """Close the connections; unanswered commands end with Disconnected."""
         await self.close()
 
     def __await__(self) -> Generator[Any, None, Robot]:
         return self.__aenter__().__await__()
 
     async def close(self) -> None:
-        """Close the connection; unanswered commands end with Disconnected.
+        """Close the connections; unanswered commands end with Disconnected.
 
-        In a child of a fork nothing happens: the connection belongs to the parent.
+        A forked child process does nothing: the connections belong to its parent.
         """
         if os.getpid() != self._process:
             return
-        self._open = False
+        self._is_open = False
         for event in self._session.abandon("disconnected", "the robot closed its connection"):
             if isinstance(event, Answered | SubscriptionEnded):
-                self._take_answer(event)
+                self._handle_event(event)
         await self._connection.close()
-        await self._asking.close()
+        await self._router.close()
         self._objects.close()
         if self._local is not None:
             self._local.close()
@@ -230,19 +242,24 @@ class Robot:
         stream: str = "pose",
         keep: bool = False,
     ) -> PoseAnswer:
-        """Estimate the camera pose of one frame in the cloud.
+        """Estimate the camera pose of one frame by PnP with RANSAC, in the cloud.
 
         Args:
             points_world: ``(n, 3)``, metres, world frame.
             pixels: ``(n, 2)``, undistorted pixels of the same points.
             camera: Intrinsics of the image.
-            options: RANSAC settings; None means the server's.
-            depths_m: ``(n,)``, metres, what a depth camera measured at the pixels, 0 where there is none; the
-                pose is refined with it.  The world frame is then that of the camera that measured the points.
-            depth_noise: Of both depth cameras; None means a Kinect's.
-            deadline_s: Seconds within which the answer is needed.
-            stream: Within a stream the newest frame wins, and older answers are dropped.
-            keep: Answer this frame even if newer ones follow.
+            options: Settings of RANSAC; None means those of the server.
+            depths_m: ``(n,)``, metres, depths that a depth camera measured at the pixels, 0 where it measured
+                none.  The pose is refined with them; the world frame must then be the frame of the camera
+                that measured the points.
+            depth_noise: Noise of both depth cameras; None means that of a Kinect.
+            deadline_s: Seconds within which the answer is needed; None means ``session.answer_timeout_s``.
+            stream: Name of the sequence of frames; a newer frame of a stream replaces an older one, whose
+                command then ends with Stale.
+            keep: Whether this frame is answered although newer ones follow.
+
+        Returns:
+            The pose ``T_camera_world`` with covariance, inliers and verdict in ``solution``.
 
         Raises:
             PnpError: The correspondences give no pose.
@@ -251,9 +268,14 @@ class Robot:
         from rse_pf.services.pnp import PnpReply, make_request
 
         request = make_request(
-            points_world, pixels, camera, options, depths_m=depths_m, depth_noise=depth_noise,
+            points_world,
+            pixels,
+            camera,
+            options,
+            depths_m=depths_m,
+            depth_noise=depth_noise,
             binary=self._session.codec.name == "bin",
-        )  # fmt: skip
+        )
         answer = await self.call("pnp", request, PnpReply, deadline_s=deadline_s, stream=stream, keep=keep)
         return PoseAnswer.of(answer, answer.reply.solution())
 
@@ -271,17 +293,18 @@ class Robot:
         """Call *service* and wait for the reply; any number of calls may run concurrently.
 
         A long service (``merge``, ``optimise``) runs as a job: it has no deadline but *deadline_s*, survives
-        reconnects and the death of its server, and ends when the call is cancelled or its deadline passes.
+        reconnects and crashes of its server, and ends when the call is cancelled or its deadline passes.
 
         Args:
-            service: Its name, such as ``pnp``.
+            service: Name of the service, such as ``pnp``.
             request: A `msgspec.Struct`, or plain lists and dicts.
-            reply_type: Type of the reply; None leaves it plain.
+            reply_type: Type of the reply; None returns plain lists and dicts.
             deadline_s: Seconds within which the answer is needed; None means ``session.answer_timeout_s``,
                 or no deadline for a long service.
-            stream: Within a stream the newest command wins; empty means no stream.
-            keep: Answer this one even if newer ones follow.
-            on_progress: Called with the progress of a long service; with it the default deadline is none.
+            stream: Name of a sequence of commands, of which a newer one replaces an older one; empty means no
+                stream.
+            keep: Whether this command is answered although newer ones of its stream follow.
+            on_progress: Called with the progress of a long service; with it there is no default deadline.
 
         Raises:
             RsePfError: The typed failure of the command.
@@ -290,11 +313,11 @@ class Robot:
         wait_s = self._session.settings.answer_timeout_s if deadline_s is None else deadline_s
         if not 0 < wait_s <= MAX_DEADLINE_S:
             raise UsageError(
-                f"deadline_s = {wait_s} is not within 0..{MAX_DEADLINE_S:g}",
-                hint="give the number of seconds that the call may take",
+                f"deadline_s = {wait_s} is not between 0 and {MAX_DEADLINE_S:g}",
+                hint="set deadline_s to the number of seconds that the call may take",
             )
-        self._keeper.sent += 1
-        call = Call(
+        self._counter.sent += 1
+        call = CallArguments(
             service=service,
             request=request,
             deadline_s=wait_s,
@@ -303,14 +326,14 @@ class Robot:
             is_open_ended=deadline_s is None,
             on_progress=on_progress,
         )
-        started = self._clock()
+        began_s = self._clock()
         try:
             refusal = self._connection.refusal
             if refusal is not None and not (self._local is not None and self._local.offers(service)):
                 raise error_from_code(refusal.code, refusal.message, hint=refusal.hint)
-            return self._type_reply(await self._asking.ask(call), reply_type, started)
+            return self._type_reply(await self._router.ask(call), reply_type, began_s)
         except RsePfError as error:
-            self._keeper.failures[error.code] += 1
+            self._counter.failures[error.code] += 1
             raise
 
     def mapper(
@@ -330,20 +353,31 @@ class Robot:
         loops: LoopsFunction | None = None,
         optimiser: OptimiserFunction | None = None,
     ) -> Mapper:
-        """Return a `Mapper` that asks this robot for its poses, within *deadline_s* each.
+        """Return a `Mapper` whose poses this robot requests from the cloud, each within *deadline_s* seconds.
 
-        The other arguments are those of `Mapper`; *options* are bounded for the codec of this robot.
+        The other arguments are those of `Mapper`.  The number of features in *options* is limited so that a
+        command fits into a message of this robot's codec.
         """
         from client_sdk.frontend import FrontEndOptions
         from client_sdk.mapper import Mapper, ask_robot
 
-        bounded = (options or FrontEndOptions()).sent_with(self._session.codec.name)
+        limited_options = (options or FrontEndOptions()).sent_with(self._session.codec.name)
         return Mapper(
-            ask=ask_robot(self.solve_pnp, deadline_s), camera=camera, options=bounded, monocular=monocular,
-            depth=depth, scale=scale, map_options=map_options, T_world_start=T_world_start,
-            keyframes_of=keyframes_of, recorder=self._recorder, features=features,
-            motion=motion, loops=loops, optimiser=optimiser,
-        )  # fmt: skip
+            ask=ask_robot(self.solve_pnp, deadline_s),
+            camera=camera,
+            options=limited_options,
+            monocular=monocular,
+            depth=depth,
+            scale=scale,
+            map_options=map_options,
+            T_world_start=T_world_start,
+            keyframes_of=keyframes_of,
+            recorder=self._recorder,
+            features=features,
+            motion=motion,
+            loops=loops,
+            optimiser=optimiser,
+        )
 
     def live_map(
         self,
@@ -363,8 +397,9 @@ class Robot:
     ) -> LiveMapper:
         """Return a `LiveMapper` for ``async with robot.live_map(name) as mapper``.
 
-        It asks this robot for its poses, within *deadline_s* each, and shares the map *name* with all robots
-        of the tenant that do the same.  The other arguments are those of `LiveMapper`.
+        This robot requests the poses of the mapper from the cloud, each within *deadline_s* seconds.  The map
+        *name* is shared with all robots of the tenant that use the same name.  The other arguments are those
+        of `LiveMapper`.
         """
         from client_sdk.frontend import FrontEndOptions
         from client_sdk.live.live_mapper import LiveMapper
@@ -372,51 +407,66 @@ class Robot:
         from client_sdk.mapper import ask_robot
 
         codec = self._session.codec.name
-        bounded = (options or FrontEndOptions.live()).sent_with(codec)
+        limited_options = (options or FrontEndOptions.live()).sent_with(codec)
         return LiveMapper(
-            self, name, ask=ask_robot(self.solve_pnp, deadline_s), camera=camera, depth=depth,
-            options=bounded,
+            self,
+            name,
+            ask=ask_robot(self.solve_pnp, deadline_s),
+            camera=camera,
+            depth=depth,
+            options=limited_options,
             live=(live or LiveOptions()).sent_with(codec),
-            spool=None if spool is None else Path(spool), map_options=map_options,
-            T_world_start=T_world_start, features=features, motion=motion, loops=loops,
-            store=self.store_object, clock=self._clock,
-        )  # fmt: skip
+            spool=None if spool is None else Path(spool),
+            map_options=map_options,
+            T_world_start=T_world_start,
+            features=features,
+            motion=motion,
+            loops=loops,
+            store=self.store_object,
+            clock=self._clock,
+        )
 
     async def store_object(self, data: bytes) -> str:
-        """Store *data*, at most 256 KiB, as an object of this robot by the data service; return its digest.
+        """Store at most 256 KiB as an object of this robot at the data service, and return its sha256.
 
-        `DataClient` stores larger ones, and repeats what fails.
+        `DataClient` stores larger objects, and repeats requests that fail.
 
         Raises:
-            ConnectError: The platform has no data service, or it does not answer.
-            StoreFull, QuotaExceeded, LimitExceeded, Unauthorized, Forbidden: It refuses the object.
+            ConnectError: The platform has no data service, or the service does not answer.
+            StoreFull, QuotaExceeded, LimitExceeded, Unauthorized, Forbidden: The service refuses the object.
         """
         return await self._objects.store(data)
 
     def record_frame(self, frame: Frame, T_odom_camera: npt.NDArray[np.float64] | None = None) -> None:
-        """Record a thumbnail of *frame*, if allowed, and its pose ``(4, 4)`` by odometry, if there is one.
+        """Add a thumbnail of *frame* and its pose by odometry to the recording.
 
-        A `mapper` of this robot does the first by itself.  Without ``record`` nothing happens.
+        A `mapper` of this robot records thumbnails by itself.  Without ``record`` nothing happens, and
+        without ``thumbnails`` no picture is recorded.
+
+        Args:
+            frame: Image and time.
+            T_odom_camera: ``(4, 4)``, from the camera frame to the odometry frame, metres; None records no
+            pose.
         """
         if self._recorder is not None:
-            self._recorder.frame(frame.timestamp_s, frame.rgb, T_odom_camera)
+            self._recorder.record_frame(frame.timestamp_s, frame.rgb, T_odom_camera)
 
     @property
     def connected(self) -> bool:
-        """Whether there is a connection to a server now; without one, commands wait for the next."""
+        """Whether a server is connected now; while none is, commands wait for the next connection."""
         return self._session.current is not None
 
     @property
     def welcome(self) -> Welcome | None:
-        """What the present server says of this robot: name, tenant, scopes, limits; None without a server."""
+        """The Welcome of the connected server: name, tenant, scopes and limits of the robot; or None."""
         return None if self._session.current is None else self._session.current.welcome
 
     @property
     def failure(self) -> RsePfError | None:
-        """Why the servers refuse this robot now, such as `Unauthorized`; None while they do not.
+        """Why all servers refuse this robot now, such as `Unauthorized`; None while they do not.
 
-        Until it is connected again every command raises this error at once, unless the robot can answer it
-        itself.  It goes on trying: nothing that a server says ends a robot.
+        Until the robot is connected again, every command raises this error at once, unless the robot can
+        answer the command itself.  The robot goes on reconnecting: no answer of a server ends it.
         """
         return self._connection.refusal
 
@@ -430,11 +480,11 @@ class Robot:
         stream: str = "",
         keep: bool = False,
     ) -> int:
-        """Send a command without waiting and return its id; *on_end* is called once with its end.
+        """Send a command without waiting for it, and return its id; *on_end* is called once with its answer.
 
-        Meant for load generators: no task, no future, no statistics, and *request* may be a
-        `PreencodedCommand`.  As with `call`, a command waits while the connection is lost; it is never
-        answered by the robot itself.
+        This is for load generators: it makes no task, future or statistics, and *request* may be a
+        `PreencodedCommand`.  As with `call`, a command waits while the connection is lost.  Neither the burst
+        function nor the robot itself answers it.
 
         Raises:
             Disconnected: The robot is not open, or its servers refuse it.
@@ -444,55 +494,55 @@ class Robot:
         identity = self._session.submit(
             service, request, now=self._clock(), deadline_s=deadline_s, stream=stream, keep=keep
         )
-        self._asking.waiting[identity] = on_end
+        self._router.waiting[identity] = on_end
         self._connection.flush()
         return identity
 
     def subscribe(self, topic: str) -> Updates:
-        """Ask for the updates of *topic*, such as ``live/MAP``; call it in the robot's event loop.
+        """Subscribe to *topic*, such as ``live/MAP``; call this in the robot's event loop.
 
-        ``async for key, value in robot.subscribe(topic)`` gets the present values first, and then each newer
-        one.  The subscription survives reconnects and moves.
+        ``async for key, value in robot.subscribe(topic)`` receives the present values first, and newer ones
+        later. The subscription survives reconnects and changes of the server.
 
         Raises:
             Disconnected: The robot is not open.
         """
         self._check_open()
-        return self._subscriptions.begin(topic)
+        return self._subscriptions.subscribe(topic)
 
     @property
     def stats(self) -> Stats:
         """A snapshot of the robot's traffic."""
-        keeper, session, connection = self._keeper, self._session, self._connection
+        counter, session, connection = self._counter, self._session, self._connection
         current = session.current
         clock = current.clock_offset if current else None
         last = current.last_exchange if current else None
         delays = clock.delays_s(last) if clock is not None and last is not None else None
         return Stats(
-            sent=keeper.sent,
-            answered=keeper.answered,
-            failed=sum(keeper.failures.values()),
-            sent_to_burst=self._burst.rules.spent,
-            answered_by_burst=keeper.answered_by_burst,
-            answered_by_robot=keeper.answered_by_robot,
-            failures_by_code=dict(keeper.failures),
+            sent=counter.sent,
+            answered=counter.answered,
+            failed=sum(counter.failures.values()),
+            sent_to_burst=self._burst.policy.spent,
+            answered_by_burst=counter.answered_by_burst,
+            answered_by_robot=counter.answered_by_robot,
+            failures_by_code=dict(counter.failures),
             unanswered=session.unanswered,
             resent=session.resent,
             dropped_answers=session.dropped_answers,
             held_back={reason: session.held_back[reason] for reason in REASONS},
-            duplicates=keeper.duplicates,
+            duplicates=counter.duplicates,
             reconnects=connection.reconnects,
             moves=connection.moves,
             region_changes=connection.region_changes,
             bytes_out=connection.bytes_out,
             bytes_in=connection.bytes_in,
-            payload_bytes_median=keeper.percentile("payload_bytes", 0.5),
-            payload_bytes_max=keeper.payload_bytes_max,
-            round_trip_ms=keeper.percentiles("round_trip_ms"),
-            up_ms=keeper.percentiles("up_ms"),
-            queue_ms=keeper.percentiles("queue_ms"),
-            compute_ms=keeper.percentiles("compute_ms"),
-            down_ms=keeper.percentiles("down_ms"),
+            payload_bytes_median=counter.percentile("payload_bytes", 0.5),
+            payload_bytes_max=counter.payload_bytes_max,
+            round_trip_ms=counter.percentiles("round_trip_ms"),
+            up_ms=counter.percentiles("up_ms"),
+            queue_ms=counter.percentiles("queue_ms"),
+            compute_ms=counter.percentiles("compute_ms"),
+            down_ms=counter.percentiles("down_ms"),
             clock_offset_s=clock.offset_s if clock else None,
             clock_uncertainty_s=clock.uncertainty_s if clock else None,
             delay_up_s=delays[0] if delays else None,
@@ -504,28 +554,31 @@ class Robot:
         )
 
     def _check_open(self, *, is_refused: bool = False) -> None:
-        if not self._open or is_refused:
+        if not self._is_open or is_refused:
             raise Disconnected("the robot is not connected", hint="use async with client_sdk.connect(...)")
         if os.getpid() != self._process:
-            raise not_connected_here(self._process)
+            raise wrong_process_error(self._process)
 
-    def _type_reply(self, answer: Answer | Failure, reply_type: type[Any] | None, started: float) -> Answer:
-        """Return the answer with its reply typed and the caller's round trip; raise if it is a failure."""
+    def _type_reply(self, answer: Answer | Failure, reply_type: type[Any] | None, began_s: float) -> Answer:
+        """Return *answer* with a reply of *reply_type* and the caller's round trip, and count it.
+
+        A failure is raised as its typed error.  *began_s* is when the call began.
+        """
         if isinstance(answer, Failure):
             raise error_from_code(
                 answer.code, answer.message, hint=answer.hint, retry_after_ms=answer.retry_after_ms
             )
         is_stored = answer.reply is None and answer.object != ""
         reply = answer.reply if reply_type is None or is_stored else as_type(answer.reply, reply_type)
-        answer = replace(answer, reply=reply, round_trip_ms=(self._clock() - started) * 1e3)
-        keeper = self._keeper
-        keeper.answered += 1
-        keeper.answered_by_burst += answer.source == "burst"
-        keeper.answered_by_robot += answer.source == "robot"
+        answer = replace(answer, reply=reply, round_trip_ms=(self._clock() - began_s) * 1e3)
+        counter = self._counter
+        counter.answered += 1
+        counter.answered_by_burst += answer.source == "burst"
+        counter.answered_by_robot += answer.source == "robot"
         if answer.source == "cloud":
-            keeper.add_payload(answer.payload_bytes)
+            counter.add_payload(answer.payload_bytes)
             for name in ("round_trip_ms", "up_ms", "queue_ms", "compute_ms", "down_ms"):
-                keeper.add(name, getattr(answer, name))
+                counter.add(name, getattr(answer, name))
         return answer
 
     async def _read_token(self) -> str | None:
@@ -534,12 +587,16 @@ class Robot:
         except DialError as failed:
             raise failed.error from None
 
-    def _take_answer(self, event: ForRobot) -> None:
+    def _read_access(self) -> tuple[str, ssl.SSLContext | None]:
+        """Return the address of the servers, and what the robot trusts there."""
+        return self._connection.url, self._connection.dialler.ssl_context
+
+    def _handle_event(self, event: RobotEvent) -> None:
         if isinstance(event, Updated | SubscriptionEnded):
-            self._subscriptions.take(event)
+            self._subscriptions.handle_event(event)
             return
-        self._asking.answered(event)
+        self._router.handle_event(event)
 
 
 connect = Robot
-"""Return a robot for ``async with connect(url, token=...) as robot``; its arguments are those of `Robot`."""
+"""Make a robot for ``async with connect(url, token=...) as robot``; the arguments are those of `Robot`."""

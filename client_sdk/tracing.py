@@ -1,8 +1,8 @@
-"""Give the commands of a robot a trace id, which servers, jobs and the function write to their logs.
+"""Give commands of a robot a trace id, which servers, jobs and the burst function write to their logs.
 
-The id is a W3C ``traceparent``.  Inside of a span of OpenTelemetry it is that span's, so that a trace of the
-robot's own program goes on in the cloud's logs; OpenTelemetry is used where the program has imported it, and
-never imported here.
+The id is a W3C ``traceparent``.  Inside of an OpenTelemetry span it is the id of that span, so that a trace
+of the robot's program continues in the logs of the cloud.  OpenTelemetry is used if the program has imported
+it, and is never imported here.
 
     with traced() as trace:
         answer = await robot.solve_pnp(...)
@@ -21,34 +21,35 @@ from contextvars import ContextVar
 
 __all__ = ["current_trace", "new_trace", "traced"]
 
-_OPENTELEMETRY = "opentelemetry.trace"
-_MAX_CHARACTERS = 64
-_TRACE: ContextVar[str] = ContextVar("rse_pf_trace", default="")
+OPENTELEMETRY_MODULE = "opentelemetry.trace"
+MAX_ID_CHARACTERS = 64
+"""Longest trace id that is sent, in characters; a traceparent of W3C version 00 has 55."""
+_trace_id: ContextVar[str] = ContextVar("rse_pf_trace", default="")
 
 
 def new_trace() -> str:
-    """Return a fresh ``traceparent``: version, 16 random bytes of the trace, 8 of the span, sampled."""
+    """Return a random ``traceparent``: version 00, 16 bytes for the trace, 8 for the span, flag sampled."""
     return f"00-{secrets.token_hex(16)}-{secrets.token_hex(8)}-01"
 
 
 @contextlib.contextmanager
 def traced(trace: str = "") -> Iterator[str]:
-    """Give each command that is asked for inside of it *trace*, by default a new one; yields the id."""
-    given = (trace or new_trace())[:_MAX_CHARACTERS]
-    before = _TRACE.set(given)
+    """Send the id *trace*, by default a new one, with all commands of a ``with`` block; yield the id."""
+    trace_id = (trace or new_trace())[:MAX_ID_CHARACTERS]
+    earlier = _trace_id.set(trace_id)
     try:
-        yield given
+        yield trace_id
     finally:
-        _TRACE.reset(before)
+        _trace_id.reset(earlier)
 
 
 def current_trace() -> str:
-    """Return the id for a command that is asked for now: of `traced`, else of the current span, else none."""
-    return _TRACE.get() or _of_current_span()
+    """Return the trace id of the `traced` block, else of the OpenTelemetry span, else an empty text."""
+    return _trace_id.get() or _read_opentelemetry_span()
 
 
-def _of_current_span() -> str:
-    module = sys.modules.get(_OPENTELEMETRY)
+def _read_opentelemetry_span() -> str:
+    module = sys.modules.get(OPENTELEMETRY_MODULE)
     if module is None:
         return ""
     context = module.get_current_span().get_span_context()

@@ -17,7 +17,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from client_sdk.auto_close import Closing
+from client_sdk.auto_close import AutoClose
 from client_sdk.bags.bag_file import BagFile, BrokenMessage, RawMessage, Topic, open_bag_file
 from client_sdk.bags.choose import (
     ChosenTopics,
@@ -120,7 +120,7 @@ class BagOptions:
 
 
 @dataclass(slots=True, eq=False)
-class Bag(Closing):
+class Bag(AutoClose):
     """The frames of a bag: iterate over it, or read one by its row; close it, or use it in ``with``.
 
     Frames that are iterated over carry the samples of ``imu``; those that are read do not.

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from client_sdk.auto_close import Closing
+from client_sdk.auto_close import AutoClose
 from client_sdk.bags.decompression import Allowance, bound_reader, charge
 from client_sdk.bags.message_types import load_types
 from rse_pf.errors import MissingExtra, UsageError
@@ -87,7 +87,7 @@ def open_bag_file(path: Path) -> BagFile:
     return BagFile(path, reader, store, size_bytes=size_bytes, is_ros1=is_ros1)
 
 
-class BagFile(Closing):
+class BagFile(AutoClose):
     """An open bag; close it, or use it in ``with``."""
 
     def __init__(self, path: Path, reader: Any, store: Any, *, size_bytes: int, is_ros1: bool) -> None:

@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from client_sdk.auto_close import Closing
+from client_sdk.auto_close import AutoClose
 from client_sdk.bags.message_maker import MessageMaker
 from client_sdk.bags.message_types import PATH, POINT_CLOUD, POSE, TF
 from client_sdk.trajectory import Trajectory
@@ -25,7 +25,7 @@ BagKind = Literal["ros1", "sqlite3", "mcap"]
 _FILE_ENDINGS = {"sqlite3": ".db3", "mcap": ".mcap"}
 
 
-class BagWriter(MessageMaker, Closing):
+class BagWriter(MessageMaker, AutoClose):
     """A new bag; use it in ``with``.
 
     ``ros1`` writes one ``.bag`` file, ``sqlite3`` and ``mcap`` the folder of a ROS 2 bag.

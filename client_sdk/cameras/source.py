@@ -16,7 +16,7 @@ from typing import Any, Protocol, TypeVar, runtime_checkable
 import numpy as np
 import numpy.typing as npt
 
-from client_sdk.auto_close import Closing
+from client_sdk.auto_close import AutoClose
 from client_sdk.datasets.thinning import Thinning
 from client_sdk.frontend import Frame, load_opencv
 from client_sdk.image_map import map_to_pinhole
@@ -92,7 +92,7 @@ class SourceInfo:
     span_s: tuple[float, float] | None = None
 
 
-class FrameStream(Closing):
+class FrameStream(AutoClose):
     """A `FrameSource` over items ``(seconds, ...)``, each of which a function makes a frame of.
 
     Items that are thinned out are dropped before a frame is made; so are those that do not ascend in time,

@@ -1,4 +1,4 @@
-"""The answers that a robot receives: a reply or a pose, who computed it, and where the time went."""
+"""Define what a robot receives for a command: a reply or a pose, who computed it, and how long it took."""
 
 from __future__ import annotations
 
@@ -19,12 +19,24 @@ __all__ = ["Answer", "PoseAnswer", "Source", "decode_reply"]
 T = TypeVar("T")
 
 Source = Literal["cloud", "burst", "robot"]
-"""A server, the burst function, or the robot itself."""
+"""Who computed an answer: a backend server, the burst function (AWS Lambda), or the robot itself."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Origin:
-    """Who answered, and where the time went (ms; None if unknown); ``why`` is empty for the cloud."""
+    """Who computed an answer, and how long it took.
+
+    Attributes:
+        source: Who computed the answer.
+        server: Name of the server, ``lambda`` for the burst function, or ``robot``.
+        round_trip_ms: From the call to the answer, as the caller measured it.
+        queue_ms: Time that the command waited on the server.
+        compute_ms: Time of the computation.
+        up_ms: Delay from robot to server, None if the offset of their clocks is unknown.
+        down_ms: Delay from server to robot, None if the offset of their clocks is unknown.
+        payload_bytes: Size of the command's message; 0 if it was not sent.
+        why: Why no server answered; empty if *source* is ``cloud``.
+    """
 
     source: Source
     server: str
@@ -39,11 +51,12 @@ class _Origin:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Answer(_Origin):
-    """A reply, who computed it, and where the time went (ms; None if unknown).
+    """The answer to a command: its reply, who computed it, and how long each step took in ms.
 
-    If *source* is ``burst`` or ``robot``, ``why`` says why no server answered.  ``object`` is the digest of
-    a reply that is stored as an object (of long services); if it is too large for a message, ``reply`` is
-    None, and ``decode_reply(DataClient(...).download(answer.object), ReplyType)`` returns it.
+    If *source* is ``burst`` or ``robot``, ``why`` says why no server answered.  Long services store their
+    reply as an object of the data service, whose digest is in ``object``.  A reply that is too large for a
+    message is only there: ``reply`` is None, and
+    ``decode_reply(DataClient(...).download(answer.object), ReplyType)`` returns it.
     """
 
     reply: Any
@@ -52,20 +65,28 @@ class Answer(_Origin):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PoseAnswer(_Origin):
-    """A pose with its evidence; the other fields are those of `Answer`."""
+    """The answer to a pose command: the pose with its evidence; the other fields are those of `Answer`."""
 
     solution: PnpSolution
 
     @classmethod
     def of(cls, answer: Answer, solution: PnpSolution) -> PoseAnswer:
-        """Return *solution* with the origin of *answer*, whose reply it was."""
+        """Return *solution*, the decoded reply of *answer*, with the source and the times of *answer*."""
         return cls(
             solution=solution, **{field.name: getattr(answer, field.name) for field in fields(_Origin)}
         )
 
 
 def decode_reply(data: bytes, reply_type: type[T]) -> T:
-    """Return the reply that was stored as an object; raises BadMessage if *data* is not of that type."""
+    """Return the reply of a long service that was stored as an object.
+
+    Args:
+        data: Bytes of the object that ``Answer.object`` names.
+        reply_type: Type of the service's reply, such as ``MergeReply``.
+
+    Raises:
+        BadMessage: *data* is no reply of that type.
+    """
     try:
         plain = msgspec.msgpack.decode(data, ext_hook=extension_hook)
     except msgspec.DecodeError as error:

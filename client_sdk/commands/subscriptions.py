@@ -1,7 +1,7 @@
-"""The updates of one topic, as `Robot.subscribe` gives them: the newest value of each key, and no queue.
+"""Deliver the updates of subscribed topics to a program: the newest value of each key, without a queue.
 
-What arrives while nobody asks replaces what waits under the same key.  The subscription survives reconnects
-and moves; the server then sends the present state again.
+A value that arrives before the program has read an earlier one of the same key replaces it.  A subscription
+survives reconnects and changes of the server; the new server sends the present values again.
 """
 
 from __future__ import annotations
@@ -12,80 +12,80 @@ from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
 from types import TracebackType
 from typing import Any
 
-from client_sdk.auto_close import Closing
+from client_sdk.auto_close import AutoClose
 from rse_pf.errors import Disconnected, RsePfError, error_from_code
 from rse_pf.wire.client_session import ClientSession
 from rse_pf.wire.client_subscriptions import SubscriptionEnded, Updated
 
 __all__ = ["BlockingUpdates", "RobotSubscriptions", "Updates"]
 
-_MAX_KEYS = 4096
-"""Values that wait; the key that waited longest is given up first."""
+MAX_UNREAD_KEYS = 4096
+"""Most keys of one subscription whose values wait to be read; beyond it the oldest one is dropped."""
 
 
 class Updates:
-    """An async iterator of keys and their values; it ends when it is closed.
+    """Iterate over the updates of one topic as pairs of key and value, until the subscription is closed.
 
-    ``async with robot.subscribe(topic) as updates`` closes it at the end of the block; an ``async for`` over
-    it closes it when the loop ends.
+    ``async with robot.subscribe(topic) as updates`` closes the subscription at the end of the block, an
+    ``async for`` over the updates at the end of the loop.
     """
 
     def __init__(self, topic: str, on_close: Callable[[], None]) -> None:
-        """Wait for values.
+        """Hold no value yet.
 
         Args:
-            topic: What the updates are about.
-            on_close: Called once, when nobody wants more of them.
+            topic: Name of the subscribed topic, such as ``live/MAP``.
+            on_close: Called once when the program closes the subscription.
         """
         self.topic = topic
         self.replaced = 0
-        """How many values newer ones replaced before they were read."""
+        """How many values were replaced by newer ones of their key before the program read them."""
         self._on_close = on_close
-        self._newest: dict[str, Any] = {}
+        self._unread: dict[str, Any] = {}
         self._changed = asyncio.Event()
         self._error: RsePfError | None = None
         self._is_closed = False
 
     async def next(self) -> tuple[str, Any]:
-        """Return a key and its newest value; the key that waited longest comes first.
+        """Wait for an update and return its key and newest value; the key that waited longest comes first.
 
         Raises:
-            StopAsyncIteration: The updates were closed.
+            StopAsyncIteration: The program closed the subscription.
             RsePfError: The server refused or ended the subscription, or the robot was closed.
         """
-        while not self._newest:
+        while not self._unread:
             if self._is_closed:
                 raise StopAsyncIteration
             if self._error is not None:
                 raise self._error
             self._changed.clear()
             await self._changed.wait()
-        key = next(iter(self._newest))
-        return key, self._newest.pop(key)
+        key = next(iter(self._unread))
+        return key, self._unread.pop(key)
 
-    def take(self, key: str, value: Any) -> None:
-        """Take the newest value of *key*."""
-        self.replaced += key in self._newest
-        self._newest[key] = value
-        if len(self._newest) > _MAX_KEYS:
-            del self._newest[next(iter(self._newest))]
+    def put(self, key: str, value: Any) -> None:
+        """Store the newest value of *key* until the program reads it."""
+        self.replaced += key in self._unread
+        self._unread[key] = value
+        if len(self._unread) > MAX_UNREAD_KEYS:
+            del self._unread[next(iter(self._unread))]
         self._changed.set()
 
-    def end(self, error: RsePfError) -> None:
-        """Raise *error* once what waits was read."""
+    def fail(self, error: RsePfError) -> None:
+        """Let `next` raise *error* after the program has read all values that wait."""
         self._error = error
         self._changed.set()
 
     def close(self) -> None:
-        """End the subscription; does nothing a second time."""
+        """End the subscription and drop unread values; do nothing if it was closed before."""
         if not self._is_closed:
             self._is_closed = True
-            self._newest.clear()
+            self._unread.clear()
             self._changed.set()
             self._on_close()
 
     async def __aiter__(self) -> AsyncIterator[tuple[str, Any]]:
-        """Yield what `next` returns."""
+        """Yield keys and their newest values, and close the subscription at the end of the loop."""
         try:
             while True:
                 try:
@@ -110,23 +110,23 @@ class Updates:
 
 
 class RobotSubscriptions:
-    """The updates that a robot has open, by the ids of their subscriptions."""
+    """Hold the open subscriptions of one robot by their ids."""
 
     def __init__(self, session: ClientSession, flush: Callable[[], None], clock: Callable[[], float]) -> None:
-        """Begin with none.
+        """Begin without subscriptions.
 
         Args:
-            session: Of the robot.
-            flush: Sends what the session has to send.
-            clock: Seconds, monotonic.
+            session: Writes the messages that begin and end a subscription.
+            flush: Sends the messages that the session has written.
+            clock: Monotonic seconds.
         """
         self._session = session
         self._flush = flush
         self._clock = clock
         self._open: dict[int, Updates] = {}
 
-    def begin(self, topic: str) -> Updates:
-        """Return the updates of *topic*."""
+    def subscribe(self, topic: str) -> Updates:
+        """Send a subscription to *topic*, and return its updates."""
         identity = self._session.subscribe(topic, self._clock())
 
         def close() -> None:
@@ -138,31 +138,33 @@ class RobotSubscriptions:
         self._flush()
         return updates
 
-    def take(self, event: Updated | SubscriptionEnded) -> None:
-        """Pass an event of the session on to whom it concerns."""
+    def handle_event(self, event: Updated | SubscriptionEnded) -> None:
+        """Deliver an event of the session to the updates that it concerns, if they are still open."""
         if isinstance(event, Updated):
             updates = self._open.get(event.id)
             if updates is not None:
-                updates.take(event.key, event.payload)
+                updates.put(event.key, event.payload)
             return
         ended = self._open.pop(event.id, None)
         if ended is not None:
-            why = event.failure
-            ended.end(
-                error_from_code(why.code, why.message, hint=why.hint, retry_after_ms=why.retry_after_ms)
+            failure = event.failure
+            ended.fail(
+                error_from_code(
+                    failure.code, failure.message, hint=failure.hint, retry_after_ms=failure.retry_after_ms
+                )
             )
 
 
-class BlockingUpdates(Closing):
-    """`Updates` for programs without asyncio; it waits for each value."""
+class BlockingUpdates(AutoClose):
+    """Iterate over the updates of one topic in a program without asyncio; see `Updates`."""
 
     def __init__(self, updates: Updates, wait: Callable[[Coroutine[Any, Any, Any]], Any]) -> None:
-        """Iterate over *updates*; *wait* runs a coroutine in their event loop and returns its result."""
+        """Wrap *updates*; *wait* runs a coroutine in the event loop of their robot and returns its result."""
         self._updates = updates
         self._wait = wait
 
     def __iter__(self) -> Iterator[tuple[str, Any]]:
-        """Yield keys and their newest values until the updates are closed."""
+        """Yield keys and their newest values until the subscription is closed."""
         while True:
             update = self._wait(self._next())
             if update is None:
@@ -170,7 +172,7 @@ class BlockingUpdates(Closing):
             yield update
 
     def close(self) -> None:
-        """End the subscription; the end of the robot ends it, too."""
+        """End the subscription; do nothing if the robot is closed already."""
         with contextlib.suppress(Disconnected):
             self._wait(self._close())
 

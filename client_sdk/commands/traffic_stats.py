@@ -1,4 +1,4 @@
-"""Statistics of a robot's own traffic, in bounded memory."""
+"""Count a robot's own commands, and compute percentiles of their times in bounded memory."""
 
 from __future__ import annotations
 
@@ -8,18 +8,17 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from random import Random
 
-__all__ = ["Percentiles", "Stats", "StatsKeeper"]
+__all__ = ["Percentiles", "Stats", "TrafficCounter"]
 
-# Number of commands of a run, drawn uniformly, from which percentiles are computed.
-_SAMPLE_SIZE = 2048
-
-# Number of the last round trips from which the next one is predicted.
-_RECENT = 32
+SAMPLE_SIZE = 2048
+"""How many commands of a run, drawn uniformly, percentiles are computed from."""
+RECENT_ROUND_TRIPS = 32
+"""How many of the last round trips the next one is predicted from."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Percentiles:
-    """Over the run, from a uniform sample of up to 2,048 commands; None before the first."""
+    """Percentiles over the run, from a uniform sample of at most 2,048 commands; None before the first."""
 
     p50: float | None
     p95: float | None
@@ -28,14 +27,45 @@ class Percentiles:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Stats:
-    """A snapshot; times in ms, clocks in s.  ``duplicates`` counts second answers to a command: 0.
+    """A snapshot of a robot's traffic since it was made.
 
-    ``sent_to_burst`` counts the commands of the present 24 hours, also those that a server answered first.
-    ``region`` is the address of the platform that is used now.  ``held_back`` counts the commands that were
-    not sent at once although there was a connection: by ``busy`` (the server's answer to this command, or to
-    another one of the stream) or ``own-limit`` (what the Welcome allows).  ``callback_errors`` counts the
-    calls of the program's callables (*on_change*, *on_progress*, *token*) that raised or took longer than
-    ``session.ping_timeout_s``; the log names them.
+    Attributes:
+        sent: Commands that the program asked for.
+        answered: Commands that ended with an answer.
+        failed: Commands that ended with an error.
+        sent_to_burst: Commands that were sent to the burst function within the present 24 hours, also those
+            that a server answered first.
+        answered_by_burst: Commands that the burst function answered first.
+        answered_by_robot: Commands that the robot answered itself.
+        failures_by_code: Number of errors by their code, such as ``expired``.
+        unanswered: Commands without a final answer at this moment.
+        resent: How often a command was sent again, after a lost connection or a failure of its server.
+        dropped_answers: Answers to commands that had ended already, such as expired ones.
+        held_back: Commands that were not sent at once although there was a connection: by ``busy`` (the
+            server's answer to this command or another one of its stream) or ``own-limit`` (limits of the
+            Welcome).
+        duplicates: Second answers that reached a caller: always 0.
+        reconnects: How often a lost connection was replaced.
+        moves: How often a server asked the robot to change to another one, and it did.
+        region_changes: How often the robot changed to another of its addresses.
+        bytes_out: Payload of all WebSocket messages that were sent.
+        bytes_in: Payload of all WebSocket messages that were received.
+        payload_bytes_median: Median size of a command.
+        payload_bytes_max: Largest size of a command.
+        round_trip_ms: From the call to the answer of a server.
+        up_ms: Delay from robot to server.
+        queue_ms: Time that commands waited on the server.
+        compute_ms: Time of the computation on the server.
+        down_ms: Delay from server to robot.
+        clock_offset_s: Server clock minus robot clock, None if unknown.
+        clock_uncertainty_s: Half of the round trip by which the offset was measured, None if unknown.
+        delay_up_s: Delay from robot to server of the last ping, None if unknown.
+        delay_down_s: Delay from server to robot of the last ping, None if unknown.
+        server: Name of the server that is connected now, empty without one.
+        region: Address of the platform that is used now, empty without one.
+        last_error: Last problem of the connection, empty without one.
+        callback_errors: Calls of the program's functions (*on_change*, *on_progress*, *token*) that raised or
+            took longer than ``session.ping_timeout_s``; the log names them.
     """
 
     sent: int
@@ -72,10 +102,11 @@ class Stats:
     callback_errors: int
 
 
-class StatsKeeper:
-    """Count and sample a robot's traffic; `Robot.stats` returns the snapshot."""
+class TrafficCounter:
+    """Count and sample the commands of one robot; `Robot.stats` makes a `Stats` of it."""
 
     def __init__(self, random: Random) -> None:
+        """Begin with nothing; *random* draws the samples."""
         self.sent = 0
         self.answered = 0
         self.answered_by_burst = 0
@@ -84,44 +115,44 @@ class StatsKeeper:
         self.failures: Counter[str] = Counter()
         self.payload_bytes_max = 0
         self._random = random
-        self._samples: dict[str, _Sample] = {}
-        self._recent_round_trips_s: deque[float] = deque(maxlen=_RECENT)
+        self._samples: dict[str, _ReservoirSample] = {}
+        self._recent_round_trips_s: deque[float] = deque(maxlen=RECENT_ROUND_TRIPS)
 
-    def add(self, name: str, value: float | None) -> None:
-        """Record one measured value."""
+    def add(self, quantity: str, value: float | None) -> None:
+        """Add a measured value of *quantity*, such as ``queue_ms``, to its sample; None is ignored."""
         if value is not None:
-            self._samples.setdefault(name, _Sample()).add(value, self._random)
+            self._samples.setdefault(quantity, _ReservoirSample()).add(value, self._random)
 
-    def add_payload(self, size: int) -> None:
-        """Record the size of one command in bytes."""
-        self.payload_bytes_max = max(self.payload_bytes_max, size)
-        self.add("payload_bytes", size)
+    def add_payload(self, size_bytes: int) -> None:
+        """Record the size of one command."""
+        self.payload_bytes_max = max(self.payload_bytes_max, size_bytes)
+        self.add("payload_bytes", size_bytes)
 
-    def add_round_trip(self, seconds: float) -> None:
-        """Record a round trip to the cloud, or the least that it took, for `expected_round_trip_s`."""
-        self._recent_round_trips_s.append(seconds)
+    def add_round_trip(self, round_trip_s: float) -> None:
+        """Record the round trip of a command to a server; for an expired command, how long it waited."""
+        self._recent_round_trips_s.append(round_trip_s)
 
     def expected_round_trip_s(self) -> float | None:
-        """Return the 95th percentile of the last few round trips, or None before the first."""
+        """Return the 95th percentile of the last 32 round trips in seconds, None before the first."""
         return _percentile(sorted(self._recent_round_trips_s), 0.95)
 
-    def percentile(self, name: str, share: float) -> float | None:
-        """Return a percentile of the recorded values, by nearest rank; None without a value."""
-        return _percentile(self._sort(name), share)
+    def percentile(self, quantity: str, share: float) -> float | None:
+        """Return a percentile of *quantity* by nearest rank, None without a value; *share* is in 0..1."""
+        return _percentile(self._sorted_values(quantity), share)
 
-    def percentiles(self, name: str) -> Percentiles:
-        """Return the 50th, 95th and 99th percentile of the recorded values."""
-        values = self._sort(name)
+    def percentiles(self, quantity: str) -> Percentiles:
+        """Return the 50th, 95th and 99th percentile of *quantity*."""
+        values = self._sorted_values(quantity)
         return Percentiles(
             p50=_percentile(values, 0.5), p95=_percentile(values, 0.95), p99=_percentile(values, 0.99)
         )
 
-    def _sort(self, name: str) -> list[float]:
-        return sorted(self._samples[name].values) if name in self._samples else []
+    def _sorted_values(self, quantity: str) -> list[float]:
+        return sorted(self._samples[quantity].values) if quantity in self._samples else []
 
 
-class _Sample:
-    """A uniform sample of a stream, in bounded memory (Vitter 1985, algorithm R)."""
+class _ReservoirSample:
+    """Draw a uniform sample from a stream of values in bounded memory (Vitter 1985, algorithm R)."""
 
     def __init__(self) -> None:
         self.values: list[float] = []
@@ -129,13 +160,14 @@ class _Sample:
 
     def add(self, value: float, random: Random) -> None:
         self._seen += 1
-        if len(self.values) < _SAMPLE_SIZE:
+        if len(self.values) < SAMPLE_SIZE:
             self.values.append(value)
             return
-        place = random.randrange(self._seen)
-        if place < _SAMPLE_SIZE:
-            self.values[place] = value
+        index = random.randrange(self._seen)
+        if index < SAMPLE_SIZE:
+            self.values[index] = value
 
 
-def _percentile(ordered: Sequence[float], share: float) -> float | None:
-    return ordered[max(0, math.ceil(share * len(ordered)) - 1)] if ordered else None
+def _percentile(ascending: Sequence[float], share: float) -> float | None:
+    """Return the value at rank ``ceil(share * n)`` of *ascending*, None if it is empty."""
+    return ascending[max(0, math.ceil(share * len(ascending)) - 1)] if ascending else None

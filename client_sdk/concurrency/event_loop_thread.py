@@ -1,6 +1,7 @@
-"""An event loop in a thread of its own, and callers in other threads that never wait for it in vain.
+"""Run an event loop in a thread, and let other threads wait for coroutines in it.
 
-A caller keeps its time limit itself.  Whatever ends the loop ends every call.
+A waiting thread measures its own time limit, so a loop that hangs cannot delay it.  Whatever ends the loop
+ends every call that waits.
 """
 
 from __future__ import annotations
@@ -14,27 +15,30 @@ from typing import Any, TypeVar
 
 from rse_pf.errors import Disconnected, Expired, RsePfError, UsageError
 
-__all__ = ["LoopThread", "not_connected_here"]
+__all__ = ["EventLoopThread", "wrong_process_error"]
 
 T = TypeVar("T")
 
-CLOSE_S = 5.0  # `LoopThread.close` waits this long for the close handshakes and the recorder
-JOIN_S = 1.0  # and then this long for the thread, which may wait for a function of the program
+CLOSE_TIMEOUT_S = 5.0
+"""How long the last coroutine of the loop may take: it closes connections and finishes a recording."""
+THREAD_JOIN_S = 1.0
+"""How long the thread of the loop may take to end after its last coroutine: a function of the program may
+block it."""
 
 
-def not_connected_here(process: int) -> Disconnected:
-    """Return the error of a robot that *process* connected, and a child of it uses."""
+def wrong_process_error(process: int) -> Disconnected:
+    """Return the error of a robot that was connected in *process* and is used in a forked child of it."""
     return Disconnected(
         f"this robot is connected in process {process}, and this is process {os.getpid()}",
         hint="connect a robot in each process, after the fork",
     )
 
 
-class LoopThread:
-    """Runs coroutines for other threads between `start` and `close`."""
+class EventLoopThread:
+    """Run coroutines for other threads between `start` and `close`."""
 
     def __init__(self, at_end: Callable[[], Coroutine[Any, Any, None]]) -> None:
-        """Start nothing yet; *at_end* is the last coroutine that the loop runs."""
+        """Start nothing yet; *at_end* makes the last coroutine that the loop runs, within 5 s."""
         self._at_end = at_end
         self._calls: set[_Call] = set()
         self._lock = threading.RLock()  # a signal handler may close while the same thread calls
@@ -46,22 +50,22 @@ class LoopThread:
         self._thread = threading.Thread(target=self._run, name="rse-pf-robot", daemon=True)
 
     def start(self) -> None:
-        """Start the thread."""
+        """Start the thread, and return when its loop runs."""
         self._process = os.getpid()
         self._thread.start()
         self._started.wait()
 
     def wait(self, work: Coroutine[Any, Any, T], limit_s: float | None = None) -> T:
-        """Run *work* in the loop and return its result, or raise its exception.
+        """Run *work* in the loop, wait for it, and return its result or raise its exception.
 
         Args:
-            work: Cancelled if this call ends before it does.
-            limit_s: Seconds; None for what has no deadline.  The end of the loop always ends the call.
+            work: Coroutine; it is cancelled if the wait ends before it does.
+            limit_s: Longest wait in seconds, None without a limit.  The end of the loop ends every wait.
 
         Raises:
-            Disconnected: The loop has ended or ends now, or another process started it.
-            Expired: The result did not come within *limit_s*.
-            UsageError: The thread of the loop calls, which would wait for itself.
+            Disconnected: The loop has ended or is ending, or another process started it.
+            Expired: *work* took longer than *limit_s*.
+            UsageError: The thread of the loop itself calls, and would wait for itself.
         """
         call = _Call(work)
         try:
@@ -86,9 +90,9 @@ class LoopThread:
         return result
 
     def close(self) -> None:
-        """End the loop and every call; from any thread, and again.
+        """End the loop and every call that waits, within 7 s; any thread may call this, repeatedly.
 
-        The thread of the loop does not wait for its own end.  In a child of a fork nothing happens.
+        The thread of the loop does not wait for its own end.  A forked child process does nothing.
         """
         if os.getpid() != self._process:
             return
@@ -100,12 +104,12 @@ class LoopThread:
                 with contextlib.suppress(RuntimeError):  # the loop has ended by itself
                     self._loop.call_soon_threadsafe(self._stop.set)
         if self._thread is not threading.current_thread():
-            self._ended.wait(CLOSE_S + JOIN_S)
-            self._thread.join(JOIN_S)
+            self._ended.wait(CLOSE_TIMEOUT_S + THREAD_JOIN_S)
+            self._thread.join(THREAD_JOIN_S)
 
     def _submit(self, call: _Call) -> None:
         if os.getpid() != self._process:
-            raise not_connected_here(self._process)
+            raise wrong_process_error(self._process)
         if threading.current_thread() is self._thread:
             raise UsageError(
                 "the event loop of the robot cannot wait for the robot",
@@ -113,9 +117,9 @@ class LoopThread:
             )
         with self._lock:
             if self._loop is None or self._is_closing:
-                raise _closed()
+                raise _not_connected_error()
             self._calls.add(call)
-            self._loop.call_soon_threadsafe(call.begin)  # before the stop of a later close
+            self._loop.call_soon_threadsafe(call.begin)  # the loop begins it before it sees a later `close`
 
     def _cancel(self, call: _Call) -> None:
         with self._lock, contextlib.suppress(RuntimeError):
@@ -134,23 +138,23 @@ class LoopThread:
         try:
             await self._stop.wait()
             with contextlib.suppress(asyncio.TimeoutError):
-                await asyncio.wait_for(self._at_end(), CLOSE_S)
+                await asyncio.wait_for(self._at_end(), CLOSE_TIMEOUT_S)
         finally:
             self._end_calls()
 
     def _end_calls(self) -> None:
-        """Let every caller go, also those whose work goes on in a function of the program."""
+        """End every wait, also if its coroutine is blocked in a function of the program."""
         with self._lock:
             self._is_closing = True
             calls = list(self._calls)
         for call in calls:
-            call.end(error=_closed())
-        self._started.set()  # also if no loop could be made
+            call.end(error=_not_connected_error())
+        self._started.set()  # `start` waits for this, also if no loop could be made
         self._ended.set()
 
 
 class _Call:
-    """One call: its work in the loop, and its end in the thread that waits."""
+    """Carry a coroutine into the loop, and its result back to the thread that waits."""
 
     def __init__(self, work: Coroutine[Any, Any, Any]) -> None:
         self.done = threading.Event()
@@ -161,7 +165,7 @@ class _Call:
 
     def begin(self) -> None:
         self._task = asyncio.get_running_loop().create_task(self._work)
-        self._task.add_done_callback(self._take)
+        self._task.add_done_callback(self._take_result)
 
     def cancel(self) -> None:
         if self._task is not None:
@@ -172,16 +176,16 @@ class _Call:
             self.result, self.error = result, error
             self.done.set()
 
-    def _take(self, task: asyncio.Task[Any]) -> None:
+    def _take_result(self, task: asyncio.Task[Any]) -> None:
         if task.cancelled():
-            self.end(error=_closed())
+            self.end(error=_not_connected_error())
         elif (error := task.exception()) is not None:
             self.end(error=error)
         else:
             self.end(task.result())
 
 
-def _closed() -> RsePfError:
+def _not_connected_error() -> RsePfError:
     return Disconnected(
         "the robot is not connected", hint="use with client_sdk.connect_blocking(...) as robot"
     )

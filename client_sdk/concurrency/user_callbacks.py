@@ -1,9 +1,9 @@
-"""Call the callables that a program gives to the SDK: whatever they do, the robot goes on.
+"""Call the functions that a program gives to the SDK, so that the robot goes on whatever they do.
 
-Every such callable is called here, except those whose error their caller receives (`client_sdk.slots`).  An
-exception is counted, and logged with its traceback once for each line that raises it.  A robot of asyncio
-calls in its own event loop, never in the middle of a change of its own state; a blocking robot calls in a
-thread, so that a callable that blocks does not cost the connection.
+An exception is counted, and logged with its traceback once for each line that raises it.  An asyncio robot
+calls the functions in its own event loop, never in the middle of a change of its own state.  A blocking robot
+calls them in a thread, so that a function that blocks does not cost the connection.  Functions whose
+exceptions their caller receives (parts of a tracker that a user replaces) are called elsewhere.
 """
 
 from __future__ import annotations
@@ -24,55 +24,62 @@ from typing import Any
 
 from rse_pf.errors import ConnectError, RsePfError, UsageError
 
-__all__ = ["Callbacks"]
+__all__ = ["UserCallbacks"]
 
 _log = logging.getLogger("client_sdk")
 
-TOKEN_LIMIT_S = 30.0  # a service that issues tokens answers within seconds; a later answer is a failure
-SLOW_S = 3.0  # the default of session.ping_timeout_s: a server closes a connection that is silent for longer
-JOIN_S = 0.2  # `Callbacks.end_thread` waits this long for a callable that runs; it may block for ever
+TOKEN_TIMEOUT_S = 30.0
+"""A token function that takes longer than this has failed: services that issue tokens answer within
+seconds."""
+SLOW_CALL_S = 3.0
+"""A function that blocks the event loop for longer than this is reported: it is the default of the setting
+session.ping_timeout_s, after which a server closes a silent connection."""
+THREAD_JOIN_S = 0.2
+"""How long the end of a robot waits for a function that still runs; such a function may block for ever."""
+CREDENTIAL_FUNCTION = "the token callable"
+"""Name of the program's token function in reports and errors."""
 
 
-class Callbacks:
-    """The callables of one program, and how many of their calls failed."""
+class UserCallbacks:
+    """Call the functions of one program; `errors` counts the calls that failed or were too slow."""
 
-    def __init__(self, slow_s: float = SLOW_S) -> None:
-        """Call in the event loop that runs; a call that blocks it for longer than *slow_s* is reported."""
+    def __init__(self, slow_s: float = SLOW_CALL_S) -> None:
+        """Call in the running event loop; report a call that blocks it for more than *slow_s* seconds."""
         self.errors = 0
         self._slow_s = slow_s
         self._reported: set[tuple[str, str, str]] = set()
         self._lock = threading.Lock()
-        self._queue: queue.SimpleQueue[Callable[[], object] | None] | None = None
+        self._calls: queue.SimpleQueue[Callable[[], object] | None] | None = None
         self._thread: threading.Thread | None = None
         self._token_loop: asyncio.AbstractEventLoop | None = None
 
     def start_thread(self) -> None:
-        """Call in a thread from now on, and token callables in the loop of another one."""
-        self._queue = queue.SimpleQueue()
+        """Call in a new thread from now on, and token functions in the event loop of another thread."""
+        self._calls = queue.SimpleQueue()
         self._thread = threading.Thread(
-            target=self._work, args=(self._queue,), name="rse-pf-callbacks", daemon=True
+            target=self._run_calls, args=(self._calls,), name="rse-pf-callbacks", daemon=True
         )
         self._thread.start()
 
     def end_thread(self) -> None:
-        """End the thread after the calls that wait; it does not wait for itself."""
-        if self._queue is not None and self._thread is not None:
-            self._queue.put(None)
+        """End the thread after the calls that wait in its queue; the thread itself may call this."""
+        if self._calls is not None and self._thread is not None:
+            self._calls.put(None)
             self._end_token_loop()
             if self._thread is not threading.current_thread():
-                self._thread.join(JOIN_S)
+                self._thread.join(THREAD_JOIN_S)
 
     def notify(self, name: str, function: Callable[..., object], *arguments: Any) -> None:
-        """Call *function* soon, in the order of these notifications; *name* is the word of the report."""
-        work = functools.partial(self.call, name, function, *arguments)
-        if self._queue is not None:
-            self._queue.put(work)
+        """Call *function* soon, in the order of these calls; the report of an exception says *name*."""
+        call = functools.partial(self.call, name, function, *arguments)
+        if self._calls is not None:
+            self._calls.put(call)
         else:
-            asyncio.get_running_loop().call_soon(work)
+            asyncio.get_running_loop().call_soon(call)
 
     def call(self, name: str, function: Callable[..., Any], *arguments: Any, default: Any = None) -> Any:
-        """Call *function* now and return its value, or *default* after an exception."""
-        began, process = time.monotonic(), os.getpid()
+        """Call *function* now and return its value, or *default* after an exception, reported as *name*."""
+        began_s, process = time.monotonic(), os.getpid()
         try:
             value = function(*arguments)
             if inspect.iscoroutine(value):
@@ -84,72 +91,76 @@ class Callbacks:
             self.report(name, error)
             return default
         finally:
-            _end_child(process, name)
+            _exit_forked_child(process, name)
         if _has_running_loop():
-            self._report_slow(name, time.monotonic() - began)
+            self._report_slow(name, time.monotonic() - began_s)
         return value
 
     async def fetch_token(self, function: Callable[[], Awaitable[str]]) -> Any:
-        """Return the token of an async token callable.
+        """Return what the async token function of the program returns, which may be no text.
 
         Raises:
-            ConnectError: It raised, was cancelled, or did not return in time; the robot tries again later.
+            ConnectError: *function* raised, was cancelled, or took longer than 30 s.
         """
-        work: asyncio.Future[Any]
-        if self._queue is None:
-            work = asyncio.ensure_future(_awaited(function))
+        result: asyncio.Future[Any]
+        if self._calls is None:
+            result = asyncio.ensure_future(_await_token(function))
         else:
-            work = asyncio.wrap_future(self._in_thread(function))
+            result = asyncio.wrap_future(self._run_in_token_thread(function))
         try:
-            await asyncio.wait({work}, timeout=TOKEN_LIMIT_S)
-            is_late = not work.done()
+            await asyncio.wait({result}, timeout=TOKEN_TIMEOUT_S)
+            is_late = not result.done()
         finally:
-            work.cancel()  # without effect on a token that came
+            result.cancel()  # no effect on a token that has arrived
         error: BaseException
         if is_late:
-            self._end_token_loop()  # the call may block it for ever
-            error = TimeoutError(f"no token within {TOKEN_LIMIT_S:g} s")
-        elif work.cancelled():
+            self._end_token_loop()  # the function may block this loop for ever
+            error = TimeoutError(f"no token within {TOKEN_TIMEOUT_S:g} s")
+        elif result.cancelled():
             error = asyncio.CancelledError()
-        elif (raised := work.exception()) is not None:
+        elif (raised := result.exception()) is not None:
             error = raised
         else:
-            return work.result()
+            return result.result()
         raise self.token_error(error)
 
     def token_error(self, error: BaseException) -> ConnectError:
-        """Report what a token callable raised, and return what it means for a connection."""
-        if isinstance(error, RsePfError):  # its message is written for users, and says what to do
-            self.report("the token callable", error, has_traceback=False)
+        """Report *error*, which a token function raised, and return it as an error of the connection."""
+        if isinstance(error, RsePfError):  # message and hint are written for users: no traceback
+            self.report(CREDENTIAL_FUNCTION, error, has_traceback=False)
             return ConnectError(f"no token: {error.message}", hint=error.hint)
-        self.report("the token callable", error)
+        self.report(CREDENTIAL_FUNCTION, error)
         return ConnectError(
-            f"no token: the token callable raised {type(error).__name__}", hint="fix the token callable"
+            f"no token: {CREDENTIAL_FUNCTION} raised {type(error).__name__}",
+            hint="repair the token callable: the log has its traceback",
         )
 
     def report(self, name: str, error: BaseException, *, has_traceback: bool = True) -> None:
-        """Count *error*, and log it unless the same line of the program raised its like before."""
+        """Count *error*, and log it unless the same line raised an error of the same type before."""
         frames = traceback.extract_tb(error.__traceback__)
-        place = f"{frames[-1].filename}:{frames[-1].lineno}" if frames else ""
-        if self._is_new((name, type(error).__name__, place)):
+        source_line = f"{frames[-1].filename}:{frames[-1].lineno}" if frames else ""
+        if self._is_new((name, type(error).__name__, source_line)):
             if isinstance(error, RsePfError):
                 cause = error.message
             else:  # str(error) may raise
                 text = "".join(traceback.format_exception_only(type(error), error))
                 cause = " ".join(text.partition(": ")[2].split())
             _log_error(
-                "%s raised %s: %s; the robot goes on", name, type(error).__name__, cause,
+                "%s raised %s: %s; the robot goes on",
+                name,
+                type(error).__name__,
+                cause,
                 exc_info=error if has_traceback else None,
-            )  # fmt: skip
+            )
 
-    def _in_thread(self, function: Callable[[], Awaitable[str]]) -> concurrent.futures.Future[Any]:
-        """Await *function* in the loop of a thread for which neither a robot nor an exit waits."""
+    def _run_in_token_thread(self, function: Callable[[], Awaitable[str]]) -> concurrent.futures.Future[Any]:
+        """Await *function* in the event loop of a daemon thread, for whose end nobody waits."""
         if self._token_loop is None:
             self._token_loop = asyncio.new_event_loop()
             threading.Thread(
                 target=_run_loop, args=(self._token_loop,), name="rse-pf-token", daemon=True
             ).start()
-        return asyncio.run_coroutine_threadsafe(_awaited(function), self._token_loop)
+        return asyncio.run_coroutine_threadsafe(_await_token(function), self._token_loop)
 
     def _end_token_loop(self) -> None:
         loop, self._token_loop = self._token_loop, None
@@ -160,8 +171,10 @@ class Callbacks:
         if took_s > self._slow_s and self._is_new((name, "slow", "")):
             _log_error(
                 "%s took %.1f s, and session.ping_timeout_s is %.1f s; hint: do long work in a thread",
-                name, took_s, self._slow_s,
-            )  # fmt: skip
+                name,
+                took_s,
+                self._slow_s,
+            )
 
     def _is_new(self, key: tuple[str, str, str]) -> bool:
         with self._lock:
@@ -170,16 +183,16 @@ class Callbacks:
             self._reported.add(key)
         return is_new
 
-    def _work(self, waiting: queue.SimpleQueue[Callable[[], object] | None]) -> None:
-        while (work := waiting.get()) is not None:
+    def _run_calls(self, calls: queue.SimpleQueue[Callable[[], object] | None]) -> None:
+        while (call := calls.get()) is not None:
             try:
-                work()
-            except BaseException as error:  # noqa: BLE001  the calls that wait are still due
+                call()
+            except BaseException as error:  # noqa: BLE001  the calls that wait in the queue are still due
                 self.report("a callable", error)
 
 
 def _log_error(text: str, *values: object, exc_info: BaseException | None = None) -> None:
-    """Log by the handlers and filters of the program, which may raise as all of its callables."""
+    """Log an error; handlers and filters of the program may raise, like all of its functions."""
     with contextlib.suppress(Exception):
         _log.error(text, *values, exc_info=exc_info)
 
@@ -191,9 +204,9 @@ def _has_running_loop() -> bool:
 
 
 def _is_interrupt(error: BaseException) -> bool:
-    """Return whether *error* is to end the program: Ctrl-C or exit in the main thread."""
-    is_exit = not isinstance(error, Exception | asyncio.CancelledError)
-    return is_exit and threading.current_thread() is threading.main_thread()
+    """Return whether *error* is meant to end the program: Ctrl-C or ``sys.exit`` in the main thread."""
+    ends_program = not isinstance(error, Exception | asyncio.CancelledError)
+    return ends_program and threading.current_thread() is threading.main_thread()
 
 
 def _run_loop(loop: asyncio.AbstractEventLoop) -> None:
@@ -206,26 +219,26 @@ def _run_loop(loop: asyncio.AbstractEventLoop) -> None:
         loop.close()
 
 
-async def _awaited(function: Callable[[], Awaitable[str]]) -> Any:
+async def _await_token(function: Callable[[], Awaitable[str]]) -> Any:
     process = os.getpid()
     try:
-        made = function()
-        if not inspect.isawaitable(made):
+        token = function()
+        if not inspect.isawaitable(token):
             raise UsageError(
-                f"the token callable returned a {type(made).__name__} and is not an async function",
+                f"{CREDENTIAL_FUNCTION} returned a {type(token).__name__} and is not an async function",
                 hint="pass an async function, such as read_enrolment(FILE).token",
             )
-        return await made
-    except (SystemExit, KeyboardInterrupt) as error:  # asyncio would end its loop by them
+        return await token
+    except (SystemExit, KeyboardInterrupt) as error:  # asyncio would end its event loop
         if _is_interrupt(error):
             raise
-        raise RuntimeError(f"the token callable raised {type(error).__name__}") from error
+        raise RuntimeError(f"{CREDENTIAL_FUNCTION} raised {type(error).__name__}") from error
     finally:
-        _end_child(process, "the token callable")
+        _exit_forked_child(process, CREDENTIAL_FUNCTION)
 
 
-def _end_child(process: int, name: str) -> None:
-    """End a child that *name* made by a fork and returned from: it would write on the parent's sockets."""
-    if os.getpid() != process:
+def _exit_forked_child(parent: int, name: str) -> None:
+    """Exit if this is a child process that *name* forked: it would write on the sockets of *parent*."""
+    if os.getpid() != parent:
         _log_error("%s forked, and its child returned; hint: end the child by os._exit", name)
         os._exit(1)

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from client_sdk.concurrency.user_callbacks import Callbacks
+from client_sdk.concurrency.user_callbacks import UserCallbacks
 from client_sdk.frontend import Features, Frame, load_opencv
 from client_sdk.live.options import LiveOptions
 from client_sdk.tracking.segments import certain_rows
@@ -201,7 +201,7 @@ class BackgroundUploader:
         self._trouble = ""
         self._store, self._clock, self._wait_quiet = store, clock, wait_quiet
         self._rate_limit = TokenBucket(bytes_per_s, burst=0.0)
-        self._callbacks = Callbacks()
+        self._callbacks = UserCallbacks()
         self._waiting: deque[bytes] = deque()
         self._waiting_bytes = 0
         self._has_object, self._is_empty = asyncio.Event(), asyncio.Event()

@@ -1,10 +1,13 @@
-"""When a robot dials again: soon after a loss, and less and less often while servers do not take it.
+"""Decide how long a robot waits before its next attempt to connect, without sleeping or connecting.
 
-Only what reaches a server is spared: an attempt that nobody answered costs nothing, and another one follows a
-second later.  The firewall in front of a platform counts the handshakes of an address, and many robots may
-share one.  So a robot bounds its handshakes by itself, whatever happens to its connections: a token bucket
-gives it `DIAL_BURST` attempts at once and `DIALS_PER_MINUTE` later.  The limit of the firewall is derived
-from the same two numbers (`rse_pf.config.front_door`).  Nothing here dials or sleeps.
+Two rules bound the attempts:
+
+    1. Pauses grow while attempts are answered and fail (exponential backoff with full jitter).  An attempt
+       that nobody answers reaches no server, so it is repeated every second whatever came before.
+    2. A token bucket bounds the attempts that are answered: `DIAL_BURST` at once, then `DIALS_PER_MINUTE`.
+       Pauses alone would not bound them while a server accepts connections and closes them.  The web firewall
+       counts attempts by IP address, and its limit is computed from these two numbers
+       (`rse_pf.config.front_door`), so many robots may share one address.
 """
 
 from __future__ import annotations
@@ -16,94 +19,113 @@ from client_sdk.network.connect_timings import ConnectTimings
 from rse_pf.config.front_door import DIAL_BURST, DIALS_PER_MINUTE
 from rse_pf.token_bucket import TokenBucket
 
-__all__ = ["Backoff", "Last"]
+__all__ = ["AttemptResult", "Backoff"]
 
 RECONNECT_BASE_S = 0.1
-"""Longest first pause; it doubles with each attempt, with full jitter (AWS Architecture Blog, 2015)."""
-_SHARE = 1.0 / 3.0
-"""Longest pause as a share of the time in which attempts fail: after an outage of a minute, 20 seconds."""
-_UNANSWERED_S = (1.0, 1.25)
-"""Between the starts of two attempts that nobody answers; not all robots at once."""
-_CUT_OFF_JITTER_S = 0.5
-_KEPT = 0.5
-_SPREAD = 1.25
-"""Robots that are told the same time to wait do not come back at the same moment."""
+"""Upper bound of the first pause in seconds; it doubles with each attempt ("full jitter", AWS Architecture
+Blog, 2015)."""
+MAX_PAUSE_RATIO = 1.0 / 3.0
+"""A pause is at most this share of the time for which attempts have failed: after an outage of a minute a
+robot is back within 20 seconds."""
+UNANSWERED_MIN_S = 1.0
+"""Shortest time between the starts of two attempts that nobody answers: such attempts load no server."""
+UNANSWERED_MAX_S = 1.25
+"""Longest time between the starts of two attempts that nobody answers; it differs from the shortest one so
+that robots of one site do not dial at the same moment."""
+REVOCATION_JITTER_S = 0.5
+"""After a revocation, robots come back spread over this time, counted from when new tokens are valid."""
+MOVE_RESERVE = 0.5
+"""While a robot is connected and moves to another server, this share of its token bucket is kept for the case
+that it loses its connection."""
+RETRY_AFTER_SPREAD = 1.25
+"""A robot waits up to this multiple of the time that a server asked for, so that robots that got the same
+number do not come back at the same moment."""
+MAX_DOUBLINGS = 16
+"""The exponential pause stops doubling after this many attempts, so that the number stays finite."""
 
 
-class Last(Enum):
+class AttemptResult(Enum):
     """How the last attempt to connect ended."""
 
     NONE = "none"
-    """There was none since the connection was lost."""
+    """There was no attempt since the connection was lost."""
     UNANSWERED = "unanswered"
-    """Nobody accepted the TCP connection, or nothing left the robot."""
+    """Nobody accepted the TCP connection, or no packet left the robot."""
     ANSWERED = "answered"
-    """Something accepted the TCP connection, or refused it; the robot may connect a little later."""
+    """A machine accepted the TCP connection or refused it, and the robot may connect a little later."""
     REFUSED = "refused"
-    """A server of ours refused the robot, and may refuse it for long."""
+    """An RSE-PF server refused this robot, perhaps for a long time."""
 
 
 class Backoff:
-    """The pauses before the attempts of one robot to connect to one address."""
+    """Compute the pauses before the attempts of one robot to connect to one address."""
 
     def __init__(self, timings: ConnectTimings, random: Random) -> None:
+        """Begin with short pauses and a full token bucket; *random* is the source of the jitter."""
         self._timings = timings
         self._random = random
-        self._attempt = 0
-        self._failing_since: float | None = None
+        self._attempts = 0
+        self._failing_since_s: float | None = None
         self._bucket = TokenBucket(DIALS_PER_MINUTE / 60.0, DIAL_BURST)
 
-    def restart(self) -> None:
-        """Begin with short pauses again: the last connection lasted, or the robot is asked to move."""
-        self._attempt, self._failing_since = 0, None
+    def reset(self) -> None:
+        """Return to short pauses: the last connection lasted, or a server asked the robot to move.
 
-    def dialled(self, now: float) -> None:
-        """Count an attempt that was answered at *now*, seconds of the robot's clock."""
-        self._bucket.spend(1.0, now)
+        The token bucket is not refilled.
+        """
+        self._attempts = 0
+        self._failing_since_s = None
+
+    def count_attempt(self, now_s: float) -> None:
+        """Take a token for an attempt that was answered at *now_s*, seconds of the robot's clock."""
+        self._bucket.spend(1.0, now_s)
 
     def pause_s(
         self,
-        now: float,
-        after_s: float = 0.0,
+        now_s: float,
+        retry_after_s: float = 0.0,
         *,
-        last: Last = Last.ANSWERED,
+        last: AttemptResult = AttemptResult.ANSWERED,
         valid_in_s: float | None = None,
         is_move: bool = False,
     ) -> float:
-        """Return how long to wait before the next attempt, from the start of the last one.
+        """Return the seconds between the start of the last attempt and the next one.
 
-        Within the first seconds of attempts that are answered, exponential with full jitter up to
-        ``reconnect_max_s``; then between a sixth and a third of that time, up to
-        ``reconnect_long_max_s``.  After a refusal, between the half and the whole of the latter.
+        While attempts are answered and fail, the pause is exponential with full jitter up to
+        ``reconnect_max_s``.  When they have failed for longer, it is between a sixth and a third of that
+        time, up to ``reconnect_long_max_s``.  After a refusal it is between half of ``reconnect_long_max_s``
+        and all of it.  It is never shorter than the token bucket demands.
 
         Args:
-            now: Seconds of the robot's clock.
-            after_s: What the server asked for.
+            now_s: Seconds of the robot's clock.
+            retry_after_s: How long the server asked the robot to wait; 0 if it asked for nothing.
             last: How the last attempt ended.
-            valid_in_s: When a token that is signed then will be accepted, None if that is not known.
-            is_move: Whether the robot has a connection; it then keeps half of its allowance for its loss.
+            valid_in_s: Seconds until tokens signed at that moment are accepted again, None if unknown.
+            is_move: Whether the robot is connected and only changes the server; half of the token bucket then
+                stays in reserve.
         """
-        asked_s = after_s * self._random.uniform(1.0, _SPREAD)
-        wait_s = self._bucket.wait_s(now)
+        asked_s = retry_after_s * self._random.uniform(1.0, RETRY_AFTER_SPREAD)
+        bucket_s = self._bucket.wait_s(now_s)
         if is_move:
-            least = _KEPT * self._bucket.burst
-            wait_s = max(wait_s, (least + 1.0 - self._bucket.tokens) / self._bucket.rate)
-        return max(asked_s + self._own_s(now, last, valid_in_s), wait_s)
+            missing_tokens = MOVE_RESERVE * self._bucket.burst + 1.0 - self._bucket.tokens
+            bucket_s = max(bucket_s, missing_tokens / self._bucket.rate)
+        return max(asked_s + self._backoff_s(now_s, last, valid_in_s), bucket_s)
 
-    def _own_s(self, now: float, last: Last, valid_in_s: float | None) -> float:
-        s, uniform = self._timings, self._random.uniform
-        if last is Last.UNANSWERED:
-            return uniform(*_UNANSWERED_S)
-        if last is Last.REFUSED:
-            pause_s = uniform(0.5 * s.reconnect_long_max_s, s.reconnect_long_max_s)
+    def _backoff_s(self, now_s: float, last: AttemptResult, valid_in_s: float | None) -> float:
+        timings, uniform = self._timings, self._random.uniform
+        if last is AttemptResult.UNANSWERED:
+            return uniform(UNANSWERED_MIN_S, UNANSWERED_MAX_S)
+        if last is AttemptResult.REFUSED:
+            pause_s = uniform(0.5 * timings.reconnect_long_max_s, timings.reconnect_long_max_s)
             if valid_in_s is None:
                 return pause_s
-            return min(pause_s, max(0.0, valid_in_s) + uniform(0.0, _CUT_OFF_JITTER_S))
-        if self._failing_since is None and last is Last.ANSWERED:
-            self._failing_since = now
-        failing_s = 0.0 if self._failing_since is None else now - self._failing_since
-        longest_s = min(s.reconnect_long_max_s, _SHARE * failing_s)
-        attempt, self._attempt = self._attempt, self._attempt + 1
-        if longest_s > s.reconnect_max_s:
+            return min(pause_s, max(0.0, valid_in_s) + uniform(0.0, REVOCATION_JITTER_S))
+        if self._failing_since_s is None and last is AttemptResult.ANSWERED:
+            self._failing_since_s = now_s
+        failing_s = 0.0 if self._failing_since_s is None else now_s - self._failing_since_s
+        longest_s = min(timings.reconnect_long_max_s, MAX_PAUSE_RATIO * failing_s)
+        doublings = min(self._attempts, MAX_DOUBLINGS)
+        self._attempts += 1
+        if longest_s > timings.reconnect_max_s:
             return uniform(0.5 * longest_s, longest_s)
-        return uniform(0.0, min(s.reconnect_max_s, RECONNECT_BASE_S * 2.0 ** min(attempt, 16)))
+        return uniform(0.0, min(timings.reconnect_max_s, RECONNECT_BASE_S * 2.0**doublings))

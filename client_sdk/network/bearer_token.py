@@ -1,6 +1,6 @@
-"""The text of a token, checked before it is sent; a text that cannot be a token is never shown.
+"""Check the text of a token before it is sent in a header; a text that cannot be a token is never shown.
 
-Whether the token is valid is judged by the server alone.
+Only the server decides whether the token is valid.
 """
 
 from __future__ import annotations
@@ -11,8 +11,9 @@ from rse_pf.errors import Unauthorized
 
 __all__ = ["strip_token"]
 
-_TOKEN = re.compile(r"[!-~]+")
-_HINT = (
+PRINTABLE_ASCII = re.compile(r"[!-~]+")
+"""Letters that the HTTP header Authorization can hold behind the word Bearer."""
+USAGE_HINT = (
     "pass the text that rse-pf token issue ROBOT prints, or a function that returns it: an async one to "
     "connect, a plain one to DataClient (client_sdk.enrolment.read_enrolment returns both)"
 )
@@ -22,17 +23,17 @@ def strip_token(token: object) -> str:
     """Return *token* without the white space around it, which files and shells add.
 
     Raises:
-        Unauthorized: It is not a text, is empty, or has letters that no header can hold.
+        Unauthorized: *token* is not a text, is empty, or has letters that an HTTP header cannot hold.
     """
     if not isinstance(token, str):
-        raise Unauthorized(f"the token is a {type(token).__name__}, not a text", hint=_HINT)
+        raise Unauthorized(f"the token is a {type(token).__name__}, not a text", hint=USAGE_HINT)
     text = token.strip()
     if not text:
-        raise Unauthorized("the token is empty", hint=_HINT)
-    if not _TOKEN.fullmatch(text):
+        raise Unauthorized("the token is empty", hint=USAGE_HINT)
+    if not PRINTABLE_ASCII.fullmatch(text):
         raise Unauthorized(
             f"the token has {len(text)} letters, and some of them are in no token: a space, a line break or "
             "a letter outside of ASCII",
-            hint=_HINT,
+            hint=USAGE_HINT,
         )
     return text

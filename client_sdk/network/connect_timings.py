@@ -1,4 +1,4 @@
-"""How patient a robot is with its network: numbers of the robot's own, which no server knows."""
+"""Settings of a robot's attempts to connect; they are the robot's own, and no server knows them."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ __all__ = ["ConnectTimings"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ConnectTimings:
-    """Limits of attempts to connect.
+    """Hold the timeouts and longest pauses of attempts to connect, in seconds.
 
     Attributes:
-        connect_timeout_s: Time limit of one attempt.
+        connect_timeout_s: Time limit of each step of an attempt: proxy, WebSocket handshake, Welcome.
         reconnect_max_s: Longest pause between attempts in the first seconds without a connection.
-        reconnect_long_max_s: Longest pause after minutes without a connection; after a refusal at least half
-            of it.
-        region_hold_s: A robot with several addresses changes to another region that has been clearly nearer
-            for this long.
+        reconnect_long_max_s: Longest pause after minutes without a connection; after a refusal the pause is
+            between half of this number and all of it.
+        region_hold_s: How long another region must be clearly nearer before a robot with several addresses
+            changes to it.
 
     Raises:
-        UsageError: A number is not positive, or the longer pause is the shorter one.
+        UsageError: A number is not positive, or *reconnect_long_max_s* is less than *reconnect_max_s*.
     """
 
     connect_timeout_s: float = 2.0
@@ -31,10 +31,11 @@ class ConnectTimings:
     region_hold_s: float = 60.0
 
     def __post_init__(self) -> None:
+        """Check the numbers."""
         for name in self.__slots__:
             if not getattr(self, name) > 0:
                 raise UsageError(
-                    f"{name} = {getattr(self, name)} is not positive", hint="set a number of seconds"
+                    f"{name} = {getattr(self, name)} is not positive", hint="set a positive number of seconds"
                 )
         if self.reconnect_long_max_s < self.reconnect_max_s:
             raise UsageError(

@@ -1,10 +1,45 @@
-"""The sockets of a robot: connect, read, write, ping, reconnect, move; `ClientSession` holds the rules.
+"""Keep a robot connected: dial, reconnect, move between servers, and choose among regions.
 
-There is one current socket, a second one during a move, and one that stands by for each further address.
-Reconnects are delayed (`client_sdk.network.reconnect_wait`).  Commands survive the loss of a socket.
-Nothing is final once the robot was connected: while its servers refuse it, commands end with the reason, and
-it goes on
-trying.
+`rse_pf.wire.client_session.ClientSession` holds the rules of the protocol and all commands; this module holds
+the WebSockets and decides when they are opened, used and closed.  A robot has one address (region) or
+several; for each region a task keeps one WebSocket open.
+
+States of a WebSocket (`RegionSocket`):
+
+    OPENING   The handshake is over and Hello is sent; no Welcome has arrived (``welcomed`` is not done).
+    STANDBY   Welcomed; it is pinged, and it carries no command.
+    CURRENT   Welcomed; new commands are sent on it (``session.current``).  At most one socket is CURRENT.
+    LEAVING   Another socket became CURRENT; answers to commands that were sent here still arrive here.
+    CLOSING   This robot began the close handshake (``is_closing``).
+    ENDED     The socket is gone (``has_ended``); its unanswered commands wait for the next CURRENT socket.
+
+Transitions:
+
+    1. Open: `_dial` opens a socket.  A Welcome within ``connect_timeout_s`` makes it STANDBY; without one it
+       is ENDED and the attempt has failed.
+    2. Adopt: `_adopt` makes a STANDBY socket CURRENT.  The session sends every unanswered command on it that
+       has no open socket, under its old id.  A socket that was CURRENT is LEAVING.
+    3. Drain: `flush` closes a LEAVING socket once all commands that were sent on it are answered.
+    4. Lose: a close, an error, silence or a missing pong makes a socket ENDED (`_discard_socket`).  If it was
+       CURRENT, the nearest STANDBY socket of another region is adopted at once (`_switch_to_standby`).
+    5. Reconnect: the task of each region (`_maintain_region`) dials again whenever its region has no socket,
+       after the pauses of `client_sdk.network.reconnect_wait`; `_adopt_if_disconnected` then adopts the
+       socket.
+    6. Move: when a server asks for it, `_move_to_other_server` opens a socket to another server of the same
+       region first, adopts it, and leaves the old one to drain (make before break).
+    7. Change of region: `_record_round_trip` adopts the socket of a region that has been nearer for long
+       enough; the earlier one drains and its region dials a new STANDBY socket.
+    8. Refusal: while every region refuses this robot, commands end with the reason (`_fail_refused_commands`)
+       and the regions go on dialling.
+    9. Close: `close` ends all tasks and sockets.  Only the program ends a robot that was connected once.
+
+Promises, and what keeps them:
+
+    - Every command is answered exactly once: ids live in the session, across sockets; a second answer to an
+      id is dropped there.
+    - A command that was not answered is sent again after a reconnect: steps 2 and 4.
+    - A planned change of server or region loses no command and interrupts none: steps 3, 6 and 7.
+    - A robot never gives up: steps 5 and 8.
 """
 
 from __future__ import annotations
@@ -14,27 +49,27 @@ import random as random_module
 import ssl
 import time
 from collections.abc import Callable, Coroutine, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from websockets.exceptions import ConnectionClosed
 
-from client_sdk.concurrency.user_callbacks import Callbacks
+from client_sdk.concurrency.tasks import cancel_tasks, wait_for_event
+from client_sdk.concurrency.user_callbacks import UserCallbacks
 from client_sdk.network.backoff import Backoff
 from client_sdk.network.connect_timings import ConnectTimings
-from client_sdk.network.dial_errors import CHECK_ADDRESS, CHECK_RUNNING, ISSUE, DialError
-from client_sdk.network.handshake import Dialler, Token
-from client_sdk.network.reconnect_wait import Pauses
-from client_sdk.network.region_choice import MAX_REGIONS, RegionChoice
-from client_sdk.network.region_sockets import Region, RegionSocket, cancel_all, either
-from rse_pf.errors import (
-    Conflict,
-    ConnectError,
-    ProtocolError,
-    RsePfError,
-    Unauthorized,
-    UnsupportedProtocol,
-    UsageError,
+from client_sdk.network.dial_errors import (
+    CHECK_ADDRESS,
+    CHECK_RUNNING,
+    DialError,
+    replaced_connection_error,
+    revoked_token_error,
 )
+from client_sdk.network.handshake import Dialler, Token
+from client_sdk.network.message_tap import MessageTap, NullMessageTap
+from client_sdk.network.reconnect_wait import ReconnectWait
+from client_sdk.network.region_choice import MAX_REGIONS, RegionChoice
+from client_sdk.network.region_sockets import Region, RegionSocket
+from rse_pf.errors import ConnectError, ProtocolError, RsePfError, UnsupportedProtocol, UsageError
 from rse_pf.wire.client_session import (
     Answered,
     ClientSession,
@@ -49,36 +84,48 @@ from rse_pf.wire.client_session import (
 from rse_pf.wire.client_subscriptions import SubscriptionEnded, Updated
 from rse_pf.wire.server_session import CLOSE_RATE, CLOSE_REPLACED, CLOSE_REVOKED, MAX_BAD_MESSAGES
 
-if TYPE_CHECKING:
-    from rse_pf.recording.robot_recorder import RobotRecorder
-
 __all__ = [
     "Connection",
-    "ForRobot",
     "OnChange",
+    "RobotEvent",
 ]
 
-ForRobot = Answered | Progressed | Updated | SubscriptionEnded
-"""What concerns a command or a subscription, and not a connection."""
+RobotEvent = Answered | Progressed | Updated | SubscriptionEnded
+"""An event of the session that concerns a command or a subscription, and not a single WebSocket."""
 
 OnChange = Callable[[str, str], None] | None
-"""Called with ``link-lost`` or ``refused`` and a reason, or with ``link-back``, ``moved`` or, for a further
-region, ``stands-by`` and the server's name."""
+"""Called with the name of a change of the connection and its detail.
 
-_FIRST_TRIES = 4
-_MIN_TICK_S = 0.001
-# How long the answers of other regions are waited for, in times of the first one, and at the most.
-_OTHERS_TIMES, _OTHERS_MAX_S = 1.0, 0.7
-# Within this time after a robot opened another connection, that one is what replaced the earlier one.
-_DOUBLE_S = 5.0
-# How long a server that was stopped may take to accept a connection attempt that was given up.
-_LATE_WELCOME_S = 60.0
-# Tokens have whole seconds: one that is signed so much later than a cut-off is issued after it.
-_LATER_SECOND_S = 1.0
+``link-lost`` and ``refused`` come with the reason, ``link-back`` and ``moved`` with the name of the server
+that is used now, ``stands-by`` with the name of a server of a further region that is connected and unused.
+"""
+
+FIRST_CONNECT_ATTEMPTS = 4
+"""Attempts of a robot's first connect before its error is raised; later reconnects have no limit."""
+MIN_TIMER_PAUSE_S = 0.001
+"""Shortest pause of the timer task, so that deadlines that are due at once do not make it spin."""
+OTHER_REGIONS_WAIT_RATIO = 1.0
+"""After the first region was measured, a first connect waits for the others by this multiple of the time that
+the first one took: a region that needs longer is not the nearest."""
+OTHER_REGIONS_MAX_WAIT_S = 0.7
+"""Longest wait for the other regions of a first connect once one of them can be used."""
+DUPLICATE_REGION_S = 5.0
+"""A server that closes a connection as replaced, this soon after the robot opened one in another region,
+shows that both addresses lead to one platform."""
+LATE_WELCOME_S = 60.0
+"""A stalled server may accept a connection attempt this long after the robot gave it up, which replaces the
+robot's newer connection; a replacement within this time is therefore not blamed on another program."""
+TOKEN_CLOCK_STEP_S = 1.0
+"""Times in tokens are whole seconds, so a token that is signed this much after a revocation is newer than
+it."""
 
 
 class Connection:
-    """Keep a `ClientSession` connected until it is closed."""
+    """Keep the `ClientSession` of one robot connected until `close`; the module text lists states and rules.
+
+    The counters `reconnects`, `moves`, `region_changes`, `bytes_in` and `bytes_out` (payload of WebSocket
+    messages) start at 0 and only grow.
+    """
 
     def __init__(
         self,
@@ -87,15 +134,32 @@ class Connection:
         token: Token,
         session: ClientSession,
         timings: ConnectTimings,
-        on_answer: Callable[[ForRobot], None],
+        on_event: Callable[[RobotEvent], None],
         clock: Callable[[], float],
         random: random_module.Random,
         wall_clock: Callable[[], float] = time.time,
         on_change: OnChange = None,
-        callbacks: Callbacks,
-        recorder: RobotRecorder | None = None,
+        callbacks: UserCallbacks,
+        tap: MessageTap | None = None,
     ) -> None:
-        self._recorder = recorder
+        """Connect to nothing yet.
+
+        Args:
+            urls: WebSocket address of each region, 1 to `MAX_REGIONS` different ones.
+            token: Text of the robot's token, an async function that returns one, or None.
+            session: Holds the commands and the rules of the protocol.
+            timings: Timeouts and longest pauses of attempts to connect.
+            on_event: Receives the events of commands and subscriptions, in the event loop.
+            clock: Monotonic seconds.
+            random: Source of the jitter of pauses.
+            wall_clock: Unix seconds; the clock by which *token* signs.
+            on_change: Function of the program that is notified when the connection changes.
+            callbacks: Calls *on_change* and *token*, and survives their exceptions.
+            tap: Observes every message, for a recording; None observes nothing.
+
+        Raises:
+            UsageError: An address is no WebSocket address or appears twice, or there are too many.
+        """
         self.reconnects = 0
         self.moves = 0
         self.region_changes = 0
@@ -103,45 +167,48 @@ class Connection:
         self.bytes_out = 0
         self.last_error = ""
         self.refusal: RsePfError | None = None
+        """Why all regions refuse this robot now; None while it is connected or may be accepted."""
+        self._tap = tap or NullMessageTap()
         self._session = session
         self._settings = session.settings
         self._timings = timings
         self.dialler = Dialler(
             token, codec=session.codec.name, settings=session.settings, timings=timings, callbacks=callbacks
         )
-        self._on_answer = on_answer
-        self._report_change, self._callbacks = on_change, callbacks
+        self._on_event = on_event
+        self._on_change = on_change
+        self._callbacks = callbacks
         self._clock = clock
-        self._pauses = Pauses(clock, wall_clock)
+        self._reconnect_wait = ReconnectWait(clock, wall_clock)
         self._sockets: list[RegionSocket] = []
         self._tasks: set[asyncio.Task[Any]] = set()
-        self._wake = asyncio.Event()
-        self._next_tick = 0.0
+        self._timer_changed = asyncio.Event()
+        self._next_timer_s = 0.0
         self._random = random
-        self._regions, self._choice = self._regions_of(urls)
+        self._regions, self._choice = self._make_regions(urls)
         self._last_region: Region | None = None
-        self._late_welcome_until = float("-inf")
+        self._late_welcome_until_s = float("-inf")
         self._main_tasks: list[asyncio.Task[None]] = []
-        self._closed = False
+        self._is_closed = False
 
-    def use(self, urls: Sequence[str], token: Token, ssl_context: ssl.SSLContext | None) -> None:
-        """Connect to *urls* from now on, trust what *ssl_context* trusts, and use *token*."""
-        self._regions, self._choice = self._regions_of(urls)
+    def set_access(self, urls: Sequence[str], token: Token, ssl_context: ssl.SSLContext | None) -> None:
+        """Replace addresses, token and TLS context before `open`; a context of None is the default one."""
+        self._regions, self._choice = self._make_regions(urls)
         self.dialler.token = token
         self.dialler.ssl_context = ssl_context
 
     @property
     def url(self) -> str:
-        """The address that is used now, or else the first one."""
+        """The address whose socket carries the commands, or the first one while none does."""
         return self._current_region().url
 
     @property
     def region(self) -> str:
-        """The same, as shown to users."""
-        return self._current_region().address
+        """The same address as `url`, without user name and password."""
+        return self._current_region().shown_url
 
     async def open(self, *, may_be_down: bool = False) -> None:
-        """Connect to a server, with a few attempts; a refusal ends this first connect.
+        """Connect for the first time, with at most four attempts, and start the tasks that keep connected.
 
         Args:
             may_be_down: Return after a first attempt that no server answered, and go on in the background.
@@ -151,441 +218,466 @@ class Connection:
             UnsupportedProtocol: Client and server share no sub-protocol.
             ConnectError: No server answers at the address.
         """
-        for attempt in range(1, _FIRST_TRIES + 1):
-            failures = await self._join_nearest()
-            best = self._choice.best(self._usable())
-            if best is not None:
-                self._adopt(self._usable()[best])
+        for attempt in range(1, FIRST_CONNECT_ATTEMPTS + 1):
+            failures = await self._join_nearest_region()
+            nearest = self._choice.nearest(self._usable_sockets())
+            if nearest is not None:
+                self._adopt(self._usable_sockets()[nearest])
                 break
-            failed = min(failures, key=self._is_hopeless)
-            if self._is_hopeless(failed):
-                raise failed.error from None
+            failure = min(failures, key=self._is_hopeless)
+            if self._is_hopeless(failure):
+                raise failure.error from None
             if may_be_down:
-                self._on_change("link-lost", failed.error.message)
+                self._notify_change("link-lost", failure.error.message)
                 break
-            if attempt == _FIRST_TRIES:
-                raise failed.error from None
-            await asyncio.sleep(self._pauses.pause_s(self._regions[0].backoff, failed))
-        self._pauses.open()
-        self._main_tasks = [self._spawn(self._tick()), *map(self._spawn, map(self._keep, self._regions))]
-        for socket in self._usable().values():
+            if attempt == FIRST_CONNECT_ATTEMPTS:
+                raise failure.error from None
+            await asyncio.sleep(self._reconnect_wait.pause_s(self._regions[0].backoff, failure))
+        self._reconnect_wait.start_watching_network()
+        region_tasks = [self._start_task(self._maintain_region(region)) for region in self._regions]
+        self._main_tasks = [self._start_task(self._run_timers()), *region_tasks]
+        for socket in self._usable_sockets().values():
             if socket.state is not self._session.current:
-                self._on_change("stands-by", socket.state.server)
+                self._notify_change("stands-by", socket.state.server)
 
     async def close(self) -> None:
-        """Close every socket and end every task."""
-        self._closed = True
-        self._pauses.close()
-        await cancel_all(self._main_tasks)
+        """End all tasks and close all sockets; unanswered commands stay in the session."""
+        self._is_closed = True
+        self._reconnect_wait.stop_watching_network()
+        await cancel_tasks(self._main_tasks)
         await asyncio.gather(*(self._close_socket(socket) for socket in list(self._sockets)))
-        await cancel_all(self._tasks)
+        await cancel_tasks(self._tasks)
 
     def flush(self) -> None:
-        """Send what the session has to send, and wake up earlier if a deadline came closer."""
+        """Let the sockets send the messages of the session, and close drained sockets.
+
+        Call it after every change of the session.  The timer task is woken if a deadline came closer.
+        """
         for socket in list(self._sockets):
             if socket.state.outgoing:
-                socket.dirty.set()
-            done = socket.state.leaving and not self._session.unanswered_on(socket.state)
-            if done and not socket.state.outgoing and not socket.is_closing:
-                self._spawn(self._close_socket(socket))
-        if self._session.next_due(self._clock()) < self._next_tick:
-            self._wake.set()
+                socket.has_outgoing.set()
+            is_drained = socket.state.leaving and not self._session.unanswered_on(socket.state)
+            if is_drained and not socket.state.outgoing and not socket.is_closing:
+                self._start_task(self._close_socket(socket))
+        if self._session.next_due(self._clock()) < self._next_timer_s:
+            self._timer_changed.set()
 
-    # --- several regions -------------------------------------------------------------------------
+    # --- Choice among several regions -----------------------------------------------------------
 
-    def _regions_of(self, urls: Sequence[str]) -> tuple[list[Region], RegionChoice]:
+    def _make_regions(self, urls: Sequence[str]) -> tuple[list[Region], RegionChoice]:
         if len(set(urls)) != len(urls) or not 0 < len(urls) <= MAX_REGIONS:
             raise UsageError(
-                f"{len(urls)} addresses, of which {len(set(urls))} differ",
-                hint=f"name 1 to {MAX_REGIONS} different addresses",
+                f"{len(urls)} addresses were given, of which {len(set(urls))} are different",
+                hint=f"give connect 1 to {MAX_REGIONS} different addresses",
             )
-        made = [Region(n, url, Backoff(self._timings, self._random)) for n, url in enumerate(urls)]
-        return made, RegionChoice(len(made), hold_s=self._timings.region_hold_s)
+        regions = [Region(n, url, Backoff(self._timings, self._random)) for n, url in enumerate(urls)]
+        return regions, RegionChoice(len(regions), hold_s=self._timings.region_hold_s)
 
     def _current_region(self) -> Region:
         current = self._session.current
-        held = (socket.region for socket in self._sockets if socket.state is current)
-        return next(held, self._regions[0])
+        regions = (socket.region for socket in self._sockets if socket.state is current)
+        return next(regions, self._regions[0])
 
-    def _is_hopeless(self, failed: DialError) -> bool:
-        """Return whether further attempts of a first connect are of no use."""
-        return failed.is_wrong_address or self._pauses.is_lasting(failed)
+    def _is_hopeless(self, failure: DialError) -> bool:
+        """Return whether another attempt of a first connect would fail in the same way."""
+        return failure.is_wrong_address or self._reconnect_wait.is_lasting_refusal(failure)
 
-    def _usable(self) -> dict[int, RegionSocket]:
-        """Return the sockets that may carry the commands, by the number of their region."""
-        usable = {region.number: region.usable for region in self._regions}
+    def _usable_sockets(self) -> dict[int, RegionSocket]:
+        """Return the STANDBY and CURRENT sockets by the number of their region."""
+        usable = {region.number: region.usable_socket for region in self._regions}
         return {number: socket for number, socket in usable.items() if socket is not None}
 
-    async def _join_nearest(self) -> list[DialError]:
-        """Dial every region until one is measured, and those that are not much later; return what failed."""
-        began = self._clock()
-        joining = [self._spawn(self._join(region)) for region in self._regions]
-        waiting = set(joining)
-        try:
-            while waiting and not self._usable():
-                _, waiting = await asyncio.wait(waiting, return_when=asyncio.FIRST_COMPLETED)
-            if waiting:
-                others_s = min(_OTHERS_MAX_S, _OTHERS_TIMES * (self._clock() - began))
-                _, waiting = await asyncio.wait(waiting, timeout=others_s)
-        except asyncio.CancelledError:
-            await cancel_all(joining)
-            raise
-        for region, task in zip(self._regions, joining, strict=True):
-            region.joining = task if task in waiting else None
-            region.failed = None if task in waiting else task.result()
-        ended = (task.result() for task in joining if task not in waiting)
-        lost = DialError(ConnectError(f"{self.region} closed at once", hint=CHECK_RUNNING))
-        return [failed for failed in ended if failed is not None] or [lost]
+    async def _join_nearest_region(self) -> list[DialError]:
+        """Dial all regions at once; return when the nearest is known, with the failures of the others.
 
-    async def _join(self, region: Region) -> DialError | None:
-        """Dial *region*, and measure it if there are others; return what failed."""
+        Attempts that still run are left to `Region.first_join`.  The list is never empty.
+        """
+        # 1. Dial every region, and wait until the first one can be used or all have failed.
+        began_s = self._clock()
+        joins = [self._start_task(self._join_region(region)) for region in self._regions]
+        running = set(joins)
+        try:
+            while running and not self._usable_sockets():
+                _, running = await asyncio.wait(running, return_when=asyncio.FIRST_COMPLETED)
+            # 2. Wait for the others, about as long again: one of them may be nearer.
+            if running:
+                elapsed_s = self._clock() - began_s
+                others_s = min(OTHER_REGIONS_MAX_WAIT_S, OTHER_REGIONS_WAIT_RATIO * elapsed_s)
+                _, running = await asyncio.wait(running, timeout=others_s)
+        except asyncio.CancelledError:
+            await cancel_tasks(joins)
+            raise
+        # 3. Keep what failed, and let what still runs go on in the background.
+        for region, task in zip(self._regions, joins, strict=True):
+            region.first_join = task if task in running else None
+            region.last_failure = None if task in running else task.result()
+        results = (task.result() for task in joins if task not in running)
+        failures = [failure for failure in results if failure is not None]
+        lost = DialError(ConnectError(f"{self.region} closed the connection at once", hint=CHECK_RUNNING))
+        return failures or [lost]
+
+    async def _join_region(self, region: Region) -> DialError | None:
+        """Dial *region*, and measure its round trip if the robot has several; return the failure, if any."""
         try:
             socket = await self._dial(region)
-        except DialError as failed:
-            return failed
+        except DialError as failure:
+            return failure
         if len(self._regions) > 1:
-            self._handle(socket, self._session.check(socket.state, self._clock()))
+            self._handle_events(socket, self._session.check(socket.state, self._clock()))
             self.flush()
-            await either(socket.measured, self._settings.ping_timeout_s)
-        self._hold(socket)
+            await wait_for_event(socket.has_round_trip, self._settings.ping_timeout_s)
+        self._hold_socket(socket)
         return None
 
-    def _hold(self, socket: RegionSocket) -> None:
-        """Keep *socket* for its region: it carries the commands, or stands by."""
+    def _hold_socket(self, socket: RegionSocket) -> None:
+        """Make a welcomed *socket* the one of its region, in the state STANDBY."""
         region = socket.region
-        if not socket.ended.is_set():
+        if not socket.has_ended.is_set():
             region.socket = socket
-            region.since = self._clock()
-            region.failed = None
-            region.is_double = False
+            region.connected_since_s = self._clock()
+            region.last_failure = None
+            region.is_duplicate = False
             if self._session.current is not None and self._main_tasks:
-                self._on_change("stands-by", socket.state.server)
+                self._notify_change("stands-by", socket.state.server)
 
-    def _measure(self, socket: RegionSocket) -> None:
-        """Take the last pong into account, and change to a region that has been better for long enough."""
+    def _record_round_trip(self, socket: RegionSocket) -> None:
+        """Count the last pong of *socket*, and adopt a region that has been nearer for long enough."""
         exchange = socket.state.last_exchange
-        if exchange is None or exchange is socket.exchange:
+        if exchange is None or exchange is socket.measured_exchange:
             return
-        socket.exchange = exchange
-        socket.measured.set()
-        # By the robot's clock alone: a server may say that all of the time was its own.
-        self._choice.measured(socket.region.number, exchange.returned_s - exchange.sent_s)
-        usable, current = self._usable(), self._current_region()
+        socket.measured_exchange = exchange
+        socket.has_round_trip.set()
+        # Measured by the robot's clock alone: a server could claim that all of the time was its own.
+        self._choice.add_round_trip(socket.region.number, exchange.returned_s - exchange.sent_s)
+        usable, current = self._usable_sockets(), self._current_region()
         if len(self._regions) > 1 and current.number in usable:
-            better = self._choice.better(current.number, usable, self._clock())
-            if better is not None:
-                self._adopt(usable[better])
-                self._on_change("moved", usable[better].state.server)
+            nearer = self._choice.find_nearer_region(current.number, usable, self._clock())
+            if nearer is not None:
+                self._adopt(usable[nearer])
+                self._notify_change("moved", usable[nearer].state.server)
 
-    def _use_standby(self) -> None:
-        """Continue in the best region that stands by, if there is one."""
-        usable = self._usable()
-        best = self._choice.best(usable)
-        if best is not None and self._main_tasks:
-            self._choice.changed()
-            self._take_socket(usable[best])
+    def _switch_to_standby(self) -> None:
+        """Adopt the nearest STANDBY socket, if there is one, after the CURRENT socket was lost."""
+        usable = self._usable_sockets()
+        nearest = self._choice.nearest(usable)
+        if nearest is not None and self._main_tasks:
+            self._choice.restart_comparison()
+            self._adopt_after_loss(usable[nearest])
 
-    # --- the main tasks -------------------------------------------------------------------------
+    # --- Tasks that run from open to close ------------------------------------------------------
 
-    async def _tick(self) -> None:
-        """Call the session when something is due."""
-        while not self._closed:
-            now = self._clock()
-            self._handle(None, self._session.due(now))
+    async def _run_timers(self) -> None:
+        """Call the session whenever a deadline, a ping or a retry is due."""
+        while not self._is_closed:
+            now_s = self._clock()
+            self._handle_events(None, self._session.due(now_s))
             for socket in list(self._sockets):
-                self._handle(socket, self._session.check(socket.state, now))
-            self._next_tick = self._session.next_due(now)
+                self._handle_events(socket, self._session.check(socket.state, now_s))
+            self._next_timer_s = self._session.next_due(now_s)
             self.flush()
-            pause_s = max(_MIN_TICK_S, self._next_tick - self._clock())
-            await either(self._wake, pause_s)
-            self._wake.clear()
+            pause_s = max(MIN_TIMER_PAUSE_S, self._next_timer_s - self._clock())
+            await wait_for_event(self._timer_changed, pause_s)
+            self._timer_changed.clear()
 
-    async def _keep(self, region: Region) -> None:
-        """Reconnect to *region* when there is no socket, and move when a server asks for it."""
-        if region.joining is not None:
-            region.failed = await region.joining
-            self._resume(region)
-        while not self._closed:
-            if region.socket is None and not (region.is_double and self._usable()):
+    async def _maintain_region(self, region: Region) -> None:
+        """Reconnect *region* when it has no socket, and move when its server asks for it."""
+        if region.first_join is not None:
+            region.last_failure = await region.first_join
+            self._adopt_if_disconnected(region)
+        while not self._is_closed:
+            is_needed = not (region.is_duplicate and self._usable_sockets())
+            if region.socket is None and is_needed:
                 await self._reconnect(region)
             elif region.move_request is not None:
-                await self._move(region, *region.move_request)
+                await self._move_to_other_server(region, *region.move_request)
                 region.move_request = None
             else:
-                region.changed.clear()
-                await region.changed.wait()
+                region.has_changed.clear()
+                await region.has_changed.wait()
 
     async def _reconnect(self, region: Region) -> None:
-        """Connect to *region*, with pauses, until a server sends Welcome."""
-        if self._clock() - region.since > self._timings.reconnect_max_s:
-            region.backoff.restart()
-        began = self._clock()
-        offset_s = self._pauses.offset_s()
+        """Dial *region*, with a pause before each attempt, until a server sends Welcome."""
+        if self._clock() - region.connected_since_s > self._timings.reconnect_max_s:
+            region.backoff.reset()
+        began_s = self._clock()
+        clock_offset_s = self._reconnect_wait.clock_offset_s()
         while True:
-            failed = region.failed
-            pause_s = self._pauses.pause_s(region.backoff, failed, spent_s=self._clock() - began)
-            await self._pauses.wait(pause_s, failed, offset_s)
-            began = self._clock()
-            offset_s = self._pauses.offset_s()
-            region.failed = await self._join(region)
-            if region.failed is None:
-                self._resume(region)
+            # 1. Pause, as the last failure demands.
+            failure = region.last_failure
+            spent_s = self._clock() - began_s
+            pause_s = self._reconnect_wait.pause_s(region.backoff, failure, spent_s=spent_s)
+            await self._reconnect_wait.wait(pause_s, failure, clock_offset_s)
+            # 2. Dial.
+            began_s = self._clock()
+            clock_offset_s = self._reconnect_wait.clock_offset_s()
+            region.last_failure = await self._join_region(region)
+            # 3. Continue the commands on the new socket, or end them if every region refuses the robot.
+            if region.last_failure is None:
+                self._adopt_if_disconnected(region)
                 return
-            self._note_refusal()
+            self._fail_refused_commands()
 
-    def _note_refusal(self) -> None:
-        """End the commands with the reason if every region refuses this robot; it goes on trying."""
-        if not all(self._pauses.is_lasting(region.failed) for region in self._regions):
+    def _fail_refused_commands(self) -> None:
+        """End all commands with the reason if every region refuses this robot; dialling goes on."""
+        if not all(self._reconnect_wait.is_lasting_refusal(region.last_failure) for region in self._regions):
             return
-        failed = self._regions[0].failed
-        assert failed is not None
-        error, before = failed.error, self.refusal
+        failure = self._regions[0].last_failure
+        assert failure is not None
+        error, earlier = failure.error, self.refusal
         self.refusal = error
         self.last_error = error.message
-        self._handle(None, self._session.end_commands(error.code, error.message, error.hint))
-        if before is None or (before.code, before.hint) != (error.code, error.hint):
-            self._on_change("refused", error.message)
+        self._handle_events(None, self._session.end_commands(error.code, error.message, error.hint))
+        if earlier is None or (earlier.code, earlier.hint) != (error.code, error.hint):
+            self._notify_change("refused", error.message)
 
-    def _resume(self, region: Region) -> None:
-        """Send the commands to *region* if no other one carries them."""
+    def _adopt_if_disconnected(self, region: Region) -> None:
+        """Adopt the socket of *region* if no other socket carries the commands."""
         if region.socket is not None and self._session.current is None:
-            self._take_socket(region.socket)
+            self._adopt_after_loss(region.socket)
 
-    def _take_socket(self, socket: RegionSocket) -> None:
+    def _adopt_after_loss(self, socket: RegionSocket) -> None:
         self.reconnects += 1
         self._adopt(socket)
-        self._on_change("link-back", socket.state.server)
+        self._notify_change("link-back", socket.state.server)
 
-    async def _move(self, region: Region, old: RegionSocket, until: float) -> None:
-        """Make before break: leave *old* once another server of its region has sent Welcome."""
-        region.backoff.restart()
-        while self._session.current is old.state and self._clock() < until:
-            failed: DialError | None = None
+    async def _move_to_other_server(self, region: Region, old: RegionSocket, until_s: float) -> None:
+        """Replace *old* by a socket to another server of its region, until *until_s* of the monotonic clock.
+
+        The load balancer may choose the same server again; the attempt is then repeated after a pause.
+        """
+        region.backoff.reset()
+        while self._session.current is old.state and self._clock() < until_s:
+            failure: DialError | None = None
             try:
                 fresh = await self._dial(region)
             except DialError as error:
-                failed = error
+                failure = error
             else:
-                if self._session.current is not old.state:
-                    self._hold(fresh)
-                    self._resume(region)
+                if self._session.current is not old.state:  # the old socket was lost meanwhile
+                    self._hold_socket(fresh)
+                    self._adopt_if_disconnected(region)
                     return
                 if fresh.state.server != old.state.server:
                     self.moves += 1
                     region.socket = fresh
                     self._adopt(fresh)
-                    self._on_change("moved", fresh.state.server)
+                    self._notify_change("moved", fresh.state.server)
                     return
-                self._spawn(self._close_socket(fresh))
-            pause_s = self._pauses.pause_s(region.backoff, failed, is_move=True)
-            await either(old.ended, min(pause_s, max(0.0, until - self._clock())))
+                self._start_task(self._close_socket(fresh))
+            pause_s = self._reconnect_wait.pause_s(region.backoff, failure, is_move=True)
+            await wait_for_event(old.has_ended, min(pause_s, max(0.0, until_s - self._clock())))
 
-    # --- one socket ------------------------------------------------------------------------------
+    # --- One WebSocket, from its handshake to its end -------------------------------------------
 
     async def _dial(self, region: Region) -> RegionSocket:
-        """Open a socket through the load balancer and wait for the Welcome; raises DialError."""
+        """Return a new socket to *region* after its Welcome; raises DialError."""
+        # 1. Open the WebSocket with the robot's token.
         try:
             websocket, token = await self.dialler.open(
-                region.url, lambda: region.backoff.dialled(self._clock())
+                region.url, lambda: region.backoff.count_attempt(self._clock())
             )
-        except DialError as failed:
-            self.last_error = failed.error.message
-            if failed.is_late:
-                self._late_welcome_until = self._clock() + _LATE_WELCOME_S
+        except DialError as failure:
+            self.last_error = failure.error.message
+            if failure.may_be_accepted_late:
+                self._late_welcome_until_s = self._clock() + LATE_WELCOME_S
             raise
+        # 2. Start to read and write it; the first message is Hello.
         socket = RegionSocket(region, websocket, self._session.open_connection(self._clock()))
         self._sockets.append(socket)
-        if self._recorder is not None:
-            socket.recorded = self._recorder.opened(self._session.codec, token)
-        socket.tasks = [self._spawn(self._read(socket)), self._spawn(self._write(socket))]
-        socket.dirty.set()
+        socket.tap_number = self._tap.open_connection(self._session.codec, token)
+        socket.tasks = [
+            self._start_task(self._read_messages(socket)),
+            self._start_task(self._write_messages(socket)),
+        ]
+        socket.has_outgoing.set()
+        # 3. Wait for the Welcome.
         try:
-            done, _ = await asyncio.wait({socket.welcome}, timeout=self._timings.connect_timeout_s)
+            done, _ = await asyncio.wait({socket.welcomed}, timeout=self._timings.connect_timeout_s)
             if not done:
-                raise DialError(ConnectError(f"{region.address} sends no Welcome", hint=CHECK_ADDRESS))
-            socket.welcome.result()
+                error = ConnectError(f"{region.shown_url} sends no Welcome message", hint=CHECK_ADDRESS)
+                raise DialError(error)
+            socket.welcomed.result()
         except BaseException:
-            self._late_welcome_until = self._clock() + _LATE_WELCOME_S
-            self._abort(socket)
+            self._late_welcome_until_s = self._clock() + LATE_WELCOME_S
+            self._abort_socket(socket)
             raise
         return socket
 
-    async def _renew(self, socket: RegionSocket) -> None:
-        """Send a fresh token on a live socket; without one, the robot reconnects when the socket expires."""
+    async def _renew_token(self, socket: RegionSocket) -> None:
+        """Send a fresh token on *socket*; without one the server will close it, and the robot reconnects."""
         try:
             token = await self.dialler.read_token()
-        except DialError as failed:
-            self.last_error = failed.error.message
+        except DialError as failure:
+            self.last_error = failure.error.message
             return
-        if token and not socket.ended.is_set() and not socket.is_closing:
+        if token and not socket.has_ended.is_set() and not socket.is_closing:
             self._session.renew(socket.state, token)
             self.flush()
 
-    async def _read(self, socket: RegionSocket) -> None:
+    async def _read_messages(self, socket: RegionSocket) -> None:
         try:
             while True:
                 data = await socket.websocket.recv(decode=False)
                 self.bytes_in += len(data)
-                if self._recorder is not None:
-                    self._recorder.said(socket.recorded, "down", data)
+                self._tap.observe_message(socket.tap_number, "down", data)
                 self._receive(socket, data)
         except (ConnectionClosed, OSError):
             code = socket.websocket.close_code
+            is_held = socket.region.socket is socket
             if code == CLOSE_RATE:
-                self.last_error = "the server closed the connection: this robot exceeds its rate"
-            elif socket.region.socket is socket and code == CLOSE_REVOKED:
-                socket.region.failed = self._cut_off_error()
-            elif socket.region.socket is socket and code == CLOSE_REPLACED:
-                socket.region.failed = self._replaced_error(socket)
+                self.last_error = "the server closed the connection: this robot exceeds its rate limit"
+            elif is_held and code == CLOSE_REVOKED:
+                is_fresh = callable(self.dialler.token)
+                valid_from_s = self._reconnect_wait.wall_clock() + TOKEN_CLOCK_STEP_S if is_fresh else None
+                socket.region.last_failure = revoked_token_error(valid_from_s)
+            elif is_held and code == CLOSE_REPLACED and self._is_replaced_by_another_program(socket):
+                socket.region.last_failure = replaced_connection_error()
+            elif is_held and code == CLOSE_REPLACED:
+                socket.region.last_failure = None
         finally:
-            self._forget(socket)
+            self._discard_socket(socket)
 
-    def _cut_off_error(self) -> DialError:
-        """Return what a cut-off means: a token of a later second may be accepted, the same one never."""
-        is_fresh = callable(self.dialler.token)
-        valid_from_s = self._pauses.wall_clock() + _LATER_SECOND_S if is_fresh else None
-        error = Unauthorized("the token was revoked, or the robot was disabled", hint=ISSUE)
-        return DialError(error, is_refusal=True, valid_from_s=valid_from_s)
+    def _is_replaced_by_another_program(self, socket: RegionSocket) -> bool:
+        """Return whether no newer connection of this robot itself explains that *socket* was replaced."""
+        is_own = self._detect_duplicate_region(socket) or socket.region.move_request is not None
+        is_late_welcome = self._clock() < self._late_welcome_until_s
+        return not is_own and not is_late_welcome and self._session.current is socket.state
 
-    def _replaced_error(self, socket: RegionSocket) -> DialError | None:
-        """Return the conflict with another program, None if this robot itself opened the newer connection."""
-        is_double = self._is_double(socket)
-        is_moving = socket.region.move_request is not None
-        by_itself = is_double or is_moving or self._clock() < self._late_welcome_until
-        if by_itself or self._session.current is not socket.state:
-            return None
-        message = "another connection of this robot replaced this one"
-        return DialError(Conflict(message, hint="give every robot a token of its own"), is_refusal=True)
+    def _detect_duplicate_region(self, socket: RegionSocket) -> bool:
+        """Mark the region of *socket* if another region of this robot leads to the same platform.
 
-    def _is_double(self, socket: RegionSocket) -> bool:
-        """Note if two addresses lead to one platform, which keeps the newest connection of a robot only."""
-        since = max(socket.state.opened, self._clock() - _DOUBLE_S)
-        others = (
-            region_socket for region_socket in self._sockets if region_socket.region is not socket.region
-        )
-        if any(other.state.opened >= since for other in others):
-            socket.region.is_double = True
-        return socket.region.is_double
+        A platform keeps the newest connection of a robot only.  So the mark is set if a socket of another
+        region was opened after *socket* and within the last `DUPLICATE_REGION_S`.
+        """
+        region = socket.region
+        since_s = max(socket.state.opened, self._clock() - DUPLICATE_REGION_S)
+        if any(other.state.opened >= since_s for other in self._sockets if other.region is not region):
+            region.is_duplicate = True
+        return region.is_duplicate
 
     def _receive(self, socket: RegionSocket, data: bytes) -> None:
         try:
             events = self._session.receive(socket.state, data, self._clock())
         except ProtocolError as error:
             self.last_error = error.message
-            socket.bad_messages += 1
-            if socket.bad_messages > MAX_BAD_MESSAGES:
-                self._abort(socket)
+            socket.malformed_messages += 1
+            if socket.malformed_messages > MAX_BAD_MESSAGES:
+                self._abort_socket(socket)
             return
-        self._handle(socket, events)
-        self._measure(socket)
+        self._handle_events(socket, events)
+        self._record_round_trip(socket)
         self.flush()
 
-    async def _write(self, socket: RegionSocket) -> None:
+    async def _write_messages(self, socket: RegionSocket) -> None:
         is_text = self._session.codec.is_text
         try:
             while True:
-                await socket.dirty.wait()
-                socket.dirty.clear()
+                await socket.has_outgoing.wait()
+                socket.has_outgoing.clear()
                 while socket.state.outgoing:
                     data = socket.state.outgoing.pop(0)
                     self.bytes_out += len(data)
-                    if self._recorder is not None:
-                        self._recorder.said(socket.recorded, "up", data)
+                    self._tap.observe_message(socket.tap_number, "up", data)
                     await socket.websocket.send(data, text=is_text)
         except (ConnectionClosed, OSError):
-            return  # the reader handles the end, after the data that still arrived
+            return  # the reading task handles the end, after the messages that still arrived
 
-    def _handle(self, socket: RegionSocket | None, events: list[Event]) -> None:
+    def _handle_events(self, socket: RegionSocket | None, events: list[Event]) -> None:
         for event in events:
-            if isinstance(event, ForRobot):
-                self._on_answer(event)
+            if isinstance(event, RobotEvent):
+                self._on_event(event)
             elif socket is not None:
                 self._handle_socket_event(socket, event)
 
     def _handle_socket_event(self, socket: RegionSocket, event: Event) -> None:
+        region = socket.region
         match event:
-            case Welcomed() if not socket.welcome.done():
-                socket.welcome.set_result(None)
+            case Welcomed() if not socket.welcomed.done():
+                socket.welcomed.set_result(None)
             case ConnectionLost():
                 self.last_error = f"connection lost: {event.reason}"
                 if not socket.state.leaving and self._session.current is None:
-                    self._on_change("link-lost", event.reason)
-                self._abort(socket)
+                    self._notify_change("link-lost", event.reason)
+                self._abort_socket(socket)
             case RenewalDue() if callable(self.dialler.token):
-                self._spawn(self._renew(socket))
+                self._start_task(self._renew_token(socket))
             case Notice():
                 failure = event.failure
                 self.last_error = failure.message
-                if not socket.welcome.done():
+                if not socket.welcomed.done():
                     error = UnsupportedProtocol(failure.message, hint=failure.hint)
-                    socket.welcome.set_exception(DialError(error, is_refusal=failure.code == error.code))
+                    is_refusal = failure.code == error.code
+                    socket.welcomed.set_exception(DialError(error, is_refusal=is_refusal))
             case MoveRequested() if socket.state is self._session.current:
-                if socket.region.move_request is None:
-                    socket.region.move_request = (socket, self._clock() + event.within_s)
-                    socket.region.changed.set()
+                if region.move_request is None:
+                    region.move_request = (socket, self._clock() + event.within_s)
+                    region.has_changed.set()
             case MoveRequested() if len(self._regions) > 1 and not socket.state.leaving:
-                self._spawn(self._close_socket(socket))  # it stands by: nothing is lost
+                self._start_task(self._close_socket(socket))  # a STANDBY socket carries no command
 
     def _adopt(self, socket: RegionSocket) -> None:
-        now = self._clock()
-        if socket.ended.is_set():
+        """Make *socket* CURRENT, and send the waiting commands on it; does nothing if it has ended."""
+        now_s = self._clock()
+        if socket.has_ended.is_set():
             return
         self.refusal = None
         self.region_changes += self._last_region not in (None, socket.region)
         self._last_region = socket.region
-        self._handle(socket, self._session.adopt(socket.state, now))
-        self._handle(socket, self._session.check(socket.state, now))
+        self._handle_events(socket, self._session.adopt(socket.state, now_s))
+        self._handle_events(socket, self._session.check(socket.state, now_s))
         self.flush()
 
-    def _abort(self, socket: RegionSocket) -> None:
+    def _abort_socket(self, socket: RegionSocket) -> None:
+        """End *socket* without a close handshake: its server is silent or breaks the protocol."""
         socket.websocket.transport.abort()
-        self._forget(socket)
+        self._discard_socket(socket)
 
     async def _close_socket(self, socket: RegionSocket) -> None:
         socket.is_closing = True
         await socket.websocket.close()
-        self._forget(socket)
+        self._discard_socket(socket)
 
-    def _forget(self, socket: RegionSocket) -> None:
-        """Keep the socket's commands for the next one, and wake up the task that reconnects."""
-        if socket.ended.is_set():
+    def _discard_socket(self, socket: RegionSocket) -> None:
+        """Make *socket* ENDED: its commands wait in the session, and its region dials again."""
+        if socket.has_ended.is_set():
             return
-        socket.ended.set()
+        # 1. Forget the socket; the session keeps its unanswered commands.
+        socket.has_ended.set()
         self._sockets.remove(socket)
-        if self._recorder is not None:
-            self._recorder.closed(socket.recorded)
-        if self._session.current is socket.state and not self._closed:
-            self._on_change("link-lost", "closed")
+        self._tap.close_connection(socket.tap_number)
+        if self._session.current is socket.state and not self._is_closed:
+            self._notify_change("link-lost", "closed")
         self._session.close_connection(socket.state)
+        # 2. End its tasks and whoever waits for its Welcome or its first pong.
         for task in socket.tasks:
             if task is not asyncio.current_task():
                 task.cancel()
-        if not socket.welcome.done():
-            error = ConnectError(f"{socket.region.address} closed without a Welcome", hint=CHECK_RUNNING)
-            socket.welcome.set_exception(DialError(error))
-            socket.welcome.exception()
-        socket.measured.set()
-        self._release(socket)
-        self._wake.set()
-
-    def _release(self, socket: RegionSocket) -> None:
-        """Take an ended socket from its region, and continue in another region that stands by."""
+        if not socket.welcomed.done():
+            shown_url = socket.region.shown_url
+            error = ConnectError(f"{shown_url} closed without a Welcome message", hint=CHECK_RUNNING)
+            socket.welcomed.set_exception(DialError(error))
+            socket.welcomed.exception()  # marks it as retrieved: perhaps nobody waits for it
+        socket.has_round_trip.set()
+        # 3. Take it from its region.
         region = socket.region
         if region.socket is socket:
             region.socket = None
             if not socket.is_closing:
-                self._choice.lost(region.number, self._clock())
-        if self._session.current is None and not self._closed:
-            self._use_standby()
-            self._note_refusal()
-        for known in self._regions:
-            known.changed.set()
+                self._choice.add_loss(region.number, self._clock())
+        # 4. Continue in another region, and wake up the tasks that reconnect.
+        if self._session.current is None and not self._is_closed:
+            self._switch_to_standby()
+            self._fail_refused_commands()
+        for any_region in self._regions:
+            any_region.has_changed.set()
+        self._timer_changed.set()
 
-    def _on_change(self, change: str, why: str) -> None:
-        if self._report_change is not None:
-            self._callbacks.notify("on_change", self._report_change, change, why)
+    def _notify_change(self, change: str, detail: str) -> None:
+        if self._on_change is not None:
+            self._callbacks.notify("on_change", self._on_change, change, detail)
 
-    def _spawn(self, work: Coroutine[Any, Any, Any]) -> asyncio.Task[Any]:
+    def _start_task(self, work: Coroutine[Any, Any, Any]) -> asyncio.Task[Any]:
+        """Run *work* as a task that is referenced until it ends, and that `close` cancels."""
         task = asyncio.get_running_loop().create_task(work)
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)

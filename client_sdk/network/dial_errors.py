@@ -1,8 +1,9 @@
-"""What a failed attempt to connect means for the next one, and how an address is shown.
+"""Turn a failed attempt to connect into a `DialError`: the cause for the user, what to do for the robot.
 
-Nothing here opens a socket.  `foreign_answers` names the cause if somebody else than our servers answered.
-Only a refusal with the mark of our servers concerns the robot itself: it may last, so it is reported, and
-the robot tries again much later.  Nothing ends a robot for good.
+Nothing here opens a socket.  `client_sdk.network.peer_diagnosis` explains answers of machines that are no
+RSE-PF servers.  A 401 or 403 concerns the robot itself only if its body carries the mark of an RSE-PF server
+(`rse_pf.wire.refusal`): it is then a refusal, which is reported, and the robot tries again after a long
+pause.
 """
 
 from __future__ import annotations
@@ -20,171 +21,212 @@ from client_sdk.network.peer_diagnosis import (
     explain_bytes,
     explain_certificate,
     explain_silence,
-    is_of_tls_server,
+    is_tls_server_answer,
     parse_answer,
 )
-from client_sdk.network.peer_probe import Probed
-from rse_pf.errors import ConnectError, Forbidden, RsePfError, Unauthorized, UsageError
+from client_sdk.network.peer_probe import PeerProbe
+from rse_pf.errors import Conflict, ConnectError, Forbidden, RsePfError, Unauthorized, UsageError
 from rse_pf.wire.refusal import CUT_OFF, RefusedHandshake, refusal_in
 
 __all__ = [
     "CHECK_ADDRESS",
     "CHECK_RUNNING",
-    "ISSUE",
     "DialError",
-    "dial_error_of",
-    "explain_unconnected",
+    "explain_tcp_failure",
     "hide_password",
+    "http_status_error",
+    "no_answer_error",
+    "replaced_connection_error",
+    "revoked_token_error",
     "show_wrong_url",
     "split_address",
-    "unconnected_error",
-    "unreachable",
-    "untrusted_error",
+    "tcp_error",
+    "untrusted_certificate_error",
 ]
 
-CHECK_RUNNING = "is the platform running? start it with rse-pf local start"
-CHECK_ADDRESS = "check host, port and path of the URL: another kind of WebSocket server answers there"
-ISSUE = (
+CHECK_RUNNING = "start the platform by rse-pf local start, or check host and port of the URL"
+"""Hint for an address where no program listens, or where the platform closes connections at once."""
+CHECK_ADDRESS = "check host, port and path of the URL: a WebSocket server of another program answers there"
+"""Hint for an address where a WebSocket server does not speak the protocol of RSE-PF."""
+RENEWAL_HINT = (
     "a token of rse-pf token issue is valid for 15 minutes: issue another one, or give the robot a key by "
     "rse-pf robot enrol; if it has one, rse-pf robot list shows whether it was disabled or has a newer key"
 )
-_MAX_RETRY_AFTER_S = 300.0
-_WRONG_ADDRESS = (400, 404, 405, 407, 410, 426)
-"""Statuses that come again until somebody changes the URL, the proxy, or a program at the address."""
-_ANSWERED = (errno.ECONNREFUSED, errno.ECONNRESET, errno.ECONNABORTED)
-_FOR_ANY_TOKEN = ("disabled", CUT_OFF, "not-yet-valid")
+"""Hint for a token that is expired, revoked or wrong."""
+MAX_RETRY_AFTER_S = 300.0
+"""Longest wait that a robot accepts from the header Retry-After, so that a wrong answer cannot keep it
+away."""
+WRONG_ADDRESS_STATUSES = (400, 404, 405, 407, 410, 426)
+"""HTTP statuses that every attempt gets until somebody changes the URL, the proxy, or the program there."""
+ANSWERED_ERRNOS = (errno.ECONNREFUSED, errno.ECONNRESET, errno.ECONNABORTED)
+"""Errors of a TCP connection that a machine at the address caused: it is there, and answered."""
+CAUSES_FOR_ANY_TOKEN = ("disabled", CUT_OFF, "not-yet-valid")
+"""Causes in a refusal that a token signed now would meet as well, so that no second one is tried."""
 
 
 class DialError(Exception):
-    """A failed connection attempt: its error, and what it means for the next one.
+    """A failed attempt to connect, with what it means for the next attempt.
 
-    ``is_refusal`` means that a server refused this robot and may do so for long, ``is_wrong_address`` that
-    the URL is probably wrong, ``is_unanswered`` that nobody accepted the TCP connection or nothing left this
-    machine, ``is_late`` that a server may still accept it, and ``valid_from_s`` the Unix time from which
-    tokens are accepted.  ``refuses_any`` means that another token, signed now, would be refused as well.
+    Attributes:
+        error: The typed error for the user.
+        retry_after_s: How long the server asked the robot to wait; 0 if it asked for nothing.
+        is_wrong_address: Whether the URL, a proxy or a program at the address has to change first.
+        is_refusal: Whether an RSE-PF server refused this robot, perhaps for a long time.
+        is_unanswered: Whether nobody accepted the TCP connection, or no packet left this machine.
+        may_be_accepted_late: Whether a stalled server may still accept this attempt.
+        refuses_any_token: Whether another token, signed now, would be refused as well.
+        valid_from_s: Unix time from which new tokens are accepted, None if unknown.
     """
 
     def __init__(
         self,
         error: RsePfError,
         *,
-        after_s: float = 0.0,
+        retry_after_s: float = 0.0,
         is_wrong_address: bool = False,
         is_refusal: bool = False,
         is_unanswered: bool = False,
-        is_late: bool = False,
+        may_be_accepted_late: bool = False,
         cause: str = "",
         valid_from_s: float | None = None,
     ) -> None:
+        """Describe the failure; *cause* is the cause that a refusal names, empty if it names none."""
         super().__init__(error.message)
         self.error = error
-        self.after_s = after_s
+        self.retry_after_s = retry_after_s
         self.is_wrong_address = is_wrong_address
         self.is_refusal = is_refusal
         self.is_unanswered = is_unanswered
-        self.is_late = is_late
-        self.refuses_any = cause in _FOR_ANY_TOKEN
+        self.may_be_accepted_late = may_be_accepted_late
+        self.refuses_any_token = cause in CAUSES_FOR_ANY_TOKEN
         self.valid_from_s = valid_from_s
 
 
-def unconnected_error(address: str, error: OSError) -> DialError:
-    """Return the error of an attempt without a TCP connection to *address*."""
-    is_answered = error.errno in _ANSWERED
-    return DialError(explain_unconnected(address, error), is_unanswered=not is_answered)
+def tcp_error(address: str, error: OSError) -> DialError:
+    """Return the error of an attempt that got no TCP connection to *address*."""
+    is_answered = error.errno in ANSWERED_ERRNOS
+    return DialError(explain_tcp_failure(address, error), is_unanswered=not is_answered)
 
 
-def explain_unconnected(address: str, error: OSError) -> ConnectError:
-    """Return what it means that there is no TCP connection to *address*."""
+def explain_tcp_failure(address: str, error: OSError) -> ConnectError:
+    """Return the typed error, with a hint, for a TCP connection to *address* that failed with *error*."""
     cause, parts = error.strerror or str(error) or type(error).__name__, urlsplit(address)
     hint = CHECK_RUNNING
     if isinstance(error, socket.gaierror):
         cause = f"the name {parts.hostname} does not resolve: {cause}"
         hint = "check the host in the URL, and the name server (DNS) of this network"
-    elif error.errno in _ANSWERED:
-        cause = os.strerror(error.errno)  # asyncio writes a tuple of the address instead
+    elif error.errno in ANSWERED_ERRNOS:
+        cause = os.strerror(error.errno)  # asyncio puts the address into the text of the error
     else:
         hint = f"check the network of this robot, and that firewalls let it reach {parts.netloc}"
     return ConnectError(f"cannot connect to {address}: {cause}", hint=hint)
 
 
-def unreachable(
+def no_answer_error(
     address: str,
     error: Exception,
     *,
     first_bytes: bytes = b"",
-    probed: Probed | None = None,
+    probe: PeerProbe | None = None,
     within_s: float | None = None,
 ) -> DialError:
-    """Return the error of an attempt that was connected and got no HTTP/1.1 answer from *address*.
+    """Return the error of an attempt that had a TCP connection and got no HTTP/1.1 answer from *address*.
 
     Args:
         address: The URL as shown to users.
-        error: Of the attempt.
-        first_bytes: That the peer sent, and that are no HTTP/1.1.
-        probed: What the peer shows when it is asked again; None if it was not.
-        within_s: How long the attempt waited for the answer, None if that is unknown.
+        error: What ended the attempt.
+        first_bytes: What the peer sent instead of HTTP/1.1; empty if it sent nothing.
+        probe: Result of a second connection without a token; None if there was none.
+        within_s: How many seconds the attempt waited for the answer, None if unknown.
     """
     if first_bytes:
-        is_wrong = parse_answer(first_bytes) is None
-        return DialError(explain_bytes(address, first_bytes), is_late=True, is_wrong_address=is_wrong)
-    known = probed or Probed()
-    explained = explain_silence(
-        address, error, certificate=known.certificate, data=known.data, within_s=within_s
-    )
-    has_other = bool(known.data) and not is_of_tls_server(known.data)
-    is_wrong = known.certificate is not None if address.startswith("ws:") else has_other
-    return DialError(explained, is_late=True, is_wrong_address=is_wrong)
+        is_wrong_address = parse_answer(first_bytes) is None
+        explained = explain_bytes(address, first_bytes)
+    else:
+        peer = probe or PeerProbe()
+        explained = explain_silence(
+            address, error, certificate=peer.certificate, data=peer.data, within_s=within_s
+        )
+        if address.startswith("ws:"):
+            is_wrong_address = peer.certificate is not None
+        else:
+            is_wrong_address = bool(peer.data) and not is_tls_server_answer(peer.data)
+    return DialError(explained, may_be_accepted_late=True, is_wrong_address=is_wrong_address)
 
 
-def untrusted_error(
+def untrusted_certificate_error(
     address: str, error: ssl.SSLCertVerificationError, *, issuer: str = "", is_enrolled: bool = False
 ) -> DialError:
-    """Return the error of a server whose certificate this robot does not trust, or not now.
+    """Return the error of a TLS certificate that this robot does not trust.
 
-    A later attempt may succeed: in some networks another machine answers first, and clocks are set.
+    Args:
+        address: The URL as shown to users.
+        error: Of the TLS handshake.
+        issuer: Name of the authority that signed the certificate, empty if unknown.
+        is_enrolled: Whether the robot trusts the authority in its enrolment file and no other.
     """
     explained = explain_certificate(address, error, issuer=issuer, is_enrolled=is_enrolled)
     return DialError(explained, is_wrong_address=True)
 
 
-def dial_error_of(address: str, status: int, headers: Mapping[str, str], body: bytes = b"") -> DialError:
-    """Return the error of an HTTP *status* that came instead of a WebSocket.
+def http_status_error(address: str, status: int, headers: Mapping[str, str], body: bytes = b"") -> DialError:
+    """Return the error of a WebSocket handshake that was answered with an HTTP *status* other than 101.
 
     Args:
         address: The URL as shown to users.
-        status: HTTP status of the handshake.
-        headers: Of the answer, with any letters of their names.
-        body: Of the answer; 401 and 403 concern this robot only with the mark of our servers in it.
+        status: HTTP status of the answer.
+        headers: Of the answer; upper and lower case do not matter.
+        body: Of the answer; an RSE-PF server writes the reason of a 401 or 403 into it.
     """
     lower = {name.lower(): value for name, value in headers.items()}
     retry_after = lower.get("retry-after", "")
-    after_s = float(retry_after) if retry_after.isdecimal() else 0.0
-    after_s = min(after_s, _MAX_RETRY_AFTER_S)
+    retry_after_s = float(retry_after) if retry_after.isdecimal() else 0.0
+    retry_after_s = min(retry_after_s, MAX_RETRY_AFTER_S)
     if status in (401, 403):
         refusal = refusal_in(body, Unauthorized.code if status == 401 else Forbidden.code)
         if refusal is not None:
             return DialError(
                 _refusal_error(address, status, refusal),
-                is_refusal=True, after_s=after_s, cause=refusal.cause, valid_from_s=refusal.valid_from_s,
-            )  # fmt: skip
+                is_refusal=True,
+                retry_after_s=retry_after_s,
+                cause=refusal.cause,
+                valid_from_s=refusal.valid_from_s,
+            )
     error = explain_answer(address, HttpAnswer(status=status, headers=lower, body=body))
-    return DialError(error, after_s=after_s, is_wrong_address=status in _WRONG_ADDRESS)
+    is_wrong_address = status in WRONG_ADDRESS_STATUSES
+    return DialError(error, retry_after_s=retry_after_s, is_wrong_address=is_wrong_address)
 
 
-def _refusal_error(address: str, status: int, handshake: RefusedHandshake) -> RsePfError:
+def revoked_token_error(valid_from_s: float | None) -> DialError:
+    """Return the error of a connection that its server closed because the token was revoked.
+
+    *valid_from_s* is the Unix time at which a freshly signed token may be accepted again; None if the robot
+    has one fixed token, which stays revoked.
+    """
+    error = Unauthorized("the token was revoked, or the robot was disabled", hint=RENEWAL_HINT)
+    return DialError(error, is_refusal=True, valid_from_s=valid_from_s)
+
+
+def replaced_connection_error() -> DialError:
+    """Return the error of a connection that another program replaced by connecting as the same robot."""
+    message = "another connection of this robot replaced this one"
+    return DialError(Conflict(message, hint="give every robot a token of its own"), is_refusal=True)
+
+
+def _refusal_error(address: str, status: int, refusal: RefusedHandshake) -> RsePfError:
     if status == 403:
-        return Forbidden(f"{address} forbids this robot to connect", hint="ask the operator")
-    if handshake.cause:
-        return Unauthorized(handshake.message, hint=handshake.hint)
-    return Unauthorized("the token is missing, wrong or expired", hint=ISSUE)
+        return Forbidden(f"{address} forbids this robot to connect", hint="ask the operator of the platform")
+    if refusal.cause:
+        return Unauthorized(refusal.message, hint=refusal.hint)
+    return Unauthorized("the token is missing, wrong or expired", hint=RENEWAL_HINT)
 
 
 def split_address(url: str, schemes: tuple[str, ...], error: UsageError) -> SplitResult:
-    """Return the parts of *url*; raises *error* unless scheme, host and port can be used."""
+    """Return the parts of *url*; raise *error* if scheme, host or port cannot be used."""
     try:
         parts = urlsplit(url)
-        parts.port  # noqa: B018 - it is read when it is asked for
-        (parts.hostname or "").encode("idna")  # refuses empty labels, and those of more than 63 letters
+        parts.port  # noqa: B018 - urllib checks the port only when it is read
+        (parts.hostname or "").encode("idna")  # refuses empty labels and labels of more than 63 letters
     except ValueError:  # UnicodeError is a ValueError, too
         raise error from None
     if parts.scheme not in schemes or not parts.hostname:
@@ -193,14 +235,18 @@ def split_address(url: str, schemes: tuple[str, ...], error: UsageError) -> Spli
 
 
 def show_wrong_url(url: str) -> str:
-    """Return what may be shown of a text that may be no URL: nothing of user name, password and query."""
+    """Return a perhaps malformed *url* without user name, password and query, to be shown in errors."""
     scheme, separator, rest = str(url).rpartition("@")[0].partition("://")
     shown = str(url).rpartition("@")[2].partition("?")[0]
     return f"{scheme}://{shown}" if separator and rest else shown
 
 
 def hide_password(url: str) -> str:
-    """Return *url* without user name and password; raises UsageError if it is no WebSocket address."""
+    """Return scheme, host, port and path of the WebSocket address *url*, without user name and password.
+
+    Raises:
+        UsageError: *url* is no WebSocket address.
+    """
     hint = "write ws://HOST:PORT/ws or wss://HOST/ws"
     error = UsageError(f"{show_wrong_url(url)!r} is not a WebSocket address", hint=hint)
     parts = split_address(url, ("ws", "wss"), error)

@@ -1,6 +1,7 @@
-"""Open one WebSocket to one address, with the token of the robot; `dialling` explains failures.
+"""Open one WebSocket to one address with the robot's token: proxy, TCP, TLS, HTTP upgrade.
 
-This module and `client_sdk.network.connection` are the only ones that know the WebSocket library.
+`client_sdk.network.dial_errors` turns each failure into a typed error.  This module and
+`client_sdk.network.connection` are the only ones that know the WebSocket library.
 """
 
 from __future__ import annotations
@@ -18,21 +19,28 @@ from websockets.asyncio.client import connect as websocket_connect
 from websockets.exceptions import InvalidStatus, WebSocketException
 from websockets.typing import Subprotocol
 
-from client_sdk.concurrency.user_callbacks import Callbacks
+from client_sdk.concurrency.user_callbacks import UserCallbacks
 from client_sdk.network.bearer_token import strip_token
 from client_sdk.network.connect_timings import ConnectTimings
 from client_sdk.network.dial_errors import (
     CHECK_ADDRESS,
     DialError,
-    dial_error_of,
     hide_password,
-    unconnected_error,
-    unreachable,
-    untrusted_error,
+    http_status_error,
+    no_answer_error,
+    tcp_error,
+    untrusted_certificate_error,
 )
-from client_sdk.network.http_proxy import Proxy, TunnelRefused, check_tunnel, is_complete_head, proxy_of
+from client_sdk.network.http_proxy import (
+    Proxy,
+    TunnelRefused,
+    check_tunnel,
+    find_proxy,
+    is_complete_head,
+    port_of,
+)
 from client_sdk.network.peer_diagnosis import explain_proxy
-from client_sdk.network.peer_probe import Probed, port_of, probe
+from client_sdk.network.peer_probe import PeerProbe, probe_peer
 from client_sdk.network.tcp import TcpDialler
 from rse_pf.config import SessionSettings
 from rse_pf.errors import ConnectError, Unauthorized, UnsupportedProtocol, UsageError
@@ -41,17 +49,22 @@ from rse_pf.wire import SUBPROTOCOLS
 __all__ = ["Dialler", "Token", "websocket_options"]
 
 Token = str | Callable[[], Awaitable[str]] | None
-"""A robot's token, or an async callable that returns a fresh one for each connect and each renewal."""
+"""A robot's token, or an async function that returns a fresh one for each connection and each renewal."""
 
-
-_ANSWER_S = 1.0
-"""How long a TCP connection may take before another attempt begins."""
-_FIRST_BYTES = 4096
-"""Of an answer that is no HTTP/1.1: its head, and the begin of a page."""
+TCP_TIMEOUT_S = 1.0
+"""Longest attempt to open a TCP connection; a shorter ``connect_timeout_s`` is used instead of this
+number."""
+MAX_FIRST_BYTES = 4096
+"""How many first bytes of the peer are kept, to explain an answer that is not HTTP/1.1: head and page
+title."""
 
 
 def websocket_options(settings: SessionSettings, timings: ConnectTimings) -> dict[str, Any]:
-    """Return the options of every WebSocket: no compression, no pings of the library, our size limit."""
+    """Return the options of the library for every WebSocket.
+
+    Compression and pings of the library are off: the codec compresses, and pings of the protocol measure
+    delays.
+    """
     return {
         "compression": None,
         "max_size": settings.max_message_bytes,
@@ -62,30 +75,32 @@ def websocket_options(settings: SessionSettings, timings: ConnectTimings) -> dic
     }
 
 
-class _StraightConnect(websocket_connect):
-    """The library's, which would follow a redirect, token and all, to whatever address it names."""
+class _NoRedirectConnect(websocket_connect):
+    """The library's connect without redirects, which would send the token to any address that an answer
+    names."""
 
     def process_redirect(self, exc: Exception) -> Exception:
-        """Take a redirect as the refusal that any other status is."""
+        """Treat a redirect as a failure, like every other status that is not 101."""
         return exc
 
 
-class _ObservedConnection(ClientConnection):
-    """Keep the peer's first bytes in *seen*: they name a peer that is no WebSocket server."""
+class _FirstBytesConnection(ClientConnection):
+    """A connection that copies the first bytes of the peer, which identify a peer that is no WebSocket
+    server."""
 
-    def __init__(self, seen: bytearray, *args: Any, **options: Any) -> None:
+    def __init__(self, first_bytes: bytearray, *args: Any, **options: Any) -> None:
         super().__init__(*args, **options)
-        self._seen = seen
+        self._first_bytes = first_bytes
 
     def data_received(self, data: bytes) -> None:
-        """Note the begin of the handshake's answer."""
-        if len(self._seen) < _FIRST_BYTES:
-            self._seen += data[:_FIRST_BYTES]
+        """Copy *data* while fewer than `MAX_FIRST_BYTES` are held, and pass all of it on."""
+        if len(self._first_bytes) < MAX_FIRST_BYTES:
+            self._first_bytes += data[:MAX_FIRST_BYTES]
         super().data_received(data)
 
 
 class Dialler:
-    """Opens WebSockets as one robot; *codec* names the sub-protocol."""
+    """Open WebSockets as one robot."""
 
     def __init__(
         self,
@@ -94,37 +109,56 @@ class Dialler:
         codec: str,
         settings: SessionSettings,
         timings: ConnectTimings,
-        callbacks: Callbacks,
+        callbacks: UserCallbacks,
     ) -> None:
+        """Open nothing yet.
+
+        Args:
+            token: The robot's token, an async function that returns one, or None.
+            codec: Name of the codec, which selects the WebSocket sub-protocol.
+            settings: Limits of messages.
+            timings: Timeouts of an attempt.
+            callbacks: Calls *token* if it is a function.
+        """
         self.token = token
         self.ssl_context: ssl.SSLContext | None = None
+        """What the robot trusts at ``wss:`` addresses; None means the authorities of the machine."""
         self._subprotocol = SUBPROTOCOLS[codec]
         self._settings = settings
         self._timings = timings
         self._callbacks = callbacks
         self._tcp = TcpDialler()
-        self._opened: set[str] = set()
+        self._opened_urls: set[str] = set()
 
     async def open(self, url: str, on_answered: Callable[[], None]) -> tuple[ClientConnection, str | None]:
-        """Return a WebSocket to *url* and the token that it was opened with; raises DialError.
+        """Return a WebSocket to *url* and the text of the token that it was opened with.
 
-        A token that is refused is asked for once more, if it comes from a callable and another one may help.
+        If the token is refused and comes from a function, a second one is requested and tried once, unless
+        the refusal says that no token would be accepted now.
 
         Args:
-            url: Of the servers.
-            on_answered: Called for each attempt that reached something: it accepted or refused a connection.
+            url: WebSocket address of the servers.
+            on_answered: Called for each attempt that a machine at the address accepted or refused.
+
+        Raises:
+            DialError: There is no WebSocket; the error names the cause.
         """
         token = await self.read_token()
         try:
-            return await self._handshake(url, token, on_answered), token
-        except DialError as failed:
-            if not callable(self.token) or not isinstance(failed.error, Unauthorized) or failed.refuses_any:
+            return await self._shake_hands(url, token, on_answered), token
+        except DialError as failure:
+            is_refused = isinstance(failure.error, Unauthorized) and not failure.refuses_any_token
+            if not callable(self.token) or not is_refused:
                 raise
         token = await self.read_token()
-        return await self._handshake(url, token, on_answered), token
+        return await self._shake_hands(url, token, on_answered), token
 
     async def read_token(self) -> str | None:
-        """Return the token without white space around it, which files and shells add; raises DialError."""
+        """Return the text of a token without white space around it, None if the robot has none.
+
+        Raises:
+            DialError: The function of the program failed, or what it returned cannot be a token.
+        """
         if not callable(self.token):
             token = self.token
         else:
@@ -139,86 +173,97 @@ class Dialler:
         except Unauthorized as error:
             raise DialError(error, is_refusal=True) from None
 
-    async def _connect(self, url: str, on_answered: Callable[[], None]) -> socket.socket:
-        """Return a TCP connection to the host of *url*, through the proxy of the environment, if any."""
-        parts, within_s = urlsplit(url), min(_ANSWER_S, self._timings.connect_timeout_s)
+    async def _connect_tcp(self, url: str, on_answered: Callable[[], None]) -> socket.socket:
+        """Return a TCP connection to the host of *url*, perhaps through a proxy of the environment."""
+        parts, within_s = urlsplit(url), min(TCP_TIMEOUT_S, self._timings.connect_timeout_s)
         host, port = parts.hostname or "", port_of(parts)
         try:
-            proxy = proxy_of(parts.scheme, host, port)
+            proxy = find_proxy(parts.scheme, host, port)
         except UsageError as error:
             raise DialError(error, is_wrong_address=True) from None
         try:
             if proxy is None:
-                made = await self._tcp.connect(host, port, within_s)
+                connection = await self._tcp.connect(host, port, within_s)
             else:
-                made = await self._tcp.connect(proxy.host, proxy.port, within_s)
+                connection = await self._tcp.connect(proxy.host, proxy.port, within_s)
         except OSError as error:
-            failed = unconnected_error(hide_password(url), error)
+            failure = tcp_error(hide_password(url), error)
             if proxy is not None:
-                failed.error = _proxy_error(url, proxy)
-            if not failed.is_unanswered:
+                failure.error = _silent_proxy_error(url, proxy)
+            if not failure.is_unanswered:
                 on_answered()
-            raise failed from error
+            raise failure from error
         on_answered()
         if proxy is not None:
             try:
-                await self._open_tunnel(made, proxy, parts, url)
+                await self._open_tunnel(connection, proxy, parts, url)
             except BaseException:
-                made.close()
+                connection.close()
                 raise
-        return made
+        return connection
 
-    async def _open_tunnel(self, made: socket.socket, proxy: Proxy, parts: SplitResult, url: str) -> None:
+    async def _open_tunnel(
+        self, connection: socket.socket, proxy: Proxy, parts: SplitResult, url: str
+    ) -> None:
         loop = asyncio.get_running_loop()
 
-        async def ask() -> bytes:
-            await loop.sock_sendall(made, proxy.connect_request(parts.hostname or "", port_of(parts)))
+        async def exchange_head() -> bytes:
+            request = proxy.connect_request(parts.hostname or "", port_of(parts))
+            await loop.sock_sendall(connection, request)
             head = b""
-            while not is_complete_head(head) and (byte := await loop.sock_recv(made, 1)):
+            while not is_complete_head(head) and (byte := await loop.sock_recv(connection, 1)):
                 head += byte
             return head
 
         try:
-            head = await asyncio.wait_for(ask(), self._timings.connect_timeout_s)
+            head = await asyncio.wait_for(exchange_head(), self._timings.connect_timeout_s)
             check_tunnel(hide_password(url), proxy, head)
         except (OSError, asyncio.TimeoutError) as error:
-            raise DialError(_proxy_error(url, proxy)) from error
+            raise DialError(_silent_proxy_error(url, proxy)) from error
         except TunnelRefused as refused:
             raise DialError(refused.error, is_wrong_address=refused.is_lasting) from None
 
-    async def _handshake(
+    async def _shake_hands(
         self, url: str, token: str | None, on_answered: Callable[[], None]
     ) -> ClientConnection:
+        # 1. Open the TCP connection, perhaps through a proxy.
         address, options = hide_password(url), websocket_options(self._settings, self._timings)
-        options["sock"] = await self._connect(url, on_answered)
+        options["sock"] = await self._connect_tcp(url, on_answered)
         if self.ssl_context is not None and url.startswith("wss:"):
             options["ssl"] = self.ssl_context
-        seen = bytearray()
+        # 2. TLS and the HTTP upgrade; each failure is explained by what the peer showed.
+        first_bytes = bytearray()
         try:
-            websocket = await _StraightConnect(
+            websocket = await _NoRedirectConnect(
                 url,
                 subprotocols=[Subprotocol(self._subprotocol)],
                 additional_headers={} if token is None else {"Authorization": f"Bearer {token}"},
-                create_connection=partial(_ObservedConnection, seen),  # type: ignore[arg-type]
+                create_connection=partial(_FirstBytesConnection, first_bytes),  # type: ignore[arg-type]
                 **options,
             )
         except InvalidStatus as error:
             response = error.response
             headers = dict(response.headers.raw_items())
-            raise dial_error_of(
-                address, response.status_code, headers, bytes(response.body or b"")
-            ) from error
+            body = bytes(response.body or b"")
+            raise http_status_error(address, response.status_code, headers, body) from error
         except ssl.SSLCertVerificationError as error:
             issuer, is_enrolled = (await self._probe(url)).issuer, self.ssl_context is not None
-            raise untrusted_error(address, error, issuer=issuer, is_enrolled=is_enrolled) from error
-        except (OSError, asyncio.TimeoutError, WebSocketException, EOFError) as error:
-            # An address where a WebSocket was once open has the right scheme and program.
-            is_asked = not seen and url not in self._opened
-            probed = await self._probe(url) if is_asked else None
-            raise unreachable(
-                address, error, first_bytes=bytes(seen), probed=probed, within_s=options["open_timeout"]
+            raise untrusted_certificate_error(
+                address, error, issuer=issuer, is_enrolled=is_enrolled
             ) from error
-        self._opened.add(url)
+        except (OSError, asyncio.TimeoutError, WebSocketException, EOFError) as error:
+            # An address where a WebSocket was open before has the right scheme and program: no probe is
+            # needed.
+            needs_probe = not first_bytes and url not in self._opened_urls
+            raise no_answer_error(
+                address,
+                error,
+                first_bytes=bytes(first_bytes),
+                probe=await self._probe(url) if needs_probe else None,
+                within_s=options["open_timeout"],
+            ) from error
+        # 3. Check that the server chose our sub-protocol.
+        self._opened_urls.add(url)
         if websocket.subprotocol != self._subprotocol:
             websocket.transport.abort()
             unsupported = UnsupportedProtocol(
@@ -227,10 +272,11 @@ class Dialler:
             raise DialError(unsupported, is_wrong_address=True)
         return websocket
 
-    async def _probe(self, url: str) -> Probed:
-        within_s = min(_ANSWER_S, self._timings.connect_timeout_s)
-        return await asyncio.to_thread(probe, urlsplit(url), within_s)
+    async def _probe(self, url: str) -> PeerProbe:
+        within_s = min(TCP_TIMEOUT_S, self._timings.connect_timeout_s)
+        return await asyncio.to_thread(probe_peer, urlsplit(url), within_s)
 
 
-def _proxy_error(url: str, proxy: Proxy) -> ConnectError:
-    return explain_proxy(hide_password(url), proxy.shown, proxy.variable, None, has_credentials=False)
+def _silent_proxy_error(url: str, proxy: Proxy) -> ConnectError:
+    """Return the error of a proxy that cannot be reached or sends no HTTP answer."""
+    return explain_proxy(hide_password(url), proxy.shown_url, proxy.variable, None, has_credentials=False)

@@ -1,10 +1,8 @@
-"""Tell when the kernel has a new link, address or route, so that a robot tries to connect at once.
+"""Notify a robot when the kernel reports a new network link, address or route, so that it dials at once.
 
-Linux only, by a netlink socket; elsewhere, or where it is not allowed, nobody is told, and a robot tries once
-a second.  Nothing is configured here, and no message is read: that there is one is enough.
-
-Source:
-    rtnetlink(7).
+It works on Linux only, by a netlink socket (rtnetlink(7)).  Where such a socket does not exist or is not
+allowed, nothing is reported, and a robot without a network dials once a second anyway.  The messages are not
+parsed.
 """
 
 from __future__ import annotations
@@ -16,46 +14,48 @@ from collections.abc import Callable
 
 __all__ = ["NetworkChanges"]
 
-_GROUPS = 0x1 | 0x10 | 0x40 | 0x100 | 0x400
-"""RTMGRP_LINK, _IPV4_IFADDR, _IPV4_ROUTE, _IPV6_IFADDR, _IPV6_ROUTE."""
-_READ_BYTES = 65536
+NETLINK_GROUPS = 0x1 | 0x10 | 0x40 | 0x100 | 0x400
+"""Multicast groups of rtnetlink(7): RTMGRP_LINK, _IPV4_IFADDR, _IPV4_ROUTE, _IPV6_IFADDR and _IPV6_ROUTE."""
+READ_BYTES = 65536
+"""Bytes of netlink messages that are read at once, and dropped."""
 
 
 class NetworkChanges:
-    """Calls *on_change* in the event loop, between `open` and `close`."""
+    """Call a function in the event loop after each network change, between `open` and `close`."""
 
     def __init__(self, on_change: Callable[[], None]) -> None:
+        """Watch nothing yet; *on_change* is called without arguments."""
         self._on_change = on_change
         self._socket: socket.socket | None = None
 
     def open(self) -> None:
-        """Begin, where the kernel has such messages."""
+        """Begin to watch; do nothing where the kernel has no netlink or forbids it."""
         family = getattr(socket, "AF_NETLINK", None)
         if family is None:
             return
         try:
-            made = socket.socket(family, socket.SOCK_RAW, 0)
+            netlink = socket.socket(family, socket.SOCK_RAW, 0)
         except OSError:
             return
         try:
-            made.setblocking(False)
-            made.bind((0, _GROUPS))
-            asyncio.get_running_loop().add_reader(made, self._read)
+            netlink.setblocking(False)
+            netlink.bind((0, NETLINK_GROUPS))
+            asyncio.get_running_loop().add_reader(netlink, self._read)
         except (OSError, NotImplementedError):
-            made.close()
+            netlink.close()
             return
-        self._socket = made
+        self._socket = netlink
 
     def close(self) -> None:
-        """End; does nothing a second time."""
-        made, self._socket = self._socket, None
-        if made is not None:
-            asyncio.get_running_loop().remove_reader(made)
-            made.close()
+        """Watch no longer; do nothing if this was called before."""
+        netlink, self._socket = self._socket, None
+        if netlink is not None:
+            asyncio.get_running_loop().remove_reader(netlink)
+            netlink.close()
 
     def _read(self) -> None:
         assert self._socket is not None
-        with contextlib.suppress(OSError):  # too many messages: that there were some is enough
-            while self._socket.recv(_READ_BYTES):
+        with contextlib.suppress(OSError):  # nothing left to read, or more messages than the kernel keeps
+            while self._socket.recv(READ_BYTES):
                 pass
         self._on_change()

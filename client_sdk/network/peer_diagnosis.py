@@ -1,7 +1,9 @@
-"""The cause of a failed connection, from the facts: status line, headers, first bytes, or certificate.
+"""Diagnose what answers at an address when it is no RSE-PF server, from the facts that an attempt collected.
 
-Between a robot and its servers stand login pages, proxies and firewalls, and another program may have the
-port.  Each function returns the error for one kind of fact: a sentence, and the action that helps.
+Login pages, proxies and firewalls stand between a robot and its servers, and another program may use the
+port. Each ``explain_`` function takes one kind of fact (HTTP answer, first bytes, silence, certificate,
+answer of a proxy) and returns a typed error: a sentence with the cause, and a hint with the action that
+helps.
 """
 
 from __future__ import annotations
@@ -24,49 +26,54 @@ __all__ = [
     "explain_certificate",
     "explain_proxy",
     "explain_silence",
-    "is_of_tls_server",
+    "is_tls_server_answer",
     "parse_answer",
 ]
 
-_OTHER_SCHEME = {"ws": "wss", "wss": "ws", "http": "https", "https": "http"}
-_WEB_SCHEME = {"ws": "http", "wss": "https", "http": "http", "https": "https"}
-_DEFAULT_PORTS = {"http": 80, "https": 443}
-_SECURE = ("wss", "https")
-_CHECK_PORT = "check host and port of the URL: no RSE-PF server answers there"
-_STATUS_LINE = re.compile(rb"HTTP/(\d(?:\.\d)?) +(\d{3})\b[^\r\n]*")
-_FOREIGN_STATUSES = (101, 301, 302, 303, 308, 407, 511)
-"""Of login pages and proxies; the data service redirects by 307 only, to presigned addresses."""
-_TLS_WANTED = re.compile(rb"https|\bssl\b|\btls\b", re.IGNORECASE)
-"""In the 400 of nginx, Apache and Go for plain HTTP at a TLS port."""
-_LOGIN = re.compile(
+OTHER_SCHEME = {"ws": "wss", "wss": "ws", "http": "https", "https": "http"}
+"""For each URL scheme the one that differs in TLS only."""
+WEB_SCHEME = {"ws": "http", "wss": "https", "http": "http", "https": "https"}
+"""For each URL scheme the one by which a web browser opens the same host."""
+DEFAULT_PORTS = {"http": 80, "https": 443}
+SECURE_SCHEMES = ("wss", "https")
+CHECK_PORT = "check host and port of the URL: no RSE-PF server answers there"
+STATUS_LINE = re.compile(rb"HTTP/(\d(?:\.\d)?) +(\d{3})\b[^\r\n]*")
+"""First line of an HTTP answer; the groups are the version and the status."""
+FOREIGN_STATUSES = (101, 301, 302, 303, 308, 407, 511)
+"""HTTP statuses that login pages and proxies send and the data service never does; it redirects by 307
+only."""
+TLS_WANTED = re.compile(rb"https|\bssl\b|\btls\b", re.IGNORECASE)
+"""Words in the 400 that nginx, Apache and Go send to plain HTTP at a TLS port."""
+LOGIN_WORDS = re.compile(
     r"\blog[ -]?[io]n\b|\bsign[ -]?in\b|\bo?auth2?\b|\bsso\b|captive|portal|password|<form"
     r"|http-equiv=.?refresh",
     re.IGNORECASE,
 )
-_TITLE = re.compile(r"<title[^>]*>(.*?)</title", re.IGNORECASE | re.DOTALL)
-_INSPECTORS = re.compile(
+"""Words in an address or a page by which a login page (captive portal) is recognised."""
+PAGE_TITLE = re.compile(r"<title[^>]*>(.*?)</title", re.IGNORECASE | re.DOTALL)
+TLS_INSPECTORS = re.compile(
     r"proxy|inspect|intercept|firewall|gateway|filter|decrypt"
     r"|zscaler|netskope|forti|blue ?coat|sophos|palo ?alto",
     re.IGNORECASE,
 )
-"""Names of authorities with which companies inspect TLS."""
-_OUR_AUTHORITY = "RSE-PF authority"
-"""Begin of the name of the authority that rse-pf local --lan makes."""
-_MAX_SHOWN = 60
-"""Characters of a foreign text that an error message shows: a title or a banner, still in one line."""
-_MAX_ADDRESS = 200
-"""Characters of a foreign address that is shown whole, so that a user can open it."""
-_TLS_RECORDS = range(0x14, 0x18)
-"""Record types of RFC 8446, 5.1."""
-_TIMES = (9, 10)
-"""Of X509_verify_cert_error_string(3): not yet valid, expired."""
-_NAMES = (62, 64)
-"""Of the same list: the certificate is for another host name, for another address."""
+"""Words in the names of certificate authorities with which companies decrypt and inspect TLS."""
+LOCAL_AUTHORITY = "RSE-PF authority"
+"""First words of the name of the certificate authority that rse-pf local --lan makes."""
+MAX_SHOWN_TEXT = 60
+"""Longest text of another program that an error message shows, in characters: a page title or a banner."""
+MAX_SHOWN_ADDRESS = 200
+"""Longest address of another program that an error message shows, in characters; a user has to open it."""
+TLS_RECORD_TYPES = range(0x14, 0x18)
+"""First byte of a TLS record (RFC 8446, 5.1): change of cipher, alert, handshake, data."""
+TIME_ERRORS = (9, 10)
+"""Codes of X509_verify_cert_error_string(3) for certificates that are not yet valid or expired."""
+NAME_ERRORS = (62, 64)
+"""Codes of X509_verify_cert_error_string(3) for certificates of another host name or IP address."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class HttpAnswer:
-    """An HTTP answer; the names of ``headers`` are in lower case."""
+    """An HTTP answer; ``headers`` has lower-case names, ``version`` is that of HTTP."""
 
     status: int
     headers: Mapping[str, str]
@@ -74,8 +81,8 @@ class HttpAnswer:
     version: str = "1.1"
 
     @property
-    def shown(self) -> str:
-        """Status and phrase, and the version if it is not the usual one."""
+    def shown_status(self) -> str:
+        """Status and phrase for an error message, such as ``404 Not Found``; the version unless it is 1.1."""
         try:
             phrase = f" {HTTPStatus(self.status).phrase}"
         except ValueError:
@@ -85,24 +92,24 @@ class HttpAnswer:
     @property
     def is_page(self) -> bool:
         """Whether the body is a page for a web browser."""
-        kind = self.headers.get("content-type", "").lower()
-        return "html" in kind or (not kind and self.body.lstrip()[:1] == b"<")
+        content_type = self.headers.get("content-type", "").lower()
+        return "html" in content_type or (not content_type and self.body.lstrip()[:1] == b"<")
 
     @property
     def is_foreign(self) -> bool:
-        """Whether no data service sends this, which writes JSON or binary data: a login page, or a proxy."""
+        """Whether a login page or proxy sent this; the data service writes JSON and binary data only."""
         is_text = self.headers.get("content-type", "").lower().startswith("text/")
-        return self.status in _FOREIGN_STATUSES or is_text or self.is_page
+        return self.status in FOREIGN_STATUSES or is_text or self.is_page
 
     @property
     def is_login(self) -> bool:
-        """Whether a login page or a proxy sends this whatever is asked for."""
-        return self.status in _FOREIGN_STATUSES or (self.status < 300 and self.is_foreign)
+        """Whether a login page or a proxy answers like this, whatever the request was."""
+        return self.status in FOREIGN_STATUSES or (self.status < 300 and self.is_foreign)
 
 
 def parse_answer(data: bytes) -> HttpAnswer | None:
-    """Return the HTTP answer of any version that *data* begins with, None if it is not HTTP."""
-    matched = _STATUS_LINE.match(data)
+    """Return the HTTP answer, of any version, at the beginning of *data*; None if *data* is not HTTP."""
+    matched = STATUS_LINE.match(data)
     if matched is None:
         return None
     head, _, body = data.replace(b"\r\n", b"\n").partition(b"\n\n")
@@ -112,92 +119,107 @@ def parse_answer(data: bytes) -> HttpAnswer | None:
 
 
 def explain_answer(address: str, answer: HttpAnswer) -> ConnectError:
-    """Return what it means that *address* answers as no RSE-PF server does."""
-    status, says = answer.status, f"{address} answers {answer.shown}"
-    later = _later(answer)
+    """Return the error for an HTTP *answer* of *address* that no RSE-PF server sends.
+
+    The cause is told by the status first, then by headers and body.
+    """
+    status, statement = answer.status, f"{address} answers {answer.shown_status}"
+    retry = _retry_hint(answer)
+    # 1. Machines of the network between robot and platform.
     if status == 407:
-        variable = f"{_WEB_SCHEME[urlsplit(address).scheme].upper()}_PROXY"
+        variable = f"{WEB_SCHEME[urlsplit(address).scheme].upper()}_PROXY"
         hint = f"set {variable}=http://USER:PASSWORD@PROXY:PORT"
-        return ConnectError(f"{says}: a proxy asks for a user name and a password", hint=hint)
+        return ConnectError(f"{statement}: a proxy asks for a user name and a password", hint=hint)
     if status == 511:
-        return ConnectError(f"{says}: this network lets nothing pass before a login", hint=_log_in(address))
+        hint = _login_hint(address)
+        return ConnectError(f"{statement}: this network lets nothing pass before a login", hint=hint)
     if 300 <= status < 400:
         return _explain_redirect(address, answer)
     if 200 <= status < 300 or status == 101:
         return _explain_success(address, answer)
     if status in (401, 403, 451):
         hint = "a firewall or a login page between robot and platform answered: ask who runs the network"
-        return ConnectError(f"{says}, and it is not an RSE-PF server that says so", hint=hint)
-    if status == 400 and _TLS_WANTED.search(answer.body) and not _is_secure(address):
+        return ConnectError(f"{statement}, and it is not an RSE-PF server that says so", hint=hint)
+    # 2. A wrong scheme, and proxies in front of the platform that change or limit requests.
+    if status == 400 and TLS_WANTED.search(answer.body) and not _is_tls_address(address):
         return _explain_tls(address)
     if status == 426 or (status == 400 and refusal_in(answer.body, "bad-message") is not None):
-        hint = "let the proxy before the platform pass on the headers Upgrade and Connection"
-        return ConnectError(f"{says}: a proxy on the way removed the header Upgrade", hint=hint)
+        hint = "let the proxy in front of the platform pass on the headers Upgrade and Connection"
+        return ConnectError(f"{statement}: a proxy on the way removed the header Upgrade", hint=hint)
     if status == 413:
-        hint = "let the proxy before the platform pass bodies of 1 MiB (nginx: client_max_body_size)"
-        return ConnectError(f"{says}: a proxy on the way limits the size of uploads", hint=hint)
+        hint = "let the proxy in front of the platform pass bodies of 1 MiB (nginx: client_max_body_size)"
+        return ConnectError(f"{statement}: a proxy on the way limits the size of uploads", hint=hint)
+    # 3. A platform that is overloaded or broken.
     if status == 429:
-        return ConnectError(f"{says}: too many attempts to connect", hint=later)
+        return ConnectError(f"{statement}: too many attempts to connect", hint=retry)
     if status == 503:
-        return ConnectError(f"{says}: the platform is full or starts", hint=later)
+        return ConnectError(f"{statement}: the platform is full, or is starting", hint=retry)
     if status in (502, 504):
-        hint = f"check that the servers of the platform run; {later}"
-        return ConnectError(f"{says}: a proxy before the platform reaches no server", hint=hint)
+        hint = f"check that the servers of the platform run; {retry}"
+        return ConnectError(f"{statement}: a proxy in front of the platform reaches no server", hint=hint)
     if status >= 500 and status not in (501, 505):
-        return ConnectError(f"{says}: the server failed", hint=f"see the log of the server; {later}")
-    server = _clean(answer.headers.get("server", ""))
-    by = f" (a server that calls itself {server!r})" if server else ""
-    if urlsplit(address).path.rstrip("/").endswith("/ws") or not address.startswith("ws"):
-        return ConnectError(says + by, hint=_CHECK_PORT)
-    return ConnectError(says + by, hint="check the URL: it ends with the path of the servers, /ws")
+        return ConnectError(f"{statement}: the server failed", hint=f"see the log of the server; {retry}")
+    # 4. Another program.
+    server = _shorten(answer.headers.get("server", ""))
+    sender = f" (a server that calls itself {server!r})" if server else ""
+    has_server_path = urlsplit(address).path.rstrip("/").endswith("/ws") or not address.startswith("ws")
+    hint = CHECK_PORT if has_server_path else "let the URL end with the path of the servers, /ws"
+    return ConnectError(statement + sender, hint=hint)
 
 
 def explain_bytes(address: str, data: bytes) -> ConnectError:
-    """Return what it means that *address* answers with *data* instead of a WebSocket."""
+    """Return the error for the first bytes, *data*, that *address* sent instead of a WebSocket handshake."""
     answer = parse_answer(data)
     if answer is not None:
         return explain_answer(address, answer)
-    if is_of_tls_server(data):
+    if is_tls_server_answer(data):
         return _explain_tls(address)
-    text = _clean("".join(chr(byte) if 32 <= byte < 127 else " " for byte in data))
+    text = _shorten("".join(chr(byte) if 32 <= byte < 127 else " " for byte in data))
     sent = repr(text) if text else f"the bytes {data[:16].hex(' ')}"
-    return ConnectError(f"another program answers at {address}: it sends {sent}", hint=_CHECK_PORT)
+    return ConnectError(f"another program answers at {address}: it sends {sent}", hint=CHECK_PORT)
 
 
 def explain_silence(
     address: str, error: Exception, *, certificate: bytes | None, data: bytes, within_s: float | None = None
 ) -> ConnectError:
-    """Return what it means that *address* accepted a connection and sent no answer that can be read.
+    """Return the error for an *address* that accepted a connection and sent no answer that can be read.
 
     Args:
-        address: As shown to users.
-        error: Of the attempt.
-        certificate: That a second attempt with TLS was shown, None if the peer does not speak TLS.
-        data: The peer's answer to a second attempt without TLS.
-        within_s: How long the attempt waited for the answer, None if that is unknown.
+        address: The URL as shown to users.
+        error: What ended the attempt.
+        certificate: What the peer showed to a second connection with TLS (DER), None if it speaks no TLS.
+        data: First bytes of its answer to a connection without TLS, which is made if it speaks no TLS.
+        within_s: How many seconds the attempt waited for the answer, None if unknown.
     """
     answer = parse_answer(data)
     is_http = answer is not None
-    if not _is_secure(address) and (certificate is not None or is_of_tls_server(data)):
+    # 1. The scheme of the URL says TLS and the peer speaks none, or the reverse.
+    if not _is_tls_address(address) and (certificate is not None or is_tls_server_answer(data)):
         return _explain_tls(address)
-    if _is_secure(address) and certificate is None and is_http and not is_of_tls_server(data):
-        hint = f"write {_OTHER_SCHEME[urlsplit(address).scheme]}:// in the URL, or a port that speaks TLS"
+    if _is_tls_address(address) and certificate is None and is_http and not is_tls_server_answer(data):
+        hint = f"write {OTHER_SCHEME[urlsplit(address).scheme]}:// in the URL, or a port that speaks TLS"
         return ConnectError(f"{address} speaks HTTP without TLS", hint=hint)
+    # 2. Another program answered the second connection.
     if answer is not None and answer.is_login:
-        return explain_answer(address, answer)  # it closed before it had read the first request
-    if data and not is_http and not is_of_tls_server(data):
+        # A login page may close the first connection before it has read the request.
+        return explain_answer(address, answer)
+    if data and not is_http and not is_tls_server_answer(data):
         return explain_bytes(address, data)
+    # 3. The TLS handshake failed.
     if isinstance(error, ssl.SSLError) and not isinstance(error, ssl.SSLEOFError):
         reason = (error.reason or str(error)).replace("_", " ").lower()
-        refused = (
-            "ask who runs the server or the firewall there why it refuses TLS 1.2 and newer from this robot"
-        )
-        hint = refused if "alert" in reason else _CHECK_PORT
+        hint = CHECK_PORT
+        if "alert" in reason:
+            hint = (
+                "ask who runs the server or the firewall there why it refuses TLS 1.2 and newer from this "
+                "robot"
+            )
         return ConnectError(f"{address} ends the TLS handshake: {reason}", hint=hint)
+    # 4. The peer is slow, or speaks another protocol.
     is_late = isinstance(error, (TimeoutError, asyncio.TimeoutError))
     within = "" if within_s is None else f" within {within_s:g} s"
     cause = f"sends no answer{within}" if is_late else "closed the connection without an answer"
-    if is_http or certificate is not None:  # in the scheme of the address: the others were explained above
+    if is_http or certificate is not None:
         return ConnectError(f"{address} {cause}", hint="try again; see the load of the server")
     hint = (
         "check host and port of the URL; on the platform, rse-pf local status shows whether its servers run"
@@ -208,25 +230,29 @@ def explain_silence(
 def explain_certificate(
     address: str, error: ssl.SSLCertVerificationError, *, issuer: str, is_enrolled: bool
 ) -> ConnectError:
-    """Return what it means that a certificate of *issuer* is not trusted; the name is empty if unknown.
+    """Return the error for a TLS certificate that this robot does not trust, with a hint for each cause.
 
-    ``is_enrolled`` says that the robot trusts the authority of its enrolment, and no other.
+    Args:
+        address: The URL as shown to users.
+        error: Of the TLS handshake.
+        issuer: Name of the authority that signed the certificate, empty if unknown.
+        is_enrolled: Whether the robot trusts the authority in its enrolment file and no other.
     """
-    why = error.verify_message.rstrip(".")
-    by = _clean(issuer)
-    of = f" (issued by {by!r})" if by else ""
-    message = f"{address} shows a certificate that this robot does not trust: {why}{of}"
-    if error.verify_code in _TIMES:
+    cause = error.verify_message.rstrip(".")
+    authority = _shorten(issuer)
+    issued_by = f" (issued by {authority!r})" if authority else ""
+    message = f"{address} shows a certificate that this robot does not trust: {cause}{issued_by}"
+    if error.verify_code in TIME_ERRORS:
         hint = "check the clock of this robot; a platform renews its certificate by itself"
-    elif error.verify_code in _NAMES:
-        hint = "write a host in the URL for which the certificate is made"
-    elif _INSPECTORS.search(by) and is_enrolled:
+    elif error.verify_code in NAME_ERRORS:
+        hint = "write a host name in the URL for which the certificate was made"
+    elif TLS_INSPECTORS.search(authority) and is_enrolled:
         hint = f"ask who runs the network to exempt {urlsplit(address).hostname} from the inspection of TLS"
-    elif _INSPECTORS.search(by):
-        hint = f"a proxy of the network inspects TLS: set SSL_CERT_FILE to the certificate of {by!r}"
+    elif TLS_INSPECTORS.search(authority):
+        hint = f"a proxy of the network inspects TLS: set SSL_CERT_FILE to the certificate of {authority!r}"
     elif is_enrolled:
         hint = "enrol again: rse-pf robot enrol ROBOT --out FILE, with --authority and its authority's file"
-    elif by.startswith(_OUR_AUTHORITY):
+    elif authority.startswith(LOCAL_AUTHORITY):
         hint = (
             "connect by the file of rse-pf robot enrol ROBOT --out FILE, made by this platform; if you did, "
             "enrol again with --authority and the file of that authority"
@@ -236,26 +262,34 @@ def explain_certificate(
             "connect by the file of rse-pf robot enrol ROBOT --out FILE; with a certificate of your own, add "
             "--authority and the file of its authority"
         )
-        if by:
-            hint += f"; if {by!r} is a proxy of the network, set SSL_CERT_FILE to its certificate"
+        if authority:
+            hint += f"; if {authority!r} is a proxy of the network, set SSL_CERT_FILE to its certificate"
     return ConnectError(message, hint=hint)
 
 
 def explain_proxy(
     address: str, proxy: str, variable: str, answer: HttpAnswer | None, *, has_credentials: bool
 ) -> ConnectError:
-    """Return what it means that *proxy*, named in *variable*, opens no tunnel to *address*."""
+    """Return the error for an HTTP proxy that opens no tunnel to *address*.
+
+    Args:
+        address: The URL of the platform as shown to users.
+        proxy: Address of the proxy without user name and password.
+        variable: Environment variable that names the proxy, such as ``HTTPS_PROXY``.
+        answer: Of the proxy to CONNECT, None if it sent nothing that is HTTP.
+        has_credentials: Whether the variable holds a user name.
+    """
     host = urlsplit(address).hostname
     if answer is None:
         hint = f"correct {variable}, or name {host} in NO_PROXY"
-        return ConnectError(f"{proxy} of {variable} does not answer as a proxy", hint=hint)
-    message = f"the proxy {proxy} of {variable} answers {answer.shown} for {address}"
+        return ConnectError(f"{proxy}, which {variable} names, does not answer as a proxy", hint=hint)
+    message = f"the proxy {proxy}, which {variable} names, answers {answer.shown_status} for {address}"
     if answer.status == 407 and has_credentials:
         hint = f"correct the user name and the password in {variable}"
     elif answer.status == 407:
         hint = f"set {variable}=http://USER:PASSWORD@HOST:PORT"
     elif answer.status == 511 or 300 <= answer.status < 400:
-        hint = _log_in(proxy)
+        hint = _login_hint(proxy)
     elif answer.status in (500, 502, 503, 504):
         hint = f"check host and port of the URL; if the proxy is not needed there, name {host} in NO_PROXY"
     elif answer.status in (401, 403):
@@ -265,81 +299,82 @@ def explain_proxy(
     return ConnectError(message, hint=hint)
 
 
-def is_of_tls_server(data: bytes) -> bool:
-    """Return whether *data* is how a TLS server answers plain HTTP: a TLS record, or a 400 that says so."""
+def is_tls_server_answer(data: bytes) -> bool:
+    """Return whether *data* is how TLS servers answer plain HTTP: a TLS record, or a 400 about TLS."""
     answer = parse_answer(data)
     if answer is not None:
-        return answer.status == 400 and _TLS_WANTED.search(answer.body) is not None
-    return len(data) > 1 and data[0] in _TLS_RECORDS and data[1] == 3
+        return answer.status == 400 and TLS_WANTED.search(answer.body) is not None
+    return len(data) > 1 and data[0] in TLS_RECORD_TYPES and data[1] == 3
 
 
 def _explain_tls(address: str) -> ConnectError:
     scheme = urlsplit(address).scheme
-    hint = f"write {_OTHER_SCHEME[scheme]}:// in the URL"
-    return ConnectError(f"{address} speaks TLS, and {scheme}:// means none", hint=hint)
+    hint = f"write {OTHER_SCHEME[scheme]}:// in the URL"
+    return ConnectError(f"{address} speaks TLS, and {scheme}:// means a connection without TLS", hint=hint)
 
 
 def _explain_redirect(address: str, answer: HttpAnswer) -> ConnectError:
-    says, parts = f"{address} answers {answer.shown}", urlsplit(address)
-    web, location = parts._replace(scheme=_WEB_SCHEME[parts.scheme]), answer.headers.get("location", "")
+    statement, parts = f"{address} answers {answer.shown_status}", urlsplit(address)
+    web, location = parts._replace(scheme=WEB_SCHEME[parts.scheme]), answer.headers.get("location", "")
     try:
         target = urlsplit(urljoin(web.geturl(), location))
     except ValueError:
         location = ""
     if not location:
-        return ConnectError(says, hint=_CHECK_PORT)
-    shown = _clean(f"{target.scheme}://{target.netloc.rpartition('@')[2]}{target.path}", _MAX_ADDRESS)
-    says += f", a redirect to {shown}"
-    if target.hostname == web.hostname and target.scheme in _DEFAULT_PORTS:
-        is_login = _LOGIN.search(f"{target.path}?{target.query}") is not None
-        if not is_login and target.scheme == "https" and web.scheme == "http":
-            secure = f"{_OTHER_SCHEME[parts.scheme]}://{target.netloc.rpartition('@')[2]}{parts.path}"
-            return ConnectError(says, hint=f"write {_clean(secure, _MAX_ADDRESS)}: TLS is required there")
-        if not is_login:
-            return ConnectError(says, hint=_CHECK_PORT)
-    return ConnectError(f"{says}: a login page", hint=_log_in(shown))
+        return ConnectError(statement, hint=CHECK_PORT)
+    target_host = target.netloc.rpartition("@")[2]
+    shown_target = _shorten(f"{target.scheme}://{target_host}{target.path}", MAX_SHOWN_ADDRESS)
+    statement += f", a redirect to {shown_target}"
+    is_same_host = target.hostname == web.hostname and target.scheme in DEFAULT_PORTS
+    if not is_same_host or LOGIN_WORDS.search(f"{target.path}?{target.query}") is not None:
+        return ConnectError(f"{statement}: a login page", hint=_login_hint(shown_target))
+    if target.scheme == "https" and web.scheme == "http":
+        secure_url = f"{OTHER_SCHEME[parts.scheme]}://{target_host}{parts.path}"
+        hint = f"write {_shorten(secure_url, MAX_SHOWN_ADDRESS)}: TLS is required there"
+        return ConnectError(statement, hint=hint)
+    return ConnectError(statement, hint=CHECK_PORT)
 
 
 def _explain_success(address: str, answer: HttpAnswer) -> ConnectError:
-    says = f"{address} answers {answer.shown}"
+    statement = f"{address} answers {answer.shown_status}"
     if not answer.is_page:
-        kind = _clean(answer.headers.get("content-type", ""))
-        return ConnectError(
-            f"{says}{f' ({kind})' if kind else ''} as no RSE-PF server does", hint=_CHECK_PORT
-        )
+        content_type = _shorten(answer.headers.get("content-type", ""))
+        shown_type = f" ({content_type})" if content_type else ""
+        return ConnectError(f"{statement}{shown_type} as no RSE-PF server does", hint=CHECK_PORT)
     text = answer.body.decode("utf-8", "replace")
-    title = _TITLE.search(text)
-    of = f" {_clean(title[1])!r}" if title and _clean(title[1]) else ""
-    if _LOGIN.search(text):
-        return ConnectError(f"{says} with a login page{of}", hint=_log_in(address))
+    title = PAGE_TITLE.search(text)
+    shown_title = f" {_shorten(title[1])!r}" if title and _shorten(title[1]) else ""
+    if LOGIN_WORDS.search(text):
+        return ConnectError(f"{statement} with a login page{shown_title}", hint=_login_hint(address))
     hint = (
         f"open {_web_page(address)} in a web browser: log in there, or correct the URL if it is another site"
     )
-    return ConnectError(f"{says} with a web page{of}, perhaps a login page", hint=hint)
+    return ConnectError(f"{statement} with a web page{shown_title}, perhaps a login page", hint=hint)
 
 
-def _log_in(where: str) -> str:
-    return f"open {_web_page(where)} in a web browser of this network, log in, and connect again"
+def _login_hint(address: str) -> str:
+    return f"open {_web_page(address)} in a web browser of this network, log in, and connect again"
 
 
 def _web_page(address: str) -> str:
-    """Return *address* for a browser; of servers, which have no page at their path, the host alone."""
+    """Return the address that a web browser opens: for ``ws:`` and ``wss:`` the host without the path."""
     parts = urlsplit(address)
     if parts.scheme in ("ws", "wss"):
-        return f"{_WEB_SCHEME[parts.scheme]}://{parts.netloc}/"
+        return f"{WEB_SCHEME[parts.scheme]}://{parts.netloc}/"
     return address
 
 
-def _later(answer: HttpAnswer) -> str:
-    after = answer.headers.get("retry-after", "")
-    return f"try again in {int(after)} s" if after.isdecimal() and len(after) < 7 else "try again later"
+def _retry_hint(answer: HttpAnswer) -> str:
+    retry_after = answer.headers.get("retry-after", "")
+    is_number = retry_after.isdecimal() and len(retry_after) < 7
+    return f"try again in {int(retry_after)} s" if is_number else "try again later"
 
 
-def _is_secure(address: str) -> bool:
-    return urlsplit(address).scheme in _SECURE
+def _is_tls_address(address: str) -> bool:
+    return urlsplit(address).scheme in SECURE_SCHEMES
 
 
-def _clean(text: str, max_shown: int = _MAX_SHOWN) -> str:
-    """Return a foreign *text* in one short line that holds no control characters."""
+def _shorten(text: str, max_shown: int = MAX_SHOWN_TEXT) -> str:
+    """Return a text of another program as one line of at most *max_shown* printable characters."""
     line = " ".join("".join(c if c.isprintable() else " " for c in text[: 8 * max_shown]).split())
     return line if len(line) <= max_shown else f"{line[: max_shown - 3]}..."

@@ -1,7 +1,7 @@
-"""Ask a peer that gave no usable answer again: does it speak TLS, of which authority, and what without TLS?
+"""Probe a peer that gave no usable answer: does it speak TLS, and what does it send without TLS?
 
-It is asked without a token.  Blocking, for at most twice the timeout; `foreign_answers` explains the
-result.
+The probe makes new connections without a token.  It blocks for at most twice its timeout.
+`client_sdk.network.peer_diagnosis` explains the result.
 """
 
 from __future__ import annotations
@@ -13,144 +13,107 @@ import time
 from dataclasses import dataclass
 from urllib.parse import SplitResult
 
-from client_sdk.network.http_proxy import TunnelRefused, check_tunnel, is_complete_head, proxy_of
-from client_sdk.network.peer_diagnosis import explain_proxy
+from client_sdk.network.http_proxy import TunnelRefused, connect_tcp, receive_until
 from rse_pf.errors import RsePfError
 
-__all__ = ["Probed", "dial", "port_of", "probe"]
+__all__ = ["PeerProbe", "probe_peer"]
 
-_COMMON_NAME = b"\x55\x04\x03"  # DER of the object identifier id-at-commonName (RFC 5280, A.1)
-_ORGANISATION = b"\x55\x04\x0a"  # the same of id-at-organizationName
-_VERSION = 0xA0  # tag of the optional first field of a certificate
-_ENOUGH_BYTES = 4096
-"""Of an answer without TLS: its head, and the begin of a page."""
+COMMON_NAME_OID = b"\x55\x04\x03"
+"""DER bytes of the object identifier id-at-commonName (RFC 5280, A.1)."""
+ORGANISATION_OID = b"\x55\x04\x0a"
+"""DER bytes of the object identifier id-at-organizationName (RFC 5280, A.1)."""
+VERSION_TAG = 0xA0
+"""DER tag of the version, the optional first field of a certificate (RFC 5280, 4.1)."""
+MAX_ANSWER_BYTES = 4096
+"""How much of an answer to plain HTTP is read: its head and the beginning of a page tell who answers."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Probed:
-    """A peer's ``certificate`` (DER, None without TLS) and its first ``data`` without TLS."""
+class PeerProbe:
+    """What a peer showed: its TLS ``certificate`` (DER), or else the first ``data`` that it sent without
+    TLS."""
 
     certificate: bytes | None = None
     data: bytes = b""
 
     @property
     def issuer(self) -> str:
-        """The name of the authority that signed the certificate, empty if it cannot be read."""
+        """Name of the authority that signed the certificate, empty without a readable certificate."""
         with contextlib.suppress(IndexError, ValueError):
-            return "" if self.certificate is None else _issuer(self.certificate)
+            return "" if self.certificate is None else _read_issuer(self.certificate)
         return ""
 
 
-def port_of(parts: SplitResult) -> int:
-    """Return the port of an address, that of its scheme if it names none."""
-    return parts.port or (443 if parts.scheme in ("wss", "https") else 80)
+def probe_peer(parts: SplitResult, timeout_s: float) -> PeerProbe:
+    """Return what the peer at the address *parts* shows.
 
-
-def dial(parts: SplitResult, timeout_s: float) -> socket.socket:
-    """Return a TCP connection to the host of *parts*, through the proxy of the environment if it has one.
-
-    Connecting to the proxy and its answer take at most *timeout_s* each.
-
-    Raises:
-        OSError: There is no connection to the host.
-        TunnelRefused: The proxy opens none, or cannot be reached.
-        UsageError: The variable of the proxy names none.
+    Each of the two steps takes at most *timeout_s* seconds; a step that fails shows nothing, and nothing is
+    raised.
     """
-    host, port = parts.hostname or "", port_of(parts)
-    proxy = proxy_of(parts.scheme, host, port)
-    if proxy is None:
-        return socket.create_connection((host, port), timeout_s)
-    address = f"{parts.scheme}://{parts.netloc.rpartition('@')[2]}"
-    try:
-        made = socket.create_connection((proxy.host, proxy.port), timeout_s)
-        try:
-            made.sendall(proxy.connect_request(host, port))
-            check_tunnel(address, proxy, _read_head(made, time.monotonic() + timeout_s))
-            made.settimeout(timeout_s)
-        except BaseException:
-            made.close()
-            raise
-    except OSError as error:
-        explained = explain_proxy(address, proxy.shown, proxy.variable, None, has_credentials=False)
-        raise TunnelRefused(explained, is_lasting=False) from error
-    return made
-
-
-def probe(parts: SplitResult, timeout_s: float) -> Probed:
-    """Return what the peer at *parts* shows with TLS, or else what it sends without, in *timeout_s* each."""
+    # 1. Try a TLS handshake, whatever the certificate is.
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
-    context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
-    deadline = time.monotonic() + timeout_s
+    context.check_hostname = False
+    context.verify_mode = ssl.CERT_NONE
     with (
         contextlib.suppress(OSError, ValueError, RsePfError, TunnelRefused),
-        _dial_until(parts, deadline) as made,
-        context.wrap_socket(made, server_hostname=parts.hostname) as secured,
+        _connect_until(parts, time.monotonic() + timeout_s) as connection,
+        context.wrap_socket(connection, server_hostname=parts.hostname) as secured,
     ):
-        return Probed(certificate=secured.getpeercert(binary_form=True) or b"")
+        return PeerProbe(certificate=secured.getpeercert(binary_form=True) or b"")
+    # 2. Send a plain HTTP request, and read the beginning of the answer.
     data, host = b"", parts.netloc.rpartition("@")[2]
-    deadline = time.monotonic() + timeout_s
+    deadline_s = time.monotonic() + timeout_s
     with (
         contextlib.suppress(OSError, ValueError, RsePfError, TunnelRefused),
-        _dial_until(parts, deadline) as made,
+        _connect_until(parts, deadline_s) as connection,
     ):
         request = f"GET {parts.path or '/'} HTTP/1.1\r\nHost: {host}\r\nConnection: close\r\n\r\n"
-        made.sendall(request.encode("ascii", "ignore"))
-        while len(data) < _ENOUGH_BYTES and (more := _receive(made, _ENOUGH_BYTES, deadline)):
-            data += more
-    return Probed(data=data)
+        connection.sendall(request.encode("ascii", "ignore"))
+        while len(data) < MAX_ANSWER_BYTES and (
+            received := receive_until(connection, MAX_ANSWER_BYTES, deadline_s)
+        ):
+            data += received
+    return PeerProbe(data=data)
 
 
-def _dial_until(parts: SplitResult, deadline: float) -> socket.socket:
-    made = dial(parts, deadline - time.monotonic())
-    _limit(made, deadline)
-    return made
+def _connect_until(parts: SplitResult, deadline_s: float) -> socket.socket:
+    """Return a TCP connection whose next operation ends at *deadline_s* of the monotonic clock."""
+    connection = connect_tcp(parts, deadline_s - time.monotonic())
+    connection.settimeout(max(0.001, deadline_s - time.monotonic()))  # 0 would mean not to block
+    return connection
 
 
-def _limit(made: socket.socket, deadline: float) -> None:
-    """Let the next operation, whose parts share one timeout, end at *deadline* of the monotonic clock."""
-    made.settimeout(max(0.001, deadline - time.monotonic()))  # 0 would mean without blocking
+def _read_issuer(certificate: bytes) -> str:
+    """Return common name and organisation of the issuer of a DER certificate, as ``Name (Organisation)``.
 
-
-def _receive(made: socket.socket, max_bytes: int, deadline: float) -> bytes:
-    if time.monotonic() >= deadline:
-        raise TimeoutError("the peer sends too slowly")
-    _limit(made, deadline)
-    return made.recv(max_bytes)
-
-
-def _read_head(made: socket.socket, deadline: float) -> bytes:
-    """Read byte by byte: what follows the head belongs to the server behind the proxy."""
-    head = b""
-    while not is_complete_head(head) and (byte := _receive(made, 1, deadline)):
-        head += byte
-    return head
-
-
-def _issuer(certificate: bytes) -> str:
-    """Return common name and organisation of the issuer (RFC 5280, 4.1): ``Name (Organisation)``."""
-    _, begin, _ = _element(certificate, 0)
-    tag, begin, _ = _element(certificate, begin)
-    tag, _, after = _element(certificate, begin)
-    if tag == _VERSION:
-        tag, _, after = _element(certificate, after)
-    _, _, after = _element(certificate, after)  # the algorithm of the signature, behind the serial number
-    _, at, end = _element(certificate, after)
-    names: dict[bytes, str] = {}
+    Source: RFC 5280, Sect. 4.1, and X.690, Sect. 8.1.  Raises IndexError for a malformed certificate.
+    """
+    # 1. Enter the certificate and its first part, the data that is signed.
+    _, begin, _ = _read_element(certificate, 0)
+    _, begin, _ = _read_element(certificate, begin)
+    # 2. Skip the version, the serial number and the algorithm of the signature.
+    tag, _, after = _read_element(certificate, begin)
+    if tag == VERSION_TAG:
+        _, _, after = _read_element(certificate, after)
+    _, _, after = _read_element(certificate, after)
+    # 3. Read the parts of the issuer's name.
+    _, at, end = _read_element(certificate, after)
+    values: dict[bytes, str] = {}
     while at < end:
-        _, inner, at = _element(certificate, at)
-        _, inner, _ = _element(certificate, inner)
-        _, begin, until = _element(certificate, inner)
-        _, value, value_end = _element(certificate, until)
-        names[certificate[begin:until]] = certificate[value:value_end].decode("utf-8", "replace")
-    name, organisation = names.get(_COMMON_NAME, ""), names.get(_ORGANISATION, "")
+        _, name_set, at = _read_element(certificate, at)
+        _, name_pair, _ = _read_element(certificate, name_set)
+        _, oid_begin, oid_end = _read_element(certificate, name_pair)
+        _, value_begin, value_end = _read_element(certificate, oid_end)
+        values[certificate[oid_begin:oid_end]] = certificate[value_begin:value_end].decode("utf-8", "replace")
+    name, organisation = values.get(COMMON_NAME_OID, ""), values.get(ORGANISATION_OID, "")
     return f"{name} ({organisation})" if name and organisation else name or organisation
 
 
-def _element(data: bytes, at: int) -> tuple[int, int, int]:
-    """Return tag, begin and end of the content of the DER element at *at* (X.690, 8.1)."""
+def _read_element(data: bytes, at: int) -> tuple[int, int, int]:
+    """Return the tag, and begin and end of the content, of the DER element at offset *at* (X.690, 8.1)."""
     length, begin = data[at + 1], at + 2
     if length & 0x80:
-        count = length & 0x7F
-        length = int.from_bytes(data[begin : begin + count], "big")
-        begin += count
+        size = length & 0x7F
+        length = int.from_bytes(data[begin : begin + size], "big")
+        begin += size
     return data[at], begin, begin + length

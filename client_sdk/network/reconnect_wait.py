@@ -1,7 +1,8 @@
-"""How long a robot waits between two attempts to connect, and what ends a pause early.
+"""Wait between two attempts to connect, and end the wait early when the cause of the failure may be gone.
 
-A pause after an attempt that nobody answered ends when the kernel has another network, and one after a
-refusal when somebody sets the clock of the robot.  Nothing here dials.
+`client_sdk.network.backoff` computes the length of the wait.  After an attempt that nobody answered, a new
+network ends it early; after a refusal, a change of the robot's wall clock does, because tokens are signed by
+it.
 """
 
 from __future__ import annotations
@@ -9,98 +10,108 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable
 
-from client_sdk.network.backoff import Backoff, Last
+from client_sdk.concurrency.tasks import wait_for_event
+from client_sdk.network.backoff import AttemptResult, Backoff
 from client_sdk.network.dial_errors import DialError
 from client_sdk.network.network_changes import NetworkChanges
-from client_sdk.network.region_sockets import either
 
-__all__ = ["Pauses", "last_of"]
+__all__ = ["ReconnectWait"]
 
-# How often the clock is looked at, and by how much it must have been set.
-_LOOK_S, _CLOCK_SET_S = 1.0, 0.5
-# Calls wait for the end of a cut-off that is so near, instead of failing; so does a first connect.
-_SOON_S = 2.0
+CLOCK_POLL_S = 1.0
+"""How often the wall clock is compared with the monotonic clock while a refused robot waits."""
+CLOCK_STEP_S = 0.5
+"""A wall clock that moved by more than this against the monotonic clock was set by somebody."""
+SHORT_REFUSAL_S = 2.0
+"""A refusal that ends within this time is not reported: commands and a first connect wait for its end."""
 
 
-class Pauses:
-    """The pauses of one robot, between `open` and `close`; *wall_clock* is the one that signs its tokens."""
+class ReconnectWait:
+    """Pause one robot between its attempts to connect."""
 
     def __init__(self, clock: Callable[[], float], wall_clock: Callable[[], float]) -> None:
+        """Watch nothing yet; *clock* is monotonic, and *wall_clock* (Unix seconds) signs tokens."""
         self._clock = clock
         self.wall_clock = wall_clock
-        self._network = NetworkChanges(self._network_changed)
-        self._has_changed = asyncio.Event()
+        self._network = NetworkChanges(self._note_network_change)
+        self._network_changed = asyncio.Event()
 
-    def open(self) -> None:
-        """Listen to the kernel."""
+    def start_watching_network(self) -> None:
+        """Begin to receive the kernel's notifications of network changes."""
         self._network.open()
 
-    def close(self) -> None:
-        """Listen no longer."""
+    def stop_watching_network(self) -> None:
+        """Receive no more notifications of network changes."""
         self._network.close()
 
     def pause_s(
-        self, backoff: Backoff, failed: DialError | None, *, spent_s: float = 0.0, is_move: bool = False
+        self, backoff: Backoff, failure: DialError | None, *, spent_s: float = 0.0, is_move: bool = False
     ) -> float:
-        """Return how long to wait after an attempt that *failed*; None means that there was none.
-
-        A pause counts from the start of the attempt, which took *spent_s*, so that none is added after one
-        that timed out; but what a server asked for or refused counts from its answer.
-        """
-        asked_s = 0.0 if failed is None else failed.after_s
-        last = last_of(failed)
-        pause_s = backoff.pause_s(
-            self._clock(), asked_s, last=last, valid_in_s=self._valid_in_s(failed), is_move=is_move
-        )
-        return pause_s if last is Last.REFUSED else max(asked_s, pause_s - spent_s)
-
-    def is_lasting(self, failed: DialError | None) -> bool:
-        """Return whether *failed* is a refusal, and not one that is known to be over soon."""
-        valid_in_s = self._valid_in_s(failed)
-        is_soon = valid_in_s is not None and valid_in_s <= _SOON_S
-        return failed is not None and failed.is_refusal and not is_soon
-
-    def offset_s(self) -> float:
-        """Return the time of the wall clock over that of the event loop; it changes if the clock is set."""
-        return self.wall_clock() - asyncio.get_running_loop().time()
-
-    async def wait(self, pause_s: float, failed: DialError | None, offset_s: float) -> None:
-        """Wait for *pause_s*, or until something else than time makes another attempt worthwhile.
+        """Return how many seconds to wait from now before the next attempt.
 
         Args:
-            pause_s: From now.
-            failed: Of the last attempt.
-            offset_s: `offset_s` when the last attempt began: the clock may have been set since then.
+            backoff: Computes the pause.
+            failure: Of the last attempt; None if there was none since the connection was lost.
+            spent_s: How long the last attempt took.  It counts towards the pause, so that an attempt that
+                timed out is repeated at once; after a refusal it does not.
+            is_move: Whether the robot is connected and only changes the server.
+
+        Returns:
+            At least the time that the server asked for in its answer.
         """
-        last, loop_time = last_of(failed), asyncio.get_running_loop().time
-        until = loop_time() + pause_s
-        while (left_s := until - loop_time()) > 0:
-            if last is Last.UNANSWERED:
-                changed = self._has_changed
-                await either(changed, left_s)
-                if changed.is_set():
+        retry_after_s = 0.0 if failure is None else failure.retry_after_s
+        last = _attempt_result(failure)
+        pause_s = backoff.pause_s(
+            self._clock(), retry_after_s, last=last, valid_in_s=self._valid_in_s(failure), is_move=is_move
+        )
+        return pause_s if last is AttemptResult.REFUSED else max(retry_after_s, pause_s - spent_s)
+
+    def is_lasting_refusal(self, failure: DialError | None) -> bool:
+        """Return whether a server refused this robot and does not accept it again within two seconds."""
+        valid_in_s = self._valid_in_s(failure)
+        is_short = valid_in_s is not None and valid_in_s <= SHORT_REFUSAL_S
+        return failure is not None and failure.is_refusal and not is_short
+
+    def clock_offset_s(self) -> float:
+        """Return wall clock minus monotonic clock in seconds; it changes only if the wall clock is set."""
+        return self.wall_clock() - asyncio.get_running_loop().time()
+
+    async def wait(self, pause_s: float, failure: DialError | None, clock_offset_s: float) -> None:
+        """Wait for *pause_s* seconds, or until a new attempt is worthwhile for another reason.
+
+        Args:
+            pause_s: Longest wait from now.
+            failure: Of the last attempt, which decides what ends the wait early.
+            clock_offset_s: `clock_offset_s` at the start of the last attempt: the wall clock may have been
+                set since then.
+        """
+        last, monotonic_s = _attempt_result(failure), asyncio.get_running_loop().time
+        until_s = monotonic_s() + pause_s
+        while (left_s := until_s - monotonic_s()) > 0:
+            if last is AttemptResult.UNANSWERED:
+                network_changed = self._network_changed
+                await wait_for_event(network_changed, left_s)
+                if network_changed.is_set():
                     return
-            elif last is Last.REFUSED:
-                if abs(self.offset_s() - offset_s) > _CLOCK_SET_S:
+            elif last is AttemptResult.REFUSED:
+                if abs(self.clock_offset_s() - clock_offset_s) > CLOCK_STEP_S:
                     return
-                await asyncio.sleep(min(left_s, _LOOK_S))
+                await asyncio.sleep(min(left_s, CLOCK_POLL_S))
             else:
                 await asyncio.sleep(left_s)
 
-    def _valid_in_s(self, failed: DialError | None) -> float | None:
-        if failed is None or failed.valid_from_s is None:
+    def _valid_in_s(self, failure: DialError | None) -> float | None:
+        if failure is None or failure.valid_from_s is None:
             return None
-        return failed.valid_from_s - self.wall_clock()
+        return failure.valid_from_s - self.wall_clock()
 
-    def _network_changed(self) -> None:
-        self._has_changed.set()
-        self._has_changed = asyncio.Event()
+    def _note_network_change(self) -> None:
+        self._network_changed.set()
+        self._network_changed = asyncio.Event()
 
 
-def last_of(failed: DialError | None) -> Last:
-    """Return how the last attempt ended, if it was the one that *failed*."""
-    if failed is None:
-        return Last.NONE
-    if failed.is_refusal:
-        return Last.REFUSED
-    return Last.UNANSWERED if failed.is_unanswered else Last.ANSWERED
+def _attempt_result(failure: DialError | None) -> AttemptResult:
+    if failure is None:
+        return AttemptResult.NONE
+    if failure.is_refusal:
+        return AttemptResult.REFUSED
+    return AttemptResult.UNANSWERED if failure.is_unanswered else AttemptResult.ANSWERED

@@ -1,7 +1,7 @@
-"""Which of several platforms a robot uses: the nearest by measurement, and when it changes.
+"""Choose the region (platform) that a robot uses: the one with the shortest measured round trip.
 
-A robot with several addresses keeps a connection to each: one carries its commands, the others stand by with
-a ping now and then.  The rules are pure; they see round trips and losses, with the time of each.
+A robot with several addresses keeps a connection to each: one carries its commands, the others stand by and
+are pinged.  These rules are pure: they receive round trips and losses, with the time of each.
 """
 
 from __future__ import annotations
@@ -15,87 +15,107 @@ from dataclasses import dataclass, field
 __all__ = ["MAX_REGIONS", "RegionChoice"]
 
 MAX_REGIONS = 4
-"""A connection to each is kept, and each costs its platform the place of a robot."""
-_RECENT = 3
-"""Round trips whose median counts: one late pong is no slow region."""
-_RATIO, _GAIN_S = 0.75, 0.02
-"""A region is clearly better with at most this share of the round trip, and at least this much less."""
-_GAP_S = 10.0
-"""Without a measurement for this long, the time begins anew: the robot may not have run."""
-_MEMORY_S = 3600.0
-_MAX_DOUBLINGS = 4
+"""Most addresses of one robot; a connection to each is kept, and takes the place of a robot at its
+platform."""
+MEDIAN_SIZE = 3
+"""The round trip of a region is the median of this many pings, so that one late pong does not count."""
+MAX_ROUND_TRIP_RATIO = 0.75
+"""A region is clearly nearer only if its round trip is at most this share of the present one."""
+MIN_ROUND_TRIP_GAIN_S = 0.02
+"""A region is clearly nearer only if its round trip is shorter by at least this time in seconds: a smaller
+gain is not worth a change, however large its share."""
+MAX_MEASUREMENT_GAP_S = 10.0
+"""If a region was not compared for this long, the time for which it has been nearer starts again: the robot
+may have been suspended."""
+LOSS_MEMORY_S = 3600.0
+"""Lost connections count for this long, in seconds."""
+MAX_DOUBLINGS = 4
+"""The time for which a region must be nearer doubles with each of its losses, at most this often (16
+times)."""
 
 
 @dataclass(slots=True)
-class _Region:
-    recent: deque[float] = field(default_factory=lambda: deque(maxlen=_RECENT))
-    losses: deque[float] = field(default_factory=deque)
-    better_since: float | None = None
-    compared: float = -math.inf
+class _RegionHistory:
+    round_trips_s: deque[float] = field(default_factory=lambda: deque(maxlen=MEDIAN_SIZE))
+    losses_s: deque[float] = field(default_factory=deque)
+    nearer_since_s: float | None = None
+    compared_s: float = -math.inf
 
 
 class RegionChoice:
-    """The measurements of *count* regions, numbered from 0, and what follows from them.
-
-    *hold_s*: seconds for which another region must be clearly better before the robot changes to it.  For a
-    region that was lost several times within an hour it doubles with each loss.
-    """
+    """Measure the regions of one robot, numbered from 0, and say when to change to another one."""
 
     def __init__(self, count: int, *, hold_s: float) -> None:
-        self._regions = [_Region() for _ in range(count)]
+        """Know no round trip yet.
+
+        Args:
+            count: Number of regions.
+            hold_s: How many seconds another region must be clearly nearer before the robot changes to it.
+                After several losses of that region within an hour this time doubles with each loss.
+        """
+        self._regions = [_RegionHistory() for _ in range(count)]
         self._hold_s = hold_s
 
-    def measured(self, region: int, round_trip_s: float) -> None:
-        """Take the round trip of one ping into account."""
-        self._regions[region].recent.append(round_trip_s)
+    def add_round_trip(self, region: int, round_trip_s: float) -> None:
+        """Record the round trip of one ping to *region*."""
+        self._regions[region].round_trips_s.append(round_trip_s)
 
-    def lost(self, region: int, now: float) -> None:
-        """Take into account that the connection to *region* was lost at *now*, seconds of any clock."""
-        lost = self._regions[region]
-        lost.losses.append(now)
-        lost.recent.clear()
-        lost.better_since = None
+    def add_loss(self, region: int, now_s: float) -> None:
+        """Record that the connection to *region* was lost at *now_s*, seconds of any clock.
+
+        The region then counts as infinitely far until its next ping.
+        """
+        history = self._regions[region]
+        history.losses_s.append(now_s)
+        history.round_trips_s.clear()
+        history.nearer_since_s = None
 
     def round_trip_s(self, region: int) -> float:
-        """Return the median of the last round trips, infinite without one."""
-        recent = self._regions[region].recent
-        return statistics.median(recent) if recent else math.inf
+        """Return the median of the last three round trips to *region*, infinite without one."""
+        round_trips_s = self._regions[region].round_trips_s
+        return statistics.median(round_trips_s) if round_trips_s else math.inf
 
-    def best(self, among: Iterable[int]) -> int | None:
-        """Return the region of *among* with the shortest round trip, the first of equal ones."""
-        return min(among, key=lambda each: (self.round_trip_s(each), each), default=None)
+    def nearest(self, regions: Iterable[int]) -> int | None:
+        """Return the one of *regions* with the shortest round trip, the first of equal ones, None of none."""
+        return min(regions, key=lambda region: (self.round_trip_s(region), region), default=None)
 
-    def better(self, current: int, among: Iterable[int], now: float) -> int | None:
-        """Return the region of *among* that has been clearly better than *current* for long enough.
+    def find_nearer_region(self, current: int, regions: Iterable[int], now_s: float) -> int | None:
+        """Return the one of *regions* to change to: clearly nearer than *current* for long enough; or None.
 
-        Call it after each measurement.
+        Call this after each measurement.  A returned region restarts the comparison of all regions.
         """
-        long_enough = []
-        for region in among:
-            if region != current and self._has_been_better(region, current, now):
-                long_enough.append(region)
-        chosen = self.best(long_enough)
+        candidates = []
+        for region in regions:
+            if region != current and self._has_been_nearer(region, current, now_s):
+                candidates.append(region)
+        chosen = self.nearest(candidates)
         if chosen is not None:
-            self.changed()
+            self.restart_comparison()
         return chosen
 
-    def changed(self) -> None:
-        """Begin to compare anew: the robot uses another region."""
-        for region in self._regions:
-            region.better_since = None
+    def restart_comparison(self) -> None:
+        """Forget for how long regions have been nearer, because the robot uses another region now."""
+        for history in self._regions:
+            history.nearer_since_s = None
 
-    def _has_been_better(self, region: int, current: int, now: float) -> bool:
-        other = self._regions[region]
-        mine_s, other_s = self.round_trip_s(current), self.round_trip_s(region)
-        if not (math.isfinite(mine_s) and other_s <= _RATIO * mine_s and mine_s - other_s >= _GAIN_S):
-            other.better_since = None
+    def _has_been_nearer(self, region: int, current: int, now_s: float) -> bool:
+        history = self._regions[region]
+        current_s, candidate_s = self.round_trip_s(current), self.round_trip_s(region)
+        is_nearer = (
+            math.isfinite(current_s)
+            and candidate_s <= MAX_ROUND_TRIP_RATIO * current_s
+            and current_s - candidate_s >= MIN_ROUND_TRIP_GAIN_S
+        )
+        if not is_nearer:
+            history.nearer_since_s = None
             return False
-        if other.better_since is None or now - other.compared > _GAP_S:
-            other.better_since = now
-        other.compared = now
-        return now - other.better_since >= self._pause_needed_s(other, now)
+        if history.nearer_since_s is None or now_s - history.compared_s > MAX_MEASUREMENT_GAP_S:
+            history.nearer_since_s = now_s
+        history.compared_s = now_s
+        return now_s - history.nearer_since_s >= self._required_s(history, now_s)
 
-    def _pause_needed_s(self, region: _Region, now: float) -> float:
-        while region.losses and region.losses[0] <= now - _MEMORY_S:
-            region.losses.popleft()
-        return self._hold_s * 2.0 ** min(_MAX_DOUBLINGS, max(0, len(region.losses) - 1))
+    def _required_s(self, history: _RegionHistory, now_s: float) -> float:
+        """Return for how many seconds a region with this history must be nearer."""
+        while history.losses_s and history.losses_s[0] <= now_s - LOSS_MEMORY_S:
+            history.losses_s.popleft()
+        return self._hold_s * 2.0 ** min(MAX_DOUBLINGS, max(0, len(history.losses_s) - 1))

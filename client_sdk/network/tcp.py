@@ -1,9 +1,8 @@
-"""Open a TCP connection to one of the addresses of a host, or say soon that nobody answers.
+"""Open a TCP connection to one of the addresses of a host, or fail soon if nobody answers.
 
-An attempt is given up after about a second: Linux repeats an unanswered one after 1, 3 and 7 s, and a robot
-whose network is back would wait for that.  A name is looked up for every attempt; while no lookup is
-answered, the last known addresses are used, so that a network without name servers costs nothing.  Nothing is
-retried here.
+The caller limits an attempt to about a second: Linux repeats an unanswered one after 1, 3 and 7 s, and a
+robot whose network is back would wait for that.  The name is looked up for every attempt; while no name
+server answers, the last known addresses are used.  A failed attempt is not repeated here.
 """
 
 from __future__ import annotations
@@ -17,104 +16,106 @@ from typing import Any
 
 __all__ = ["TcpDialler"]
 
-_LOOKUP_S = 0.25
-"""A lookup that takes longer goes on, for the next attempt; this one uses the last known addresses."""
-_NEXT_ADDRESS_S = 0.25
-"""Source: RFC 8305, 5."""
-_MAX_ADDRESSES = 4
+LOOKUP_WAIT_S = 0.25
+"""An attempt waits this long for a name server if addresses of the host are known from an earlier lookup."""
+NEXT_ADDRESS_S = 0.25
+"""While no address of a host has answered, the next one is tried after this time (RFC 8305, 5)."""
+MAX_ADDRESSES = 4
+"""An attempt tries at most this many addresses of a host, so that a long list cannot fill the time limit."""
 
-_Address = tuple[Any, ...]
-"""What `socket.getaddrinfo` returns for one address."""
+_AddressInfo = tuple[Any, ...]
+"""What `socket.getaddrinfo` returns for one address: family, type, protocol, canonical name, socket
+address."""
 
 
 class TcpDialler:
-    """Opens TCP connections, and remembers the last addresses of each host."""
+    """Open TCP connections, and remember the last known addresses of each host."""
 
     def __init__(self) -> None:
-        self._known: dict[tuple[str, int], list[_Address]] = {}
-        self._lookups: dict[tuple[str, int], asyncio.Future[list[_Address]]] = {}
+        """Know no addresses yet."""
+        self._known: dict[tuple[str, int], list[_AddressInfo]] = {}
+        self._lookups: dict[tuple[str, int], asyncio.Future[list[_AddressInfo]]] = {}
 
     async def connect(self, host: str, port: int, within_s: float) -> socket.socket:
         """Return a connected, non-blocking socket.
 
         Raises:
-            OSError: Nobody answered within *within_s* (``ETIMEDOUT``), the connection was refused, there is
-                no way there, or the name is not known.
+            OSError: Nobody answered within *within_s* seconds (``ETIMEDOUT``), the connection was refused,
+                there is no route to the host, or its name is unknown.
         """
-        until = asyncio.get_running_loop().time() + within_s
-        addresses = await self._addresses(host, port, within_s)
-        return await _first_answer(addresses[:_MAX_ADDRESSES], until)
+        until_s = asyncio.get_running_loop().time() + within_s
+        addresses = await self._find_addresses(host, port, within_s)
+        return await _connect_first(addresses[:MAX_ADDRESSES], until_s)
 
-    async def _addresses(self, host: str, port: int, within_s: float) -> list[_Address]:
+    async def _find_addresses(self, host: str, port: int, within_s: float) -> list[_AddressInfo]:
         key = (host, port)
+        # 1. An IP address needs no name server.
         with contextlib.suppress(socket.gaierror):
             numeric = socket.AI_NUMERICHOST | socket.AI_NUMERICSERV
             return socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=numeric)
+        # 2. Look the name up; a lookup that still runs from an earlier attempt is used.
         lookup = self._lookups.get(key)
         if lookup is None:
             loop = asyncio.get_running_loop()
             lookup = asyncio.ensure_future(loop.getaddrinfo(host, port, type=socket.SOCK_STREAM))
             self._lookups[key] = lookup
-            lookup.add_done_callback(lambda ended: self._take_lookup(key, ended))
+            lookup.add_done_callback(lambda ended: self._keep_addresses(key, ended))
         known = self._known.get(key)
-        done, _ = await asyncio.wait({lookup}, timeout=within_s if known is None else _LOOKUP_S)
+        done, _ = await asyncio.wait({lookup}, timeout=within_s if known is None else LOOKUP_WAIT_S)
+        # 3. Prefer fresh addresses, then the last known ones.
         if done and lookup.exception() is None:
             return lookup.result()
         if known is not None:
             return known
         if done:
-            return lookup.result()
-        raise _nobody(f"no name server says where {host} is")
+            return lookup.result()  # raises what the name server answered
+        raise OSError(errno.ETIMEDOUT, f"no name server answers for {host}")
 
-    def _take_lookup(self, key: tuple[str, int], ended: asyncio.Future[list[_Address]]) -> None:
+    def _keep_addresses(self, key: tuple[str, int], lookup: asyncio.Future[list[_AddressInfo]]) -> None:
         self._lookups.pop(key, None)
-        if not ended.cancelled() and ended.exception() is None:
-            self._known[key] = ended.result()
+        if not lookup.cancelled() and lookup.exception() is None:
+            self._known[key] = lookup.result()
 
 
-async def _first_answer(addresses: list[_Address], until: float) -> socket.socket:
-    """Return the first connection of those to *addresses*, begun one after the other."""
+async def _connect_first(addresses: list[_AddressInfo], until_s: float) -> socket.socket:
+    """Try *addresses* one after the other without waiting for a failure; return the first connection."""
     loop = asyncio.get_running_loop()
-    rest, waiting = deque(addresses), set[asyncio.Task[socket.socket]]()
-    failed: OSError | None = None
+    untried, running = deque(addresses), set[asyncio.Task[socket.socket]]()
+    failure: OSError | None = None
     try:
-        while rest or waiting:
-            left_s = until - loop.time()
+        while untried or running:
+            left_s = until_s - loop.time()
             if left_s <= 0:
                 break
-            if rest:
-                waiting.add(loop.create_task(_connect(rest.popleft())))
-            timeout_s = min(left_s, _NEXT_ADDRESS_S) if rest else left_s
-            done, _ = await asyncio.wait(waiting, timeout=timeout_s, return_when=asyncio.FIRST_COMPLETED)
+            if untried:
+                running.add(loop.create_task(_connect(untried.popleft())))
+            timeout_s = min(left_s, NEXT_ADDRESS_S) if untried else left_s
+            done, _ = await asyncio.wait(running, timeout=timeout_s, return_when=asyncio.FIRST_COMPLETED)
             for task in done:
-                waiting.discard(task)
+                running.discard(task)
                 try:
                     return task.result()
-                except OSError as error:
-                    failed = error if failed is None or error.errno == errno.ECONNREFUSED else failed
+                except OSError as error:  # a refusal tells more than a time-out of another address
+                    failure = error if failure is None or error.errno == errno.ECONNREFUSED else failure
     finally:
-        for task in waiting:
-            task.add_done_callback(_close)
+        for task in running:
+            task.add_done_callback(_close_connection)
             task.cancel()
-    raise failed or _nobody("nobody answers")
+    raise failure or OSError(errno.ETIMEDOUT, "nobody answers")
 
 
-async def _connect(address: _Address) -> socket.socket:
-    family, kind, protocol, _, where = address
-    made = socket.socket(family, kind, protocol)
+async def _connect(address: _AddressInfo) -> socket.socket:
+    family, kind, protocol, _, socket_address = address
+    connection = socket.socket(family, kind, protocol)
     try:
-        made.setblocking(False)
-        await asyncio.get_running_loop().sock_connect(made, where)
+        connection.setblocking(False)
+        await asyncio.get_running_loop().sock_connect(connection, socket_address)
     except BaseException:
-        made.close()
+        connection.close()
         raise
-    return made
+    return connection
 
 
-def _close(task: asyncio.Task[socket.socket]) -> None:
+def _close_connection(task: asyncio.Task[socket.socket]) -> None:
     if not task.cancelled() and task.exception() is None:
         task.result().close()
-
-
-def _nobody(why: str) -> OSError:
-    return OSError(errno.ETIMEDOUT, why)

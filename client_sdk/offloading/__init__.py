@@ -1,5 +1,5 @@
-"""Who computes a pose: a server, the burst function, or the robot itself.
+"""Decide who computes a command, and ask them: a backend server, the burst function, or the robot itself.
 
-How a command travels belongs to `client_sdk.network`, the services that a robot computes itself to
-`client_sdk.offloading.local_services`.
+The burst function is the platform's AWS Lambda, which answers pose commands while no server can.  WebSockets
+belong to `client_sdk.network`.
 """

@@ -1,7 +1,7 @@
-"""When a robot may send a command to the burst function, and to which address.
+"""Decide when a robot may send a command to the burst function (AWS Lambda), and to which address.
 
-Decisions only: a budget for each day, a circuit breaker, and the expected time of an answer.  Time is an
-argument; `client_sdk.offloading.burst_client` sends.
+The decisions are pure: a budget for each day, a circuit breaker, and the expected time of an answer.
+`client_sdk.offloading.burst_client` sends the commands.
 """
 
 from __future__ import annotations
@@ -13,110 +13,122 @@ from urllib.parse import urlsplit
 
 from rse_pf.errors import UsageError
 
-__all__ = ["BurstRules", "burst_address", "check_burst_url"]
+__all__ = ["BurstPolicy", "burst_address", "check_burst_url"]
 
-_DAY_S = 86400.0
-_FAILURES = 3
-"""Consecutive failures that open the breaker."""
-_FIRST_PAUSE_S, _MAX_PAUSE_S = 1.0, 60.0
-_MAX_IN_FLIGHT = 8
-_RECENT = 16
-_FRESH_S = 10.0
-"""After this an answer's time counts no more, so that a slow one does not end all attempts."""
-_SHARE = 0.75
+DAY_S = 86400.0
+BREAKER_FAILURES = 3
+"""The circuit breaker opens after this many consecutive failures: no command is sent for a while."""
+FIRST_OPEN_S = 1.0
+"""Longest time for which the breaker stays open at first, in seconds; it doubles with each further
+failure."""
+MAX_OPEN_S = 60.0
+"""Longest time for which the breaker stays open, in seconds."""
+MAX_DOUBLINGS = 16
+"""The open time stops doubling after this many failures, so that the number stays finite."""
+MAX_IN_FLIGHT = 8
+"""Most unanswered commands of one robot at the function; after an open breaker one is sent, as a trial."""
+RECENT_ANSWERS = 16
+"""How many of the last answers the expected time of the next one is taken from."""
+ANSWER_MEMORY_S = 10.0
+"""An answer's time counts for this long, so that one slow answer does not prevent all later attempts."""
+EXPECTED_PERCENTILE = 0.75
+"""The expected time of an answer is this percentile of the recent ones: most count, and not the slowest."""
 
 
 @dataclass(slots=True, kw_only=True)
-class BurstRules:
-    """The budget and the breaker of one robot.
+class BurstPolicy:
+    """Hold the daily budget and the circuit breaker of one robot; all times are seconds of one clock.
 
     Attributes:
-        commands_per_day: How many commands may be sent in 24 hours, counted from the first.
-        first_s: Expected time of an answer, seconds, until one was measured.
-        spent: Commands that were sent in the present 24 hours.
+        commands_per_day: How many commands may be sent within 24 hours, counted from the first.
+        first_s: Expected time of an answer until one was measured.
+        spent: Commands that were sent within the present 24 hours.
+        in_flight: Commands that were sent and have no result yet.
     """
 
     commands_per_day: int
     first_s: float = 0.15
     spent: int = 0
     in_flight: int = 0
-    _day_began: float = -math.inf
+    _day_began_s: float = -math.inf
     _failures: int = 0
-    _closed_until: float = -math.inf
-    _recent: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=_RECENT))
+    _open_until_s: float = -math.inf
+    _recent: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=RECENT_ANSWERS))
+    """When each of the last answers arrived, and how long it took."""
 
-    def may_send(self, now: float) -> bool:
-        """Return whether a command may be sent at *now*, seconds."""
-        if now - self._day_began >= _DAY_S:
-            self._day_began, self.spent = now, 0
-        allowed = 1 if self._failures >= _FAILURES else _MAX_IN_FLIGHT
-        return self.spent < self.commands_per_day and now >= self._closed_until and self.in_flight < allowed
+    def may_send(self, now_s: float) -> bool:
+        """Return whether a command may be sent at *now_s*, and begin a new day after 24 hours."""
+        if now_s - self._day_began_s >= DAY_S:
+            self._day_began_s, self.spent = now_s, 0
+        max_in_flight = 1 if self._failures >= BREAKER_FAILURES else MAX_IN_FLIGHT
+        is_closed = now_s >= self._open_until_s
+        return self.spent < self.commands_per_day and is_closed and self.in_flight < max_in_flight
 
-    def sent(self) -> None:
-        """Count a command that is sent."""
+    def count_sent(self) -> None:
+        """Count a command that is sent now."""
         self.spent += 1
         self.in_flight += 1
 
-    def answered(self, now: float, took_s: float | None) -> None:
-        """Record an answer that arrived at *now*: the function works.
+    def count_answer(self, now_s: float, took_s: float | None) -> None:
+        """Count an answer that arrived at *now_s*, which closes the breaker.
 
-        Args:
-            now: Seconds.
-            took_s: How long it took; None where an execution was started for it, which says nothing of the
-                next one.
+        *took_s* is how long the answer took; None after a cold start, which says nothing about the next
+        answer.
         """
         self.in_flight -= 1
         self._failures = 0
         if took_s is not None:
-            self._recent.append((now, took_s))
+            self._recent.append((now_s, took_s))
 
-    def failed(self, now: float, *, retry_after_s: float = 0.0, jitter: float = 0.5) -> None:
-        """Record a failure of the function.
+    def count_failure(self, now_s: float, *, retry_after_s: float = 0.0, jitter: float = 0.5) -> None:
+        """Count a failure of the function at *now_s*, and open the breaker after the third one in a row.
 
         Args:
-            now: Seconds.
-            retry_after_s: How long the function asked the robot to stay away.
-            jitter: Uniform in 0..1; the pause is between its half and the whole.
+            now_s: When the failure was noticed.
+            retry_after_s: How long the function asked the robot to send nothing.
+            jitter: Uniform in 0..1; the breaker stays open for between half of its time and all of it.
         """
         self.in_flight -= 1
-        is_open = self._failures >= _FAILURES and now < self._closed_until
-        self._failures += not is_open  # several in flight fail by one cause
-        pause_s = 0.0
-        if self._failures >= _FAILURES and not is_open:
-            doubled = min(self._failures - _FAILURES, 16)
-            pause_s = min(_MAX_PAUSE_S, _FIRST_PAUSE_S * 2.0**doubled) * (0.5 + 0.5 * jitter)
-        self._closed_until = max(self._closed_until, now + max(pause_s, retry_after_s))
+        is_open = self._failures >= BREAKER_FAILURES and now_s < self._open_until_s
+        self._failures += not is_open  # commands that are in flight together fail by one cause
+        open_s = 0.0
+        if self._failures >= BREAKER_FAILURES and not is_open:
+            doublings = min(self._failures - BREAKER_FAILURES, MAX_DOUBLINGS)
+            open_s = min(MAX_OPEN_S, FIRST_OPEN_S * 2.0**doublings) * (0.5 + 0.5 * jitter)
+        self._open_until_s = max(self._open_until_s, now_s + max(open_s, retry_after_s))
 
-    def withdrawn(self) -> None:
-        """Record that the robot no longer waits for a command that was sent; it stays spent."""
+    def count_withdrawal(self) -> None:
+        """Count a command whose result nobody waits for any more; it stays spent."""
         self.in_flight -= 1
 
-    def expected_s(self, now: float) -> float:
-        """Return the time within which an answer is expected, seconds: three of four recent ones were."""
-        fresh = sorted(took_s for at, took_s in self._recent if now - at < _FRESH_S)
-        return fresh[max(0, math.ceil(_SHARE * len(fresh)) - 1)] if fresh else self.first_s
+    def expected_s(self, now_s: float) -> float:
+        """Return the expected time of an answer: the 75th percentile of the answers of the last 10 s."""
+        times_s = sorted(took_s for at_s, took_s in self._recent if now_s - at_s < ANSWER_MEMORY_S)
+        if not times_s:
+            return self.first_s
+        return times_s[max(0, math.ceil(EXPECTED_PERCENTILE * len(times_s)) - 1)]
 
 
 def burst_address(url: str, own_url: str) -> str | None:
-    """Return the address of HTTP that *url* means for a robot that connects to *own_url*.
+    """Return the HTTP address of the burst function for a robot that connects to *own_url*.
 
     Args:
-        url: An address, or a path at the robot's own address.
+        url: An absolute address, or a path at the host of *own_url*.
         own_url: ``ws://HOST:PORT/ws`` or ``wss://...``.
 
     Returns:
-        None if *url* is none, or would send the token of a robot that uses TLS without TLS.
+        None if *url* is malformed, or if a robot that uses TLS would send its token without TLS.
     """
     own = urlsplit(own_url)
-    secure = own.scheme == "wss"
+    uses_tls = own.scheme == "wss"
     if url.startswith("/") and not url.startswith("//"):
-        url = f"{'https' if secure else 'http'}://{own.netloc.rpartition('@')[2]}{url}"
+        url = f"{'https' if uses_tls else 'http'}://{own.netloc.rpartition('@')[2]}{url}"
     try:
         parts = urlsplit(url)
         _ = parts.port
     except ValueError:
         return None
-    if parts.scheme not in ("http", "https") or not parts.hostname or (secure and parts.scheme == "http"):
+    if parts.scheme not in ("http", "https") or not parts.hostname or (uses_tls and parts.scheme == "http"):
         return None
     if any(not "!" <= letter <= "~" for letter in url):
         return None
@@ -124,10 +136,14 @@ def burst_address(url: str, own_url: str) -> str | None:
 
 
 def check_burst_url(url: str | None, own_url: str) -> str | None:
-    """Return *url*, given by the user; raises UsageError if it is no address that may be used."""
+    """Return *url*, which the user gave, unchanged; None and an empty text are allowed.
+
+    Raises:
+        UsageError: *url* is no address of HTTP, or would send a token without TLS (see `burst_address`).
+    """
     if url and burst_address(url, own_url or "ws://an-enrolment-names-it/ws") is None:
         raise UsageError(
-            f"burst_url={url!r} is not an address that takes commands",
-            hint="write https://HOST/burst, or /burst at the address of the servers; http: only beside ws:",
+            f"burst_url={url!r} is no HTTP address that a robot may send its token to",
+            hint="write https://HOST/burst, or /burst at the address of the servers; http: only with ws:",
         )
     return url

@@ -1,7 +1,7 @@
-"""Ask for one command: a server, the burst function and the robot itself, as a plan of `CloudFirst` says.
+"""Send a command to a backend server, the burst function or the robot itself, as a plan of `CloudFirst` says.
 
-A call ends with the first good answer.  No place is asked once it cannot be in time, and a failure that
-another place may not share is passed on only if no other place is left.
+A call ends with the first good answer.  A place is not asked if it cannot answer in time.  A failure that
+another place may not share is returned only if no other place is left.
 """
 
 from __future__ import annotations
@@ -13,28 +13,33 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from client_sdk.commands.answer_types import Answer
-from client_sdk.commands.traffic_stats import StatsKeeper
-from client_sdk.concurrency.user_callbacks import Callbacks
-from client_sdk.network.region_sockets import cancel_all
-from client_sdk.offloading.burst_client import Burst
+from client_sdk.commands.traffic_stats import TrafficCounter
+from client_sdk.concurrency.tasks import cancel_tasks
+from client_sdk.concurrency.user_callbacks import UserCallbacks
+from client_sdk.offloading.burst_client import BurstClient
 from client_sdk.offloading.local_services import LocalServices
 from client_sdk.offloading.offload_policy import CloudFirst, Plan
 from client_sdk.tracing import current_trace
 from rse_pf.wire import Command, Failure, Result
 from rse_pf.wire.client_session import Answered, ClientSession, Progressed
 
-__all__ = ["Asking", "Call", "OnProgress"]
+__all__ = ["CallArguments", "CommandRouter", "OnProgress"]
 
 OnProgress = Callable[[float, str], None]
-"""Called with the share of a long command that is done (0..1), and what was done last."""
+"""Called with the share of a long command that is done (0..1), and the name of the step that was done
+last."""
 
-Ended = Answer | Failure
-_SHOWN = {"server": "the cloud", "burst": "the burst function", "robot": "the robot"}
+PLACE_NAMES = {"server": "the cloud", "burst": "the burst function", "robot": "the robot"}
+"""How the reason in an answer names the place that failed before."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Call:
-    """The arguments of one call."""
+class CallArguments:
+    """The arguments of one call of `Robot.call`, which explains them.
+
+    ``deadline_s`` is always a number; ``is_open_ended`` says that the caller gave none, so that a long
+    service may take longer.
+    """
 
     service: str
     request: Any
@@ -46,63 +51,79 @@ class Call:
 
 
 @dataclass(frozen=True, slots=True)
-class _Turn:
+class _PlannedRequest:
+    """A place, and after how many seconds it is asked if there is no answer by then."""
+
     place: Literal["server", "burst", "robot"]
     after_s: float
 
 
-class Asking:
-    """The three places that may answer a robot's commands, and the commands that wait for a server."""
+class CommandRouter:
+    """Ask the three places that may answer the commands of one robot, and hold the commands at the
+    servers."""
 
     def __init__(
         self,
         *,
         session: ClientSession,
         flush: Callable[[], None],
-        keeper: StatsKeeper,
+        counter: TrafficCounter,
         clock: Callable[[], float],
-        offload: CloudFirst | None,
+        policy: CloudFirst | None,
         local: LocalServices | None,
-        burst: Burst,
-        callbacks: Callbacks,
+        burst: BurstClient,
+        callbacks: UserCallbacks,
     ) -> None:
+        """Hold no command yet.
+
+        Args:
+            session: Sends commands to the servers.
+            flush: Sends the messages that the session has written.
+            counter: Learns round trips, and predicts the next one.
+            clock: Monotonic seconds.
+            policy: Plans the commands; None means the defaults.
+            local: Services of the robot itself, None without them.
+            burst: Client of the burst function.
+            callbacks: Calls the *on_progress* of a call.
+        """
         self.waiting: dict[int, asyncio.Future[Answered] | Callable[[Answered], None]] = {}
+        """For each command at the servers its future, or the function that receives its end."""
         self._session = session
         self._flush = flush
-        self._keeper = keeper
+        self._counter = counter
         self._clock = clock
-        self._offload = offload or CloudFirst()
+        self._policy = policy or CloudFirst()
         self._local = local
         self._burst = burst
         self._callbacks = callbacks
         self._on_progress: dict[int, OnProgress] = {}
-        self._tasks: set[asyncio.Task[Ended]] = set()
+        self._tasks: set[asyncio.Task[Answer | Failure]] = set()
 
-    async def ask(self, call: Call) -> Ended:
-        """Return the answer of the first place that has one, or the failure."""
+    async def ask(self, call: CallArguments) -> Answer | Failure:
+        """Return the first good answer to *call*, or a failure."""
         local, current = self._local, self._session.current
-        self.hear_welcome()
-        plan = self._offload.plan(
+        self.read_welcome()
+        plan = self._policy.plan(
             deadline_s=call.deadline_s,
             connected=current is not None,
-            expected_round_trip_s=self._keeper.expected_round_trip_s(),
+            expected_round_trip_s=self._counter.expected_round_trip_s(),
             robot_solve_s=None if local is None else local.solve_s,
             robot_can=local is not None and local.offers(call.service),
             burst_s=None if call.on_progress is not None else self._burst.expected_s(call.service),
         )
-        turns = _turns(plan)
-        if [turn.place for turn in turns] == ["server"]:
+        requests = _planned_requests(plan)
+        if [request.place for request in requests] == ["server"]:
             return await self._ask_server(call)
-        return await self._race(turns, call, plan.why)
+        return await self._race(requests, call, plan.why)
 
-    def hear_welcome(self) -> None:
-        """Remember what the present server says of the burst function, for when there is none."""
+    def read_welcome(self) -> None:
+        """Keep what the connected server says of the burst function, for the time without a server."""
         current = self._session.current
         if current is not None and current.welcome is not None:
-            self._burst.heard(current.welcome)
+            self._burst.read_welcome(current.welcome)
 
-    def answered(self, event: Answered | Progressed) -> None:
-        """Hand an event of the session to whom it concerns."""
+    def handle_event(self, event: Answered | Progressed) -> None:
+        """Deliver an answer of a server, or the progress of a long command, to the call that waits for it."""
         if isinstance(event, Progressed):
             if event.id in self._on_progress:
                 self._callbacks.notify("on_progress", self._on_progress[event.id], event.done, event.what)
@@ -110,77 +131,86 @@ class Asking:
         waiting = self.waiting.get(event.id)
         if isinstance(waiting, asyncio.Future):
             if waiting.done():
-                self._keeper.duplicates += not waiting.cancelled()
+                self._counter.duplicates += not waiting.cancelled()
             else:
                 waiting.set_result(event)
         elif waiting is not None:
             del self.waiting[event.id]
             self._callbacks.notify("on_end", waiting, event)
         else:
-            self._keeper.duplicates += 1
+            self._counter.duplicates += 1
 
     async def close(self) -> None:
-        """End what still runs."""
-        await cancel_all(self._tasks)
+        """Cancel all calls that still run, and close the client of the burst function."""
+        await cancel_tasks(self._tasks)
         await self._burst.close()
 
-    async def _race(self, turns: deque[_Turn], call: Call, why: str) -> Ended:
-        """Ask each place in its turn, or as soon as nobody else is asked; return the first good answer."""
-        began = self._clock()
-        racing: dict[asyncio.Task[Ended], _Turn] = {}
+    async def _race(
+        self, requests: deque[_PlannedRequest], call: CallArguments, why: str
+    ) -> Answer | Failure:
+        """Ask each place at its time, or as soon as no other place is asked; return the first good answer."""
+        began_s = self._clock()
+        running: dict[asyncio.Task[Answer | Failure], _PlannedRequest] = {}
         message = "neither the cloud nor the robot answered in time"
-        failure = Failure(code="expired", message=message, hint="set a longer deadline_s")
-        first: Failure | None = None
+        expired = Failure(code="expired", message=message, hint="set a longer deadline_s")
+        first_failure: Failure | None = None
         try:
-            while turns or racing:
-                past_s = self._clock() - began
-                if past_s >= call.deadline_s:
-                    return failure
-                while turns and (turns[0].after_s <= past_s or not racing):
-                    turn = turns.popleft()
-                    left_s = call.deadline_s - past_s
-                    if self._can_be_in_time(turn, call, left_s):
-                        racing[self._spawn(self._ask_place(turn, call, left_s, why))] = turn
-                if not racing:
+            while requests or running:
+                # 1. Give up at the deadline.
+                elapsed_s = self._clock() - began_s
+                if elapsed_s >= call.deadline_s:
+                    return expired
+                # 2. Ask the places whose time has come.
+                while requests and (requests[0].after_s <= elapsed_s or not running):
+                    request = requests.popleft()
+                    left_s = call.deadline_s - elapsed_s
+                    if self._can_be_in_time(request, call, left_s):
+                        running[self._start_task(self._ask_place(request, call, left_s, why))] = request
+                if not running:
                     continue
-                until_s = turns[0].after_s if turns else call.deadline_s
+                # 3. Wait for an answer, or for the time of the next place.
+                until_s = requests[0].after_s if requests else call.deadline_s
                 done, _ = await asyncio.wait(
-                    racing, timeout=max(0.0, until_s - past_s), return_when=asyncio.FIRST_COMPLETED
+                    running, timeout=max(0.0, until_s - elapsed_s), return_when=asyncio.FIRST_COMPLETED
                 )
-                for task in sorted(done, key=lambda task: racing[task].place != "server"):
-                    turn, ended = racing.pop(task), task.result()
-                    if turn.place == "robot" or isinstance(ended, Answer):
-                        return ended
-                    if not self._offload.can_recover(ended.code):
-                        return ended
-                    why = f"{_SHOWN[turn.place]} answered {ended.code}"
-                    first = first or ended
-            return first or failure
+                # 4. Return a good answer or a final failure; a server's answer is preferred.
+                for task in sorted(done, key=lambda task: running[task].place != "server"):
+                    request, answer = running.pop(task), task.result()
+                    if request.place == "robot" or isinstance(answer, Answer):
+                        return answer
+                    if not self._policy.can_recover(answer.code):
+                        return answer
+                    why = f"{PLACE_NAMES[request.place]} answered {answer.code}"
+                    first_failure = first_failure or answer
+            return first_failure or expired
         except asyncio.CancelledError:
-            for task in racing:
+            for task in running:
                 task.cancel()
             raise
         finally:
-            # Late answers still count as measured; but what waits for a server is not sent later.
-            for task, turn in racing.items():
-                if turn.place == "server" and self._session.current is None:
+            # Requests that still run go on, because their times are measured; but a command that waits for a
+            # connection is cancelled, so that it is not sent later.
+            for task, request in running.items():
+                if request.place == "server" and self._session.current is None:
                     task.cancel()
 
-    def _can_be_in_time(self, turn: _Turn, call: Call, left_s: float) -> bool:
-        if turn.place != "burst":
+    def _can_be_in_time(self, request: _PlannedRequest, call: CallArguments, left_s: float) -> bool:
+        if request.place != "burst":
             return True
         expected_s = self._burst.expected_s(call.service)
         return expected_s is not None and expected_s < left_s
 
-    def _ask_place(self, turn: _Turn, call: Call, left_s: float, why: str) -> Coroutine[Any, Any, Ended]:
-        if turn.place == "server":
+    def _ask_place(
+        self, request: _PlannedRequest, call: CallArguments, left_s: float, why: str
+    ) -> Coroutine[Any, Any, Answer | Failure]:
+        if request.place == "server":
             return self._ask_server(call)
-        if turn.place == "burst":
+        if request.place == "burst":
             return self._ask_burst(call, left_s, why)
         assert self._local is not None
         return self._ask_robot(self._local, call, why)
 
-    async def _ask_server(self, call: Call) -> Ended:
+    async def _ask_server(self, call: CallArguments) -> Answer | Failure:
         identity = self._session.submit(
             call.service,
             call.request,
@@ -197,59 +227,64 @@ class Asking:
             self._on_progress[identity] = call.on_progress
         self._flush()
         try:
-            ended = await future
+            answered = await future
         finally:
             self._on_progress.pop(identity, None)
             self.waiting.pop(identity, None)
             self._session.cancel(identity)
             self._flush()
-        round_trip_s = self._clock() - ended.sent_s
-        answer = ended.answer
+        round_trip_s = self._clock() - answered.sent_s
+        answer = answered.answer
         if isinstance(answer, Result) or answer.code == "expired":
-            self._keeper.add_round_trip(round_trip_s)
-        return _from_server(ended, answer, round_trip_s) if isinstance(answer, Result) else answer
+            self._counter.add_round_trip(round_trip_s)
+        return _server_answer(answered, answer, round_trip_s) if isinstance(answer, Result) else answer
 
-    async def _ask_burst(self, call: Call, left_s: float, why: str) -> Ended:
+    async def _ask_burst(self, call: CallArguments, left_s: float, why: str) -> Answer | Failure:
         command = Command(
-            id=1, service=call.service, payload=call.request, stream=call.stream, keep=call.keep,
-            deadline_ms=left_s * 1e3, trace=current_trace(),
-        )  # fmt: skip
+            id=1,
+            service=call.service,
+            payload=call.request,
+            stream=call.stream,
+            keep=call.keep,
+            deadline_ms=left_s * 1e3,
+            trace=current_trace(),
+        )
         return await self._burst.ask(command, deadline_s=left_s, why=why)
 
-    async def _ask_robot(self, local: LocalServices, call: Call, why: str) -> Ended:
-        started = self._clock()
-        ended = await local.ask(Command(id=0, service=call.service, payload=call.request))
-        if isinstance(ended, Failure):
-            return ended
+    async def _ask_robot(self, local: LocalServices, call: CallArguments, why: str) -> Answer | Failure:
+        began_s = self._clock()
+        result = await local.ask(Command(id=0, service=call.service, payload=call.request))
+        if isinstance(result, Failure):
+            return result
         return Answer(
-            reply=ended.reply,
+            reply=result.reply,
             source="robot",
-            server=ended.server,
-            round_trip_ms=(self._clock() - started) * 1e3,
+            server=result.server,
+            round_trip_ms=(self._clock() - began_s) * 1e3,
             queue_ms=0.0,
-            compute_ms=ended.compute_ms,
+            compute_ms=result.compute_ms,
             why=why,
         )
 
-    def _spawn(self, work: Coroutine[Any, Any, Ended]) -> asyncio.Task[Ended]:
+    def _start_task(self, work: Coroutine[Any, Any, Answer | Failure]) -> asyncio.Task[Answer | Failure]:
         task = asyncio.get_running_loop().create_task(work)
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
         return task
 
 
-def _turns(plan: Plan) -> deque[_Turn]:
-    """Return who is asked, in the order of time; the burst function comes before the robot."""
-    turns = [] if plan.where == "robot" else [_Turn("server", 0.0)]
+def _planned_requests(plan: Plan) -> deque[_PlannedRequest]:
+    """Return the places to ask in the order of their times; the burst function comes before the robot."""
+    requests = [] if plan.where == "robot" else [_PlannedRequest("server", 0.0)]
     if plan.burst_after_s is not None:
-        turns.append(_Turn("burst", plan.burst_after_s))
+        requests.append(_PlannedRequest("burst", plan.burst_after_s))
     if plan.where != "cloud":
-        turns.append(_Turn("robot", plan.robot_after_s))
-    return deque(sorted(turns, key=lambda turn: turn.after_s))
+        requests.append(_PlannedRequest("robot", plan.robot_after_s))
+    return deque(sorted(requests, key=lambda request: request.after_s))
 
 
-def _from_server(ended: Answered, result: Result, round_trip_s: float) -> Answer:
-    up_ms, down_ms = (None if s is None else s * 1e3 for s in (ended.up_s, ended.down_s))
+def _server_answer(answered: Answered, result: Result, round_trip_s: float) -> Answer:
+    up_ms, down_ms = (None if s is None else s * 1e3 for s in (answered.up_s, answered.down_s))
     return Answer(
         reply=result.reply,
         source="cloud",
@@ -259,6 +294,6 @@ def _from_server(ended: Answered, result: Result, round_trip_s: float) -> Answer
         compute_ms=result.compute_ms,
         up_ms=up_ms,
         down_ms=down_ms,
-        payload_bytes=ended.wire_bytes,
+        payload_bytes=answered.wire_bytes,
         object=result.object,
     )

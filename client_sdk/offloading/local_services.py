@@ -1,6 +1,6 @@
-"""Services on the robot itself: the same `dispatch` as on a server, in one thread.
+"""Answer commands on the robot itself, in one thread, by the same `dispatch` as on a server.
 
-A solver is imported only by `LocalServices.prepare`.  Commands are answered one at a time.
+Solvers are imported only by `LocalServices.prepare`, so that a robot without them starts quickly.
 """
 
 from __future__ import annotations
@@ -16,28 +16,37 @@ from rse_pf.wire import Command, Failure, Result, make_codec
 
 __all__ = ["LocalServices"]
 
-_RECENT = 8
+RECENT_ANSWERS = 8
+"""How many of the last answers the expected time of the next one is taken from."""
 
 
 class LocalServices:
-    """The services that a robot offers without the cloud."""
+    """Hold the services that a robot offers itself, and answer one command at a time."""
 
     def __init__(self, registry: Registry | None, clock: Callable[[], float]) -> None:
-        self._recent_s: deque[float] = deque(maxlen=_RECENT)
+        """Load nothing yet.
+
+        Args:
+            registry: The services; None means the built-in ones.
+            clock: Monotonic seconds.
+        """
+        self._recent_s: deque[float] = deque(maxlen=RECENT_ANSWERS)
         self._registry = registry
         self._clock = clock
         self._codec = make_codec("bin")
         self._executor = ThreadPoolExecutor(1, "rse-pf-local-services")
 
     async def prepare(self) -> None:
-        """Load the services and measure a typical solve; a first one, which pays for imports, is not counted.
+        """Load the services and measure how long a typical pose takes.
+
+        The first pose is not counted, because it pays for imports.
 
         Raises:
             MissingExtra: No solver is installed.
         """
-        await asyncio.get_running_loop().run_in_executor(self._executor, self._prepare)
+        await asyncio.get_running_loop().run_in_executor(self._executor, self._load_services)
         if self.offers("pnp"):
-            command = _typical_command()
+            command = _typical_pose_command()
             await self.ask(command)
             self._recent_s.clear()
             await self.ask(command)
@@ -47,36 +56,36 @@ class LocalServices:
         return self._registry is not None and any(registered.name == service for registered in self._registry)
 
     async def ask(self, command: Command) -> Result | Failure:
-        """Answer *command* on the robot."""
-        started = self._clock()
+        """Compute *command* on the robot, after the commands that came before."""
+        began_s = self._clock()
         loop = asyncio.get_running_loop()
         answer = await loop.run_in_executor(self._executor, self._answer, command)
-        self._recent_s.append(self._clock() - started)
+        self._recent_s.append(self._clock() - began_s)
         return answer
 
     @property
     def solve_s(self) -> float | None:
-        """The longest of the last few answers, in seconds, or None before the first."""
+        """The longest of the last eight answers in seconds, waiting included; None before the first."""
         return max(self._recent_s, default=None)
 
     def close(self) -> None:
-        """End the thread; the answer that it works on is dropped."""
+        """End the thread after its present command, whose answer is dropped."""
         self._executor.shutdown(wait=False, cancel_futures=True)
 
     def _answer(self, command: Command) -> Result | Failure:
-        """Dispatch the command encoded and decoded, exactly as a server receives it."""
+        """Encode and decode *command*, so that it is exactly what a server receives, and compute it."""
         assert self._registry is not None
         try:
-            arrived = self._codec.decode_from_robot(self._codec.encode(command))
-            assert isinstance(arrived, Command)
-            answer = dispatch(self._registry, arrived, self._clock, server="robot")
-            sent = self._codec.decode_from_server(self._codec.encode(answer))
+            received = self._codec.decode_from_robot(self._codec.encode(command))
+            assert isinstance(received, Command)
+            answer = dispatch(self._registry, received, self._clock, server="robot")
+            decoded = self._codec.decode_from_server(self._codec.encode(answer))
         except RsePfError as error:
             return failure_of(error, command, server="robot")
-        assert isinstance(sent, Result | Failure)
-        return sent
+        assert isinstance(decoded, Result | Failure)
+        return decoded
 
-    def _prepare(self) -> None:
+    def _load_services(self) -> None:
         from rse_pf.config import PlatformSettings
         from rse_pf.services.builtin import builtin_services
 
@@ -84,7 +93,7 @@ class LocalServices:
             self._registry = builtin_services(PlatformSettings())
 
 
-def _typical_command() -> Command:
+def _typical_pose_command() -> Command:
     from rse_pf.pnp.problems import make_problem
     from rse_pf.services.pnp import make_request
 

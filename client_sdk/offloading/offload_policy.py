@@ -1,8 +1,8 @@
-"""Where a command is solved: by a server, by the burst function, or on the robot, and from when on.
+"""Plan who computes a command, and when each of them is asked; `CommandRouter` carries the plan out.
 
-The paper's rule (Sect. 6.2): "the saved time should be more than transmission delay so that real-time
-performance gains from cloud computing".  This module only decides;
-`client_sdk.offloading.command_router` carries the plan out.
+The candidates are the backend servers, the burst function (AWS Lambda) and the robot itself.  The rule of the
+paper (Sect. 6.2) is: "the saved time should be more than transmission delay so that real-time performance
+gains from cloud computing".
 """
 
 from __future__ import annotations
@@ -14,10 +14,11 @@ from rse_pf.service import Registry
 
 __all__ = ["CloudFirst", "Plan"]
 
-# A fallback begins this many of its own expected times before the last moment at which it helps.
-_MARGIN = 2.0
+FALLBACK_MARGIN = 2.0
+"""A fallback is asked while there is time for this many of its own expected answers, so that it is not
+late."""
 
-_RECOVERABLE = frozenset(
+RECOVERABLE_CODES = frozenset(
     {
         "busy",
         "quota",
@@ -33,16 +34,21 @@ _RECOVERABLE = frozenset(
         "conflict",
     }
 )
+"""Codes of failures that are no fault of the command itself, so that another place may succeed."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Plan:
-    """Where to solve one command.
+    """Who computes one command, and from when on.
 
-    ``cloud`` asks the servers alone and ``robot`` the robot alone; ``both`` asks the servers, and
-    after ``robot_after_s`` seconds the robot too, unless there is an answer by then.  The burst function is
-    asked after ``burst_after_s`` seconds, or as soon as the servers have failed; None asks it never.
-    ``why`` is the reason given in an answer that is not a server's.
+    Attributes:
+        where: ``cloud`` asks the servers and never the robot, ``robot`` never the servers, ``both`` asks the
+            servers at once and the robot later.
+        robot_after_s: Seconds after which the robot itself is asked if there is no answer by then.
+        burst_after_s: Seconds after which the burst function is asked if there is no answer by then, or
+        earlier
+            if the servers have failed; None never asks it.
+        why: The reason that is given in an answer of the burst function or of the robot.
     """
 
     where: Literal["cloud", "robot", "both"]
@@ -53,15 +59,16 @@ class Plan:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CloudFirst:
-    """Ask the servers, then the burst function if there is one, and at last the robot itself.
+    """Ask the servers first, then the burst function if there is one, and the robot itself at last.
 
-    Each is asked while it can still meet the deadline; the robot itself needs no network, so it is the last.
+    Each of them is asked early enough to meet the deadline.  The robot is the last because it needs no
+    network.
 
     Attributes:
-        registry: The services that the robot offers itself; None means the built-in ones.
-        robot_solve_s: How long the robot's own solver takes, until it is measured.
-        slack_s: Further time by which a fallback starts earlier, because the processor is shared.
-        take_faster: Apply the paper's rule: do not ask a cloud that is slower than the robot.
+        registry: Services that the robot offers itself; None means the built-in ones.
+        robot_solve_s: Expected time of the robot's own solver in seconds, until it was measured.
+        slack_s: Time in seconds by which the robot starts earlier, because its processor has other work.
+        take_faster: Whether the rule of the paper applies: do not ask a cloud that is slower than the robot.
     """
 
     registry: Registry | None = None
@@ -79,20 +86,23 @@ class CloudFirst:
         robot_can: bool = True,
         burst_s: float | None = None,
     ) -> Plan:
-        """Return the plan for a command that must be answered within *deadline_s*.
+        """Return the plan for one command.
 
         Args:
-            deadline_s: Seconds from now.
-            connected: Whether a connection is open.
-            expected_round_trip_s: The 95th percentile of recent round trips, or None if unknown.
-            robot_solve_s: The robot's own recent time for such a command, or None if unknown.
+            deadline_s: Seconds from now within which the answer is needed.
+            connected: Whether a server is connected.
+            expected_round_trip_s: 95th percentile of recent round trips to a server, None if unknown.
+            robot_solve_s: Recent time of the robot for such a command in seconds, None if unknown.
             robot_can: Whether the robot offers the service.
-            burst_s: Expected time of an answer of the burst function, or None if it cannot be asked.
+            burst_s: Expected time of an answer of the burst function, None if it cannot be asked.
         """
+        # 1. The latest moment at which the robot can start and still meet the deadline.
         local_s = self.robot_solve_s if robot_solve_s is None else robot_solve_s
-        latest_s = max(0.0, deadline_s - (_MARGIN * local_s if robot_can else 0.0) - self.slack_s)
+        robot_needs_s = FALLBACK_MARGIN * local_s if robot_can else 0.0
+        latest_s = max(0.0, deadline_s - robot_needs_s - self.slack_s)
         if burst_s is not None and burst_s > latest_s:
             burst_s = None
+        # 2. Without a server that can be in time, the burst function and the robot start at once.
         where: Literal["cloud", "both"] = "both" if robot_can else "cloud"
         is_slow = expected_round_trip_s is not None and expected_round_trip_s >= deadline_s
         if not connected or is_slow:
@@ -105,35 +115,38 @@ class CloudFirst:
                 burst_after_s=None if burst_s is None else 0.0,
                 why=why,
             )
+        # 3. The rule of the paper: a cloud that is slower than the robot is not asked.
         if self.take_faster and robot_can and expected_round_trip_s is not None:
             why = f"the robot takes {local_s * 1e3:.1f} ms, the cloud {expected_round_trip_s * 1e3:.1f} ms"
             if local_s <= expected_round_trip_s:
                 return Plan(where="robot", why=why)
+        # 4. Ask the servers now, and the others as late as is safe.
+        burst_after_s = None
+        if burst_s is not None:
+            burst_after_s = _burst_after_s(latest_s, burst_s, expected_round_trip_s)
         return Plan(
             where=where,
             robot_after_s=latest_s,
-            burst_after_s=None
-            if burst_s is None
-            else _last_chance_s(latest_s, burst_s, expected_round_trip_s),
+            burst_after_s=burst_after_s,
             why="the cloud did not answer in time",
         )
 
     @staticmethod
     def can_recover(code: str) -> bool:
-        """Whether the robot may succeed where the cloud failed with *code*.
+        """Return whether another place may succeed where one failed with the error *code*.
 
-        An error of the command itself (too few points, no consensus) would occur on the robot as well.
+        An error of the command itself (too few points, no consensus) would occur everywhere.
         """
-        return code in _RECOVERABLE
+        return code in RECOVERABLE_CODES
 
 
-def _last_chance_s(latest_s: float, burst_s: float, expected_round_trip_s: float | None) -> float:
-    """Return when the burst function is asked beside a server that has not answered yet.
+def _burst_after_s(latest_s: float, burst_s: float, expected_round_trip_s: float | None) -> float:
+    """Return after how many seconds the burst function is asked while a server has not answered yet.
 
-    As late as it is safe, and not while most answers of the servers are still on their way: each command
-    that both answer is paid for nothing.
+    That is as late as is safe, and after the 95th percentile of the servers' round trips: a command that both
+    answer is paid for twice.
 
     Source:
         Dean and Barroso 2013, "The tail at scale": a second request after the 95th percentile of the first.
     """
-    return min(latest_s - burst_s, max(expected_round_trip_s or 0.0, latest_s - _MARGIN * burst_s))
+    return min(latest_s - burst_s, max(expected_round_trip_s or 0.0, latest_s - FALLBACK_MARGIN * burst_s))

@@ -1,8 +1,7 @@
-"""Upload keyframes in the background: at a limited rate, in order, from a bounded spool folder.
+"""Upload keyframes in the background: in order, at a limited rate, from a spool folder of bounded size.
 
-The rate limit allows no burst, so that keyframes collected during hours offline are uploaded at a steady rate
-and do not delay live poses.  The spool survives a restart of the robot.  `BackgroundUploader.add` never
-blocks; keyframes that do not fit into the spool are dropped and counted.
+The rate limit allows no burst: keyframes of hours without a network are uploaded at a steady rate, so that
+they do not delay live poses.  The spool survives a restart of the robot.
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from client_sdk.concurrency.user_callbacks import Callbacks
+from client_sdk.concurrency.user_callbacks import UserCallbacks
 from client_sdk.transfer.data_client import DataClient
 from rse_pf.errors import BadRequest, LimitExceeded, RsePfError, UsageError
 from rse_pf.files import replace_file
@@ -22,18 +21,21 @@ from rse_pf.token_bucket import TokenBucket
 
 __all__ = ["BYTES_PER_S", "MAX_SPOOL_BYTES", "BackgroundUploader"]
 
-# Rate of the uploads: a small part of a wireless link, so that poses are not delayed.
 BYTES_PER_S = 262_144.0
-# Keyframes of some hours without a network.
+"""Default rate of uploads, in bytes per second: a small part of a wireless link, so that poses are not
+delayed."""
 MAX_SPOOL_BYTES = 1 << 30
-
-_JOIN_TIMEOUT_S = 5.0
-_RETRY_PAUSE_S = 5.0
-_BUSY_POLL_S = 0.05
+"""Default size of the spool folder, in bytes: room for the keyframes of some hours without a network."""
+THREAD_JOIN_S = 5.0
+"""How long `BackgroundUploader.close` waits for the upload that its thread works on."""
+RETRY_PAUSE_S = 5.0
+"""Pause after an upload that failed; the data client has repeated its requests before."""
+BUSY_POLL_S = 0.05
+"""How often *is_busy* is called while live poses are waiting."""
 
 
 class BackgroundUploader:
-    """Keep keyframes in a folder until a thread has uploaded them, oldest first."""
+    """Keep keyframes in a spool folder until a thread has uploaded them, oldest first."""
 
     def __init__(
         self,
@@ -45,100 +47,109 @@ class BackgroundUploader:
         clock: Callable[[], float] = time.monotonic,
         is_busy: Callable[[], bool] = lambda: False,
     ) -> None:
-        """Describe the uploads; `start` begins them.
+        """Upload nothing yet.
 
         Args:
             uploads: Client of the data service.
-            folder: The spool; created by `start`, which also takes over keyframes of an earlier run.
-            bytes_per_s: Rate of the uploads.
-            max_spool_bytes: Size of the spool; keyframes above it are dropped.
+            folder: The spool folder, which `start` creates; keyframes of an earlier run in it are uploaded,
+            too.
+            bytes_per_s: Highest rate of the uploads, in bytes per second.
+            max_spool_bytes: Largest size of the spool folder; keyframes that do not fit are dropped.
             clock: Monotonic seconds.
-            is_busy: Whether live poses are waiting; no keyframe and no part is started meanwhile.
-                An exception counts as not busy, and is logged.
+            is_busy: Returns whether live poses are waiting; no keyframe and no part of one is sent meanwhile.
+                If it raises, the exception is logged and the uploads go on.
         """
         self.sent = 0
+        """Keyframes that were uploaded."""
         self.dropped = 0
+        """Keyframes that did not fit into the spool, or that the data service refused for good."""
         self.last_error = ""
+        """Message of the last failure, empty without one."""
         self._uploads = uploads
         self._folder = folder
         self._bytes_per_s = bytes_per_s
         self._max_spool_bytes = max_spool_bytes
         self._clock = clock
         self._is_busy = is_busy
-        self._callbacks = Callbacks()
+        self._callbacks = UserCallbacks()
         self._condition = threading.Condition()
-        self._held: dict[str, int] = {}
-        self._next = 0
-        self._over = False
-        self._thread = threading.Thread(target=self._work, name="keyframe-uploads", daemon=True)
+        self._spooled: dict[str, int] = {}
+        self._next_number = 0
+        self._is_closed = False
+        self._thread = threading.Thread(target=self._run_uploads, name="keyframe-uploads", daemon=True)
 
     def start(self) -> None:
-        """Take over the keyframes of an earlier run, and start the uploads."""
+        """Find the keyframes of an earlier run in the spool folder, and start the thread of the uploads."""
         self._folder.mkdir(parents=True, exist_ok=True)
         with self._condition:
             for path in sorted(self._folder.glob("*.keyframe")):
-                self._held[path.name] = path.stat().st_size
-                self._next = max(self._next, int(path.name.partition("-")[0]) + 1)
+                self._spooled[path.name] = path.stat().st_size
+                self._next_number = max(self._next_number, int(path.name.partition("-")[0]) + 1)
         self._thread.start()
 
     @property
     def waiting(self) -> int:
-        """How many keyframes are not uploaded yet."""
+        """Number of keyframes that are not uploaded yet."""
         with self._condition:
-            return len(self._held)
+            return len(self._spooled)
 
     def add(self, data: bytes) -> str | None:
-        """Spool a keyframe and return its digest; None if the spool is full and it was dropped."""
+        """Write an encoded keyframe to the spool without waiting for its upload.
+
+        Returns:
+            The sha256 of the keyframe; None if it was dropped because the spool or the disk is full.
+        """
         digest = hashlib.sha256(data).hexdigest()
         with self._condition:
-            if sum(self._held.values()) + len(data) > self._max_spool_bytes:
+            if sum(self._spooled.values()) + len(data) > self._max_spool_bytes:
                 self.dropped += 1
                 return None
-            name = f"{self._next:012d}-{digest[:16]}.keyframe"
-            self._next += 1
+            name = f"{self._next_number:012d}-{digest[:16]}.keyframe"
+            self._next_number += 1
             try:
                 replace_file(self._folder / name, data)
             except OSError as error:
                 self.dropped += 1
                 self.last_error = str(error)
                 return None
-            self._held[name] = len(data)
+            self._spooled[name] = len(data)
             self._condition.notify_all()
         return digest
 
     def wait_sent(self, timeout_s: float) -> bool:
-        """Wait until all keyframes are uploaded; return whether they are."""
+        """Wait until all keyframes are uploaded, at most *timeout_s* seconds; return whether they are."""
         with self._condition:
-            return self._condition.wait_for(lambda: not self._held, timeout_s)
+            return self._condition.wait_for(lambda: not self._spooled, timeout_s)
 
     def close(self) -> None:
-        """End the thread; keyframes not uploaded stay in the spool for the next run."""
+        """End the thread; keyframes that are not uploaded stay in the spool for the next run."""
         with self._condition:
-            self._over = True
+            self._is_closed = True
             self._condition.notify_all()
         self._uploads.close()
         if self._thread.is_alive() and self._thread is not threading.current_thread():
-            self._thread.join(_JOIN_TIMEOUT_S)
+            self._thread.join(THREAD_JOIN_S)
 
-    def _work(self) -> None:
+    def _run_uploads(self) -> None:
         bucket = TokenBucket(self._bytes_per_s, burst=0.0)
         while True:
             with self._condition:
-                self._condition.wait_for(lambda: self._over or bool(self._held))
-                if self._over:
+                self._condition.wait_for(lambda: self._is_closed or bool(self._spooled))
+                if self._is_closed:
                     return
-                name = min(self._held)
-                size = self._held[name]
-            if self._pause(bucket.spend(size, self._clock())) or not self._wait_for_quiet():
+                name = min(self._spooled)
+                size = self._spooled[name]
+            if self._wait_closed(bucket.spend(size, self._clock())) or not self._wait_not_busy():
                 return
-            if not self._send(name) and self._pause(_RETRY_PAUSE_S):
+            if not self._upload(name) and self._wait_closed(RETRY_PAUSE_S):
                 return
 
-    def _send(self, name: str) -> bool:
+    def _upload(self, name: str) -> bool:
+        """Upload a file of the spool and remove it; return False if it has to be tried again."""
         path = self._folder / name
         try:
-            self._uploads.upload(path, self._between_parts)
-        except (BadRequest, LimitExceeded, UsageError) as error:  # it is refused for good, or is missing
+            self._uploads.upload(path, self._pause_between_parts)
+        except (BadRequest, LimitExceeded, UsageError) as error:  # refused for good, or the file is missing
             self.dropped += 1
             self.last_error = error.message
         except RsePfError as error:
@@ -149,21 +160,24 @@ class BackgroundUploader:
         with contextlib.suppress(OSError):
             path.unlink()
         with self._condition:
-            self._held.pop(name, None)
+            self._spooled.pop(name, None)
             self._condition.notify_all()
         return True
 
-    def _between_parts(self, done: int, size: int) -> None:
+    def _pause_between_parts(self, done: int, size: int) -> None:
         if done < size:
-            self._wait_for_quiet()
+            self._wait_not_busy()
 
-    def _wait_for_quiet(self) -> bool:
+    def _wait_not_busy(self) -> bool:
+        """Wait until no live pose is waiting; return False if the uploader was closed."""
         while self._callbacks.call("is_busy", self._is_busy, default=False):
-            if self._pause(_BUSY_POLL_S):
+            if self._wait_closed(BUSY_POLL_S):
                 return False
         return True
 
-    def _pause(self, seconds: float) -> bool:
-        """Wait, and return whether the uploader was closed."""
+    def _wait_closed(self, seconds: float) -> bool:
+        """Wait until the uploader is closed, at most for *seconds*; return whether it is."""
         with self._condition:
-            return self._condition.wait_for(lambda: self._over, seconds) if seconds > 0 else self._over
+            if seconds > 0:
+                self._condition.wait_for(lambda: self._is_closed, seconds)
+            return self._is_closed

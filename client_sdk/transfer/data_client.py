@@ -1,9 +1,9 @@
-"""Send and fetch large data by HTTP (paper, Sect. 5.2): images, keyframes, clouds, maps.
+"""Store and fetch large data by HTTP (paper, Sect. 5.2): images, keyframes, point clouds, maps.
 
-`DataClient` is blocking; run it in a thread.  Objects are named by their sha256, so a repeated or resumed
-transfer can neither store an object twice nor mix two versions.  An upload returns when the data server has
-reported the object durable.  Objects may take a presigned address of the service's bucket; when that fails,
-the service carries the bytes itself.
+`DataClient` blocks; an asyncio program runs it in a thread.  Objects are named by their sha256, so a repeated
+or resumed transfer can neither store an object twice nor mix two versions.  An upload returns when the data
+server has reported the object durable.  The service may offer a presigned address of its bucket (S3), which
+takes the bytes directly; when that fails, the bytes go through the service.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ from urllib.parse import quote, urlencode, urlsplit
 
 import msgspec
 
-from client_sdk.concurrency.user_callbacks import Callbacks
+from client_sdk.concurrency.user_callbacks import UserCallbacks
 from client_sdk.enrolment import read_enrolment
 from client_sdk.network.http_proxy import TunnelRefused
 from client_sdk.transfer.data_connection import (
     MAX_SINGLE_PUT_BYTES,
     NO_UPSTREAM,
-    DataRequests,
+    DataConnection,
     Response,
     StoredReply,
     open_connection,
@@ -54,13 +54,19 @@ from rse_pf.maps.record import MapRecord
 __all__ = ["DataClient", "DataOptions", "OnBytes", "is_allowed"]
 
 OnBytes = Callable[[int, int], None]
-"""Called after each part with the bytes transferred and the bytes in total."""
+"""Called after each part with the number of bytes that are transferred, and of all bytes."""
 
-_PIECE_BYTES = 1 << 20
-_PRESIGNED_TRIES = 3
-_REDIRECTED = 307
-_NO_SERVICE_S = 5.0
-_RETRIED = {408, 429, 500, 502, 503, 504}
+PIECE_BYTES = 1 << 20
+"""Size of the ranges of a download, and of the pieces in which a file is read, in bytes."""
+PRESIGNED_ATTEMPTS = 3
+"""How often a transfer by presigned addresses is tried before the bytes go through the data service."""
+TEMPORARY_REDIRECT = 307
+"""Status by which the data service offers a presigned address."""
+NO_SERVICE_TIMEOUT_S = 5.0
+"""How long a request is repeated while the load balancer says that the platform has no data server: a
+platform that starts needs seconds, and one without a data service never has one."""
+RETRIED_STATUSES = {408, 429, 500, 502, 503, 504}
+"""HTTP statuses of failures that may pass, so that the request is repeated."""
 T = TypeVar("T")
 
 
@@ -96,9 +102,19 @@ class _MapVersion(msgspec.Struct, frozen=True, kw_only=True):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DataOptions:
-    """Timeouts and retries of a client; ``deadline_s`` limits the time without any progress.
+    """Timeouts and repeats of a data client.
 
-    ``ssl_context`` is for ``https:``; None trusts the authorities of the machine.
+    Attributes:
+        timeout_s: How long one attempt of a request may wait for data.
+        deadline_s: How long a request is repeated; since each part of a transfer is a request, this is the
+            longest time without progress.
+        first_pause_s: Longest pause before the first repeat; it doubles with each repeat.
+        max_pause_s: Longest pause between repeats.
+        part_bytes: Largest part of an upload.
+        clock: Monotonic seconds.
+        sleep: Waits for a number of seconds.
+        random: Source of the jitter of pauses.
+        ssl_context: What ``https:`` trusts; None means the authorities of the machine.
     """
 
     timeout_s: float = 10.0
@@ -113,7 +129,7 @@ class DataOptions:
 
 
 class DataClient:
-    """A robot's client of the data service; one connection, used by one thread at a time."""
+    """Store and fetch objects and maps of one robot over one connection, which threads use in turn."""
 
     def __init__(self, url: str, token: str | Callable[[], str], options: DataOptions | None = None) -> None:
         """Store the address; nothing is sent yet.
@@ -124,70 +140,75 @@ class DataClient:
             options: Timeouts, retries and part sizes.
 
         Raises:
-            UsageError: *url* is not such an address.
+            UsageError: *url* has another scheme, or no usable host or port.
         """
         self._token = token
-        self._callbacks = Callbacks()
+        self._callbacks = UserCallbacks()
         self._options = options or DataOptions()
-        self._requests = DataRequests(
+        self._connection = DataConnection(
             url, timeout_s=self._options.timeout_s, ssl_context=self._options.ssl_context
         )
         self._lock = threading.Lock()
 
     @classmethod
     def enrolled(cls, enrolment: str | Path) -> DataClient:
-        """Return the client of a robot by its file of ``rse-pf robot enrol --out``.
+        """Return a client with the address and the key in an enrolment file.
+
+        Args:
+            enrolment: File of ``rse-pf robot enrol --out``.
 
         Raises:
-            UsageError: The file cannot be used.
+            UsageError: The file cannot be read, or it holds no enrolment.
         """
         access = read_enrolment(enrolment)
         return cls(access.url, access.fresh_token, DataOptions(ssl_context=access.ssl_context))
 
     def close(self) -> None:
         """Close the connection; the next call opens another."""
-        self._requests.close()
+        self._connection.close()
 
     def upload(self, source: bytes | Path, progress: OnBytes | None = None) -> str:
-        """Store bytes or a file and return the digest, once the object is durable.
+        """Store bytes or a file as an object, and return its sha256 once it is durable.
 
-        An earlier upload of the same bytes is resumed, also one by another process.
+        An earlier upload of the same bytes is resumed, also one by another process.  *progress* is called
+        after each part.
 
         Raises:
-            ConnectError: No progress for ``deadline_s``, or the platform has no data service for 5 s.
-            StoreFull, QuotaExceeded, LimitExceeded, Unauthorized, Forbidden: The server refuses it.
+            ConnectError: There was no progress for ``deadline_s``, or no data service for 5 s.
+            StoreFull, QuotaExceeded, LimitExceeded, Unauthorized, Forbidden: The server refuses the object.
             UsageError: The file cannot be read.
         """
-        with self._lock, _Source(source) as opened:
-            size, digest = opened.size, opened.digest()
+        with self._lock, _Source(source) as reader:
+            size, digest = reader.size, reader.digest()
             if size <= MAX_SINGLE_PUT_BYTES:
                 self._request(
-                    "PUT", f"/data/v1/objects/{digest}", StoredReply, opened.read(0, size), digest=digest
+                    "PUT", f"/data/v1/objects/{digest}", StoredReply, reader.read(0, size), digest=digest
                 )
                 self._report(progress, size, size)
             else:
-                self._upload_parts(opened, digest, progress)
+                self._upload_parts(reader, digest, progress)
             return digest
 
     def download(self, digest: str, to: Path | None = None, progress: OnBytes | None = None) -> bytes:
-        """Return an object, or write it to file *to* (and return no bytes), verified by its digest.
+        """Return the bytes of an object, or write them to the file *to* and return no bytes.
 
-        The file appears only when it is complete; an interrupted download is kept beside it and resumed.
+        The bytes are verified by *digest*, the sha256 of the object.  The file appears only when it is
+        complete; a download that was interrupted is kept in the same folder and resumed.
 
         Raises:
-            NotFound: There is no such object of this robot.
+            NotFound: This robot has no such object.
             StoreError: The bytes do not match the digest.
         """
         with self._lock:
             return self._download(f"/data/v1/objects/{digest}", digest, to, progress)
 
     def delete(self, digest: str) -> None:
-        """Remove an object; a missing one is no error."""
+        """Remove the object with the sha256 *digest*; it is no error if there is none."""
         with self._lock:
             self._request("DELETE", f"/data/v1/objects/{digest}", bytes)
 
     def objects(self) -> Iterator[tuple[str, int]]:
-        """Yield digest and size of each of this robot's objects."""
+        """Yield sha256 and size in bytes of each object of this robot."""
         after = ""
         while True:
             with self._lock:
@@ -198,36 +219,42 @@ class DataClient:
             after = page.next
 
     def maps(self) -> dict[str, str]:
-        """Return the maps of this tenant: name to id of the head."""
+        """Return the names of all maps of this tenant, each with the id of its head, the newest version."""
         with self._lock:
             return {entry.name: entry.head for entry in self._reply("GET", "/data/v1/maps", _MapPage).maps}
 
     def map_version(self, name: str, version: str = "head") -> dict[str, Any]:
-        """Return ``id`` and ``record`` of a version of a map."""
+        """Return a version of the map *name* as a dict of ``id`` and ``record`` (digest, parent, note)."""
         with self._lock:
-            reply = self._reply("GET", f"{_versions(name)}/{version}", _MapVersion)
+            reply = self._reply("GET", f"{_versions_path(name)}/{version}", _MapVersion)
         description: dict[str, Any] = msgspec.to_builtins(reply)
         return description
 
     def download_map(self, name: str, version: str = "head", progress: OnBytes | None = None) -> bytes:
-        """Return a version's bytes, for `rse_pf.maps.format.decode_map`."""
+        """Return the encoded map of a version, for `rse_pf.maps.format.decode_map`."""
         description = self.map_version(name, version)
         with self._lock:
-            path = f"{_versions(name)}/{description['id']}/content"
+            path = f"{_versions_path(name)}/{description['id']}/content"
             return self._download(path, description["record"]["digest"], None, progress)
 
     def commit_map(self, name: str, data: bytes, *, parent: str | None, note: str = "") -> str:
-        """Upload the bytes of a map and make them the head; return the version's id.
+        """Upload an encoded map as the new head of the map *name*; return the id of the version.
+
+        Args:
+            name: Name of the map.
+            data: Encoded map.
+            parent: Id of the present head, None if there is no such map yet.
+            note: Text for people who read the history.
 
         Raises:
-            Conflict: Another robot committed first: *parent* is no longer the head.
+            Conflict: *parent* is no longer the head: another robot committed first.
         """
         body = {"digest": self.upload(data), "parent": parent, "note": note}
         with self._lock:
-            return self._reply("POST", _versions(name), _MapVersion, json.dumps(body).encode()).id
+            return self._reply("POST", _versions_path(name), _MapVersion, json.dumps(body).encode()).id
 
     def update_map(self, name: str, data: bytes, *, note: str = "") -> str:
-        """Upload the bytes of a map and make them the head, whatever it was; return the version's id.
+        """Upload an encoded map as the new head of the map *name*, whatever its head is; return the id.
 
         Raises:
             Conflict: Another robot committed at the same moment.
@@ -239,17 +266,17 @@ class DataClient:
         return self.commit_map(name, data, parent=parent, note=note)
 
     def localise(self, name: str, photo: bytes, lens: PhotoLens) -> PhotoLocation:
-        """Return where a photo was taken in the head of a map.
+        """Return the pose from which a photo was taken, in the head of the map *name*.
 
         Args:
-            name: Of the map.
-            photo: A JPEG or PNG, as its file has it.
+            name: Name of the map.
+            photo: Bytes of a JPEG or PNG file.
             lens: Intrinsics of the camera that took it.
 
         Raises:
-            NotFound: There is no such map of this tenant.
+            NotFound: The tenant has no such map.
             BadRequest, LimitExceeded, InvalidCamera: The photo or its intrinsics cannot be used.
-            Forbidden: The token has not the scope ``maps:localise/MAP``.
+            Forbidden: The token lacks the scope ``maps:localise/MAP``.
         """
         query: dict[str, Any] = msgspec.to_builtins(lens)
         query |= {"distortion": ",".join(map(repr, lens.distortion))} if lens.distortion else {}
@@ -258,93 +285,100 @@ class DataClient:
             return self._reply("POST", path, PhotoLocation, photo)
 
     def map_outline(self, name: str) -> MapOutline:
-        """Return the head of a map as it is seen from above; raises as `localise`."""
+        """Return the outline of the head of the map *name* from above; raise the errors of `localise`."""
         with self._lock:
             path = f"{LOCALISE_PATH}{quote(name, safe='')}"
             return self._reply("GET", path, MapOutline)
 
-    def _upload_parts(self, opened: _Source, digest: str, progress: OnBytes | None) -> None:
-        path, size = f"/data/v1/uploads/{digest}", opened.size
-        begin = json.dumps({"size": size}).encode()
-        state = self._begin(path, begin, opened, digest, progress)
+    def _upload_parts(self, reader: _Source, digest: str, progress: OnBytes | None) -> None:
+        path, size = f"/data/v1/uploads/{digest}", reader.size
+        request = json.dumps({"size": size}).encode()
+        state = self._open_upload(path, request, reader, digest, progress)
         part_bytes = min(state.part_bytes, self._options.part_bytes)
         offset = state.offset
         self._report(progress, offset, size)
         while offset < size:
-            part = opened.read(offset, min(part_bytes, size - offset))
+            part = reader.read(offset, min(part_bytes, size - offset))
             try:
                 state = self._reply(
                     "PATCH", path, _Upload, part, {"Upload-Offset": str(offset)}, digest=digest
                 )
-            except (
-                Conflict,
-                NotFound,
-            ):  # the answer to this part was lost, or another process uploads the same object
-                state = self._reply("PUT", path, _Upload, begin, digest=digest)
+            except (Conflict, NotFound):
+                # The answer to an earlier part was lost, or another process uploads the same object.
+                state = self._reply("PUT", path, _Upload, request, digest=digest)
             offset = state.offset
             self._report(progress, offset, size)
 
-    def _begin(
-        self, path: str, begin: bytes, opened: _Source, digest: str, progress: OnBytes | None
+    def _open_upload(
+        self, path: str, request: bytes, reader: _Source, digest: str, progress: OnBytes | None
     ) -> _Upload:
-        """Open an upload, and send the object to a presigned address if the service offers one."""
-        tries, pause = _PRESIGNED_TRIES, self._options.first_pause_s
-        while True:
-            state = self._reply("PUT", path, _Upload, begin, digest=digest)
-            direct = state.direct
-            if direct is None or not tries or not is_allowed(direct.url, secure=self._requests.secure):
-                return state
-            tries -= 1
-            body = opened.pieces(functools.partial(self._report, progress))
-            if not _ask_bucket("PUT", direct.url, direct.headers, body, self._options.timeout_s):
-                self._options.sleep(pause)
-                pause *= 2
+        """Open an upload; send the object to a presigned address if the service offers one.
 
-    def _piece(self, path: str, headers: dict[str, str], route: _Route) -> Response:
-        """Fetch a range from a presigned address if the service offers one, else from the service."""
+        The returned state says how many bytes the service has; all of them after a presigned upload.
+        """
+        attempts, pause_s = PRESIGNED_ATTEMPTS, self._options.first_pause_s
+        while True:
+            state = self._reply("PUT", path, _Upload, request, digest=digest)
+            direct = state.direct
+            if direct is None or not attempts or not self._may_use(direct.url):
+                return state
+            attempts -= 1
+            body = reader.pieces(functools.partial(self._report, progress))
+            if not _request_bucket("PUT", direct.url, direct.headers, body, self._options.timeout_s):
+                self._options.sleep(pause_s)
+                pause_s *= 2
+
+    def _may_use(self, presigned_url: str) -> bool:
+        return is_allowed(presigned_url, secure=self._connection.uses_tls)
+
+    def _fetch_piece(self, path: str, headers: dict[str, str], route: _DownloadRoute) -> Response:
+        """Fetch a range of an object from a presigned address, or from the service if it offers none."""
         options = self._options
-        while route.tries:
+        while route.attempts_left:
             if not route.url:
                 offer = {**headers, "X-Accept-Direct": "1"}
-                status, answer, piece = self._request(
-                    "GET", path, bytes, None, offer, also=(_REDIRECTED, 416)
-                )
-                route.url = answer.get("Location", "") if status == _REDIRECTED else ""
-                if status != _REDIRECTED:
+                expected = (TEMPORARY_REDIRECT, 416)
+                status, answer, piece = self._request("GET", path, bytes, None, offer, expected=expected)
+                if status != TEMPORARY_REDIRECT:
                     return status, answer, piece
-            if is_allowed(route.url, secure=self._requests.secure):
-                response = _ask_bucket("GET", route.url, headers, None, options.timeout_s)
+                route.url = answer.get("Location", "")
+            if self._may_use(route.url):
+                response = _request_bucket("GET", route.url, headers, None, options.timeout_s)
                 if response is not None:
                     return response
-            route.url, route.tries = "", route.tries - 1  # expired, or the bucket cannot be reached
+            # The address has expired, or the bucket cannot be reached.
+            route.url, route.attempts_left = "", route.attempts_left - 1
             options.sleep(options.first_pause_s)
-        return self._request("GET", path, bytes, None, headers, also=(416,))
+        return self._request("GET", path, bytes, None, headers, expected=(416,))
 
     def _download(self, path: str, digest: str, to: Path | None, progress: OnBytes | None) -> bytes:
+        # 1. Begin with what an interrupted download has left.
         partial = None if to is None else to.with_name(f".{to.name}.{digest[:16]}.part")
-        held = bytearray(partial.read_bytes() if partial is not None and partial.exists() else b"")
-        size, route = -1, _Route()
-        while size != len(held):
-            end = len(held) + _PIECE_BYTES - 1
-            headers = {"Range": f"bytes={len(held)}-{end}"}
-            status, answer, piece = self._piece(path, headers, route)
+        received = bytearray(partial.read_bytes() if partial is not None and partial.exists() else b"")
+        # 2. Fetch one range after the other until nothing is missing.
+        size, route = -1, _DownloadRoute()
+        while size != len(received):
+            end = len(received) + PIECE_BYTES - 1
+            headers = {"Range": f"bytes={len(received)}-{end}"}
+            status, answer, piece = self._fetch_piece(path, headers, route)
             content_range = answer.get("Content-Range", "")
             size = int(content_range.rpartition("/")[2]) if content_range else len(piece)
             if status == 200:
-                held[:] = piece
+                received[:] = piece
             elif status == 206:
-                held += piece
+                received += piece
                 _append(partial, piece)
-            elif size != len(held):  # the partial file is longer than the object
-                held.clear()
+            elif size != len(received):  # the partial file is longer than the object
+                received.clear()
                 _remove(partial)
-            self._report(progress, len(held), size)
-        if hashlib.sha256(held).hexdigest() != digest:
+            self._report(progress, len(received), size)
+        # 3. Verify the bytes, and let the file appear.
+        if hashlib.sha256(received).hexdigest() != digest:
             _remove(partial)
-            raise StoreError("the bytes do not match the digest", hint="fetch it again")
+            raise StoreError("the downloaded bytes do not match the digest", hint="download the object again")
         if to is None or partial is None:
-            return bytes(held)
-        partial.write_bytes(held)
+            return bytes(received)
+        partial.write_bytes(received)
         os.replace(partial, to)
         return b""
 
@@ -368,57 +402,84 @@ class DataClient:
             self._callbacks.call("progress", progress, done, size)
 
     def _reply(
-        self, method: str, path: str, kind: type[T], body: bytes | None = None,
-        headers: dict[str, str] | None = None, digest: str = "",
-    ) -> T:  # fmt: skip
+        self,
+        method: str,
+        path: str,
+        kind: type[T],
+        body: bytes | None = None,
+        headers: dict[str, str] | None = None,
+        digest: str = "",
+    ) -> T:
         return self._request(method, path, kind, body, headers, digest=digest)[2]
 
     def _request(
-        self, method: str, path: str, kind: type[T], body: bytes | None = None,
-        headers: dict[str, str] | None = None, *, also: tuple[int, ...] = (), digest: str = "",
-    ) -> tuple[int, http.client.HTTPMessage, T]:  # fmt: skip
-        """Repeat a request until it succeeds or is refused; all requests of this class are idempotent."""
+        self,
+        method: str,
+        path: str,
+        kind: type[T],
+        body: bytes | None = None,
+        headers: dict[str, str] | None = None,
+        *,
+        expected: tuple[int, ...] = (),
+        digest: str = "",
+    ) -> tuple[int, http.client.HTTPMessage, T]:
+        """Repeat a request until it succeeds, is refused, or ``deadline_s`` has passed.
+
+        All requests of this class are idempotent.
+
+        Args:
+            method: Of HTTP.
+            path: With the query.
+            kind: Type of the reply.
+            body: Of the request.
+            headers: Further headers of the request.
+            expected: Statuses of 300 and above that are no errors.
+            digest: The object that the reply must be about, empty for any.
+
+        Returns:
+            Status, headers and decoded reply.
+        """
         options = self._options
-        begin, pause = options.clock(), options.first_pause_s
-        end = begin + options.deadline_s
+        began_s, pause_s = options.clock(), options.first_pause_s
+        until_s = began_s + options.deadline_s
         while True:
             error: RsePfError | None
-            after_s = 0.0
+            retry_after_s = 0.0
             try:
                 token = self._read_token()
-                response = self._requests.request(method, path, body, headers or {}, token)
+                response = self._connection.request(method, path, body, headers or {}, token)
                 status, answer, content = response
-                error = self._requests.failure(*response, also)
+                error = self._connection.failure(*response, expected)
                 if error is None:
-                    return status, answer, self._requests.decode(response, kind, digest)
-            except ConnectError as broken:
-                if self._requests.is_wrong_address:
+                    return status, answer, self._connection.decode(response, kind, digest)
+            except ConnectError as connect_error:
+                if self._connection.is_wrong_address:
                     raise
-                error = broken
+                error = connect_error
             else:
-                if status not in _RETRIED or isinstance(error, StoreRefused):
+                if status not in RETRIED_STATUSES or isinstance(error, StoreRefused):
                     raise error
                 if content == NO_UPSTREAM:
-                    end = min(end, begin + _NO_SERVICE_S)
+                    until_s = min(until_s, began_s + NO_SERVICE_TIMEOUT_S)
                 retry_after = answer.get("Retry-After", "")
-                after_s = float(retry_after) if retry_after.isdecimal() else 0.0
-            wait_s = max(after_s, pause * options.random.uniform(0.5, 1.0))
-            if options.clock() + wait_s > end:
+                retry_after_s = float(retry_after) if retry_after.isdecimal() else 0.0
+            wait_s = max(retry_after_s, pause_s * options.random.uniform(0.5, 1.0))
+            if options.clock() + wait_s > until_s:
                 raise error
             options.sleep(wait_s)
-            pause = min(2 * pause, options.max_pause_s)
+            pause_s = min(2 * pause_s, options.max_pause_s)
 
 
 @dataclass(slots=True)
-class _Route:
-    """How a download is fetched: from the presigned *url*, or from the service when no tries are left."""
+class _DownloadRoute:
+    """Where a download comes from: the presigned *url*, or the service when no attempts are left."""
 
     url: str = ""
-    tries: int = _PRESIGNED_TRIES
+    attempts_left: int = PRESIGNED_ATTEMPTS
 
 
 class _Source:
-    """Bytes or a file, read at any offset."""
+    """Read bytes or a file at any offset."""
 
     def __init__(self, source: bytes | Path) -> None:
         self._data = source if isinstance(source, bytes) else b""
@@ -427,7 +488,9 @@ class _Source:
             try:
                 self._file = source.open("rb")
             except OSError as error:
-                raise UsageError(f"cannot read {source}: {error.strerror}", hint="name a file") from error
+                raise UsageError(
+                    f"cannot read {source}: {error.strerror}", hint="name a file that can be read"
+                ) from error
         self.size = os.fstat(self._file.fileno()).st_size if self._file else len(self._data)
 
     def digest(self) -> str:
@@ -437,10 +500,10 @@ class _Source:
         return digest.hexdigest()
 
     def pieces(self, progress: OnBytes | None) -> Iterator[bytes]:
-        for offset in range(0, self.size, _PIECE_BYTES):
-            yield self.read(offset, _PIECE_BYTES)
+        for offset in range(0, self.size, PIECE_BYTES):
+            yield self.read(offset, PIECE_BYTES)
             if progress is not None:
-                progress(min(offset + _PIECE_BYTES, self.size), self.size)
+                progress(min(offset + PIECE_BYTES, self.size), self.size)
 
     def read(self, offset: int, length: int) -> bytes:
         if self._file is None:
@@ -457,15 +520,18 @@ class _Source:
 
 
 def is_allowed(url: str, *, secure: bool) -> bool:
-    """Return whether a presigned *url* may be used with a data service that is reached by TLS or without."""
+    """Return whether a presigned *url* may carry data: without TLS only if *secure* is False.
+
+    *secure* says whether the data service itself is reached by TLS.
+    """
     parts = urlsplit(url)
     return bool(parts.hostname) and parts.scheme in (("https",) if secure else ("http", "https"))
 
 
-def _ask_bucket(
+def _request_bucket(
     method: str, url: str, headers: Mapping[str, str], body: Iterable[bytes] | None, timeout_s: float
 ) -> Response | None:
-    """Send exactly *headers*, never the token, to a presigned address; None unless the request succeeded."""
+    """Return the answer of a presigned address, None unless it succeeds; never send the token."""
     parts = urlsplit(url)
     connection = None
     try:
@@ -481,7 +547,7 @@ def _ask_bucket(
     return response if answer.status in ((200, 206, 416) if method == "GET" else (200, 201)) else None
 
 
-def _versions(name: str) -> str:
+def _versions_path(name: str) -> str:
     return f"/data/v1/maps/{quote(name, safe='')}/versions"
 
 

@@ -1,4 +1,7 @@
-"""One request to the data service at a time, by HTTP: connection, token and typed errors, without repeats."""
+"""Send one HTTP request at a time to the data service, with the robot's token and typed errors.
+
+A request is sent once; repeats belong to `client_sdk.transfer.data_client`.
+"""
 
 from __future__ import annotations
 
@@ -12,16 +15,16 @@ from urllib.parse import SplitResult
 import msgspec
 
 from client_sdk.network.bearer_token import strip_token
-from client_sdk.network.dial_errors import explain_unconnected, show_wrong_url, split_address
-from client_sdk.network.http_proxy import TunnelRefused
+from client_sdk.network.dial_errors import explain_tcp_failure, show_wrong_url, split_address
+from client_sdk.network.http_proxy import TunnelRefused, connect_tcp, port_of
 from client_sdk.network.peer_diagnosis import (
     HttpAnswer,
     explain_answer,
     explain_certificate,
     explain_silence,
-    is_of_tls_server,
+    is_tls_server_answer,
 )
-from client_sdk.network.peer_probe import dial, port_of, probe
+from client_sdk.network.peer_probe import probe_peer
 from rse_pf.errors import (
     ConnectError,
     RsePfError,
@@ -32,55 +35,58 @@ from rse_pf.errors import (
 __all__ = [
     "MAX_SINGLE_PUT_BYTES",
     "NO_UPSTREAM",
-    "DataRequests",
+    "DataConnection",
     "Response",
     "StoredReply",
     "open_connection",
 ]
 
 MAX_SINGLE_PUT_BYTES = 262_144
-"""Larger objects are sent in parts."""
+"""Largest object, in bytes, that is sent in one request; larger ones are sent in parts that can be
+resumed."""
 NO_UPSTREAM = b"no healthy upstream"
-"""The body of the load balancer's 503 while it knows no data server at all."""
-_PROBE_S = 1.0
-"""How long a peer that gave no usable answer may take when it is asked again; a live one needs less."""
-_HTTP_SCHEMES = {"ws": "http", "wss": "https"}
+"""Body of the 503 that the load balancer (Envoy) sends while it knows no data server at all."""
+PROBE_TIMEOUT_S = 1.0
+"""Time limit of each step of the probe of a peer that gave no usable answer; a live peer needs less."""
+HTTP_SCHEMES = {"ws": "http", "wss": "https"}
+"""The scheme of the data service at the address of the WebSocket servers."""
 Response = tuple[int, http.client.HTTPMessage, bytes]
+"""Status, headers and body of an HTTP answer."""
 T = TypeVar("T")
 
 
 class StoredReply(msgspec.Struct, frozen=True, kw_only=True):
-    """The begin of every reply about an object: its sha256 and its length."""
+    """The fields that every reply about an object has: its sha256 in hexadecimal, and its size in bytes."""
 
     digest: str
     size: int
 
 
-class DataRequests:
-    """A connection to the data service; used by one thread at a time."""
+class DataConnection:
+    """Keep one HTTP connection to the data service; one thread may use it at a time."""
 
     def __init__(self, url: str, *, timeout_s: float, ssl_context: ssl.SSLContext | None) -> None:
         """Store the address; nothing is sent yet.
 
         Args:
             url: ``http://HOST:PORT`` or ``https://...``, or the ``ws:`` or ``wss:`` address of the servers.
-            timeout_s: Of one answer.
+            timeout_s: How long one request may wait for data.
             ssl_context: For ``https:``; None trusts the authorities of the machine.
 
         Raises:
-            UsageError: *url* is not such an address.
+            UsageError: *url* has another scheme, or no usable host or port.
         """
         error = UsageError(
             f"{show_wrong_url(url)!r} is not an address of a data service", hint="write https://HOST"
         )
         parts = split_address(url, ("http", "https", "ws", "wss"), error)
-        scheme = _HTTP_SCHEMES.get(parts.scheme, parts.scheme)
+        scheme = HTTP_SCHEMES.get(parts.scheme, parts.scheme)
         netloc = parts.netloc.rpartition("@")[2]
         self._parts = SplitResult(scheme, netloc, "", "", "")
-        self.secure = scheme == "https"
+        self.uses_tls = scheme == "https"
         self.host = self._parts.hostname or ""
         self.is_wrong_address = False
-        """Whether the last request failed in a way that only another address or setting changes."""
+        """Whether the last request failed by its address or settings, so that a repeat cannot help."""
         self._has_answered = False
         self._timeout_s, self._ssl_context = timeout_s, ssl_context
         self._connection: http.client.HTTPConnection | None = None
@@ -94,10 +100,10 @@ class DataRequests:
     def request(
         self, method: str, path: str, body: bytes | None, headers: dict[str, str], token: object
     ) -> Response:
-        """Return the answer to one request.
+        """Send one request and return its answer, whatever its status.
 
         Raises:
-            ConnectError: There is none.
+            ConnectError: There is no answer.
             Unauthorized: *token* is no text of a token.
         """
         authorization = {"Authorization": f"Bearer {strip_token(token)}"}
@@ -107,42 +113,47 @@ class DataRequests:
                 self._connection = open_connection(self._parts, self._timeout_s, self._ssl_context)
             self._connection.request(method, path, body, {**authorization, **headers})
             answer = self._connection.getresponse()
-            content = answer.read()
+            body_received = answer.read()
         except TunnelRefused as refused:
             self.is_wrong_address = refused.is_lasting
             raise refused.error from None
-        except (OSError, http.client.HTTPException) as broken:
+        except (OSError, http.client.HTTPException) as error:
             self.close()
-            raise self._explain(broken) from broken
+            raise self._explain_no_answer(error) from error
         if answer.will_close:
             self.close()
         self._has_answered = True
-        return answer.status, answer.headers, content
+        return answer.status, answer.headers, body_received
 
     def failure(
         self,
         status: int,
         headers: http.client.HTTPMessage,
         content: bytes,
-        also: tuple[int, ...] = (),
+        expected: tuple[int, ...] = (),
     ) -> RsePfError | None:
-        """Return the typed error of an answer, None if it is a success, or the caller expects its status.
+        """Return the typed error of an answer; None for a success or an *expected* status.
 
-        Login pages and proxies answer with 200 and redirects, too; none of their answers is a success.
+        Login pages and proxies answer with 200 and redirects, too; such an answer is always an error.
         """
         answer = _answer_of(status, headers, content)
-        if not answer.is_foreign and (status < 300 or status in also):
+        if not answer.is_foreign and (status < 300 or status in expected):
             return None
         if content == NO_UPSTREAM:
-            return self.no_service()
+            return self._no_service_error()
         error = None if answer.is_foreign else _error_of(content)
         return error or explain_answer(self._parts.geturl(), answer)
 
     def decode(self, response: Response, kind: type[T], digest: str = "") -> T:
-        """Return the reply in a success, of an object with *digest* if it is given; bytes are not decoded.
+        """Return the reply in the answer to a successful request.
+
+        Args:
+            response: The answer.
+            kind: Type of the reply; `bytes` returns the body as it is.
+            digest: The object that a `StoredReply` must be about; empty for any.
 
         Raises:
-            ConnectError: The data service does not write this: somebody else answered.
+            ConnectError: The body is no such reply, so another program answered.
         """
         if kind is bytes:
             return response[2]  # type: ignore[return-value]
@@ -150,39 +161,37 @@ class DataRequests:
             reply = msgspec.json.decode(response[2], type=kind)
         except (ValueError, RecursionError):  # msgspec.DecodeError and UnicodeDecodeError are ValueErrors
             reply = None
-        is_other = isinstance(reply, StoredReply) and digest not in ("", reply.digest)
-        if reply is None or is_other:
+        is_of_other_object = isinstance(reply, StoredReply) and digest not in ("", reply.digest)
+        if reply is None or is_of_other_object:
             raise explain_answer(self._parts.geturl(), _answer_of(*response))
         return reply
 
-    def no_service(self) -> ConnectError:
-        """Return what `NO_UPSTREAM` means."""
+    def _no_service_error(self) -> ConnectError:
         return ConnectError(
             f"the platform at {self.host} has no data service",
             hint="start rse-pf local without --no-data; in a cloud, set data.enabled",
         )
 
-    def _explain(self, broken: OSError | http.client.HTTPException) -> ConnectError:
-        """Return what it means that a request has no answer; a peer that never gave one is asked again."""
+    def _explain_no_answer(self, error: OSError | http.client.HTTPException) -> ConnectError:
+        """Return the typed error of a request without an answer; probe a peer that has never answered."""
         address = self._parts.geturl()
-        if isinstance(broken, ssl.SSLCertVerificationError):
+        if isinstance(error, ssl.SSLCertVerificationError):
             self.is_wrong_address = True
-            return explain_certificate(
-                address, broken, issuer=probe(self._parts, _PROBE_S).issuer,
-                is_enrolled=self._ssl_context is not None,
-            )  # fmt: skip
+            issuer = probe_peer(self._parts, PROBE_TIMEOUT_S).issuer
+            is_enrolled = self._ssl_context is not None
+            return explain_certificate(address, error, issuer=issuer, is_enrolled=is_enrolled)
         if not self._has_answered:
-            known = probe(self._parts, _PROBE_S)
-            data, speaks_tls = known.data, known.certificate is not None
-            if isinstance(broken, http.client.BadStatusLine) and not isinstance(broken, ConnectionResetError):
-                data = data or str(broken).encode("latin-1", "replace")
-            has_other = bool(data) and not is_of_tls_server(data)
-            self.is_wrong_address = self.secure != speaks_tls and (speaks_tls or has_other)
+            peer = probe_peer(self._parts, PROBE_TIMEOUT_S)
+            data, speaks_tls = peer.data, peer.certificate is not None
+            if isinstance(error, http.client.BadStatusLine) and not isinstance(error, ConnectionResetError):
+                data = data or str(error).encode("latin-1", "replace")
+            sends_without_tls = bool(data) and not is_tls_server_answer(data)
+            self.is_wrong_address = self.uses_tls != speaks_tls and (speaks_tls or sends_without_tls)
             return explain_silence(
-                address, broken, certificate=known.certificate, data=data, within_s=self._timeout_s
+                address, error, certificate=peer.certificate, data=data, within_s=self._timeout_s
             )
         return ConnectError(
-            f"no answer from {self.host}: {broken or type(broken).__name__}",
+            f"no answer from {self.host}: {error or type(error).__name__}",
             hint="call again to resume the transfer",
         )
 
@@ -193,29 +202,29 @@ def open_connection(
     """Return a connection to the host of *parts*, through the proxy of the environment if it has one.
 
     Raises:
-        ConnectError: There is no connection.
-        OSError: TLS fails.
-        TunnelRefused: The proxy opens none.
-        UsageError: The variable of the proxy names none.
+        ConnectError: There is no TCP connection.
+        OSError: The TLS handshake failed.
+        TunnelRefused: The proxy opens no tunnel, or cannot be reached.
+        UsageError: The environment variable names no HTTP proxy.
     """
     host, port = parts.hostname or "", port_of(parts)
-    made = http.client.HTTPConnection(host, port, timeout=timeout_s)
-    made.auto_open = 0  # it would not know the proxy
+    connection = http.client.HTTPConnection(host, port, timeout=timeout_s)
+    connection.auto_open = 0  # http.client would connect again without the proxy
     try:
-        connected = dial(parts, timeout_s)
+        tcp = connect_tcp(parts, timeout_s)
     except OSError as error:
-        raise explain_unconnected(parts._replace(path="", query="").geturl(), error) from error
-    connected.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        raise explain_tcp_failure(parts._replace(path="", query="").geturl(), error) from error
+    tcp.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     if parts.scheme == "https":
         try:
             context = ssl_context or ssl.create_default_context()
-            connected = context.wrap_socket(connected, server_hostname=host)
+            tcp = context.wrap_socket(tcp, server_hostname=host)
         except BaseException:
-            connected.close()
+            tcp.close()
             raise
-        made.default_port = http.client.HTTPS_PORT  # of the header Host
-    made.sock = connected
-    return made
+        connection.default_port = http.client.HTTPS_PORT  # the header Host then omits the port
+    connection.sock = tcp
+    return connection
 
 
 def _answer_of(status: int, headers: http.client.HTTPMessage, content: bytes) -> HttpAnswer:
@@ -224,7 +233,7 @@ def _answer_of(status: int, headers: http.client.HTTPMessage, content: bytes) ->
 
 
 def _error_of(content: bytes) -> RsePfError | None:
-    """Return the typed error in the body of a refusal, None if the data service did not write it."""
+    """Return the typed error in the body of an answer, None if the data service did not write the body."""
     try:
         error = json.loads(content)
         return error_from_code(str(error["code"]), str(error["message"]), hint=str(error.get("hint", "")))

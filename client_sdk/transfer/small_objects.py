@@ -1,4 +1,4 @@
-"""Store small objects over the data service of a connected robot, in a thread, with the robot's own token."""
+"""Store small objects at the data service of a connected robot, in a thread, with the robot's own token."""
 
 from __future__ import annotations
 
@@ -7,67 +7,71 @@ import hashlib
 import ssl
 from collections.abc import Awaitable, Callable
 
-from client_sdk.transfer.data_connection import MAX_SINGLE_PUT_BYTES, DataRequests, StoredReply
+from client_sdk.transfer.data_connection import MAX_SINGLE_PUT_BYTES, DataConnection, StoredReply
 from rse_pf.errors import LimitExceeded, Unauthorized
 
-__all__ = ["RobotObjects"]
+__all__ = ["SmallObjectStore"]
 
-_TIMEOUT_S = 5.0
+REQUEST_TIMEOUT_S = 5.0
+"""How long one request to the data service may wait for data, in seconds; the caller repeats what failed."""
 
 
-class RobotObjects:
-    """Stores the objects of one robot, one at a time."""
+class SmallObjectStore:
+    """Store objects of one robot, one at a time."""
 
     def __init__(
         self,
         read_token: Callable[[], Awaitable[str | None]],
-        own: Callable[[], tuple[str, ssl.SSLContext | None]],
+        read_access: Callable[[], tuple[str, ssl.SSLContext | None]],
     ) -> None:
-        """Connect to nobody yet.
+        """Connect to nothing yet.
 
         Args:
             read_token: Returns a valid token, None where the platform needs none.
-            own: Returns the address of the robot's servers, and what it trusts.
+            read_access: Returns the WebSocket address of the robot's servers, and what the robot trusts
+            there.
         """
-        self._read_token, self._own = read_token, own
+        self._read_token = read_token
+        self._read_access = read_access
         self._url = ""
-        self._requests: DataRequests | None = None
-        self._one = asyncio.Lock()
+        self._connection: DataConnection | None = None
+        self._lock = asyncio.Lock()
 
     async def store(self, data: bytes) -> str:
-        """Store *data* as an object and return its digest, once it is durable; nothing is repeated.
+        """Store *data* as an object and return its sha256 once it is durable; a failure is not repeated.
 
         Raises:
             ConnectError: There is no answer, or the platform has no data service.
             LimitExceeded: *data* is larger than 256 KiB.
-            StoreFull, QuotaExceeded, Unauthorized, Forbidden: The server refuses it.
+            StoreFull, QuotaExceeded, Unauthorized, Forbidden: The server refuses the object.
         """
         if len(data) > MAX_SINGLE_PUT_BYTES:
             raise LimitExceeded(
-                f"{len(data)} bytes are above {MAX_SINGLE_PUT_BYTES}", hint="use client_sdk.DataClient"
+                f"an object of {len(data)} bytes is above {MAX_SINGLE_PUT_BYTES}",
+                hint="store it by client_sdk.DataClient",
             )
-        async with self._one:
+        async with self._lock:
             token = await self._read_token()
             if token is None:
                 raise Unauthorized("objects are stored with a token only", hint="enrol the robot")
-            url, ssl_context = self._own()
-            if self._requests is None or url != self._url:
+            url, ssl_context = self._read_access()
+            if self._connection is None or url != self._url:
                 self.close()
-                self._requests = DataRequests(url, timeout_s=_TIMEOUT_S, ssl_context=ssl_context)
+                self._connection = DataConnection(url, timeout_s=REQUEST_TIMEOUT_S, ssl_context=ssl_context)
                 self._url = url
-            return await asyncio.to_thread(_put, self._requests, data, token)
+            return await asyncio.to_thread(_put_object, self._connection, data, token)
 
     def close(self) -> None:
         """Close the connection; the next call opens another."""
-        requests, self._requests = self._requests, None
-        if requests is not None:
-            requests.close()
+        connection, self._connection = self._connection, None
+        if connection is not None:
+            connection.close()
 
 
-def _put(requests: DataRequests, data: bytes, token: str) -> str:
+def _put_object(connection: DataConnection, data: bytes, token: str) -> str:
     digest = hashlib.sha256(data).hexdigest()
-    response = requests.request("PUT", f"/data/v1/objects/{digest}", data, {}, token)
-    error = requests.failure(*response)
+    response = connection.request("PUT", f"/data/v1/objects/{digest}", data, {}, token)
+    error = connection.failure(*response)
     if error is not None:
         raise error
-    return requests.decode(response, StoredReply, digest).digest
+    return connection.decode(response, StoredReply, digest).digest

@@ -200,7 +200,7 @@ WRONG_INPUTS: tuple[WrongInput, ...] = (
     WrongInput("swarm --name default", USAGE, "no platform 'default' is running", "rse-pf local --name default"),
     WrongInput("swarm --url http://127.0.0.1:8700 --token-from default", USAGE, "is not a WebSocket address", "ws://HOST:PORT/ws"),
     WrongInput("swarm --url ws://127.0.0.1:8700/ws", USAGE, "--url needs --token-from", "name a local platform"),
-    WrongInput("swarm --quiet --url ws://127.0.0.1:9/ws --token-from default", FAILED, "cannot connect to ws://127.0.0.1:9/ws", "is the platform running?"),
+    WrongInput("swarm --quiet --url ws://127.0.0.1:9/ws --token-from default", FAILED, "cannot connect to ws://127.0.0.1:9/ws", "start the platform by rse-pf local start"),
     WrongInput("swarm --out results", USAGE, "results holds other files", "an empty folder"),
     WrongInput("camera calibrat", USAGE, "'calibrat' is not one of calibrate, board, check", "did you mean calibrate?"),
     WrongInput("camera calibrate", USAGE, "arguments are required: SOURCE", "rse-pf camera calibrate --help"),

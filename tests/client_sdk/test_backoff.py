@@ -8,7 +8,7 @@ from random import Random
 
 import pytest
 
-from client_sdk.network.backoff import Backoff, Last
+from client_sdk.network.backoff import AttemptResult, Backoff
 from client_sdk.network.connect_timings import ConnectTimings
 from rse_pf.config import PlatformSettings
 from rse_pf.config.front_door import DIAL_BURST, DIALS_PER_MINUTE
@@ -38,7 +38,7 @@ def play(settings: PlatformSettings, *, robots: int, outage_s: float, seed: int 
     while due:
         now, robot = heapq.heappop(due)
         dials[robot].append(now)
-        backoffs[robot].dialled(now)
+        backoffs[robot].count_attempt(now)
         reply = firewall.judge(SITE, "/ws", now)
         if reply is None and now >= BEGAN_S + outage_s:
             connected_s.append(now - BEGAN_S)
@@ -78,10 +78,10 @@ def test_a_server_that_accepts_and_dies_again_and_again_does_not_empty_the_allow
     backoff, now, dials = Backoff(timings, Random(1)), 0.0, 0
     while now < 600.0:
         now += backoff.pause_s(now)
-        backoff.dialled(now)
+        backoff.count_attempt(now)
         dials += 1
         now += 1.5  # longer than reconnect_max_s: counts as a connection that lasted
-        backoff.restart()
+        backoff.reset()
 
     allowed = DIAL_BURST + 10 * DIALS_PER_MINUTE
     assert allowed - 2 <= dials <= allowed + 1
@@ -92,15 +92,15 @@ def test_a_move_that_does_not_succeed_leaves_half_of_the_allowance():
     backoff, now = Backoff(timings, Random(2)), 0.0
     dials_until_s = []
     while now < 30.0:
-        backoff.dialled(now)
+        backoff.count_attempt(now)
         dials_until_s.append(now)
         now += backoff.pause_s(now, is_move=True)
 
     assert len(dials_until_s) <= 0.5 * DIAL_BURST + 0.5 * DIALS_PER_MINUTE + 1
-    backoff.restart()
+    backoff.reset()
     for _ in range(DIAL_BURST // 2):
         assert backoff.pause_s(now) <= timings.reconnect_max_s
-        backoff.dialled(now)
+        backoff.count_attempt(now)
 
 
 def test_a_server_that_dies_is_dialled_again_within_a_second():
@@ -130,7 +130,7 @@ def test_attempts_that_nobody_answers_go_on_once_a_second_and_cost_no_allowance(
     backoff, now = Backoff(ConnectTimings(), Random(3)), 0.0
     pauses = []
     for _ in range(200):
-        pauses.append(backoff.pause_s(now, last=Last.UNANSWERED))
+        pauses.append(backoff.pause_s(now, last=AttemptResult.UNANSWERED))
         now += pauses[-1]
 
     assert min(pauses) >= 1.0
@@ -141,9 +141,9 @@ def test_pauses_grow_with_the_time_of_answers_and_not_with_that_of_silence():
     timings = ConnectTimings()
     for seed in range(20):
         backoff, now = Backoff(timings, Random(seed)), 0.0
-        backoff.pause_s(now, last=Last.NONE)
+        backoff.pause_s(now, last=AttemptResult.NONE)
         while now < 120.0:
-            now += backoff.pause_s(now, last=Last.UNANSWERED)
+            now += backoff.pause_s(now, last=AttemptResult.UNANSWERED)
 
         assert backoff.pause_s(now) <= timings.reconnect_max_s
 
@@ -151,8 +151,8 @@ def test_pauses_grow_with_the_time_of_answers_and_not_with_that_of_silence():
 def test_a_robot_that_is_refused_tries_again_every_20_to_40_s_for_ever():
     backoff, now, pauses = Backoff(ConnectTimings(), Random(4)), 0.0, []
     while now < 7200.0:
-        backoff.dialled(now)
-        pauses.append(backoff.pause_s(now, last=Last.REFUSED))
+        backoff.count_attempt(now)
+        pauses.append(backoff.pause_s(now, last=AttemptResult.REFUSED))
         now += pauses[-1]
 
     assert min(pauses) >= 20.0
@@ -164,20 +164,22 @@ def test_a_robot_that_is_refused_tries_again_every_20_to_40_s_for_ever():
 def test_after_a_cut_off_a_robot_is_back_half_a_second_after_its_tokens_are_late_enough(valid_in_s, least_s):
     for seed in range(50):
         pause_s = Backoff(ConnectTimings(), Random(seed)).pause_s(
-            5.0, last=Last.REFUSED, valid_in_s=valid_in_s
+            5.0, last=AttemptResult.REFUSED, valid_in_s=valid_in_s
         )
 
         assert least_s <= pause_s <= least_s + 0.5
 
 
 def test_a_cut_off_far_away_by_a_wrong_clock_does_not_keep_a_robot_from_trying():
-    assert Backoff(ConnectTimings(), Random(1)).pause_s(0.0, last=Last.REFUSED, valid_in_s=1e6) <= 40.0
+    assert (
+        Backoff(ConnectTimings(), Random(1)).pause_s(0.0, last=AttemptResult.REFUSED, valid_in_s=1e6) <= 40.0
+    )
 
 
 def test_refusals_cost_the_allowance_of_the_firewall_like_every_other_answer():
     timings = ConnectTimings()
     backoff = Backoff(timings, Random(1))
     for _ in range(DIAL_BURST):
-        backoff.dialled(0.0)
+        backoff.count_attempt(0.0)
 
-    assert backoff.pause_s(0.0, last=Last.REFUSED, valid_in_s=0.0) >= 60.0 / DIALS_PER_MINUTE
+    assert backoff.pause_s(0.0, last=AttemptResult.REFUSED, valid_in_s=0.0) >= 60.0 / DIALS_PER_MINUTE

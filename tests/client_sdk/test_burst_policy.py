@@ -6,28 +6,28 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from client_sdk.offloading.burst_policy import BurstRules, burst_address, check_burst_url
+from client_sdk.offloading.burst_policy import BurstPolicy, burst_address, check_burst_url
 from rse_pf.errors import UsageError
 
 DAY_S = 86400.0
 
 
-def rules(budget: int = 1000) -> BurstRules:
-    return BurstRules(commands_per_day=budget)
+def rules(budget: int = 1000) -> BurstPolicy:
+    return BurstPolicy(commands_per_day=budget)
 
 
-def fail(of: BurstRules, now: float, times: int = 1, **changes: float) -> None:
+def fail(of: BurstPolicy, now: float, times: int = 1, **changes: float) -> None:
     for _ in range(times):
-        of.sent()
-        of.failed(now, **changes)
+        of.count_sent()
+        of.count_failure(now, **changes)
 
 
 def test_the_budget_of_a_day_is_spent_once_and_is_there_again_on_the_next():
     budget = rules(3)
     for _ in range(3):
         assert budget.may_send(10.0)
-        budget.sent()
-        budget.answered(10.0, 0.1)
+        budget.count_sent()
+        budget.count_answer(10.0, 0.1)
 
     assert not budget.may_send(10.0 + DAY_S - 1)
     assert budget.may_send(10.0 + DAY_S)
@@ -38,12 +38,12 @@ def test_no_run_spends_more_than_the_budget_in_its_day(events: list[tuple[float,
     limited, sent = rules(budget), []
     for now, works in sorted(events):
         if limited.may_send(now):
-            limited.sent()
+            limited.count_sent()
             sent.append(now)
             if works:
-                limited.answered(now, 0.1)
+                limited.count_answer(now, 0.1)
             else:
-                limited.failed(now)
+                limited.count_failure(now)
 
     first = sent[0] if sent else 0.0
     assert sum(now < first + DAY_S for now in sent) <= budget
@@ -59,9 +59,9 @@ def test_three_failures_in_a_row_open_the_breaker_and_one_trial_closes_it():
 
     assert not breaker.may_send(0.4)
     assert breaker.may_send(0.75)
-    breaker.sent()
+    breaker.count_sent()
     assert not breaker.may_send(0.75), "one trial at a time"
-    breaker.answered(0.8, 0.05)
+    breaker.count_answer(0.8, 0.05)
     assert breaker.may_send(0.8)
 
 
@@ -91,8 +91,8 @@ def test_a_function_that_asks_for_a_pause_gets_it():
 
 def test_a_cold_start_says_nothing_of_the_next_answer():
     warm = rules()
-    warm.sent()
-    warm.answered(1.0, None)
+    warm.count_sent()
+    warm.count_answer(1.0, None)
 
     assert warm.expected_s(1.0) == warm.first_s
 
@@ -100,8 +100,8 @@ def test_a_cold_start_says_nothing_of_the_next_answer():
 def test_a_slow_answer_is_forgotten_after_ten_seconds():
     slow = rules()
     slow.may_send(0.0)
-    slow.sent()
-    slow.answered(1.0, 1.5)
+    slow.count_sent()
+    slow.count_answer(1.0, 1.5)
 
     assert slow.expected_s(10.9) == 1.5
     assert slow.expected_s(11.0) == slow.first_s
@@ -110,8 +110,8 @@ def test_a_slow_answer_is_forgotten_after_ten_seconds():
 def test_most_answers_decide_and_not_the_slowest():
     mixed = rules()
     for took_s in (0.02, 0.03, 0.03, 2.0):
-        mixed.sent()
-        mixed.answered(1.0, took_s)
+        mixed.count_sent()
+        mixed.count_answer(1.0, took_s)
 
     assert mixed.expected_s(1.0) == 0.03
 

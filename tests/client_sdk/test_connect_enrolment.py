@@ -11,7 +11,7 @@ import pytest
 from fake_platform import FakePlatform
 
 import client_sdk
-from client_sdk.network.dial_errors import untrusted_error
+from client_sdk.network.dial_errors import untrusted_certificate_error
 from rse_pf.auth.tokens import SigningKey
 from rse_pf.enrolment import Enrolment
 from rse_pf.errors import ConnectError, UsageError
@@ -62,7 +62,7 @@ def test_a_certificate_that_is_not_trusted_is_not_tried_again_at_once(
     cause = ssl.SSLCertVerificationError()
     cause.verify_code, cause.verify_message = code, message
 
-    failed = untrusted_error("wss://10.1.2.3:8700/ws", cause)
+    failed = untrusted_certificate_error("wss://10.1.2.3:8700/ws", cause)
 
     assert isinstance(failed.error, ConnectError)
     assert message in failed.error.message

@@ -8,8 +8,8 @@ import socket
 import pytest
 
 import client_sdk
-from client_sdk.network.dial_errors import dial_error_of, hide_password, unconnected_error, unreachable
-from client_sdk.network.peer_probe import Probed
+from client_sdk.network.dial_errors import hide_password, http_status_error, no_answer_error, tcp_error
+from client_sdk.network.peer_probe import PeerProbe
 from client_sdk.transfer.data_client import DataClient
 from rse_pf.auth.tokens import KeySet
 from rse_pf.config import PlatformSettings
@@ -22,7 +22,7 @@ REFUSALS = [(401, "unauthorized", Unauthorized), (403, "forbidden", Forbidden)]
 
 @pytest.mark.parametrize(("status", "code", "error"), REFUSALS)
 def test_a_refusal_by_one_of_our_servers_concerns_the_robot(status, code, error):
-    failed = dial_error_of("ws://host/ws", status, {}, refusal_body(code, "no", "ask"))
+    failed = http_status_error("ws://host/ws", status, {}, refusal_body(code, "no", "ask"))
 
     assert isinstance(failed.error, error)
     assert failed.is_refusal
@@ -44,12 +44,12 @@ def test_a_refusal_by_one_of_our_servers_concerns_the_robot(status, code, error)
     ],
 )
 def test_a_refusal_of_whoever_stands_between_is_temporary(status, body):
-    failed = dial_error_of("ws://host/ws", status, {"Retry-After": "60"}, body)
+    failed = http_status_error("ws://host/ws", status, {"Retry-After": "60"}, body)
 
     assert isinstance(failed.error, ConnectError)
     assert not failed.is_refusal
     assert not failed.is_wrong_address
-    assert failed.after_s == 60.0
+    assert failed.retry_after_s == 60.0
     assert "firewall" in failed.error.hint
 
 
@@ -71,8 +71,8 @@ def test_every_refusal_of_the_handshake_carries_the_mark():
 
     assert isinstance(refused, Rejected)
     assert isinstance(origin, Rejected)
-    assert dial_error_of("ws://host/ws", refused.status, {}, refused.body).is_refusal
-    assert dial_error_of("ws://host/ws", origin.status, {}, origin.body).is_refusal
+    assert http_status_error("ws://host/ws", refused.status, {}, refused.body).is_refusal
+    assert http_status_error("ws://host/ws", origin.status, {}, origin.body).is_refusal
 
 
 @pytest.mark.parametrize(
@@ -86,23 +86,23 @@ def test_every_refusal_of_the_handshake_carries_the_mark():
     ],
 )
 def test_what_reaches_nobody_is_told_from_what_a_firewall_counts(error, is_unanswered):
-    assert unconnected_error("ws://host/ws", error).is_unanswered is is_unanswered
+    assert tcp_error("ws://host/ws", error).is_unanswered is is_unanswered
 
 
 def test_a_connection_that_was_accepted_counts_whatever_came_then():
-    assert not unreachable("ws://host/ws", TimeoutError()).is_unanswered
-    assert unreachable("ws://host/ws", TimeoutError()).is_late
+    assert not no_answer_error("ws://host/ws", TimeoutError()).is_unanswered
+    assert no_answer_error("ws://host/ws", TimeoutError()).may_be_accepted_late
 
 
 @pytest.mark.parametrize(
     ("address", "probed"),
     [
-        ("ws://host/ws", Probed(data=b"HTTP/1.1 426 Upgrade Required\r\n\r\n")),
-        ("wss://host/ws", Probed(certificate=b"")),
+        ("ws://host/ws", PeerProbe(data=b"HTTP/1.1 426 Upgrade Required\r\n\r\n")),
+        ("wss://host/ws", PeerProbe(certificate=b"")),
     ],
 )
 def test_a_slow_server_of_ours_is_not_taken_for_another_program(address, probed):
-    failed = unreachable(address, TimeoutError(), probed=probed, within_s=5.0)
+    failed = no_answer_error(address, TimeoutError(), probe=probed, within_s=5.0)
 
     assert failed.error.message == f"{address} sends no answer within 5 s"
     assert failed.error.hint == "try again; see the load of the server"
@@ -110,9 +110,9 @@ def test_a_slow_server_of_ours_is_not_taken_for_another_program(address, probed)
 
 
 def test_bytes_of_a_tls_server_do_not_prove_a_wrong_address():
-    alert = Probed(data=b"\x15\x03\x01\x00\x02\x02\x46")
+    alert = PeerProbe(data=b"\x15\x03\x01\x00\x02\x02\x46")
 
-    assert not unreachable("wss://host/ws", TimeoutError(), probed=alert).is_wrong_address
+    assert not no_answer_error("wss://host/ws", TimeoutError(), probe=alert).is_wrong_address
 
 
 def test_the_cause_and_the_time_of_a_refusal_reach_the_robot():
@@ -121,26 +121,26 @@ def test_the_cause_and_the_time_of_a_refusal_reach_the_robot():
         cause="cut-off", valid_from_s=1700000000.0,
     )  # fmt: skip
 
-    failed = dial_error_of("ws://host/ws", 401, {}, body)
+    failed = http_status_error("ws://host/ws", 401, {}, body)
 
     assert (failed.error.message, failed.error.hint) == (
         "tokens issued before noon are revoked", "sign another one"
     )  # fmt: skip
     assert failed.valid_from_s == 1700000000.0
-    assert failed.refuses_any
+    assert failed.refuses_any_token
 
 
 @pytest.mark.parametrize("time", [True, "1700000000", -1, 1e12, float("nan"), None])
 def test_a_time_that_is_none_is_not_believed(time):
     body = refusal_body("unauthorized", "no", "", cause="cut-off", valid_from_s=time)
 
-    assert dial_error_of("ws://host/ws", 401, {}, body).valid_from_s is None
+    assert http_status_error("ws://host/ws", 401, {}, body).valid_from_s is None
 
 
 def test_a_cause_with_line_breaks_is_not_shown():
     body = refusal_body("unauthorized", "no\x1b[2J\nroot:", "", cause="disabled")
 
-    assert dial_error_of("ws://host/ws", 401, {}, body).error.message == ""
+    assert http_status_error("ws://host/ws", 401, {}, body).error.message == ""
 
 
 @pytest.mark.parametrize(
@@ -148,7 +148,7 @@ def test_a_cause_with_line_breaks_is_not_shown():
     [(400, True, "URL"), (404, True, "URL"), (429, False, "later"), (503, False, "later")],
 )
 def test_other_statuses_allow_another_attempt_and_hint_at_the_cause(status, is_wrong_address, hint):
-    failed = dial_error_of("ws://host/ws", status, {})
+    failed = http_status_error("ws://host/ws", status, {})
 
     assert isinstance(failed.error, ConnectError)
     assert not failed.is_refusal
@@ -158,7 +158,7 @@ def test_other_statuses_allow_another_attempt_and_hint_at_the_cause(status, is_w
 
 @pytest.mark.parametrize(("header", "after_s"), [("", 0.0), ("5", 5.0), ("86400", 300.0), ("soon", 0.0)])
 def test_the_wait_that_a_server_asks_for_is_bounded(header, after_s):
-    assert dial_error_of("ws://host/ws", 503, {"retry-after": header}).after_s == after_s
+    assert http_status_error("ws://host/ws", 503, {"retry-after": header}).retry_after_s == after_s
 
 
 @pytest.mark.parametrize("url", ["wws://robot:secret@host/ws", "ws://r:secret@:80/ws", "host?t=secret"])
@@ -172,7 +172,7 @@ def test_a_refused_address_is_shown_without_credentials(use, url):
 
 def test_the_address_of_a_redirect_is_shown_without_credentials():
     headers = {"Location": "https://robot:secret@host/a?token=secret"}
-    error = dial_error_of("ws://host/ws", 301, headers).error
+    error = http_status_error("ws://host/ws", 301, headers).error
     assert "secret" not in error.message + error.hint
     assert "wss://host/ws" in error.hint
 

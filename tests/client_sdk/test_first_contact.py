@@ -101,5 +101,5 @@ async def test_with_an_offload_a_robot_answers_itself_until_the_cloud_is_there()
 async def test_without_an_offload_a_cloud_that_is_down_is_an_error() -> None:
     with socket.socket() as held:
         held.bind(("127.0.0.1", 0))
-        with pytest.raises(ConnectError, match="start it with rse-pf local"):
+        with pytest.raises(ConnectError, match="start the platform by rse-pf local"):
             await robot(f"ws://127.0.0.1:{held.getsockname()[1]}/ws").__aenter__()

@@ -12,7 +12,7 @@ from fake_platform import FakePlatform
 
 import client_sdk
 from client_sdk.network.connect_timings import ConnectTimings
-from client_sdk.network.http_proxy import proxy_of
+from client_sdk.network.http_proxy import find_proxy
 from client_sdk.transfer.data_client import DataClient, DataOptions
 from rse_pf.errors import RsePfError, UsageError
 
@@ -47,12 +47,12 @@ def test_the_variable_of_the_scheme_names_the_proxy(scheme, given, variable, env
     for name, value in given.items():
         environment(name, value)
 
-    proxy = proxy_of(scheme, "robots.example", 443)
+    proxy = find_proxy(scheme, "robots.example", 443)
 
     assert proxy is not None
     assert (proxy.variable, proxy.host, proxy.port) == (variable, "proxy.example", 3128)
     assert base64.b64decode(proxy.authorization.removeprefix("Basic ")) == b"robot:s@cret"
-    assert "cret" not in repr(proxy) + proxy.shown
+    assert "cret" not in repr(proxy) + proxy.shown_url
 
 
 @pytest.mark.parametrize(
@@ -82,7 +82,7 @@ def test_no_proxy_exempts_hosts_suffixes_ports_and_networks(exempt, host, is_dir
     environment("HTTP_PROXY", URL)
     environment("no_proxy", exempt)
 
-    assert (proxy_of("ws", host, 8700) is None) is is_direct
+    assert (find_proxy("ws", host, 8700) is None) is is_direct
 
 
 @pytest.mark.parametrize(
@@ -138,7 +138,7 @@ async def test_a_refusal_of_the_proxy_is_one_line(answer, credentials, message, 
     with peer(after_request(answer)) as port:
         environment("HTTP_PROXY", f"http://{credentials}127.0.0.1:{port}")
         for error in (await robot_error(), data_error()):
-            assert f"http://127.0.0.1:{port} of HTTP_PROXY" in error.message
+            assert f"http://127.0.0.1:{port}, which HTTP_PROXY names," in error.message
             assert message in error.message
             assert hint in error.hint
             assert "secret" not in error.message + error.hint
@@ -149,7 +149,7 @@ async def test_a_proxy_that_cannot_be_reached_is_named(proxy, environment):
     with peer(silent) as port:
         environment("HTTP_PROXY", "http://" + proxy.replace("silent", f"127.0.0.1:{port}"))
         for error in (await robot_error(), data_error()):
-            assert "of HTTP_PROXY does not answer as a proxy" in error.message
+            assert "which HTTP_PROXY names, does not answer as a proxy" in error.message
             assert "robots.invalid in NO_PROXY" in error.hint
 
 

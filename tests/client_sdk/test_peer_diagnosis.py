@@ -15,7 +15,7 @@ from fake_peers import after_request, at_once, http, peer, read_head, silent, tl
 
 import client_sdk
 from client_sdk.network.connect_timings import ConnectTimings
-from client_sdk.network.peer_probe import probe
+from client_sdk.network.peer_probe import probe_peer
 from client_sdk.transfer.data_client import DataClient, DataOptions
 from rse_pf.auth import certificates
 from rse_pf.auth.certificates import AUTHORITY_S, CertificateWithKey, make_authority
@@ -58,8 +58,8 @@ HTTP_CASES = [
 WEBSOCKET_CASES = [
     Case("page in 1.0", http(HTML, PORTAL, version="1.0"), "HTTP/1.0", "log in"),
     Case("http.server", http("404 File not found", version="1.0"), "404 Not Found in HTTP/1.0", "host and"),
-    Case("full", http("503 Service Unavailable\r\nRetry-After: 1"), "full or starts", "try again in 1 s"),
-    Case("starting", http("503 Service Unavailable"), "full or starts", "try again later"),
+    Case("full", http("503 Service Unavailable\r\nRetry-After: 1"), "is full, or is", "try again in 1 s"),
+    Case("starting", http("503 Service Unavailable"), "is full, or is starting", "try again later"),
     Case("no upgrade", http("426 Upgrade Required"), "removed the header Upgrade", "Upgrade and Connection"),
     Case("no upgrade at ours", http("400 Bad Request", refusal_body("bad-message", "no", "").decode()),
          "removed the header Upgrade", "Upgrade and Connection"),
@@ -187,7 +187,7 @@ async def test_an_enrolled_robot_is_shown_the_issuer_that_is_not_the_one_of_its_
 
 @pytest.mark.parametrize(
     ("names", "made_s", "hint"),
-    [(["10.9.9.9"], 0.0, "host in the URL"), (["127.0.0.1"], -AUTHORITY_S / 2, "clock")],
+    [(["10.9.9.9"], 0.0, "host name in the URL"), (["127.0.0.1"], -AUTHORITY_S / 2, "clock")],
 )
 def test_a_certificate_of_another_host_or_another_time(names, made_s, hint, authority, tmp_path):
     context = tls_context(authority, names, tmp_path, time.time() + made_s)
@@ -216,7 +216,9 @@ def test_a_peer_that_never_stops_sending_slowly_ends_no_later_than_a_silent_one(
             monkeypatch.setenv("HTTPS_PROXY", f"http://127.0.0.1:{port}")
             monkeypatch.setenv("HTTP_PROXY", f"http://127.0.0.1:{port}")
         began = time.monotonic()
-        probed = probe(urlsplit("ws://robots.invalid/ws" if has_proxy else f"ws://127.0.0.1:{port}/ws"), 0.3)
+        probed = probe_peer(
+            urlsplit("ws://robots.invalid/ws" if has_proxy else f"ws://127.0.0.1:{port}/ws"), 0.3
+        )
     assert probed.certificate is None
     assert time.monotonic() - began < 5.0
 

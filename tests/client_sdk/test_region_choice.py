@@ -26,8 +26,8 @@ class Drive:
         while self.now < until:
             for region, round_trip_ms in ((NEAR, near_ms), (FAR, far_ms)):
                 if math.isfinite(round_trip_ms):
-                    self.choice.measured(region, round_trip_ms / 1e3)
-                    better = self.choice.better(self.current, (NEAR, FAR), self.now)
+                    self.choice.add_round_trip(region, round_trip_ms / 1e3)
+                    better = self.choice.find_nearer_region(self.current, (NEAR, FAR), self.now)
                     if better is not None:
                         self.current = better
                         self.changes.append((self.now, better))
@@ -37,19 +37,19 @@ class Drive:
 
 def test_the_region_with_the_shortest_round_trip_is_the_best():
     choice = RegionChoice(3, hold_s=HOLD_S)
-    choice.measured(1, 0.13)
-    choice.measured(2, 0.03)
+    choice.add_round_trip(1, 0.13)
+    choice.add_round_trip(2, 0.03)
 
-    assert choice.best([0, 1, 2]) == 2
-    assert choice.best([0, 1]) == 1
-    assert choice.best([0]) == 0
-    assert choice.best([]) is None
+    assert choice.nearest([0, 1, 2]) == 2
+    assert choice.nearest([0, 1]) == 1
+    assert choice.nearest([0]) == 0
+    assert choice.nearest([]) is None
 
 
 def test_one_late_pong_is_no_slow_region():
     choice = RegionChoice(2, hold_s=HOLD_S)
     for round_trip_s in (0.03, 2.0, 0.03):
-        choice.measured(NEAR, round_trip_s)
+        choice.add_round_trip(NEAR, round_trip_s)
 
     assert choice.round_trip_s(NEAR) == 0.03
 
@@ -89,9 +89,9 @@ def test_a_change_begins_the_comparison_anew():
     choice = RegionChoice(2, hold_s=HOLD_S)
     chosen = []
     for now in range(0, 2 * int(HOLD_S) + 2, 2):  # a robot that cannot follow stays in NEAR
-        choice.measured(NEAR, 0.4)
-        choice.measured(FAR, 0.13)
-        chosen.append(choice.better(NEAR, [NEAR, FAR], float(now)))
+        choice.add_round_trip(NEAR, 0.4)
+        choice.add_round_trip(FAR, 0.13)
+        chosen.append(choice.find_nearer_region(NEAR, [NEAR, FAR], float(now)))
 
     assert [2 * row for row, region in enumerate(chosen) if region is not None] == [HOLD_S]
 
@@ -108,9 +108,9 @@ def test_two_regions_that_take_turns_every_minute_cause_at_most_one_change_a_min
 def test_a_region_that_is_lost_again_and_again_has_to_prove_itself_longer_each_time():
     drive, returned_after_s = Drive(current=FAR), []
     for _ in range(6):
-        drive.choice.lost(NEAR, drive.now)
+        drive.choice.add_loss(NEAR, drive.now)
         drive.current = FAR
-        drive.choice.changed()
+        drive.choice.restart_comparison()
         lost_s, before = drive.now, len(drive.changes)
         drive.measure(30, 130, for_s=1000)
         returned_after_s.append([at - lost_s for at, _ in drive.changes[before:]])
@@ -122,7 +122,7 @@ def test_a_region_that_is_lost_again_and_again_has_to_prove_itself_longer_each_t
 def test_losses_of_the_last_hour_count_and_no_older_ones():
     drive = Drive(current=FAR)
     for second in range(3):
-        drive.choice.lost(NEAR, float(second))
+        drive.choice.add_loss(NEAR, float(second))
     drive.now = 4000.0
 
     drive.measure(30, 130, for_s=120)
@@ -141,10 +141,10 @@ def test_a_robot_that_was_suspended_has_measured_nothing_meanwhile():
 
 def test_a_region_that_was_not_measured_since_its_loss_is_no_better_one():
     choice = RegionChoice(2, hold_s=HOLD_S)
-    choice.measured(NEAR, 0.03)
-    choice.lost(NEAR, 10.0)
-    choice.measured(FAR, 0.13)
+    choice.add_round_trip(NEAR, 0.03)
+    choice.add_loss(NEAR, 10.0)
+    choice.add_round_trip(FAR, 0.13)
 
     assert choice.round_trip_s(NEAR) == math.inf
-    assert choice.best([NEAR, FAR]) == FAR
-    assert choice.better(FAR, [NEAR, FAR], 100.0) is None
+    assert choice.nearest([NEAR, FAR]) == FAR
+    assert choice.find_nearer_region(FAR, [NEAR, FAR], 100.0) is None

@@ -10,7 +10,7 @@ import pytest
 from fake_platform import FakePlatform, echo_services
 
 import client_sdk
-from client_sdk.commands.traffic_stats import StatsKeeper
+from client_sdk.commands.traffic_stats import TrafficCounter
 from client_sdk.network.connect_timings import ConnectTimings
 from rse_pf import native
 from rse_pf.config import PlatformSettings, SessionSettings
@@ -173,7 +173,7 @@ async def test_the_stats_are_a_snapshot_that_nobody_can_change():
 
 
 def test_the_stats_of_a_long_run_keep_their_size_and_their_percentiles():
-    keeper = StatsKeeper(Random(3))
+    keeper = TrafficCounter(Random(3))
     for value in range(50_000):
         keeper.add("round_trip_ms", value)
 
@@ -183,7 +183,7 @@ def test_the_stats_of_a_long_run_keep_their_size_and_their_percentiles():
 
 
 def test_percentiles_are_the_nearest_rank():
-    keeper = StatsKeeper(Random(0))
+    keeper = TrafficCounter(Random(0))
     for value in range(1, 101):
         keeper.add("round_trip_ms", value)
 

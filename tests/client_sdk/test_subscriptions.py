@@ -124,7 +124,7 @@ async def test_values_that_nobody_reads_are_bounded() -> None:
     updates = Updates("live/m", lambda: None)
 
     for number in range(5000):
-        updates.take(f"pose/{number}", number)
+        updates.put(f"pose/{number}", number)
 
     assert await updates.next() == ("pose/904", 904)
 

@@ -13,7 +13,7 @@ from fakes import FakeServer, answer_at_once, answer_nothing
 from quick_robots import QUICK, TIMINGS, robot
 
 import client_sdk
-from client_sdk import callbacks
+from client_sdk.concurrency import user_callbacks
 from rse_pf.errors import ConnectError, Disconnected
 from rse_pf.wire import Progress
 from tests.client_sdk.server_thread import server_thread
@@ -173,8 +173,8 @@ async def test_a_token_callable_that_only_awaits_is_not_reported_as_slow(caplog)
 
 @pytest.mark.parametrize("has_thread", [False, True])
 async def test_a_token_callable_that_hangs_is_reported_as_late(has_thread, monkeypatch, caplog):
-    monkeypatch.setattr(callbacks, "TOKEN_LIMIT_S", 0.1)
-    calling = callbacks.Callbacks()
+    monkeypatch.setattr(user_callbacks, "TOKEN_TIMEOUT_S", 0.1)
+    calling = user_callbacks.UserCallbacks()
     if has_thread:
         calling.start_thread()
 
@@ -185,8 +185,8 @@ async def test_a_token_callable_that_hangs_is_reported_as_late(has_thread, monke
 
 
 async def test_token_callables_of_a_blocking_robot_share_a_loop_until_one_hangs(monkeypatch):
-    monkeypatch.setattr(callbacks, "TOKEN_LIMIT_S", 0.5)
-    calling, may_go_on, seen = callbacks.Callbacks(), threading.Event(), []
+    monkeypatch.setattr(user_callbacks, "TOKEN_TIMEOUT_S", 0.5)
+    calling, may_go_on, seen = user_callbacks.UserCallbacks(), threading.Event(), []
     calling.start_thread()
 
     async def token():
@@ -210,7 +210,7 @@ async def test_token_callables_of_a_blocking_robot_share_a_loop_until_one_hangs(
 
 
 async def test_a_callable_outside_the_event_loop_is_not_reported_as_slow(caplog):
-    calling = callbacks.Callbacks(slow_s=-1.0)
+    calling = user_callbacks.UserCallbacks(slow_s=-1.0)
 
     await asyncio.to_thread(calling.call, "progress", int)
     assert calling.errors == 0

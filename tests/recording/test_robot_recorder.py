@@ -91,7 +91,7 @@ def test_a_map_that_the_robot_saves_is_a_point_cloud_in_the_file(tmp_path: Path)
     recorder = RobotRecorder(tmp_path, thumbnails=False, session=SessionSettings())
     recorder.start()
 
-    recorder.map(np.arange(600_000, dtype=np.float32).reshape(-1, 3))
+    recorder.record_map(np.arange(600_000, dtype=np.float32).reshape(-1, 3))
     recorder.stop()
 
     (cloud,) = (json.loads(each) for each in topics(tmp_path)["map"])
@@ -125,11 +125,11 @@ def test_a_missing_package_is_told_by_its_extra(tmp_path: Path, monkeypatch: pyt
 def test_what_does_not_fit_into_the_queue_is_dropped_and_counted(tmp_path: Path):
     recorder = RobotRecorder(tmp_path, thumbnails=False, session=SessionSettings())
     recorder.start()
-    recorder._waiting.maxsize = 1  # as on a robot whose disk is too slow
+    recorder._queue.maxsize = 1  # as on a robot whose disk is too slow
 
     for _ in range(5000):
-        recorder.said(1, "up", b"")
-    recorder._waiting.maxsize = 10
+        recorder.observe_message(1, "up", b"")
+    recorder._queue.maxsize = 10
     recorder.stop()
 
     assert recorder.dropped > 0

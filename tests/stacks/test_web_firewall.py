@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from client_sdk.network.dial_errors import dial_error_of
+from client_sdk.network.dial_errors import http_status_error
 from rse_pf.config.front_door import DIAL_BURST, DIALS_PER_MINUTE
 from rse_pf.config.resource_names import ROSBRIDGE_PATH
 from tests.played_firewall import PlayedFirewall, rules_of_settings, rules_of_template
@@ -66,11 +66,11 @@ def test_what_is_blocked_is_told_when_to_come_back_and_never_ends_a_robot(templa
         reply = PlayedFirewall([rule]).judge(SITE, "/data/x" if rule.name == "data" else "/burst", 0.0)
         reply = reply or PlayedFirewall([rule]).judge(SITE, "/ws", 0.0)
         assert reply is not None
-        failed = dial_error_of("ws://host/ws", reply.status, reply.headers, reply.body)
+        failed = http_status_error("ws://host/ws", reply.status, reply.headers, reply.body)
 
         assert reply.status == 429
         assert not failed.is_refusal
-        assert failed.after_s == 60.0
+        assert failed.retry_after_s == 60.0
 
 
 def test_an_address_above_its_limit_does_not_block_another(template: Any) -> None:

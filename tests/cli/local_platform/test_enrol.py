@@ -114,5 +114,5 @@ def test_a_file_whose_authority_is_no_certificate_is_refused_before_anything_is_
     file = tmp_path / "r1"
     Enrolment(url="wss://a/ws", authority="nonsense", robot="r", key=key).write(file)
 
-    with pytest.raises(UsageError, match="its authority is no certificate"):
+    with pytest.raises(UsageError, match="the authority in the file is no certificate"):
         read_enrolment(file)

@@ -47,7 +47,7 @@ def test_an_enrolled_robot_signs_tokens_for_the_data_service(tmp_path: Path) -> 
 
     assert callable(client._token)
     assert client._token().count(".") == 2
-    assert client._requests._parts.geturl() == "http://127.0.0.1:9"
+    assert client._connection._parts.geturl() == "http://127.0.0.1:9"
 
 
 def test_without_the_file_the_data_client_says_so(tmp_path: Path) -> None:
