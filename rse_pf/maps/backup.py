@@ -1,9 +1,10 @@
-"""Back up all maps of a tenant in one file, and check and restore such a file.
+"""Back up all maps of a tenant in one file, check such a file, and restore maps from it.
 
-The file is a tar archive.  It holds ``MAP/blobs/DIGEST`` and ``MAP/versions/ID`` with the bytes of the store,
-and at its end ``backup.json`` with the heads, so that a file that was cut off is no backup.  Robots may write
-meanwhile: versions never change, so each one in the file is whole, and so is the head of each map.  Nothing
-is restored before the whole file was checked.
+The file is a tar archive with the members ``MAP/blobs/DIGEST`` (encoded maps) and ``MAP/versions/ID``
+(records), whose bytes are those of the store, and as its last member ``backup.json`` with the heads, so that
+a truncated file is not accepted.  Robots may commit while a backup is written: versions never change, so that
+each version and each head in the file is complete.  A restore checks the whole file before it writes
+anything.
 """
 
 from __future__ import annotations
@@ -26,20 +27,27 @@ from rse_pf.object_store import MIN_CHARGE_BYTES, ObjectStore, charge_of, name_s
 
 __all__ = ["BackupContent", "CheckedBackup", "check_backup", "restore_backup", "write_backup"]
 
-_CONTENT = "backup.json"
+_CONTENT_FILE = "backup.json"  # name of the last member, which lists heads and charges
 _MEMBER = re.compile(r"(?P<map>[a-z0-9][a-z0-9-]{0,63})/(?P<kind>blobs|versions)/(?P<id>[0-9a-f]{64})")
 _CHARGE = re.compile(
     r"[A-Za-z0-9][A-Za-z0-9._=-]{0,127}/(?P<map>[a-z0-9-]{1,64})/(?P<id>[0-9a-f]{64})\.\d{1,15}"
 )
-_MAX_RECORD_BYTES = 1 << 20  # a record names robots; the longest one that is written has some KiB
-_MAX_CONTENT_BYTES = 256 << 20  # heads and charges of 10,000 maps with all their versions
-_PIECE_BYTES = 1 << 20
+_MAX_RECORD_BYTES = 1 << 20  # size of the record of a version; a record with many robots has some KiB
+_MAX_CONTENT_BYTES = 256 << 20  # size of the list of heads and charges; enough for 10,000 maps with versions
+_CHUNK_BYTES = 1 << 20  # bytes of a member that are read at once: 1 MiB
 
 
 class BackupContent(msgspec.Struct, frozen=True, kw_only=True):
-    """The last member: whose maps, made when (Unix time), their heads, and who is charged with versions.
+    """What a backup contains, the last member of its file.
 
-    A charge is the name of an object below ``charges/TENANT/``, see `rse_pf.maps.charges`.
+    Attributes:
+        format: Distinguishes a backup of maps from other files.
+        version: Version of the format.
+        tenant: The tenant whose maps these are.
+        created_s: When the backup was written, Unix seconds.
+        heads: The id of the head of each map, by the name of the map.
+        charges: The charges of the versions: names of objects below ``charges/TENANT/``, see
+            `rse_pf.maps.charges`.
     """
 
     format: Literal["rse-pf-maps"] = "rse-pf-maps"
@@ -53,7 +61,14 @@ class BackupContent(msgspec.Struct, frozen=True, kw_only=True):
 def write_backup(
     file: BinaryIO, maps: MapRegistry, store: ObjectStore, *, tenant: str, created_s: float
 ) -> BackupContent:
-    """Write all versions and heads of the maps of *tenant* to *file*; returns its content.
+    """Write all maps of a tenant to *file*, and return what the backup contains.
+
+    Args:
+        file: A writable binary file.
+        maps: The maps of the tenant.
+        store: The store of the maps, for their charges.
+        tenant: The tenant.
+        created_s: Unix seconds.
 
     Raises:
         StoreError: The store failed, or a version is damaged.
@@ -71,33 +86,35 @@ def write_backup(
                     if info.name.rpartition("/")[2].partition(".")[0] in versions
                 ]
         content = BackupContent(tenant=tenant, created_s=created_s, heads=heads, charges=charges)
-        _add(archive, _CONTENT, msgspec.json.encode(content))
+        _add_member(archive, _CONTENT_FILE, msgspec.json.encode(content))
     return content
 
 
 def _write_map(archive: tarfile.TarFile, maps: MapRegistry, name: str) -> tuple[str, set[str]]:
     """Write a map; return the id of its head, and the ids of all versions that were written."""
+    # 1. Write the head, which exists whatever is removed meanwhile.
     head, data = _read_head(maps, name)
-    _add(archive, f"{name}/blobs/{head.digest}", data)
-    blobs, versions = {head.digest}, {head.id}
+    _add_member(archive, f"{name}/blobs/{head.digest}", data)
     _add_record(archive, name, head)
-    for record in _versions(maps, name):
+    digests, ids = {head.digest}, {head.id}
+    # 2. Write the other versions, and equal bytes only once.
+    for record in _list_versions(maps, name):
         if record.id == head.id:
             continue
-        if record.digest not in blobs:
+        if record.digest not in digests:
             try:
                 data = maps.data(name, record.id)
-            except NotFound:  # it was removed meanwhile
+            except NotFound:  # Another process has removed this version meanwhile.
                 continue
-            _add(archive, f"{name}/blobs/{record.digest}", data)
-        blobs.add(record.digest)
-        versions.add(record.id)
+            _add_member(archive, f"{name}/blobs/{record.digest}", data)
+        digests.add(record.digest)
+        ids.add(record.id)
         _add_record(archive, name, record)
-    return head.id, versions
+    return head.id, ids
 
 
-def _versions(maps: MapRegistry, name: str) -> list[MapRecord]:
-    """Return the versions of a map; none if all that were listed have been removed while they were read."""
+def _list_versions(maps: MapRegistry, name: str) -> list[MapRecord]:
+    """Return the records of a map's versions; none if the map has been removed meanwhile."""
     try:
         return maps.versions(name)
     except NotFound:
@@ -105,7 +122,7 @@ def _versions(maps: MapRegistry, name: str) -> list[MapRecord]:
 
 
 def _read_head(maps: MapRegistry, name: str) -> tuple[MapRecord, bytes]:
-    """Return record and bytes of the head, also if others set another head and remove this one meanwhile."""
+    """Return record and bytes of the head; read again if another process replaces and removes the head."""
     while True:
         head = maps.head(name)
         try:
@@ -116,10 +133,10 @@ def _read_head(maps: MapRegistry, name: str) -> tuple[MapRecord, bytes]:
 
 
 def _add_record(archive: tarfile.TarFile, name: str, record: MapRecord) -> None:
-    _add(archive, f"{name}/versions/{record.id}", msgspec.json.encode(record))
+    _add_member(archive, f"{name}/versions/{record.id}", msgspec.json.encode(record))
 
 
-def _add(archive: tarfile.TarFile, name: str, data: bytes) -> None:
+def _add_member(archive: tarfile.TarFile, name: str, data: bytes) -> None:
     member = tarfile.TarInfo(name)
     member.size, member.mode = len(data), 0o600
     archive.addfile(member, io.BytesIO(data))
@@ -127,7 +144,14 @@ def _add(archive: tarfile.TarFile, name: str, data: bytes) -> None:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CheckedBackup:
-    """A file in which every hash is right: what it holds, the records of each map, where their bytes are."""
+    """A backup whose file is complete and whose hashes are right.
+
+    Attributes:
+        content: What the backup contains.
+        records: The records of the versions of each map, by the name of the map.
+        archive: The open tar archive.
+        blobs: The members with encoded maps, by the name of the map and the sha256 of the bytes.
+    """
 
     content: BackupContent
     records: dict[str, list[MapRecord]]
@@ -135,18 +159,18 @@ class CheckedBackup:
     blobs: dict[tuple[str, str], tarfile.TarInfo]
 
     def data(self, name: str, record: MapRecord) -> bytes:
-        """Return the bytes of a version of map *name*."""
-        return b"".join(_pieces(self.archive, self.blobs[name, record.digest]))
+        """Return the encoded map of the version with this *record* of map *name*."""
+        return b"".join(_read_chunks(self.archive, self.blobs[name, record.digest]))
 
 
 def check_backup(file: BinaryIO) -> CheckedBackup:
-    """Read all of *file*, and return what it holds.
+    """Read and check all of *file*, and return the backup.
 
     Raises:
-        UsageError: It is no backup, or was cut off or changed.
+        UsageError: The file is no backup, is truncated, or was changed.
     """
     try:
-        return _check(file)
+        return _read_backup(file)
     except (tarfile.TarError, msgspec.MsgspecError, ValueError, EOFError, OverflowError) as error:
         raise UsageError(
             f"this is not a whole backup of maps: {str(error)[:150]}",
@@ -154,31 +178,35 @@ def check_backup(file: BinaryIO) -> CheckedBackup:
         ) from error
 
 
-def _check(file: BinaryIO) -> CheckedBackup:
-    archive = tarfile.open(fileobj=file, mode="r:")  # noqa: SIM115  it is read for as long as the file is open
+def _read_backup(file: BinaryIO) -> CheckedBackup:
+    """Return the backup of *file*; raises ValueError and errors of tarfile and msgspec if it is malformed."""
+    # The result keeps the archive open, which is read until the caller closes the file.
+    archive = tarfile.open(fileobj=file, mode="r:")  # noqa: SIM115
     records: dict[str, list[MapRecord]] = {}
     blobs: dict[tuple[str, str], tarfile.TarInfo] = {}
     content = None
     for member in archive:
         match = _MEMBER.fullmatch(member.name)
-        if member.type != tarfile.REGTYPE or (match is None and member.name != _CONTENT):
-            raise ValueError(f"{member.name[:80]!r} does not belong into it")
+        if member.type != tarfile.REGTYPE or (match is None and member.name != _CONTENT_FILE):
+            raise ValueError(f"the member {member.name[:80]!r} does not belong into a backup")
         if match is None:
-            content = msgspec.json.decode(_read(archive, member, _MAX_CONTENT_BYTES), type=BackupContent)
+            content = msgspec.json.decode(
+                _read_member(archive, member, _MAX_CONTENT_BYTES), type=BackupContent
+            )
         elif match["kind"] == "blobs":
             hashed = hashlib.sha256()
-            for piece in _pieces(archive, member):
-                hashed.update(piece)
+            for chunk in _read_chunks(archive, member):
+                hashed.update(chunk)
             if hashed.hexdigest() != match["id"]:
-                raise ValueError(f"the hash of {member.name} is another one")
+                raise ValueError(f"the bytes of {member.name} have another sha256 than its name says")
             blobs[match["map"], match["id"]] = member
         else:
-            record = msgspec.json.decode(_read(archive, member, _MAX_RECORD_BYTES), type=MapRecord)
+            record = msgspec.json.decode(_read_member(archive, member, _MAX_RECORD_BYTES), type=MapRecord)
             if record.id != match["id"]:
-                raise ValueError(f"the hash of {member.name} is another one")
+                raise ValueError(f"the bytes of {member.name} have another sha256 than its name says")
             records.setdefault(match["map"], []).append(record)
     if content is None:
-        raise ValueError("its end is missing")
+        raise ValueError(f"its last member, {_CONTENT_FILE}, is missing")
     _check_references(content, records, blobs)
     return CheckedBackup(content=content, records=records, archive=archive, blobs=blobs)
 
@@ -188,19 +216,19 @@ def _check_references(
     records: dict[str, list[MapRecord]],
     blobs: dict[tuple[str, str], tarfile.TarInfo],
 ) -> None:
-    """Raise ValueError if a head, a charge or a version refers to something that the file does not hold."""
-    known = {(name, record.id) for name, versions in records.items() for record in versions}
+    """Raise ValueError if a head, a charge or a version refers to something that is not in the backup."""
+    ids = {(name, record.id) for name, versions in records.items() for record in versions}
     for name, versions in records.items():
         for record in versions:
             blob = blobs.get((name, record.digest))
             if blob is None or blob.size != record.size:
                 raise ValueError(f"the bytes of version {record.id[:12]} of {name} are missing")
-    if records.keys() != content.heads.keys() or not content.heads.items() <= known:
-        raise ValueError("the head of a map is missing")
+    if records.keys() != content.heads.keys() or not content.heads.items() <= ids:
+        raise ValueError("the version that is the head of a map is missing")
     for charge in content.charges:
         match = _CHARGE.fullmatch(charge)
-        if match is None or (match["map"], match["id"]) not in known:
-            raise ValueError(f"{charge[:80]!r} is no charge of a version in it")
+        if match is None or (match["map"], match["id"]) not in ids:
+            raise ValueError(f"{charge[:80]!r} is no charge of a version in the backup")
 
 
 def restore_backup(
@@ -212,48 +240,56 @@ def restore_backup(
     check_room: Callable[[int], None],
     charge: Callable[[int], None],
 ) -> int:
-    """Write the versions of a backup that are missing, and set the heads; return how many were missing.
+    """Write the versions of a backup that the store lacks, set the heads, and return the number of versions.
 
     Args:
-        backup: The file.
-        maps: Of the tenant of the backup.
-        store: Where they lie.
-        is_overwriting: Whether heads of maps that exist are set back; their other versions stay.
-        check_room: Gets for how many bytes all versions count, before anything is written.
-        charge: Gets the size of each version before it is written.
+        backup: The backup.
+        maps: The maps of the tenant of the backup.
+        store: The store of the maps, for their charges.
+        is_overwriting: Whether to set the heads of maps that have another head; their newer versions stay.
+        check_room: Called once, before anything is written, with the bytes that all versions will be charged
+            with; may refuse them by an error.
+        charge: Called with the size of each version before it is written; may refuse it by an error.
 
     Raises:
-        UsageError: Maps exist and have other heads, and *is_overwriting* is false; nothing was written.
-        StoreError: The store failed; the same call continues.  And what *check_room* and *charge* raise.
+        UsageError: Maps exist with other heads, and *is_overwriting* is false; nothing was written.
+        StoreError: The store failed; the same call continues the restore.
     """
     content, heads = backup.content, maps.heads()
-    others = [name for name, head in content.heads.items() if heads.get(name, head) != head]
-    if others and not is_overwriting:
+    # 1. Check that no head is overwritten by mistake.
+    different = [name for name, head in content.heads.items() if heads.get(name, head) != head]
+    if different and not is_overwriting:
         raise UsageError(
-            f"maps exist and have another head: {', '.join(others)}"[:300],
+            f"maps exist and have another head: {', '.join(different)}"[:300],
             hint="--overwrite sets their heads to those of the backup; their other versions stay",
         )
+    # 2. Check the quota.
     missing = {name: maps.missing_versions(name, records) for name, records in backup.records.items()}
     added = [record for records in missing.values() for record in records]
     if added:
         check_room(sum(charge_of(record.size) + MIN_CHARGE_BYTES for record in added))
+    # 3. Write the versions, the heads and the charges.
     for name, head in content.heads.items():
         maps.restore(
-            name, missing[name], head, expected=heads.get(name), charge=charge,
+            name,
+            missing[name],
+            head,
+            expected=heads.get(name),
+            charge=charge,
             read=functools.partial(backup.data, name),
-        )  # fmt: skip
-    for each in content.charges:
-        store.put(f"charges/{name_segment(content.tenant)}/{each}", b"")
+        )
+    for charge_path in content.charges:
+        store.put(f"charges/{name_segment(content.tenant)}/{charge_path}", b"")
     return len(added)
 
 
-def _pieces(archive: tarfile.TarFile, member: tarfile.TarInfo) -> Iterator[bytes]:
+def _read_chunks(archive: tarfile.TarFile, member: tarfile.TarInfo) -> Iterator[bytes]:
     file = archive.extractfile(member)
-    while file is not None and (piece := file.read(_PIECE_BYTES)):
-        yield piece
+    while file is not None and (chunk := file.read(_CHUNK_BYTES)):
+        yield chunk
 
 
-def _read(archive: tarfile.TarFile, member: tarfile.TarInfo, max_bytes: int) -> bytes:
+def _read_member(archive: tarfile.TarFile, member: tarfile.TarInfo, max_bytes: int) -> bytes:
     if member.size > max_bytes:
-        raise ValueError(f"{member.name} is longer than {max_bytes} bytes")
-    return b"".join(_pieces(archive, member))
+        raise ValueError(f"{member.name} has {member.size} bytes, more than {max_bytes}")
+    return b"".join(_read_chunks(archive, member))
