@@ -169,7 +169,10 @@ class LiveMapClient:
     def _connection(self, tenant: str, map_name: str) -> MapConnection:
         """Return the connection of a map, which is started if there is none; raises BadRequest."""
         if self._settings.data.store == "memory:":
-            raise BadRequest("live maps need a store that all servers share", hint="set data.store")
+            raise BadRequest(
+                "live maps need an object store that all servers share, but data.store is memory:",
+                hint="set data.store to dir:PATH or s3:BUCKET",
+            )
         connection = self._connections.get((tenant, map_name))
         if connection is None:
             connection = self._connections[tenant, map_name] = MapConnection(

@@ -111,15 +111,15 @@ def check_token(
     signature_bytes = hashlib.sha256().digest_size
     signature, body = token[:signature_bytes], token[signature_bytes:]
     if not hmac.compare_digest(signature, hmac.digest(key, body, "sha256")):
-        raise _refused()
+        raise _token_refused()
     try:
         claims = _decode(body)
     except msgspec.MsgspecError as error:
-        raise _refused() from error
+        raise _token_refused() from error
     is_for_this_connection = msgspec.structs.replace(claims, expires_s=expected.expires_s) == expected
     is_valid_now = now_s - leeway_s < claims.expires_s <= now_s + TOKEN_S + leeway_s
     if not is_for_this_connection or not is_valid_now:
-        raise _refused()
+        raise _token_refused()
 
 
 def server_context(address: str, *, now_s: float) -> tuple[ssl.SSLContext, str]:
@@ -170,11 +170,14 @@ def check_certificate(connection: Any, expected: str) -> None:
     """
     certificate = connection.getpeercert(binary_form=True) or b""
     if not hmac.compare_digest(hashlib.sha256(certificate).hexdigest(), expected):
-        raise _refused()
+        raise Unauthorized(
+            "the map server does not have the certificate that its lease names",
+            hint="let servers reach each other directly, without a proxy that ends TLS",
+        )
 
 
-def _refused() -> Unauthorized:
+def _token_refused() -> Unauthorized:
     return Unauthorized(
-        "the connection between two servers was refused",
-        hint="check that their clocks agree, and that they use the same store",
+        "the token of a worker is not valid for this map server",
+        hint="set the clocks of both servers, and check that both use the same data.store",
     )

@@ -277,8 +277,8 @@ class LiveMapRouter(CommandQueue):
         if blocked_s > 0:
             self._context.metrics.shed["live-garbage"] += 1
             raise Forbidden(
-                f"this robot sent too many invalid requests to live maps; they are closed to it for "
-                f"{blocked_s:.0f} s",
+                f"this robot sent {_MAX_INVALID_REQUESTS} invalid requests to live maps within "
+                f"{_WINDOW_S:.0f} s; live maps are closed to it for {blocked_s:.0f} s",
                 hint="update the robot's SDK, or correct what it sends",
             )
 

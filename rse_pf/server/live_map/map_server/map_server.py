@@ -344,7 +344,8 @@ class MapServer:
         folders += [folder for folder in folders_of(request.robot, contributors) if folder not in folders]
         if not folders:
             raise NotFound(
-                f"robot {request.robot[:80]!r} contributed nothing", hint="see rse-pf map live show MAP"
+                f"robot {request.robot[:80]!r} contributed nothing to the live map",
+                hint="name a robot that rse-pf map live show MAP lists",
             )
         for folder in folders:
             await asyncio.shield(self._writer.submit(RobotForgotten(robot=folder)))
@@ -676,7 +677,7 @@ class MapServer:
 
     def _moving_error(self) -> MapMoving:
         return MapMoving(
-            "the live map moves to another server",
+            "the live map is moving to another server",
             hint="send the request again",
             retry_after_ms=BUSY_RETRY_MS,
         )

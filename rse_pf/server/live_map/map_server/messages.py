@@ -42,12 +42,16 @@ def decode_request(operation: str, data: bytes) -> LiveRequest:
     """
     request_class = LIVE_REQUESTS.get(operation)
     if request_class is None:
-        raise UnknownService(f"no operation {operation[:80]!r} of live maps", hint="see docs/protocol.md")
+        raise UnknownService(
+            f"live maps have no operation {operation[:80]!r}",
+            hint="use one of the services live-* that docs/protocol.md lists",
+        )
     try:
         return msgspec.msgpack.decode(data, type=request_class)
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:
         raise BadRequest(
-            f"the request of the live map is invalid: {message_of(error)}", hint="see docs/protocol.md"
+            f"the request {operation} is invalid: {message_of(error)}",
+            hint="send the fields that docs/protocol.md lists for this service",
         ) from error
 
 
