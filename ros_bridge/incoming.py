@@ -19,7 +19,7 @@ from client_sdk.bags.images import ImageFormat, check_image, decode_colour, deco
 from client_sdk.bags.lens import lens_of
 from client_sdk.bags.message_maker import MessageMaker
 from client_sdk.bags.message_types import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, IMU
-from client_sdk.cameras.source import no_depth
+from client_sdk.cameras.source import make_empty_depth
 from client_sdk.frontend import Frame, load_opencv
 from client_sdk.image_map import ImageMap, map_to_pinhole
 from client_sdk.source_facts import MAX_MEDIAN_DEPTH_M, MIN_MEDIAN_DEPTH_M, median_depth_m
@@ -194,7 +194,7 @@ class IncomingFrames:
             with self._lock:
                 samples = self.rig.imu_until(images.stamp_ns)
             made = Frame(
-                timestamp_s=images.stamp_ns / 1e9, rgb=rgb, depth_m=no_depth(wanted), camera=wanted,
+                timestamp_s=images.stamp_ns / 1e9, rgb=rgb, depth_m=make_empty_depth(wanted), camera=wanted,
                 imu=samples, T_body_camera=self.rig.T_body_camera,
             )  # fmt: skip
             if self._partner == "right":

@@ -1,6 +1,7 @@
-"""Cameras and recordings as iterators of frames: devices, videos, folders, RealSense; and their calibration.
+"""Cameras, videos, folders of images and RealSense cameras as iterators of frames, and camera calibration.
 
-Whatever yields a `Frame` belongs here; what a robot does with it does not.
+Tracking and mapping of the frames belong to `client_sdk.mapper`, recordings of benchmarks to
+`client_sdk.datasets`.
 """
 
 from client_sdk.cameras.open_camera import open_camera, source_of_frames

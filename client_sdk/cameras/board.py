@@ -1,6 +1,6 @@
-"""Calibration boards: a chessboard or a ChArUco board, to print and to find in images.
+"""Calibration boards: print a chessboard or a ChArUco board, and find its corners in images.
 
-The size counts inner corners, as OpenCV does: 9x6 has 10 by 7 squares.
+The size of a board counts inner corners, as OpenCV does: a board of 9x6 has 10 by 7 squares.
 """
 
 from __future__ import annotations
@@ -19,17 +19,30 @@ from rse_pf.geometry import Array
 
 __all__ = ["Board", "find_corners", "write_board"]
 
-_MARKER_SHARE = 0.75
-_MODULES = 8
-"""Pixels of a square in the smallest exact picture: a ChArUco marker has 6 modules on 0.75 of a square."""
-_MM_PER_POINT = 25.4 / 72.0
-_PNG_PX_PER_MM = 300 / 25.4
-_MARGIN_MM = 10.0
+_MARKER_SHARE = 0.75  # side of a ChArUco marker over that of its square
+_SQUARE_PX = 8
+"""Pixels of a square in the smallest exact image of a board: the 6 modules of a ChArUco marker fill 0.75 of
+the square."""
+_MIN_CHARUCO_CORNERS = 6  # corners of a ChArUco board that must be found in an image
+_MIN_CORNERS = 3  # corners of a board in a row or column: OpenCV needs at least three
+_MAX_CORNERS = 40
+"""Corners of a board in a row or column: the 1000 markers of DICT_4X4_1000 are enough for it."""
+_MIN_SQUARE_M = 0.001  # side of a square: a smaller one is a length in metres where millimetres were meant
+_MAX_SQUARE_M = 1.0  # side of a square: a larger one is a length in a smaller unit
+_MM_PER_POINT = 25.4 / 72.0  # millimetres in a point, the unit of PDF
+_PNG_PX_PER_MM = 300 / 25.4  # pixels of a PNG in a millimetre, at 300 dots per inch
+_MARGIN_MM = 10.0  # white margin around the board on a PDF page: printers do not print to the edge
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Board:
-    """A board of *columns* by *rows* inner corners with squares of *square_m*.
+    """A calibration board.
+
+    Attributes:
+        columns: Inner corners in a row.
+        rows: Inner corners in a column.
+        square_m: Side of a square, m.
+        charuco: Whether the board is a ChArUco board, of which a part is enough; else a chessboard.
 
     Raises:
         UsageError: The size is not within 3..40 corners, or the squares are not within 1 mm to 1 m.
@@ -41,11 +54,12 @@ class Board:
     charuco: bool = False
 
     def __post_init__(self) -> None:
-        if not (3 <= self.columns <= 40 and 3 <= self.rows <= 40):
+        if not all(_MIN_CORNERS <= count <= _MAX_CORNERS for count in (self.columns, self.rows)):
             raise UsageError(
-                f"a board of {self.columns}x{self.rows} corners is not within 3..40", hint="use 9x6"
+                f"a board of {self.columns}x{self.rows} corners is not within {_MIN_CORNERS}..{_MAX_CORNERS}",
+                hint="use 9x6",
             )
-        if not 0.001 <= self.square_m <= 1.0:
+        if not _MIN_SQUARE_M <= self.square_m <= _MAX_SQUARE_M:
             raise UsageError(
                 f"squares of {1000 * self.square_m:g} mm are not within 1..1000 mm",
                 hint="measure one printed square, in millimetres",
@@ -53,7 +67,11 @@ class Board:
 
     @classmethod
     def parse(cls, size: str, square_mm: float, *, charuco: bool = False) -> Board:
-        """Return the board of a word such as ``9x6``; raises UsageError."""
+        """Return the board of *size*, a word such as ``9x6``, with squares of *square_mm*.
+
+        Raises:
+            UsageError: The word is no size, or `Board` refuses the numbers.
+        """
         match = re.fullmatch(r"(\d{1,3})x(\d{1,3})", size)
         if match is None:
             raise UsageError(f"{size} is not the size of a board", hint="count inner corners, such as 9x6")
@@ -61,12 +79,12 @@ class Board:
 
     @property
     def corners(self) -> int:
-        """The number of inner corners."""
+        """The number of inner corners of the board."""
         return self.columns * self.rows
 
     @property
     def points(self) -> npt.NDArray[np.float32]:
-        """The ``(corners, 3)`` corners on the board, metres, row after row."""
+        """The positions ``(corners, 3)`` of the corners on the board, m, row after row, with z = 0."""
         grid = np.zeros((self.corners, 3), dtype=np.float32)
         grid[:, :2] = np.mgrid[1 : self.columns + 1, 1 : self.rows + 1].T.reshape(-1, 2)
         grid *= np.float32(self.square_m)
@@ -74,91 +92,101 @@ class Board:
 
 
 def find_corners(gray: npt.NDArray[np.uint8], board: Board) -> tuple[npt.NDArray[np.int64], Array] | None:
-    """Return the numbers and ``(n, 2)`` pixels of the corners of *board* in a grey image, or None.
+    """Find the corners of *board* in a grey image ``(h, w)``.
 
-    A chessboard is found whole or not at all; of a ChArUco board any six corners are enough.
+    A chessboard is found whole or not at all; of a ChArUco board, six corners are enough.
+
+    Returns:
+        Indices ``(n,)`` of the corners in `Board.points`, and their pixels ``(n, 2)``; None without a board.
 
     Raises:
         MissingExtra: OpenCV is not installed.
     """
     cv2 = load_opencv()
     if board.charuco:
-        corners, numbers, _, _ = cv2.aruco.CharucoDetector(_charuco(cv2, board)).detectBoard(gray)
-        if numbers is None or len(numbers) < 6:
+        detector = cv2.aruco.CharucoDetector(_charuco_board(cv2, board))
+        corners, indices, _, _ = detector.detectBoard(gray)
+        if indices is None or len(indices) < _MIN_CHARUCO_CORNERS:
             return None
-        return numbers.ravel().astype(np.int64), corners.reshape(-1, 2).astype(np.float64)
+        return indices.ravel().astype(np.int64), corners.reshape(-1, 2).astype(np.float64)
     size = (board.columns, board.rows)
     flags = cv2.CALIB_CB_ADAPTIVE_THRESH + cv2.CALIB_CB_NORMALIZE_IMAGE + cv2.CALIB_CB_FAST_CHECK
-    good, corners = cv2.findChessboardCorners(gray, size, flags=flags)
-    if not good:
+    is_found, corners = cv2.findChessboardCorners(gray, size, flags=flags)
+    if not is_found:
         return None
     criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 30, 1e-3)
-    spacing = np.linalg.norm(np.diff(corners.reshape(board.rows, board.columns, 2), axis=1), axis=2).min()
-    half = int(np.clip(spacing / 3, 2, 11))  # the window must not reach the next corner
-    refined = cv2.cornerSubPix(gray, corners, (half, half), (-1, -1), criteria)
+    spacing_px = np.linalg.norm(np.diff(corners.reshape(board.rows, board.columns, 2), axis=1), axis=2).min()
+    half_window_px = int(np.clip(spacing_px / 3, 2, 11))  # the window must not reach the next corner
+    refined = cv2.cornerSubPix(gray, corners, (half_window_px, half_window_px), (-1, -1), criteria)
     return np.arange(board.corners), refined.reshape(-1, 2).astype(np.float64)
 
 
 def write_board(path: Path, board: Board) -> None:
-    """Write a board to print at its true size: a ``.pdf``, or a ``.png`` of 300 dots per inch.
+    """Write an image of a board that prints at its true size: a ``.pdf``, or a ``.png`` with 300 dots per
+    inch.
 
     Raises:
-        UsageError: The ending is another one, or the file cannot be written.
+        UsageError: The file name has another ending, or the file cannot be written.
         MissingExtra: OpenCV is not installed.
     """
     if path.suffix not in (".pdf", ".png"):
         raise UsageError(
             f"{path} is neither .pdf nor .png", hint="write board.pdf: it prints at its true size"
         )
-    picture = _picture(board)
-    module_mm = 1e3 * board.square_m / _MODULES
+    image = _draw_board(board)
+    pixel_mm = 1e3 * board.square_m / _SQUARE_PX
     try:
         if path.suffix == ".pdf":
-            path.write_bytes(_pdf(picture, module_mm))
+            path.write_bytes(_pdf_of(image, pixel_mm))
             return
         cv2 = load_opencv()
-        size = [round(n * module_mm * _PNG_PX_PER_MM) for n in picture.shape[::-1]]
-        good, data = cv2.imencode(".png", cv2.resize(picture, size, interpolation=cv2.INTER_NEAREST))
-        assert good
+        size = [round(pixels * pixel_mm * _PNG_PX_PER_MM) for pixels in image.shape[::-1]]
+        is_encoded, data = cv2.imencode(".png", cv2.resize(image, size, interpolation=cv2.INTER_NEAREST))
+        assert is_encoded
         path.write_bytes(data.tobytes())
     except OSError as error:
         raise UsageError(f"cannot write {path}: {error.strerror}", hint="name another file") from error
 
 
-def _picture(board: Board) -> npt.NDArray[np.uint8]:
-    """Return the board with eight pixels for a square, black 0 and white 255."""
-    across, down = board.columns + 1, board.rows + 1
+def _draw_board(board: Board) -> npt.NDArray[np.uint8]:
+    """Return the image ``(h, w)`` of a board, 8 pixels for the side of a square, 0 black and 255 white."""
+    columns, rows = board.columns + 1, board.rows + 1
     if board.charuco:
         cv2 = load_opencv()
-        drawn: npt.NDArray[np.uint8] = _charuco(cv2, board).generateImage(
-            (across * _MODULES, down * _MODULES), marginSize=0, borderBits=1
+        image: npt.NDArray[np.uint8] = _charuco_board(cv2, board).generateImage(
+            (columns * _SQUARE_PX, rows * _SQUARE_PX), marginSize=0, borderBits=1
         )
-        return np.where(drawn > 127, 255, 0).astype(np.uint8)
-    squares = np.indices((down, across)).sum(axis=0) % 2
-    return np.kron(squares * 255, np.ones((_MODULES, _MODULES))).astype(np.uint8)
+        return np.where(image > 127, 255, 0).astype(np.uint8)
+    is_white = np.indices((rows, columns)).sum(axis=0) % 2
+    return np.kron(is_white * 255, np.ones((_SQUARE_PX, _SQUARE_PX))).astype(np.uint8)
 
 
-def _charuco(cv2: Any, board: Board) -> Any:
+def _charuco_board(cv2: Any, board: Board) -> Any:
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_1000)
     size = (board.columns + 1, board.rows + 1)
     return cv2.aruco.CharucoBoard(size, board.square_m, _MARKER_SHARE * board.square_m, dictionary)
 
 
-def _pdf(picture: npt.NDArray[np.uint8], module_mm: float) -> bytes:
-    """Return a page on which every black run of a row is a rectangle, so that its size is exact."""
-    margin, module = _MARGIN_MM / _MM_PER_POINT, module_mm / _MM_PER_POINT
-    height, width = picture.shape
-    page = (width * module + 2 * margin, height * module + 2 * margin)
-    drawing = []
+def _pdf_of(image: npt.NDArray[np.uint8], pixel_mm: float) -> bytes:
+    """Return a PDF page with an image ``(h, w)`` whose pixels have a side of *pixel_mm*.
+
+    Each run of black pixels in a row is drawn as a rectangle, because a printer may resample images.
+    """
+    # 1. Rectangles, in points from the lower left corner of the page.
+    margin, pixel = _MARGIN_MM / _MM_PER_POINT, pixel_mm / _MM_PER_POINT
+    height, width = image.shape
+    page = (width * pixel + 2 * margin, height * pixel + 2 * margin)
+    rectangles = []
     for row in range(height):
-        black = np.concatenate(([0], (picture[row] == 0).astype(np.int8), [0]))
+        black = np.concatenate(([0], (image[row] == 0).astype(np.int8), [0]))
         starts, ends = np.flatnonzero(np.diff(black) == 1), np.flatnonzero(np.diff(black) == -1)
-        y = page[1] - margin - (row + 1) * module
-        drawing += [
-            f"{margin + start * module:.4f} {y:.4f} {(end - start) * module:.4f} {module:.4f} re"
+        y = page[1] - margin - (row + 1) * pixel
+        rectangles += [
+            f"{margin + start * pixel:.4f} {y:.4f} {(end - start) * pixel:.4f} {pixel:.4f} re"
             for start, end in zip(starts, ends, strict=True)
         ]
-    content = ("0 g\n" + "\n".join(drawing) + "\nf\n").encode("ascii")
+    content = ("0 g\n" + "\n".join(rectangles) + "\nf\n").encode("ascii")
+    # 2. The objects of the file: catalogue, list of pages, page, and its content.
     objects = [
         b"<< /Type /Catalog /Pages 2 0 R >>",
         b"<< /Type /Pages /Kids [3 0 R] /Count 1 >>",
@@ -166,11 +194,12 @@ def _pdf(picture: npt.NDArray[np.uint8], module_mm: float) -> bytes:
         "/Resources << >> >>".encode("ascii"),
         f"<< /Length {len(content)} >>\nstream\n".encode("ascii") + content + b"endstream",
     ]
-    data, places = b"%PDF-1.4\n", []
+    # 3. The file, with the table of the offsets of its objects.
+    data, offsets = b"%PDF-1.4\n", []
     for number, pdf_object in enumerate(objects, start=1):
-        places.append(len(data))
+        offsets.append(len(data))
         data += f"{number} 0 obj\n".encode("ascii") + pdf_object + b"\nendobj\n"
-    table = "".join(f"{place:010d} 00000 n \n" for place in places)
-    end = f"xref\n0 {len(places) + 1}\n0000000000 65535 f \n{table}trailer\n"
-    end += f"<< /Size {len(places) + 1} /Root 1 0 R >>\nstartxref\n{len(data)}\n%%EOF\n"
+    table = "".join(f"{offset:010d} 00000 n \n" for offset in offsets)
+    end = f"xref\n0 {len(offsets) + 1}\n0000000000 65535 f \n{table}trailer\n"
+    end += f"<< /Size {len(offsets) + 1} /Root 1 0 R >>\nstartxref\n{len(data)}\n%%EOF\n"
     return data + end.encode("ascii")

@@ -1,6 +1,6 @@
-"""Calibrate a camera from images of a board: intrinsics, distortion, and how good they are.
+"""Calibrate a camera from images of a calibration board, and refuse a calibration that is too uncertain.
 
-It judges the result and refuses one that a robot should not use; it opens no camera.
+Devices are opened, and images read, by `client_sdk.cameras.open_camera`.
 """
 
 from __future__ import annotations
@@ -18,111 +18,135 @@ from rse_pf.geometry import Array, Camera
 
 __all__ = ["BoardViews", "calibrate"]
 
-_MIN_VIEWS = 8
-_MAX_FOCAL_PERCENT = 2.0
-"""Largest standard deviation of the focal length: above it the views are too alike."""
+MIN_VIEWS = 8  # images of the board that a calibration needs, of one camera or of a stereo pair
+_MAX_FOCAL_DEVIATION_PERCENT = 2.0
+"""Largest standard deviation of the focal length, percent of the focal length: above it the views are too
+similar."""
 _MIN_TILT_DEG = 20.0
-"""Smallest angle that must lie between the boards of two views."""
-_NEW_VIEW_SHARE = 0.05
-"""A view is new if its corners moved by more than this share of the image's width."""
+"""Angle that the boards of two views must have at least: without it, focal length and distance of the board
+cannot be told apart, and the standard deviation of the focal length says nothing."""
+_MIN_MOTION_SHARE = 0.05
+"""Motion of the corners against any other view, as a share of the image width, above which a view is new."""
+_MAX_VIEW_ERROR_FACTOR = 2.5  # error of a view over the median of all views, above which the view is left out
+_MAX_GOOD_VIEW_ERROR_PX = 0.1  # reprojection error of a view below which the view is never left out
 
 
 @dataclass(slots=True, eq=False)
 class BoardViews:
-    """Views of one board by one camera, collected image by image."""
+    """The views of one board by one camera, collected image by image.
+
+    Attributes:
+        board: The calibration board.
+        size: Width and height of the images, px; None before the first image.
+        images: Number of images that were searched.
+        similar: Number of images that show the board, but too similar to an earlier view.
+        views: Of each view, indices ``(n,)`` of the corners on the board, and their pixels ``(n, 2)``.
+    """
 
     board: Board
     size: tuple[int, int] | None = None
     images: int = 0
-    alike: int = 0
-    found: list[tuple[npt.NDArray[np.int64], Array]] = field(default_factory=list)
+    similar: int = 0
+    views: list[tuple[npt.NDArray[np.int64], Array]] = field(default_factory=list)
 
     def add(self, gray: npt.NDArray[np.uint8]) -> bool:
-        """Look for the board in a grey image; return whether this is a new view of it.
+        """Find the board in a grey image ``(h, w)``, and return whether the image is a new view of the board.
 
         Raises:
-            UsageError: The image has another size than those before.
+            UsageError: The image has another size than the images before.
         """
         size = (int(gray.shape[1]), int(gray.shape[0]))
         if self.size not in (None, size):
             assert self.size is not None
             raise UsageError(
                 f"an image is {size[0]}x{size[1]} px, those before are {self.size[0]}x{self.size[1]} px",
-                hint="calibrate with images of one size: that which the robot will use",
+                hint="calibrate with images of one size, which is the size that the robot will use",
             )
         self.size = size
         self.images += 1
         corners = find_corners(gray, self.board)
         if corners is None:
             return False
-        if any(self._is_alike(corners, other) for other in self.found):
-            self.alike += 1
+        if any(self._is_similar(corners, view) for view in self.views):
+            self.similar += 1
             return False
-        self.found.append(corners)
+        self.views.append(corners)
         return True
 
-    def _is_alike(
-        self, one: tuple[npt.NDArray[np.int64], Array], other: tuple[npt.NDArray[np.int64], Array]
+    def _is_similar(
+        self, first: tuple[npt.NDArray[np.int64], Array], second: tuple[npt.NDArray[np.int64], Array]
     ) -> bool:
-        _, rows, other_rows = np.intersect1d(one[0], other[0], return_indices=True)
+        """Return whether the corners that two views share have nearly the same pixels."""
+        _, first_rows, second_rows = np.intersect1d(first[0], second[0], return_indices=True)
         assert self.size is not None
-        if not len(rows):
+        if not len(first_rows):
             return False
-        moved = np.linalg.norm(one[1][rows] - other[1][other_rows], axis=1).max()
-        return bool(moved < _NEW_VIEW_SHARE * self.size[0])
+        moved_px = np.linalg.norm(first[1][first_rows] - second[1][second_rows], axis=1).max()
+        return bool(moved_px < _MIN_MOTION_SHARE * self.size[0])
 
 
 def calibrate(views: BoardViews, *, max_rms_px: float = 1.0, depth_scale: float | None = None) -> Intrinsics:
-    """Return the intrinsics that explain all views best.
+    """Return the radial-tangential intrinsics that explain all views of a board best.
+
+    Args:
+        views: The views of the board.
+        max_rms_px: Largest root mean square reprojection error, px, of a calibration that is accepted.
+        depth_scale: Units of the camera's depth images in a metre, which is copied into the result.
 
     Raises:
-        CommandFailed: There are too few views, they are too alike, or the error is above *max_rms_px*.
+        CommandFailed: There are too few views, they are too similar, or the error is above *max_rms_px*.
         MissingExtra: OpenCV is not installed.
 
     Source:
         Zhang, PAMI 2000, as OpenCV implements it.
     """
     board = views.board
-    if len(views.found) < _MIN_VIEWS:
-        alike = f", {views.alike} of them too like others" if views.alike else ""
+    if len(views.views) < MIN_VIEWS:
+        similar = f", and {views.similar} that are too similar to these" if views.similar else ""
         raise CommandFailed(
-            f"{len(views.found)} usable views of the board in {views.images} images{alike}; "
-            f"a calibration needs {_MIN_VIEWS}",
+            f"{len(views.views)} usable views of the board in {views.images} images{similar}; "
+            f"a calibration needs {MIN_VIEWS}",
             hint=f"show the {board.columns}x{board.rows} corners, sharp, from many sides; check --board",
         )
+    # 1. Calibrate with all views.
     cv2 = load_opencv()
-    points = [board.points[numbers] for numbers, _ in views.found]
-    pixels = [corners.astype(np.float32) for _, corners in views.found]
-    rms_px, K, distortion, turns, _, deviations, _, each_px = cv2.calibrateCameraExtended(
+    points = [board.points[indices] for indices, _ in views.views]
+    pixels = [corners.astype(np.float32) for _, corners in views.views]
+    rms_px, K, distortion, rotations, _, deviations, _, view_errors_px = cv2.calibrateCameraExtended(
         points, pixels, views.size, None, None
     )
-    # Views that were blurred or half found are far worse than the others: leave them out once.
-    good_rows = np.flatnonzero(each_px.ravel() <= max(2.5 * float(np.median(each_px)), 0.1))
-    if _MIN_VIEWS <= len(good_rows) < len(points):
+    # 2. Calibrate again without views that are far worse than the others: blurred or half found.
+    max_error_px = max(_MAX_VIEW_ERROR_FACTOR * float(np.median(view_errors_px)), _MAX_GOOD_VIEW_ERROR_PX)
+    good_rows = np.flatnonzero(view_errors_px.ravel() <= max_error_px)
+    if MIN_VIEWS <= len(good_rows) < len(points):
         points, pixels = [points[row] for row in good_rows], [pixels[row] for row in good_rows]
-        rms_px, K, distortion, turns, _, deviations, _, _ = cv2.calibrateCameraExtended(
+        rms_px, K, distortion, rotations, _, deviations, _, _ = cv2.calibrateCameraExtended(
             points, pixels, views.size, None, None
         )
+    # 3. Refuse a calibration that does not fit, or is not determined by these views.
     if not rms_px <= max_rms_px:
         raise CommandFailed(
             f"the reprojection error is {rms_px:.2f} px, above {max_rms_px:g} px",
             hint="keep board and camera still in each view, and the board flat; check --board",
         )
-    uncertain_percent = 100 * float(max(deviations.ravel()[:2]) / K[0, 0])
-    normals = np.array([cv2.Rodrigues(turn)[0][:, 2] for turn in turns])
+    focal_deviation_percent = 100 * float(max(deviations.ravel()[:2]) / K[0, 0])
+    normals = np.array([cv2.Rodrigues(rotation)[0][:, 2] for rotation in rotations])
     tilt_deg = float(np.degrees(np.arccos(np.clip((normals @ normals.T).min(), -1.0, 1.0))))
-    # Without a tilt the focal length follows the distance, and its deviation says nothing.
-    if not uncertain_percent <= _MAX_FOCAL_PERCENT or tilt_deg < _MIN_TILT_DEG:
+    if not focal_deviation_percent <= _MAX_FOCAL_DEVIATION_PERCENT or tilt_deg < _MIN_TILT_DEG:
         raise CommandFailed(
-            f"the views are too alike: the board is tilted by {tilt_deg:.0f} deg in all, and the focal "
-            f"length is uncertain by {uncertain_percent:.1f} %",
+            f"the views are too similar: the board is tilted by {tilt_deg:.0f} deg in all, and the focal "
+            f"length is uncertain by {focal_deviation_percent:.1f} %",
             hint="tilt the board by 20 to 45 degrees to all sides, and show it near the corners of the image",
         )
     assert views.size is not None
     camera = Camera(
-        fx=float(K[0, 0]), fy=float(K[1, 1]), cx=float(K[0, 2]), cy=float(K[1, 2]),
-        width=views.size[0], height=views.size[1],
-    )  # fmt: skip
+        fx=float(K[0, 0]),
+        fy=float(K[1, 1]),
+        cx=float(K[0, 2]),
+        cy=float(K[1, 2]),
+        width=views.size[0],
+        height=views.size[1],
+    )
     return Intrinsics(
         camera=camera,
         distortion=tuple(float(value) for value in distortion.ravel()[:5]),

@@ -1,9 +1,9 @@
-"""A folder of images as a camera: colours, with or without depth; and two folders as a pair of cameras.
+"""Read a folder of images as a camera, with or without depth, and two folders as a stereo pair.
 
-Colours lie in ``rgb/``, ``color/``, ``images/`` or in the folder itself, depth (16 bits) in ``depth/``, or
-beside the colours with ``depth`` in its names.  Images that belong together have one name, one number or one
-time.  Names that are decimal numbers, or times since 1970, are time stamps.  Recordings that list their
-images are read by `client_sdk.datasets`.
+Colour images are in ``rgb/``, ``color/``, ``images/`` or the folder itself.  Depth images (16 bits) are in
+``depth/``, or in the folder of the colour images with ``depth`` in their names.  Images that belong together
+share their name, a number in their name, or their time.  Names that are decimal numbers, or times since 1970,
+are time stamps.  Recordings that list their images in a file are read by `client_sdk.datasets`.
 """
 
 from __future__ import annotations
@@ -47,18 +47,25 @@ __all__ = ["FolderImages", "list_folder", "list_pairs", "pair_folders"]
 
 _COLOUR_FOLDERS = ("rgb", "color", "colour", "image", "images", "results")
 _DEPTH_FOLDERS = ("depth", "depths", "aligned_depth", "depth_image", "depth_images")
-_PAIR_FOLDERS = ("{}", "image_{}", "images_{}", "{}_images", "img_{}", "rgb_{}")  # of left and right
-_PERIOD_S = 0.1  # between images that state neither time nor rate
-_MAX_APART_S = 0.02  # of a colour and a depth image that are paired by time
-_NANOSECOND_DIGITS = 9  # ROS writes seconds, a point and nanoseconds, often without their leading zeros
-_TIME = re.compile(r"(?:[A-Za-z][A-Za-z_]*[-_]?)?(-?\d+(?:\.\d+)?)(?:[._-][A-Za-z]+)?")
+_PAIR_FOLDERS = ("{}", "image_{}", "images_{}", "{}_images", "img_{}", "rgb_{}")
+"""Names of the folders of a stereo pair, with ``left`` or ``right`` in the place of the braces."""
+_ASSUMED_PERIOD_S = 0.1  # time between images where neither names nor intrinsics state times or a rate
+_MAX_PAIR_DIFFERENCE_S = 0.02  # between the times in the names of two images that are paired by time
+_NANOSECOND_DIGITS = 9  # ROS names images SECONDS.NANOSECONDS, often without leading zeros of the nanoseconds
+_NAME_WITH_TIME = re.compile(r"(?:[A-Za-z][A-Za-z_]*[-_]?)?(-?\d+(?:\.\d+)?)(?:[._-][A-Za-z]+)?")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class FolderImages:
-    """Images in the order of time, their ``(n,)`` stamps, and what belongs to them, if anything does.
+    """The images of a folder in the order of time.
 
-    ``partners`` are the depth images, or the images of the right camera.
+    Attributes:
+        name: Path of the folder, for messages.
+        images: Colour images, or images of the left camera.
+        partners: For each image its depth image, or the image of the right camera; None without any.
+        stamps_s: ``(n,)``, time stamps of the images.
+        doubts: Doubts about the time stamps, and about images without a partner.
+        assumed: Sentences on what the folder does not state.
     """
 
     name: str
@@ -69,10 +76,15 @@ class FolderImages:
     assumed: tuple[str, ...]
 
     def facts(self, lens: Intrinsics, stated_by: str, *, has_depth: bool) -> SourceFacts:
-        """Return what the folder states and delivers; some of its images are read for it.
+        """Return what the folder states; its first, middle and last image are read to compare it.
+
+        Args:
+            lens: Intrinsics of the images.
+            stated_by: The file of the intrinsics, for messages.
+            has_depth: Whether the partners are depth images that will be used.
 
         Raises:
-            UsageError: No image can be read, or depth is of another kind.
+            UsageError: No image can be read, or a depth image has not 16 bits.
         """
         assumed = self.assumed
         depth = None
@@ -80,9 +92,11 @@ class FolderImages:
             units_per_m = lens.depth_units_per_m
             depths = probe(self.partners, lambda path: read_depth(path, units_per_m))
             depth = DepthFacts(
-                median_m=median_depth_m(depths), units_per_m=units_per_m,
-                is_unit_stated=lens.depth_scale is not None, is_registered=lens.is_depth_registered,
-            )  # fmt: skip
+                median_m=median_depth_m(depths),
+                units_per_m=units_per_m,
+                is_unit_stated=lens.depth_scale is not None,
+                is_registered=lens.is_depth_registered,
+            )
             if not depth.is_unit_stated:
                 assumed += (f"{stated_by} states no depth_scale: {units_per_m:g} units a metre are assumed",)
         camera = CameraFacts(
@@ -95,12 +109,15 @@ class FolderImages:
 
     @property
     def size_px(self) -> tuple[int, int]:
-        """Width and height of the images; raises UsageError where none can be read."""
+        """Width and height of the images, px; raises UsageError if no image can be read."""
         height, width = probe(self.images, read_colour)[0].shape[:2]
         return width, height
 
     def frames(self, log: DoubtLog, depth_units_per_m: float | None) -> Iterator[RawFrame]:
-        """Yield the frames, without depth if its unit is None; *log* counts images that cannot be read."""
+        """Yield the frames, not undistorted; *log* counts images that cannot be read.
+
+        *depth_units_per_m* are the units of a depth image in a metre; with None, depth is not read.
+        """
 
         def read(row: int) -> RawFrame:
             depth_m = None
@@ -111,7 +128,7 @@ class FolderImages:
         return readable(range(len(self.images)), read, log)
 
     def pairs(self, log: DoubtLog) -> Iterator[RawPair]:
-        """Yield the pairs of two cameras; *log* counts images that cannot be read."""
+        """Yield the stereo pairs, not rectified; *log* counts images that cannot be read."""
         rights = self.partners or ()
 
         def read(row: int) -> RawPair:
@@ -121,25 +138,25 @@ class FolderImages:
 
 
 def list_folder(folder: Path, rate_hz: float | None = None) -> FolderImages:
-    """Return the images of a folder; *rate_hz* is that of images that state no time.
+    """Return the images of a folder; *rate_hz* is the rate of images whose names state no time (None: 10 Hz).
 
     Raises:
-        UsageError: There is no image, or depth that belongs to none.
+        UsageError: There is no image, or there are depth images and none belongs to a colour image.
     """
-    inside = _first_folder(folder, _COLOUR_FOLDERS) or folder
-    depth_folder = _first_folder(folder, _DEPTH_FOLDERS)
-    colours = image_files(inside)
+    colour_folder = _find_folder(folder, _COLOUR_FOLDERS) or folder
+    depth_folder = _find_folder(folder, _DEPTH_FOLDERS)
+    colours = image_files(colour_folder)
     depths = [] if depth_folder is None else image_files(depth_folder)
     if depth_folder is None or not depths:
         depths = [path for path in colours if "depth" in path.stem.lower()]
         colours = [path for path in colours if path not in set(depths)]
     if not colours:
         raise UsageError(f"{folder} holds no image", hint="put images into it, or into its folder rgb/")
-    return _listed(str(folder), colours, depths or None, "depth image", rate_hz)
+    return _order_by_time(str(folder), colours, depths or None, "depth image", rate_hz)
 
 
 def pair_folders(folder: Path) -> tuple[Path, Path] | None:
-    """Return the folders of the left and of the right images; None if there are not both."""
+    """Return the folders of the left and of the right images of a stereo pair; None if one is missing."""
     for name in _PAIR_FOLDERS:
         left, right = (folder / name.format(side) for side in ("left", "right"))
         if left.is_dir() and right.is_dir():
@@ -148,104 +165,146 @@ def pair_folders(folder: Path) -> tuple[Path, Path] | None:
 
 
 def list_pairs(folder: Path, rate_hz: float | None = None) -> FolderImages:
-    """Return the images of `pair_folders` that belong together.
+    """Return the stereo pairs of the two folders of `pair_folders`; *rate_hz* as of `list_folder`.
 
     Raises:
-        UsageError: There is no image, or none of the left has a partner.
+        UsageError: There is no left image, or no left image has a right one.
     """
     left, right = pair_folders(folder) or (folder / "left", folder / "right")
     lefts, rights = image_files(left), image_files(right)
     if not lefts:
         raise UsageError(f"{left} holds no image", hint="put the images of the left camera into it")
-    return _listed(str(folder), lefts, rights, "right image", rate_hz)
+    return _order_by_time(str(folder), lefts, rights, "right image", rate_hz)
 
 
-def _listed(
-    name: str, images: list[Path], partners: list[Path] | None, what: str, rate_hz: float | None
+def _order_by_time(
+    name: str, images: list[Path], partners: list[Path] | None, partner_kind: str, rate_hz: float | None
 ) -> FolderImages:
-    """Join images with their partners, and put them in the order of time."""
+    """Return images with their partners in the order of time.
+
+    Args:
+        name: Path of the folder, for messages.
+        images: All images, in the order of the numbers in their names.
+        partners: All depth images or right images, in any order; None without any.
+        partner_kind: What partners are called in messages.
+        rate_hz: Rate of images whose names state no time; None for 10 Hz.
+
+    Raises:
+        UsageError: No image has a partner, or the time stamps are in no order.
+    """
+    # 1. Time stamps from names, or from the rate.
     doubts: tuple[Doubt, ...] = ()
-    named_s, assumed = _named_times(images, name)
-    period_s = _PERIOD_S if rate_hz is None else 1.0 / rate_hz
+    named_s, assumed = _times_in_names(images, name)
+    period_s = _ASSUMED_PERIOD_S if rate_hz is None else 1.0 / rate_hz
     stamps_s: Array = np.arange(len(images), dtype=np.float64) * period_s if named_s is None else named_s
     if named_s is None and rate_hz is None:
-        assumed = (f"names of images in {name} are no times: {_PERIOD_S:g} s between images are assumed",)
-    chosen: list[Path] | None = None
+        assumed = (
+            f"names of images in {name} are no times: {_ASSUMED_PERIOD_S:g} s between images are assumed",
+        )
+    # 2. Only images with a partner are used.
+    paired: list[Path] | None = None
     if partners is not None:
-        pairs = _joined(images, partners)
+        pairs = _match_names(images, partners)
         if not pairs:
             raise UsageError(
-                f"none of {len(images)} images of {name} has a {what} of the same name, number or time among "
-                f"{len(partners)}",
+                f"none of {len(images)} images of {name} has a {partner_kind} with the same name, number "
+                f"or time among {len(partners)}",
                 hint="give images that belong together one number or one time stamp",
             )
-        joined = {row for row, _ in pairs}
-        alone = [path.name for row, path in enumerate(images) if row not in joined]
+        rows_with_partner = {row for row, _ in pairs}
+        alone = [path.name for row, path in enumerate(images) if row not in rows_with_partner]
         if alone:
-            sentence = f"{len(alone)} of {len(images)} images of {name} left out, without a {what}: "
+            sentence = f"{len(alone)} of {len(images)} images of {name} left out, without a {partner_kind}: "
             doubts = (
                 Doubt(name=DoubtName.LEFT_OUT, sentence=sentence + some_names(alone), hint="copy all images"),
             )
         images = [images[row] for row, _ in pairs]
-        chosen = [partners[row] for _, row in pairs]
+        paired = [partners[row] for _, row in pairs]
         stamps_s = stamps_s[[row for row, _ in pairs]]
+    # 3. The order of time, without repeated time stamps.
     order = np.argsort(stamps_s, kind="stable")
     times = TimeFacts(stated_by=name, stamps_s=stamps_s[order])
-    rows, of_times = rows_in_time(times)
+    rows, time_doubts = rows_in_time(times)
     used = order[rows]
     return FolderImages(
-        name=name, images=[images[row] for row in used], stamps_s=stamps_s[used],
-        partners=None if chosen is None else [chosen[row] for row in used],
-        doubts=(*doubts, *of_times), assumed=assumed,
-    )  # fmt: skip
+        name=name,
+        images=[images[row] for row in used],
+        stamps_s=stamps_s[used],
+        partners=None if paired is None else [paired[row] for row in used],
+        doubts=(*doubts, *time_doubts),
+        assumed=assumed,
+    )
 
 
-def _first_folder(folder: Path, names: Sequence[str]) -> Path | None:
-    """Return the folder of the first of *names* that there is; ``rgb_0`` is a folder of ``rgb``."""
-    found = sorted((path for path in folder.iterdir() if path.is_dir()), reverse=True)
-    by_name = {path.name.lower().rstrip("_0123456789"): path for path in found}
+def _find_folder(folder: Path, names: Sequence[str]) -> Path | None:
+    """Return the folder inside *folder* with the first of *names* that exists, None if none does.
+
+    Case and a number at the end are ignored: ``rgb_0`` has the name ``rgb``.
+    """
+    folders = sorted((path for path in folder.iterdir() if path.is_dir()), reverse=True)
+    by_name = {path.name.lower().rstrip("_0123456789"): path for path in folders}
     return next((by_name[name] for name in names if name in by_name), None)
 
 
-def _joined(firsts: list[Path], seconds: list[Path]) -> list[tuple[int, int]]:
-    """Return rows of images that belong together by name, by numbers, by the last or first, or by time."""
+def _match_names(firsts: list[Path], seconds: list[Path]) -> list[tuple[int, int]]:
+    """Return the rows of files that belong together by their names; empty if no rule joins most of them.
+
+    The rules, in this order: equal names, equal numbers in the names, equal last numbers, equal first
+    numbers, and at last the nearest times.
+    """
     keys: tuple[Callable[[Path], Hashable], ...] = (
-        lambda path: path.stem, numbers_in_name,
-        lambda path: numbers_in_name(path)[-1:], lambda path: numbers_in_name(path)[:1],
-    )  # fmt: skip
+        lambda path: path.stem,
+        numbers_in_name,
+        lambda path: numbers_in_name(path)[-1:],
+        lambda path: numbers_in_name(path)[:1],
+    )
     for key in keys:
-        rows = {key(path): row for row, path in enumerate(seconds)}
-        of_firsts = [key(path) for path in firsts]
-        if len(rows) == len(seconds) and len(set(of_firsts)) == len(firsts):
-            pairs = [(row, rows[each]) for row, each in enumerate(of_firsts) if each in rows]
+        second_rows_by_key = {key(path): row for row, path in enumerate(seconds)}
+        first_keys = [key(path) for path in firsts]
+        if len(second_rows_by_key) == len(seconds) and len(set(first_keys)) == len(firsts):
+            pairs = [
+                (row, second_rows_by_key[first_key])
+                for row, first_key in enumerate(first_keys)
+                if first_key in second_rows_by_key
+            ]
             if 2 * len(pairs) > min(len(firsts), len(seconds)):
                 return pairs
-    first_s, second_s = _named_times(firsts, "")[0], _named_times(seconds, "")[0]
+    first_s, second_s = _times_in_names(firsts, "")[0], _times_in_names(seconds, "")[0]
     if first_s is None or second_s is None:
         return []
     first_rows, second_rows = np.argsort(first_s), np.argsort(second_s)
-    pairs = pair_stamps(first_s[first_rows], second_s[second_rows], _MAX_APART_S)
+    pairs = pair_stamps(first_s[first_rows], second_s[second_rows], _MAX_PAIR_DIFFERENCE_S)
     return [(int(first_rows[first]), int(second_rows[second])) for first, second in pairs]
 
 
-def _named_times(paths: Sequence[Path], name: str) -> tuple[Array | None, tuple[str, ...]]:
-    """Return the times, s, that names state, None if they state none; and what was assumed of them."""
-    matches = [_TIME.fullmatch(path.stem) for path in paths]
+def _times_in_names(paths: Sequence[Path], name: str) -> tuple[Array | None, tuple[str, ...]]:
+    """Return the times ``(n,)``, s, that the names of files state, and notes on what was assumed of them.
+
+    The times are None if a name is no number, or if the numbers are whole and no times since 1970.  *name* is
+    the folder, for the notes.
+    """
+    matches = [_NAME_WITH_TIME.fullmatch(path.stem) for path in paths]
     words = [match[1] for match in matches if match is not None]
     if len(words) < len(paths):
         return None, ()
     values = np.array([float(word) for word in words])
     if any("." in word for word in words):
-        nanoseconds = _seconds_and_nanoseconds(words)
-        if nanoseconds is not None and _unevenness(nanoseconds) < _unevenness(values):
-            return nanoseconds, (f"names in {name} are taken as seconds, a point and whole nanoseconds",)
+        with_nanoseconds_s = _parse_seconds_and_nanoseconds(words)
+        if with_nanoseconds_s is not None and _unevenness(with_nanoseconds_s) < _unevenness(values):
+            return with_nanoseconds_s, (
+                f"names in {name} are taken as seconds, a point and whole nanoseconds",
+            )
         return stamps_in_seconds(values, f"names in {name}")
     stamps_s, assumed = stamps_in_seconds(values, f"names in {name}", "seconds")
     return (stamps_s, assumed) if is_since_1970(stamps_s) else (None, ())
 
 
-def _seconds_and_nanoseconds(words: Sequence[str]) -> Array | None:
-    """Return names as seconds and a whole number of nanoseconds; None where they cannot be that."""
+def _parse_seconds_and_nanoseconds(words: Sequence[str]) -> Array | None:
+    """Return the times ``(n,)``, s, of words ``SECONDS.NANOSECONDS`` without leading zeros of the
+    nanoseconds.
+
+    None means that the words are decimal numbers: no word has nine digits after the point, or all words have.
+    """
     parts = [word.partition(".") for word in words]
     lengths = {len(fraction) for _, _, fraction in parts}
     if max(lengths) != _NANOSECOND_DIGITS or len(lengths) == 1:
@@ -254,7 +313,7 @@ def _seconds_and_nanoseconds(words: Sequence[str]) -> Array | None:
 
 
 def _unevenness(stamps_s: Array) -> float:
-    """Return how much intervals differ from their median, relative to it."""
-    steps_s = np.diff(np.sort(stamps_s))
-    typical_s = float(np.median(steps_s)) if len(steps_s) else 1.0
-    return float(np.median(np.abs(steps_s - typical_s))) / max(typical_s, 1e-12)
+    """Return the median absolute deviation of the intervals of times ``(n,)`` over their median."""
+    intervals_s = np.diff(np.sort(stamps_s))
+    median_s = float(np.median(intervals_s)) if len(intervals_s) else 1.0
+    return float(np.median(np.abs(intervals_s - median_s))) / max(median_s, 1e-12)

@@ -1,4 +1,4 @@
-"""Open whatever gives frames, by one word: a device, a video, a folder, a recording, a RealSense camera."""
+"""Open any source of frames by its name: a device, a video, a folder, a recording, or a RealSense camera."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from client_sdk.cameras.source import (
     RawSource,
     SourceInfo,
     StereoSource,
-    no_depth,
+    make_empty_depth,
 )
 from client_sdk.datasets import CameraChoice, open_dataset
 from client_sdk.datasets.recordings import is_listed
@@ -34,9 +34,9 @@ from rse_pf.geometry import Camera
 
 __all__ = ["is_recording", "open_camera", "source_of_frames"]
 
-_ROS = {".mcap", ".db3"}
-_REALSENSE = ("realsense", "realsense-stereo")  # words for devices
-_SOURCES = "name a device by its number, a video, a folder or a recording that exists"
+_ROS_BAG_ENDINGS = {".mcap", ".db3"}  # of ROS 2 bags, which `client_sdk.bags` reads
+_REALSENSE_NAMES = ("realsense", "realsense-stereo")  # sources that are no files, although they look so
+_SOURCE_HINT = "name a device by its number, a video, a folder or a recording that exists"
 
 
 def open_camera(
@@ -48,46 +48,52 @@ def open_camera(
     camera: CameraChoice | None = None,
     imu: bool | None = None,
 ) -> FrameStream:
-    """Return the frames of *source* as an iterator; close it, or use it in ``with``.
+    """Open a source, and return its undistorted frames as an iterator to be closed, or used in ``with``.
 
     Args:
         source: ``0`` (a device), a video, a stream ``rtsp://...``, a folder of images, a recording of
-            `open_dataset`, ``realsense``, or the ``.bag`` of a RealSense camera.  Stereo: two devices
-            ``0,2`` or videos ``LEFT,RIGHT``, one that gives both images side by side, a folder with ``left/``
-            and ``right/``, or ``realsense-stereo``.
-        intrinsics: Of the camera, or the file ``intrinsics.json``; of two cameras a rig, or ``rig.json``.
-            Folders and recordings may have their own.
-        rate_hz: Leave frames out so that so many per second remain; all of a source at this rate or a lower.
-        depth: False leaves the depth out.
-        camera: ``left`` takes one camera of a rig; None takes both where there are two.
+            `open_dataset`, ``realsense``, or the ``.bag`` of a RealSense camera.  Stereo: two devices ``0,2``
+            or videos ``LEFT,RIGHT``, a device or video that shows both images side by side (with a rig), a
+            folder with ``left/`` and ``right/``, or ``realsense-stereo``.
+        intrinsics: Intrinsics or rig of the cameras, or a file of them (``intrinsics.json``, ``rig.json``).
+            None for folders, recordings and RealSense cameras that state their own.
+        rate_hz: Frames a second to deliver on average, see `client_sdk.datasets.thinning`; None for all.
+        depth: Whether depth is read, where there is some.
+        camera: ``left`` for the left camera of a rig alone, ``stereo`` for both; None for both where there
+            are two.
         imu: Whether frames carry samples of an IMU; None for yes where there is one.
 
     Raises:
-        UsageError: There is no such source, or its intrinsics are missing.
+        UsageError: There is no such source, its intrinsics are missing, or facts about it contradict each
+            other.
         MissingExtra: A package for this kind of source is not installed.
     """
+    # 1. The source exists, and the user's intrinsics can be read.
     word = str(source)
     path = Path(word)
     for name in (word,) if path.exists() or word.count(",") != 1 else word.split(","):
-        if not name.isdigit() and "://" not in name and name not in _REALSENSE:
-            check_exists(name, _SOURCES)
+        if not name.isdigit() and "://" not in name and name not in _REALSENSE_NAMES:
+            check_exists(name, _SOURCE_HINT)
     own = read_calibration(intrinsics) if isinstance(intrinsics, Path | str) else intrinsics
     stated_by = str(intrinsics) if isinstance(intrinsics, Path | str) else f"the intrinsics of {word}"
+    # 2. Stereo sources with a rig of their own, and RealSense cameras.
     if word == "realsense-stereo":
         pairs, rig, close = open_realsense_stereo()
         facts = SourceFacts(name=word)
-        return _pair(facts, lambda log: pairs, own if isinstance(own, Rig) else rig, rate_hz, camera, close)
+        rig = own if isinstance(own, Rig) else rig
+        return _open_pair(facts, lambda log: pairs, rig, rate_hz, camera, close)
     if pair_folders(path) is not None:
         rig = own if isinstance(own, Rig) else read_rig(path / "rig.json")
         images = list_pairs(path, rig.left.lens.rate_hz)
         facts = images.facts(rig.left.lens, str(intrinsics or path / "rig.json"), has_depth=False)
-        return _pair(facts, images.pairs, rig, rate_hz, camera)
+        return _open_pair(facts, images.pairs, rig, rate_hz, camera)
     if word == "realsense" or path.suffix == ".bag":
         raw, factory, close = open_realsense(None if word == "realsense" else path)
         lens = own if isinstance(own, Intrinsics) else factory
         facts = _facts_of_lens(word, lens, stated_by)
-        return _single(facts, lambda log: _without_depth(raw, depth), lens, rate_hz, depth, close)
-    if path.suffix in _ROS or (path / "metadata.yaml").is_file():
+        return _open_single(facts, lambda log: _without_depth(raw, depth), lens, rate_hz, depth, close)
+    # 3. Recordings.
+    if path.suffix in _ROS_BAG_ENDINGS or (path / "metadata.yaml").is_file():
         raise UsageError(
             f"{word} is a ROS bag",
             hint="read it with rse-pf map from-bag (extra bags)",
@@ -99,10 +105,16 @@ def open_camera(
         dataset.check()
         dataset = dataset if rate_hz is None else dataset.thinned(rate_hz)
         return source_of_frames(
-            word, dataset, dataset.camera,
-            has_depth=depth and dataset.has_depth, has_stereo=dataset.has_stereo,
-            notes=dataset.notes, log=dataset.log, span_s=dataset.span_s,
-        )  # fmt: skip
+            word,
+            dataset,
+            dataset.camera,
+            has_depth=depth and dataset.has_depth,
+            has_stereo=dataset.has_stereo,
+            notes=dataset.notes,
+            log=dataset.log,
+            span_s=dataset.span_s,
+        )
+    # 4. Devices and videos of a stereo rig.
     if isinstance(own, Rig) and own.right is None:
         own = own.left.lens
     if isinstance(own, Rig) and path.is_dir():
@@ -111,7 +123,8 @@ def open_camera(
             hint="give the intrinsics of one camera, or name the folder above both",
         )
     if isinstance(own, Rig):
-        return _stereo_video(word, own, rate_hz, camera, stated_by)
+        return _open_stereo_video(word, own, rate_hz, camera, stated_by)
+    # 5. One camera: a folder, a video or a device.
     if camera == "stereo":
         raise UsageError(f"{word} is one camera", hint="name a rig: --intrinsics rig.json")
     if imu:
@@ -119,10 +132,10 @@ def open_camera(
     if path.is_dir():
         if own is None:
             file = path / "intrinsics.json"
-            found = None if file.exists() else find_folder_camera(path, lambda: list_folder(path).size_px)
-            file, own = (file, read_intrinsics(file)) if found is None else found
+            stated = None if file.exists() else find_folder_camera(path, lambda: list_folder(path).size_px)
+            file, own = (file, read_intrinsics(file)) if stated is None else stated
             stated_by = str(file)
-        return _folder(path, own, stated_by, rate_hz, depth)
+        return _open_folder(path, own, stated_by, rate_hz, depth)
     if word.count(",") == 1 and not path.exists():
         raise UsageError(
             f"{word} names two cameras, and no rig",
@@ -131,16 +144,16 @@ def open_camera(
     if own is None:
         raise UsageError(f"the intrinsics of {word} are not known", hint=TYPICAL_HINT)
     facts = _facts_of_lens(word, own, stated_by)
-    check_source(facts)  # before a device is opened
+    check_source(facts)  # wrong intrinsics are refused before a device is opened
     video = open_video(word)
     facts = replace(facts, assumed=video.notes)
-    return _single(facts, lambda log: video.images, own, rate_hz, False, video.close, video.span_s)
+    return _open_single(facts, lambda log: video.images, own, rate_hz, False, video.close, video.span_s)
 
 
-def _folder(
+def _open_folder(
     path: Path, lens: Intrinsics, stated_by: str, rate_hz: float | None, use_depth: bool
 ) -> FrameStream:
-    """Return the images of a folder, with depth where there is some and it is wanted."""
+    """Return the frames of a folder of images, with depth if there is some and *use_depth* is set."""
     images = list_folder(path, lens.rate_hz)
     has_depth = use_depth and images.partners is not None
     facts = images.facts(lens, stated_by, has_depth=has_depth)
@@ -148,10 +161,10 @@ def _folder(
     def frames(log: DoubtLog) -> Iterator[RawFrame]:
         return images.frames(log, lens.depth_units_per_m if has_depth else None)
 
-    return _single(facts, frames, lens, rate_hz, has_depth)
+    return _open_single(facts, frames, lens, rate_hz, has_depth)
 
 
-def _single(
+def _open_single(
     facts: SourceFacts,
     frames: Callable[[DoubtLog], Iterator[RawFrame]],
     lens: Intrinsics,
@@ -160,17 +173,25 @@ def _single(
     close: Callable[[], None] | None = None,
     span_s: tuple[float, float] | None = None,
 ) -> FrameStream:
-    """Return the frames of one camera that has passed the gate."""
+    """Check the facts of one camera, and return its frames.
+
+    Raises:
+        UsageError: Two facts contradict each other; nothing was read then.
+    """
     log = DoubtLog(check_source(facts))
-    about = SourceInfo(
-        name=facts.name, camera=lens.camera, has_depth=has_depth, notes=facts.assumed, log=log,
+    info = SourceInfo(
+        name=facts.name,
+        camera=lens.camera,
+        has_depth=has_depth,
+        notes=facts.assumed,
+        log=log,
         span_s=span_s or facts.span_s,
-    )  # fmt: skip
-    return RawSource(about, frames(log), lens, rate_hz=rate_hz, close=close)
+    )
+    return RawSource(info, frames(log), lens, rate_hz=rate_hz, close=close)
 
 
 def _facts_of_lens(name: str, lens: Intrinsics, stated_by: str) -> SourceFacts:
-    """Return what is known of a camera whose images were not looked at; their sizes are compared later."""
+    """Return the facts of a camera none of whose images was read; `RawSource` compares their size later."""
     camera = CameraFacts(stated_by=stated_by, lens=lens)
     return SourceFacts(name=name, cameras=(camera,))
 
@@ -187,44 +208,50 @@ def source_of_frames(
     log: DoubtLog | None = None,
     span_s: tuple[float, float] | None = None,
 ) -> FrameStream:
-    """Return frames that are undistorted and registered already as a source; *close* releases their file.
+    """Return *frames* that are undistorted and registered already as a `FrameSource`.
 
-    *notes*, *log* and *span_s* are those of `SourceInfo`.
+    Without *has_depth*, their depth is removed.  *close* releases the file of the frames.  All other
+    arguments are the fields of `SourceInfo`.
     """
-    blank = no_depth(camera)
+    empty_depth = make_empty_depth(camera)
 
-    def make(item: tuple[float, Frame]) -> Frame:
-        return item[1] if has_depth else replace(item[1], depth_m=blank)
+    def make_frame(item: tuple[float, Frame]) -> Frame:
+        return item[1] if has_depth else replace(item[1], depth_m=empty_depth)
 
-    about = SourceInfo(
-        name=name, camera=camera, has_depth=has_depth, has_stereo=has_stereo, notes=notes,
-        log=DoubtLog() if log is None else log, span_s=span_s,
-    )  # fmt: skip
-    return FrameStream(about, ((frame.timestamp_s, frame) for frame in frames), make, close=close)
+    info = SourceInfo(
+        name=name,
+        camera=camera,
+        has_depth=has_depth,
+        has_stereo=has_stereo,
+        notes=notes,
+        log=DoubtLog() if log is None else log,
+        span_s=span_s,
+    )
+    return FrameStream(info, ((frame.timestamp_s, frame) for frame in frames), make_frame, close=close)
 
 
 def is_recording(path: Path) -> bool:
-    """Say whether a path is a recording that lists its images, or a labelled file."""
+    """Return whether `open_dataset` reads a path: a layout of TUM, EuRoC or KITTI, or NYU Depth V2."""
     is_raw = any(path.glob("d-*.pgm"))
     return path.suffix == ".mat" or is_listed(path) or is_raw or is_euroc(path) or is_kitti(path)
 
 
-def _stereo_video(
+def _open_stereo_video(
     word: str, rig: Rig, rate_hz: float | None, camera: CameraChoice | None, stated_by: str
 ) -> FrameStream:
-    """Return two devices or videos, or one whose images show both cameras side by side."""
+    """Return the stereo frames of two devices or videos, or of one that shows both images side by side."""
     if word.count(",") == 1:
         names = (word.split(",")[0], word.split(",")[1])
         both = open_pair_videos(*names)
         facts = replace(both.facts(names), cameras=_facts_of_lens(word, rig.left.lens, stated_by).cameras)
-        return _pair(facts, both.pairs, rig, rate_hz, camera, both.close, both.left.span_s)
+        return _open_pair(facts, both.pairs, rig, rate_hz, camera, both.close, both.left.span_s)
     video = open_video(word)
     facts = replace(_facts_of_lens(word, rig.left.lens, stated_by), assumed=video.notes)
     pairs = split_pairs(video.images, word)
-    return _pair(facts, lambda log: pairs, rig, rate_hz, camera, video.close, video.span_s)
+    return _open_pair(facts, lambda log: pairs, rig, rate_hz, camera, video.close, video.span_s)
 
 
-def _pair(
+def _open_pair(
     facts: SourceFacts,
     pairs: Callable[[DoubtLog], Iterator[RawPair]],
     rig: Rig,
@@ -233,21 +260,34 @@ def _pair(
     close: Callable[[], None] | None = None,
     span_s: tuple[float, float] | None = None,
 ) -> FrameStream:
-    """Return the frames of a pair that has passed the gate, or those of its left camera."""
+    """Check the facts of a stereo pair, and return its frames, or those of the left camera for ``left``.
+
+    Raises:
+        UsageError: Two facts contradict each other, or the rig has no stereo pair.
+    """
     if camera == "left":
-        return _single(
-            replace(facts, videos={}), lambda log: ((stamp, left, None) for stamp, left, _ in pairs(log)),
-            rig.left.lens, rate_hz, False, close, span_s,
-        )  # fmt: skip
+        return _open_single(
+            replace(facts, videos={}),
+            lambda log: ((stamp_s, left, None) for stamp_s, left, _ in pairs(log)),
+            rig.left.lens,
+            rate_hz,
+            False,
+            close,
+            span_s,
+        )
     right = rig.left if rig.right is None else rig.right
-    of_right = _facts_of_lens(facts.name, right.lens, f"the right camera of {facts.name}").cameras
-    log = DoubtLog(check_source(replace(facts, cameras=(*facts.cameras, *of_right))))
-    about = SourceInfo(
-        name=facts.name, camera=rig.left.lens.camera, has_stereo=True, notes=facts.assumed, log=log,
+    right_facts = _facts_of_lens(facts.name, right.lens, f"the right camera of {facts.name}").cameras
+    log = DoubtLog(check_source(replace(facts, cameras=(*facts.cameras, *right_facts))))
+    info = SourceInfo(
+        name=facts.name,
+        camera=rig.left.lens.camera,
+        has_stereo=True,
+        notes=facts.assumed,
+        log=log,
         span_s=span_s or facts.span_s,
-    )  # fmt: skip
-    return StereoSource(about, pairs(log), rig, rate_hz=rate_hz, close=close)
+    )
+    return StereoSource(info, pairs(log), rig, rate_hz=rate_hz, close=close)
 
 
 def _without_depth(raw: Iterator[RawFrame], has_depth: bool) -> Iterator[RawFrame]:
-    return raw if has_depth else ((stamp, rgb, None) for stamp, rgb, _ in raw)
+    return raw if has_depth else ((stamp_s, rgb, None) for stamp_s, rgb, _ in raw)

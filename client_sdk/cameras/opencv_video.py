@@ -1,6 +1,7 @@
-"""Cameras and videos that OpenCV opens: a device number, a video file, or the address of a stream.
+"""Open cameras and videos with OpenCV: a device by its number, a video file, or a stream by its address.
 
-The time stamps of a file are its presentation times, those of a device are the clock's.  There is no depth.
+The time stamps of a file are its presentation times; those of a device or stream are times of arrival on a
+monotonic clock.  There is no depth.
 """
 
 from __future__ import annotations
@@ -20,38 +21,50 @@ from rse_pf.images import MAX_IMAGE_PIXELS, load_opencv
 
 __all__ = ["Video", "open_video"]
 
-_LOOKED_AT = 3  # frames that are read to see whether a file has presentation times
-_MAX_MISSES = 30
-"""A device that gives no image so many times in a row has gone."""
+_PROBED_FRAMES = 3  # frames that are read to find out whether a file has presentation times
+_MAX_MISSES = 30  # successive reads without an image, after which a device counts as disconnected
+_MIN_RATE_HZ = 0.1  # rate that a file may state; a lower one is a mistake of its container
+_MAX_RATE_HZ = 1000.0  # rate that a file may state; a higher one is a mistake of its container
+_ASSUMED_RATE_HZ = 30.0  # rate of a file that states none
+_TEXT_PROBE_BYTES = 64  # bytes at the start of a file that show whether the file is a text
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Video:
-    """Images of a device or of a file, and how to close it.
+    """An open device, stream or file.
 
-    ``frames`` is how many a file states, 0 if it states none; ``period_s`` is the time between them, of a
-    device 0.  ``notes`` say what was assumed.
+    Attributes:
+        images: Its images, not undistorted, without depth.
+        close: Releases the device or file.
+        frame_count: Number of frames that a file states; 0 if it states none, and of a device or stream.
+        period_s: Time between frames of a file, s; 0 of a device or stream.
+        notes: Sentences for the user on what was assumed.
     """
 
     images: Iterator[RawFrame]
     close: Callable[[], None]
-    frames: int = 0
+    frame_count: int = 0
     period_s: float = 0.0
     notes: tuple[str, ...] = ()
 
     @property
     def span_s(self) -> tuple[float, float] | None:
-        """First and last time of a file, by the frames that it states; None of a device."""
-        return (0.0, self.frames * self.period_s) if self.frames else None
+        """First and last presentation time of a file, s, by its stated number of frames; None of a device."""
+        return (0.0, self.frame_count * self.period_s) if self.frame_count else None
 
 
 def open_video(source: str, clock: Callable[[], float] = time.monotonic) -> Video:
-    """Open a device (``0``), a video file or a stream.
+    """Open a device (``0``), a video file or a stream (``rtsp://...``).
+
+    Args:
+        source: Number, path or address.
+        clock: Clock of the time stamps of a device or stream, s.
 
     Raises:
-        UsageError: There is no such device or file, or OpenCV cannot read it.
+        UsageError: There is no such device or file, OpenCV cannot read it, or its images are too large.
         MissingExtra: OpenCV is not installed.
     """
+    # 1. Refuse what is no video, before OpenCV waits for it or follows other files that it names.
     cv2 = load_opencv()
     is_device, is_file = source.isdigit(), not source.isdigit() and "://" not in source
     if is_file:
@@ -63,9 +76,10 @@ def open_video(source: str, clock: Callable[[], float] = time.monotonic) -> Vide
         )
     if is_file and _is_text(Path(source)):
         raise UsageError(
-            f"{source} is a text, not a video", hint="a playlist names other files: name the video itself"
+            f"{source} is a text file, not a video", hint="name the video itself, not a playlist of videos"
         )
-    _silence(cv2)
+    # 2. Open it.
+    _silence_warnings(cv2)
     capture = cv2.VideoCapture(int(source) if is_device else source)
     if not capture.isOpened():
         capture.release()
@@ -90,55 +104,58 @@ def open_video(source: str, clock: Callable[[], float] = time.monotonic) -> Vide
             f"{source} has images of {width}x{height} px, above {MAX_IMAGE_PIXELS} pixels",
             hint="make them smaller",
         )
+    # 3. A device delivers its latest image; a file delivers all of them with their presentation times.
     if is_device:
         capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
     if not is_file:
         return Video(images=_device_images(capture, source, clock), close=capture.release)
     rate_hz = float(capture.get(cv2.CAP_PROP_FPS))
-    period_s = 1.0 / rate_hz if 0.1 <= rate_hz <= 1000 else 1.0 / 30.0
+    period_s = 1.0 / (rate_hz if _MIN_RATE_HZ <= rate_hz <= _MAX_RATE_HZ else _ASSUMED_RATE_HZ)
     has_times = _has_times(cv2, source)
     assumed = f"{source} states no presentation times: {1.0 / period_s:g} frames a second are assumed"
     return Video(
         images=_file_images(cv2, capture, source, None if has_times else period_s),
         close=capture.release,
-        frames=max(0, int(capture.get(cv2.CAP_PROP_FRAME_COUNT))),
+        frame_count=max(0, int(capture.get(cv2.CAP_PROP_FRAME_COUNT))),
         period_s=period_s,
         notes=() if has_times else (assumed,),
     )
 
 
 def _has_times(cv2: Any, source: str) -> bool:
-    """Return whether the first frames of a file have presentation times: some containers report none."""
+    """Return whether the presentation times of a file increase; some containers have none."""
     capture = cv2.VideoCapture(source)
     try:
-        times_ms = [float(capture.get(cv2.CAP_PROP_POS_MSEC)) for _ in range(_LOOKED_AT) if capture.grab()]
+        times_ms = [
+            float(capture.get(cv2.CAP_PROP_POS_MSEC)) for _ in range(_PROBED_FRAMES) if capture.grab()
+        ]
     finally:
         capture.release()
     return len(times_ms) < 2 or all(earlier < later for earlier, later in itertools.pairwise(times_ms))
 
 
 def _is_text(path: Path) -> bool:
-    """Say whether a file begins as a text; of the formats of videos only YUV4MPEG2 does."""
+    """Return whether a file begins with printable text; of all video formats, only YUV4MPEG2 does."""
     try:
         with path.open("rb") as file:
-            start = file.read(64)
+            start = file.read(_TEXT_PROBE_BYTES)
     except OSError as error:
         raise UsageError(f"cannot read {path}: {error.strerror}", hint="name another video") from error
     return all(32 <= byte < 127 or byte in b"\t\r\n" for byte in start) and not start.startswith(b"YUV4MPEG2")
 
 
-def _silence(cv2: Any) -> None:
-    """Keep OpenCV from printing warnings of its own beside ours; 4.14 has the function in another module."""
+def _silence_warnings(cv2: Any) -> None:
+    """Keep OpenCV from printing warnings of its own; since 4.14, the function is in another module."""
     logging = cv2 if hasattr(cv2, "setLogLevel") else cv2.utils.logging
     logging.setLogLevel(0)
 
 
 def _file_images(cv2: Any, capture: Any, name: str, period_s: float | None) -> Iterator[RawFrame]:
-    """Yield the images of a file with their presentation times, or *period_s* apart."""
+    """Yield the images of a file with their presentation times, or every *period_s* if it is not None."""
     row = 0
     while True:
-        good, image = capture.read()
-        if not good:
+        is_read, image = capture.read()
+        if not is_read:
             if row == 0:
                 raise UsageError(f"{name} holds no image", hint="record it again")
             return
@@ -148,10 +165,15 @@ def _file_images(cv2: Any, capture: Any, name: str, period_s: float | None) -> I
 
 
 def _device_images(capture: Any, name: str, clock: Callable[[], float]) -> Iterator[RawFrame]:
+    """Yield the images of a device or stream with their times of arrival, until it delivers no more.
+
+    Raises:
+        UsageError: The device has delivered no image in 30 successive reads.
+    """
     misses = 0
     while misses < _MAX_MISSES:
-        good, image = capture.read()
-        misses = 0 if good else misses + 1
-        if good:
+        is_read, image = capture.read()
+        misses = 0 if is_read else misses + 1
+        if is_read:
             yield clock(), colour_of(image, name), None
     raise UsageError(f"camera {name} gives no more images", hint="check its cable")

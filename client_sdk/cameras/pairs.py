@@ -1,6 +1,6 @@
-"""Pairs of images of a stereo camera: two devices or videos, or one image with both side by side.
+"""Read the pairs of images of a stereo camera: from two devices or videos, or from images with both halves.
 
-What is wrong with a pair of images is judged in `client_sdk.rigs`.
+Whether the images of a pair fit each other is checked in `client_sdk.rigs.stereo_pair_checks`.
 """
 
 from __future__ import annotations
@@ -17,39 +17,42 @@ from rse_pf.errors import UsageError
 
 __all__ = ["PairVideos", "open_pair_videos", "split_pairs"]
 
-_MAX_APART = 0.4  # of a pair of two files, in frames: images that are farther apart show two moments
+_MAX_TIME_DIFFERENCE = 0.4
+"""Difference between the times of two images of a pair, in image intervals of the faster video: images that
+are farther apart belong to two moments."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PairVideos:
-    """Two devices or two videos."""
+    """Two open devices, or two open videos, of a stereo pair; ``name`` is for messages."""
 
     name: str
     left: Video
     right: Video
 
     def facts(self, names: tuple[str, str]) -> SourceFacts:
-        """Return what both videos state, and what was assumed."""
+        """Return the facts that two videos state; *names* are their file names.  Devices state none."""
         stated = {
-            name: VideoFacts(frames=video.frames, period_s=video.period_s)
+            name: VideoFacts(frames=video.frame_count, period_s=video.period_s)
             for name, video in zip(names, (self.left, self.right), strict=True)
-            if video.frames
+            if video.frame_count
         }
         return SourceFacts(name=self.name, videos=stated, assumed=(*self.left.notes, *self.right.notes))
 
     def pairs(self, log: DoubtLog) -> Iterator[RawPair]:
-        """Yield images of devices as they come, and images of files that have one time.
+        """Yield pairs: of devices, images as they come; of videos, images with the same presentation time.
 
-        *log* counts images of files without a partner.
+        *log* counts images of videos without a partner.
         """
-        within_s = _MAX_APART * min(self.left.period_s, self.right.period_s)
+        # 0 for devices, whose images are taken as they come.
+        max_difference_s = _MAX_TIME_DIFFERENCE * min(self.left.period_s, self.right.period_s)
         left, right = next(self.left.images, None), next(self.right.images, None)
         while left is not None and right is not None:
-            apart_s = right[0] - left[0]
-            if within_s and apart_s > within_s:
+            difference_s = right[0] - left[0]
+            if max_difference_s and difference_s > max_difference_s:
                 log.leave_out(f"the left image at {left[0]:.3f} s")
                 left = next(self.left.images, None)
-            elif within_s and apart_s < -within_s:
+            elif max_difference_s and difference_s < -max_difference_s:
                 log.leave_out(f"the right image at {right[0]:.3f} s")
                 right = next(self.right.images, None)
             else:
@@ -57,30 +60,31 @@ class PairVideos:
                 left, right = next(self.left.images, None), next(self.right.images, None)
 
     def close(self) -> None:
-        """Release both."""
+        """Release both devices or files."""
         self.left.close()
         self.right.close()
 
 
 def open_pair_videos(left: str, right: str) -> PairVideos:
-    """Open two devices or two videos.
+    """Open two devices or two videos, named as for `open_video`.
 
     Raises:
-        UsageError: One cannot be opened.
+        UsageError: One of them cannot be opened; the other one is closed then.
+        MissingExtra: OpenCV is not installed.
     """
-    of_left = open_video(left)
+    left_video = open_video(left)
     try:
-        return PairVideos(name=f"{left},{right}", left=of_left, right=open_video(right))
+        return PairVideos(name=f"{left},{right}", left=left_video, right=open_video(right))
     except UsageError:
-        of_left.close()
+        left_video.close()
         raise
 
 
 def split_pairs(raw: Iterator[RawFrame], name: str) -> Iterator[RawPair]:
-    """Yield the left and the right half of each image.
+    """Yield the left and the right half of each image of *raw*, a camera that shows both images side by side.
 
     Raises:
-        UsageError: The width is odd.
+        UsageError: The width of an image is odd; *name* is the source, for the message.
     """
     for stamp, rgb, _ in raw:
         half = rgb.shape[1] // 2

@@ -1,8 +1,8 @@
-"""Intel RealSense cameras, and the ``.bag`` files that they record: colour and registered depth, or infrared.
+"""Open Intel RealSense cameras, and ``.bag`` files that they recorded: colour with depth, or infrared stereo.
 
-Depth is aligned to the colour image by librealsense; intrinsics come from the camera.  The pair of infrared
-cameras is used with the projector off, whose dots move with the camera.  This module is tested
-with a stand-in of ``pyrealsense2`` only, not on a device.
+librealsense aligns depth to the colour image, and states the intrinsics.  The infrared cameras are used with
+the projector off, because its dots move with the camera, and would look like a scene that does not.  This
+module is tested with a stand-in of ``pyrealsense2`` only, not on a device.
 """
 
 from __future__ import annotations
@@ -22,15 +22,16 @@ from rse_pf.geometry import Camera, inverse
 
 __all__ = ["open_realsense", "open_realsense_stereo"]
 
-_SIZE, _RATE_HZ = (640, 480), 30
-_TIMEOUT_MS = 5000
+_SIZE = (640, 480)  # width and height of the images that the camera is asked for, px
+_RATE_HZ = 30  # images a second that the camera is asked for
+_TIMEOUT_MS = 5000  # wait for an image, after which the camera counts as disconnected
 
 
 def open_realsense(bag: Path | None = None) -> tuple[Iterator[RawFrame], Intrinsics, Callable[[], None]]:
-    """Open the first RealSense camera, or a *bag* that one has recorded.
+    """Open the colour and depth images of the first RealSense camera, or of a *bag* that a camera recorded.
 
     Returns:
-        Its images, its intrinsics, and how to close it.
+        The images, the intrinsics of the colour camera, and the function that closes the camera.
 
     Raises:
         MissingExtra: ``pyrealsense2`` is not installed.
@@ -45,20 +46,20 @@ def open_realsense(bag: Path | None = None) -> tuple[Iterator[RawFrame], Intrins
     else:
         config.enable_stream(rs.stream.depth, *_SIZE, rs.format.z16, _RATE_HZ)
         config.enable_stream(rs.stream.color, *_SIZE, rs.format.rgb8, _RATE_HZ)
-    pipeline, profile = _started(rs, config, str(bag or "no RealSense camera"))
+    pipeline, profile = _start_pipeline(rs, config, str(bag or "no RealSense camera"))
     if bag is not None:
         profile.get_device().as_playback().set_real_time(False)
     lens = profile.get_stream(rs.stream.color).as_video_stream_profile().get_intrinsics()
     unit_m = float(profile.get_device().first_depth_sensor().get_depth_scale())
-    intrinsics = _lens(rs, lens, 1.0 / unit_m)
+    intrinsics = _intrinsics_of(rs, lens, 1.0 / unit_m)
     return _images(rs, pipeline, unit_m, is_file=bag is not None), intrinsics, pipeline.stop
 
 
 def open_realsense_stereo() -> tuple[Iterator[RawPair], Rig, Callable[[], None]]:
-    """Open the infrared cameras of the first RealSense camera.
+    """Open the two infrared cameras of the first RealSense camera as a stereo pair.
 
     Returns:
-        Its pairs of images, its rig, whose body is the left camera, and how to close it.
+        The pairs of images, the rig (its body is the left camera), and the function that closes the camera.
 
     Raises:
         MissingExtra: ``pyrealsense2`` is not installed.
@@ -68,7 +69,7 @@ def open_realsense_stereo() -> tuple[Iterator[RawPair], Rig, Callable[[], None]]
     config = rs.config()
     for side in (1, 2):
         config.enable_stream(rs.stream.infrared, side, *_SIZE, rs.format.y8, _RATE_HZ)
-    pipeline, profile = _started(rs, config, "no RealSense camera")
+    pipeline, profile = _start_pipeline(rs, config, "no RealSense camera")
     profile.get_device().first_depth_sensor().set_option(rs.option.emitter_enabled, 0)
     left, right = (profile.get_stream(rs.stream.infrared, side).as_video_stream_profile() for side in (1, 2))
     extrinsics = left.get_extrinsics_to(right)
@@ -76,9 +77,13 @@ def open_realsense_stereo() -> tuple[Iterator[RawPair], Rig, Callable[[], None]]
     T_right_left[:3, :3] = np.array(extrinsics.rotation).reshape(3, 3).T  # librealsense: column after column
     T_right_left[:3, 3] = extrinsics.translation
     cameras = (
-        RigCamera(name="left", lens=_lens(rs, left.get_intrinsics(), 1000.0), T_body_camera=np.eye(4)),
         RigCamera(
-            name="right", lens=_lens(rs, right.get_intrinsics(), 1000.0), T_body_camera=inverse(T_right_left)
+            name="left", lens=_intrinsics_of(rs, left.get_intrinsics(), 1000.0), T_body_camera=np.eye(4)
+        ),
+        RigCamera(
+            name="right",
+            lens=_intrinsics_of(rs, right.get_intrinsics(), 1000.0),
+            T_body_camera=inverse(T_right_left),
         ),
     )
     return _pairs(pipeline), Rig(cameras=cameras), pipeline.stop
@@ -92,7 +97,7 @@ def _load() -> Any:
     return rs
 
 
-def _started(rs: Any, config: Any, name: str) -> tuple[Any, Any]:
+def _start_pipeline(rs: Any, config: Any, name: str) -> tuple[Any, Any]:
     pipeline = rs.pipeline()
     try:
         return pipeline, pipeline.start(config)
@@ -102,13 +107,17 @@ def _started(rs: Any, config: Any, name: str) -> tuple[Any, Any]:
         ) from error
 
 
-def _lens(rs: Any, lens: Any, depth_scale: float) -> Intrinsics:
+def _intrinsics_of(rs: Any, lens: Any, depth_scale: float) -> Intrinsics:
+    """Return the intrinsics of *lens*, an ``rs.intrinsics``; *depth_scale* are the depth units in a metre.
+
+    Only coefficients of the model Brown-Conrady are used; images of any other model are taken as undistorted.
+    """
     camera = Camera(
         fx=lens.fx, fy=lens.fy, cx=lens.ppx, cy=lens.ppy, width=int(lens.width), height=int(lens.height)
     )
-    distorts = lens.model == rs.distortion.brown_conrady
+    is_distorted = lens.model == rs.distortion.brown_conrady
     return Intrinsics(
-        camera=camera, distortion=tuple(lens.coeffs) if distorts else (), depth_scale=depth_scale
+        camera=camera, distortion=tuple(lens.coeffs) if is_distorted else (), depth_scale=depth_scale
     )
 
 
@@ -120,12 +129,10 @@ def _pairs(pipeline: Any) -> Iterator[RawPair]:
             raise UsageError("the RealSense camera gives no more images", hint="check its cable") from error
         left, right = frames.get_infrared_frame(1), frames.get_infrared_frame(2)
         if left and right:
-            images = [np.array(each.get_data(), dtype=np.uint8) for each in (left, right)]
-            yield (
-                float(left.get_timestamp()) / 1e3,
-                colour_of(images[0], "realsense"),
-                colour_of(images[1], "realsense"),
+            left_rgb, right_rgb = (
+                colour_of(np.array(frame.get_data(), dtype=np.uint8), "realsense") for frame in (left, right)
             )
+            yield float(left.get_timestamp()) / 1e3, left_rgb, right_rgb
 
 
 def _images(rs: Any, pipeline: Any, unit_m: float, *, is_file: bool) -> Iterator[RawFrame]:
@@ -134,7 +141,7 @@ def _images(rs: Any, pipeline: Any, unit_m: float, *, is_file: bool) -> Iterator
         try:
             frames = align.process(pipeline.wait_for_frames(_TIMEOUT_MS))
         except RuntimeError as error:
-            if is_file:  # librealsense ends a playback so
+            if is_file:  # the end of a recording
                 return
             raise UsageError("the RealSense camera gives no more images", hint="check its cable") from error
         colour, depth = frames.get_color_frame(), frames.get_depth_frame()

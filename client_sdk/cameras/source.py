@@ -1,6 +1,6 @@
-"""What every source of frames promises, and the part that all sources share.
+"""The interface of all sources of frames, and what they have in common: order, undistortion, rectification.
 
-It knows no device and no file format.
+Devices and file formats are in the other modules of this package, and in `client_sdk.datasets`.
 """
 
 from __future__ import annotations
@@ -34,30 +34,37 @@ from rse_pf.errors import UsageError
 from rse_pf.geometry import Camera
 
 __all__ = [
-    "FrameSource", "FrameStream", "RawFrame", "RawPair", "RawSource", "SourceInfo", "StereoSource",
-    "no_depth",
-]  # fmt: skip
+    "FrameSource",
+    "FrameStream",
+    "RawFrame",
+    "RawPair",
+    "RawSource",
+    "SourceInfo",
+    "StereoSource",
+    "make_empty_depth",
+]
 
-_LOOKED_AT = 8
-"""Frames of a pair of cameras whose images are compared at the start."""
-_LOOK_EVERY = 5  # frames of a pair of cameras between two that are looked at in the drive
-_LOOKS = 2  # in succession that say the same: one of them may be of a blurred image
+_CHECKED_AT_START = 8  # stereo frames whose images are compared before the first one is delivered
+_CHECK_INTERVAL = 5  # stereo frames from one comparison of both images to the next, after the start
+_CHECKS_TO_REFUSE = 2  # successive comparisons that must show a fault: one alone may be of a blurred image
 _Item = TypeVar("_Item", bound=tuple[Any, ...])
 
 RawFrame = tuple[float, npt.NDArray[np.uint8], "npt.NDArray[np.float32] | None"]
-"""Time stamp in seconds, ``(h, w, 3)`` colours, red first, and ``(h, w)`` metres or None; still distorted."""
+"""A frame before undistortion: time stamp (s), RGB image ``(h, w, 3)``, and depth ``(h, w)`` (m) or None."""
 
 RawPair = tuple[float, npt.NDArray[np.uint8], npt.NDArray[np.uint8]]
-"""Time stamp in seconds, and ``(h, w, 3)`` colours of the left and the right camera, not rectified."""
+"""A stereo frame before rectification: time stamp (s), left and right RGB image ``(h, w, 3)``."""
 
 
 @runtime_checkable
 class FrameSource(Protocol):
-    """An iterator of frames of one camera, in the order of time; the end of a device never comes.
+    """An iterator of undistorted frames in the order of time; a device delivers frames until it is closed.
 
-    ``camera`` is that of all frames; ``has_depth`` and ``has_stereo`` say whether they have depth, or the
-    right image of a pair; ``name`` is for people.
-    After `close`, which may be called again, the iterator is at its end.
+    Attributes:
+        name: Path or device, for messages.
+        camera: The pinhole camera of all frames.
+        has_depth: Whether frames have depth.
+        has_stereo: Whether frames have the right image of a stereo pair.
     """
 
     name: str
@@ -69,18 +76,24 @@ class FrameSource(Protocol):
         """Return the source itself."""
 
     def __next__(self) -> Frame:
-        """Return the next frame; raises UsageError where it cannot be used."""
+        """Return the next frame; raises UsageError if it cannot be used, and StopIteration at the end."""
 
     def close(self) -> None:
-        """Release the device or file."""
+        """Release the device or file; may be called again.  The iterator is then at its end."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SourceInfo:
-    """What `FrameSource` says of a source.
+    """The description of a source that `FrameStream` publishes, see `FrameSource`.
 
-    ``notes`` say what was assumed, ``log`` what is unlikely; ``span_s`` are the first and the last time
-    stamp, None where only the drive tells them.
+    Attributes:
+        name: Path or device, for messages.
+        camera: The pinhole camera of all frames.
+        has_depth: Whether frames have depth.
+        has_stereo: Whether frames have the right image of a stereo pair.
+        notes: Sentences for the user on what was assumed.
+        log: The doubts about the source, to which reading may add some.
+        span_s: First and last time stamp, s; None if they are known only while frames come.
     """
 
     name: str
@@ -93,36 +106,43 @@ class SourceInfo:
 
 
 class FrameStream(AutoClose):
-    """A `FrameSource` over items ``(seconds, ...)``, each of which a function makes a frame of.
+    """A `FrameSource` that makes a frame of each item of an iterator, in the order of time.
 
-    Items that are thinned out are dropped before a frame is made; so are those that do not ascend in time,
-    which is a doubt about the source.
+    An item is a tuple whose first element is the time stamp (s).  Items that exceed the wanted rate, and
+    items that are not later than the one before, are dropped before a frame is made; the latter add a doubt.
     """
 
     def __init__(
         self,
-        about: SourceInfo,
+        info: SourceInfo,
         items: Iterator[_Item],
-        make: Callable[[_Item], Frame],
+        make_frame: Callable[[_Item], Frame],
         *,
         rate_hz: float | None = None,
         close: Callable[[], None] | None = None,
     ) -> None:
-        """Take items at *rate_hz* as `Thinning` does; *close* releases what they are read from.
+        """Store the source; nothing is read before the first frame is asked for.
+
+        Args:
+            info: Description of the source.
+            items: Items in the order of time.
+            make_frame: Makes a frame of an item.
+            rate_hz: Frames a second that are delivered at most, see `Thinning`; None for all.
+            close: Releases the device or file; None if there is none.
 
         Raises:
             UsageError: The rate is not above 0.
         """
         self._thinning = None if rate_hz is None else Thinning(rate_hz)
-        self.name = about.name
-        self.camera = about.camera
-        self.has_depth = about.has_depth
-        self.has_stereo = about.has_stereo
-        self.notes = about.notes
-        self.log = about.log
-        self.span_s = about.span_s
+        self.name = info.name
+        self.camera = info.camera
+        self.has_depth = info.has_depth
+        self.has_stereo = info.has_stereo
+        self.notes = info.notes
+        self.log = info.log
+        self.span_s = info.span_s
         self._items: Iterator[Any] = items
-        self._make: Callable[[Any], Frame] = make
+        self._make_frame: Callable[[Any], Frame] = make_frame
         self._last_s = -math.inf
         self._close = close
 
@@ -133,7 +153,7 @@ class FrameStream(AutoClose):
         return self
 
     async def __anext__(self) -> Frame:
-        """Return the next frame; the camera is read in a thread, so that the connection is served."""
+        """Return the next frame, read in a thread, so that the event loop can serve the connection."""
         frame = await asyncio.to_thread(next, self, None)
         if frame is None:
             raise StopAsyncIteration
@@ -144,12 +164,13 @@ class FrameStream(AutoClose):
             item = next(self._items)
             timestamp_s = item[0]
             if timestamp_s <= self._last_s:
-                self._report_order(timestamp_s)
+                self._report_disorder(timestamp_s)
             elif self._thinning is None or self._thinning.plays(timestamp_s):
                 self._last_s = timestamp_s
-                return self._make(item)
+                return self._make_frame(item)
 
-    def _report_order(self, timestamp_s: float) -> None:
+    def _report_disorder(self, timestamp_s: float) -> None:
+        """Add a doubt about the first image that is not later than the image before."""
         if any(doubt.name is DoubtName.TIME_ORDER for doubt in self.log.doubts):
             return
         sentence = (
@@ -168,27 +189,27 @@ class FrameStream(AutoClose):
 
 
 class RawSource(FrameStream):
-    """A `FrameSource` over raw images: checks their size, and undistorts them."""
+    """A `FrameSource` over the images of one camera: checks their size, and undistorts them."""
 
     def __init__(
         self,
-        about: SourceInfo,
+        info: SourceInfo,
         raw: Iterator[RawFrame],
         intrinsics: Intrinsics,
         *,
         rate_hz: float | None = None,
         close: Callable[[], None] | None = None,
     ) -> None:
-        """Take images from *raw*; the other arguments are those of `FrameStream`.
+        """Take images from *raw* and undistort them by *intrinsics*; other arguments as of `FrameStream`.
 
         Raises:
             UsageError: The rate is not above 0.
         """
-        super().__init__(about, raw, self._frame, rate_hz=rate_hz, close=close)
+        super().__init__(info, raw, self._undistort, rate_hz=rate_hz, close=close)
         self._undistortion = map_to_pinhole(intrinsics)
-        self._no_depth = no_depth(self.camera)
+        self._empty_depth = make_empty_depth(self.camera)
 
-    def _frame(self, raw: RawFrame) -> Frame:
+    def _undistort(self, raw: RawFrame) -> Frame:
         timestamp_s, rgb, depth_m = raw
         for image in (rgb, rgb if depth_m is None else depth_m):
             height, width = image.shape[:2]
@@ -201,86 +222,94 @@ class RawSource(FrameStream):
         return Frame(
             timestamp_s=timestamp_s,
             rgb=self._undistortion.colour(rgb),
-            depth_m=self._no_depth if depth_m is None else self._undistortion.depth(depth_m),
+            depth_m=self._empty_depth if depth_m is None else self._undistortion.depth(depth_m),
             camera=self.camera,
         )
 
 
 class StereoSource(FrameStream):
-    """A `FrameSource` over raw pairs of images, which it rectifies."""
+    """A `FrameSource` over the images of a stereo pair: rectifies them, and checks that both fit."""
 
     def __init__(
         self,
-        about: SourceInfo,
+        info: SourceInfo,
         raw: Iterator[RawPair],
         rig: Rig,
         *,
         rate_hz: float | None = None,
         close: Callable[[], None] | None = None,
     ) -> None:
-        """Take pairs from *raw*, rectified to a camera of their own; other arguments as of `FrameStream`.
+        """Take pairs from *raw* and rectify them by *rig*; other arguments as of `FrameStream`.
+
+        The camera of the source is the rectified one, whatever *info* says.
 
         Raises:
             UsageError: The rate is not above 0, or the rig has no stereo pair.
         """
         if rig.right is None:
-            raise UsageError(f"the rig of {about.name} has one camera", hint="calibrate both: --stereo")
+            raise UsageError(f"the rig of {info.name} has one camera", hint="calibrate both: --stereo")
         self._rectification = Rectification(rig.left, rig.right)
-        about = replace(about, camera=self._rectification.camera)
-        super().__init__(about, raw, self._frame, rate_hz=rate_hz, close=close)
-        self._no_depth = no_depth(self.camera)
-        self._ahead: deque[Frame] | None = None
-        self._given = 0
-        self._last: Frame | None = None
-        self._looks: deque[PairMeasurement] = deque(maxlen=_LOOKS)
+        info = replace(info, camera=self._rectification.camera)
+        super().__init__(info, raw, self._rectify, rate_hz=rate_hz, close=close)
+        self._empty_depth = make_empty_depth(self.camera)
+        self._checked_frames: deque[Frame] | None = None  # not yet delivered; None before the first check
+        self._delivered = 0
+        self._previous: Frame | None = None
+        self._measurements: deque[PairMeasurement] = deque(maxlen=_CHECKS_TO_REFUSE)
 
     def __next__(self) -> Frame:
-        """Return the next frame; the first ones are compared before one is given out, and some later ones."""
-        if self._ahead is None:
-            self._ahead = deque()
-            for _ in range(_LOOKED_AT):
-                try:
-                    self._ahead.append(super().__next__())
-                except StopIteration:
-                    break
-            check_stereo_pairs(itertools.pairwise(self._ahead), self.name)
-        frame = self._ahead.popleft() if self._ahead else super().__next__()
-        self._look_at(frame)
-        return frame
-
-    def _look_at(self, frame: Frame) -> None:
-        """Refuse pairs that have come apart: a camera that lost an image shows another moment from then on.
+        """Return the next frame; both images of the first frames and of every fifth later one are compared.
 
         Raises:
-            UsageError: The rows of two images in succession do not fit any more.
+            UsageError: The cameras are swapped, not synchronised, or rectified wrongly.
         """
-        if self._given % _LOOK_EVERY == 1 and self._last is not None:
-            self._looks.append(measure_pair(self._last, frame))
-            fault = find_fault(self._looks)
-            if fault is not None and len(self._looks) == _LOOKS:
+        if self._checked_frames is None:
+            self._checked_frames = deque()
+            for _ in range(_CHECKED_AT_START):
+                try:
+                    self._checked_frames.append(super().__next__())
+                except StopIteration:
+                    break
+            check_stereo_pairs(itertools.pairwise(self._checked_frames), self.name)
+        frame = self._checked_frames.popleft() if self._checked_frames else super().__next__()
+        self._check_later_pair(frame)
+        return frame
+
+    def _check_later_pair(self, frame: Frame) -> None:
+        """Refuse pairs that fitted at the start and no longer do.
+
+        If a camera loses an image, all its later images belong to another moment than those of the other one.
+
+        Raises:
+            UsageError: Two successive comparisons show a fault.
+        """
+        if self._delivered % _CHECK_INTERVAL == 1 and self._previous is not None:
+            self._measurements.append(measure_pair(self._previous, frame))
+            fault = find_fault(self._measurements)
+            if fault is not None and len(self._measurements) == _CHECKS_TO_REFUSE:
                 raise UsageError(
                     f"{self.name}: the pairs of images fit at the start, and no longer before "
                     f"{frame.timestamp_s:.3f} s, as if a camera had lost an image: {fault.message}",
                     hint="record the time of each image (MP4, MKV or a bag), or take one: --camera left",
                 )
-        self._given += 1
-        self._last = frame
+        self._delivered += 1
+        self._previous = frame
 
-    def _frame(self, raw: RawPair) -> Frame:
+    def _rectify(self, raw: RawPair) -> Frame:
         timestamp_s, left, right = raw
         cv2 = load_opencv()
         return Frame(
             timestamp_s=timestamp_s,
             rgb=self._rectification.left(left),
-            depth_m=self._no_depth,
+            depth_m=self._empty_depth,
             camera=self.camera,
             stereo=self._rectification.right(cv2.cvtColor(right, cv2.COLOR_RGB2GRAY)),
             T_body_camera=self._rectification.T_body_camera,
         )
 
 
-def no_depth(camera: Camera) -> npt.NDArray[np.float32]:
-    """Return a depth image without a reading, which cannot be written to."""
+def make_empty_depth(camera: Camera) -> npt.NDArray[np.float32]:
+    """Return a depth image ``(h, w)`` without readings (0 m), read-only, for cameras without depth."""
     depth_m = np.zeros((camera.height, camera.width), dtype=np.float32)
     depth_m.flags.writeable = False
     return depth_m

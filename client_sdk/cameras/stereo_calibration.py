@@ -1,6 +1,6 @@
-"""Calibrate a stereo pair from images of a board that both cameras see.
+"""Calibrate a stereo pair from images of a calibration board that both cameras see.
 
-Each camera is calibrated and judged as one alone is; then its place beside the other one is found.
+The intrinsics of each camera are calibrated first, and then kept while the pose between both is estimated.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from client_sdk.cameras.board import Board
-from client_sdk.cameras.calibration import BoardViews, calibrate
+from client_sdk.cameras.calibration import MIN_VIEWS, BoardViews, calibrate
 from client_sdk.frontend import load_opencv
 from client_sdk.rigs.rectification import Rectification
 from client_sdk.rigs.rig import Rig, RigCamera
@@ -20,13 +20,19 @@ from rse_pf.geometry import inverse
 
 __all__ = ["PairViews", "StereoCalibration", "calibrate_pair"]
 
-_MIN_PAIRS = 8
-_MIN_CORNERS = 6
+_MIN_COMMON_CORNERS = 6  # corners of the board that both images of a view must show
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StereoCalibration:
-    """A rig whose body is the left camera, and how well it explains *views* that both cameras saw."""
+    """A calibrated stereo rig, and how good the calibration is.
+
+    Attributes:
+        rig: The rig; the frame of its body is that of the left camera.
+        baseline_m: Distance between both cameras.
+        rms_px: Root mean square reprojection error in both images.
+        views: Number of views in which both cameras see the board.
+    """
 
     rig: Rig
     baseline_m: float
@@ -36,7 +42,14 @@ class StereoCalibration:
 
 @dataclass(slots=True, eq=False)
 class PairViews:
-    """Views of one board by both cameras, collected pair by pair."""
+    """The views of one board by both cameras, collected pair by pair.
+
+    Attributes:
+        board: The calibration board.
+        left: Views of the left camera.
+        right: Views of the right camera.
+        pairs: Indices of the views of the left and the right camera that were taken together.
+    """
 
     board: Board
     left: BoardViews = field(init=False)
@@ -47,56 +60,68 @@ class PairViews:
         self.left, self.right = BoardViews(self.board), BoardViews(self.board)
 
     def add(self, left: npt.NDArray[np.uint8], right: npt.NDArray[np.uint8]) -> bool:
-        """Look for the board in two grey images; return whether both have a new view of it.
+        """Find the board in two grey images ``(h, w)``, and return whether both are new views of the board.
 
         Raises:
-            UsageError: An image has another size than those before.
+            UsageError: An image has another size than the images of this camera before.
         """
-        new = self.left.add(left), self.right.add(right)
-        if all(new):
-            self.pairs.append((len(self.left.found) - 1, len(self.right.found) - 1))
-        return all(new)
+        are_new = self.left.add(left), self.right.add(right)
+        if all(are_new):
+            self.pairs.append((len(self.left.views) - 1, len(self.right.views) - 1))
+        return all(are_new)
 
 
 def calibrate_pair(views: PairViews, *, max_rms_px: float = 1.0) -> StereoCalibration:
-    """Return the rig that explains all views best.
+    """Return the stereo rig that explains all views of a board best.
+
+    Args:
+        views: The views of the board by both cameras.
+        max_rms_px: Largest root mean square reprojection error, px, of a calibration that is accepted, for
+            each camera and for the pair.
 
     Raises:
-        CommandFailed: One camera cannot be calibrated, both saw the board too rarely, the error is above
-            *max_rms_px*, or the cameras are no pair.
-        UsageError: The right camera is not beside the left one.
+        CommandFailed: One camera cannot be calibrated, both see the board in too few views, or the error is
+            above *max_rms_px*.
+        UsageError: The cameras differ in size, or the right camera is not to the right of the left one.
         MissingExtra: OpenCV is not installed.
 
     Source:
         Zhang, PAMI 2000, and Bouguet, as OpenCV's ``stereoCalibrate`` implements it.
     """
+    # 1. The intrinsics of each camera.
     lenses = []
-    for side, each in (("left", views.left), ("right", views.right)):
+    for side, views_of_side in (("left", views.left), ("right", views.right)):
         try:
-            lenses.append(calibrate(each, max_rms_px=max_rms_px))
+            lenses.append(calibrate(views_of_side, max_rms_px=max_rms_px))
         except CommandFailed as error:
             raise CommandFailed(f"the {side} camera: {error.message}", hint=error.hint) from error
-    points, lefts, rights = [], [], []
-    for row, other in views.pairs:
-        numbers, mine, theirs = np.intersect1d(
-            views.left.found[row][0], views.right.found[other][0], return_indices=True
-        )
-        if len(numbers) >= _MIN_CORNERS:
-            points.append(views.board.points[numbers])
-            lefts.append(views.left.found[row][1][mine].astype(np.float32))
-            rights.append(views.right.found[other][1][theirs].astype(np.float32))
-    if len(points) < _MIN_PAIRS:
+    # 2. Corners that both cameras see.
+    points, left_pixels, right_pixels = [], [], []
+    for left_view, right_view in views.pairs:
+        left_indices, left_corners = views.left.views[left_view]
+        right_indices, right_corners = views.right.views[right_view]
+        common, left_rows, right_rows = np.intersect1d(left_indices, right_indices, return_indices=True)
+        if len(common) >= _MIN_COMMON_CORNERS:
+            points.append(views.board.points[common])
+            left_pixels.append(left_corners[left_rows].astype(np.float32))
+            right_pixels.append(right_corners[right_rows].astype(np.float32))
+    if len(points) < MIN_VIEWS:
         raise CommandFailed(
-            f"both cameras see the board in {len(points)} views at once; a pair needs {_MIN_PAIRS}",
+            f"both cameras see the board in {len(points)} views at once; a pair needs {MIN_VIEWS}",
             hint="hold the board where both cameras see it whole, still, from many sides",
         )
+    # 3. The pose between both cameras.
     cv2 = load_opencv()
-    models = [(lens.camera.matrix, np.array(lens.distortion)) for lens in lenses]
     camera = lenses[0].camera
     rms_px, _, _, _, _, R, t, _, _ = cv2.stereoCalibrate(
-        points, lefts, rights, *models[0], *models[1], (camera.width, camera.height),
+        points,
+        left_pixels,
+        right_pixels,
+        *(lenses[0].camera.matrix, lenses[0].coefficients),
+        *(lenses[1].camera.matrix, lenses[1].coefficients),
+        (camera.width, camera.height),
         flags=cv2.CALIB_FIX_INTRINSIC,
-    )  # fmt: skip
+    )
     if not rms_px <= max_rms_px:
         raise CommandFailed(
             f"the reprojection error of the pair is {rms_px:.2f} px, above {max_rms_px:g} px",

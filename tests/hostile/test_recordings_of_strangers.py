@@ -154,7 +154,7 @@ def test_a_playlist_under_the_name_of_a_video_opens_no_other_file(tmp_path: Path
     (tmp_path / "v.avi").write_bytes(video((64, 48), 3, (64, 48)))
     (tmp_path / "drive.mp4").write_text(text)
 
-    with pytest.raises(UsageError, match="is a text, not a video"):
+    with pytest.raises(UsageError, match="is a text file, not a video"):
         open_camera(tmp_path / "drive.mp4", intrinsics=Intrinsics(camera=Camera(**_pinhole())))
 
 

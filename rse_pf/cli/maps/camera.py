@@ -112,12 +112,12 @@ def _calibrate(args: argparse.Namespace, board: Board) -> int:
     for image in _raw_images(args.sources):
         views.add(image)
         show_progress(
-            f"{len(views.found)} of {_WANTED_VIEWS} views in {views.images} images; move and tilt the board",
+            f"{len(views.views)} of {_WANTED_VIEWS} views in {views.images} images; move and tilt the board",
             is_over=False,
         )
-        if len(views.found) >= _WANTED_VIEWS or (is_live and views.images >= _LIVE_IMAGES):
+        if len(views.views) >= _WANTED_VIEWS or (is_live and views.images >= _LIVE_IMAGES):
             break
-    show_progress(f"{len(views.found)} views in {views.images} images; computing", is_over=True)
+    show_progress(f"{len(views.views)} views in {views.images} images; computing", is_over=True)
     calibration = calibrate(views, max_rms_px=args.max_rms_px, depth_scale=args.depth_scale)
     write_intrinsics(args.out, calibration)
     camera = calibration.camera

@@ -99,7 +99,7 @@ def test_refuses_too_few_views_views_that_are_alike_and_large_errors(tmp_path: P
 
     with pytest.raises(CommandFailed, match=r"3 usable views .* in 3 images; a calibration needs 8"):
         calibrate(few)
-    with pytest.raises(CommandFailed, match=r"too alike: the board is tilted by \d deg"):
+    with pytest.raises(CommandFailed, match=r"too similar: the board is tilted by \d deg"):
         calibrate(flat)
     with pytest.raises(CommandFailed, match=r"above 0\.001 px"):
         calibrate(good, max_rms_px=0.001)
@@ -109,7 +109,7 @@ def test_the_same_view_twice_counts_once() -> None:
     views = BoardViews(BOARD)
 
     assert [views.add(view(poses(1)[0])) for _ in range(3)] == [True, False, False]
-    assert (views.images, views.alike) == (3, 2)
+    assert (views.images, views.similar) == (3, 2)
     with pytest.raises(UsageError, match="160x120 px"):
         views.add(np.zeros((120, 160), np.uint8))
 

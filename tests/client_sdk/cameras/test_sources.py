@@ -315,7 +315,7 @@ def _of_an_empty_folder(folder: Path) -> None:
         (_with_broken_images, "cannot read the image"),
         (_without_intrinsics, "there is no .*intrinsics.json"),
         (_with_wrong_intrinsics, "has no fy"),
-        (_of_no_video, "is a text, not a video"),
+        (_of_no_video, "is a text file, not a video"),
         (_of_an_empty_folder, "holds no image"),
         (lambda folder: open_camera(folder / "none.mp4", intrinsics=INTRINSICS), "none.mp4 does not exist"),
         (lambda folder: open_camera(folder / "none.mp4"), "none.mp4 does not exist"),
