@@ -240,7 +240,7 @@ class Mapper:
 
     @property
     def map(self) -> PointMap:
-        """The map of segment 0 so far: a dense cloud with depth, else points of features or landmarks."""
+        """Points of segment 0 so far: depth readings, features of stereo pairs, or monocular landmarks."""
         tracker = self._tracker
         if not isinstance(tracker, MonocularTracker):
             return self._records.first.cloud
@@ -255,7 +255,7 @@ class Mapper:
 
     @property
     def frames(self) -> int:
-        """Number of frames tracked so far."""
+        """Number of frames given to `track` so far, with or without a pose."""
         return 0 if self._tracker is None else self._tracker.frames
 
     def restart_clock(self) -> None:

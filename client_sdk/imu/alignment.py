@@ -559,14 +559,14 @@ def _tangents(gravity: Array) -> Array:
 
 
 def _huber_weights(residuals: Array) -> Array:
-    """Return the Huber weights of groups of three whitened axes, repeated for each axis."""
+    """Return the Huber weights ``(n, k)`` of whitened residuals ``(n, k)``; three axes share one weight."""
     norms = np.linalg.norm(residuals.reshape(len(residuals), -1, 3), axis=2) / np.sqrt(3.0)
     weights: Array = np.repeat(np.minimum(1.0, _HUBER_WIDTH / np.maximum(norms, 1e-12)), 3, axis=1)
     return weights
 
 
 def _huber_cost(residuals: Array) -> Array:
-    """Return the Huber loss of each group of three whitened axes."""
+    """Return the Huber loss ``(n, k / 3)`` of whitened residuals ``(n, k)``, one for each three axes."""
     squared = np.square(residuals.reshape(len(residuals), -1, 3)).sum(axis=2)
     norms = np.sqrt(squared / 3.0)
     linear = 3.0 * (2.0 * _HUBER_WIDTH * norms - _HUBER_WIDTH**2)

@@ -59,7 +59,7 @@ class ImuEstimator:
         self._history = ImuHistory(model)
         self._camera = camera
         self._gyro_bias: Array = np.zeros(3)
-        self._has_agreed = False  # whether the gyroscope has agreed with the camera once
+        self._has_agreed = False  # whether the rates of gyroscope and camera have agreed once
         self._due_s = float("-inf")
         self._misfits_in_a_row = 0
         self._motions: dict[tuple[float, float], Preintegration] = {}

@@ -23,7 +23,7 @@ class ImuHistory:
 
     def __init__(self, model: ImuModel) -> None:
         self.model = model
-        self._new_parts: list[Array] = []  # arrays as those of `to_array`, not appended to it yet
+        self._new_parts: list[Array] = []  # arrays ``(n, 7)`` that were added since the last `to_array`
         self._samples: Array = np.empty((0, 7))
 
     def add(self, samples: ImuSamples) -> None:

@@ -31,7 +31,7 @@ _MAX_CORRECTIONS = 1000
 """Corrections that are kept for a reader that falls behind; its oldest ones are dropped."""
 
 AlignedBy = Literal["map", "relocalisation", "nothing"]
-"""Source of an alignment: loop closures of the map, one keyframe that the map localised, or none."""
+"""Source of an alignment: ``map`` for its loop closures, ``relocalisation`` for one localised keyframe."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

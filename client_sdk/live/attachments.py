@@ -158,7 +158,7 @@ class Attachments:
             self._image_uploader.add(encoded.image)
 
     async def run(self) -> None:
-        """Upload attachments until cancelled."""
+        """Upload the attachments that `add` was given, until cancelled."""
         await asyncio.gather(*(uploader.run() for uploader in self._uploaders()))
 
     async def wait_empty(self) -> None:
@@ -177,7 +177,7 @@ class Attachments:
 
 
 class BackgroundUploader:
-    """Store waiting objects one after the other, oldest first, at a limited rate and low priority."""
+    """Upload objects of a robot to the object store, oldest first, at a limited rate and low priority."""
 
     def __init__(
         self,
@@ -208,7 +208,7 @@ class BackgroundUploader:
         self._is_empty.set()
 
     def add(self, data: bytes) -> None:
-        """Append an object; the oldest waiting ones are dropped while more than 16 MiB wait."""
+        """Add an object to upload; while more than 16 MiB wait, the oldest waiting objects are dropped."""
         self._waiting.append(data)
         self._waiting_bytes += len(data)
         while self._waiting_bytes > _MAX_WAITING_BYTES:
@@ -232,14 +232,14 @@ class BackgroundUploader:
         }
 
     async def wait_empty(self) -> None:
-        """Wait until no object waits."""
+        """Wait until every added object was uploaded or dropped."""
         await self._is_empty.wait()
 
     async def run(self) -> None:
         """Upload objects until cancelled; a failed upload is repeated after a pause, unless it is refused."""
         pause_s = _FIRST_PAUSE_S
         while True:
-            # 1. Wait for an object, for the rate limit, and until nothing more urgent waits.
+            # 1. Wait for an object, for the rate limit, and for pose queries and keyframes.
             while not self._waiting:
                 self._is_empty.set()
                 self._has_object.clear()
@@ -248,11 +248,11 @@ class BackgroundUploader:
             await asyncio.sleep(self._rate_limit.spend(len(data) + _REQUEST_BYTES, self._clock()))
             with contextlib.suppress(asyncio.TimeoutError):
                 await asyncio.wait_for(self._wait_quiet(), _MAX_QUIET_WAIT_S)
-            # 2. Store the object.
+            # 2. Upload the object.
             try:
                 await self._store(data)
             except Exception as error:  # noqa: BLE001  the function may belong to the user's program
-                # 3. Drop what is refused, and pause.
+                # 3. After a failure, drop refused objects, and pause before the next upload.
                 if not isinstance(error, RsePfError):
                     self._callbacks.report("store", error)
                     error = InternalError(

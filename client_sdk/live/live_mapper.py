@@ -170,7 +170,7 @@ class LiveMapper:
         self._monocular_odometry: MonocularOdometry | None = None
         self._alignments = Alignments()
         self._correction_stream = CorrectionStream()
-        self._is_corrected = False  # since the last frame, in the present segment
+        self._is_corrected = False  # whether the present segment was corrected since the last frame
         self._segment = 0
         self._last_keyframe: Array | None = None
         self._last_keyframe_s: float | None = None
@@ -432,7 +432,7 @@ class LiveMapper:
 
     @property
     def frames(self) -> int:
-        """Number of frames tracked so far."""
+        """Number of frames given to `track` so far, with or without a pose."""
         return self._mapper.frames
 
     def restart_clock(self) -> None:
@@ -505,10 +505,10 @@ class LiveMapper:
         """
         return self._correction_stream.read()
 
-    # --- Segments and keyframes ---
+    # --- Segments, and the making of keyframes ---
 
     def _begin_segment(self) -> None:
-        """Begin another odometry frame, whose first frame becomes a keyframe and is relocalised at once."""
+        """Begin another odometry frame; its first keyframe is relocalised without a pause."""
         self._segment += 1
         self._sender.current_segment = self._segment
         self._last_keyframe = self._last_keyframe_s = None
@@ -634,7 +634,7 @@ class LiveMapper:
         if self._cloud_update is not None:
             await self._cloud_update
 
-    # --- Updates of the map ---
+    # --- Updates that the map publishes, and relocalisations ---
 
     async def _follow_updates(self) -> None:
         """Apply the updates of the map's topic until cancelled; after a failure, subscribe again."""

@@ -104,7 +104,7 @@ class Renderer:
             colour[:, channel] = (
                 self._colour_0[channel][face] + value * self._colour_range[channel][face]
             ) * light
-        # 4. Clear the pixels without a face.
+        # 4. Set depth and colour of pixels without a face to 0.
         depth_m[has_no_face] = 0.0
         colour[has_no_face.ravel()] = 0.0
         return colour.reshape(*face_numbers.shape, 3), depth_m, cosine.reshape(face_numbers.shape)

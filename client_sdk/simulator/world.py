@@ -25,12 +25,12 @@ __all__ = [
     "make_world",
 ]
 
-ROOM_M = 5.0  # extent of a room along x
-DEPTH_M = 4.6  # extent of all rooms along y
-HEIGHT_M = 2.6  # height of the ceiling
-ROOMS = 3  # rooms of the world, unless another number is asked for
-DOOR_Y_M = (1.55, 3.05)  # y of the left and of the right side of each door
-_DOOR_HEIGHT_M = 2.1  # height of the doors
+ROOM_M = 5.0  # extent of a simulated room along x, metres
+DEPTH_M = 4.6  # extent of all simulated rooms along y, metres
+HEIGHT_M = 2.6  # height of the ceiling of the simulated rooms, metres
+ROOMS = 3  # default number of rooms of the simulated world
+DOOR_Y_M = (1.55, 3.05)  # y in metres of the two sides of each door
+_DOOR_HEIGHT_M = 2.1  # height of the doors between the simulated rooms, metres
 _WALL_M = 0.12  # thickness of the walls between rooms
 
 # Width of a texel in metres, for the textures of walls and furniture
