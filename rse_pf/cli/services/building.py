@@ -14,6 +14,7 @@ from pathlib import Path
 
 from rse_pf.errors import CommandFailed, UsageError
 from rse_pf.local.state import state_folder
+from rse_pf.services.custom.cpp import INCLUDE_FOLDER
 from rse_pf.services.custom.dependencies import (
     LOCK_FILE,
     Dependencies,
@@ -22,7 +23,6 @@ from rse_pf.services.custom.dependencies import (
     platform_tag,
 )
 from rse_pf.services.custom.installed import InstalledService, read_service
-from rse_pf.services.custom.native import INCLUDE_FOLDER
 from rse_pf.terminal import at_work, counted, show
 
 __all__ = ["build_service", "built_service", "changed_s", "lock_service"]

@@ -17,7 +17,13 @@ from rse_pf.config.resource_names import ResourceNames
 from rse_pf.errors import UsageError
 from rse_pf.object_store import ObjectStore
 from rse_pf.services.custom.installed import install
-from rse_pf.services.custom.publishing import LOOK_PERIOD_S, PublishedService, publish, read_list, remove
+from rse_pf.services.custom.publishing import (
+    LIST_POLL_PERIOD_S,
+    PublishedService,
+    publish,
+    read_list,
+    unpublish,
+)
 from rse_pf.terminal import show, show_json
 
 __all__ = ["add_publish_arguments", "publish_service"]
@@ -47,8 +53,8 @@ def publish_service(args: argparse.Namespace, settings: PlatformSettings) -> int
     if args.list:
         return _list(_store(settings), as_json=args.json)
     if args.remove:
-        remove(args.what, _store(settings))
-        show(f"{args.what} is removed: servers stop offering it within {LOOK_PERIOD_S} s")
+        unpublish(args.what, _store(settings))
+        show(f"{args.what} is removed: servers stop offering it within {LIST_POLL_PERIOD_S} s")
         return 0
     built, dependencies = built_service(Path(args.what))
     with tempfile.TemporaryDirectory(prefix="rse-pf-publish-") as folder:
@@ -56,7 +62,7 @@ def publish_service(args: argparse.Namespace, settings: PlatformSettings) -> int
         entry = publish(service, Path(folder), _store(settings), now_s=time.time())
     show(
         f"{entry.name} ({entry.language}) is published: {entry.size} bytes, sha256 {entry.archive[:16]}",
-        f"servers load it within {LOOK_PERIOD_S} s; "
+        f"servers load it within {LIST_POLL_PERIOD_S} s; "
         f"rse-pf service publish {entry.name} --remove takes it out",
     )
     return 0

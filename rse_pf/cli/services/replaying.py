@@ -13,7 +13,7 @@ from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError
 from rse_pf.files import read_document
 from rse_pf.services.custom.installed import InstalledService
-from rse_pf.services.custom.output import shown_output
+from rse_pf.services.custom.output import format_output_line
 from rse_pf.terminal import counted, show
 
 __all__ = ["Recorded", "plain", "recorded_requests", "replay"]
@@ -51,7 +51,7 @@ def replay(service: InstalledService, recorded: Recorded, settings: PlatformSett
 
     requests = [call["request"] for _, call in recorded]
     missing, runs = dry_run(
-        service, requests, settings, lambda line: show(shown_output(time.time(), _DRY_RUN, line))
+        service, requests, settings, lambda line: show(format_output_line(time.time(), _DRY_RUN, line))
     )
     if missing:
         show(f"note: this machine lacks isolation that a server has: {', '.join(missing)}")

@@ -51,9 +51,9 @@ from rse_pf.config import PlatformSettings
 from rse_pf.errors import RsePfError, UsageError
 from rse_pf.files import read_document
 from rse_pf.local.state import read_state, state_folder
+from rse_pf.services.custom.cpp import INCLUDE_FOLDER
 from rse_pf.services.custom.installed import install, installed_services
-from rse_pf.services.custom.native import INCLUDE_FOLDER
-from rse_pf.services.custom.output import shown_output
+from rse_pf.services.custom.output import format_output_line
 from rse_pf.terminal import error_lines, show, show_json, show_progress
 
 __all__ = ["add_arguments", "run"]
@@ -234,7 +234,7 @@ def _format_line(line: LogLine) -> str:
     text = printed["text"]
     with suppress(ValueError):  # a text with spaces is quoted
         text = str(json.loads(text)) if text.startswith('"') else text
-    return shown_output(line.time_s, printed["robot"], text)
+    return format_output_line(line.time_s, printed["robot"], text)
 
 
 async def _reload(

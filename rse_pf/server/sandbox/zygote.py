@@ -198,7 +198,7 @@ def _warm_up(languages: set[str]) -> None:
     importlib.import_module("numpy.linalg")
 
     if "cpp" in languages:
-        importlib.import_module("rse_pf.services.custom.native")
+        importlib.import_module("rse_pf.services.custom.cpp")
     if "lua" in languages:
         from rse_pf.services.custom.lua import warm_up
 

@@ -77,7 +77,7 @@ from rse_pf.server.supervisor.orders import (
 from rse_pf.server.supervisor.robot_events import RobotEvents
 from rse_pf.server.supervisor.robot_rows import MAX_ROBOT_ROWS, robot_rows
 from rse_pf.service import Registry
-from rse_pf.services.custom.installed import InstalledService, installed_services, published_services
+from rse_pf.services.custom.installed import InstalledService, installed_services, packaged_services
 from rse_pf.services.loading import load_services
 from rse_pf.wire.server_session import CLOSE_RATE
 
@@ -291,7 +291,7 @@ class _Worker:
 
     def _installed_services(self, chosen: ServiceSettings) -> list[InstalledService]:
         """Return the services that are installed; of a folder that is followed, none if it is damaged."""
-        published = published_services() if chosen.published else []
+        published = packaged_services() if chosen.published else []
         if not chosen.folder:
             return published
         if not chosen.follow:
@@ -357,7 +357,7 @@ class _Worker:
         except (RsePfError, OSError) as error:
             self._log.error("services-refused", reason=message_of(error))
             return
-        self._sandboxes.replace(services + (published_services() if chosen.published else []))
+        self._sandboxes.replace(services + (packaged_services() if chosen.published else []))
 
     def _jobs(self, plan: WorkerPlan, answers: Answers) -> JobManager:
         settings = plan.settings

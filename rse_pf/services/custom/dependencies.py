@@ -1,8 +1,9 @@
-"""Python packages of a service's own: locked by hashes, installed once from wheels, named by their content.
+"""The Python packages of a service: lock their versions and hashes, install wheels, and verify them.
 
-``requirements.txt`` in the folder of a service names every package with its version and hashes.  Only wheels
-are installed, so that no code of a package runs before it is inside the sandbox.  What an author wishes for
-is parsed here, and pip gets names and versions alone: it would build a folder, and follow an address.
+An author writes the wanted packages to ``requirements.in``; `lock_dependencies` resolves them to
+``requirements.txt``, the lock, with one version and its hashes for each package; `build_dependencies`
+installs the lock.  Only wheels are installed, so that no code of a package runs outside of a sandbox.  Lines
+of authors are parsed before pip sees them, since pip would build a folder, and download from an address.
 """
 
 from __future__ import annotations
@@ -24,35 +25,40 @@ from typing import Any
 
 from rse_pf.errors import CommandFailed, ConfigurationError, MissingExtra, UsageError
 from rse_pf.files import replace_file, replace_json
-from rse_pf.services.custom.plain_files import read_plain
+from rse_pf.services.custom.regular_files import read_regular_file
 
 __all__ = [
     "LOCK_FILE",
     "Dependencies",
     "LockedRequirement",
     "build_dependencies",
-    "check_dependencies",
-    "check_together",
     "copy_dependencies",
     "lock_dependencies",
     "platform_tag",
     "read_lock",
+    "require_same_versions",
     "tree_digest",
+    "verify_dependencies",
     "write_lock",
 ]
 
 LOCK_FILE = "requirements.txt"
+"""Name of the lock in the folder of a service."""
 _WANTED_FILE = "requirements.in"
+"""Name of the file in the folder of a service that lists the wanted packages."""
 PROVIDED = ("msgspec", "numpy")
-"""Packages that a sandbox has loaded before a service is: another version would not be used."""
+"""Packages that a sandbox loads before the service, so that another version in the lock would not be used."""
 
-_LINE = re.compile(
+_LOCKED_LINE = re.compile(
     r"(?P<name>[A-Za-z0-9](?:[\w.-]*[A-Za-z0-9])?)(?:\[[\w.,\s-]*\])?\s*==\s*(?P<version>[\w.!+-]+)"
     r"(?P<marker>\s*;(?:(?!\s-)[^#$])*?)?(?P<hashes>(?:\s+--hash=sha256:[0-9a-f]{64})+)"
 )
-_PINNED = re.compile(r"[\w.\[\],-]+\s*==\s*[\w.!+-]+\s*(;.*)?")
+"""A line of a lock: name, extras, one version, environment marker, and at least one SHA-256."""
+_LINE_WITHOUT_HASH = re.compile(r"[\w.\[\],-]+\s*==\s*[\w.!+-]+\s*(;.*)?")
+"""A line with one version but no hash, for a helpful error."""
 _SHA256 = re.compile(r"[0-9a-f]{64}")
-_LEFT_OUT_VARIABLES = {
+"""A SHA-256 in hexadecimal digits."""
+_REMOVED_VARIABLES = {
     "PIP_NO_BINARY",
     "PIP_ONLY_BINARY",
     "PIP_TARGET",
@@ -60,13 +66,14 @@ _LEFT_OUT_VARIABLES = {
     "PIP_USER",
     "PIP_REQUIRE_HASHES",
 }
-"""Settings of pip that would change what is installed where."""
+"""Environment variables of pip that would change which files are installed, or where."""
 _MAX_REASON = 300
+"""Characters of pip's reason that an error quotes."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LockedRequirement:
-    """One package of a lock: its normalised name, its version, and its line for pip."""
+    """A package of a lock: its normalised name, its version, and its line for pip with the hashes."""
 
     name: str
     version: str
@@ -75,10 +82,13 @@ class LockedRequirement:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Dependencies:
-    """Installed packages.
+    """The installed packages of a service.
 
-    ``folder`` is named by ``digest``, which `tree_digest` gives; ``packages`` maps names to versions, and
-    ``platform`` is the `platform_tag` that they were installed for.
+    Attributes:
+        folder: Folder of the packages, whose name is *digest*.
+        digest: `tree_digest` of the folder.
+        packages: Versions of the packages by name.
+        platform: `platform_tag` of the interpreter for which they were installed.
     """
 
     folder: Path
@@ -88,24 +98,25 @@ class Dependencies:
 
 
 def platform_tag() -> str:
-    """Return the interpreter and machine that wheels are chosen for, such as ``cp311-linux-x86_64``."""
+    """Return interpreter and machine of this process, which wheels must fit, as ``cp311-linux-x86_64``."""
     return f"cp{sys.version_info.major}{sys.version_info.minor}-{sysconfig.get_platform()}"
 
 
 def read_lock(folder: Path) -> list[LockedRequirement]:
-    """Return what ``requirements.txt`` in *folder* locks, sorted by name; nothing if there is no such file.
+    """Return the packages of the lock in *folder*, sorted by name; an empty list without a lock.
 
     Raises:
-        UsageError: A line is not one version with hashes, or names a package that every sandbox provides.
+        UsageError: A line is not one version with hashes, names a package twice, or one that every sandbox
+            provides.
     """
     path = folder / LOCK_FILE
-    text = _text_of(path)
+    text = _read_text(path)
     if text is None:
         return []
     hint = f"lock the versions: rse-pf service lock {folder}"
-    found: dict[str, LockedRequirement] = {}
-    for number, line in _lines(text):
-        match = _LINE.fullmatch(line)
+    requirements: dict[str, LockedRequirement] = {}
+    for number, line in _numbered_lines(text):
+        match = _LOCKED_LINE.fullmatch(line)
         where = f"{path}, line {number}"
         if match is None:
             raise UsageError(f"{where}: {line[:80]!r} {_why_unlocked(line)}", hint=hint)
@@ -115,83 +126,94 @@ def read_lock(folder: Path) -> list[LockedRequirement]:
                 f"{where}: every sandbox has {name} {metadata.version(name)} already",
                 hint=f"leave it out, or {hint}",
             )
-        if name in found:
+        if name in requirements:
             raise UsageError(f"{where}: {name} is locked twice", hint=hint)
-        found[name] = LockedRequirement(name=name, version=match["version"], line=" ".join(line.split()))
-    return sorted(found.values(), key=lambda each: each.name)
+        requirements[name] = LockedRequirement(
+            name=name, version=match["version"], line=" ".join(line.split())
+        )
+    return sorted(requirements.values(), key=lambda requirement: requirement.name)
 
 
 def build_dependencies(folder: Path, store: Path) -> Dependencies | None:
-    """Return the installed packages of the service in *folder*, None if it locks none.
+    """Install the packages that the service in *folder* locks; return None if it locks none.
 
-    They are installed below *store* once; later calls with the same lock find them there.
+    Packages of the same lock that are already installed below *store* are returned without a call of pip.
+
+    Args:
+        folder: The service.
+        store: Folder below which packages are installed, each set in a folder named by its digest.
 
     Raises:
-        UsageError: The lock is refused, or pip is not installed.
-        CommandFailed: pip cannot install it: there is no wheel, or a hash differs.
+        UsageError: The lock is invalid, or pip is not installed.
+        CommandFailed: pip fails: a package has no wheel for this platform, or a hash differs.
     """
     requirements = read_lock(folder)
     if not requirements:
         return None
-    lines = [each.line for each in requirements]
+    lines = [requirement.line for requirement in requirements]
     key = hashlib.sha256("\n".join([platform_tag(), *lines]).encode()).hexdigest()
     record = store / f"{key}.json"
-    built = _built(record, store)
-    if built is None:
-        built = _install(requirements, folder, store)
-        document = asdict(built) | {"folder": None}
-        replace_json(record, document)
-    return built
+    dependencies = _find_built(record, store)
+    if dependencies is None:
+        dependencies = _install(requirements, folder, store)
+        replace_json(record, asdict(dependencies) | {"folder": None})
+    return dependencies
 
 
-def check_dependencies(built: Dependencies, service: str) -> None:
-    """Check that the packages of *service* are for this interpreter, and that no byte was changed.
+def verify_dependencies(dependencies: Dependencies, service: str) -> None:
+    """Check that the packages of *service* are for this interpreter and machine, and unchanged.
 
     Raises:
-        ConfigurationError: They are not, or something was changed, added or removed.
+        ConfigurationError: The packages are for another platform, missing, or a file was changed, added or
+            removed.
     """
     hint = "install the service again with: rse-pf service install FOLDER"
-    if built.platform != platform_tag():
+    folder = dependencies.folder
+    if dependencies.platform != platform_tag():
         raise ConfigurationError(
-            f"the packages of {service} are for {built.platform}, this server is {platform_tag()}", hint=hint
+            f"the packages of {service} are for {dependencies.platform}, this server is {platform_tag()}",
+            hint=hint,
         )
-    if not built.folder.is_dir():
-        raise ConfigurationError(f"the packages of {service} are missing: {built.folder}", hint=hint)
-    if tree_digest(built.folder) != built.digest:
-        raise ConfigurationError(f"the packages of {service} were changed: {built.folder}", hint=hint)
+    if not folder.is_dir():
+        raise ConfigurationError(f"the packages of {service} are missing: {folder}", hint=hint)
+    if tree_digest(folder) != dependencies.digest:
+        raise ConfigurationError(f"the packages of {service} were changed: {folder}", hint=hint)
 
 
-def check_together(built: Mapping[str, Dependencies]) -> None:
-    """Check that services (name to packages) agree on versions: one sandbox may load all of them.
+def require_same_versions(packages: Mapping[str, Mapping[str, str]]) -> None:
+    """Check that services need the same version of each package, since one sandbox may load all services.
+
+    Args:
+        packages: For each service the versions of its packages by name.
 
     Raises:
-        ConfigurationError: Two services lock different versions of one package.
+        ConfigurationError: Two services need different versions of a package.
     """
-    owners: dict[str, tuple[str, str]] = {}
-    for service, each in sorted(built.items()):
-        for package, version in each.packages.items():
-            owner, other = owners.setdefault(package, (service, version))
-            if other != version:
+    first_users: dict[str, tuple[str, str]] = {}
+    for service, versions in sorted(packages.items()):
+        for package, version in versions.items():
+            first_service, first_version = first_users.setdefault(package, (service, version))
+            if first_version != version:
                 raise ConfigurationError(
-                    f"{owner} needs {package} {other} and {service} needs {package} {version}, "
-                    "and the sandbox of a robot may run both",
+                    f"{first_service} needs {package} {first_version} and {service} needs {package} "
+                    f"{version}, and the sandbox of a robot may run both",
                     hint="lock both services to one version, or serve them by different servers",
                 )
 
 
-def copy_dependencies(built: Dependencies, store: Path) -> None:
-    """Copy *built* below *store*, under its digest; what is there already and unchanged is kept."""
-    target = store / built.digest
-    if target.is_dir() and tree_digest(target) == built.digest:
+def copy_dependencies(dependencies: Dependencies, store: Path) -> None:
+    """Copy packages to the folder below *store* named by their digest, unless a copy is there."""
+    target = store / dependencies.digest
+    if target.is_dir() and tree_digest(target) == dependencies.digest:
         return
     store.mkdir(parents=True, exist_ok=True)
     fresh = Path(tempfile.mkdtemp(prefix=".new-", dir=store))
-    shutil.copytree(built.folder, fresh, dirs_exist_ok=True, symlinks=True)
-    _settle(fresh, target)
+    shutil.copytree(dependencies.folder, fresh, dirs_exist_ok=True, symlinks=True)
+    _publish_folder(fresh, target)
 
 
 def tree_digest(folder: Path) -> str:
-    """Return the SHA-256 of the names and contents of all files below *folder*; a link is its own content."""
+    """Return the SHA-256 of the names and contents of all files below *folder*; a link contains its target."""
     digest = hashlib.sha256()
     for path in sorted(folder.rglob("*")):
         if path.is_dir() and not path.is_symlink():
@@ -203,48 +225,57 @@ def tree_digest(folder: Path) -> str:
 
 
 def lock_dependencies(folder: Path) -> list[LockedRequirement]:
-    """Resolve ``requirements.in`` in *folder* and write the lock; return what it holds.
+    """Resolve ``requirements.in`` in *folder* with pip, write ``requirements.txt``, and return its packages.
 
-    Without that file, ``requirements.txt`` is taken for it and kept under its name.  Only wheels for this
-    interpreter are chosen.
+    Without ``requirements.in``, the lines of ``requirements.txt`` are moved there first.  Only wheels for
+    this interpreter and machine are chosen.
 
     Raises:
         UsageError: There is neither file, a line is more than a name with versions, or pip is not installed.
-        CommandFailed: pip finds no versions that fit, or no wheel.
-        MissingExtra: The package that parses the lines is not installed.
+        CommandFailed: pip finds no versions that fit together, or no wheel.
+        MissingExtra: The package ``packaging``, which parses the lines, is not installed.
     """
+    # 1. Read and validate the wanted packages.
     wanted, lock = folder / _WANTED_FILE, folder / LOCK_FILE
-    source, text = wanted, _text_of(wanted)
+    source, text = wanted, _read_text(wanted)
     if text is None:
-        source, text = lock, _text_of(lock)
+        source, text = lock, _read_text(lock)
     if text is None:
         raise UsageError(
             f"there is no {wanted}",
             hint="write the packages that the service imports there, one on each line",
         )
-    lines = [_wish(line, f"{source}, line {number}") for number, line in _lines(text)]
+    lines = [_validate_wanted(line, f"{source}, line {number}") for number, line in _numbered_lines(text)]
+    # 2. Let pip resolve them, with the provided packages fixed to their installed versions.
     with tempfile.TemporaryDirectory(prefix="rse-pf-lock-") as temporary:
         report, constraints = Path(temporary, "report.json"), Path(temporary, "constraints.txt")
-        wishes = Path(temporary, "wishes.txt")
-        wishes.write_text("".join(f"{line}\n" for line in lines), encoding="utf-8")
+        requirements = Path(temporary, "requirements.txt")
+        requirements.write_text("".join(f"{line}\n" for line in lines), encoding="utf-8")
         provided = "".join(f"{name}=={metadata.version(name)}\n" for name in PROVIDED)
         constraints.write_text(provided, encoding="utf-8")
-        _pip(
-            "--dry-run", "--ignore-installed", "--report", str(report), "-c", str(constraints),
-            "-r", str(wishes),
+        options = ["--dry-run", "--ignore-installed", "--report", str(report)]
+        _run_pip(
+            *options,
+            "-c",
+            str(constraints),
+            "-r",
+            str(requirements),
             hint=f"correct {source}; a package must have a wheel for {platform_tag()}",
-        )  # fmt: skip
+        )
         document = json.loads(report.read_text(encoding="utf-8"))
+    # 3. Write the lock.
     if source == lock:
         replace_file(wanted, text.encode())
-    chosen = sorted(filter(None, map(_chosen, document["install"])), key=lambda each: each.name)
-    write_lock(lock, chosen, f"Locked from {_WANTED_FILE} by rse-pf service lock, for {platform_tag()}.")
-    return chosen
+    resolved = filter(None, map(_read_report_entry, document["install"]))
+    locked = sorted(resolved, key=lambda requirement: requirement.name)
+    write_lock(lock, locked, f"Locked from {_WANTED_FILE} by rse-pf service lock, for {platform_tag()}.")
+    return locked
 
 
-def write_lock(path: Path, requirements: Sequence[LockedRequirement], about: str) -> None:
-    """Replace the lock *path* by *requirements*, under a comment that says *about*."""
-    replace_file(path, "".join(f"{line}\n" for line in (f"# {about}", *(each.line for each in requirements))))
+def write_lock(path: Path, requirements: Sequence[LockedRequirement], comment: str) -> None:
+    """Replace the lock *path* by the lines of *requirements* after a line with *comment*."""
+    lines = (f"# {comment}", *(requirement.line for requirement in requirements))
+    replace_file(path, "".join(f"{line}\n" for line in lines))
 
 
 def _install(requirements: Sequence[LockedRequirement], folder: Path, store: Path) -> Dependencies:
@@ -253,23 +284,28 @@ def _install(requirements: Sequence[LockedRequirement], folder: Path, store: Pat
     lock = fresh.with_suffix(".lock")
     try:
         write_lock(lock, requirements, "one installation")
-        _pip(
-            "--require-hashes", "--no-deps", "--no-compile", "--target", str(fresh.absolute()),
-            "-r", str(lock.absolute()),
+        _run_pip(
+            "--require-hashes",
+            "--no-deps",
+            "--no-compile",
+            "--target",
+            str(fresh.absolute()),
+            "-r",
+            str(lock.absolute()),
             hint=f"only wheels with the hashes of the lock are installed: rse-pf service lock {folder}",
-        )  # fmt: skip
-        shutil.rmtree(fresh / "bin", ignore_errors=True)  # programs, which no sandbox can start
+        )
+        shutil.rmtree(fresh / "bin", ignore_errors=True)  # Sandboxes cannot start programs.
         digest = tree_digest(fresh)
-        _settle(fresh, store / digest)
+        _publish_folder(fresh, store / digest)
     finally:
         lock.unlink(missing_ok=True)
         shutil.rmtree(fresh, ignore_errors=True)
-    packages = {each.name: each.version for each in requirements}
+    packages = {requirement.name: requirement.version for requirement in requirements}
     return Dependencies(folder=store / digest, digest=digest, packages=packages, platform=platform_tag())
 
 
-def _settle(fresh: Path, target: Path) -> None:
-    """Let every user read *fresh*, and nobody write it; then give it its name."""
+def _publish_folder(fresh: Path, target: Path) -> None:
+    """Make *fresh* readable for all users and its files read-only, then rename it to *target*."""
     for path in (fresh, *fresh.rglob("*")):
         if not path.is_symlink():
             path.chmod(0o755 if path.is_dir() else 0o444)
@@ -277,33 +313,34 @@ def _settle(fresh: Path, target: Path) -> None:
     fresh.rename(target)
 
 
-def _built(record: Path, store: Path) -> Dependencies | None:
+def _find_built(record: Path, store: Path) -> Dependencies | None:
+    """Return the packages that the file *record* describes, None if they are missing or changed."""
     try:
         document = json.loads(record.read_text(encoding="utf-8"))
         built = Dependencies(**{**document, "folder": store / document["digest"]})
     except (OSError, ValueError, KeyError, TypeError):
         return None
-    is_whole = _SHA256.fullmatch(built.digest) and built.folder.is_dir()
-    return built if is_whole and tree_digest(built.folder) == built.digest else None
+    is_present = _SHA256.fullmatch(built.digest) and built.folder.is_dir()
+    return built if is_present and tree_digest(built.folder) == built.digest else None
 
 
-def _text_of(path: Path) -> str | None:
-    """Return the text of *path*, None if it is missing."""
+def _read_text(path: Path) -> str | None:
+    """Return the text of the file *path*, None if there is no such file."""
     try:
-        return read_plain(path).decode("utf-8")
+        return read_regular_file(path).decode("utf-8")
     except FileNotFoundError:
         return None
     except (OSError, UnicodeDecodeError) as error:
         raise UsageError(f"cannot read {path}: {error}", hint="write one package on each line") from error
 
 
-def _wish(line: str, where: str) -> str:
-    """Return *line* as pip shall read it: a name, extras, versions, a marker, and the hashes of a lock."""
+def _validate_wanted(line: str, where: str) -> str:
+    """Return a wanted package in the form for pip: a name, extras, versions, a marker, and hashes."""
     try:
         from packaging.requirements import InvalidRequirement, Requirement
     except ImportError as error:
         raise MissingExtra("packaging", "backend") from error
-    locked = _LINE.fullmatch(line)
+    locked = _LOCKED_LINE.fullmatch(line)
     hashes = "" if locked is None else locked["hashes"]
     try:
         parsed = Requirement(line.removesuffix(hashes))
@@ -314,17 +351,17 @@ def _wish(line: str, where: str) -> str:
             f"{where}: {line[:80]!r} is not the name of a package with its versions",
             hint="write lines such as scipy>=1.11: no path, no address, no option of pip, no variable",
         )
-    parsed.name = _normalised(parsed.name)  # a name such as a.zip would be a file
+    parsed.name = _normalised(parsed.name)  # pip would read a name such as a.zip as a file.
     return f"{parsed}{hashes}"
 
 
-def _pip(*arguments: str, hint: str) -> None:
-    command = [
-        sys.executable, "-m", "pip", "install", "--only-binary=:all:", "--quiet", "--no-input",
-        "--disable-pip-version-check", *arguments,
-    ]  # fmt: skip
-    variables = {name: value for name, value in os.environ.items() if name not in _LEFT_OUT_VARIABLES}
-    with tempfile.TemporaryDirectory(prefix="rse-pf-pip-") as empty:  # python -m imports from where it runs
+def _run_pip(*arguments: str, hint: str) -> None:
+    """Run ``pip install`` for wheels only; raises CommandFailed with pip's first reason and *hint*."""
+    options = ["--only-binary=:all:", "--quiet", "--no-input", "--disable-pip-version-check"]
+    command = [sys.executable, "-m", "pip", "install", *options, *arguments]
+    variables = {name: value for name, value in os.environ.items() if name not in _REMOVED_VARIABLES}
+    # An empty folder, since python -m imports modules from the current folder.
+    with tempfile.TemporaryDirectory(prefix="rse-pf-pip-") as empty:
         done = subprocess.run(command, capture_output=True, text=True, check=False, env=variables, cwd=empty)
     if done.returncode == 0:
         return
@@ -335,12 +372,12 @@ def _pip(*arguments: str, hint: str) -> None:
     raise CommandFailed(f"pip: {reason.removeprefix('ERROR: ')[:_MAX_REASON]}", hint=hint)
 
 
-def _chosen(each: Mapping[str, Any]) -> LockedRequirement | None:
-    """Return one package of a report of pip; None if every sandbox provides it."""
-    name, version = _normalised(each["metadata"]["name"]), each["metadata"]["version"]
+def _read_report_entry(entry: Mapping[str, Any]) -> LockedRequirement | None:
+    """Return the package of an entry of pip's report; None if every sandbox provides the package."""
+    name, version = _normalised(entry["metadata"]["name"]), entry["metadata"]["version"]
     if name in PROVIDED:
         return None
-    sha256 = each["download_info"].get("archive_info", {}).get("hashes", {}).get("sha256", "")
+    sha256 = entry["download_info"].get("archive_info", {}).get("hashes", {}).get("sha256", "")
     if not _SHA256.fullmatch(sha256):
         raise CommandFailed(
             f"{name} {version} is not a file with a hash", hint="name a version that an index has"
@@ -348,20 +385,20 @@ def _chosen(each: Mapping[str, Any]) -> LockedRequirement | None:
     return LockedRequirement(name=name, version=version, line=f"{name}=={version} --hash=sha256:{sha256}")
 
 
-def _lines(text: str) -> Iterator[tuple[int, str]]:
-    """Yield number and text of each line; a line that ends with a backslash continues on the next one."""
-    number, begun = 0, ""
-    for at, raw in enumerate(text.splitlines(), 1):
-        number = number if begun else at
-        line = f"{begun} {re.sub(r'(^|[ ])#.*', '', raw).strip()}".strip()
+def _numbered_lines(text: str) -> Iterator[tuple[int, str]]:
+    """Yield number and text of each line without comments; a backslash at the end continues a line."""
+    number, continued = 0, ""
+    for line_number, raw in enumerate(text.splitlines(), 1):
+        number = number if continued else line_number
+        line = f"{continued} {re.sub(r'(^|[ ])#.*', '', raw).strip()}".strip()
         if line.endswith("\\"):
-            begun = line[:-1].rstrip() or " "
+            continued = line[:-1].rstrip() or " "
             continue
-        begun = ""
+        continued = ""
         if line:
             yield number, line
-    if begun.strip():
-        yield number, begun.strip()
+    if continued.strip():
+        yield number, continued.strip()
 
 
 def _why_unlocked(line: str) -> str:
@@ -369,7 +406,11 @@ def _why_unlocked(line: str) -> str:
         return "is an option of pip, which a lock does not take"
     if "@" in line or "://" in line or line.startswith((".", "/")):
         return "is an address, not a version of an index"
-    return "has no sha256 hash" if _PINNED.match(line) else "is not locked to one version and its hashes"
+    return (
+        "has no sha256 hash"
+        if _LINE_WITHOUT_HASH.match(line)
+        else "is not locked to one version and its hashes"
+    )
 
 
 def _normalised(name: str) -> str:

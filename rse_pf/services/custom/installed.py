@@ -1,7 +1,7 @@
-"""Services that the operator installs: one folder each, in Python, C/C++ or Lua, pinned by file hashes.
+"""Read, install and verify the folders of services; ``pins.json`` holds the SHA-256 of every installed file.
 
-Robots do not send code: a server runs what is in its services folder, and refuses a folder that was changed
-after it was installed.  Nothing of a service is executed here.
+A server runs the services in its services folder, and refuses one whose files were changed after the
+installation.
 """
 
 from __future__ import annotations
@@ -23,44 +23,59 @@ from rse_pf.errors import ConfigurationError, UsageError
 from rse_pf.service import Kind
 from rse_pf.services.custom.dependencies import (
     Dependencies,
-    check_dependencies,
-    check_together,
     copy_dependencies,
     read_lock,
+    require_same_versions,
+    verify_dependencies,
 )
-from rse_pf.services.custom.plain_files import copy_plain, read_plain
+from rse_pf.services.custom.regular_files import copy_regular_files, read_regular_file
 
 __all__ = [
     "DEPENDENCIES_FOLDER",
     "ENTRY_POINTS",
     "InstalledService",
-    "check_installed",
-    "dependencies_of",
-    "identity_of",
     "install",
     "installed_services",
-    "published_services",
+    "packaged_services",
+    "read_dependencies",
+    "read_identity",
     "read_service",
+    "verify_installed",
 ]
 
 _Language = Literal["python", "cpp", "lua"]
 
 ENTRY_POINTS = "rse_pf.services"
-"""Entry-point group by which Python packages publish services: ``name = "package.module"``."""
+"""Entry-point group by which installed Python packages offer services: ``name = "package.module"``."""
 
-_MANIFEST, _PINS, _DEPENDENCIES = "service.json", "pins.json", "dependencies.json"
+_MANIFEST = "service.json"  # file in which the author describes the service
+_PINS = "pins.json"  # file of an installed service with the SHA-256 of every other file
+_DEPENDENCIES = "dependencies.json"  # file of an installed service that names its Python packages
 DEPENDENCIES_FOLDER = ".dependencies"
-"""Folder beside the services: their packages, each set named by its digest."""
-_NAME = re.compile(r"[a-z][a-z0-9_-]{0,39}")
-_DIGEST = re.compile(r"[0-9a-f]{64}")
+"""Folder in a services folder that holds the Python packages of services, each set in a folder named by its
+digest."""
+_NAME = re.compile(r"[a-z][a-z0-9_-]{0,39}")  # pattern of a service's name
+_DIGEST = re.compile(r"[0-9a-f]{64}")  # pattern of a SHA-256 in hexadecimal digits
 _IGNORED = {
-    "__pycache__", ".git", ".pytest_cache", "requests", "tests", _PINS, _DEPENDENCIES,
-    "CMakeFiles", "CMakeCache.txt", "cmake_install.cmake", "Makefile",
-}  # fmt: skip
-"""Not installed: recorded requests, tests and temporary files of a build."""
+    "__pycache__",
+    ".git",
+    ".pytest_cache",
+    "requests",
+    "tests",
+    _PINS,
+    _DEPENDENCIES,
+    "CMakeFiles",
+    "CMakeCache.txt",
+    "cmake_install.cmake",
+    "Makefile",
+}
+"""Names of files and folders that are not installed: recorded requests, tests, and temporary files of a
+build."""
 
 
 class _Manifest(msgspec.Struct, forbid_unknown_fields=True):
+    """The content of ``service.json``."""
+
     name: Annotated[str, msgspec.Meta(pattern=rf"^{_NAME.pattern}\Z")]
     language: _Language
     entry: Annotated[str, msgspec.Meta(min_length=1)]
@@ -69,13 +84,19 @@ class _Manifest(msgspec.Struct, forbid_unknown_fields=True):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class InstalledService:
-    """One service folder.
+    """A service that can be loaded.
 
-    ``entry`` is the file that is run: a Python or Lua source, or a shared library; for a service that a
-    Python package publishes (language ``package``) it is the module's dotted name.  A command to a
-    ``stateless`` service may be retried in another sandbox; a ``per_robot_state`` one keeps state as long
-    as the robot is connected.  ``dependencies`` is the folder of its own Python packages; ``identity`` is the
-    SHA-256 of all that was installed, its packages included, and empty for a folder that was only read.
+    Attributes:
+        name: Name by which robots call the service.
+        language: ``python``, ``cpp`` or ``lua``; ``package`` for a service of an installed Python package.
+        entry: File that is loaded, relative to *folder*: a Python or Lua source, or a shared library.  For
+            the language ``package`` the dotted name of the module.
+        kind: ``stateless``: a command may be retried in another sandbox.  ``per_robot_state``: the service
+            keeps state as long as the robot is connected.
+        folder: Folder of the service.
+        dependencies: Folder of the service's own Python packages; None without any.
+        identity: SHA-256 of ``pins.json``, and so of all that was installed, packages included; empty for a
+            folder that is not installed.
     """
 
     name: str
@@ -88,7 +109,7 @@ class InstalledService:
 
     @property
     def entry_path(self) -> Path:
-        """Path of the file that is run."""
+        """Path of the file that is loaded."""
         return self.folder / self.entry
 
 
@@ -96,11 +117,11 @@ def read_service(folder: Path) -> InstalledService:
     """Return the service that ``service.json`` in *folder* describes.
 
     Raises:
-        UsageError: It is missing, is not JSON, or has an invalid field.
+        UsageError: The file is missing, is not JSON, or has an invalid field.
     """
     path = folder / _MANIFEST
     try:
-        manifest = msgspec.json.decode(read_plain(path), type=_Manifest)
+        manifest = msgspec.json.decode(read_regular_file(path), type=_Manifest)
     except OSError as error:
         raise UsageError(
             f"cannot read {path}: {error.strerror}", hint="make a service with: rse-pf service new NAME"
@@ -118,23 +139,29 @@ def read_service(folder: Path) -> InstalledService:
 
 
 def install(folder: Path, into: Path, dependencies: Dependencies | None = None) -> InstalledService:
-    """Copy the service in *folder* below *into* and pin every file; an older copy is replaced.
+    """Copy the service in *folder* to the services folder *into*, and write the hash of every file.
+
+    An installed service of the same name is replaced at once, when the copy is complete.
 
     Args:
         folder: The service.
-        into: The services folder.
-        dependencies: The packages that `build_dependencies` installed for it; they are copied, too.
+        into: The services folder, which is created if it is missing.
+        dependencies: Packages that `build_dependencies` installed for the service, which are copied as well.
 
     Raises:
-        UsageError: The folder is not a service, holds a link, its entry is missing (a library that was not
-            built), or it locks packages and *dependencies* is None.
-        ConfigurationError: An installed service needs another version of one of the packages.
+        UsageError: The folder is not a service, holds a link, its entry is missing (such as a library that
+            was not built), or it locks packages and *dependencies* is None.
+        ConfigurationError: An installed service needs another version of a package.
     """
+    # 1. Check the folder and the versions of its packages.
     service = read_service(folder)
     if not service.entry_path.is_file():
-        built = "build it first: cmake -B build && cmake --build build" if service.language == "cpp" else ""
+        is_library = service.language == "cpp"
         raise UsageError(
-            f"{service.name}: {service.entry_path} is missing", hint=built or "correct entry in service.json"
+            f"{service.name}: {service.entry_path} is missing",
+            hint="build it first: cmake -B build && cmake --build build"
+            if is_library
+            else "correct entry in service.json",
         )
     if dependencies is None and read_lock(folder):
         raise UsageError(
@@ -142,14 +169,15 @@ def install(folder: Path, into: Path, dependencies: Dependencies | None = None) 
         )
     into.mkdir(parents=True, exist_ok=True)
     if dependencies is not None:
-        others = {name: each for name, each in _dependencies_in(into) if name != service.name}
-        check_together({**others, service.name: dependencies})
+        packages = {name: installed.packages for name, installed in _dependencies_in(into)}
+        require_same_versions({**packages, service.name: dependencies.packages})
         copy_dependencies(dependencies, into / DEPENDENCIES_FOLDER)
-    fresh, old, target = (into / f"{mark}{service.name}" for mark in (".new-", ".old-", ""))
+    # 2. Copy the folder under a temporary name, and write packages and hashes.
+    fresh, old, target = (into / f"{prefix}{service.name}" for prefix in (".new-", ".old-", ""))
     for leftover in (fresh, old):
         shutil.rmtree(leftover, ignore_errors=True)
     try:
-        copy_plain(folder, fresh, _IGNORED)
+        copy_regular_files(folder, fresh, _IGNORED)
     except UsageError:
         shutil.rmtree(fresh, ignore_errors=True)
         raise
@@ -158,8 +186,9 @@ def install(folder: Path, into: Path, dependencies: Dependencies | None = None) 
         (fresh / _DEPENDENCIES).write_text(
             json.dumps(document, indent=1, sort_keys=True) + "\n", encoding="utf-8"
         )
-    pins = {path: _sha256(fresh / path) for path in _files(fresh)}
+    pins = {path: _file_sha256(fresh / path) for path in _list_files(fresh)}
     (fresh / _PINS).write_text(json.dumps(pins, indent=1, sort_keys=True) + "\n", encoding="utf-8")
+    # 3. Let it take the place of the installed service.
     if target.exists():
         target.rename(old)
     fresh.rename(target)
@@ -168,75 +197,74 @@ def install(folder: Path, into: Path, dependencies: Dependencies | None = None) 
 
 
 def installed_services(folder: Path) -> list[InstalledService]:
-    """Return the services installed below *folder*, sorted by name, every file checked against its pin.
+    """Compare the services in the services folder *folder* with their hashes, and return them sorted by name.
 
     Raises:
-        ConfigurationError: The folder is missing, a file of a service or of its packages was changed, added
-            or removed, or two services need different versions of one package.
+        ConfigurationError: The folder is missing; a file of a service or of its packages was changed, added
+            or removed; or two services need different versions of a package.
     """
     if not folder.is_dir():
         raise ConfigurationError(
             f"there is no services folder {folder}",
             hint=f"install one there: rse-pf service install FOLDER --services {folder}",
         )
-    found = []
+    services = []
     for target in sorted(folder.iterdir()):
         if target.is_dir() and not target.name.startswith("."):
-            check_installed(target)
-            found.append(_read_installed(target))
-    built = dict(_dependencies_in(folder))
-    for name, dependencies in built.items():
-        check_dependencies(dependencies, name)
-    check_together(built)
-    return found
+            verify_installed(target)
+            services.append(_read_installed(target))
+    dependencies = dict(_dependencies_in(folder))
+    for name, packages in dependencies.items():
+        verify_dependencies(packages, name)
+    require_same_versions({name: packages.packages for name, packages in dependencies.items()})
+    return services
 
 
-def published_services() -> list[InstalledService]:
-    """Return the services that installed Python packages publish; the packages are not imported.
+def packaged_services() -> list[InstalledService]:
+    """Return the services that Python packages offer by entry points; the packages are not imported.
 
-    The module defines ``serve`` or ``Service``, like the file of a service folder.
+    The module of an entry point defines ``serve`` or ``Service``, like the file of a service folder.
 
     Raises:
-        ConfigurationError: A name is invalid or published twice.
+        ConfigurationError: A name is invalid, or two packages use it.
     """
-    found: dict[str, InstalledService] = {}
+    services: dict[str, InstalledService] = {}
     for point in metadata.entry_points(group=ENTRY_POINTS):
-        if not _NAME.fullmatch(point.name) or point.name in found:
+        if not _NAME.fullmatch(point.name) or point.name in services:
             raise ConfigurationError(
                 f"the service {point.name!r} of {point.value} has an invalid name, or one that is in use",
                 hint="uninstall the package, or set services.published to false",
             )
-        top = point.value.partition(".")[0]
-        spec = importlib.util.find_spec(top)
+        spec = importlib.util.find_spec(point.value.partition(".")[0])
         folder = Path(spec.origin).parent if spec is not None and spec.origin else Path()
-        found[point.name] = InstalledService(
+        services[point.name] = InstalledService(
             name=point.name, language="package", entry=point.value, kind="per_robot_state", folder=folder
         )
-    return sorted(found.values(), key=lambda service: service.name)
+    return sorted(services.values(), key=lambda service: service.name)
 
 
 def _read_installed(target: Path) -> InstalledService:
-    service, dependencies = read_service(target), dependencies_of(target)
+    service, dependencies = read_service(target), read_dependencies(target)
     return replace(
         service,
         dependencies=None if dependencies is None else dependencies.folder,
-        identity=identity_of(target),
+        identity=read_identity(target),
     )
 
 
 def _dependencies_in(folder: Path) -> Iterator[tuple[str, Dependencies]]:
-    """Yield name and packages of every installed service that has some."""
+    """Yield name and packages of each service in the services folder *folder* that has packages."""
     for target in sorted(folder.iterdir()):
-        dependencies = None if target.name.startswith(".") else dependencies_of(target)
+        dependencies = None if target.name.startswith(".") else read_dependencies(target)
         if dependencies is not None:
             yield target.name, dependencies
 
 
-def dependencies_of(target: Path) -> Dependencies | None:
-    """Return the packages of the service that is installed in *target*, None if it has none.
+def read_dependencies(target: Path) -> Dependencies | None:
+    """Return the packages of the installed service in the folder *target*, None if it has none.
 
     Raises:
-        ConfigurationError: The record of them is damaged.
+        ConfigurationError: ``dependencies.json`` is damaged.
     """
     path = target / _DEPENDENCIES
     if not path.is_file() or not (target / _PINS).is_file():
@@ -245,7 +273,7 @@ def dependencies_of(target: Path) -> Dependencies | None:
         document = json.loads(path.read_text(encoding="utf-8"))
         digest = str(document["digest"])
         if not _DIGEST.fullmatch(digest):
-            raise ValueError("its digest is none")
+            raise ValueError("the digest is not a SHA-256")
         return Dependencies(**{**document, "folder": target.parent.absolute() / DEPENDENCIES_FOLDER / digest})
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ConfigurationError(
@@ -253,16 +281,16 @@ def dependencies_of(target: Path) -> Dependencies | None:
         ) from error
 
 
-def identity_of(target: Path) -> str:
-    """Return the `InstalledService.identity` of what is installed in *target*; raises OSError."""
-    return _sha256(target / _PINS)
+def read_identity(target: Path) -> str:
+    """Return `InstalledService.identity` of the installed service in the folder *target*; raises OSError."""
+    return _file_sha256(target / _PINS)
 
 
-def check_installed(target: Path) -> None:
-    """Check that *target* holds the files of an installed service, as they were installed.
+def verify_installed(target: Path) -> None:
+    """Check that the folder *target* holds an installed service with unchanged files.
 
     Raises:
-        ConfigurationError: It was not installed, or a file was changed, added or removed.
+        ConfigurationError: The service was not installed, or a file was changed, added or removed.
     """
     try:
         pins = json.loads((target / _PINS).read_text(encoding="utf-8"))
@@ -270,8 +298,8 @@ def check_installed(target: Path) -> None:
         raise ConfigurationError(
             f"{target} was not installed: {error}", hint="install it with: rse-pf service install FOLDER"
         ) from error
-    present = set(_files(target)) - {_PINS}
-    changed = [path for path in sorted(present & set(pins)) if _sha256(target / path) != pins[path]]
+    present = set(_list_files(target)) - {_PINS}
+    changed = [path for path in sorted(present & set(pins)) if _file_sha256(target / path) != pins[path]]
     changed += [f"{path} (added)" for path in sorted(present - set(pins))]
     changed += [f"{path} (removed)" for path in sorted(set(pins) - present)]
     if changed:
@@ -281,11 +309,11 @@ def check_installed(target: Path) -> None:
         )
 
 
-def _files(folder: Path) -> Iterator[str]:
+def _list_files(folder: Path) -> Iterator[str]:
     for path in sorted(folder.rglob("*")):
         if (path.is_file() or path.is_symlink()) and "__pycache__" not in path.parts:
             yield str(path.relative_to(folder))
 
 
-def _sha256(path: Path) -> str:
+def _file_sha256(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()

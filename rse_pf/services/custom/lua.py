@@ -1,8 +1,8 @@
-"""Services in Lua: one LuaJIT virtual machine per robot, as in the paper (Sect. 5.2, Figs. 3 and 4).
+"""The runtime of services in Lua: a LuaJIT virtual machine per robot, as in the paper (Sect. 5.2, Fig. 3).
 
-A script returns a function of one table, or a table with ``serve`` and maybe ``snapshot`` and ``restore``.
-It may require ``json``, ``zlib`` and ``ffi``, and load shared libraries of its own folder.  It sees nothing
-else of Python; the sandbox isolates it, not Lua.
+A script returns a function of one table, or a table with ``serve`` and optionally ``snapshot`` and
+``restore``.  A script may require ``json``, ``zlib`` and ``ffi``, and load shared libraries of its own
+folder; it has no access to Python.  The process of the sandbox isolates the script, not the Lua machine.
 """
 
 from __future__ import annotations
@@ -27,9 +27,11 @@ from rse_pf.wire.arrays import json_encode_hook
 
 __all__ = ["LuaRuntime", "warm_up"]
 
+# Most bytes that zlib.inflate returns to a script: 16 MiB, so that a bomb cannot fill the memory.
 _MAX_INFLATED = 1 << 24
 _MAX_LEVELS = 64
-"""Of tables inside tables, so that one that holds itself ends; a message takes fewer levels."""
+"""Most levels of nested tables in a reply, so that a table that holds itself ends; a message has fewer
+levels."""
 _SETUP = """
 local json_decode, json_encode, inflate, deflate, folder = ...
 package.preload.json = function() return {decode = json_decode, encode = json_encode} end
@@ -43,7 +45,7 @@ return pcall
 
 
 def warm_up() -> Any:
-    """Load LuaJIT into this process and return its module; raises MissingExtra."""
+    """Load LuaJIT into this process and return the module ``lupa``; raises MissingExtra without it."""
     try:
         import lupa.luajit21 as lupa
     except ImportError as error:
@@ -52,9 +54,19 @@ def warm_up() -> Any:
 
 
 class LuaRuntime:
-    """One virtual machine with one script."""
+    """A virtual machine with a loaded script.
+
+    Attributes:
+        has_snapshots: Whether the script defines ``snapshot`` and ``restore``.
+    """
 
     def __init__(self, service: InstalledService) -> None:
+        """Run the script of *service*, which defines its functions.
+
+        Raises:
+            ConfigurationError: The script fails, or defines no function ``serve``.
+            MissingExtra: LuaJIT is not installed.
+        """
         lupa = warm_up()
         self._name = service.name
         self._lupa = lupa
@@ -85,31 +97,39 @@ class LuaRuntime:
         self.has_snapshots = {"snapshot", "restore"} <= set(self._functions)
 
     def call(self, payload: Any) -> Any:
-        """Return the reply to *payload*; a script with ``takes_text`` gets and returns JSON text."""
+        """Return the reply of the script to *payload*.
+
+        A table with ``takes_text = true`` receives and returns JSON text instead of tables.
+        """
         if self._takes_text:
             return self._parse(self._run("serve", msgspec.json.encode(payload, enc_hook=json_encode_hook)))
         return self._from_lua(self._run("serve", self._to_lua(payload)))
 
     def snapshot(self) -> bytes:
-        """Return what the script's ``snapshot`` returned, as JSON; raises InternalError if it cannot."""
+        """Return the state of the script as JSON; raises InternalError if JSON cannot hold it."""
         return msgspec.json.encode(self._from_lua(self._run("snapshot"), "snapshot"))
 
     def restore(self, data: bytes) -> None:
-        """Give a snapshot to the script's ``restore``."""
+        """Call the script's ``restore`` with the state of a snapshot."""
         self._run("restore", self._to_lua(msgspec.json.decode(data)))
 
     def _run(self, function: str, *arguments: Any) -> Any:
         try:
             result = self._pcall(self._functions[function], *arguments)
-        except self._lupa.LuaError as error:  # out of memory, which pcall does not catch
+        except self._lupa.LuaError as error:
+            # Out of memory, the only error that pcall does not catch.
             raise InternalError(f"{self._name}: {_first_line(error)}") from error
-        done, value = (*result, None)[:2] if isinstance(result, tuple) else (result, None)
-        if not done:
-            raise self._failure(value)
+        is_success, value = (*result, None)[:2] if isinstance(result, tuple) else (result, None)
+        if not is_success:
+            raise self._convert_error(value)
         return value
 
-    def _failure(self, error: Any) -> RsePfError:
-        """``error({code = "bad-request", message = "..."})`` is a typed failure, all else a defect."""
+    def _convert_error(self, error: Any) -> RsePfError:
+        """Return the error that a script raised.
+
+        ``error({code = "bad-request", message = "..."})`` becomes a failure with this code, any other error
+        an InternalError.
+        """
         if isinstance(error, RsePfError):
             return error
         if self._lupa.lua_type(error) == "table":
@@ -138,23 +158,32 @@ class LuaRuntime:
         return self._lua.table_from(value, recursive=True) if isinstance(value, dict | list) else value
 
     def _from_lua(self, value: Any, what: str = "reply", level: int = 0) -> Any:
+        """Return a Lua value as plain Python values: a table with the keys 1..n as a list, others as dicts.
+
+        Args:
+            value: The Lua value.
+            what: What the value is, for the error: ``reply`` or ``snapshot``.
+            level: Levels of tables around the value.
+        """
         if self._lupa.lua_type(value) != "table":
             if value is None or isinstance(value, bool | int | float):
                 return value
             if isinstance(value, bytes):
                 return _text(value)
-            raise self._wrong(what, self._kind(value))
+            raise self._unencodable_error(what, self._kind(value))
         if level == _MAX_LEVELS:
-            raise self._wrong(what, f"tables in more than {_MAX_LEVELS} levels, or a table that holds itself")
+            raise self._unencodable_error(
+                what, f"tables in more than {_MAX_LEVELS} levels, or a table that holds itself"
+            )
         length = len(value)
         if length and sum(1 for _ in value.keys()) == length:  # noqa: SIM118  a Lua table is not a mapping
             return [self._from_lua(value[i], what, level + 1) for i in range(1, length + 1)]
-        return {_text(key): self._from_lua(each, what, level + 1) for key, each in value.items()}
+        return {_text(key): self._from_lua(item, what, level + 1) for key, item in value.items()}
 
     def _kind(self, value: Any) -> str:
         return f"a {self._lupa.lua_type(value) or type(value).__name__}"
 
-    def _wrong(self, what: str, held: str) -> InternalError:
+    def _unencodable_error(self, what: str, held: str) -> InternalError:
         return InternalError(
             f"the {what} of service {self._name!r} holds {held}, which no message can hold",
             hint="return nil, booleans, numbers, strings, and tables of these",
@@ -171,15 +200,15 @@ class LuaRuntime:
 
 
 def _encode_text(value: Any) -> Any:
-    """Return *value* with all text as bytes, like the strings of Lua."""
+    """Return *value* with all text as bytes, which are the strings of Lua, and arrays as lists."""
     if isinstance(value, str):
         return value.encode()
     if isinstance(value, np.ndarray):
         return value.tolist()
     if isinstance(value, Mapping):
-        return {str(key).encode(): _encode_text(each) for key, each in value.items()}
+        return {str(key).encode(): _encode_text(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_encode_text(each) for each in value]
+        return [_encode_text(item) for item in value]
     return value
 
 

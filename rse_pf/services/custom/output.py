@@ -1,7 +1,7 @@
-"""What a service prints, as lines of bounded length and number, none of which is lost in between.
+"""Split the printed output of a service into log lines of limited length and rate.
 
-Bytes arrive as the pipe delivers them: a line is complete with its newline, or with the end of the service.
-Nothing is read or written here, and the time is an argument.
+Bytes arrive as the pipe of a sandbox delivers them; a line is complete at its newline, or when the service
+ends.  This module neither reads nor writes, and the time is an argument.
 """
 
 from __future__ import annotations
@@ -12,71 +12,71 @@ from collections.abc import Iterator
 
 from rse_pf.token_bucket import TokenBucket
 
-__all__ = ["MAX_LINE", "OutputLines", "shown_output"]
+__all__ = ["MAX_LINE", "OutputLines", "format_output_line"]
 
-MAX_LINE = 256
-"""Letters of a line, its mark included: what a line of the log holds."""
-_MARK_LETTERS = 40
-_LINES_PER_S = 50.0
-_BURST_LINES = 200.0
+MAX_LINE = 256  # longest line of output in characters: the length that a line of the log holds
+_MARK_CHARACTERS = 40  # characters of a cut line that are reserved for the mark "[N letters more]"
+_LINES_PER_S = 50.0  # lines per second that pass in the long run, so that one service cannot fill the log
+_BURST_LINES = 200.0  # lines that pass at once, such as a traceback, after a time without output
 
 
 class OutputLines:
     """Splits the output of one sandbox into lines.
 
-    At most 200 lines at once and 50 a second pass; the number of the others is told in a line of its own.  A
-    line of more than `MAX_LINE` letters is cut, and a mark says how many letters are missing.
+    A token bucket lets 200 lines pass at once and 50 per second; the next line that passes is preceded by one
+    with the number of dropped lines.  A line of more than `MAX_LINE` characters is cut, and ends with the
+    number of missing ones.
     """
 
     def __init__(self) -> None:
-        """Begin with no output."""
+        """Start without output."""
         self._decode = codecs.getincrementaldecoder("utf-8")("replace").decode
         self._bucket = TokenBucket(_LINES_PER_S, _BURST_LINES)
-        self._begun = ""
-        self._begun_letters = 0
-        self._left_out = 0
+        self._line = ""  # start of the incomplete line, at most MAX_LINE characters
+        self._line_characters = 0  # characters of the incomplete line
+        self._dropped = 0  # lines dropped since the last line that passed
 
     def feed(self, data: bytes, now: float) -> Iterator[str]:
-        """Yield the lines that *data* completes at *now* (s, monotonic)."""
-        *whole, rest = self._decode(data).split("\n")
-        for text in whole:
+        """Yield the lines that *data* completes at *now* (s, monotonic) and the rate limit lets pass."""
+        *complete_lines, rest = self._decode(data).split("\n")
+        for text in complete_lines:
             self._extend(text)
             yield from self._complete(now)
         self._extend(rest)
 
     def end(self, now: float) -> Iterator[str]:
-        """Yield what is left at the end: a line without a newline, and the number of lines left out."""
+        """Yield a last line without newline, and the number of dropped lines, after the service has ended."""
         self._extend(self._decode(b"", True))
-        if self._begun_letters:
+        if self._line_characters:
             yield from self._complete(now)
-        yield from self._told()
+        yield from self._report_dropped()
 
     def _extend(self, text: str) -> None:
-        self._begun += text[: max(0, MAX_LINE - len(self._begun))]
-        self._begun_letters += len(text)
+        self._line += text[: max(0, MAX_LINE - len(self._line))]
+        self._line_characters += len(text)
 
     def _complete(self, now: float) -> Iterator[str]:
-        line, letters = self._begun, self._begun_letters
-        self._begun, self._begun_letters = "", 0
+        line, characters = self._line, self._line_characters
+        self._line, self._line_characters = "", 0
         if self._bucket.take(now) > 0:
-            self._left_out += 1
+            self._dropped += 1
             return
-        yield from self._told()
-        yield (line if letters <= MAX_LINE else _cut(line, letters)).removesuffix("\r")
+        yield from self._report_dropped()
+        yield (line if characters <= MAX_LINE else _cut(line, characters)).removesuffix("\r")
 
-    def _told(self) -> Iterator[str]:
-        if self._left_out:
-            lines = "line was" if self._left_out == 1 else "lines were"
-            yield f"[{self._left_out} {lines} left out here: the service printed too fast]"
-            self._left_out = 0
+    def _report_dropped(self) -> Iterator[str]:
+        if self._dropped:
+            lines = "line was" if self._dropped == 1 else "lines were"
+            yield f"[{self._dropped} {lines} left out here: the service printed too fast]"
+            self._dropped = 0
 
 
-def shown_output(time_s: float, robot: str, text: str) -> str:
-    """Return a line of output for a person: local time of *time_s* (Unix), robot, and *text*."""
+def format_output_line(time_s: float, robot: str, text: str) -> str:
+    """Return a line for a terminal: local time of *time_s* (Unix), *robot*, and printed *text*."""
     clock = time.strftime("%H:%M:%S", time.localtime(time_s))
     return f"{clock}.{int(time_s % 1 * 1e3):03d}  {robot}  | {text}"
 
 
-def _cut(line: str, letters: int) -> str:
-    kept = MAX_LINE - _MARK_LETTERS
-    return f"{line[:kept]} [{letters - kept} letters more]"
+def _cut(line: str, characters: int) -> str:
+    shown = MAX_LINE - _MARK_CHARACTERS
+    return f"{line[:shown]} [{characters - shown} letters more]"

@@ -1,70 +1,119 @@
-"""Services that operators publish for all servers: an archive of each, and the list that says which ones run.
+"""Publish services to all servers of a platform on AWS, and follow what was published.
 
-An archive is named by its sha256, and the list names archives: a server runs nothing that the list does not
-name with its digest.  Only operators may write either; servers read.  Nothing of a service is executed here.
+An operator uploads an archive of each service, and a list of the services that run, to the artifact bucket.
+The list names each archive by its SHA-256, so a server runs only what the list names.  Operators may write
+both, servers only read. A server unpacks the archives into a `PublishedFolder`, which it uses as its services
+folder.
 """
 
 from __future__ import annotations
 
 import gzip
+import hashlib
 import io
+import os
 import re
+import shutil
 import tarfile
-from collections.abc import Iterator, Mapping, Sequence
-from pathlib import Path
+import tempfile
+import zlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path, PurePosixPath
 
 import msgspec
 
 from rse_pf.config.resource_names import SERVICES_PREFIX
 from rse_pf.errors import ConfigurationError, Conflict, NotFound, StoreError, UsageError
 from rse_pf.object_store import ObjectStore, digest_of
-from rse_pf.services.custom.dependencies import Dependencies, check_together
-from rse_pf.services.custom.installed import InstalledService, dependencies_of
-from rse_pf.services.custom.plain_files import check_plain, read_plain
+from rse_pf.services.custom.dependencies import Dependencies, require_same_versions
+from rse_pf.services.custom.installed import (
+    DEPENDENCIES_FOLDER,
+    InstalledService,
+    installed_services,
+    read_dependencies,
+)
+from rse_pf.services.custom.regular_files import read_regular_file, require_regular_files
 
 __all__ = [
+    "CURRENT",
     "LIST_NAME",
-    "LOOK_PERIOD_S",
+    "LIST_POLL_PERIOD_S",
     "MAX_ARCHIVE_BYTES",
     "SERVER_PLATFORM",
+    "PublishedFolder",
     "PublishedList",
     "PublishedService",
     "archive_name",
-    "archive_of",
-    "check_for_servers",
-    "damaged",
+    "assemble_folder",
+    "damaged_error",
     "decode_list",
+    "pack_archive",
     "publish",
     "read_list",
-    "remove",
+    "require_server_platform",
+    "unpack_archive",
+    "unpublish",
 ]
 
 LIST_NAME = f"{SERVICES_PREFIX}/list.json"
-"""Of the list in the artifact bucket; `archive_name` gives those of the archives."""
-LOOK_PERIOD_S = 15
-"""How often servers look at the list."""
+"""Name of the list in the artifact bucket."""
+LIST_POLL_PERIOD_S = 15
+"""Seconds between two reads of the list by a server: a new service runs everywhere after this time."""
 SERVER_PLATFORM = "cp311-linux-x86_64"
-"""What servers on AWS run: Debian 12 on x86-64."""
+"""Platform tag of servers on AWS, which run Debian 12 on x86-64; packages of services must have the same
+tag."""
 MAX_ARCHIVE_BYTES = 128 << 20
-_NAME, _DIGEST = re.compile(r"[a-z][a-z0-9_-]{0,39}"), re.compile(r"[0-9a-f]{64}")
-_MAX_TRIES = 8
-_ELF_X86_64 = (b"\x7fELF\x02\x01", 62)
-_MACHINE = slice(18, 20)
-"""Of an ELF header: the machine it is for, little-endian."""
+"""Largest archive of a service in bytes, compressed; larger data, such as models, belongs to the object
+store."""
+CURRENT = "current"
+"""Name of the link in a `PublishedFolder` that leads to the services folder that runs."""
+
+# --- The folders of a PublishedFolder ---
+_ARCHIVES = "archives"  # folder of the unpacked archives, each named by its digest
+_LISTS = "lists"  # folder of the services folders, each named by the digest of its list
+
+# --- Limits of an archive, above which it is refused while it is unpacked ---
+_MAX_UNPACKED_BYTES = 1 << 30  # total size of the files in bytes, so that a bomb cannot fill the disk
+_MAX_FILES = 20_000  # number of files
+_MAX_PATH = 2000  # bytes of a path within the archive
+_MAX_PART = 200  # characters of a file name, below the limit of file systems
+_ARCHIVE_ERRORS = (
+    tarfile.TarError,
+    EOFError,
+    zlib.error,
+    gzip.BadGzipFile,
+    FileExistsError,
+    NotADirectoryError,
+    ValueError,
+)
+"""Errors that a damaged archive causes.  Others, such as that of a full disk, pass, and the list is tried
+again."""
+
+_NAME = re.compile(r"[a-z][a-z0-9_-]{0,39}")  # pattern of a service's name
+_DIGEST = re.compile(r"[0-9a-f]{64}")  # pattern of a SHA-256 in hexadecimal digits
+_MAX_TRIES = 8  # attempts to replace the list while other operators publish at the same time
+
+# --- What the shared libraries of a service may need ---
+_ELF_MAGIC = b"\x7fELF\x02\x01"  # first bytes of a 64-bit little-endian ELF file
+_ELF_MACHINE = slice(18, 20)  # bytes of an ELF header that hold the machine, little-endian
+_ELF_X86_64 = 62  # the machine x86-64 in an ELF header
 _SYMBOL_VERSION = re.compile(rb"\b(GLIBC|GLIBCXX)_(\d+)\.(\d+)(?:\.(\d+))?\b")
-_NEWEST = {b"GLIBC": (2, 36, 0), b"GLIBCXX": (3, 4, 30)}
-"""What Debian 12 has."""
+_NEWEST_VERSIONS = {b"GLIBC": (2, 36, 0), b"GLIBCXX": (3, 4, 30)}
+"""Newest symbol versions of the C and C++ libraries of Debian 12."""
 _BUILD_HINT = "build it on Debian 12 (x86-64), for example in a container, and publish from there"
 
 
 class PublishedService(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """One service: the digest of its archive, and what is shown and compared without reading that.
+    """An entry of the list: a service with the digest of its archive.
 
     Attributes:
-        archive: The sha256 of the archive in hex, which is part of its name.
-        identity: The `InstalledService.identity`.
-        packages: Names and versions of the Python packages of its own.
-        published_s: Unix time.
+        name: Name of the service.
+        language: ``python``, ``cpp`` or ``lua``.
+        archive: SHA-256 of the archive in hexadecimal digits.
+        size: Size of the archive in bytes.
+        identity: `InstalledService.identity` of the service in the archive.
+        published_s: Unix time of the publication in seconds.
+        packages: Versions of the service's Python packages by name.
     """
 
     name: str
@@ -77,103 +126,113 @@ class PublishedService(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
 
 
 class PublishedList(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The services that every server runs, sorted by name."""
+    """The services that all servers run, sorted by name."""
 
     services: tuple[PublishedService, ...] = ()
 
 
 def decode_list(data: bytes) -> PublishedList:
-    """Return the list in *data*; raises ConfigurationError if it is none."""
+    """Return the list that *data* encodes as JSON; raises ConfigurationError if the list is damaged."""
     try:
-        found = msgspec.json.decode(data, type=PublishedList)
+        published = msgspec.json.decode(data, type=PublishedList)
     except msgspec.MsgspecError as error:
-        raise damaged(f"{LIST_NAME} is no list of services: {error}") from error
-    names = [each.name for each in found.services]
-    digests = [each.archive for each in found.services]
+        raise damaged_error(f"{LIST_NAME} is not a list of services: {error}") from error
+    names = [entry.name for entry in published.services]
+    digests = [entry.archive for entry in published.services]
     if names != sorted(set(names)) or not all(map(_NAME.fullmatch, names)):
-        raise damaged(f"{LIST_NAME} names a service twice, or by a name that none has")
+        raise damaged_error(f"{LIST_NAME} names a service twice, out of order, or by an invalid name")
     if not all(map(_DIGEST.fullmatch, digests)):
-        raise damaged(f"{LIST_NAME} names an archive without its digest")
-    return found
+        raise damaged_error(f"{LIST_NAME} names an archive without its digest")
+    return published
 
 
 def read_list(store: ObjectStore) -> PublishedList:
-    """Return the list of *store*; an empty one if nothing was published."""
+    """Return the list in *store*; an empty list if nothing was published."""
     return _read(store)[1]
 
 
 def publish(service: InstalledService, root: Path, store: ObjectStore, *, now_s: float) -> PublishedService:
-    """Store the archive of *service*, which is installed alone in *root*, and put it into the list.
+    """Upload the archive of a service, and put the service into the list; it replaces one of the same name.
 
-    A service of the same name is replaced.
+    Args:
+        service: The service.
+        root: Services folder in which it is the only service.
+        store: The artifact bucket.
+        now_s: Unix time, seconds.
 
     Raises:
-        ConfigurationError: Servers cannot run it, or another published service needs other versions.
-        StoreError: Nothing was listed.
+        ConfigurationError: Servers cannot run the service, the archive is too large, or another published
+            service needs another version of a package.
+        StoreError: The store fails; the list stays.
     """
-    dependencies = check_for_servers(service, root)
-    archive = archive_of(root)
+    dependencies = require_server_platform(service, root)
+    archive = pack_archive(root)
     if len(archive) > MAX_ARCHIVE_BYTES:
         raise ConfigurationError(
             f"{service.name} is {len(archive)} bytes, above {MAX_ARCHIVE_BYTES}",
             hint="publish fewer files, or put models into the object store",
         )
     entry = PublishedService(
-        name=service.name, language=service.language, archive=digest_of(archive), size=len(archive),
-        identity=service.identity, published_s=now_s,
+        name=service.name,
+        language=service.language,
+        archive=digest_of(archive),
+        size=len(archive),
+        identity=service.identity,
+        published_s=now_s,
         packages={} if dependencies is None else dict(dependencies.packages),
-    )  # fmt: skip
-    _check_packages((entry, *read_list(store).services))
+    )
+    _require_compatible_packages((entry, *read_list(store).services))
     store.put(archive_name(entry.archive), archive)
-    _change(store, {entry.name: entry})
+    _change_list(store, {entry.name: entry})
     return entry
 
 
-def remove(name: str, store: ObjectStore) -> None:
-    """Take a service out of the list; its archive stays until the bucket's rules delete it.
+def unpublish(name: str, store: ObjectStore) -> None:
+    """Remove the service *name* from the list; its archive stays until a lifecycle rule deletes it.
 
     Raises:
-        UsageError: It is not in the list.
+        UsageError: The list has no service of this name.
     """
-    published = read_list(store)
-    if name not in {each.name for each in published.services}:
-        known = ", ".join(each.name for each in published.services) or "none"
-        raise UsageError(f"no service {name!r} is published", hint=f"published are: {known}")
-    _change(store, {name: None})
+    published = [entry.name for entry in read_list(store).services]
+    if name not in published:
+        raise UsageError(
+            f"no service {name!r} is published", hint=f"published are: {', '.join(published) or 'none'}"
+        )
+    _change_list(store, {name: None})
 
 
-def check_for_servers(service: InstalledService, root: Path) -> Dependencies | None:
-    """Return the packages of *service*, if any, after checking that servers on AWS can load it.
+def require_server_platform(service: InstalledService, root: Path) -> Dependencies | None:
+    """Check that servers on AWS can load *service* in the services folder *root*; return its packages.
 
     Raises:
-        ConfigurationError: Its packages or libraries are for another machine, or need a newer C library.
+        ConfigurationError: Packages or shared libraries are for another platform, or need a newer C library.
     """
-    dependencies = dependencies_of(root / service.name)
+    dependencies = read_dependencies(root / service.name)
     if dependencies is not None and dependencies.platform != SERVER_PLATFORM:
         raise ConfigurationError(
             f"the packages of {service.name} are for {dependencies.platform}, servers are {SERVER_PLATFORM}",
             hint="publish with Python 3.11 on Linux (x86-64)",
         )
-    for path in _files(root):
+    for path in _list_files(root):
         if re.search(r"\.so(\.\d+)*$", path.name):
-            _check_library(service.name, path)
+            _require_loadable_library(service.name, path)
     return dependencies
 
 
-def archive_of(root: Path) -> bytes:
-    """Return all files below *root* as a compressed archive; equal files give equal bytes.
+def pack_archive(root: Path) -> bytes:
+    """Return all files below *root* as a gzip-compressed tar archive; equal files give equal bytes.
 
     Raises:
-        UsageError: One of them is a link, or no file.
+        UsageError: An entry below *root* is neither a regular file nor a folder.
     """
-    check_plain(root)
+    require_regular_files(root)
     packed = io.BytesIO()
     with tarfile.open(fileobj=packed, mode="w", format=tarfile.PAX_FORMAT) as archive:
-        for path in _files(root):
-            content = read_plain(path)
-            about = tarfile.TarInfo(path.relative_to(root).as_posix())
-            about.size, about.mode = len(content), 0o644
-            archive.addfile(about, io.BytesIO(content))
+        for path in _list_files(root):
+            content = read_regular_file(path)
+            member = tarfile.TarInfo(path.relative_to(root).as_posix())
+            member.size, member.mode = len(content), 0o644
+            archive.addfile(member, io.BytesIO(content))
     return gzip.compress(packed.getvalue(), compresslevel=6, mtime=0)
 
 
@@ -185,62 +244,202 @@ def _read(store: ObjectStore) -> tuple[bytes | None, PublishedList]:
     return data, decode_list(data)
 
 
-def _change(store: ObjectStore, changes: Mapping[str, PublishedService | None]) -> None:
-    """Replace the list by one with *changes*, whatever other operators publish meanwhile."""
+def _change_list(store: ObjectStore, changes: Mapping[str, PublishedService | None]) -> None:
+    """Apply *changes* (name to new entry, None to remove) to the list by compare-and-swap, with retries."""
     for _ in range(_MAX_TRIES):
         before, published = _read(store)
-        merged = {**{each.name: each for each in published.services}, **changes}
-        chosen = tuple(each for _, each in sorted(merged.items()) if each is not None)
-        _check_packages(chosen)
+        merged = {**{entry.name: entry for entry in published.services}, **changes}
+        entries = tuple(entry for _, entry in sorted(merged.items()) if entry is not None)
+        _require_compatible_packages(entries)
         try:
-            store.compare_and_swap(LIST_NAME, before, msgspec.json.encode(PublishedList(services=chosen)))
+            store.compare_and_swap(LIST_NAME, before, msgspec.json.encode(PublishedList(services=entries)))
         except Conflict:
             continue
         return
     raise StoreError("the list of services changes all the time", hint="publish again")
 
 
-def _check_packages(entries: Sequence[PublishedService]) -> None:
-    """Raise ConfigurationError if two services need different versions of one package."""
-    chosen: dict[str, PublishedService] = {}
-    for each in entries:
-        chosen.setdefault(each.name, each)
-    check_together(
-        {
-            name: Dependencies(folder=Path(), digest="", packages=each.packages, platform=SERVER_PLATFORM)
-            for name, each in chosen.items()
-        }
-    )
+def _require_compatible_packages(entries: Sequence[PublishedService]) -> None:
+    """Raise ConfigurationError if two services need different versions; of equal names the first counts."""
+    first_of_name: dict[str, PublishedService] = {}
+    for entry in entries:
+        first_of_name.setdefault(entry.name, entry)
+    require_same_versions({name: entry.packages for name, entry in first_of_name.items()})
 
 
-def _check_library(service: str, path: Path) -> None:
+def _require_loadable_library(service: str, path: Path) -> None:
+    """Raise ConfigurationError unless the shared library *path* can be loaded on Debian 12 (x86-64)."""
     data = path.read_bytes()
-    magic, machine = _ELF_X86_64
-    if not data.startswith(magic) or int.from_bytes(data[_MACHINE], "little") != machine:
+    if not data.startswith(_ELF_MAGIC) or int.from_bytes(data[_ELF_MACHINE], "little") != _ELF_X86_64:
         raise ConfigurationError(
-            f"{path.name} of {service} is no library for x86-64, which the servers are", hint=_BUILD_HINT
+            f"{path.name} of {service} is not a library for x86-64, the processor of the servers",
+            hint=_BUILD_HINT,
         )
     for library, major, minor, patch in set(_SYMBOL_VERSION.findall(data)):
-        wanted = (int(major), int(minor), int(patch or 0))
-        if wanted > _NEWEST[library]:
-            shown = ".".join(map(str, wanted if patch else wanted[:2]))
+        needed = (int(major), int(minor), int(patch or 0))
+        if needed > _NEWEST_VERSIONS[library]:
+            version = ".".join(map(str, needed if patch else needed[:2]))
             raise ConfigurationError(
-                f"{path.name} of {service} needs {library.decode()}_{shown}, Debian 12 has an older one",
+                f"{path.name} of {service} needs {library.decode()}_{version}, Debian 12 has an older one",
                 hint=_BUILD_HINT,
             )
 
 
-def _files(root: Path) -> Iterator[Path]:
+def _list_files(root: Path) -> Iterator[Path]:
     for path in sorted(root.rglob("*")):
         if path.is_file() or path.is_symlink():
             yield path
 
 
 def archive_name(digest: str) -> str:
-    """Return the object name of the archive with this sha256 in hex."""
+    """Return the object name of the archive whose SHA-256 in hexadecimal digits is *digest*."""
     return f"{SERVICES_PREFIX}/archives/{digest}"
 
 
-def damaged(what: str) -> ConfigurationError:
-    """Return the error that *what* was published is not what `publish` publishes."""
-    return ConfigurationError(what, hint="publish the services again with: rse-pf service publish FOLDER")
+def damaged_error(message: str) -> ConfigurationError:
+    """Return the error for published data that `publish` did not write."""
+    return ConfigurationError(message, hint="publish the services again with: rse-pf service publish FOLDER")
+
+
+class PublishedFolder:
+    """The services folder of a server that follows the published list.
+
+    Below one root lie the unpacked archives, a services folder for each list, and the link ``current`` to the
+    services folder that runs.  A new list gets a new folder, and the link moves when all of it is verified: a
+    server that still reads the old folder is not disturbed, and a server that fails in between keeps it.
+    """
+
+    def __init__(self, root: Path) -> None:
+        """Use the folder *root*, which is created by the first `install`."""
+        self._root = root
+
+    @property
+    def link(self) -> Path:
+        """Path of the link ``current``, which a server uses as its services folder."""
+        return self._root / CURRENT
+
+    def holds(self, data: bytes) -> bool:
+        """Return whether the link leads to the services of the list *data*."""
+        return self.link.is_dir() and self.link.resolve().name == _folder_name(data)
+
+    def install(self, data: bytes, fetch: Callable[[PublishedService], bytes]) -> list[InstalledService]:
+        """Move the link ``current`` to the services of the list *data*, and return them.
+
+        Args:
+            data: Encoded list, as `decode_list` reads it.
+            fetch: Function that returns the archive of a service; called for archives that are not unpacked
+                yet.
+
+        Raises:
+            ConfigurationError: The list or an archive is damaged, or two services cannot run together; the
+                link stays.
+            StoreError: An archive cannot be fetched; the link stays.
+        """
+        entries = decode_list(data).services
+        archives, target = self._root / _ARCHIVES, self._root / _LISTS / _folder_name(data)
+        for folder in (archives, target.parent):
+            folder.mkdir(parents=True, exist_ok=True)
+        # 1. Fetch and unpack the archives that are missing.
+        for entry in entries:
+            if not (archives / entry.archive).is_dir():
+                if entry.size > MAX_ARCHIVE_BYTES:
+                    raise damaged_error(f"the archive of {entry.name} is {entry.size} bytes")
+                fresh = Path(tempfile.mkdtemp(prefix=".new-", dir=archives))
+                try:
+                    unpack_archive(entry, fetch(entry), fresh)
+                    fresh.rename(archives / entry.archive)
+                finally:
+                    shutil.rmtree(fresh, ignore_errors=True)
+        # 2. Make the services folder of the list, and verify its services.
+        shutil.rmtree(target, ignore_errors=True)
+        services = assemble_folder(entries, archives, target)
+        # 3. Move the link.
+        former = self.link.resolve() if self.link.is_dir() else target
+        self._move_link(target)
+        # 4. Remove what no server reads any more.
+        self._remove_others({target.name, former.name}, {entry.archive for entry in entries})
+        return services
+
+    def _move_link(self, target: Path) -> None:
+        fresh = self._root / ".new-current"
+        fresh.unlink(missing_ok=True)
+        fresh.symlink_to(target.relative_to(self._root))
+        fresh.replace(self.link)
+
+    def _remove_others(self, lists: set[str], archives: set[str]) -> None:
+        """Remove all but the named services folders and archives; files that are linked elsewhere stay."""
+        for folder, keep in ((_LISTS, lists), (_ARCHIVES, archives)):
+            for path in (self._root / folder).iterdir():
+                if path.name not in keep:
+                    shutil.rmtree(path, ignore_errors=True)
+
+
+def unpack_archive(entry: PublishedService, archive: bytes, into: Path) -> None:
+    """Write the files of *archive* below *into*, which must be empty or missing.
+
+    Raises:
+        ConfigurationError: The digest of the archive is not that of *entry*, or the archive holds what no
+            archive of `pack_archive` does: links, paths that leave the folder, too many or too large files.
+    """
+    if digest_of(archive) != entry.archive:
+        raise damaged_error(f"the archive of {entry.name} is not the one in the list")
+    into.mkdir(parents=True, exist_ok=True)
+    files = size = 0
+    try:
+        with tarfile.open(fileobj=io.BytesIO(archive), mode="r:gz") as packed:
+            for member in packed:
+                parts = PurePosixPath(member.name).parts
+                files, size = files + 1, size + member.size
+                if not member.isreg() or not parts or parts[0] not in (entry.name, DEPENDENCIES_FOLDER):
+                    raise damaged_error(f"the archive of {entry.name} holds {member.name[:80]!r}")
+                if len(os.fsencode(member.name)) > _MAX_PATH or max(map(len, parts)) > _MAX_PART:
+                    raise damaged_error(f"the archive of {entry.name} holds a name that is too long")
+                if ".." in parts or files > _MAX_FILES or size > _MAX_UNPACKED_BYTES:
+                    raise damaged_error(f"the archive of {entry.name} leaves its folder, or is too large")
+                target = into.joinpath(*parts)
+                target.parent.mkdir(parents=True, exist_ok=True)
+                content = packed.extractfile(member)
+                assert content is not None
+                with target.open("xb") as file:
+                    shutil.copyfileobj(content, file)
+                target.chmod(0o644)
+    except _ARCHIVE_ERRORS as error:
+        raise damaged_error(f"the archive of {entry.name} cannot be read: {error}") from error
+
+
+def assemble_folder(
+    entries: Sequence[PublishedService], unpacked: Path, into: Path
+) -> list[InstalledService]:
+    """Make a services folder of unpacked archives by hard links, and return its services.
+
+    Args:
+        entries: Services of the list.
+        unpacked: Folder of the unpacked archives, each named by its digest.
+        into: Path of the new folder, which must not exist; it appears once all services are verified.
+
+    Raises:
+        ConfigurationError: A file is not as it was published, or two services cannot run together.
+    """
+    fresh = Path(tempfile.mkdtemp(prefix=".new-", dir=into.parent))
+    try:
+        for entry in entries:
+            shutil.copytree(unpacked / entry.archive, fresh, copy_function=_link, dirs_exist_ok=True)
+        services = installed_services(fresh)
+        listed = [(entry.name, entry.identity) for entry in entries]
+        if [(service.name, service.identity) for service in services] != listed:
+            raise damaged_error("the archives do not hold the services of the list")
+        for folder in (fresh, *(path for path in fresh.rglob("*") if path.is_dir())):
+            folder.chmod(0o755)  # Sandboxes may run as another user.
+        fresh.rename(into)
+    finally:
+        shutil.rmtree(fresh, ignore_errors=True)
+    return installed_services(into)
+
+
+def _link(source: str, target: str) -> None:
+    if not os.path.exists(target):  # Two services may share packages.
+        os.link(source, target)
+
+
+def _folder_name(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()[:16]

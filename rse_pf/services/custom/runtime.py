@@ -1,7 +1,7 @@
-"""Load an installed service and call it: one interface for Python, C/C++ and Lua.
+"""Load an installed service into a sandbox: the interface of all runtimes, and the runtime of Python.
 
-Used inside of sandboxes only.  A payload reaches every language as it was sent: names, numbers, text, lists
-and arrays.
+Only the processes of sandboxes use this module.  Every language receives a payload as the robot sent it:
+names, numbers, text, lists and arrays.
 """
 
 from __future__ import annotations
@@ -34,11 +34,16 @@ _KINDS: dict[Any, tuple[type, ...]] = {
     list: _ROWS, tuple: _ROWS, np.ndarray: _ROWS, dict: (dict,), types.NoneType: (types.NoneType,),
     None: (types.NoneType,),
 }  # fmt: skip
-"""Annotation of a field of a reply, and what a robot can read as that."""
+"""For each annotation of a field of a reply the classes of values that its message carries correctly."""
 
 
 class Runtime(Protocol):
-    """A loaded service."""
+    """A loaded service of any language.
+
+    Attributes:
+        has_snapshots: Whether the service has `snapshot` and `restore`, so that its state survives its
+            process.
+    """
 
     has_snapshots: bool
 
@@ -46,37 +51,41 @@ class Runtime(Protocol):
         """Return the reply to *payload*: a struct, or plain values and arrays."""
 
     def snapshot(self) -> bytes:
-        """Return the state, for `restore` in another process."""
+        """Return the state of the service, for `restore` in another process."""
 
     def restore(self, data: bytes) -> None:
-        """Replace the state by one that `snapshot` returned."""
+        """Replace the state of the service by the snapshot *data*."""
 
 
 def open_runtime(service: InstalledService, scratch: Path) -> Runtime:
-    """Load *service*, which may write files below *scratch* only.
+    """Load *service* by the runtime of its language.
+
+    Args:
+        service: The service, usually the verified copy.
+        scratch: Folder in which the service may write files.
 
     Raises:
-        ConfigurationError: It cannot be loaded; the message says why.
-        MissingExtra: Its language is not installed on this server.
+        ConfigurationError: The service cannot be loaded; the message says why.
+        MissingExtra: The language of the service is not installed on this server.
     """
     if service.language in ("python", "package"):
         return _PythonRuntime(service)
     if service.language == "cpp":
-        from rse_pf.services.custom.native import NativeRuntime
+        from rse_pf.services.custom.cpp import CppRuntime
 
-        return NativeRuntime(service, scratch)
+        return CppRuntime(service, scratch)
     from rse_pf.services.custom.lua import LuaRuntime
 
     return LuaRuntime(service)
 
 
 class _PythonRuntime:
-    """A function ``serve(request: Request) -> Reply``, or a class ``Service`` with such a method."""
+    """The runtime of Python: calls a function ``serve`` or the method ``serve`` of a class ``Service``."""
 
     def __init__(self, service: InstalledService) -> None:
-        module = _load(service)
-        maker = getattr(module, "Service", None)
-        self._object: Any = maker() if callable(maker) else None
+        module = _load_module(service)
+        service_class = getattr(module, "Service", None)
+        self._object: Any = service_class() if callable(service_class) else None
         function: Callable[[Any], Any] | None = getattr(self._object or module, "serve", None)
         if function is None:
             raise ConfigurationError(
@@ -86,7 +95,7 @@ class _PythonRuntime:
         registry = Registry()
         registry.service(service.name)(function)
         self._service = registry.get(service.name)
-        self._fields = _checked_fields(self._service.reply_type)
+        self._fields = _list_checkable_fields(self._service.reply_type)
         self.has_snapshots = all(
             inspect.ismethod(getattr(self._object, name, None)) for name in ("snapshot", "restore")
         )
@@ -124,32 +133,32 @@ class _PythonRuntime:
         self._object.restore(data)
 
 
-def _checked_fields(reply_type: type[Any]) -> list[tuple[str, tuple[type, ...], str]]:
-    """Return each field whose type can be told at once: its name, its classes, and its annotation.
+def _list_checkable_fields(reply_type: type[Any]) -> list[tuple[str, tuple[type, ...], str]]:
+    """Return name, allowed classes and annotation of each field of a reply that ``isinstance`` can check.
 
-    What lists and maps hold is not looked at: that would cost as much as encoding them.
+    The elements of lists and maps are not checked: that would take as long as to encode them.
     """
-    checked = []
+    fields = []
     for field, annotation in typing.get_type_hints(reply_type).items():
-        kinds = _kinds_of(annotation)
+        kinds = _allowed_classes(annotation)
         if kinds:
             declared = annotation.__name__ if isinstance(annotation, type) else str(annotation)
-            checked.append((field, kinds, declared))
-    return checked
+            fields.append((field, kinds, declared))
+    return fields
 
 
-def _kinds_of(annotation: Any) -> tuple[type, ...]:
-    """Return the classes of values that fit *annotation*, () if that cannot be told."""
+def _allowed_classes(annotation: Any) -> tuple[type, ...]:
+    """Return the classes of the values that *annotation* allows; empty if ``isinstance`` cannot decide."""
     origin = typing.get_origin(annotation) or annotation
     if origin in (typing.Union, types.UnionType):
-        arms = [_kinds_of(arm) for arm in typing.get_args(annotation)]
-        return tuple(kind for arm in arms for kind in arm) if all(arms) else ()
+        members = [_allowed_classes(member) for member in typing.get_args(annotation)]
+        return tuple(kind for member in members for kind in member) if all(members) else ()
     if isinstance(origin, type) and issubclass(origin, msgspec.Struct):
         return (origin,)
     return _KINDS.get(origin, ()) if isinstance(origin, collections.abc.Hashable) else ()
 
 
-def _load(service: InstalledService) -> Any:
+def _load_module(service: InstalledService) -> Any:
     try:
         if service.language == "package":
             return importlib.import_module(service.entry)
@@ -172,7 +181,8 @@ def _load_file(service: InstalledService) -> Any:
         )
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module
-    for folder in (service.folder, service.dependencies):  # the service's own packages come first
+    # The last folder is searched first: the packages of the service before its own folder.
+    for folder in (service.folder, service.dependencies):
         if folder is not None and str(folder) not in sys.path:
             sys.path.insert(0, str(folder))
     spec.loader.exec_module(module)

@@ -1,7 +1,8 @@
-"""Copies of installed services that sandboxes load: the bytes whose hash was compared are the bytes that run.
+"""Private copies of installed services for sandboxes, so that the verified bytes are the bytes that run.
 
-A server compares the pins of a service when it starts, and a sandbox may load it hours later.  So its zygote
-copies every file to a folder of its own, and compares the copy.  Nothing of a service is executed here.
+A server compares the files of a service with their hashes when it starts, and a sandbox may load them hours
+later.  The zygote, which is the parent process of all sandboxes, therefore copies the files to a folder of
+its own, and compares the copy.
 """
 
 from __future__ import annotations
@@ -15,101 +16,111 @@ from dataclasses import replace
 from pathlib import Path
 
 from rse_pf.errors import ConfigurationError, RsePfError
-from rse_pf.services.custom.dependencies import check_dependencies, copy_dependencies
+from rse_pf.services.custom.dependencies import copy_dependencies, verify_dependencies
 from rse_pf.services.custom.installed import (
     DEPENDENCIES_FOLDER,
     InstalledService,
-    check_installed,
-    dependencies_of,
-    identity_of,
+    read_dependencies,
+    read_identity,
+    verify_installed,
 )
-from rse_pf.services.custom.plain_files import copy_plain
+from rse_pf.services.custom.regular_files import copy_regular_files
 
 __all__ = ["PrivateFolder", "VerifiedCopy"]
 
 _PREFIX = "rse-pf-services-"
-_Mark = tuple[int, int, int, int]
-"""Of a file: inode, size, and when content and attributes changed, in nanoseconds."""
+"""Start of the names of private folders, by which abandoned ones are found."""
+_FileStatus = tuple[int, int, int, int]
+"""Inode, size, and times at which content and attributes of a file changed, in nanoseconds."""
 
 
 class PrivateFolder:
-    """A temporary folder that its process holds; one whose process was killed is removed by the next one."""
+    """A temporary folder that its process locks, so that the next process can remove abandoned ones."""
 
     def __init__(self, parent: Path) -> None:
-        """Remember *parent*, and make nothing."""
+        """Prepare a folder below *parent*; `make` creates it."""
         self._parent = parent
         self._lock = -1
         self.path: Path | None = None
 
     def make(self) -> Path:
-        """Make it, and return its path; remove those below the parent that nobody holds."""
+        """Create the folder and return its path, after the removal of folders whose processes were killed."""
         self._remove_abandoned()
         while self.path is None:
-            made = Path(tempfile.mkdtemp(prefix=_PREFIX, dir=self._parent))
-            self._lock = os.open(made, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+            path = Path(tempfile.mkdtemp(prefix=_PREFIX, dir=self._parent))
+            self._lock = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
             fcntl.flock(self._lock, fcntl.LOCK_SH)
-            if made.exists():
-                self.path = made
-            else:  # another process took it for abandoned before it was locked
+            if path.exists():
+                self.path = path
+            else:
+                # Another process removed the folder as abandoned before it was locked: try again.
                 os.close(self._lock)
         return self.path
 
     def remove(self) -> None:
-        """Remove it with its content; one that was not made is no error."""
+        """Remove the folder with its content; do nothing if it was not created."""
         if self.path is not None:
             shutil.rmtree(self.path, ignore_errors=True)
             os.close(self._lock)
             self.path = None
 
     def _remove_abandoned(self) -> None:
-        for left in self._parent.glob(f"{_PREFIX}*"):
+        for path in self._parent.glob(f"{_PREFIX}*"):
             try:
-                about = left.lstat()
-                if not stat.S_ISDIR(about.st_mode) or about.st_uid != os.getuid():
+                status = path.lstat()
+                if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.getuid():
                     continue
-                held = os.open(left, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
+                lock = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
             except OSError:
-                continue  # its process removed it meanwhile
+                continue  # Its own process has removed the folder meanwhile.
             try:
-                fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                shutil.rmtree(left, ignore_errors=True)
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                shutil.rmtree(path, ignore_errors=True)
             except BlockingIOError:
-                pass
+                pass  # Its process is running.
             finally:
-                os.close(held)
+                os.close(lock)
 
 
 class VerifiedCopy:
-    """The copy of one installed service; ``service`` leads to it, ``original`` to what was copied."""
+    """The private copy of one installed service.
+
+    Attributes:
+        original: The service in the services folder.
+        service: The service in the copy, once `make` has returned.
+    """
 
     def __init__(self, original: InstalledService, into: Path) -> None:
-        """Remember what to copy below *into*, and copy nothing."""
+        """Prepare a copy of *original* below the folder *into*; `make` copies."""
         self.original = original
         self.service = original
         self._into = into
-        self._marks: dict[str, _Mark] = {}
+        self._file_statuses: dict[str, _FileStatus] = {}
 
     def make(self) -> None:
-        """Copy the service and its packages, and compare the copy.
+        """Copy the service and its packages, and compare the copy with the hashes.
 
         Raises:
-            ConfigurationError: It is not what was installed when the server looked.
+            ConfigurationError: The files are not those that the server verified when it started, or cannot be
+                copied.
         """
         original = self.original
-        marks, target = _marks(original), self._into / original.name
+        file_statuses, target = _file_statuses(original), self._into / original.name
         try:
-            copy_plain(original.folder, target, ("__pycache__",))
-            check_installed(target)
-            if identity_of(target) != original.identity:
+            copy_regular_files(original.folder, target, ("__pycache__",))
+            verify_installed(target)
+            if read_identity(target) != original.identity:
                 raise ConfigurationError(
                     f"{original.name} was installed again while its server started",
                     hint="start the server again, or roll: rse-pf local roll",
                 )
-            built = dependencies_of(original.folder)
-            if built is not None:
-                copy_dependencies(built, self._into / DEPENDENCIES_FOLDER)
-                built = replace(built, folder=self._into / DEPENDENCIES_FOLDER / built.digest)
-                check_dependencies(built, original.name)
+            dependencies = read_dependencies(original.folder)
+            if dependencies is not None:
+                copy_dependencies(dependencies, self._into / DEPENDENCIES_FOLDER)
+                dependencies = replace(
+                    dependencies, folder=self._into / DEPENDENCIES_FOLDER / dependencies.digest
+                )
+                verify_dependencies(dependencies, original.name)
         except OSError as error:
             raise ConfigurationError(
                 f"{original.name} cannot be copied: {error}",
@@ -117,43 +128,44 @@ class VerifiedCopy:
             ) from error
         except RsePfError as error:
             raise ConfigurationError(error.message, hint=error.hint) from error
-        folder = None if built is None else built.folder
+        folder = None if dependencies is None else dependencies.folder
         self.service = replace(original, folder=target, dependencies=folder)
-        self._marks = marks
+        self._file_statuses = file_statuses
 
     def problem(self) -> ConfigurationError | None:
-        """Return how the original was changed since it was installed, None if it was not.
+        """Return an error that names the files of the original that were changed, None if none was.
 
-        Another installation in its place is no change: its server runs this copy until it is replaced.
+        A newer installation of the service is not an error: the server runs this copy until it is replaced.
         """
-        marks = _marks(self.original)
-        if marks == self._marks:
+        file_statuses = _file_statuses(self.original)
+        if file_statuses == self._file_statuses:
             return None
         try:
-            if identity_of(self.original.folder) != self.original.identity:
+            if read_identity(self.original.folder) != self.original.identity:
                 return None
-            check_installed(self.original.folder)
-            built = dependencies_of(self.original.folder)
-            if built is not None:
-                check_dependencies(built, self.original.name)
+            verify_installed(self.original.folder)
+            dependencies = read_dependencies(self.original.folder)
+            if dependencies is not None:
+                verify_dependencies(dependencies, self.original.name)
         except OSError:
-            return None  # it is being removed or replaced
+            return None  # The service is being removed or replaced.
         except ConfigurationError as error:
             return error
-        self._marks = marks  # other times, the same bytes
+        self._file_statuses = file_statuses  # The files have other times, but the same bytes.
         return None
 
 
-def _marks(service: InstalledService) -> dict[str, _Mark]:
-    """Return what tells that a file of *service* or of its packages may have changed."""
-    marks = {}
-    for folder in filter(None, (service.folder, service.dependencies)):
-        for place, names, files in os.walk(folder):
-            for name in (*files, *(each for each in names if os.path.islink(os.path.join(place, each)))):
-                path = os.path.join(place, name)
+def _file_statuses(service: InstalledService) -> dict[str, _FileStatus]:
+    """Return the status of each file of *service* and its packages by path; it changes with the file."""
+    statuses = {}
+    for root in filter(None, (service.folder, service.dependencies)):
+        for folder, folders, files in os.walk(root):
+            links = (name for name in folders if os.path.islink(os.path.join(folder, name)))
+            for name in (*files, *links):
+                path = os.path.join(folder, name)
                 try:
-                    about = os.lstat(path)
+                    status = os.lstat(path)
                 except OSError:
                     continue
-                marks[path] = (about.st_ino, about.st_size, about.st_mtime_ns, about.st_ctime_ns)
-    return marks
+                statuses[path] = (status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns)
+    return statuses

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from rse_pf.cli.main import main
+from rse_pf.services.custom.cpp import INCLUDE_FOLDER
 from rse_pf.services.custom.installed import read_service
-from rse_pf.services.custom.native import INCLUDE_FOLDER
 
 
 @pytest.fixture(autouse=True)

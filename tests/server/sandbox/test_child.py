@@ -17,8 +17,8 @@ import pytest
 from rse_pf.ipc import encode_message, receive
 from rse_pf.server.sandbox import isolation
 from rse_pf.server.sandbox.child import readable_paths
+from rse_pf.services.custom.cpp import INCLUDE_FOLDER
 from rse_pf.services.custom.installed import read_service
-from rse_pf.services.custom.native import INCLUDE_FOLDER
 
 pytestmark = pytest.mark.system
 

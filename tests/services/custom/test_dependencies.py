@@ -19,10 +19,10 @@ from rse_pf.services.custom import dependencies
 from rse_pf.services.custom.dependencies import (
     Dependencies,
     build_dependencies,
-    check_together,
     lock_dependencies,
     platform_tag,
     read_lock,
+    require_same_versions,
     tree_digest,
 )
 from rse_pf.services.custom.installed import install, installed_services, read_service
@@ -250,12 +250,9 @@ def test_packages_of_another_interpreter_are_refused(
 
 
 def test_two_services_of_one_server_agree_on_versions() -> None:
-    def needs(**packages: str) -> Dependencies:
-        return Dependencies(folder=Path(), digest="", packages=packages, platform="")
-
-    check_together({"a": needs(x="1", y="2"), "b": needs(x="1")})
+    require_same_versions({"a": {"x": "1", "y": "2"}, "b": {"x": "1"}})
     with pytest.raises(ConfigurationError, match="a needs x 1 and b needs x 2"):
-        check_together({"a": needs(x="1"), "b": needs(x="2")})
+        require_same_versions({"a": {"x": "1"}, "b": {"x": "2"}})
 
 
 @pytest.mark.slow

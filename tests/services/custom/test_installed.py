@@ -12,7 +12,7 @@ from rse_pf.errors import ConfigurationError, UsageError
 from rse_pf.services.custom.installed import (
     install,
     installed_services,
-    published_services,
+    packaged_services,
     read_service,
 )
 from rse_pf.services.custom.runtime import open_runtime
@@ -145,7 +145,7 @@ def package(tmp_path, monkeypatch):
 
 def test_a_package_publishes_a_service_by_an_entry_point(package, tmp_path):
     package("doubling = doubling_for_tests")
-    (service,) = [each for each in published_services() if each.name == "doubling"]
+    (service,) = [each for each in packaged_services() if each.name == "doubling"]
 
     assert open_runtime(service, tmp_path).call({"x": 21}).y == 42
 
@@ -154,7 +154,7 @@ def test_a_published_service_with_a_bad_name_is_one_line(package):
     package("Doubling! = doubling_for_tests")
 
     with pytest.raises(ConfigurationError, match="Doubling!"):
-        published_services()
+        packaged_services()
 
 
 def _link(path, target):
@@ -181,7 +181,7 @@ def test_a_service_with_a_link_or_a_special_file_is_not_installed(folder, tmp_pa
     path.unlink(missing_ok=True)
     make(path, secret)
 
-    with pytest.raises(UsageError, match=r"regular files alone|is missing") as caught:
+    with pytest.raises(UsageError, match=r"consists of regular files only|is missing") as caught:
         install(folder, tmp_path / "services")
     assert str(path) in caught.value.message
     assert list((tmp_path / "services").rglob("*")) == [] or not (tmp_path / "services").exists()

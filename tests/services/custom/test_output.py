@@ -6,7 +6,7 @@ import time
 
 import pytest
 
-from rse_pf.services.custom.output import MAX_LINE, OutputLines, shown_output
+from rse_pf.services.custom.output import MAX_LINE, OutputLines, format_output_line
 
 
 def lines_of(*pieces: bytes, now: float = 0.0) -> list[str]:
@@ -45,7 +45,7 @@ def test_a_line_that_never_ends_takes_no_memory() -> None:
     for _ in range(100):
         assert list(output.feed(b"x" * 10_000, 0.0)) == []
 
-    assert len(output._begun) <= MAX_LINE
+    assert len(output._line) <= MAX_LINE
 
 
 def test_lines_are_bounded_per_second_and_those_left_out_are_counted() -> None:
@@ -67,4 +67,4 @@ def test_a_line_is_shown_with_its_time_and_robot() -> None:
     now = 1_700_000_000.25
     clock = time.strftime("%H:%M:%S", time.localtime(now))
 
-    assert shown_output(now, "robot-1", "hello") == f"{clock}.250  robot-1  | hello"
+    assert format_output_line(now, "robot-1", "hello") == f"{clock}.250  robot-1  | hello"

@@ -17,19 +17,20 @@ from rse_pf.errors import ConfigurationError, StoreError, UsageError
 from rse_pf.object_store import MemoryStore, digest_of
 from rse_pf.services.custom.dependencies import Dependencies, tree_digest
 from rse_pf.services.custom.installed import InstalledService, install, installed_services
-from rse_pf.services.custom.published_folder import PublishedFolder, unpack
 from rse_pf.services.custom.publishing import (
     LIST_NAME,
     MAX_ARCHIVE_BYTES,
     SERVER_PLATFORM,
+    PublishedFolder,
     PublishedList,
     PublishedService,
     archive_name,
-    archive_of,
     decode_list,
+    pack_archive,
     publish,
     read_list,
-    remove,
+    unpack_archive,
+    unpublish,
 )
 
 
@@ -128,7 +129,7 @@ def test_a_new_list_replaces_the_former_at_once_and_fetches_only_what_is_new(
     assert asked == ["b"]
     assert (server.link / "b" / "service.py").read_text() == "x = 3\n"
     assert (former / "b" / "service.py").read_text() == "x = 1\n", "a server may still read it"
-    remove("a", author.store)
+    unpublish("a", author.store)
     server.install(author.data(), author.fetch)
     assert [each.name for each in installed_services(server.link)] == ["b"]
     assert not former.exists()
@@ -203,7 +204,7 @@ def test_an_archive_that_no_publisher_makes_is_refused(
     )
 
     with pytest.raises(ConfigurationError, match=why):
-        unpack(entry, archive, tmp_path / "into")
+        unpack_archive(entry, archive, tmp_path / "into")
     assert not [path for path in tmp_path.rglob("x") if path.parent.name != "adder"]
 
 
@@ -213,7 +214,7 @@ def test_an_archive_with_another_digest_is_not_even_opened(author: Author, tmp_p
     changed[-1] ^= 1
 
     with pytest.raises(ConfigurationError, match="is not the one in the list"):
-        unpack(entry, bytes(changed), tmp_path / "into")
+        unpack_archive(entry, bytes(changed), tmp_path / "into")
     assert not (tmp_path / "into").exists()
 
 
@@ -247,8 +248,8 @@ def test_a_list_whose_identity_is_not_that_of_its_archive_is_refused(
 @pytest.mark.parametrize(
     ("data", "why"),
     [
-        (library(machine=183), "no library for x86-64"),
-        (b"text", "no library for x86-64"),
+        (library(machine=183), "not a library for x86-64"),
+        (b"text", "not a library for x86-64"),
         (library(b"GLIBC_2.17\0GLIBC_2.38\0"), "needs GLIBC_2.38"),
         (library(b"GLIBCXX_3.4.32\0"), "needs GLIBCXX_3.4.32"),
     ],
@@ -282,7 +283,7 @@ def test_a_link_is_refused_as_it_would_lead_elsewhere_on_a_server(author: Author
     (root / "adder" / "secret").symlink_to("/etc/passwd")
 
     with pytest.raises(UsageError, match="secret is a link"):
-        archive_of(root)
+        pack_archive(root)
     assert service.name == "adder"
 
 
@@ -306,7 +307,7 @@ def test_two_operators_who_publish_at_the_same_time_lose_nothing(author: Author)
 def test_what_is_not_published_cannot_be_removed(author: Author) -> None:
     author.publish()
     with pytest.raises(UsageError, match="no service 'ader'") as told:
-        remove("ader", author.store)
+        unpublish("ader", author.store)
     assert "adder" in told.value.hint
 
 

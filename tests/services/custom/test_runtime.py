@@ -17,8 +17,8 @@ from rse_pf.errors import (
     InternalError,
     RsePfError,
 )
+from rse_pf.services.custom.cpp import INCLUDE_FOLDER
 from rse_pf.services.custom.installed import read_service
-from rse_pf.services.custom.native import INCLUDE_FOLDER
 from rse_pf.services.custom.runtime import open_runtime
 
 PYTHON = """

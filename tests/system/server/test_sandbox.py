@@ -14,8 +14,8 @@ from pathlib import Path
 import pytest
 
 from rse_pf.cli.main import main as rse_pf
+from rse_pf.services.custom.cpp import INCLUDE_FOLDER
 from rse_pf.services.custom.installed import install
-from rse_pf.services.custom.native import INCLUDE_FOLDER
 from rse_pf.wire import Failure, Result
 
 pytestmark = pytest.mark.system

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from rse_pf.services.custom.cpp import INCLUDE_FOLDER
 from rse_pf.services.custom.installed import install
-from rse_pf.services.custom.native import INCLUDE_FOLDER
 from tests.system.server.test_sandbox import until, written
 
 pytestmark = pytest.mark.system

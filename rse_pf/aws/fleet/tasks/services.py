@@ -10,14 +10,14 @@ import msgspec
 
 from rse_pf.aws.fleet.task import AgentContext, Task
 from rse_pf.errors import ConfigurationError, Disconnected, NotFound
-from rse_pf.services.custom.published_folder import PublishedFolder
 from rse_pf.services.custom.publishing import (
     LIST_NAME,
-    LOOK_PERIOD_S,
+    LIST_POLL_PERIOD_S,
+    PublishedFolder,
     PublishedList,
     PublishedService,
     archive_name,
-    damaged,
+    damaged_error,
 )
 
 __all__ = ["FOLDER", "task"]
@@ -36,7 +36,7 @@ def task(context: AgentContext) -> Task:
         name = archive_name(entry.archive)
         size = context.artifacts.head(name).size
         if size != entry.size:  # before it is read into memory
-            raise damaged(f"the archive of {entry.name} is {size} bytes, the list says {entry.size}")
+            raise damaged_error(f"the archive of {entry.name} is {size} bytes, the list says {entry.size}")
         return context.artifacts.get(name)
 
     def follow() -> None:
@@ -59,4 +59,4 @@ def task(context: AgentContext) -> Task:
                 return  # a server that starts reads the folder itself
             loaded = data
 
-    return Task(name="services", period_s=float(LOOK_PERIOD_S), call=follow, in_thread=True)
+    return Task(name="services", period_s=float(LIST_POLL_PERIOD_S), call=follow, in_thread=True)

@@ -1,7 +1,8 @@
-"""Services in C and C++: a shared library with the C interface of ``include/rse_pf_service.h``.
+"""The runtime of services in C and C++: load a shared library and call it by ``include/rse_pf_service.h``.
 
-The version of the interface is checked before any other call.  Memory that the library returns is copied and
-freed at once.
+The version of the interface is compared before any other call.  Memory that the library passes out is copied,
+and given back at once.  What the library claims about that memory (sizes, types, shapes) is checked before it
+is read.
 """
 
 from __future__ import annotations
@@ -26,20 +27,24 @@ from rse_pf.errors import (
 from rse_pf.services.custom.installed import InstalledService
 from rse_pf.wire.arrays import json_encode_hook
 
-__all__ = ["INCLUDE_FOLDER", "NativeRuntime"]
+__all__ = ["INCLUDE_FOLDER", "CppRuntime"]
 
 INCLUDE_FOLDER = Path(__file__).parent / "include"
-"""Folder of ``rse_pf_service.h`` and ``rse_pf_service.hpp``."""
+"""Folder of the C interface ``rse_pf_service.h`` and the C++ layer ``rse_pf_service.hpp``."""
 
-_ABI = 1
-_FLOAT64, _TEXT = 1, 2
-_MAX_RANK = 4
-_MAX_FIELDS = 1024
-_MAX_BYTES = 1 << 28
+_ABI = 1  # RSE_PF_SERVICE_ABI, the version of the C interface
+_FLOAT64 = 1  # RSE_PF_FLOAT64, the type of a field that holds an array of doubles
+_TEXT = 2  # RSE_PF_TEXT, the type of a field that holds UTF-8
+_MAX_RANK = 4  # most axes of an array, the size of ``shape`` in the C struct
+_MAX_FIELDS = 1024  # most fields of a reply: more are a defect of the library, whose memory must not be read
+_MAX_BYTES = 1 << 28  # largest reply, snapshot or field in bytes: more is a defect of the library
 _ERRORS: dict[int, type[RsePfError]] = {1: BadRequest, 2: CommandFailed, 3: DegenerateGeometry}
+"""Error of each code of ``enum rse_pf_status``."""
 
 
 class _Field(ctypes.Structure):
+    """The C struct ``rse_pf_field``."""
+
     _fields_ = (
         ("name", ctypes.c_char_p),
         ("type", ctypes.c_uint32),
@@ -50,10 +55,20 @@ class _Field(ctypes.Structure):
     )
 
 
-class NativeRuntime:
-    """An opened library."""
+class CppRuntime:
+    """A loaded library with its state.
+
+    Attributes:
+        has_snapshots: Whether the library exports ``rse_pf_service_snapshot`` and ``rse_pf_service_restore``.
+    """
 
     def __init__(self, service: InstalledService, scratch: Path) -> None:
+        """Load the library of *service* and open it with the private folder *scratch*.
+
+        Raises:
+            ConfigurationError: The library cannot be loaded, lacks a function, has another interface version,
+                or fails to open.
+        """
         self._name = service.name
         try:
             self._library = ctypes.CDLL(str(service.entry_path))
@@ -80,22 +95,22 @@ class NativeRuntime:
             raise ConfigurationError(f"{service.name}: rse_pf_service_open returned {code}")
 
     def call(self, payload: Any) -> Any:
-        """Return the reply to *payload*."""
+        """Return the library's reply to *payload*: fields of numbers, arrays and text, or any JSON value."""
         return (
             self._call_with_bytes(payload) if self._call_arrays is None else self._call_with_arrays(payload)
         )
 
     def snapshot(self) -> bytes:
-        """Return the library's state."""
-        return self._bytes_of(self._snapshot, self._state)
+        """Return the state of the library as bytes."""
+        return self._read_bytes(self._snapshot, self._state)
 
     def restore(self, data: bytes) -> None:
-        """Restore the library's state from *data*."""
+        """Replace the state of the library by the snapshot *data*."""
         self._check(self._restore(self._state, data, ctypes.c_uint64(len(data))))
 
     def _call_with_bytes(self, payload: Any) -> Any:
         request = msgspec.json.encode(payload, enc_hook=json_encode_hook)
-        reply = self._bytes_of(self._call_bytes, self._state, request, ctypes.c_uint64(len(request)))
+        reply = self._read_bytes(self._call_bytes, self._state, request, ctypes.c_uint64(len(request)))
         try:
             return msgspec.json.decode(reply)
         except msgspec.DecodeError as error:
@@ -110,7 +125,7 @@ class NativeRuntime:
         code = self._call_arrays(
             self._state, request, ctypes.c_uint32(len(request)), ctypes.byref(reply), ctypes.byref(count)
         )
-        del buffers  # the library reads the request's memory until here
+        del buffers  # They must live until here: the library reads the memory of the request.
         self._check(code)
         try:
             if count.value > _MAX_FIELDS or (count.value and not reply):
@@ -123,7 +138,8 @@ class NativeRuntime:
         finally:
             self._free(self._state, reply)
 
-    def _bytes_of(self, function: Any, *arguments: Any) -> bytes:
+    def _read_bytes(self, function: Any, *arguments: Any) -> bytes:
+        """Call a function that passes out bytes, and return a copy of them."""
         data, size = ctypes.POINTER(ctypes.c_uint8)(), ctypes.c_uint64()
         self._check(function(*arguments, ctypes.byref(data), ctypes.byref(size)))
         try:
@@ -139,6 +155,7 @@ class NativeRuntime:
             self._free(self._state, data)
 
     def _check(self, code: int) -> None:
+        """Raise the error of a code of ``enum rse_pf_status``, with the text of the library; 0 is success."""
         if code == 0:
             return
         text = self._error(self._state) if self._error is not None else None
@@ -198,16 +215,16 @@ def _as_array(name: str, value: Any) -> Any:
         raise BadRequest(
             f"field {name!r} is neither numbers nor text", hint="send a number, text, or lists of numbers"
         ) from error
-    array = array.reshape(np.shape(value))  # ascontiguousarray makes a number an array of one
+    array = array.reshape(np.shape(value))  # ascontiguousarray turns a scalar into an array of one element.
     if array.ndim > _MAX_RANK or not np.isfinite(array).all():
         raise BadRequest(f"field {name!r} has more than {_MAX_RANK} axes, or a number that is not finite")
     return array
 
 
 def _decode_field(field: Any, service: str) -> tuple[str, Any]:
-    """Return name and value of one field of a reply; what cannot be read is refused before it is read."""
+    """Return name and value of a field of a reply; raises InternalError if the field is invalid."""
     name = (field.name or b"").decode("utf-8", "replace")
-    problem = _problem_of(field)
+    problem = _find_problem(field)
     if problem:
         raise InternalError(
             f"service {service!r} replied with a field {name!r} {problem}", hint="see rse_pf_service.h"
@@ -218,7 +235,8 @@ def _decode_field(field: Any, service: str) -> tuple[str, Any]:
     return name, float(values[0]) if field.rank == 0 and values.size == 1 else values
 
 
-def _problem_of(field: Any) -> str:
+def _find_problem(field: Any) -> str:
+    """Return what is wrong with the description of a field, an empty text if nothing is."""
     if field.name is None:
         return "without a name"
     if field.type not in (_FLOAT64, _TEXT):
