@@ -213,7 +213,7 @@ def copy_dependencies(dependencies: Dependencies, store: Path) -> None:
 
 
 def tree_digest(folder: Path) -> str:
-    """Return the SHA-256 of the names and contents of all files below *folder*; a link contains its target."""
+    """Return the SHA-256 of names and contents of all files below *folder*; a link contains its target."""
     digest = hashlib.sha256()
     for path in sorted(folder.rglob("*")):
         if path.is_dir() and not path.is_symlink():
