@@ -1,6 +1,7 @@
-"""The robot's visual front end: frames, features with their points, and the queries for poses.
+"""The robot's visual front end: frames, features with their 3-D points, pose queries and tracked frames.
 
-What a frame is matched with is decided in `client_sdk.tracking`.
+The trackers of `client_sdk.tracking` decide which features are matched, and which poses are accepted.  A
+user's own feature extractor enters here, through the argument *plugin* of `describe` and `extract`.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from client_sdk.imu.samples import ImuSamples
-from client_sdk.slots import FeaturesSlot
+from client_sdk.plugins import FeaturesPlugin
 from client_sdk.stereo.depth import noise_of, stereo_points
 from client_sdk.stereo.view import StereoView
 from rse_pf.errors import UsageError
@@ -23,11 +24,12 @@ from rse_pf.images import load_opencv
 from rse_pf.maps.descriptors import ORB, DescriptorKind, Descriptors
 from rse_pf.native import address_of, aligned, core_function
 from rse_pf.pnp import DepthNoise
-from rse_pf.slam.orb import DescribedPixels, describe_orb, spread_rows
+from rse_pf.slam.orb import DescribedKeypoints, describe_orb, select_spread_rows
+from rse_pf.slam.tracking import ImageFeatures, measure_distinctiveness
 
 __all__ = [
     "Correspondences",
-    "DescribedPixels",
+    "DescribedKeypoints",
     "Features",
     "Frame",
     "FrontEndOptions",
@@ -40,24 +42,29 @@ __all__ = [
     "round_for_wire",
 ]
 
-_MAX_STAMP_S = 1e10  # seconds since 1970 of the year 2286; milliseconds and nanoseconds are beyond it
-
-# So many matches fit into a command of 10 kB.  Each takes 14 to 15 bytes with zlib in recordings, and 18 if
-# all digits are random; 24 with MessagePack; 40 with plain JSON, 43 at most.
-_MATCHES_OF_CODEC = {"zlib": 530, "bin": 400, "json": 220}
+_MAX_STAMP_S = 1e10
+"""Seconds since 1970, in the year 2286: a larger time stamp is one of milliseconds or nanoseconds."""
+_MAX_MATCHES_OF_CODEC = {"zlib": 530, "bin": 400, "json": 220}
+"""Matches that fit into a command of 10 kB by codec: a match takes 14 to 18 bytes with JSON and zlib, 24 with
+MessagePack (``bin``), and 40 to 43 with plain JSON."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Frame:
-    """One undistorted colour image with registered depth, or with the right image of a stereo pair.
+    """One undistorted colour image, with registered depth or with the right image of a stereo pair.
 
-    ``rgb`` is ``(h, w, 3)`` uint8, red first; ``depth_m`` is ``(h, w)`` float32, metres along
-    the optical axis, 0 where there is no reading.  With *stereo*, ``rgb`` and ``camera`` are those of the
-    rectified left camera, and ``depth_m`` is all 0.  *imu* has the samples since the last frame.
-    *T_body_camera* ``(4, 4)``, metres, is the pose of the camera in the body of its rig, None without a rig.
+    Attributes:
+        timestamp_s: Seconds.
+        rgb: ``(h, w, 3)`` uint8, red first; the rectified left image of a stereo pair.
+        depth_m: ``(h, w)`` floats, metres along the optical axis, 0 where there is no reading; all 0 for
+            stereo pairs and for cameras without depth.
+        camera: Intrinsics of *rgb*.
+        stereo: The right image of a stereo pair, or None.
+        imu: Samples of the IMU since the last frame, or None.
+        T_body_camera: ``(4, 4)``, metres: pose of the camera in the body of its rig; None without a rig.
 
     Raises:
-        UsageError: Arrays have another type or size, or the time stamp is not one of seconds.
+        UsageError: An array has another type or size, or the time stamp cannot be one of seconds.
     """
 
     timestamp_s: float
@@ -94,41 +101,42 @@ class Frame:
 
     @property
     def depth_noise(self) -> DepthNoise:
-        """The noise of the depths that the frame's features get, where the picture is clear."""
+        """Noise model of the depths of this frame's features in a sharp image: a Kinect's, or a stereo
+        pair's."""
         return DepthNoise() if self.stereo is None else noise_of(self.stereo, self.camera)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FrontEndOptions:
-    """How a robot finds and matches features, and which poses it accepts.
+    """Options of a robot's front end: how features are extracted and matched, and which poses are accepted.
 
-    Defaults: measured on the red-kitchen recording at 5 and 10 Hz (ATE 4 to 5 cm).
+    The defaults were measured on the red-kitchen recording at 5 and 10 Hz (ATE 4 to 5 cm).
 
     Attributes:
-        features: How many ORB features a frame has.
-        is_spread: Whether they are spread over the image, or the strongest wherever they are.
-        ratio: Lowe's ratio test: the best match must be this much closer than the second best.
-        max_matches: The best by descriptor distance are sent, so that a command stays under 10 kB with zlib;
-            other codecs need more bytes a match, see `sent_with`.
-        min_depth_m: Nearer depth readings are not used.
-        max_depth_m: Farther depth readings are not used.
-        depth_spread_percent: A 3x3 patch whose depths differ by more of their median lies on an edge and is
-            not used.
+        features: Number of features of a frame.
+        is_spread: Whether features are spread over the image; otherwise the strongest of the image are taken.
+        max_matches: Largest number of matches that a pose query sends, an even sample of all; 530 keep a
+            command below 10 kB with the codec zlib, see `sent_with` for other codecs.
+        min_depth_m: Smallest depth reading that is used.
+        max_depth_m: Largest depth reading that is used.
+        depth_spread_percent: A pixel has no depth if the depths of its 3x3 patch differ by more than this
+            percentage of their median: the patch lies on the edge of an object.
         inlier_px: Largest reprojection error of an inlier.
-        max_iterations: Of RANSAC.
-        min_inliers: A pose with fewer is not accepted.
-        max_jump_m: The largest plausible motion from one frame to the next.
-        keyframe_m: A frame farther from every keyframe becomes one.
-        keyframe_deg: A frame turned further from every keyframe becomes one.
-        keyframe_share: A frame that sees a smaller share of what the last keyframe saw becomes one.
-        search_px: Radius around a predicted pixel in which a landmark is sought.
-        segment_after: A new segment begins after so many frames that show enough and no place that is known.
-        max_keyframes: So many are matched against at most; then older ones are thinned out.
+        max_iterations: Largest number of RANSAC iterations.
+        min_inliers: Smallest number of inliers of an accepted pose.
+        max_jump_m: Largest plausible motion between two frames.
+        keyframe_m: A frame farther than this from every keyframe becomes a keyframe.
+        keyframe_deg: A frame rotated by more than this from every keyframe becomes a keyframe.
+        keyframe_share: A frame that sees less than this share of the landmarks that the newest keyframe saw
+            becomes a keyframe.
+        search_px: Radius around the predicted pixel of a landmark in which features are compared.
+        segment_after: Number of frames in a row with enough features and no recognised place after which a
+            new segment begins.
+        max_keyframes: Largest number of keyframes of a segment; beyond it older keyframes are thinned out.
     """
 
     features: int = 1000
     is_spread: bool = True
-    ratio: float = 0.75
     max_matches: int = 530
     min_depth_m: float = 0.3
     max_depth_m: float = 6.0
@@ -151,75 +159,108 @@ class FrontEndOptions:
                 f"min_inliers = {self.min_inliers}, and that not below 4",
                 hint="leave them out to get the defaults",
             )
-        if not (0 < self.ratio <= 1 and 0 <= self.min_depth_m < self.max_depth_m and self.inlier_px > 0):
+        if not (0 <= self.min_depth_m < self.max_depth_m and self.inlier_px > 0):
             raise UsageError(
-                f"ratio = {self.ratio:g}, depth {self.min_depth_m:g}..{self.max_depth_m:g} m or "
+                f"depths from {self.min_depth_m:g} to {self.max_depth_m:g} m or "
                 f"inlier_px = {self.inlier_px:g} cannot be used",
                 hint="leave them out to get the defaults",
             )
 
     def sent_with(self, codec: str) -> FrontEndOptions:
-        """Return these options with as many matches as fit into a command of 10 kB.
+        """Return these options with *max_matches* reduced to what fits into a command of 10 kB.
 
         Args:
-            codec: ``zlib``, ``json`` or ``bin``, as the robot's connection has it.
+            codec: Codec of the robot's connection: ``zlib``, ``json`` or ``bin``.
 
         Raises:
             UsageError: There is no such codec.
         """
-        if codec not in _MATCHES_OF_CODEC:
+        if codec not in _MAX_MATCHES_OF_CODEC:
             raise UsageError(
-                f"no codec named {codec!r}", hint=f"choose one of {', '.join(_MATCHES_OF_CODEC)}"
+                f"no codec named {codec!r}", hint=f"choose one of {', '.join(_MAX_MATCHES_OF_CODEC)}"
             )
-        return replace(self, max_matches=min(self.max_matches, _MATCHES_OF_CODEC[codec]))
+        return replace(self, max_matches=min(self.max_matches, _MAX_MATCHES_OF_CODEC[codec]))
 
     @classmethod
     def live(cls) -> FrontEndOptions:
-        """Return options for live maps: the strongest features wherever they are, which link best.
+        """Return options for live maps: the strongest features of the image, which close most loops.
 
-        With spread features the last of three robots joins the kitchen's map at its frame 67, and 63 % of the
-        poses are aligned when they are given out; with these at 17, and 90 %.
+        With spread features the last of three robots joins the kitchen's map at its frame 67, and 63 % of all
+        poses are aligned when they are returned; with these options at frame 17, and 90 %.
         """
         return cls(is_spread=False)
 
     @classmethod
     def wide_baseline(cls) -> FrontEndOptions:
-        """Return options for views that lie 0.4 to 0.8 m apart, such as the NYU dining room's.
+        """Return options for views that lie 0.4 to 0.8 m apart, such as those of the NYU dining room.
 
-        Four times the features and a looser ratio test find the few matches that survive such a
-        change of view: 24, 32, 30 and 530 inliers on those four pairs, where 3000 features leave
-        the first pair 11 to 13.  The jump limit is above the baseline.
+        Four times the features find the few matches that survive such a change of
+        view: 24, 32, 30 and 530 inliers on the four pairs of that room, where 3000 features leave 11 to 13
+        for the first pair.  The largest plausible motion is above the baseline.
         """
-        return cls(features=4000, is_spread=False, ratio=0.8, inlier_px=4.0, min_inliers=12, max_jump_m=1.5)
+        return cls(features=4000, is_spread=False, inlier_px=4.0, min_inliers=12, max_jump_m=1.5)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Features:
-    """Features of one frame, ORB or those of a user.
+    """Features of one frame with their 3-D points, by ORB or by a user's feature extractor.
 
-    ``pixels`` ``(n, 2)``; ``descriptors`` ``(n, d)`` of one ``kind``; ``points_camera`` ``(n, 3)`` metres,
-    NaN where the depth cannot be trusted; ``turns`` ``(n, 2)``, cosine and sine of the orientation; ``sizes``
-    ``(n,)``, the scale of the pyramid's level, 1 for the finest.  Turns and sizes tell nothing unless the
-    features are *is_oriented* and *is_scaled*.
+    Attributes:
+        pixels: ``(n, 2)``, column and row.
+        descriptors: ``(n, d)`` of one *kind*.
+        points_camera: ``(n, 3)`` metres in the camera's frame, NaN where the depth is missing or unreliable.
+        orientations: ``(n, 2)``, cosine and sine of each feature's angle in the image.
+        sizes: ``(n,)``, scale of each feature, 1 for the finest pyramid level.
+        kind: Name, type and length of the descriptors.
+        is_oriented: Whether *orientations* were measured; otherwise they are meaningless.
+        is_scaled: Whether *sizes* were measured; otherwise they are meaningless.
     """
 
     pixels: Array
     descriptors: Descriptors
     points_camera: Array
-    turns: Array
+    orientations: Array
     sizes: Array
     kind: DescriptorKind = ORB
     is_oriented: bool = True
     is_scaled: bool = True
 
+    @classmethod
+    def from_keypoints(cls, described: DescribedKeypoints, points_camera: Array) -> Features:
+        """Return described keypoints as features with the ``(n, 3)`` points *points_camera*."""
+        return cls(
+            pixels=described.pixels,
+            descriptors=described.descriptors,
+            points_camera=points_camera,
+            orientations=described.orientations,
+            sizes=described.sizes,
+            kind=described.kind,
+            is_oriented=described.is_oriented,
+            is_scaled=described.is_scaled,
+        )
+
+    def for_matching(self) -> ImageFeatures:
+        """Return the features as the matchers need them, with the distinctiveness of each descriptor."""
+        return ImageFeatures(
+            pixels=self.pixels,
+            descriptors=self.descriptors,
+            orientations=self.orientations,
+            sizes=self.sizes,
+            distinctiveness=measure_distinctiveness(self.descriptors, self.pixels),
+            is_oriented=self.is_oriented,
+            is_scaled=self.is_scaled,
+        )
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Correspondences:
-    """Points of a reference view, seen in another one; rounded as they are sent.
+    """Correspondences between 3-D points of a reference view and pixels of another view, as they are sent.
 
-    ``points_world`` ``(n, 3)``: metres, in the frame of the *reference camera*, which is the
-    world of this one query.  ``pixels`` ``(n, 2)``: row *i* observes point *i*, and ``depths_m``
-    ``(n,)`` is the depth measured there, 0 where it cannot be trusted.
+    Attributes:
+        points_world: ``(n, 3)``, metres in the frame of the *reference camera*, which is the world of this
+            one query; rounded to 0.1 mm.
+        pixels: ``(n, 2)``: pixel *i* shows point *i*; rounded to 0.01 px.
+        depths_m: ``(n,)``, depth measured at each pixel, 0 where it is missing or unreliable.
     """
 
     points_world: Array
@@ -230,71 +271,84 @@ class Correspondences:
         return len(self.pixels)
 
 
-def extract(frame: Frame, options: FrontEndOptions, slot: FeaturesSlot | None = None) -> Features:
-    """Find ORB features, or those of *slot*, spread over the image, and their points; deterministic.
+def extract(frame: Frame, options: FrontEndOptions, plugin: FeaturesPlugin | None = None) -> Features:
+    """Extract the features of a frame with their 3-D points; deterministic with ORB.
+
+    Args:
+        frame: Image with depth, or a stereo pair.
+        options: Number of features, whether they are spread, and the range of depths.
+        plugin: A user's feature extractor; None for ORB.
 
     Raises:
-        MissingExtra: OpenCV is not installed.
-        UsageError: The features function failed, or returned no features.
+        MissingExtra: OpenCV or the native core is not installed.
+        UsageError: The user's function failed, or returned values that cannot be features.
     """
-    described = describe(frame.rgb, options.features, is_spread=options.is_spread, slot=slot)
-    return Features(
-        pixels=described.pixels, descriptors=described.descriptors, turns=described.turns,
-        sizes=described.sizes, points_camera=points_at(frame, described.pixels, options),
-        kind=described.kind, is_oriented=described.is_oriented, is_scaled=described.is_scaled,
-    )  # fmt: skip
+    described = describe(frame.rgb, options.features, is_spread=options.is_spread, plugin=plugin)
+    return Features.from_keypoints(described, points_at(frame, described.pixels, options))
 
 
 def describe(
-    rgb: npt.NDArray[np.uint8], count: int, *, is_spread: bool = True, slot: FeaturesSlot | None = None
-) -> DescribedPixels:
-    """Return *count* ORB features of an ``(h, w, 3)`` image, or those of *slot*; deterministic.
+    rgb: npt.NDArray[np.uint8],
+    count: int,
+    *,
+    is_spread: bool = True,
+    plugin: FeaturesPlugin | None = None,
+) -> DescribedKeypoints:
+    """Detect and describe the keypoints of an image, by ORB or by a user's feature extractor.
 
     Args:
-        rgb: ``(h, w, 3)``.
-        count: The most features.
-        is_spread: Take the strongest of each cell of 40 px, with weak ones where there are no others; else
-            the strongest of the image.
-        slot: A user's features; None for ORB.
+        rgb: ``(h, w, 3)`` uint8, red first.
+        count: Largest number of keypoints.
+        is_spread: Take the strongest keypoints of each cell of 40 px, also weak ones where a cell has no
+            others; otherwise take the strongest of the image.
+        plugin: A user's feature extractor; None for ORB.
 
     Raises:
-        MissingExtra: OpenCV is not installed.
-        UsageError: The features function failed, or returned no features.
+        MissingExtra: OpenCV or the native core is not installed.
+        UsageError: The user's function failed, or returned values that cannot be features.
     """
-    if slot is not None:
-        return _described_by(slot, rgb, count, is_spread=is_spread)
-    return describe_orb(rgb, count, is_spread=is_spread)
-
-
-def _described_by(
-    slot: FeaturesSlot, rgb: npt.NDArray[np.uint8], count: int, *, is_spread: bool
-) -> DescribedPixels:
-    """Return a user's features, the best first, of which a keyframe takes as many as fit."""
-    found = slot(rgb)
-    n = len(found.pixels)
-    rows = np.arange(min(count, n))
-    if is_spread and n > count:
-        rows = np.array(spread_rows(found.pixels, found.scores, (rgb.shape[0], rgb.shape[1]), count))
-    return DescribedPixels(
-        pixels=found.pixels[rows], descriptors=found.descriptors[rows], turns=found.turns[rows],
-        sizes=found.sizes[rows], kind=slot.kind, is_oriented=slot.is_oriented, is_scaled=slot.is_scaled,
-    )  # fmt: skip
+    if plugin is None:
+        return describe_orb(rgb, count, is_spread=is_spread)
+    checked = plugin(rgb)
+    rows = np.arange(min(count, len(checked.pixels)))
+    if is_spread and len(checked.pixels) > count:
+        rows = np.array(
+            select_spread_rows(checked.pixels, checked.scores, (rgb.shape[0], rgb.shape[1]), count)
+        )
+    return DescribedKeypoints(
+        pixels=checked.pixels[rows],
+        descriptors=checked.descriptors[rows],
+        orientations=checked.orientations[rows],
+        sizes=checked.sizes[rows],
+        kind=plugin.kind,
+        is_oriented=plugin.is_oriented,
+        is_scaled=plugin.is_scaled,
+    )
 
 
 def round_for_wire(points_world: Array, pixels: Array) -> tuple[Array, Array]:
-    """Round points to 0.1 mm and pixels to 0.01 px, so that cloud and robot solve the same numbers.
+    """Round points to 0.1 mm and pixels to 0.01 px, so that server and robot solve the same numbers.
 
-    The pose moves by about 0.02 mm, the message shrinks to a third.
+    The rounding moves a pose by about 0.02 mm and shrinks the message to a third.
     """
     return np.round(points_world, 4), np.round(pixels, 2)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PoseQuery:
-    """One query for the PnP service: the pose of this camera in the reference camera's frame.
+    """A query for the PnP service: the pose of a camera in the frame of the query's reference camera.
 
-    Solve with ``correspondences`` (their depths, too), ``camera``, ``inlier_px``, ``max_iterations`` and
-    ``depth_noise`` (None: a Kinect's), then pass the answer to `Tracker.accept`.
+    The pose ``T_camera_reference`` is solved from all fields, and passed to the tracker's ``accept``.
+
+    Attributes:
+        timestamp_s: Time of the frame, in seconds.
+        correspondences: Points, pixels and depths.
+        camera: Intrinsics of the pixels.
+        inlier_px: Largest reprojection error of an inlier.
+        max_iterations: Largest number of RANSAC iterations.
+        against: The source of the points: the ``map`` near the predicted pose, the last ``frame``, a
+            ``keyframe`` by which the place is recognised, or a keyframe of another ``segment``.
+        depth_noise: Noise model of the depths; None for a Kinect's.
     """
 
     timestamp_s: float
@@ -308,20 +362,32 @@ class PoseQuery:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class TrackedFrame:
-    """The result for one frame; a lost one has no pose and must not be drawn.
+    """The result of tracking one frame.
 
-    ``T_world_camera`` ``(4, 4)`` is in metres, unless ``scale`` says ``up to scale``.  ``status`` is
-    ``starting`` before a camera without depth has moved enough; ``reason`` says why there is no pose, or why
-    it is weak.  `Mapper.track` fills the rest: ``covariance`` ``(6, 6)`` of the twist (metres, radians) on
-    the left of the pose of the last query, who solved it, and how long that took.  ``corrected`` says that
-    poses that were returned before have changed: read the trajectory again.  Where the world itself was
-    turned since the last frame, such as upright, ``T_new_old`` ``(4, 4)`` is its motion: what was returned
-    before is ``T_new_old @ T_world_camera`` now.
-    ``features`` are those of the image as they were found, None where nobody found any; their points are NaN
-    where depth is not used.
-
-    In a live map, ``T_map_camera`` is the pose in the map, None until ``segment``, the present odometry
-    frame, is aligned; ``corrected`` says that its alignment has changed since the last frame.
+    Attributes:
+        frame: The frame.
+        T_world_camera: ``(4, 4)``, metres unless *scale* is ``up to scale``; None for a lost frame, which
+            must not be drawn.
+        keyframe: Whether the frame became a keyframe.
+        inliers: Number of landmarks that agree with the pose.
+        matches: Number of matches of the frame.
+        status: ``lost`` without a pose, ``starting`` without a pose before a camera without depth has moved
+            enough, ``tracked`` with a pose; `Mapper` reports the first pose as ``first``.
+        reason: Why there is no pose, or why it is weak; empty otherwise.
+        scale: Whether lengths are metres, or of an arbitrary unit.
+        covariance: ``(6, 6)`` of the twist (metres, radians) on the left of the pose of the last query;
+            filled by `Mapper.track`.
+        source: Who solved the last query: a server (``cloud``), the Lambda (``burst``), or the ``robot``;
+            filled by `Mapper.track`.
+        round_trip_ms: Duration of the last query in milliseconds; filled by `Mapper.track`.
+        corrected: Whether poses that were returned before have changed, so that the trajectory must be read
+            again; in a live map, whether the alignment of the segment has changed since the last frame.
+        T_new_old: ``(4, 4)``: the world was rotated since the last frame, such as upright, and a pose that
+            was returned before is ``T_new_old @ T_world_camera`` now; None if it was not.
+        T_map_camera: ``(4, 4)``, the pose in the live map; None until the segment is aligned.
+        segment: Number of the present segment, that is, of the odometry frame.
+        features: Features of the image before any correction, None where none were extracted; their points
+            are NaN where depth is not used.
     """
 
     frame: Frame
@@ -343,21 +409,30 @@ class TrackedFrame:
 
     @property
     def T_world_body(self) -> Array | None:
-        """The pose ``(4, 4)`` of the body of the rig; None without a pose, a rig, or metres."""
+        """Pose ``(4, 4)`` of the rig's body in metres; None without a pose, a rig, or a metric scale."""
         pose, mount = self.T_world_camera, self.frame.T_body_camera
         return None if pose is None or mount is None or self.scale != "metric" else body_poses(pose, mount)
 
     @property
     def lost(self) -> bool:
-        """Whether no pose was accepted."""
+        """Whether the frame has no pose."""
         return self.T_world_camera is None
 
 
 def points_at(frame: Frame, pixels: Array, options: FrontEndOptions) -> Array:
-    """Return the ``(n, 3)`` points of the camera frame that *frame* shows at ``(n, 2)`` pixels.
+    """Return the 3-D points that a frame shows at given pixels.
 
-    The depth of a pixel is the median of its 3x3 patch, NaN where that is sparse, spread, near or far.  A
-    stereo pair is matched, see `client_sdk.stereo.depth`.
+    The depth of a pixel is the median of the readings in its 3x3 patch.  A stereo pair is matched at the
+    pixels instead, see `client_sdk.stereo.depth`.
+
+    Args:
+        frame: Image with depth, or a stereo pair.
+        pixels: ``(n, 2)``, column and row.
+        options: Range of depths, and how much the readings of a patch may differ.
+
+    Returns:
+        ``(n, 3)`` metres in the camera's frame; NaN where a patch has too few readings, or readings that
+        differ too much or are out of range.
 
     Raises:
         MissingExtra: The native core is not installed.

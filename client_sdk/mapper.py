@@ -38,16 +38,16 @@ from client_sdk.frontend import Features, Frame, FrontEndOptions, PoseQuery, Tra
 from client_sdk.imu.estimator import ImuEstimator, ImuScale, level_start_pose
 from client_sdk.imu.samples import ImuSamples
 from client_sdk.monocular.scale import MarkerScale, OdometryScale
+from client_sdk.plugins import FeaturesFunction, LoopsFunction, MotionFunction, OptimiserFunction, Plugins
 from client_sdk.point_map import MapOptions, PointMap, write_ply
-from client_sdk.slots import FeaturesFunction, LoopsFunction, MotionFunction, OptimiserFunction, Slots
 from client_sdk.source_facts import DepthFacts, SourceFacts, check_source, median_depth_m
 from client_sdk.tracking.monocular_tracker import MonocularOptions, MonocularTracker
 from client_sdk.tracking.segments import (
     DriveRecords,
     SegmentRecord,
-    keyframe_of,
     landmark_keyframes,
-    tracker_record,
+    make_keyframe,
+    read_segment,
 )
 from client_sdk.tracking.stereo_adjustment import StereoAdjustment
 from client_sdk.tracking.tracker import Tracker
@@ -179,7 +179,7 @@ class Mapper:
         self._keyframes_of = keyframes_of
         self._adds_frames = adds_frames
         self._recorder = recorder
-        self._slots = Slots.of(features=features, motion=motion, loops=loops, optimiser=optimiser)
+        self._plugins = Plugins.wrap(features=features, motion=motion, loops=loops, optimiser=optimiser)
         self._processed_joins = 0  # of a monocular tracker also its loop closures
         self._depth_source: Literal["depth", "stereo"] = "depth"
         self._metric_segments: set[int] = set()  # segments of a monocular tracker whose scale is known
@@ -244,7 +244,7 @@ class Mapper:
         tracker = self._tracker
         if not isinstance(tracker, MonocularTracker):
             return self._records.first.cloud
-        return tracker_record(tracker, 0, self._map_options).cloud
+        return read_segment(tracker, 0, self._map_options).cloud
 
     @property
     def trajectory(self) -> Trajectory:
@@ -495,7 +495,7 @@ class Mapper:
         if not isinstance(tracker, MonocularTracker):
             return [(record, True) for record in self._records.apart]
         return [
-            (tracker_record(tracker, number, self._map_options), number in self._metric_segments)
+            (read_segment(tracker, number, self._map_options), number in self._metric_segments)
             for number in tracker.segments[1:]
         ]
 
@@ -533,16 +533,16 @@ class Mapper:
             has_depth = bool(frame.depth_m.any()) if self._uses_depth is None else self._uses_depth
             if frame.stereo is not None or has_depth:
                 self._depth_source = "depth" if frame.stereo is None else "stereo"
-                self._tracker = Tracker(self._options, self._T_world_start, self._slots)
+                self._tracker = Tracker(self._options, self._T_world_start, self._plugins)
             else:
-                self._tracker = MonocularTracker(self._monocular_options, self._T_world_start, self._slots)
+                self._tracker = MonocularTracker(self._monocular_options, self._T_world_start, self._plugins)
         return self._tracker
 
     def _start_imu(self, samples: ImuSamples, camera: Camera) -> None:
         """Start the IMU estimator; gravity levels the first camera, unless its pose was given."""
         self._imu = ImuEstimator(samples.model, camera)
         self._imu.add(samples)
-        self._slots = replace(self._slots, inertial=self._imu)
+        self._plugins = replace(self._plugins, inertial=self._imu)
         self._scale = self._scale or ImuScale(self._imu)
         if self._T_world_start is None:
             gravity_camera = self._imu.stationary_gravity()
@@ -598,7 +598,9 @@ class Mapper:
             if self._adds_frames:
                 self._records.add_to_cloud(tracked, pose, tracker.last_features)
             if tracked.keyframe and self._keyframes_of and tracker.last_features is not None:
-                record.keyframes.append(keyframe_of(tracked, pose, tracker.last_features, self._keyframes_of))
+                record.keyframes.append(
+                    make_keyframe(tracked, pose, tracker.last_features, self._keyframes_of)
+                )
         return self._apply_gravity(tracker, self._apply_joins(tracker, tracked))
 
     def _apply_joins(self, tracker: Tracker, tracked: TrackedFrame) -> TrackedFrame:

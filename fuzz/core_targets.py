@@ -24,13 +24,13 @@ from rse_pf.pnp.problems import KINECT
 from rse_pf.slam.descriptors import match_orb
 from rse_pf.slam.orb import Keypoints, describe_keypoints, detect_keypoints
 from rse_pf.slam.tracking import (
+    GuidedMatchLimits,
     ImageFeatures,
-    NearLimits,
     Observations,
-    SoughtFeatures,
-    distinct_distances,
+    PredictedFeatures,
     fit_pose,
-    match_near,
+    match_predictions,
+    measure_distinctiveness,
 )
 from tests.oracles import depths, matching
 
@@ -310,24 +310,35 @@ def track(data: bytes, meter: Meter) -> None:
         )  # fmt: skip
     sought, image = sides
     apart_px = _STRANGE[data[3] % 5] if data[3] > 250 else data[3] / 8.0
-    distinct = meter.call(lambda _: distinct_distances(image[3], image[0], apart_px), data, ProtocolError)
-    expected_distinct = matching.distinct_distances(image[3], image[0], apart_px)
+    distinct = meter.call(
+        lambda _: measure_distinctiveness(image[3], image[0], apart_px), data, ProtocolError
+    )
+    expected_distinct = matching.measure_distinctiveness(image[3], image[0], apart_px)
     expect(np.array_equal(distinct, expected_distinct), "other distances")
     ratio = _STRANGE[data[5] % 5] if data[5] > 250 else data[5] / 128
-    limits = NearLimits(
-        radius_px=min(10.0 ** (data[4] / 28.0) - 1.0, 1e9), ratio=ratio, distinct_ratio=2.0 - ratio,
-        min_cosine=-1.0 if kind & 32 else 0.9, max_size_ratio=9.0 if kind & 64 else 1.35,
+    limits = GuidedMatchLimits(
+        radius_px=min(10.0 ** (data[4] / 28.0) - 1.0, 1e9),
+        lowe_ratio=ratio,
+        distinctiveness_ratio=2.0 - ratio,
+        min_orientation_cosine=-1.0 if kind & 32 else 0.9,
+        max_size_ratio=9.0 if kind & 64 else 1.35,
         max_distance=data[7] + data[7] // 255,
-    )  # fmt: skip
+    )
     numbers_of = (
-        limits.radius_px, limits.ratio, limits.distinct_ratio, limits.min_cosine, limits.max_size_ratio,
+        limits.radius_px,
+        limits.lowe_ratio,
+        limits.distinctiveness_ratio,
+        limits.min_orientation_cosine,
+        limits.max_size_ratio,
         limits.max_distance,
-    )  # fmt: skip
-    names = ("pixels", "turns", "sizes", "descriptors")
-    sought_features = SoughtFeatures(**dict(zip(names, sought, strict=True)))
-    image_features = ImageFeatures(**dict(zip(names, image, strict=True)), distinct=distinct)
-    found = meter.call(lambda _: match_near(sought_features, image_features, limits), data, ProtocolError)
-    expected = matching.match_near(sought_features, image_features, limits)
+    )
+    names = ("pixels", "orientations", "sizes", "descriptors")
+    sought_features = PredictedFeatures(**dict(zip(names, sought, strict=True)))
+    image_features = ImageFeatures(**dict(zip(names, image, strict=True)), distinctiveness=distinct)
+    found = meter.call(
+        lambda _: match_predictions(sought_features, image_features, limits), data, ProtocolError
+    )
+    expected = matching.match_predictions(sought_features, image_features, limits)
     expect(_all_equal(found, expected), "matches are not those of the definition")
     _near_directly(sought, (*image, distinct), numbers_of, len(expected[0]))
     _fit(data, meter)
@@ -380,8 +391,8 @@ def _fit(data: bytes, meter: Meter) -> None:
     rows = points.reshape(n, 3), spreads.reshape(n, 6)
     measured = pixels.reshape(n, 2), deviations, depths_m, depths_dev_m
     observed = Observations(
-        points=rows[0], spreads=full, pixels=measured[0], pixels_px=deviations, depths_m=depths_m,
-        depths_dev_m=depths_dev_m,
+        points=rows[0], covariances=full, pixels=measured[0], pixel_sigmas_px=deviations, depths_m=depths_m,
+        depth_sigmas_m=depths_dev_m,
     )  # fmt: skip
     found = meter.call(
         lambda _: fit_pose(observed, _CAMERA, T.reshape(4, 4), cauchy=cauchy), data, ProtocolError

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from client_sdk.frontend import DescribedPixels, Features, Frame, describe, load_opencv
+from client_sdk.frontend import DescribedKeypoints, Features, Frame, describe, load_opencv
 from client_sdk.stereo.depth import stereo_points
 from rse_pf.geometry import Array, Camera, inverse, log_se3
 from rse_pf.maps.descriptors import ORB
@@ -123,7 +123,7 @@ class KeyframeStore:
         while frame.timestamp_s - self._depths[0][0] > _AROUND_S:
             self._depths.popleft()
 
-    def _is_new(self, described: DescribedPixels | Features, width: int) -> bool:
+    def _is_new(self, described: DescribedKeypoints | Features, width: int) -> bool:
         if not self.keyframes:
             return True
         last = self.keyframes[-1]
@@ -134,7 +134,7 @@ class KeyframeStore:
         return float(np.median(moved)) > self._moved_share * width
 
     def _made(
-        self, frame: Frame, described: DescribedPixels | Features, T_world_camera: Array | None
+        self, frame: Frame, described: DescribedKeypoints | Features, T_world_camera: Array | None
     ) -> Keyframe:
         pixels = described.pixels
         keyframe = Keyframe(
@@ -164,7 +164,7 @@ class KeyframeStore:
         return keyframe
 
 
-def _described(frame: Frame, found: Features | None) -> DescribedPixels | Features:
+def _described(frame: Frame, found: Features | None) -> DescribedKeypoints | Features:
     """Return the ORB features of a frame: those that were found, the finest where they are many."""
     if found is None or found.kind != ORB or not (found.is_oriented and found.is_scaled):
         return describe(frame.rgb, _FEATURES)
@@ -173,7 +173,8 @@ def _described(frame: Frame, found: Features | None) -> DescribedPixels | Featur
     # The finest: they are the same ones in the next image, which each second one would not be.
     rows = np.sort(np.argsort(found.sizes, kind="stable")[:_MOST_FEATURES])
     return replace(
-        found, pixels=found.pixels[rows], descriptors=found.descriptors[rows], turns=found.turns[rows],
+        found, pixels=found.pixels[rows], descriptors=found.descriptors[rows],
+        orientations=found.orientations[rows],
         sizes=found.sizes[rows], points_camera=found.points_camera[rows],
     )  # fmt: skip
 

@@ -23,7 +23,7 @@ import numpy.typing as npt
 from client_sdk.concurrency.user_callbacks import UserCallbacks
 from client_sdk.frontend import Features, Frame, load_opencv
 from client_sdk.live.options import LiveOptions
-from client_sdk.tracking.segments import certain_rows
+from client_sdk.tracking.segments import select_certain_rows
 from client_sdk.transfer.data_connection import MAX_SINGLE_PUT_BYTES
 from rse_pf.errors import (
     BadRequest,
@@ -294,7 +294,7 @@ def encode_keyframe_points(frame: Frame, features: Features, max_points: int) ->
         pixels = _choose_grid_pixels(frame, max_points)
         depths_m = frame.depth_m[pixels[:, 1], pixels[:, 0]].astype(np.float64)
     else:
-        rows = certain_rows(frame, features)
+        rows = select_certain_rows(frame, features)
         last_pixel = np.array([frame.camera.width, frame.camera.height]) - 1
         pixels = np.clip(np.rint(features.pixels[rows]).astype(np.int64), 0, last_pixel)
         depths_m = features.points_camera[rows, 2].astype(np.float64)

@@ -42,9 +42,9 @@ from client_sdk.live.monocular_odometry import MonocularOdometry
 from client_sdk.live.options import LiveOptions
 from client_sdk.live.relocaliser import Relocaliser
 from client_sdk.mapper import AskPose, Mapper
+from client_sdk.plugins import FeaturesFunction, LoopsFunction, MotionFunction
 from client_sdk.point_map import MapOptions, PointMap
-from client_sdk.slots import FeaturesFunction, LoopsFunction, MotionFunction
-from client_sdk.tracking.monocular_tracker import MonocularTracker, SeenKeyframe
+from client_sdk.tracking.monocular_tracker import AdjustedKeyframe, MonocularTracker
 from client_sdk.tracking.segments import add_to_cloud
 from client_sdk.trajectory import Trajectory
 from rse_pf.errors import BadMessage, BadRequest, RsePfError, UnsupportedProtocol, UsageError
@@ -590,7 +590,7 @@ class LiveMapper:
         )
         return encode_keyframe(keyframe), attachments
 
-    def _encode_monocular_keyframe(self, seen: SeenKeyframe, T_odom_camera: Array) -> bytes:
+    def _encode_monocular_keyframe(self, seen: AdjustedKeyframe, T_odom_camera: Array) -> bytes:
         """Encode a keyframe up to scale: features with a landmark, thus a depth, come first."""
         assert self._mapper.camera is not None
         rows = np.argsort(np.isnan(seen.depths), kind="stable")[: self._max_features(seen.kind)]
@@ -599,7 +599,7 @@ class LiveMapper:
             T_odom_camera=T_odom_camera,
             camera=self._mapper.camera,
             features=make_scaleless_features(
-                seen.image.pixels[rows], seen.depths[rows], seen.image.descriptors[rows], seen.kind
+                seen.features.pixels[rows], seen.depths[rows], seen.features.descriptors[rows], seen.kind
             ),
             imu=self._mapper.keyframe_imu(seen.T_world_camera, self._last_keyframe_s, seen.timestamp_s),
         )

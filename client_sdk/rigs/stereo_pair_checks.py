@@ -14,7 +14,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from client_sdk.frontend import DescribedPixels, Frame, describe, load_opencv
+from client_sdk.frontend import DescribedKeypoints, Frame, describe, load_opencv
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Array
 
@@ -228,7 +228,7 @@ def _estimate_delay_s(row_offsets_px: Array, row_rates_px_s: Array) -> float | N
 
 
 def match_features(
-    first: DescribedPixels, second: DescribedPixels
+    first: DescribedKeypoints, second: DescribedKeypoints
 ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
     """Return the rows of matching ORB features in two images, two arrays ``(m,)``.
 

@@ -1,154 +1,125 @@
-"""The map that a tracker matches frames against: keyframes, and the landmarks that they measured.
+"""The map of one segment of a camera with depth: keyframes, and the landmarks that they measured.
 
-A landmark is a feature with depth.  Each frame that sees it again measures it again, and the measurements are
-fused by their noise.  Nothing is matched here, and no keyframe is ever moved but with its whole map.
+A landmark is a feature with depth.  Every frame that sees it again measures it again, and the measurements
+are fused by their covariances.  Keyframes are not adjusted one by one: they move only with the whole map.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import numpy.typing as npt
 
 from client_sdk.stereo.depth import with_offset
-from client_sdk.tracking.place import Place
+from client_sdk.tracking.landmarks import NO_LANDMARK, Landmarks, Matches, shift_landmarks
+from client_sdk.tracking.place_recognition import LazyPlaceVector
 from rse_pf.geometry import Array, Camera, inverse, transform
 from rse_pf.maps.descriptors import Descriptors
 from rse_pf.pnp import DepthNoise
-from rse_pf.slam.tracking import ImageFeatures, LandmarkLooks, NearLimits, seek_near
+from rse_pf.slam.tracking import GuidedMatchLimits, ImageFeatures, match_landmarks
 
-__all__ = [
-    "NO_LANDMARK",
-    "KeyframeMap",
-    "Landmarks",
-    "View",
-    "between",
-    "measure_points",
-]
+__all__ = ["PIXEL_SIGMA_PX", "KeyframeMap", "View", "depths_for_noise", "measure_points"]
 
 Rows = npt.NDArray[np.int64]
 
-NO_LANDMARK = -1
-_FIRST_ROOM = 4096
+PIXEL_SIGMA_PX = 1.0
+"""Standard deviation, in pixels, of a feature's position on the finest pyramid level; it grows with the size
+of the feature."""
+_INITIAL_CAPACITY = 4096
+"""Number of landmarks for which a new map has memory; the memory doubles when it is full."""
 _DEG_PER_M = 30.0
-"""A view that is turned by so many degrees shows as little of another one as a view a metre away."""
-_FUSED_FLOOR_M2 = 0.003**2 / 20.0
-"""Added to the variance of a landmark with each measurement: their errors are not independent."""
+"""Degrees of rotation that change a view as much as a metre of translation, where nearest keyframes are
+sought."""
+_FUSION_FLOOR_M2 = 0.003**2 / 20.0
+"""Square metres that each fusion adds to the variance of a landmark, (3 mm)^2 in 20 fusions: the errors of
+its measurements are correlated, so that its variance must not fall to 0."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class View:
-    """One image: its features, and their ``(n, 3)`` points in the camera's frame, NaN without depth.
+    """One image with depth, as it is matched and kept in a map.
 
-    ``sways`` ``(n, 3)`` is how far the points move for each second that the camera's readout takes longer.
-    ``is_stereo`` says that the depths are those of disparities, whose noise has no floor.  ``timestamp_s`` is
-    that of the frame.
+    Attributes:
+        features: Features of the image, ``n`` of them.
+        points_camera: ``(n, 3)`` metres in the camera's frame, NaN without depth.
+        shutter_displacements: ``(n, 3)``, how far each point moves in the camera's frame for each second that
+            the camera's rolling-shutter readout takes longer.
+        camera: Intrinsics.
+        place_vector: Vector by which the place of the image is recognised.
+        is_stereo: Whether depths are computed from disparities, whose noise has no constant part.
+        timestamp_s: Time of the frame, in seconds.
     """
 
     features: ImageFeatures
     points_camera: Array
-    sways: Array
+    shutter_displacements: Array
     camera: Camera
-    place: Place
+    place_vector: LazyPlaceVector
     is_stereo: bool = False
     timestamp_s: float = 0.0
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Landmarks:
-    """Points of the world that are sought in an image.
+def depths_for_noise(measured_m: Array, expected_m: Array) -> Array:
+    """Return the depths at which the noise of stereo depths is evaluated: the mean of measured and expected.
 
-    ``points`` ``(n, 3)``; ``spreads`` ``(n, 3, 3)`` their covariances; ``rays`` ``(n, 3)`` from where they
-    were seen last; ``turns`` ``(n, 3)`` their orientation there, in the world; ``sizes`` ``(n,)``;
-    ``numbers`` ``(n,)`` of the map, NO_LANDMARK for points that only the last image has; ``sways`` ``(n, 3)``
-    how far they move for each second that the camera's readout takes longer, empty without depth.
-    """
+    The noise at the measured depth itself would favour points that are measured too near, and draw the map
+    nearer.  At the geometric mean, the deviation of a depth is exactly that of its disparity.
 
-    points: Array
-    spreads: Array
-    descriptors: Descriptors
-    rays: Array
-    turns: Array
-    sizes: Array
-    numbers: Rows
-    sways: Array = field(default_factory=lambda: np.empty((0, 3)))
-
-    @property
-    def looks(self) -> LandmarkLooks:
-        """How they looked."""
-        return LandmarkLooks(
-            points=self.points, rays=self.rays, turns=self.turns, sizes=self.sizes,
-            descriptors=self.descriptors,
-        )  # fmt: skip
-
-    def seek(
-        self, T_camera_world: Array, camera: Camera, image: ImageFeatures, limits: NearLimits,
-        margin_px: float,
-    ) -> tuple[Rows, Rows]:  # fmt: skip
-        """Return their rows, and those of an image's features, that match where a pose expects them."""
-        every = np.arange(len(self.points))
-        return seek_near(self.looks, every, T_camera_world, camera, image, limits, margin_px)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Keyframe:
-    """``landmarks`` ``(n,)`` holds the landmark of each feature; ``own`` those that there are, sorted."""
-
-    view: View
-    landmarks: Rows
-    own: Rows
-
-
-def between(measured_m: Array, expected_m: Array) -> Array:
-    """Return the depths at which the noise of measured depths is taken where others are expected.
-
-    What is measured too near would seem the better measurement, and draw the map nearer.  At the geometric
-    mean, the deviation of a depth is exactly that of its disparity.
+    Args:
+        measured_m: ``(n,)`` metres.
+        expected_m: ``(n,)`` metres, by the map; limited to a quarter and to four times the measured depth.
     """
     mean: Array = np.sqrt(measured_m * np.clip(expected_m, 0.25 * measured_m, 4.0 * measured_m))
     return mean
 
 
 def measure_points(
-    view: View, T_world_camera: Array, rows: Rows, noise: DepthNoise, pixel_px: float,
-    expected_m: Array | None = None,
-) -> tuple[Array, Array]:  # fmt: skip
-    """Return ``(n, 3)`` points in the world, and their ``(n, 3, 3)`` covariances by the noise.
+    view: View, T_world_camera: Array, rows: Rows, noise: DepthNoise, expected_m: Array | None = None
+) -> tuple[Array, Array]:
+    """Return the points of features in the world, and their covariances by the noise of pixels and depths.
 
-    *expected_m* are ``(n,)`` depths where the points are known already.
+    Args:
+        view: The image.
+        T_world_camera: ``(4, 4)``, its pose.
+        rows: ``(n,)`` rows of the features.
+        noise: Noise model of the depths.
+        expected_m: ``(n,)`` depths by the map, at which the noise of stereo depths is evaluated; None where
+            they are not known.
+
+    Returns:
+        ``(n, 3)`` metres, and ``(n, 3, 3)`` square metres, world axes.
     """
     points, camera = view.points_camera[rows], view.camera
     z = points[:, 2]
-    along = points / z[:, None]
-    variance = noise.variance_m2(z if expected_m is None else between(z, expected_m))
-    spread = along[:, :, None] * along[:, None, :] * variance[:, None, None]
-    pixel2 = (pixel_px * view.features.sizes[rows]) ** 2
-    spread[:, 0, 0] += pixel2 * (z / camera.fx) ** 2
-    spread[:, 1, 1] += pixel2 * (z / camera.fy) ** 2
+    rays = points / z[:, None]
+    depth_variance = noise.variance_m2(z if expected_m is None else depths_for_noise(z, expected_m))
+    covariances = rays[:, :, None] * rays[:, None, :] * depth_variance[:, None, None]
+    pixel_variance = (PIXEL_SIGMA_PX * view.features.sizes[rows]) ** 2
+    covariances[:, 0, 0] += pixel_variance * (z / camera.fx) ** 2
+    covariances[:, 1, 1] += pixel_variance * (z / camera.fy) ** 2
     rotation = T_world_camera[:3, :3]
-    return transform(T_world_camera, points), rotation @ spread @ rotation.T
+    return transform(T_world_camera, points), rotation @ covariances @ rotation.T
 
 
 class KeyframeMap:
-    """Keyframes and landmarks of one odometry frame; at most *max_keyframes*, then older ones are thinned."""
+    """Keyframes and landmarks of one segment; beyond *max_keyframes* the older keyframes are thinned out."""
 
     def __init__(self, max_keyframes: int) -> None:
         self._max_keyframes = max_keyframes
-        self._keyframes: list[_Keyframe] = []
+        self._views: list[View] = []
+        self._seen: list[Rows] = []
+        """The landmark of each feature of each keyframe, or NO_LANDMARK."""
         self._poses: Array = np.empty((0, 4, 4))
-        self._places: npt.NDArray[np.float32] = np.empty((0, 0), dtype=np.float32)
+        self._place_vectors: npt.NDArray[np.float32] = np.empty((0, 0), dtype=np.float32)
         self._count = 0
-        self._points: Array = np.empty((_FIRST_ROOM, 3))
-        self._spreads: Array = np.empty((_FIRST_ROOM, 3, 3))
-        self._sways: Array = np.empty((_FIRST_ROOM, 3))
-        self._descriptors: Descriptors = np.empty((_FIRST_ROOM, 0), dtype=np.uint8)
-        self._rays: Array = np.empty((_FIRST_ROOM, 3))
-        self._turns: Array = np.empty((_FIRST_ROOM, 3))
-        self._sizes: Array = np.empty(_FIRST_ROOM)
+        self._table = _allocate(_INITIAL_CAPACITY, np.empty((0, 0), dtype=np.uint8))
+        """All landmarks, then free rows."""
 
-    def __len__(self) -> int:
-        return len(self._keyframes)
+    @property
+    def keyframe_count(self) -> int:
+        """The number of keyframes."""
+        return len(self._views)
 
     @property
     def landmark_count(self) -> int:
@@ -156,272 +127,310 @@ class KeyframeMap:
         return self._count
 
     def pose(self, keyframe: int) -> Array:
-        """Return ``T_world_camera`` of a keyframe."""
+        """Return ``T_world_camera`` ``(4, 4)`` of a keyframe."""
         pose: Array = self._poses[keyframe]
         return pose
 
+    def poses(self) -> Array:
+        """Return ``T_world_camera`` ``(k, 4, 4)`` of all keyframes, oldest first."""
+        poses: Array = self._poses.copy()
+        return poses
+
     def view(self, keyframe: int) -> View:
         """Return the image of a keyframe."""
-        return self._keyframes[keyframe].view
+        return self._views[keyframe]
 
-    def seen_in(self, keyframe: int) -> Rows:
+    def landmarks_of_features(self, keyframe: int) -> Rows:
         """Return the landmark of each feature of a keyframe, or NO_LANDMARK."""
-        return self._keyframes[keyframe].landmarks
+        return self._seen[keyframe]
 
-    def add_keyframe(
-        self, view: View, T_world_camera: Array, landmarks: Rows, noise: DepthNoise, pixel_px: float
-    ) -> Rows:
+    def add_keyframe(self, view: View, T_world_camera: Array, landmarks: Rows, noise: DepthNoise) -> Rows:
         """Add a keyframe; its features with depth and without a landmark become landmarks.
 
         Args:
             view: The image.
-            T_world_camera: ``(4, 4)``.
-            landmarks: ``(n,)``, of each feature, or NO_LANDMARK.
-            noise: Of the depths.
-            pixel_px: Deviation of a pixel on the finest level.
+            T_world_camera: ``(4, 4)``, its pose.
+            landmarks: ``(n,)``, landmark of each feature, or NO_LANDMARK.
+            noise: Noise model of the depths.
 
         Returns:
-            ``(n,)``, the landmark of each feature.
+            ``(n,)``, landmark of each feature, with the new ones; numbers change if the map was thinned out.
         """
         descriptors = view.features.descriptors
         if not self._count:
-            self._descriptors = np.empty((len(self._points), descriptors.shape[1]), dtype=descriptors.dtype)
-        if len(self._keyframes) >= self._max_keyframes:
-            landmarks = self._thin(landmarks)
+            self._table = _allocate(len(self._table), descriptors)
+        if len(self._views) >= self._max_keyframes:
+            landmarks = self._thin_out(landmarks)
         landmarks = landmarks.copy()
-        seen = np.flatnonzero(landmarks != NO_LANDMARK)
+        known = np.flatnonzero(landmarks != NO_LANDMARK)
         new = np.flatnonzero((landmarks == NO_LANDMARK) & np.isfinite(view.points_camera[:, 2]))
         numbers = self._count + np.arange(len(new))
         landmarks[new] = numbers
-        self._make_room(self._count + len(new))
+        self._reserve(self._count + len(new))
         self._count += len(new)
-        points, spreads = measure_points(view, T_world_camera, new, noise, pixel_px)
-        self._points[numbers], self._spreads[numbers] = points, spreads
-        self._sways[numbers] = view.sways[new] @ T_world_camera[:3, :3].T
-        for rows in (seen, new):
-            self._note_look(landmarks[rows], view, T_world_camera, rows)
-        keyframe = _Keyframe(view=view, landmarks=landmarks, own=np.sort(landmarks[landmarks != NO_LANDMARK]))
-        self._keyframes.append(keyframe)
+        table = self._table
+        table.points[numbers], table.covariances[numbers] = measure_points(view, T_world_camera, new, noise)
+        table.shutter_displacements[numbers] = view.shutter_displacements[new] @ T_world_camera[:3, :3].T
+        for rows in (known, new):
+            self._update_appearance(landmarks[rows], view, T_world_camera, rows)
+        self._views.append(view)
+        self._seen.append(landmarks)
         self._poses = np.concatenate([self._poses, T_world_camera[None]])
-        place = view.place.vector()[None]
-        self._places = np.concatenate([self._places, place]) if len(self._places) else place
+        vector = view.place_vector.get()[None]
+        self._place_vectors = (
+            np.concatenate([self._place_vectors, vector]) if len(self._place_vectors) else vector
+        )
         return landmarks
 
     def distances(self, T_world_camera: Array) -> tuple[Array, Array]:
-        """Return how far ``(k,)`` keyframes are from a pose: metres, and degrees."""
+        """Return the ``(k,)`` distances of all keyframes from a pose in metres, and their angles in
+        degrees."""
         metres = np.linalg.norm(self._poses[:, :3, 3] - T_world_camera[:3, 3], axis=1)
         cosines = (np.einsum("nij,ij->n", self._poses[:, :3, :3], T_world_camera[:3, :3]) - 1.0) / 2.0
         return metres, np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0)))
 
     def nearest(self, T_world_camera: Array, count: int) -> list[int]:
-        """Return the *count* keyframes whose views a pose shares most, and the newest one."""
+        """Return the *count* keyframes with the nearest poses, nearest first, and the newest keyframe."""
         metres, degrees = self.distances(T_world_camera)
-        chosen: list[int] = np.argsort(metres + degrees / _DEG_PER_M, kind="stable")[:count].tolist()
-        newest = len(self._keyframes) - 1
-        return chosen if newest in chosen else [*chosen, newest]
+        nearest: list[int] = np.argsort(metres + degrees / _DEG_PER_M, kind="stable")[:count].tolist()
+        newest = len(self._views) - 1
+        return nearest if newest in nearest else [*nearest, newest]
 
-    def most_alike(self, place: Place, count: int) -> list[int]:
-        """Return the *count* keyframes that look most like an image, best first."""
-        alike: list[int] = np.argsort(-(self._places @ place.vector()), kind="stable").tolist()
-        return alike[:count]
+    def rank_by_similarity(self, place: LazyPlaceVector, count: int) -> list[int]:
+        """Return the *count* keyframes whose place vectors are most similar to that of an image, best
+        first."""
+        ranked: list[int] = np.argsort(-(self._place_vectors @ place.get()), kind="stable").tolist()
+        return ranked[:count]
 
     def landmarks(self, numbers: Rows) -> Landmarks:
         """Return landmarks by their numbers."""
-        return Landmarks(
-            points=self._points[numbers], spreads=self._spreads[numbers], sways=self._sways[numbers],
-            descriptors=self._descriptors[numbers], rays=self._rays[numbers], turns=self._turns[numbers],
-            sizes=self._sizes[numbers], numbers=numbers,
-        )  # fmt: skip
+        return self._table.select(numbers)
 
-    def landmarks_of(self, keyframes: list[int]) -> Landmarks:
-        """Return the landmarks that any of the keyframes sees."""
-        return self.landmarks(self._seen_by(keyframes))
+    def landmarks_seen_by(self, keyframes: list[int]) -> Landmarks:
+        """Return the landmarks that at least one of the keyframes sees."""
+        return self.landmarks(self._numbers_seen_by(keyframes))
 
-    def seek(
-        self, keyframes: list[int], T_camera_world: Array, view: View, limits: NearLimits, margin_px: float
-    ) -> tuple[Rows, Rows]:
-        """Match the landmarks that any of the keyframes sees with an image where a pose expects them.
+    def match(
+        self,
+        keyframes: list[int],
+        T_camera_world: Array,
+        view: View,
+        limits: GuidedMatchLimits,
+        margin_px: float,
+    ) -> Matches:
+        """Match the landmarks of keyframes with an image near the pixels at which a pose predicts them.
 
-        Returns:
-            The landmarks, and the rows of the image's features.
+        Args:
+            keyframes: Numbers of keyframes; landmarks that at least one of them sees are matched.
+            T_camera_world: ``(4, 4)``, the predicted pose of the image.
+            view: The image.
+            limits: Conditions of a match.
+            margin_px: Width of the border around the image in which landmarks are predicted, too.
         """
-        numbers, count = self._seen_by(keyframes), self._count
-        looks = LandmarkLooks(
-            points=self._points[:count], rays=self._rays[:count], turns=self._turns[:count],
-            sizes=self._sizes[:count], descriptors=self._descriptors[:count],
-        )  # fmt: skip
-        rows, features = seek_near(
-            looks, numbers, T_camera_world, view.camera, view.features, limits, margin_px
+        numbers = self._numbers_seen_by(keyframes)
+        appearance = self._table.select(slice(self._count)).appearance
+        rows, features = match_landmarks(
+            appearance, numbers, T_camera_world, view.camera, view.features, limits, margin_px
         )
-        return numbers[rows], features
+        return Matches(landmarks=self.landmarks(numbers[rows]), features=features)
 
     def landmarks_in(self, keyframe: int) -> tuple[Landmarks, Descriptors]:
-        """Return the landmarks of one keyframe, with the descriptors that this keyframe has of them."""
-        record = self._keyframes[keyframe]
-        rows = np.flatnonzero(record.landmarks != NO_LANDMARK)
-        return self.landmarks(record.landmarks[rows]), record.view.features.descriptors[rows]
+        """Return the landmarks that a keyframe sees, and their descriptors in that keyframe."""
+        seen = self._seen[keyframe]
+        rows = np.flatnonzero(seen != NO_LANDMARK)
+        return self.landmarks(seen[rows]), self._views[keyframe].features.descriptors[rows]
 
     def landmarks_of_view(
-        self, view: View, T_world_camera: Array, landmarks: Rows, noise: DepthNoise, pixel_px: float
+        self, view: View, T_world_camera: Array, landmarks: Rows, noise: DepthNoise
     ) -> Landmarks:
-        """Return the landmarks of an image, and points of its own where it has depth and no landmark."""
+        """Return the landmarks of an image, and as further ones its features with depth that show no
+        landmark.
+
+        All of them look as in this image.
+
+        Args:
+            view: The image, which need not be a keyframe.
+            T_world_camera: ``(4, 4)``, its pose.
+            landmarks: ``(n,)``, landmark of each feature, or NO_LANDMARK.
+            noise: Noise model of the depths.
+        """
         rows = np.flatnonzero((landmarks != NO_LANDMARK) | np.isfinite(view.points_camera[:, 2]))
         numbers = landmarks[rows]
-        points, spreads, sways = self._points[numbers], self._spreads[numbers], self._sways[numbers]
         new = np.flatnonzero(numbers == NO_LANDMARK)
-        points[new], spreads[new] = measure_points(view, T_world_camera, rows[new], noise, pixel_px)
-        sways[new] = view.sways[rows[new]] @ T_world_camera[:3, :3].T
+        points, covariances = self._table.points[numbers], self._table.covariances[numbers]
+        displacements = self._table.shutter_displacements[numbers]
+        points[new], covariances[new] = measure_points(view, T_world_camera, rows[new], noise)
+        displacements[new] = view.shutter_displacements[rows[new]] @ T_world_camera[:3, :3].T
         return Landmarks(
-            points=points, spreads=spreads, sways=sways, descriptors=view.features.descriptors[rows],
-            rays=points - T_world_camera[:3, 3], turns=_turns_in_world(view, T_world_camera, rows),
-            sizes=view.features.sizes[rows], numbers=numbers,
-        )  # fmt: skip
+            points=points,
+            covariances=covariances,
+            shutter_displacements=displacements,
+            descriptors=view.features.descriptors[rows],
+            rays=points - T_world_camera[:3, 3],
+            orientations=_orientations_in_world(view, T_world_camera, rows),
+            sizes=view.features.sizes[rows],
+            numbers=numbers,
+        )
 
-    def fuse(
-        self, view: View, T_world_camera: Array, landmarks: Rows, noise: DepthNoise, pixel_px: float
-    ) -> None:
-        """Take what an image measured of ``(n,)`` landmarks of its features into the map."""
+    def fuse(self, view: View, T_world_camera: Array, landmarks: Rows, noise: DepthNoise) -> None:
+        """Update landmarks by the measurements of an image, as a Kalman filter does.
+
+        Args:
+            view: The image.
+            T_world_camera: ``(4, 4)``, its pose.
+            landmarks: ``(n,)``, landmark of each feature, or NO_LANDMARK.
+            noise: Noise model of the depths.
+        """
         rows = np.flatnonzero((landmarks != NO_LANDMARK) & np.isfinite(view.points_camera[:, 2]))
         if not len(rows):
             return
-        numbers = landmarks[rows]
-        known = transform(inverse(T_world_camera), self._points[numbers])[:, 2] if view.is_stereo else None
-        points, spreads = measure_points(view, T_world_camera, rows, noise, pixel_px, known)
-        before = self._spreads[numbers]
-        gain = before @ _inverse_symmetric(before + spreads)
-        sways = view.sways[rows] @ T_world_camera[:3, :3].T
-        self._points[numbers] += np.einsum("nij,nj->ni", gain, points - self._points[numbers])
-        self._sways[numbers] += np.einsum("nij,nj->ni", gain, sways - self._sways[numbers])
-        self._spreads[numbers] = (np.eye(3) - gain) @ before + _FUSED_FLOOR_M2 * np.eye(3)
+        numbers, table = landmarks[rows], self._table
+        expected_m = None
+        if view.is_stereo:
+            expected_m = transform(inverse(T_world_camera), table.points[numbers])[:, 2]
+        points, covariances = measure_points(view, T_world_camera, rows, noise, expected_m)
+        prior = table.covariances[numbers]
+        gain = prior @ _invert_symmetric(prior + covariances)
+        displacements = view.shutter_displacements[rows] @ T_world_camera[:3, :3].T
+        for column, measured in ((table.points, points), (table.shutter_displacements, displacements)):
+            column[numbers] += np.einsum("nij,nj->ni", gain, measured - column[numbers])
+        table.covariances[numbers] = (np.eye(3) - gain) @ prior + _FUSION_FLOOR_M2 * np.eye(3)
 
-    def lengthen_readout(self, more_s: float) -> None:
-        """Move all landmarks to where they are if the camera reads an image for so many seconds longer."""
-        self._points[: self._count] += more_s * self._sways[: self._count]
+    def change_readout(self, change_s: float) -> None:
+        """Move all landmarks to where they are if the camera's readout takes *change_s* seconds longer."""
+        table, count = self._table, self._count
+        table.points[:count] += change_s * table.shutter_displacements[:count]
 
     def move(self, T_new_old: Array) -> None:
-        """Express the whole map in another frame."""
-        rotation, count = T_new_old[:3, :3], self._count
+        """Express the whole map in another world frame, by the ``(4, 4)`` rigid motion *T_new_old*."""
+        rotation, table = T_new_old[:3, :3], self._table.select(slice(self._count))
         self._poses = T_new_old @ self._poses
-        self._points[:count] = transform(T_new_old, self._points[:count])
-        self._spreads[:count] = rotation @ self._spreads[:count] @ rotation.T
-        self._sways[:count] = self._sways[:count] @ rotation.T
-        self._rays[:count] = self._rays[:count] @ rotation.T
-        self._turns[:count] = self._turns[:count] @ rotation.T
+        table.points[:] = transform(T_new_old, table.points)
+        table.covariances[:] = rotation @ table.covariances @ rotation.T
+        for directions in (table.shutter_displacements, table.rays, table.orientations):
+            directions[:] = directions @ rotation.T
 
     def correct(self, T_world_camera: Array, f_baseline: float, offset_px: float) -> None:
-        """Take corrected poses, and disparities that are *offset_px* larger.
+        """Set corrected poses, and add an offset to all disparities.
 
-        Each landmark follows the last keyframe that sees it.
+        Each landmark moves with the last keyframe that sees it.
 
         Args:
-            T_world_camera: ``(k, 4, 4)``, of all keyframes.
+            T_world_camera: ``(k, 4, 4)``, corrected poses of all keyframes.
             f_baseline: Focal length in pixels times the baseline in metres.
-            offset_px: Pixels.
+            offset_px: Pixels that are added to every disparity.
         """
-        of = np.zeros(self._count, dtype=np.int64)
-        for number, record in enumerate(self._keyframes):
-            of[record.own] = number
-        count, before, after = self._count, self._poses[of, :3], T_world_camera[of, :3]
-        seen = np.einsum("nji,nj->ni", before[:, :, :3], self._points[:count] - before[:, :, 3])
-        moved = with_offset(seen, f_baseline, offset_px)
-        seen = np.where(np.isfinite(moved), moved, seen)
-        rotation = after[:, :, :3] @ before[:, :, :3].transpose(0, 2, 1)
-        self._rays[:count] = np.einsum("nij,nj->ni", after[:, :, :3], seen)
-        self._points[:count] = self._rays[:count] + after[:, :, 3]
-        self._spreads[:count] = rotation @ self._spreads[:count] @ rotation.transpose(0, 2, 1)
-        self._turns[:count] = np.einsum("nij,nj->ni", rotation, self._turns[:count])
-        self._sways[:count] = np.einsum("nij,nj->ni", rotation, self._sways[:count])
+        newest_keyframe = np.zeros(self._count, dtype=np.int64)
+        for keyframe, seen in enumerate(self._seen):
+            newest_keyframe[seen[seen != NO_LANDMARK]] = keyframe
+        old, new = self._poses[newest_keyframe, :3], T_world_camera[newest_keyframe, :3]
+        table = self._table.select(slice(self._count))
+        # 1. Points in the frame of their keyframe, moved along their rays by the offset.
+        local = np.einsum("nji,nj->ni", old[:, :, :3], table.points - old[:, :, 3])
+        moved = with_offset(local, f_baseline, offset_px)
+        local = np.where(np.isfinite(moved), moved, local)
+        # 2. Back to the world by the corrected poses.
+        rotation = new[:, :, :3] @ old[:, :, :3].transpose(0, 2, 1)
+        table.rays[:] = np.einsum("nij,nj->ni", new[:, :, :3], local)
+        table.points[:] = table.rays + new[:, :, 3]
+        table.covariances[:] = rotation @ table.covariances @ rotation.transpose(0, 2, 1)
+        table.orientations[:] = np.einsum("nij,nj->ni", rotation, table.orientations)
+        table.shutter_displacements[:] = np.einsum("nij,nj->ni", rotation, table.shutter_displacements)
         self._poses = T_world_camera.copy()
-        self._keyframes = [
-            replace(record, view=replace(
-                record.view, points_camera=with_offset(record.view.points_camera, f_baseline, offset_px)
-            ))
-            for record in self._keyframes
-        ]  # fmt: skip
+        # 3. The points that the keyframes measured.
+        self._views = [
+            replace(view, points_camera=with_offset(view.points_camera, f_baseline, offset_px))
+            for view in self._views
+        ]
 
-    def take(self, other: KeyframeMap) -> int:
-        """Add all of another map in the same frame; return the number that its first landmark has here."""
+    def append(self, other: KeyframeMap) -> int:
+        """Add all of another map in the same world frame; return the number of its first landmark here."""
         first = self._count
-        for number, record in enumerate(other._keyframes):
-            landmarks = np.where(record.landmarks == NO_LANDMARK, NO_LANDMARK, record.landmarks + first)
-            self._keyframes.append(_Keyframe(view=record.view, landmarks=landmarks, own=record.own + first))
-            self._poses = np.concatenate([self._poses, other._poses[number][None]])
-        self._places = np.concatenate([self._places, other._places])
-        self._make_room(first + other._count)
+        self._views += other._views
+        self._seen += [shift_landmarks(seen, first) for seen in other._seen]
+        self._poses = np.concatenate([self._poses, other._poses])
+        self._place_vectors = np.concatenate([self._place_vectors, other._place_vectors])
+        self._reserve(first + other._count)
         self._count += other._count
-        for mine, theirs in zip(self._arrays(), other._arrays(), strict=True):
-            mine[first : self._count] = theirs[: other._count]
+        for own, others in zip(_columns(self._table), _columns(other._table), strict=True):
+            own[first : self._count] = others[: other._count]
         return first
 
-    def _seen_by(self, keyframes: list[int]) -> Rows:
-        """Return the landmarks that any of the keyframes sees, ascending."""
-        is_seen = np.zeros(self._count, dtype=bool)
-        for number in keyframes:
-            is_seen[self._keyframes[number].own] = True
-        return np.flatnonzero(is_seen)
+    def _numbers_seen_by(self, keyframes: list[int]) -> Rows:
+        """Return the ascending numbers of the landmarks that at least one of the keyframes sees."""
+        is_seen = np.zeros(self._count + 1, dtype=bool)  # the last row is that of NO_LANDMARK
+        for keyframe in keyframes:
+            is_seen[self._seen[keyframe]] = True
+        return np.flatnonzero(is_seen[:-1])
 
-    def _note_look(self, numbers: Rows, view: View, T_world_camera: Array, rows: Rows) -> None:
-        """Take how landmarks look in the newest keyframe that sees them."""
-        self._descriptors[numbers] = view.features.descriptors[rows]
-        self._rays[numbers] = self._points[numbers] - T_world_camera[:3, 3]
-        self._turns[numbers] = _turns_in_world(view, T_world_camera, rows)
-        self._sizes[numbers] = view.features.sizes[rows]
+    def _update_appearance(self, numbers: Rows, view: View, T_world_camera: Array, rows: Rows) -> None:
+        """Note how landmarks look in the newest keyframe that sees them."""
+        table = self._table
+        table.descriptors[numbers] = view.features.descriptors[rows]
+        table.rays[numbers] = table.points[numbers] - T_world_camera[:3, 3]
+        table.orientations[numbers] = _orientations_in_world(view, T_world_camera, rows)
+        table.sizes[numbers] = view.features.sizes[rows]
 
-    def _arrays(self) -> tuple[npt.NDArray[np.generic], ...]:
-        return (
-            self._points, self._spreads, self._sways, self._descriptors, self._rays, self._turns, self._sizes
-        )  # fmt: skip
-
-    def _make_room(self, count: int) -> None:
-        if count <= len(self._points):
+    def _reserve(self, count: int) -> None:
+        """Provide memory for *count* landmarks, at least twice as much as before if it does not suffice."""
+        if count <= len(self._table):
             return
-        room = max(count, 2 * len(self._points))
+        larger = _allocate(max(count, 2 * len(self._table)), self._table.descriptors)
+        for new, old in zip(_columns(larger), _columns(self._table), strict=True):
+            new[: self._count] = old[: self._count]
+        self._table = larger
 
-        def grown(array: npt.NDArray[np.generic]) -> npt.NDArray[np.generic]:
-            larger = np.empty((room, *array.shape[1:]), dtype=array.dtype)
-            larger[: self._count] = array[: self._count]
-            return larger
+    def _thin_out(self, current: Rows) -> Rows:
+        """Remove every second keyframe of the older half, and landmarks that no keyframe sees any more.
 
-        arrays = [grown(array) for array in self._arrays()]
-        self._points, self._spreads, self._sways = arrays[0], arrays[1], arrays[2]  # type: ignore[assignment]
-        self._descriptors, self._rays = arrays[3], arrays[4]  # type: ignore[assignment]
-        self._turns, self._sizes = arrays[5], arrays[6]  # type: ignore[assignment]
-
-    def _thin(self, current: Rows) -> Rows:
-        """Drop every second keyframe of the older half, and landmarks that none sees; renumber *current*."""
-        half = len(self._keyframes) // 2
-        stays = np.ones(len(self._keyframes), dtype=bool)
-        stays[:half:2] = False
-        keyframes = [record for record, is_kept in zip(self._keyframes, stays, strict=True) if is_kept]
-        is_seen = np.zeros(self._count + 1, dtype=bool)
-        for record in keyframes:
-            is_seen[record.own] = True
-        is_seen[current] = True
-        is_seen[self._count] = False  # where NO_LANDMARK points to
-        numbers = np.full(self._count + 1, NO_LANDMARK)
-        numbers[np.flatnonzero(is_seen)] = np.arange(int(is_seen.sum()))
-        rows = np.flatnonzero(is_seen)
-        for array in self._arrays():
-            array[: len(rows)] = array[rows]
+        Landmarks are renumbered; *current*, landmarks that must stay, is returned with the new numbers.
+        """
+        is_kept = np.ones(len(self._views), dtype=bool)
+        is_kept[: len(self._views) // 2 : 2] = False
+        kept = np.flatnonzero(is_kept)
+        self._views = [self._views[keyframe] for keyframe in kept]
+        self._seen = [self._seen[keyframe] for keyframe in kept]
+        self._poses, self._place_vectors = self._poses[kept], self._place_vectors[kept]
+        rows = np.unique(np.concatenate([*self._seen, current]))
+        rows = rows[rows != NO_LANDMARK]
+        new_numbers = np.full(self._count + 1, NO_LANDMARK)  # the last row is that of NO_LANDMARK
+        new_numbers[rows] = np.arange(len(rows))
+        for column in _columns(self._table):
+            column[: len(rows)] = column[rows]
         self._count = len(rows)
-        self._keyframes = [
-            _Keyframe(view=record.view, landmarks=numbers[record.landmarks], own=np.sort(numbers[record.own]))
-            for record in keyframes
-        ]
-        self._poses, self._places = self._poses[stays], self._places[stays]
-        return numbers[current]
+        self._seen = [new_numbers[seen] for seen in self._seen]
+        return new_numbers[current]
 
 
-def _inverse_symmetric(matrices: Array) -> Array:
-    """Return the inverses of ``(n, 3, 3)`` symmetric matrices by their cofactors: LAPACK takes longer."""
+def _allocate(capacity: int, descriptors: Descriptors) -> Landmarks:
+    """Return memory for landmarks with descriptors of the kind of *descriptors*; only the numbers are set."""
+    return Landmarks(
+        points=np.empty((capacity, 3)),
+        covariances=np.empty((capacity, 3, 3)),
+        shutter_displacements=np.empty((capacity, 3)),
+        descriptors=np.empty((capacity, descriptors.shape[1]), dtype=descriptors.dtype),
+        rays=np.empty((capacity, 3)),
+        orientations=np.empty((capacity, 3)),
+        sizes=np.empty(capacity),
+        numbers=np.arange(capacity),
+    )
+
+
+def _columns(table: Landmarks) -> list[npt.NDArray[np.generic]]:
+    """Return the arrays of a table of landmarks, but for the numbers, which are those of its rows."""
+    return [getattr(table, column.name) for column in fields(table) if column.name != "numbers"]
+
+
+def _invert_symmetric(matrices: Array) -> Array:
+    """Invert ``(n, 3, 3)`` symmetric matrices by their cofactors, which is faster than LAPACK."""
     a, b, c, d, e, f = matrices.reshape(-1, 9).T[[0, 1, 2, 4, 5, 8]]
     ab, ac, bc = c * e - b * f, b * e - c * d, b * c - a * e
-    inverses = np.stack([d * f - e * e, ab, ac, ab, a * f - c * c, bc, ac, bc, a * d - b * b], axis=1)
-    inverses /= (a * inverses[:, 0] + b * ab + c * ac)[:, None]
-    found: Array = inverses.reshape(-1, 3, 3)
-    return found
+    cofactors = np.stack([d * f - e * e, ab, ac, ab, a * f - c * c, bc, ac, bc, a * d - b * b], axis=1)
+    cofactors /= (a * cofactors[:, 0] + b * ab + c * ac)[:, None]
+    inverses: Array = cofactors.reshape(-1, 3, 3)
+    return inverses
 
 
-def _turns_in_world(view: View, T_world_camera: Array, rows: Rows) -> Array:
-    turned: Array = view.features.turns[rows] @ T_world_camera[:3, :2].T
-    return turned
+def _orientations_in_world(view: View, T_world_camera: Array, rows: Rows) -> Array:
+    directions: Array = view.features.orientations[rows] @ T_world_camera[:3, :2].T
+    return directions

@@ -1,8 +1,7 @@
-"""The map of one camera without depth: keyframes, the landmarks that they see, and their adjustment.
+"""The map of one segment of a camera without depth: keyframes, landmarks, and their bundle adjustment.
 
-A landmark is a point that two or more keyframes have triangulated.  Memory and time are bounded by
-``LandmarkLimits``.  It holds no images and sends nothing; which frame becomes a keyframe, and which places
-are the same, is decided elsewhere.
+A landmark is a point that two or more keyframes have triangulated.  `LandmarkLimits` bounds memory and time.
+The tracker decides which frames become keyframes, and which keyframes show the same place.
 """
 
 from __future__ import annotations
@@ -13,39 +12,58 @@ import numpy as np
 import numpy.typing as npt
 
 from client_sdk.monocular.bundle import Adjuster, Bundle, adjust
-from client_sdk.tracking.keyframe_map import NO_LANDMARK, Landmarks
-from client_sdk.tracking.place import Place
+from client_sdk.tracking.landmarks import NO_LANDMARK, Landmarks, Matches, shift_landmarks
+from client_sdk.tracking.place_recognition import LazyPlaceVector
 from rse_pf.geometry import Array, Camera, exp_se3, inverse, log_se3, scaled, transform
 from rse_pf.maps.descriptors import Descriptors
-from rse_pf.slam.place_recognition import PlaceVector
-from rse_pf.slam.tracking import ImageFeatures, NearLimits
+from rse_pf.slam.tracking import GuidedMatchLimits, ImageFeatures
 from rse_pf.slam.triangulation import parallax_deg, reprojection_errors, triangulate
 
-__all__ = ["MIN_SHARED", "LandmarkLimits", "LandmarkMap", "ViewFeatures"]
+__all__ = ["MIN_SHARED_LANDMARKS", "LandmarkLimits", "LandmarkMap", "MonocularKeyframe", "MonocularView"]
 
 Rows = npt.NDArray[np.int64]
 
-MIN_SHARED = 15
-"""Keyframes that share so many landmarks are neighbours."""
-_NEAREST_LANDMARKS = 3
+MIN_SHARED_LANDMARKS = 15
+"""Fewest common landmarks of two keyframes that are neighbours in the covisibility graph."""
+_LATEST_NEIGHBOURS = 2
+"""Number of newest keyframes that count as neighbours of a keyframe even without common landmarks."""
+_DEPTH_LANDMARKS = 3
+"""Number of nearest landmarks in the image whose mean depth is taken for a feature without a landmark."""
+_MIN_LANDMARK_DEPTH = 1e-3
+"""Smallest depth, in the unit of the map, whose inverse is taken where depths are averaged."""
+_MIN_BASELINE_DEPTH_SHARE = 0.01
+"""Smallest distance of two keyframes that triangulate, as a share of the median depth: nearer, they see no
+parallax."""
+_OBSERVE_RADIUS_PX = 3.0
+"""Radius around a projected landmark in which a keyframe without it may observe it again."""
+_PROJECTED_LOWE_RATIO = 0.9
+"""Lowe's ratio for matches around the pixels of a triangulated landmark in another keyframe."""
+_LOCAL_ITERATIONS = 5
+"""Iterations of the bundle adjustment that follows every keyframe: bounds the time of a frame."""
+_CULL_AGE_KEYFRAMES = 3
+"""Number of newer keyframes after which a landmark that too few keyframes have seen is removed."""
+_CULL_OBSERVATIONS = 3
+"""Fewest keyframes that must have seen a landmark when it is no longer new: a wrong match is seen by two."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LandmarkLimits:
-    """How much a map holds, and which observations it accepts.
+    """Limits of the map of a camera without depth: its size, and the observations that it accepts.
 
     Attributes:
-        neighbours: Keyframes with which a new one is triangulated.
-        local: Keyframes that share landmarks with one, among whose landmarks a frame is matched.
-        search_px: Radius in which a feature is sought whose depth is that of the landmarks around it.
-        window: Keyframes that a local adjustment moves.
-        fixed: Further keyframes that see the same landmarks and take part with fixed poses.
-        in_all: Landmarks that an adjustment of all keyframes takes, those seen most; the others follow.
-        max_in_all: Keyframes of a map beyond which they are no longer adjusted all together.
-        min_parallax_deg: Smallest angle between the rays of a new landmark.
-        outlier_sigma: Observations farther than this many standard deviations from the landmark are removed.
-        pixel_sigma: Standard deviation of a feature of the finest octave, pixels.
-        max_keyframes: After that the map is tracked, and no longer extended.
+        neighbours: Number of neighbours with which a new keyframe triangulates landmarks.
+        local: Number of neighbours of a keyframe whose landmarks are matched with a frame.
+        search_px: Radius in which a feature is matched whose depth is taken from the landmarks around it.
+        window: Number of keyframes that a local bundle adjustment moves.
+        fixed: Number of further keyframes that take part in a local adjustment with fixed poses.
+        in_all: Number of landmarks, those seen most often, that an adjustment of all keyframes takes; the
+            others are adjusted to the result.
+        max_in_all: Number of keyframes beyond which they are no longer adjusted all together.
+        min_parallax_deg: Smallest angle between the rays of a new landmark, in degrees.
+        outlier_sigma: Observations whose reprojection error is larger than this many standard deviations are
+            removed.
+        pixel_sigma: Standard deviation of a feature on the finest pyramid level, in pixels.
+        max_keyframes: Number of keyframes after which the map is tracked, and no longer extended.
     """
 
     neighbours: int = 6
@@ -62,319 +80,213 @@ class LandmarkLimits:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class ViewFeatures:
-    """Features of one image, their ``(n, 3)`` uint8 colours, and its place."""
+class MonocularView:
+    """One image without depth, as it is matched and kept in a map.
 
-    image: ImageFeatures
+    Attributes:
+        features: Features of the image, ``n`` of them.
+        colours: ``(n, 3)`` uint8, red first: colour of the image at each feature.
+        place_vector: Vector by which the place of the image is recognised.
+    """
+
+    features: ImageFeatures
     colours: npt.NDArray[np.uint8]
-    place: Place
+    place_vector: LazyPlaceVector
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
-class _Keyframe:
-    """``landmarks`` ``(n,)`` holds the landmark of each feature, or NO_LANDMARK."""
+class MonocularKeyframe:
+    """A keyframe of a map: its image, and what the bundle adjustment changes.
 
-    features: ViewFeatures
+    Attributes:
+        view: The image.
+        T_camera_world: ``(4, 4)``.
+        landmarks: ``(n,)``, landmark of each feature, or NO_LANDMARK.
+    """
+
+    view: MonocularView
     T_camera_world: Array
     landmarks: Rows
-    place: PlaceVector
 
 
 class LandmarkMap:
-    """Keyframes and landmarks; ``camera`` took all of them, and *adjuster* adjusts them as `adjust` does."""
+    """Keyframes of one camera and their landmarks.
+
+    Attributes:
+        camera: Intrinsics of all keyframes.
+        limits: Limits of the map.
+        keyframes: All keyframes, oldest first.
+        points: ``(n, 3)`` landmarks in the world, in the unit of the map.
+        descriptors: ``(n, d)``, in the newest keyframe that sees each landmark.
+        colours: ``(n, 3)`` uint8.
+        is_alive: ``(n,)``; removed landmarks keep their number and are not alive.
+    """
 
     def __init__(
         self, camera: Camera, limits: LandmarkLimits | None = None, adjuster: Adjuster = adjust
     ) -> None:
         self.camera = camera
-        self._adjust_bundle = adjuster
         self.limits = limits or LandmarkLimits()
-        self.keyframes: list[_Keyframe] = []
+        self.keyframes: list[MonocularKeyframe] = []
         self.points: Array = np.empty((0, 3))
         self.descriptors: Descriptors = np.empty((0, 0), dtype=np.uint8)
         self.colours: npt.NDArray[np.uint8] = np.empty((0, 3), dtype=np.uint8)
         self.is_alive: npt.NDArray[np.bool_] = np.empty(0, dtype=bool)
-        self._born: Rows = np.empty(0, dtype=np.int64)
+        self._adjust_bundle = adjuster
+        self._first_keyframes: Rows = np.empty(0, dtype=np.int64)
+        """The newest keyframe when each landmark was made."""
         self._rays: Array = np.empty((0, 3))
-        self._turns: Array = np.empty((0, 3))
+        self._orientations: Array = np.empty((0, 3))
         self._sizes: Array = np.empty(0)
 
-    def __len__(self) -> int:
+    @property
+    def keyframe_count(self) -> int:
+        """The number of keyframes."""
+        return len(self.keyframes)
+
+    @property
+    def landmark_count(self) -> int:
+        """The number of landmarks that are alive."""
         return int(self.is_alive.sum())
 
-    def add_keyframe(self, features: ViewFeatures, T_camera_world: Array, landmarks: Rows) -> int:
-        """Add a keyframe whose features see *landmarks*, ``(n,)``, and return its number."""
+    # --- Add keyframes and landmarks ---
+
+    def add_keyframe(self, view: MonocularView, T_camera_world: Array, landmarks: Rows) -> int:
+        """Add a keyframe and return its number.
+
+        Args:
+            view: The image.
+            T_camera_world: ``(4, 4)``, its pose.
+            landmarks: ``(n,)``, landmark of each feature, or NO_LANDMARK.
+        """
         if not len(self.points):
-            self.descriptors = features.image.descriptors[:0]
+            self.descriptors = view.features.descriptors[:0]
         self.keyframes.append(
-            _Keyframe(
-                features=features,
-                T_camera_world=T_camera_world,
-                landmarks=landmarks.copy(),
-                place=features.place.vector(),
-            )
+            MonocularKeyframe(view=view, T_camera_world=T_camera_world, landmarks=landmarks.copy())
         )
+        view.place_vector.get()  # computed now, so that the image is released
+        number = len(self.keyframes) - 1
         seen = np.flatnonzero(landmarks != NO_LANDMARK)
-        self._observed(len(self.keyframes) - 1, landmarks[seen], seen)
-        return len(self.keyframes) - 1
+        self._update_appearance(number, landmarks[seen], seen)
+        return number
 
     def add_landmarks(self, points: Array, first: tuple[int, Rows], second: tuple[int, Rows]) -> None:
-        """Add landmarks that two keyframes see; each is (number of the keyframe, rows of its features)."""
-        rows = len(self.points) + np.arange(len(points))
-        features = self.keyframes[second[0]].features
-        self.points = np.concatenate((self.points, points))
-        self.descriptors = np.concatenate((self.descriptors, features.image.descriptors[second[1]]))
-        self.colours = np.concatenate((self.colours, features.colours[second[1]]))
-        self.is_alive = np.concatenate((self.is_alive, np.ones(len(points), dtype=bool)))
-        self._born = np.concatenate((self._born, np.full(len(points), len(self.keyframes) - 1)))
-        self._rays = np.concatenate((self._rays, np.zeros((len(points), 3))))
-        self._turns = np.concatenate((self._turns, np.zeros((len(points), 3))))
-        self._sizes = np.concatenate((self._sizes, np.ones(len(points))))
-        for number, of_features in (first, second):
-            self.keyframes[number].landmarks[of_features] = rows
-            self._observed(number, rows, of_features)
+        """Add landmarks that two keyframes see.
+
+        Args:
+            points: ``(n, 3)``, in the world.
+            first: Number of a keyframe, and the ``(n,)`` rows of its features that show the landmarks.
+            second: The same of the other keyframe, which gives the colours.
+        """
+        count = len(points)
+        numbers = len(self.points) + np.arange(count)
+        view = self.keyframes[second[0]].view
+        self._append_landmarks(
+            points=points,
+            descriptors=view.features.descriptors[second[1]],
+            colours=view.colours[second[1]],
+            is_alive=np.ones(count, dtype=bool),
+            _first_keyframes=np.full(count, len(self.keyframes) - 1),
+            _rays=np.zeros((count, 3)),
+            _orientations=np.zeros((count, 3)),
+            _sizes=np.ones(count),
+        )
+        for keyframe, features in (first, second):
+            self.keyframes[keyframe].landmarks[features] = numbers
+            self._update_appearance(keyframe, numbers, features)
+
+    def extend(self, number: int) -> int:
+        """Triangulate new landmarks from a keyframe and its neighbours; return how many were added."""
+        count = len(self.points)
+        depths = self._interpolate_depths(number)
+        if depths is None:
+            return 0
+        for neighbour in self._neighbours(number)[: self.limits.neighbours]:
+            self._triangulate(number, neighbour, depths)
+        for neighbour in self._neighbours(number):
+            self._observe_again(neighbour, np.arange(count, len(self.points)))
+        return len(self.points) - count
+
+    def append(self, other: LandmarkMap) -> tuple[int, int]:
+        """Add all of another map in the same world frame; return its first keyframe's and landmark's
+        numbers."""
+        keyframe, landmark = len(self.keyframes), len(self.points)
+        if not landmark:
+            self.descriptors = other.descriptors[:0]
+        self.keyframes += [
+            replace(record, landmarks=shift_landmarks(record.landmarks, landmark))
+            for record in other.keyframes
+        ]
+        self._append_landmarks(
+            points=other.points,
+            descriptors=other.descriptors,
+            colours=other.colours,
+            is_alive=other.is_alive,
+            _first_keyframes=other._first_keyframes + keyframe,
+            _rays=other._rays,
+            _orientations=other._orientations,
+            _sizes=other._sizes,
+        )
+        return keyframe, landmark
+
+    def _append_landmarks(self, **columns: npt.NDArray[np.generic]) -> None:
+        """Append rows to all arrays that have one row for each landmark."""
+        for name, rows in columns.items():
+            setattr(self, name, np.concatenate((getattr(self, name), rows)))
+
+    # --- Look up ---
 
     def landmarks_of(self, number: int) -> Rows:
-        """Return the landmarks that a keyframe sees."""
+        """Return the numbers of the landmarks that a keyframe sees."""
         landmarks: Rows = self.keyframes[number].landmarks
         seen: Rows = landmarks[landmarks != NO_LANDMARK]
         return seen
 
     def landmarks(self, numbers: Rows) -> Landmarks:
-        """Return landmarks as they are sought in an image; they are points without spread."""
+        """Return landmarks by their numbers, without uncertainty."""
+        count = len(numbers)
         return Landmarks(
-            points=self.points[numbers], spreads=np.broadcast_to(np.zeros((3, 3)), (len(numbers), 3, 3)),
-            descriptors=self.descriptors[numbers], rays=self._rays[numbers], turns=self._turns[numbers],
-            sizes=self._sizes[numbers], numbers=numbers,
-        )  # fmt: skip
-
-    def local(self, number: int) -> list[int]:
-        """Return a keyframe and those that share landmarks with it, most first."""
-        return [number, *self._neighbours(number)[: self.limits.local]]
-
-    def around(self, number: int) -> Rows:
-        """Return the landmarks of a keyframe and of those that share landmarks with it."""
-        return np.unique(np.concatenate([self.landmarks_of(keyframe) for keyframe in self.local(number)]))
-
-    def most_alike(self, place: Place, among: Rows) -> list[int]:
-        """Return keyframes of *among* in the order of how much they look like an image."""
-        places = np.stack([self.keyframes[number].place for number in among])
-        alike: list[int] = among[np.argsort(-(places @ place.vector()), kind="stable")].tolist()
-        return alike
-
-    def landmarks_in(self, number: int) -> tuple[Rows, Descriptors]:
-        """Return the landmarks of one keyframe, and the descriptors that this keyframe has of them."""
-        keyframe = self.keyframes[number]
-        rows = np.flatnonzero(keyframe.landmarks != NO_LANDMARK)
-        return keyframe.landmarks[rows], keyframe.features.image.descriptors[rows]
-
-    def extend(self, number: int) -> int:
-        """Triangulate what a keyframe and its neighbours see and no landmark has; return how many."""
-        before = len(self.points)
-        depths = self._depths_nearby(number)
-        if depths is None:
-            return 0
-        for other in self._neighbours(number)[: self.limits.neighbours]:
-            self._triangulate(number, other, depths)
-        for other in self._neighbours(number):
-            self._observe_again(other, np.arange(before, len(self.points)))
-        return len(self.points) - before
-
-    def adjust_around(self, number: int) -> None:
-        """Adjust a keyframe, its neighbours, and all landmarks that they see; remove outliers."""
-        window = [number, *self._neighbours(number)[: self.limits.window - 1]]
-        self._adjust(sorted(window), self.limits.fixed, iterations=5)
-
-    def adjust_all(self, *, iterations: int = 12) -> None:
-        """Adjust every keyframe and every landmark; the first two keyframes keep their places.
-
-        A map of more than ``max_in_all`` keyframes stays as it is.
-        """
-        if len(self.keyframes) > self.limits.max_in_all:
-            return
-        everything = list(range(len(self.keyframes)))
-        self._adjust(everything, 0, iterations=iterations)
-        self._adjust(everything, 0, iterations=iterations)
-
-    def cull(self) -> None:
-        """Remove landmarks that only two keyframes see although newer ones should."""
-        counts = self._observation_counts()
-        age = len(self.keyframes) - 1 - self._born
-        self._remove(np.flatnonzero(self.is_alive & ((counts < 2) | ((age >= 3) & (counts < 3)))))
-
-    def move(self, T_new_old: Array, scale: float = 1.0) -> None:
-        """Express the map in another frame: multiply all lengths by *scale*, then move it by *T_new_old*."""
-        rotation = T_new_old[:3, :3]
-        self.points = transform(T_new_old, scale * self.points)
-        self._rays = scale * self._rays @ rotation.T
-        self._turns = self._turns @ rotation.T
-        for keyframe in self.keyframes:
-            keyframe.T_camera_world = scaled(keyframe.T_camera_world, scale) @ inverse(T_new_old)
-
-    def take(self, other: LandmarkMap) -> tuple[int, int]:
-        """Add all of another map in the same frame; return the numbers of its first keyframe and landmark."""
-        keyframe, landmark = len(self.keyframes), len(self.points)
-        if not landmark:
-            self.descriptors = other.descriptors[:0]
-        self.keyframes += [
-            replace(
-                record,
-                landmarks=np.where(record.landmarks == NO_LANDMARK, NO_LANDMARK, record.landmarks + landmark),
-            )
-            for record in other.keyframes
-        ]
-        self.points = np.concatenate((self.points, other.points))
-        self.descriptors = np.concatenate((self.descriptors, other.descriptors))
-        self.colours = np.concatenate((self.colours, other.colours))
-        self.is_alive = np.concatenate((self.is_alive, other.is_alive))
-        self._born = np.concatenate((self._born, other._born + keyframe))
-        self._rays = np.concatenate((self._rays, other._rays))
-        self._turns = np.concatenate((self._turns, other._turns))
-        self._sizes = np.concatenate((self._sizes, other._sizes))
-        return keyframe, landmark
-
-    def bend(self, older: int, newer: int, T_new_old: Array, scale: float) -> None:
-        """Move the keyframes between two by a growing share of what moves the newer one and its landmarks.
-
-        Args:
-            older: Stays, with all before it.
-            newer: Moves as a whole, with all after it: by *T_new_old* after its lengths are multiplied.
-            T_new_old: ``(4, 4)``.
-            scale: Of all lengths, about the origin.
-        """
-        centre = inverse(self.keyframes[newer].T_camera_world)[:3, 3]
-        moved = transform(T_new_old, scale * centre[None])[0]
-        turn = log_se3(_turned(T_new_old[:3, :3])[None])[0]
-        numbers = np.arange(len(self.keyframes))
-        shares = np.clip((numbers - older) / max(1, newer - older), 0.0, 1.0)
-        rotations = exp_se3(shares[:, None] * turn)[:, :3, :3]
-        scales = scale**shares
-        # x -> centre + share (moved - centre) + scale R (x - centre), of each keyframe.
-        shifts = centre + shares[:, None] * (moved - centre)
-        shifts -= scales[:, None] * (rotations @ centre)
-        for number in np.flatnonzero(shares > 0.0):
-            motion = _turned(rotations[number])
-            motion[:3, 3] = shifts[number]
-            keyframe = self.keyframes[number]
-            keyframe.T_camera_world = scaled(keyframe.T_camera_world, scales[number]) @ inverse(motion)
-        born = self._born
-        self.points = (
-            scales[born, None] * np.einsum("nij,nj->ni", rotations[born], self.points) + shifts[born]
+            points=self.points[numbers],
+            covariances=np.broadcast_to(np.zeros((3, 3)), (count, 3, 3)),
+            shutter_displacements=np.broadcast_to(np.zeros(3), (count, 3)),
+            descriptors=self.descriptors[numbers],
+            rays=self._rays[numbers],
+            orientations=self._orientations[numbers],
+            sizes=self._sizes[numbers],
+            numbers=numbers,
         )
 
-    def fuse(self, number: int, landmarks: Rows, radius_px: float) -> int:
-        """Let a keyframe see *landmarks* where it sees them; return how many were two landmarks, now one.
+    def landmarks_in(self, keyframe: int) -> tuple[Landmarks, Descriptors]:
+        """Return the landmarks that a keyframe sees, and their descriptors in that keyframe."""
+        record = self.keyframes[keyframe]
+        rows = np.flatnonzero(record.landmarks != NO_LANDMARK)
+        return self.landmarks(record.landmarks[rows]), record.view.features.descriptors[rows]
 
-        Where the feature at the projected pixel has another landmark already, both are the same.
+    def local_keyframes(self, number: int) -> list[int]:
+        """Return a keyframe, and its neighbours in the order of how many landmarks they share with it."""
+        return [number, *self._neighbours(number)[: self.limits.local]]
+
+    def local_landmarks(self, number: int) -> Rows:
+        """Return the ascending numbers of the landmarks that a keyframe and its neighbours see."""
+        return np.unique(
+            np.concatenate([self.landmarks_of(keyframe) for keyframe in self.local_keyframes(number)])
+        )
+
+    def rank_by_similarity(self, place: LazyPlaceVector, count: int, among: Rows | None = None) -> list[int]:
+        """Return the *count* keyframes whose place vectors are most similar to that of an image, best first.
+
+        Only keyframes of *among* are considered, all for None.
         """
-        keyframe = self.keyframes[number]
-        landmarks = landmarks[self.is_alive[landmarks] & ~np.isin(landmarks, keyframe.landmarks)]
-        rows, columns = self.landmarks(landmarks).seek(
-            keyframe.T_camera_world, self.camera, keyframe.features.image,
-            NearLimits(radius_px=radius_px, ratio=0.9), 0.0,
-        )  # fmt: skip
-        landmarks, same = landmarks[rows], keyframe.landmarks[columns]
-        is_free = same == NO_LANDMARK
-        keyframe.landmarks[columns[is_free]] = landmarks[is_free]
-        becomes = np.arange(len(self.points) + 1)
-        becomes[-1] = NO_LANDMARK  # where NO_LANDMARK points to
-        becomes[same[~is_free]] = landmarks[~is_free]
-        for record in self.keyframes:
-            renamed = becomes[record.landmarks]
-            known, firsts = np.unique(renamed, return_index=True)
-            record.landmarks = np.full(len(renamed), NO_LANDMARK)
-            record.landmarks[firsts[known != NO_LANDMARK]] = known[known != NO_LANDMARK]
-        self.is_alive[same[~is_free]] = False
-        return int((~is_free).sum())
+        numbers = np.arange(len(self.keyframes)) if among is None else among
+        vectors = np.stack([self.keyframes[number].view.place_vector.get() for number in numbers])
+        ranked: list[int] = numbers[np.argsort(-(vectors @ place.get()), kind="stable")].tolist()
+        return ranked[:count]
 
-    def shared_with(self, number: int) -> Rows:
-        """Return how many landmarks each keyframe shares with one, ``(k,)``."""
-        own = np.zeros(len(self.points), dtype=bool)
-        own[self.landmarks_of(number)] = True
-        return np.array([int(own[self.landmarks_of(other)].sum()) for other in range(len(self.keyframes))])
-
-    def _observed(self, number: int, landmarks: Rows, of_features: Rows) -> None:
-        """Take how landmarks look in the newest keyframe that sees them."""
-        keyframe = self.keyframes[number]
-        image, T = keyframe.features.image, inverse(keyframe.T_camera_world)
-        self.descriptors[landmarks] = image.descriptors[of_features]
-        self._rays[landmarks] = self.points[landmarks] - T[:3, 3]
-        self._turns[landmarks] = image.turns[of_features] @ T[:3, :2].T
-        self._sizes[landmarks] = image.sizes[of_features]
-
-    def _neighbours(self, number: int) -> list[int]:
-        """Return the other keyframes that share landmarks with one, most first."""
-        shared = self.shared_with(number)
-        shared[number] = 0
-        order = np.argsort(-shared, kind="stable")
-        near = [int(other) for other in order if shared[other] >= MIN_SHARED]
-        latest = [other for other in range(number - 1, max(-1, number - 3), -1) if other not in near]
-        return near + latest
-
-    def _triangulate(self, number: int, other: int, depths: Array) -> None:
-        one, two = self.keyframes[other], self.keyframes[number]
-        base = np.linalg.norm(inverse(one.T_camera_world)[:3, 3] - inverse(two.T_camera_world)[:3, 3])
-        if base < 0.01 * self.median_depth(number):
-            return
-        rows, columns = self._matches_by_depth(one, two, depths)
-        if not len(rows):
-            return
-        sigma = np.maximum(one.features.image.sizes[rows], two.features.image.sizes[columns])
-        points, good = triangulate(
-            one.T_camera_world, two.T_camera_world, one.features.image.pixels[rows],
-            two.features.image.pixels[columns], self.camera,
-            max_error_px=self.limits.outlier_sigma * self.limits.pixel_sigma * sigma,
-        )  # fmt: skip
-        angles = parallax_deg(points, inverse(one.T_camera_world)[:3, 3], inverse(two.T_camera_world)[:3, 3])
-        good &= angles >= self.limits.min_parallax_deg
-        self.add_landmarks(points[good], (other, rows[good]), (number, columns[good]))
-
-    def _depths_nearby(self, number: int) -> Array | None:
-        """Return the depth that each feature of a keyframe may have by the landmarks around it in the image.
-
-        The mean, in inverse depth, of the three nearest landmarks; None without landmarks.
-        """
-        keyframe = self.keyframes[number]
-        seen = np.flatnonzero(keyframe.landmarks != NO_LANDMARK)
-        if not len(seen):
-            return None
-        known = transform(keyframe.T_camera_world, self.points[keyframe.landmarks[seen]])[:, 2]
-        u, v = keyframe.features.image.pixels.T.astype(np.float32)
-        squared = np.square(u[:, None] - u[seen]) + np.square(v[:, None] - v[seen])
-        nearest = np.argpartition(squared, min(_NEAREST_LANDMARKS, len(seen)) - 1, axis=1)[
-            :, :_NEAREST_LANDMARKS
-        ]
-        depths: Array = 1.0 / (1.0 / np.maximum(known, 1e-3))[nearest].mean(axis=1)
-        return depths
-
-    def _matches_by_depth(self, one: _Keyframe, two: _Keyframe, depths: Array) -> tuple[Rows, Rows]:
-        """Return free features of two keyframes that match near the pixels which depths predict."""
-        image = two.features.image
-        free = np.flatnonzero(two.landmarks == NO_LANDMARK)
-        T_world_two = inverse(two.T_camera_world)
-        points = transform(T_world_two, self.camera.back_project(image.pixels[free], depths[free]))
-        looks = Landmarks(
-            points=points, spreads=np.empty((0, 3, 3)), descriptors=image.descriptors[free],
-            rays=points - T_world_two[:3, 3], turns=image.turns[free] @ T_world_two[:3, :2].T,
-            sizes=image.sizes[free], numbers=free,
-        )  # fmt: skip
-        rows, columns = looks.seek(
-            one.T_camera_world, self.camera, one.features.image,
-            NearLimits(radius_px=self.limits.search_px), self.limits.search_px,
-        )  # fmt: skip
-        is_free = one.landmarks[columns] == NO_LANDMARK
-        return columns[is_free], free[rows[is_free]]
-
-    def _observe_again(self, number: int, landmarks: Rows) -> None:
-        """Let a keyframe see *landmarks* where its free features look alike at the projected pixels."""
-        keyframe = self.keyframes[number]
-        landmarks = landmarks[self.is_alive[landmarks] & ~np.isin(landmarks, keyframe.landmarks)]
-        rows, columns = self.landmarks(landmarks).seek(
-            keyframe.T_camera_world, self.camera, keyframe.features.image,
-            NearLimits(radius_px=3.0, ratio=0.9), 0.0,
-        )  # fmt: skip
-        is_free = keyframe.landmarks[columns] == NO_LANDMARK
-        keyframe.landmarks[columns[is_free]] = landmarks[rows[is_free]]
+    def count_shared_landmarks(self, number: int) -> Rows:
+        """Return how many landmarks each keyframe shares with keyframe *number*, ``(k,)``."""
+        is_seen = np.zeros(len(self.points), dtype=bool)
+        is_seen[self.landmarks_of(number)] = True
+        return np.array([int(is_seen[self.landmarks_of(k)].sum()) for k in range(len(self.keyframes))])
 
     def median_depth(self, number: int) -> float:
         """Return the median depth of the landmarks that a keyframe sees, 1 if it sees none."""
@@ -383,7 +295,7 @@ class LandmarkMap:
         return float(np.median(depths)) if len(depths) else 1.0
 
     def depths(self, number: int) -> Array:
-        """Return the ``(n,)`` depths of a keyframe's features by their landmarks, NaN where there is none."""
+        """Return the ``(n,)`` depths of a keyframe's features by their landmarks, NaN without a landmark."""
         keyframe = self.keyframes[number]
         seen = keyframe.landmarks != NO_LANDMARK
         depths = np.full(len(seen), np.nan)
@@ -391,96 +303,317 @@ class LandmarkMap:
         depths[seen] = transform(keyframe.T_camera_world, points)[:, 2]
         return depths
 
-    def _observation_counts(self) -> Rows:
+    # --- Adjust, move and clean up ---
+
+    def adjust_around(self, number: int) -> None:
+        """Adjust a keyframe, its neighbours and all landmarks that they see; remove outlier observations."""
+        window = [number, *self._neighbours(number)[: self.limits.window - 1]]
+        self._adjust(sorted(window), self.limits.fixed, iterations=_LOCAL_ITERATIONS)
+
+    def adjust_all(self, *, iterations: int = 12) -> None:
+        """Adjust all keyframes and landmarks twice, with outliers removed in between.
+
+        The first two keyframes keep their poses, which fixes the frame and the scale of the map.  A map of
+        more than ``max_in_all`` keyframes stays as it is.
+        """
+        if len(self.keyframes) > self.limits.max_in_all:
+            return
+        everything = list(range(len(self.keyframes)))
+        self._adjust(everything, 0, iterations=iterations)
+        self._adjust(everything, 0, iterations=iterations)
+
+    def cull(self) -> None:
+        """Remove landmarks that fewer than two keyframes see, and older ones that only two keyframes see."""
+        counts = self._count_observations()
+        age = len(self.keyframes) - 1 - self._first_keyframes
+        is_old = age >= _CULL_AGE_KEYFRAMES
+        is_doubtful = (counts < 2) | (is_old & (counts < _CULL_OBSERVATIONS))
+        self._remove(np.flatnonzero(self.is_alive & is_doubtful))
+
+    def move(self, T_new_old: Array, scale: float = 1.0) -> None:
+        """Express the map in another world frame: multiply all lengths by *scale*, then apply *T_new_old*."""
+        rotation = T_new_old[:3, :3]
+        self.points = transform(T_new_old, scale * self.points)
+        self._rays = scale * self._rays @ rotation.T
+        self._orientations = self._orientations @ rotation.T
+        for keyframe in self.keyframes:
+            keyframe.T_camera_world = scaled(keyframe.T_camera_world, scale) @ inverse(T_new_old)
+
+    def bend(self, older: int, newer: int, T_new_old: Array, scale: float) -> None:
+        """Distribute the similarity that closes a loop over the keyframes of the loop.
+
+        Keyframes between *older* and *newer*, and the landmarks that were made with them, move by a share of
+        the similarity that grows from 0 to 1.
+
+        Args:
+            older: Number of the keyframe that stays, with all before it.
+            newer: Number of the keyframe that moves by the whole similarity, with all after it.
+            T_new_old: ``(4, 4)``, rigid motion, applied after the lengths are multiplied.
+            scale: Factor of all lengths, about the origin.
+        """
+        centre = inverse(self.keyframes[newer].T_camera_world)[:3, 3]
+        moved_centre = transform(T_new_old, scale * centre[None])[0]
+        twist = log_se3(_rotation_pose(T_new_old[:3, :3])[None])[0]
+        numbers = np.arange(len(self.keyframes))
+        shares = np.clip((numbers - older) / max(1, newer - older), 0.0, 1.0)
+        rotations = exp_se3(shares[:, None] * twist)[:, :3, :3]
+        scales = scale**shares
+        # A point x of a keyframe moves to centre + share (moved_centre - centre) + scale R (x - centre).
+        shifts = centre + shares[:, None] * (moved_centre - centre)
+        shifts -= scales[:, None] * (rotations @ centre)
+        for number in np.flatnonzero(shares > 0.0):
+            motion = _rotation_pose(rotations[number])
+            motion[:3, 3] = shifts[number]
+            keyframe = self.keyframes[number]
+            keyframe.T_camera_world = scaled(keyframe.T_camera_world, scales[number]) @ inverse(motion)
+        of = self._first_keyframes
+        self.points = scales[of, None] * np.einsum("nij,nj->ni", rotations[of], self.points) + shifts[of]
+
+    def fuse(self, number: int, landmarks: Rows, radius_px: float) -> int:
+        """Match landmarks with a keyframe that does not see them yet, and fuse duplicates.
+
+        Where the matched feature has another landmark already, both are the same point: all keyframes see the
+        given landmark instead.
+
+        Args:
+            number: Number of the keyframe.
+            landmarks: Numbers of landmarks.
+            radius_px: Radius around the projected landmarks.
+
+        Returns:
+            How many pairs of landmarks became one.
+        """
+        keyframe = self.keyframes[number]
+        matches = self._match_projected(keyframe, landmarks, radius_px)
+        matched, existing = matches.landmarks.numbers, keyframe.landmarks[matches.features]
+        is_free = existing == NO_LANDMARK
+        keyframe.landmarks[matches.features[is_free]] = matched[is_free]
+        # 1. Replace each duplicate by the matched landmark in all keyframes.
+        replacements = np.arange(len(self.points) + 1)
+        replacements[-1] = NO_LANDMARK  # the last row is that of NO_LANDMARK
+        replacements[existing[~is_free]] = matched[~is_free]
+        for record in self.keyframes:
+            renumbered = replacements[record.landmarks]
+            # 2. A keyframe sees a landmark once: its first feature keeps the landmark.
+            unique, firsts = np.unique(renumbered, return_index=True)
+            record.landmarks = np.full(len(renumbered), NO_LANDMARK)
+            record.landmarks[firsts[unique != NO_LANDMARK]] = unique[unique != NO_LANDMARK]
+        self.is_alive[existing[~is_free]] = False
+        return int((~is_free).sum())
+
+    # --- Private: triangulation ---
+
+    def _match_projected(self, keyframe: MonocularKeyframe, landmarks: Rows, radius_px: float) -> Matches:
+        """Match landmarks that a keyframe does not see near their projections in it."""
+        landmarks = landmarks[self.is_alive[landmarks] & ~np.isin(landmarks, keyframe.landmarks)]
+        limits = GuidedMatchLimits(radius_px=radius_px, lowe_ratio=_PROJECTED_LOWE_RATIO)
+        return self.landmarks(landmarks).match(
+            keyframe.T_camera_world, self.camera, keyframe.view.features, limits, 0.0
+        )
+
+    def _observe_again(self, number: int, landmarks: Rows) -> None:
+        """Match landmarks with the free features of a keyframe that does not see them yet."""
+        keyframe = self.keyframes[number]
+        matches = self._match_projected(keyframe, landmarks, _OBSERVE_RADIUS_PX)
+        is_free = keyframe.landmarks[matches.features] == NO_LANDMARK
+        keyframe.landmarks[matches.features[is_free]] = matches.landmarks.numbers[is_free]
+
+    def _triangulate(self, number: int, neighbour: int, depths: Array) -> None:
+        """Add landmarks from the free features that a keyframe and its neighbour share.
+
+        *depths* ``(n,)`` are guesses of the depths of the keyframe's features.
+        """
+        one, two = self.keyframes[neighbour], self.keyframes[number]
+        centres = [inverse(keyframe.T_camera_world)[:3, 3] for keyframe in (one, two)]
+        if np.linalg.norm(centres[0] - centres[1]) < _MIN_BASELINE_DEPTH_SHARE * self.median_depth(number):
+            return
+        rows, columns = self._match_by_depth(one, two, depths)
+        if not len(rows):
+            return
+        sizes = np.maximum(one.view.features.sizes[rows], two.view.features.sizes[columns])
+        points, is_good = triangulate(
+            one.T_camera_world,
+            two.T_camera_world,
+            one.view.features.pixels[rows],
+            two.view.features.pixels[columns],
+            self.camera,
+            max_error_px=self.limits.outlier_sigma * self.limits.pixel_sigma * sizes,
+        )
+        is_good &= parallax_deg(points, *centres) >= self.limits.min_parallax_deg
+        self.add_landmarks(points[is_good], (neighbour, rows[is_good]), (number, columns[is_good]))
+
+    def _interpolate_depths(self, number: int) -> Array | None:
+        """Guess the depth of each feature of a keyframe: the mean inverse depth of the three nearest
+        landmarks.
+
+        Nearest means in the image.  Returned is ``(n,)``, None if the keyframe sees no landmark.
+        """
+        keyframe = self.keyframes[number]
+        seen = np.flatnonzero(keyframe.landmarks != NO_LANDMARK)
+        if not len(seen):
+            return None
+        known = transform(keyframe.T_camera_world, self.points[keyframe.landmarks[seen]])[:, 2]
+        u, v = keyframe.view.features.pixels.T.astype(np.float32)
+        squared = np.square(u[:, None] - u[seen]) + np.square(v[:, None] - v[seen])
+        nearest = np.argpartition(squared, min(_DEPTH_LANDMARKS, len(seen)) - 1, axis=1)
+        inverse_depths = (1.0 / np.maximum(known, _MIN_LANDMARK_DEPTH))[nearest[:, :_DEPTH_LANDMARKS]]
+        depths: Array = 1.0 / inverse_depths.mean(axis=1)
+        return depths
+
+    def _match_by_depth(
+        self, one: MonocularKeyframe, two: MonocularKeyframe, depths: Array
+    ) -> tuple[Rows, Rows]:
+        """Match features without a landmark of two keyframes by guesses *depths* of those of the second.
+
+        Returned are the rows of matched features in the first and in the second keyframe.
+        """
+        image = two.view.features
+        free = np.flatnonzero(two.landmarks == NO_LANDMARK)
+        T_world_two = inverse(two.T_camera_world)
+        points = transform(T_world_two, self.camera.back_project(image.pixels[free], depths[free]))
+        guesses = Landmarks(
+            points=points,
+            covariances=np.broadcast_to(np.zeros((3, 3)), (len(free), 3, 3)),
+            shutter_displacements=np.broadcast_to(np.zeros(3), (len(free), 3)),
+            descriptors=image.descriptors[free],
+            rays=points - T_world_two[:3, 3],
+            orientations=image.orientations[free] @ T_world_two[:3, :2].T,
+            sizes=image.sizes[free],
+            numbers=free,
+        )
+        limits = GuidedMatchLimits(radius_px=self.limits.search_px)
+        matches = guesses.match(
+            one.T_camera_world, self.camera, one.view.features, limits, self.limits.search_px
+        )
+        is_free = one.landmarks[matches.features] == NO_LANDMARK
+        return matches.features[is_free], matches.landmarks.numbers[is_free]
+
+    def _neighbours(self, number: int) -> list[int]:
+        """Return the keyframes that share landmarks with one, most first, and the two before it."""
+        shared = self.count_shared_landmarks(number)
+        shared[number] = 0
+        order = np.argsort(-shared, kind="stable")
+        covisible = [int(k) for k in order if shared[k] >= MIN_SHARED_LANDMARKS]
+        latest = range(number - 1, max(-1, number - 1 - _LATEST_NEIGHBOURS), -1)
+        return covisible + [k for k in latest if k not in covisible]
+
+    def _update_appearance(self, number: int, landmarks: Rows, features: Rows) -> None:
+        """Note how landmarks look in the newest keyframe that sees them."""
+        keyframe = self.keyframes[number]
+        image, T_world_camera = keyframe.view.features, inverse(keyframe.T_camera_world)
+        self.descriptors[landmarks] = image.descriptors[features]
+        self._rays[landmarks] = self.points[landmarks] - T_world_camera[:3, 3]
+        self._orientations[landmarks] = image.orientations[features] @ T_world_camera[:3, :2].T
+        self._sizes[landmarks] = image.sizes[features]
+
+    def _count_observations(self) -> Rows:
+        """Return how many keyframes see each landmark, ``(n,)``."""
         counts = np.zeros(len(self.points), dtype=np.int64)
         for number in range(len(self.keyframes)):
             counts[self.landmarks_of(number)] += 1
         return counts
 
     def _remove(self, landmarks: Rows) -> None:
-        gone = np.zeros(len(self.points) + 1, dtype=bool)
-        gone[landmarks] = True
+        is_removed = np.zeros(len(self.points) + 1, dtype=bool)  # the last row is that of NO_LANDMARK
+        is_removed[landmarks] = True
         self.is_alive[landmarks] = False
         for keyframe in self.keyframes:
-            keyframe.landmarks[gone[keyframe.landmarks]] = NO_LANDMARK
+            keyframe.landmarks[is_removed[keyframe.landmarks]] = NO_LANDMARK
 
-    def _adjust(self, window: list[int], fixed: int, *, iterations: int) -> None:
-        in_window = np.zeros(len(self.points), dtype=bool)
+    # --- Private: bundle adjustment ---
+
+    def _adjust(self, window: list[int], fixed_count: int, *, iterations: int) -> None:
+        """Adjust the keyframes of *window* and their landmarks; remove observations that do not fit.
+
+        *fixed_count* further keyframes that see most of the landmarks take part with fixed poses.
+        """
+        # 1. The landmarks of the window, and the keyframes with fixed poses.
+        is_adjusted = np.zeros(len(self.points), dtype=bool)
         for number in window:
-            in_window[self.landmarks_of(number)] = True
+            is_adjusted[self.landmarks_of(number)] = True
         shared = {
-            number: int(in_window[self.landmarks_of(number)].sum())
+            number: int(is_adjusted[self.landmarks_of(number)].sum())
             for number in range(len(self.keyframes))
             if number not in window
         }
-        helpers = sorted((n for n in shared if shared[n] > 0), key=lambda n: -shared[n])[:fixed]
-        numbers = sorted([*window, *helpers])
-        is_fixed = np.array([number in helpers or number == 0 for number in numbers])
+        fixed = sorted((n for n in shared if shared[n] > 0), key=lambda n: -shared[n])[:fixed_count]
+        numbers = sorted([*window, *fixed])
+        is_fixed = np.array([number in fixed or number == 0 for number in numbers])
         if is_fixed.sum() < 2:
             is_fixed[:2] = True
-        table, landmarks = self._observations(numbers, in_window)
-        used, of_points = np.unique(landmarks, return_inverse=True)
-        images = [self.keyframes[number].features.image for number in numbers]
-        counts = np.bincount(table[:, 0], minlength=len(numbers))
-        rows_of = np.split(table[:, 1], np.cumsum(counts)[:-1])
-        pixels = np.concatenate([image.pixels[rows] for image, rows in zip(images, rows_of, strict=True)])
-        sigma = np.concatenate([image.sizes[rows] for image, rows in zip(images, rows_of, strict=True)])
+        # 2. All observations as one bundle.
+        cameras, features, landmarks = self._observations(numbers, is_adjusted)
+        used, points = np.unique(landmarks, return_inverse=True)
+        images = [self.keyframes[number].view.features for number in numbers]
+        features_of = np.split(features, np.cumsum(np.bincount(cameras, minlength=len(numbers)))[:-1])
+        pixels = np.concatenate([i.pixels[rows] for i, rows in zip(images, features_of, strict=True)])
+        sizes = np.concatenate([i.sizes[rows] for i, rows in zip(images, features_of, strict=True)])
         bundle = Bundle(
             T_camera_world=np.stack([self.keyframes[number].T_camera_world for number in numbers]),
             is_fixed=is_fixed,
             points_world=self.points[used],
-            cameras=table[:, 0],
-            points=of_points.ravel(),
+            cameras=cameras,
+            points=points.ravel(),
             pixels=pixels,
-            sigma_px=sigma * self.limits.pixel_sigma,
+            sigma_px=sizes * self.limits.pixel_sigma,
         )
-        bundle = self._adjusted(bundle, iterations)
+        # 3. Adjust, and write the result back.
+        bundle = self._solve(bundle, iterations)
         self.points[used] = bundle.points_world
-        for row, number in enumerate(numbers):
-            self.keyframes[number].T_camera_world = bundle.T_camera_world[row]
-        errors, _ = reprojection_errors(
+        for camera, number in enumerate(numbers):
+            self.keyframes[number].T_camera_world = bundle.T_camera_world[camera]
+        # 4. Remove outlier observations, and landmarks that fewer than two keyframes see.
+        errors_px, _ = reprojection_errors(
             bundle.T_camera_world[bundle.cameras], bundle.points_world[bundle.points], pixels, self.camera
         )
-        wrong = errors > self.limits.outlier_sigma * bundle.sigma_px
-        for row, number in enumerate(numbers):
-            own = wrong & (table[:, 0] == row)
-            self.keyframes[number].landmarks[table[own, 1]] = NO_LANDMARK
-        self._remove(used[self._observation_counts()[used] < 2])
+        is_outlier = errors_px > self.limits.outlier_sigma * bundle.sigma_px
+        for camera, number in enumerate(numbers):
+            self.keyframes[number].landmarks[features[is_outlier & (cameras == camera)]] = NO_LANDMARK
+        self._remove(used[self._count_observations()[used] < 2])
 
-    def _observations(self, numbers: list[int], is_wanted: npt.NDArray[np.bool_]) -> tuple[Rows, Rows]:
-        """Return ``(n, 2)`` row in *numbers* and feature, and the ``(n,)`` wanted landmark that it sees."""
-        table, landmarks = [], []
-        for row, number in enumerate(numbers):
+    def _observations(self, numbers: list[int], is_wanted: npt.NDArray[np.bool_]) -> tuple[Rows, Rows, Rows]:
+        """Return all observations of wanted landmarks: row of *numbers*, feature and landmark, ``(n,)``
+        each."""
+        cameras, features, landmarks = [], [], []
+        for camera, number in enumerate(numbers):
             of_features = self.keyframes[number].landmarks
-            features = np.flatnonzero(of_features != NO_LANDMARK)
-            features = features[is_wanted[of_features[features]]]
-            table.append(np.column_stack((np.full(len(features), row), features)))
-            landmarks.append(of_features[features])
-        return np.concatenate(table), np.concatenate(landmarks)
+            rows = np.flatnonzero(of_features != NO_LANDMARK)
+            rows = rows[is_wanted[of_features[rows]]]
+            cameras.append(np.full(len(rows), camera))
+            features.append(rows)
+            landmarks.append(of_features[rows])
+        return np.concatenate(cameras), np.concatenate(features), np.concatenate(landmarks)
 
-    def _adjusted(self, bundle: Bundle, iterations: int) -> Bundle:
-        """Return a bundle after its adjustment: by its landmarks that are seen most, if there are many."""
-        if len(bundle.points_world) <= self.limits.in_all:
+    def _solve(self, bundle: Bundle, iterations: int) -> Bundle:
+        """Return an adjusted bundle; of many landmarks, those seen most move the cameras, then all follow."""
+        limit = self.limits.in_all
+        if len(bundle.points_world) <= limit:
             poses, points = self._adjust_bundle(bundle, self.camera, iterations=iterations)
             return replace(bundle, T_camera_world=poses, points_world=points)
-        seen = np.bincount(bundle.points, minlength=len(bundle.points_world))
-        takes_part = np.zeros(len(seen), dtype=bool)
-        takes_part[np.argsort(-seen, kind="stable")[: self.limits.in_all]] = True
-        rows = takes_part[bundle.points]
+        # 1. Adjust cameras and the landmarks that are seen most.
+        counts = np.bincount(bundle.points, minlength=len(bundle.points_world))
+        is_used = np.zeros(len(counts), dtype=bool)
+        is_used[np.argsort(-counts, kind="stable")[:limit]] = True
+        rows = is_used[bundle.points]
         poses, points = self._adjust_bundle(
             replace(
-                bundle, cameras=bundle.cameras[rows], points=bundle.points[rows], pixels=bundle.pixels[rows],
+                bundle,
+                cameras=bundle.cameras[rows],
+                points=bundle.points[rows],
+                pixels=bundle.pixels[rows],
                 sigma_px=bundle.sigma_px[rows],
             ),
-            self.camera, iterations=iterations,
-        )  # fmt: skip
+            self.camera,
+            iterations=iterations,
+        )
+        # 2. Adjust all landmarks to the cameras, which are fixed now.
         bundle = replace(bundle, T_camera_world=poses, points_world=points)
-        everywhere = replace(bundle, is_fixed=np.ones(len(poses), dtype=bool))
-        _, points = self._adjust_bundle(everywhere, self.camera, iterations=iterations)
+        with_fixed_cameras = replace(bundle, is_fixed=np.ones(len(poses), dtype=bool))
+        _, points = self._adjust_bundle(with_fixed_cameras, self.camera, iterations=iterations)
         return replace(bundle, points_world=points)
 
 
-def _turned(rotation: Array) -> Array:
+def _rotation_pose(rotation: Array) -> Array:
     pose = np.eye(4)
     pose[:3, :3] = rotation
     return pose

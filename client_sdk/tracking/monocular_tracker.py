@@ -1,92 +1,121 @@
-"""Track a camera without depth against its map of landmarks, as a state machine without input or output.
+"""Track a camera without depth against its map of landmarks.
 
-`MonocularTracker` has the steps of `Tracker`: frames and answers go in, pose queries and tracked frames come
-out.  The unit of length of each segment is arbitrary until `MonocularTracker.rescale` is called, or the
-segment is joined to an older one, whose unit it takes.
+`MonocularTracker` is a state machine without input or output, with the steps of `Tracker`: extract features,
+predict the pose, match landmarks, solve the pose (elsewhere, by a query), verify it, decide what becomes of
+the frame, and keep it in the map.  Each segment has an arbitrary unit of length until
+`MonocularTracker.rescale` is called, or the segment is joined to an older one, whose unit it takes.
 """
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
 
-from client_sdk.frontend import (
-    Correspondences,
-    Features,
-    Frame,
-    PoseQuery,
-    TrackedFrame,
-    describe,
-    round_for_wire,
-)
+from client_sdk.frontend import Features, Frame, PoseQuery, TrackedFrame, describe
 from client_sdk.monocular.bundle import adjust
 from client_sdk.monocular.two_view import TwoViewStart, start_from_two_views
-from client_sdk.slots import Slots
-from client_sdk.tracking.keyframe_map import NO_LANDMARK
-from client_sdk.tracking.landmark_map import MIN_SHARED, LandmarkLimits, LandmarkMap, ViewFeatures
-from client_sdk.tracking.place import place_of
-from client_sdk.tracking.queries import Answer, OneQuery, Steps
-from client_sdk.tracking.tracker import Join
+from client_sdk.plugins import Plugins
+from client_sdk.tracking.landmark_map import (
+    MIN_SHARED_LANDMARKS,
+    LandmarkLimits,
+    LandmarkMap,
+    MonocularView,
+)
+from client_sdk.tracking.landmarks import NO_LANDMARK, Matches, match_by_appearance, shift_landmarks
+from client_sdk.tracking.place_recognition import (
+    LATEST_KEYFRAMES,
+    list_other_segments,
+    list_relocalisation_candidates,
+    make_place_vector,
+    match_candidates,
+)
+from client_sdk.tracking.pose_queries import CLEAR_INLIERS, FrameSteps, OpenQuery, QueryAnswer, make_query
+from client_sdk.tracking.segment_join import NOT_JOINED, Join
 from client_sdk.trajectory import Trajectory
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Array, inverse, pose_difference, rigid, scaled, transform
 from rse_pf.maps.descriptors import ORB, DescriptorKind
 from rse_pf.slam.descriptors import match_all
-from rse_pf.slam.tracking import (
-    ImageFeatures,
-    NearLimits,
-    Observations,
-    distinct_distances,
-    fit_pose,
-)
+from rse_pf.slam.tracking import GuidedMatchLimits, ImageFeatures, Observations, fit_pose
 
-__all__ = ["MonocularOptions", "MonocularTracker", "SeenKeyframe"]
+__all__ = ["AdjustedKeyframe", "MonocularOptions", "MonocularTracker"]
 
 Rows = npt.NDArray[np.int64]
 
-_FEATURES_OF_PX, _MAX_FEATURES = 640, 2000
+_FEATURES_WIDTH_PX = 640
+"""Image width for which `MonocularOptions.features` is meant; wider images have proportionally more
+features."""
+_MAX_FEATURES = 2000
+"""Largest number of features of a wide image: bounds the time of a frame."""
 _START_DEPTH = 2.0
-"""Median depth of the first landmarks in the arbitrary unit: fine enough for points rounded to 0.0001."""
-_MAX_WAITING, _MIN_START_MATCHES = 30, 100
-_LATEST, _ALIKE, _QUERIES = 3, 5, 3
-_MANY = 3
-"""A guided match with so many times the fewest inliers is worth a query."""
-_WIDER = 2.5
-_CONFIRM_PX, _LAST_PX = 8.0, 5.0
-_TRACKED_RATIO, _CLEAR_RATIO, _CLEAR_INLIERS = 0.25, 0.5, 40
-"""Shares of the matches that must agree: where the camera was just now, and at any other place."""
-_JOIN_EVERY, _LOOP_ALIKE = 3, 2
-_LOOP_AGE = 15
-"""Keyframes of the same segment that are so much older, and share few landmarks, may be an older place."""
-_AGREE_DEPTH, _AGREE_DEG, _AGREE_SCALE = 0.07, 4.0, 1.1
-"""Two measurements of one similarity agree: in shares of the depth, in degrees, and as a ratio."""
-_MAX_DEPTH_SPREAD = 0.15
-"""Median distance from the median of the depths' ratios that give a scale, as a share of it."""
+"""Median depth of a segment's first landmarks in its arbitrary unit: large enough that points rounded to
+0.0001 are exact."""
+_MAX_WAITING_FRAMES = 30
+"""Largest number of frames that wait for a second view with parallax; then the oldest is dropped."""
+_MIN_START_MATCHES = 100
+"""Fewest features of a frame, and fewest matches of two frames, that can begin a segment."""
+_MAX_RELOCALISATION_QUERIES = 3
+"""Largest number of keyframes that are asked for the place of one frame, those with the most matches
+first."""
+_GUIDED_MATCHES_FACTOR = 3
+"""A frame is asked for near its predicted pose only with this many times ``min_inliers`` matches: with fewer,
+the prediction is wrong."""
+_WIDE_SEARCH_FACTOR = 2.5
+"""Radius of the second guided search as a multiple of ``search_px``, for a camera that moved unexpectedly."""
+_VERIFY_RADIUS_PX = 8.0
+"""Radius around projected landmarks in which a solved pose is matched first."""
+_REFINE_RADIUS_PX = 5.0
+"""Radius around projected landmarks in which a fitted pose is matched again."""
+_VERIFY_LOWE_RATIO = 0.9
+"""Lowe's ratio for matches around the pixels of a solved pose: looser than elsewhere, since the radius is
+small."""
+_TRACKED_RATIO = 0.25
+"""Smallest share of inliers among the matches of an accepted answer."""
+_JOIN_INTERVAL_FRAMES = 3
+"""Every third frame is compared with other segments, if there are any: bounds the time of a frame."""
+_LOOP_CANDIDATES = 2
+"""Number of older keyframes that are compared with a new keyframe to find a loop closure."""
+_LOOP_AGE_KEYFRAMES = 15
+"""Number of keyframes between the two keyframes of a loop closure, and between two loop closures."""
+_AGREEMENT_DEPTH_SHARE = 0.07
+"""Largest distance of the camera's centre between two measurements of one similarity that confirm each other,
+as a share of the median depth."""
+_AGREEMENT_DEG = 4.0
+"""Largest rotation, in degrees, between two measurements of one similarity that confirm each other."""
+_AGREEMENT_SCALE_RATIO = 1.1
+"""Largest ratio of the scales of two measurements of one similarity that confirm each other."""
+_MAX_SCALE_SPREAD = 0.15
+"""Largest median deviation of the ratios of depths from their median, as a share of it, with which they give
+the scale between two segments."""
 _MERGE_ITERATIONS = 6
-_NO_SPREAD = np.zeros((3, 3))
+"""Iterations of the adjustment of all keyframes after a join, a loop closure, and at the end of a drive."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MonocularOptions:
-    """How a camera without depth is tracked.
+    """Options of tracking a camera without depth.
 
     Attributes:
-        features: Features of a frame of 640 px, spread over its cells; wider ones have more, up to 2000.
-        max_matches: An even sample of so many is sent: a command stays under 10 kB in every codec.
+        features: Number of features of a frame of 640 px; wider frames have more, up to 2000.
+        max_matches: Largest number of matches that a pose query sends, an even sample of all; 250 keep a
+            command below 10 kB in every codec.
         inlier_px: Largest reprojection error of an inlier.
-        max_iterations: Of RANSAC.
-        min_inliers: A pose with fewer is not accepted.
-        search_px: Radius around the predicted pixels in which matches are sought.
-        keyframe_share: A frame that sees a smaller share of its keyframe's landmarks becomes a keyframe.
-        keyframe_deg: A frame turned further from the last keyframe becomes one.
-        keyframe_depth_percent: A frame that moved further, in percent of the median depth, becomes one.
-        start_parallax_deg: Median angle between the two views of the start.
-        segment_after: A new segment begins after so many frames that show enough and no place that is known.
-        limits: Of the map.
+        max_iterations: Largest number of RANSAC iterations.
+        min_inliers: Smallest number of inliers of an accepted pose.
+        search_px: Radius around the predicted pixel of a landmark in which features are compared.
+        keyframe_share: A frame that sees less than this share of its reference keyframe's landmarks becomes a
+            keyframe.
+        keyframe_deg: A frame rotated by more than this from its reference keyframe becomes a keyframe.
+        keyframe_depth_percent: A frame that moved farther than this from its reference keyframe, in percent
+            of the median depth, becomes a keyframe.
+        start_parallax_deg: Smallest median parallax of the two views that begin a segment.
+        segment_after: Number of frames in a row with enough features and no recognised place after which a
+            new segment begins.
+        limits: Limits of the map.
     """
 
     features: int = 1000
@@ -104,23 +133,29 @@ class MonocularOptions:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class SeenKeyframe:
-    """A keyframe as it is adjusted now: time in seconds, ``(4, 4)`` pose in the world, features of a kind.
+class AdjustedKeyframe:
+    """A keyframe as the bundle adjustment has it now.
 
-    ``depths`` ``(n,)`` are those of the features along the optical axis, in the unit of the segment, NaN
-    where no landmark is known.
+    Attributes:
+        timestamp_s: Time of the frame, in seconds.
+        T_world_camera: ``(4, 4)``, in the unit of the segment.
+        features: Features of the image, ``n`` of them.
+        kind: Kind of their descriptors.
+        depths: ``(n,)``, depth of each feature along the optical axis in the unit of the segment, NaN for
+            features without a landmark.
     """
 
     timestamp_s: float
     T_world_camera: Array
-    image: ImageFeatures
+    features: ImageFeatures
     kind: DescriptorKind
     depths: Array
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Placed:
-    """A pose relative to a keyframe, so that later adjustments of the keyframe move it, too."""
+class _RelativePose:
+    """Pose of a frame relative to a keyframe, so that later adjustments of the keyframe move the frame,
+    too."""
 
     timestamp_s: float
     keyframe: int
@@ -128,10 +163,18 @@ class _Placed:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Posed:
-    """An image with its pose, the landmark of each feature, and whether its pose may be trusted."""
+class _PosedView:
+    """An image with its verified pose.
 
-    features: ViewFeatures
+    Attributes:
+        view: The image.
+        T_camera_world: ``(4, 4)``, in the frame and unit of its segment.
+        landmarks: ``(n,)``, landmark of each feature, or NO_LANDMARK.
+        matches: Number of matches of the image.
+        is_weak: Whether the solver calls the pose weak; the image never becomes a keyframe then.
+    """
+
+    view: MonocularView
     T_camera_world: Array
     landmarks: Rows
     matches: int
@@ -144,205 +187,269 @@ class _Posed:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Matched:
-    """Landmarks of a segment, and the features of an image that match them."""
-
-    landmarks: Rows
-    features: Rows
-
-    def __len__(self) -> int:
-        return len(self.landmarks)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Similarity:
-    """Where a map lies in *segment*, by *keyframe* there: its lengths times *scale*, then moved by *T*."""
+    """Where a segment lies in another one, or the newer part of a segment in its older part.
+
+    Attributes:
+        segment: The segment in which it lies.
+        keyframe: Keyframe of that segment that shows the same place.
+        T: ``(4, 4)``, rigid motion into that segment, after all lengths are multiplied by *scale*.
+        scale: Factor of all lengths.
+    """
 
     segment: int
     keyframe: int
     T: Array
     scale: float
 
+    def inverted(self, segment: int, keyframe: int) -> _Similarity:
+        """Return where that segment lies in *segment*, whose *keyframe* shows the same place."""
+        return _Similarity(
+            segment=segment,
+            keyframe=keyframe,
+            T=scaled(inverse(self.T), 1.0 / self.scale),
+            scale=1.0 / self.scale,
+        )
+
+    def agrees_with(self, other: _Similarity, centre: Array, depth: float) -> bool:
+        """Return whether two measurements confirm each other at a camera's *centre* ``(3,)``.
+
+        Distances are compared with the median *depth* of the place.
+        """
+        first, second = (transform(s.T, s.scale * centre[None])[0] for s in (self, other))
+        _, apart_deg = pose_difference(self.T, other.T)
+        scale_ratio = max(self.scale / other.scale, other.scale / self.scale)
+        return (
+            float(np.linalg.norm(first - second)) <= _AGREEMENT_DEPTH_SHARE * depth
+            and apart_deg <= _AGREEMENT_DEG
+            and scale_ratio <= _AGREEMENT_SCALE_RATIO
+        )
+
 
 @dataclass(slots=True, kw_only=True, eq=False)
 class _Segment:
-    """One map, the frames that were placed in it, and the keyframe around which frames are tracked.
+    """One segment of a drive.
 
-    ``unit`` says by what the lengths around the newest frames were multiplied since the segment began.
+    Attributes:
+        map: Keyframes and landmarks.
+        length_factor: By what the lengths around the newest frames were multiplied since the segment began.
+        frames: Poses of all frames of the segment.
+        reference: The reference keyframe, around which frames are tracked.
+        reference_landmarks: Number of landmarks that it saw when it became the reference.
     """
 
     map: LandmarkMap
-    unit: float = 1.0
-    placed: list[_Placed] = field(default_factory=list)
+    length_factor: float = 1.0
+    frames: list[_RelativePose] = field(default_factory=list)
     reference: int = 0
-    reference_seen: int = 0
+    reference_landmarks: int = 0
 
-    def refer_to(self, keyframe: int) -> None:
-        """Track frames around a keyframe."""
+    def set_reference(self, keyframe: int) -> None:
+        """Track frames around a keyframe from now on."""
         self.reference = keyframe
-        self.reference_seen = len(self.map.landmarks_of(keyframe))
+        self.reference_landmarks = len(self.map.landmarks_of(keyframe))
 
-    def place(self, timestamp_s: float, T_camera_world: Array, keyframe: int) -> None:
-        """Take a frame with its pose, which follows a keyframe."""
+    def add_frame(self, timestamp_s: float, T_camera_world: Array, keyframe: int) -> None:
+        """Add a frame with its pose, which follows a keyframe."""
         relative = self.map.keyframes[keyframe].T_camera_world @ inverse(T_camera_world)
-        self.placed.append(_Placed(timestamp_s=timestamp_s, keyframe=keyframe, T_keyframe_camera=relative))
+        self.frames.append(
+            _RelativePose(timestamp_s=timestamp_s, keyframe=keyframe, T_keyframe_camera=relative)
+        )
 
     def move(self, T_new_old: Array, scale: float) -> None:
-        """Express all in another frame, after lengths are multiplied."""
+        """Express the segment in another frame: multiply all lengths by *scale*, then apply *T_new_old*."""
         self.map.move(T_new_old, scale)
-        self.unit *= scale
-        self.placed = [
-            replace(placed, T_keyframe_camera=scaled(placed.T_keyframe_camera, scale))
-            for placed in self.placed
+        self.length_factor *= scale
+        self.frames = [
+            replace(frame, T_keyframe_camera=scaled(frame.T_keyframe_camera, scale)) for frame in self.frames
         ]
 
+    def append(self, newer: _Segment) -> tuple[int, int]:
+        """Add all of a segment in the same frame; return its first keyframe's and landmark's numbers here."""
+        keyframe, landmark = self.map.append(newer.map)
+        self.frames += [replace(frame, keyframe=frame.keyframe + keyframe) for frame in newer.frames]
+        return keyframe, landmark
+
     def trajectory(self) -> Trajectory:
-        """Return the placed frames in the order of time."""
-        stamps = np.array([placed.timestamp_s for placed in self.placed])
+        """Return the poses of all frames in the order of time."""
+        stamps_s = np.array([frame.timestamp_s for frame in self.frames])
         poses = [
-            inverse(self.map.keyframes[placed.keyframe].T_camera_world) @ placed.T_keyframe_camera
-            for placed in self.placed
+            inverse(self.map.keyframes[frame.keyframe].T_camera_world) @ frame.T_keyframe_camera
+            for frame in self.frames
         ]
-        order = np.argsort(stamps, kind="stable")
-        return Trajectory(stamps[order], np.array(poses).reshape(-1, 4, 4)[order])
+        order = np.argsort(stamps_s, kind="stable")
+        return Trajectory(stamps_s[order], np.array(poses).reshape(-1, 4, 4)[order])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _TrackState:
+    """What a tracker knows of the camera between two frames.
+
+    Attributes:
+        segment: Number of the present segment.
+        last: The last frame; None after a loss.
+        timestamp_s: Time of the last pose, in seconds.
+        T_next_last: ``(4, 4)``, motion of the world from one camera frame to the next, assumed constant.
+        unrecognised: Number of frames since the last accepted pose that show enough features and no known
+            place.
+        candidate: Where the segment may lie in another one, measured once and not confirmed.
+        next_loop_keyframe: Number of the first keyframe for which a loop closure is looked for again.
+    """
+
+    segment: int = 0
+    last: _PosedView | None = None
+    timestamp_s: float = 0.0
+    T_next_last: Array = field(default_factory=lambda: np.eye(4))
+    unrecognised: int = 0
+    candidate: _Similarity | None = None
+    next_loop_keyframe: int = 0
 
 
 class MonocularTracker:
-    """Visual odometry of one camera without depth, which knows where it has been.
+    """Visual odometry of one camera without depth, with relocalisation and loop closure.
 
     Use it as `Tracker`: ``prepare(frame)``, then ``accept(query, T_camera_world, inliers)`` until a
     `TrackedFrame` comes back.
 
     A segment begins with two views that have parallax; the frames between them get their poses then.  A frame
-    is matched near the pixels at which a constant velocity predicts the landmarks around the last keyframe,
-    then in a wider radius, then with the last frame, then with the latest keyframes and those of all segments
-    that look most alike.  If nothing fits, the frame is lost, and waits for the start of a new segment.  A
-    segment is joined to an older one, in whose unit it is then, when two images of it were seen there.  An
-    older place of the same segment that is recognised twice corrects what drifted in between.
+    is matched near the pixels at which a constant velocity predicts the landmarks around the reference
+    keyframe, then in a wider radius, then with the last frame, then with the newest keyframes and with the
+    most similar keyframes of all segments.  If no pose fits, the frame is lost, and waits for the start of a
+    new segment.  A segment is joined to an older one, whose unit it takes, when two of its images were found
+    there.  An older place of the same segment that is recognised twice closes a loop and corrects what
+    drifted in between.
 
-    ``frames`` counts the frames, ``lost_frames`` those without a pose after the first start,
-    ``starting_frames`` those before it; ``unrecognised`` those since the last pose that show enough and no
-    known place; ``joins`` are the joins so far, ``loop_scales`` those by which an older place corrected the
-    lengths around the newest frames.
+    Attributes:
+        options: Options of tracking.
+        frames: Number of frames so far.
+        lost_frames: Number of frames without a pose after the first start.
+        starting_frames: Number of frames without a pose before the first start.
+        joins: All joins of segments so far, in their order.
+        loop_scales: By what each loop closure so far multiplied the lengths around the newest frames.
     """
 
     def __init__(
         self,
         options: MonocularOptions | None = None,
         T_world_start: Array | None = None,
-        slots: Slots | None = None,
+        plugins: Plugins | None = None,
     ) -> None:
         self.options = options or MonocularOptions()
-        self._slots = slots or Slots()
         self.frames = 0
         self.lost_frames = 0
         self.starting_frames = 0
-        self.unrecognised = 0
         self.loop_scales: list[float] = []
         self.joins: list[Join] = []
+        self._plugins = plugins or Plugins()
         self._T_world_start = np.eye(4) if T_world_start is None else T_world_start
+        self._state = _TrackState()
         self._segments: dict[int, _Segment] = {}
-        self._segment = 0
-        self._begun = 0
-        self._waiting: list[tuple[float, ViewFeatures]] = []
-        self._last: _Posed | None = None
-        self._motion: Array = np.eye(4)
-        self._last_s = 0.0
-        self._similar: _Similarity | None = None
-        self._loop_from = 0
-        self._frame: Frame  # set by `prepare`
-        self._raw: Features
-        self._open = OneQuery()
+        self._next_segment = 0
+        self._waiting: list[tuple[float, MonocularView]] = []
+        """Times and images of frames without a pose that may be the first view of a segment."""
+        self._frame: Frame  # the frame that is tracked, set by `prepare`
+        self._raw: Features  # its features
+        self._open = OpenQuery()
 
     @property
     def keyframes(self) -> int:
-        """The number of keyframes."""
-        return sum(len(segment.map.keyframes) for segment in self._segments.values())
+        """The number of keyframes of all segments."""
+        return sum(segment.map.keyframe_count for segment in self._segments.values())
 
     @property
     def loops(self) -> int:
-        """The number of older places that corrected the map."""
+        """The number of loop closures."""
         return len(self.loop_scales)
+
+    @property
+    def unrecognised(self) -> int:
+        """Number of frames since the last pose that show enough features and no known place.
+
+        An image with few features, such as that of a covered lens, does not count.
+        """
+        return self._state.unrecognised
 
     @property
     def segment(self) -> int:
         """The number of the segment of the newest pose."""
-        return self._segment
+        return self._state.segment
 
     @property
-    def unit(self) -> float:
-        """By what the lengths around the newest frames of this segment were multiplied since it began."""
-        return self._own.unit
+    def segments(self) -> tuple[int, ...]:
+        """The numbers of all segments that were not joined to others, ascending; the first is 0."""
+        return tuple(sorted(self._segments))
+
+    @property
+    def length_factor(self) -> float:
+        """By what the lengths around the newest frames of the present segment were multiplied since it
+        began."""
+        return self._present.length_factor
 
     @property
     def segment_keyframes(self) -> int:
-        """The number of keyframes of this segment."""
-        return len(self._own.map.keyframes)
+        """The number of keyframes of the present segment."""
+        return self._present.map.keyframe_count
 
-    def keyframe(self, number: int, segment: int | None = None) -> SeenKeyframe:
-        """Return a keyframe of a segment; None for that of the newest pose."""
-        own = self._own if segment is None else self._segments[segment]
+    def keyframe(self, number: int, segment: int | None = None) -> AdjustedKeyframe:
+        """Return a keyframe of a segment as it is adjusted now; of the present segment for None."""
+        own = self._present if segment is None else self._segments[segment]
         keyframe = own.map.keyframes[number]
-        return SeenKeyframe(
-            timestamp_s=next(placed.timestamp_s for placed in own.placed if placed.keyframe == number),
+        return AdjustedKeyframe(
+            timestamp_s=next(frame.timestamp_s for frame in own.frames if frame.keyframe == number),
             T_world_camera=self._T_world_start @ inverse(keyframe.T_camera_world),
-            image=keyframe.features.image,
-            kind=ORB if self._slots.features is None else self._slots.features.kind,
+            features=keyframe.view.features,
+            kind=ORB if self._plugins.features is None else self._plugins.features.kind,
             depths=own.map.depths(number),
         )
 
     def keyframe_pose(self, number: int) -> Array:
-        """Return the ``(4, 4)`` pose of a keyframe of this segment in the world, as it is adjusted now."""
-        pose: Array = self._T_world_start @ inverse(self._own.map.keyframes[number].T_camera_world)
+        """Return ``T_world_camera`` ``(4, 4)`` of a keyframe of the present segment as it is adjusted now."""
+        pose: Array = self._T_world_start @ inverse(self._present.map.keyframes[number].T_camera_world)
         return pose
 
-    def keyframes_of(self, segment: int) -> Iterator[SeenKeyframe]:
-        """Yield the keyframes of a segment, oldest first."""
-        for number in range(len(self._segments[segment].map.keyframes) if segment in self._segments else 0):
+    def keyframes_of(self, segment: int) -> Iterator[AdjustedKeyframe]:
+        """Yield the keyframes of a segment as they are adjusted now, oldest first; none of an unknown
+        segment."""
+        for number in range(self._segments[segment].map.keyframe_count if segment in self._segments else 0):
             yield self.keyframe(number, segment)
 
-    @property
-    def segments(self) -> tuple[int, ...]:
-        """The numbers of the segments, but for those that were joined to others; the first is 0."""
-        return tuple(sorted(self._segments))
-
     def prepare(self, frame: Frame) -> PoseQuery | TrackedFrame:
-        """Take the next frame; return a query, or the result for the frame if none is needed.
+        """Take the next frame; return a query for its pose, or its result if no query is needed.
 
         Raises:
-            UsageError: The last query was not answered yet, or the camera is another one.
+            UsageError: The last query was not answered yet, the frame has another camera than those before,
+                or a user's feature extractor failed.
         """
         self._open.refuse_open()
-        if self._segments and frame.camera != self._own.map.camera:
+        if self._segments and frame.camera != self._present.map.camera:
             raise UsageError("the camera of this frame is another one", hint="use one tracker per camera")
         self.frames += 1
-        self._frame = frame
-        wider = max(1.0, frame.camera.width / _FEATURES_OF_PX)
-        self._raw = _found(frame, self._feature_count(wider), self._slots)
-        return self._open.begin(self._track(_looked_up(frame, self._raw, self._slots)))
+        self._frame, self._raw = frame, self._extract(frame)
+        return self._open.begin(self._track(self._make_view()))
 
     def accept(
         self, query: PoseQuery, T_camera_world: Array | None, inliers: int = 0, *, is_weak: bool = False
     ) -> PoseQuery | TrackedFrame:
-        """Take the answer to *query*; return another query, or the result for the frame.
+        """Take the answer to *query*; return another query, or the result of the frame.
 
         Args:
             query: The query that `prepare` or `accept` returned last.
-            T_camera_world: ``(4, 4)`` as the PnP service returns it; ``None`` if there was no answer.
-            inliers: How many correspondences agree with it.
-            is_weak: Whether its evidence is weak: then the frame becomes no keyframe.
+            T_camera_world: ``(4, 4)`` as the PnP service returns it; None if there was no answer.
+            inliers: Number of correspondences that agree with the pose.
+            is_weak: Whether the service calls the evidence for the pose weak; the frame becomes no keyframe
+                then.
 
         Raises:
             UsageError: *query* is not the open one.
         """
-        return self._open.answer(query, Answer(T_camera_world, inliers, is_weak))
+        return self._open.answer(query, QueryAnswer(T_camera_world, inliers, is_weak))
 
     def trajectory(self, segment: int = 0) -> Trajectory:
-        """Return all poses of a segment so far, in the order of time, as its keyframes are adjusted now."""
+        """Return all poses of a segment in the order of time, as its keyframes are adjusted now."""
         if segment not in self._segments:
             return Trajectory(np.empty(0), np.empty((0, 4, 4)))
-        found = self._segments[segment].trajectory()
-        return Trajectory(found.timestamps_s, self._T_world_start @ found.T_world_camera)
+        path = self._segments[segment].trajectory()
+        return Trajectory(path.timestamps_s, self._T_world_start @ path.T_world_camera)
 
     def points(self, segment: int = 0) -> tuple[Array, npt.NDArray[np.uint8]]:
         """Return the ``(n, 3)`` landmarks of a segment in the world and their ``(n, 3)`` uint8 colours."""
@@ -351,10 +458,16 @@ class MonocularTracker:
         own = self._segments[segment].map
         return transform(self._T_world_start, own.points[own.is_alive]), own.colours[own.is_alive]
 
+    def median_depth(self, segment: int = 0) -> float:
+        """Return the median depth of the landmarks of a segment's reference keyframe, in the segment's
+        unit."""
+        own = self._segments.get(segment)
+        return 1.0 if own is None else own.map.median_depth(own.reference)
+
     def adjust(self) -> None:
         """Adjust all keyframes and landmarks of each segment together, such as at the end of a drive.
 
-        It takes seconds, and poses that were returned before are corrected.
+        This takes seconds, and corrects poses that were returned before.
 
         Raises:
             UsageError: A query is open.
@@ -362,534 +475,602 @@ class MonocularTracker:
         self._open.refuse_open()
         for segment in self._segments.values():
             segment.map.adjust_all(iterations=_MERGE_ITERATIONS)
-        self._last = self._similar = None
+        self._state = replace(self._state, last=None, candidate=None)
 
     def rescale(self, scale: float, segment: int = 0) -> None:
-        """Multiply all lengths of a segment by *scale*, such as metres per unit."""
+        """Multiply all lengths of a segment by *scale*, such as by the metres per unit."""
         if segment not in self._segments:
             return
         self._segments[segment].move(np.eye(4), scale)
-        self._similar = None
-        if segment == self._segment:
-            self._move_last(np.eye(4), scale)
+        self._state = replace(self._state, candidate=None)
+        if segment == self._state.segment:
+            self._move_state(np.eye(4), scale)
 
     def turn(self, T_new_old: Array) -> None:
-        """Turn the world, such as after gravity became known; poses that were returned before change."""
+        """Express all poses in a rotated world, such as after gravity became known.
+
+        Poses that were returned before are ``T_new_old @ T_world_camera`` in the new world.
+        """
         self._T_world_start = T_new_old @ self._T_world_start
 
-    def median_depth(self, segment: int = 0) -> float:
-        """Return the median depth of the landmarks around the newest frames of a segment, in its unit."""
-        known = self._segments.get(segment)
-        return 1.0 if known is None else known.map.median_depth(known.reference)
+    # --- The steps of one frame ---
 
-    @property
-    def _own(self) -> _Segment:
-        return self._segments[self._segment]
-
-    def _feature_count(self, wider: float) -> int:
-        return int(min(max(self.options.features, _MAX_FEATURES), self.options.features * wider))
-
-    # --- one frame ---
-
-    def _track(self, features: ViewFeatures) -> Steps:
-        """Return the result of a frame, and yield the queries that it needs."""
+    def _track(self, view: MonocularView) -> FrameSteps:
+        """Yield the queries of the present frame, and return its result."""
+        # 1. Predict, match, solve and verify around the last pose, then at all known places.
         posed = None
         reason = "a place that was not seen before"
-        if self._last is not None:
-            for how in ("near", "wide", "frame"):
-                posed, reason = yield from self._follow(features, how)
-                if posed is not None:
-                    break
+        if self._state.last is not None:
+            posed, reason = yield from self._track_from_last_pose(view)
         if posed is None and self._segments:
-            posed, reason = yield from self._recognise(features)
+            posed, reason = yield from self._relocalise(view)
+        # 2. Decide: without a pose, the frame is lost or begins a segment.
         if posed is None:
-            return self._start_or_lose(features, reason)
+            return self._start_or_lose(view, reason)
+        # 3. Keep the frame in the map, and look for its place in other segments or earlier in this one.
         self._waiting = []
-        keyframe = self._keep(posed)
-        assert self._last is not None
-        if len(self._segments) > 1 and self.frames % _JOIN_EVERY == 0:
-            yield from self._seek_join(self._last)
-        elif keyframe:
-            yield from self._seek_loop(self._last)
-        return self._result(posed, keyframe=keyframe)
+        is_keyframe = self._keep(posed)
+        if len(self._segments) > 1 and self.frames % _JOIN_INTERVAL_FRAMES == 0:
+            yield from self._find_join()
+        elif is_keyframe:
+            yield from self._find_loop()
+        return self._make_result(posed, is_keyframe=is_keyframe)
 
-    def _follow(
-        self, features: ViewFeatures, how: str
-    ) -> Generator[PoseQuery, Answer, tuple[_Posed | None, str]]:
-        """Yield a query against the landmarks that the last pose predicts, or against the last frame."""
-        assert self._last is not None
-        least = self.options.min_inliers
-        if how == "frame":
-            matched = self._matched_with_last(features, self._last)
-        else:
-            radius = self.options.search_px * (_WIDER if how == "wide" else 1.0)
-            T_expected = self._expected(self._last)
-            matched = _matched_near(self._own, features, T_expected, NearLimits(radius_px=radius))
-            least *= _MANY
-        if len(matched) < least:
-            return None, f"only {len(matched)} matches with the map"
-        answer = yield self._make_query(self._own, features, matched, "frame" if how == "frame" else "map")
-        return self._confirm(self._own, features, answer, len(matched))
+    def _extract(self, frame: Frame) -> Features:
+        """Return features that are spread over the image, without 3-D points."""
+        wider = max(1.0, frame.camera.width / _FEATURES_WIDTH_PX)
+        count = int(min(max(self.options.features, _MAX_FEATURES), self.options.features * wider))
+        described = describe(frame.rgb, count, plugin=self._plugins.features)
+        return Features.from_keypoints(described, np.full((len(described.pixels), 3), np.nan))
 
-    def _expected(self, last: _Posed) -> Array:
-        """Return ``T_camera_world`` as a user's motion function expects it, else by a constant velocity.
+    def _make_view(self) -> MonocularView:
+        """Return the image of the present frame."""
+        frame, features = self._frame, self._raw
+        last_pixel = np.array([frame.camera.width - 1, frame.camera.height - 1])
+        columns, lines = np.clip(np.rint(features.pixels).astype(np.int64), 0, last_pixel).T
+        return MonocularView(
+            features=features.for_matching(),
+            colours=frame.rgb[lines, columns],
+            place_vector=make_place_vector(features.descriptors, frame.rgb, self._plugins.loops),
+        )
 
-        With an IMU the camera turns as the gyroscope measured it.
-        """
-        motion, inertial = self._slots.motion, self._slots.inertial
-        T = None if motion is None else motion.expected(self._frame.timestamp_s)
-        if T is not None:
-            return inverse(T)
-        T_last_now = inverse(self._motion)
-        turned = None if inertial is None else inertial.camera_rotation(self._last_s, self._frame.timestamp_s)
-        if turned is not None:
-            T_last_now[:3, :3] = turned
-        expected: Array = inverse(T_last_now) @ last.T_camera_world
-        return expected
+    # --- Predict and match ---
 
-    def _matched_with_last(self, features: ViewFeatures, last: _Posed) -> _Matched:
-        rows = np.flatnonzero(last.landmarks != NO_LANDMARK)
-        rows = rows[self._own.map.is_alive[last.landmarks[rows]]]
-        known, columns = match_all(last.features.image.descriptors[rows], features.image.descriptors)
-        return _Matched(landmarks=last.landmarks[rows[known]], features=columns)
-
-    def _recognise(self, features: ViewFeatures) -> Generator[PoseQuery, Answer, tuple[_Posed | None, str]]:
-        """Yield queries against the latest and the most alike keyframes of all segments."""
-        candidates = [
-            (segment, number, self._matched_with(segment, number, features))
-            for segment, number in self._candidates(features)
-        ]
-        candidates.sort(key=lambda candidate: -len(candidate[2]))
-        reason = f"only {len(candidates[0][2])} matches with the map"
-        for segment, number, matched in candidates[:_QUERIES]:
-            if len(matched) < self.options.min_inliers:
-                break
-            known = self._segments[segment]
-            answer = yield self._make_query(known, features, matched, "keyframe")
-            reason = "the matches agree on no pose"
-            is_near = segment == self._segment and number >= len(known.map.keyframes) - _LATEST
-            if not (is_near or self._is_clear(answer, len(matched))):
+    def _track_from_last_pose(
+        self, view: MonocularView
+    ) -> Generator[PoseQuery, QueryAnswer, tuple[_PosedView | None, str]]:
+        """Ask for the pose of a frame around its last pose; return it, or None and why there is none."""
+        reason, search_px, min_inliers = "", self.options.search_px, self.options.min_inliers
+        attempts: tuple[tuple[Callable[[], Matches], Literal["map", "frame"], int], ...] = (
+            (lambda: self._match_predicted(view, search_px), "map", _GUIDED_MATCHES_FACTOR * min_inliers),
+            (
+                lambda: self._match_predicted(view, _WIDE_SEARCH_FACTOR * search_px),
+                "map",
+                _GUIDED_MATCHES_FACTOR * min_inliers,
+            ),
+            (lambda: self._match_last_frame(view), "frame", min_inliers),
+        )
+        for match, against, min_matches in attempts:
+            matches = match()
+            if len(matches) < min_matches:
+                reason = f"only {len(matches)} matches with the map"
                 continue
-            posed, reason = self._confirm(known, features, answer, len(matched), number)
+            answer = yield self._make_query(view, matches, against)
+            posed, reason = self._verify(self._present, view, answer, len(matches))
             if posed is not None:
-                self._segment, self._last, self._similar = segment, None, None
-                known.refer_to(number)
                 return posed, ""
         return None, reason
 
-    def _candidates(self, features: ViewFeatures) -> Iterator[tuple[int, int]]:
-        """Yield the keyframes that may show what a frame shows: (segment, number)."""
-        for segment, known in self._segments.items():
-            count = len(known.map.keyframes)
-            numbers = known.map.most_alike(features.place, np.arange(count))[:_ALIKE]
-            if segment == self._segment:
-                numbers = [*range(count - 1, max(-1, count - 1 - _LATEST), -1), *numbers]
-            yield from ((segment, number) for number in dict.fromkeys(numbers))
+    def _match_predicted(self, view: MonocularView, radius_px: float) -> Matches:
+        """Match the landmarks around the reference keyframe near the pixels of the predicted pose."""
+        limits = GuidedMatchLimits(radius_px=radius_px)
+        return _match_guided(self._present, view, self._predict_pose(), limits)
 
-    def _is_clear(self, answer: Answer, matches: int) -> bool:
-        asked = min(matches, self.options.max_matches)
-        return not answer.is_weak and answer.inliers >= max(_CLEAR_INLIERS, _CLEAR_RATIO * asked)
+    def _predict_pose(self) -> Array:
+        """Predict ``T_camera_world`` of the frame: by a user's motion model, or by a constant velocity.
 
-    # --- the same place twice ---
+        With an IMU the rotation is that of the gyroscope.
+        """
+        state, now_s = self._state, self._frame.timestamp_s
+        assert state.last is not None
+        T_world_camera = self._plugins.predict_pose(now_s)
+        if T_world_camera is not None:
+            return inverse(T_world_camera)
+        T_last_next = self._plugins.predict_motion(inverse(state.T_next_last), state.timestamp_s, now_s)
+        predicted: Array = inverse(T_last_next) @ state.last.T_camera_world
+        return predicted
 
-    def _seek_join(self, posed: _Posed) -> Generator[PoseQuery, Answer, None]:
-        """Yield a query for the place of a tracked frame in another segment; join the two when two agree."""
-        everywhere = [
-            (segment, number)
-            for segment, known in self._segments.items()
-            if segment != self._segment
-            for number in known.map.most_alike(posed.features.place, np.arange(len(known.map.keyframes)))[
-                :_ALIKE
-            ]
-        ]
-        similar = yield from self._seek_place(posed, everywhere)
-        if similar is None:
+    def _match_last_frame(self, view: MonocularView) -> Matches:
+        """Match the landmarks of the last frame by appearance, wherever they are."""
+        last, own = self._state.last, self._present.map
+        assert last is not None
+        rows = np.flatnonzero(last.landmarks != NO_LANDMARK)
+        rows = rows[own.is_alive[last.landmarks[rows]]]
+        landmarks = own.landmarks(last.landmarks[rows])
+        return match_by_appearance(landmarks, last.view.features.descriptors[rows], view.features)
+
+    # --- Recognise known places ---
+
+    @property
+    def _present(self) -> _Segment:
+        """The present segment."""
+        return self._segments[self._state.segment]
+
+    @property
+    def _maps(self) -> dict[int, LandmarkMap]:
+        """The map of each segment."""
+        return {number: segment.map for number, segment in self._segments.items()}
+
+    def _relocalise(
+        self, view: MonocularView
+    ) -> Generator[PoseQuery, QueryAnswer, tuple[_PosedView | None, str]]:
+        """Ask for the pose of a frame at known places; return it, or None and why there is none."""
+        present = self._state.segment
+        keyframes = list_relocalisation_candidates(self._maps, view.place_vector, present)
+        candidates = match_candidates(self._maps, keyframes, view.features)
+        reason = f"only {len(candidates[0].matches)} matches with the map"
+        for candidate in candidates[:_MAX_RELOCALISATION_QUERIES]:
+            count = len(candidate.matches)
+            if count < self.options.min_inliers:
+                break
+            segment, keyframe = self._segments[candidate.segment], candidate.keyframe
+            answer = yield self._make_query(view, candidate.matches, "keyframe")
+            reason = "the matches agree on no pose"
+            # Far from the newest keyframes, only a clear answer is accepted: perceptual aliases exist.
+            is_new = keyframe >= segment.map.keyframe_count - LATEST_KEYFRAMES
+            if not ((candidate.segment == present and is_new) or self._is_clear(answer, count)):
+                continue
+            posed, reason = self._verify(segment, view, answer, count, keyframe)
+            if posed is not None:
+                self._state = replace(self._state, segment=candidate.segment, last=None, candidate=None)
+                segment.set_reference(keyframe)
+                return posed, ""
+        return None, reason
+
+    def _find_join(self) -> Generator[PoseQuery, QueryAnswer, None]:
+        """Ask for the place of the last frame in other segments; join two segments if two frames agree."""
+        last, present = self._state.last, self._state.segment
+        assert last is not None
+        keyframes = list_other_segments(self._maps, last.view.place_vector, present)
+        similarity = yield from self._measure_similarity(last, keyframes)
+        if similarity is None:
             return
-        if similar.segment < self._segment:
-            self._join(self._segment, similar)
-        else:  # the camera is back in the older segment: its poses stay
-            back = inverse(similar.T)
-            self._join(
-                similar.segment,
-                _Similarity(
-                    segment=self._segment, keyframe=self._own.reference,
-                    T=scaled(back, 1.0 / similar.scale), scale=1.0 / similar.scale,
-                ),
-                similar.keyframe,
-            )  # fmt: skip
+        # The older segment keeps its frame and its unit: in it, the camera's poses stay.
+        if similarity.segment < present:
+            self._join(present, similarity, self._present.reference)
+        else:
+            back = similarity.inverted(present, self._present.reference)
+            self._join(similarity.segment, back, similarity.keyframe)
 
-    def _seek_loop(self, posed: _Posed) -> Generator[PoseQuery, Answer, None]:
-        """Yield a query for the place of a new keyframe among older ones, and correct the map by it."""
-        own = self._own.map
-        newest = len(own.keyframes) - 1
-        apart = np.flatnonzero(own.shared_with(newest)[: max(0, newest - _LOOP_AGE)] < MIN_SHARED)
-        if not len(apart) or newest < self._loop_from:
+    def _find_loop(self) -> Generator[PoseQuery, QueryAnswer, None]:
+        """Ask for the place of a new keyframe among much older ones; close the loop if two keyframes
+        agree."""
+        # 1. Choose older keyframes that share few landmarks with the new one.
+        state, own = self._state, self._present.map
+        assert state.last is not None
+        newest = own.keyframe_count - 1
+        shared = own.count_shared_landmarks(newest)[: max(0, newest - _LOOP_AGE_KEYFRAMES)]
+        apart = np.flatnonzero(shared < MIN_SHARED_LANDMARKS)
+        if not len(apart) or newest < state.next_loop_keyframe:
             return
-        alike = own.most_alike(posed.features.place, apart)[:_LOOP_ALIKE]
-        similar = yield from self._seek_place(posed, [(self._segment, number) for number in alike])
-        if similar is None:
+        similar = own.rank_by_similarity(state.last.view.place_vector, _LOOP_CANDIDATES, apart)
+        # 2. Measure where the new keyframe lies by the older ones.
+        similarity = yield from self._measure_similarity(
+            state.last, [(state.segment, keyframe) for keyframe in similar]
+        )
+        if similarity is None:
             return
-        self._motion = scaled(self._motion, similar.scale)
-        if self._slots.motion is not None:
-            self._slots.motion.clear()
-        self._merge_places(similar.keyframe, newest, similar)
-        self._own.unit *= similar.scale
-        self.loop_scales.append(similar.scale)
-        self._loop_from = newest + _LOOP_AGE
+        # 3. Bend the map, so that both places are one.
+        self._state = replace(
+            self._state,
+            T_next_last=scaled(self._state.T_next_last, similarity.scale),
+            next_loop_keyframe=newest + _LOOP_AGE_KEYFRAMES,
+        )
+        self._plugins.forget_poses()
+        self._merge_places(similarity.keyframe, newest, similarity)
+        self._present.length_factor *= similarity.scale
+        self.loop_scales.append(similarity.scale)
 
-    def _seek_place(
-        self, posed: _Posed, keyframes: list[tuple[int, int]]
-    ) -> Generator[PoseQuery, Answer, _Similarity | None]:
-        """Yield a query against the best matched of *keyframes*; return the place if two frames agree."""
-        matched = [
-            (segment, number, self._matched_with(segment, number, posed.features))
-            for segment, number in keyframes
-        ]
-        segment, number, best = max(matched, key=lambda candidate: len(candidate[2]))
-        if len(best) < _CLEAR_INLIERS:
+    def _measure_similarity(
+        self, posed: _PosedView, keyframes: Iterable[tuple[int, int]]
+    ) -> Generator[PoseQuery, QueryAnswer, _Similarity | None]:
+        """Measure where the present segment lies by the place of a frame among keyframes.
+
+        Args:
+            posed: The frame with its pose in the present segment.
+            keyframes: (segment, keyframe) of the candidates.
+
+        Returns:
+            The similarity, once two frames in a row agree on it; otherwise None.
+        """
+        # 1. Solve and verify the pose by the keyframe with the most matches.
+        best = match_candidates(self._maps, keyframes, posed.view.features)[0]
+        count, segment = len(best.matches), self._segments[best.segment]
+        if count < CLEAR_INLIERS:
             return None
-        known = self._segments[segment]
-        answer = yield self._make_query(known, posed.features, best, "segment")
-        if not self._is_clear(answer, len(best)):
+        answer = yield self._make_query(posed.view, best.matches, "segment")
+        if not self._is_clear(answer, count):
             return None
-        there, _ = self._confirm(known, posed.features, answer, len(best), number)
+        there, _ = self._verify(segment, posed.view, answer, count, best.keyframe)
         if there is None:
             return None
-        scale = self._scale_between(posed, there, known)
+        # 2. The scale is the ratio of the depths of landmarks on both sides.
+        scale = self._measure_scale(posed, there, segment.map)
         if scale is None:
             return None
-        T = inverse(there.T_camera_world) @ scaled(posed.T_camera_world, scale)
-        similar = _Similarity(segment=segment, keyframe=number, T=T, scale=scale)
-        before, self._similar = self._similar, similar
-        if before is None or before.segment != segment:
+        # 3. Compare the measurement with that of an earlier frame.
+        measured = _Similarity(
+            segment=best.segment,
+            keyframe=best.keyframe,
+            T=inverse(there.T_camera_world) @ scaled(posed.T_camera_world, scale),
+            scale=scale,
+        )
+        previous = self._state.candidate
+        self._state = replace(self._state, candidate=measured)
+        if previous is None or previous.segment != best.segment:
             return None
-        centre = inverse(posed.T_camera_world)[:3, 3]
-        return similar if _agree(before, similar, centre, known.map.median_depth(number)) else None
+        centre, depth = inverse(posed.T_camera_world)[:3, 3], segment.map.median_depth(best.keyframe)
+        return measured if previous.agrees_with(measured, centre, depth) else None
 
-    def _scale_between(self, posed: _Posed, there: _Posed, known: _Segment) -> float | None:
-        """Return by what the lengths of this segment are multiplied there; None if depths do not agree."""
+    def _measure_scale(self, posed: _PosedView, there: _PosedView, other_map: LandmarkMap) -> float | None:
+        """Return by what the lengths of the present segment are multiplied in another map.
+
+        It is the median ratio of the depths of features that have a landmark in both maps; None if these are
+        too few, or their ratios differ too much.
+        """
         both = np.flatnonzero((posed.landmarks != NO_LANDMARK) & (there.landmarks != NO_LANDMARK))
-        here = transform(posed.T_camera_world, self._own.map.points[posed.landmarks[both]])[:, 2]
-        ratios = transform(there.T_camera_world, known.map.points[there.landmarks[both]])[:, 2] / here
+        points_here = self._present.map.points[posed.landmarks[both]]
+        points_there = other_map.points[there.landmarks[both]]
+        depths_here = transform(posed.T_camera_world, points_here)[:, 2]
+        ratios = transform(there.T_camera_world, points_there)[:, 2] / depths_here
         if len(both) < self.options.min_inliers:
             return None
         scale = float(np.median(ratios))
-        return scale if np.median(np.abs(ratios - scale)) <= _MAX_DEPTH_SPREAD * scale else None
+        return scale if np.median(np.abs(ratios - scale)) <= _MAX_SCALE_SPREAD * scale else None
 
-    def _join(self, segment: int, similar: _Similarity, of_segment: int | None = None) -> None:
+    def _join(self, segment: int, similarity: _Similarity, keyframe: int) -> None:
         """Move all of *segment*, the newer one, into an older one, which keeps its frame and its unit.
 
         Args:
-            segment: The newer one.
-            similar: Where it lies in the older one.
-            of_segment: Its keyframe that shows the keyframe of *similar*; None means its newest reference.
+            segment: Number of the newer segment.
+            similarity: Where it lies in the older one.
+            keyframe: Keyframe of the newer segment that shows the same place as that of *similarity*.
         """
-        newer, into = self._segments.pop(segment), self._segments[similar.segment]
-        newer.move(similar.T, similar.scale)
-        keyframe, landmark = into.map.take(newer.map)
-        into.placed += [replace(placed, keyframe=placed.keyframe + keyframe) for placed in newer.placed]
+        newer, into = self._segments.pop(segment), self._segments[similarity.segment]
+        newer.move(similarity.T, similarity.scale)
+        first_keyframe, first_landmark = into.append(newer)
         start = self._T_world_start
-        self.joins.append(
-            Join(
-                segment,
-                similar.segment,
-                start @ similar.T @ scaled(inverse(start), similar.scale),
-                similar.scale,
+        T_into_segment = start @ similarity.T @ scaled(inverse(start), similarity.scale)
+        self.joins.append(Join(segment, similarity.segment, T_into_segment, similarity.scale))
+        if segment == self._state.segment:
+            self._state = replace(self._state, segment=similarity.segment)
+            into.set_reference(newer.reference + first_keyframe)
+            self._move_state(similarity.T, similarity.scale, first_landmark)
+        self._merge_places(similarity.keyframe, first_keyframe + keyframe)
+
+    def _move_state(self, T_new_old: Array, scale: float, first_landmark: int = 0) -> None:
+        """Express the last pose in another frame and unit, and its landmarks in a map where they begin
+        later."""
+        state = self._state
+        last = state.last
+        if last is not None:
+            last = replace(
+                last,
+                T_camera_world=scaled(last.T_camera_world, scale) @ inverse(T_new_old),
+                landmarks=shift_landmarks(last.landmarks, first_landmark),
             )
-        )
-        if segment == self._segment:
-            self._segment = similar.segment
-            into.refer_to(newer.reference + keyframe)
-            self._move_last(similar.T, similar.scale, landmark)
-        self._merge_places(
-            similar.keyframe, keyframe + (newer.reference if of_segment is None else of_segment)
-        )
+        self._state = replace(state, T_next_last=scaled(state.T_next_last, scale), last=last)
+        self._plugins.forget_poses()
 
-    def _move_last(self, T_new_old: Array, scale: float, first_landmark: int = 0) -> None:
-        self._motion = scaled(self._motion, scale)
-        if self._slots.motion is not None:
-            self._slots.motion.clear()
-        if self._last is not None:
-            moved = np.where(
-                self._last.landmarks == NO_LANDMARK, NO_LANDMARK, self._last.landmarks + first_landmark
-            )
-            T_camera_world = scaled(self._last.T_camera_world, scale) @ inverse(T_new_old)
-            self._last = replace(self._last, T_camera_world=T_camera_world, landmarks=moved)
+    def _merge_places(self, older: int, newer: int, bend_by: _Similarity | None = None) -> None:
+        """Fuse the landmarks around two keyframes of one place, and adjust the whole present map.
 
-    def _merge_places(self, older: int, newer: int, bent: _Similarity | None = None) -> None:
-        """Make one landmark of those around two keyframes that are the same, and adjust the whole map.
-
-        With *bent* the keyframes between the two are moved before, so that the newer one is in its place.
+        With *bend_by* the map between the two keyframes is bent before, so that the newer one is in its
+        place.
         """
-        own, reference = self._own.map, self._own.reference
-        relative = None
-        if self._last is not None:
-            relative = self._last.T_camera_world @ inverse(own.keyframes[reference].T_camera_world)
-        if bent is not None:
-            own.bend(older, newer, bent.T, bent.scale)
-        for keyframe in own.local(newer):
-            own.fuse(keyframe, own.around(older), _CONFIRM_PX)
+        own, reference, last = self._present.map, self._present.reference, self._state.last
+        T_camera_reference = None
+        if last is not None:
+            T_camera_reference = last.T_camera_world @ inverse(own.keyframes[reference].T_camera_world)
+        if bend_by is not None:
+            own.bend(older, newer, bend_by.T, bend_by.scale)
+        for keyframe in own.local_keyframes(newer):
+            own.fuse(keyframe, own.local_landmarks(older), _VERIFY_RADIUS_PX)
         own.adjust_around(newer)
         own.adjust_all(iterations=_MERGE_ITERATIONS)
-        self._similar = None
-        if self._last is not None and relative is not None:
-            T_camera_world = relative @ own.keyframes[reference].T_camera_world
-            self._last = replace(self._last, T_camera_world=T_camera_world)
+        if last is not None and T_camera_reference is not None:
+            T_camera_world = T_camera_reference @ own.keyframes[reference].T_camera_world
+            last = replace(last, T_camera_world=T_camera_world)
+        self._state = replace(self._state, last=last, candidate=None)
 
-    # --- matches and poses ---
-
-    def _matched_with(self, segment: int, number: int, features: ViewFeatures) -> _Matched:
-        """Match the landmarks of a keyframe by appearance alone."""
-        landmarks, descriptors = self._segments[segment].map.landmarks_in(number)
-        rows, columns = match_all(descriptors, features.image.descriptors)
-        return _Matched(landmarks=landmarks[rows], features=columns)
+    # --- Solve and verify ---
 
     def _make_query(
-        self, segment: _Segment, features: ViewFeatures, matched: _Matched, against: str
+        self, view: MonocularView, matches: Matches, against: Literal["map", "frame", "keyframe", "segment"]
     ) -> PoseQuery:
-        landmarks, columns = matched.landmarks, matched.features
-        if len(landmarks) > self.options.max_matches:
-            even = np.linspace(0, len(landmarks) - 1, self.options.max_matches).astype(np.int64)
-            landmarks, columns = landmarks[even], columns[even]
-        leftmost = np.argsort(features.image.pixels[columns, 0], kind="stable")
-        points, pixels = round_for_wire(
-            segment.map.points[landmarks[leftmost]], features.image.pixels[columns[leftmost]]
-        )
-        return PoseQuery(
-            timestamp_s=self._frame.timestamp_s,
-            correspondences=Correspondences(
-                points_world=points, pixels=pixels, depths_m=np.zeros(len(points))
-            ),
-            camera=self._frame.camera,
-            inlier_px=self.options.inlier_px,
-            max_iterations=self.options.max_iterations,
-            against=against,  # type: ignore[arg-type]
+        return make_query(
+            self._frame,
+            matches,
+            view.features,
+            self.options,
+            max_matches=self.options.max_matches,
+            against=against,
         )
 
-    def _confirm(
-        self, segment: _Segment, features: ViewFeatures, answer: Answer, matches: int,
+    def _is_clear(self, answer: QueryAnswer, match_count: int) -> bool:
+        """Return whether an answer alone proves a place."""
+        return answer.is_clear(min(match_count, self.options.max_matches))
+
+    def _verify(
+        self,
+        segment: _Segment,
+        view: MonocularView,
+        answer: QueryAnswer,
+        match_count: int,
         around: int | None = None,
-    ) -> tuple[_Posed | None, str]:  # fmt: skip
-        """Return the pose that fits all landmarks near that of an answer, or why there is none."""
-        asked = min(matches, self.options.max_matches)
-        pose = None if answer.T_camera_world is None else rigid(answer.T_camera_world)
-        if pose is None or answer.inliers < max(self.options.min_inliers, _TRACKED_RATIO * asked):
+    ) -> tuple[_PosedView | None, str]:
+        """Fit the pose of an answer to all landmarks around it; return None and why if too few agree.
+
+        Args:
+            segment: The segment in which the pose was solved.
+            view: The image.
+            answer: The answer to its query.
+            match_count: Number of matches of the query.
+            around: Keyframe around which landmarks are matched; None for the reference keyframe.
+        """
+        sent = min(match_count, self.options.max_matches)
+        pose = answer.accepted_pose(max(self.options.min_inliers, _TRACKED_RATIO * sent))
+        if pose is None:
             return None, "the matches agree on no pose"
-        fitted = self._fit(segment, features, pose, _CONFIRM_PX, around)
+        fitted = self._fit(segment, view, pose, _VERIFY_RADIUS_PX, around)
         if fitted is None:
             return None, "too few landmarks agree with the pose"
-        return replace(fitted, matches=matches, is_weak=answer.is_weak), ""
+        return replace(fitted, matches=match_count, is_weak=answer.is_weak), ""
 
     def _fit(
-        self, segment: _Segment, features: ViewFeatures, T_camera_world: Array, radius_px: float,
+        self,
+        segment: _Segment,
+        view: MonocularView,
+        T_camera_world: Array,
+        radius_px: float,
         around: int | None = None,
-    ) -> _Posed | None:  # fmt: skip
-        """Match all landmarks that a pose should see, and fit the pose to them; None if too few agree."""
-        limits, least = self.options.limits, self.options.min_inliers
-        pose = T_camera_world
-        for radius in (radius_px, _LAST_PX):
-            near = NearLimits(radius_px=radius, ratio=0.9)
-            matched = _matched_near(segment, features, pose, near, around)
-            count = len(matched)
-            if count < least:
+    ) -> _PosedView | None:
+        """Match landmarks near the pixels of a pose and fit the pose to them, twice; None if too few
+        agree."""
+        limits, min_inliers = self.options.limits, self.options.min_inliers
+        for radius in (radius_px, _REFINE_RADIUS_PX):
+            near = GuidedMatchLimits(radius_px=radius, lowe_ratio=_VERIFY_LOWE_RATIO)
+            matches = _match_guided(segment, view, T_camera_world, near, around)
+            count = len(matches)
+            if count < min_inliers:
                 return None
             observed = Observations(
-                points=segment.map.points[matched.landmarks],
-                spreads=np.broadcast_to(_NO_SPREAD, (count, 3, 3)),
-                pixels=features.image.pixels[matched.features],
-                pixels_px=limits.pixel_sigma * features.image.sizes[matched.features],
+                points=matches.landmarks.points,
+                covariances=matches.landmarks.covariances,
+                pixels=view.features.pixels[matches.features],
+                pixel_sigmas_px=limits.pixel_sigma * view.features.sizes[matches.features],
                 depths_m=np.zeros(count),
-                depths_dev_m=np.ones(count),
+                depth_sigmas_m=np.ones(count),
             )
-            fitted = fit_pose(observed, segment.map.camera, pose, gate2=limits.outlier_sigma**2)
-            if fitted is None or fitted.is_inlier.sum() < least:
+            fitted = fit_pose(observed, segment.map.camera, T_camera_world, gate2=limits.outlier_sigma**2)
+            if fitted is None or fitted.is_inlier.sum() < min_inliers:
                 return None
-            rotated = rigid(fitted.T_camera_world)
-            if rotated is None:
+            pose = rigid(fitted.T_camera_world)
+            if pose is None:
                 return None
-            pose, is_inlier = rotated, fitted.is_inlier
-        landmarks = np.full(len(features.image), NO_LANDMARK)
-        landmarks[matched.features[is_inlier]] = matched.landmarks[is_inlier]
-        return _Posed(
-            features=features, T_camera_world=pose, landmarks=landmarks, matches=count, is_weak=False
+            T_camera_world, is_inlier = pose, fitted.is_inlier
+        inliers = np.flatnonzero(is_inlier)
+        landmarks = np.full(len(view.features), NO_LANDMARK)
+        landmarks[matches.features[inliers]] = matches.landmarks.numbers[inliers]
+        return _PosedView(
+            view=view, T_camera_world=T_camera_world, landmarks=landmarks, matches=count, is_weak=False
         )
 
-    # --- the start of a segment ---
+    # --- The start of a segment ---
 
-    def _start_or_lose(self, features: ViewFeatures, reason: str) -> TrackedFrame:
-        """Wait for a second view with parallax; then begin a segment, if so many frames before were lost."""
-        if len(features.image) >= _MIN_START_MATCHES:
-            self.unrecognised += 1
-            views, rows, columns, why = self._two_views(features)
-            if views is not None and (not self._segments or self.unrecognised > self.options.segment_after):
-                return self._begin(features, views, rows, columns)
-            self._waiting.append((self._frame.timestamp_s, features))
-            reason = reason if self._segments else why
+    def _start_or_lose(self, view: MonocularView, reason: str) -> TrackedFrame:
+        """Let a frame without a pose wait for a second view; or begin a segment with it as the second view.
+
+        A later segment begins only if enough frames before it were lost.
+        """
+        if len(view.features) >= _MIN_START_MATCHES:
+            self._state = replace(self._state, unrecognised=self._state.unrecognised + 1)
+            start, rows, columns, start_reason = self._find_start(view)
+            may_begin = not self._segments or self._state.unrecognised > self.options.segment_after
+            if start is not None and may_begin:
+                return self._begin_segment(view, start, rows, columns)
+            self._waiting.append((self._frame.timestamp_s, view))
+            reason = reason if self._segments else start_reason
         elif not self._segments:
-            reason = f"only {len(features.image)} features"
+            reason = f"only {len(view.features)} features"
         if self._segments:
             self.lost_frames += 1
-            self._last = None
-            return self._without_pose("lost", reason)
+            self._state = replace(self._state, last=None)
+            return self._make_result_without_pose("lost", reason)
         self.starting_frames += 1
-        return self._without_pose("starting", reason)
+        return self._make_result_without_pose("starting", reason)
 
-    def _two_views(self, features: ViewFeatures) -> tuple[TwoViewStart | None, Rows, Rows, str]:
-        """Return the start by the oldest waiting view that still shows the same, or why there is none."""
-        none = np.empty(0, dtype=np.int64)
+    def _find_start(self, view: MonocularView) -> tuple[TwoViewStart | None, Rows, Rows, str]:
+        """Find the oldest waiting view that shows the same place as the present one, and their relative pose.
+
+        Waiting views before it are dropped.
+
+        Returns:
+            The start, None if the two views do not suffice; the rows of matched features in both views; why
+            there is no start.
+        """
         reason = "the first frame"
         while self._waiting:
             first = self._waiting[0][1]
-            rows, columns = match_all(first.image.descriptors, features.image.descriptors)
-            if len(rows) >= _MIN_START_MATCHES and len(self._waiting) < _MAX_WAITING:
-                views = start_from_two_views(
-                    first.image.pixels[rows], features.image.pixels[columns], self._frame.camera,
+            rows, columns = match_all(first.features.descriptors, view.features.descriptors)
+            if len(rows) >= _MIN_START_MATCHES and len(self._waiting) < _MAX_WAITING_FRAMES:
+                start = start_from_two_views(
+                    first.features.pixels[rows],
+                    view.features.pixels[columns],
+                    self._frame.camera,
                     min_parallax_deg=self.options.start_parallax_deg,
-                )  # fmt: skip
-                return (None if views.reason else views), rows, columns, views.reason
+                )
+                return (None if start.reason else start), rows, columns, start.reason
             self._waiting.pop(0)
             reason = f"only {len(rows)} matches with the first view"
+        none = np.empty(0, dtype=np.int64)
         return None, none, none, reason
 
-    def _begin(self, features: ViewFeatures, views: TwoViewStart, rows: Rows, columns: Rows) -> TrackedFrame:
-        """Begin a segment with two views; place the frames between them."""
-        first_s, first = self._waiting[0]
-        unit = _START_DEPTH / float(np.median(views.points[:, 2]))
-        made = LandmarkMap(self._frame.camera, self.options.limits, self._slots.optimiser or adjust)
-        made.add_keyframe(first, np.eye(4), np.full(len(first.image), NO_LANDMARK))
-        pose = scaled(views.T_second_first, unit)
-        made.add_keyframe(features, pose, np.full(len(features.image), NO_LANDMARK))
-        made.add_landmarks(unit * views.points, (0, rows[views.rows]), (1, columns[views.rows]))
-        made.adjust_all()
-        is_first = not self._segments
-        self._segment = self._begun
-        self._begun += 1
-        own = self._segments[self._segment] = _Segment(map=made)
-        own.refer_to(1)
-        own.place(first_s, np.eye(4), 0)
-        second = made.keyframes[1]
-        before = self._place_waiting(own, second.T_camera_world)
-        if not is_first:
-            self.lost_frames -= len(own.placed)
-        posed = _Posed(
-            features=features, T_camera_world=second.T_camera_world, landmarks=second.landmarks,
-            matches=len(rows), is_weak=False,
-        )  # fmt: skip
-        self._motion = np.eye(4) if before is None else second.T_camera_world @ inverse(before)
-        self._last, self._similar, self.unrecognised, self._loop_from = posed, None, 0, 0
-        self._last_s = self._frame.timestamp_s
-        return self._result(posed, keyframe=True)
+    def _begin_segment(
+        self, view: MonocularView, start: TwoViewStart, rows: Rows, columns: Rows
+    ) -> TrackedFrame:
+        """Begin a segment with the first waiting view and the present one.
 
-    def _place_waiting(self, own: _Segment, T_second: Array) -> Array | None:
-        """Give the frames between the two views their poses; return that of the last one, if it has one."""
+        Args:
+            view: The present, second view.
+            start: Relative pose and points of the two views.
+            rows: Features of the first view that match.
+            columns: Features of the second view that match them.
+        """
+        # 1. Make a map of two keyframes in a unit in which the median depth is 2, and adjust it.
+        first_s, first = self._waiting[0]
+        unit = _START_DEPTH / float(np.median(start.points[:, 2]))
+        adjuster = self._plugins.optimiser or adjust
+        new_map = LandmarkMap(self._frame.camera, self.options.limits, adjuster)
+        for new_view, pose in ((first, np.eye(4)), (view, scaled(start.T_second_first, unit))):
+            new_map.add_keyframe(new_view, pose, np.full(len(new_view.features), NO_LANDMARK))
+        new_map.add_landmarks(unit * start.points, (0, rows[start.rows]), (1, columns[start.rows]))
+        new_map.adjust_all()
+        # 2. Give the frames between the two views their poses.
+        is_first = not self._segments
+        number = self._next_segment
+        self._next_segment += 1
+        segment = self._segments[number] = _Segment(map=new_map)
+        segment.set_reference(1)
+        segment.add_frame(first_s, np.eye(4), 0)
+        second = new_map.keyframes[1]
+        T_before = self._pose_waiting_frames(segment, second.T_camera_world)
+        if not is_first:
+            self.lost_frames -= len(segment.frames)
+        # 3. The present frame is the last one now.
+        posed = _PosedView(
+            view=view,
+            T_camera_world=second.T_camera_world,
+            landmarks=second.landmarks,
+            matches=len(rows),
+            is_weak=False,
+        )
+        self._state = _TrackState(
+            segment=number,
+            last=posed,
+            timestamp_s=self._frame.timestamp_s,
+            T_next_last=np.eye(4) if T_before is None else second.T_camera_world @ inverse(T_before),
+        )
+        return self._make_result(posed, is_keyframe=True)
+
+    def _pose_waiting_frames(self, segment: _Segment, T_second: Array) -> Array | None:
+        """Fit the poses of the frames between the two views of a start, each from an interpolated guess.
+
+        *T_second* is ``T_camera_world`` of the second view.  Returned is that of the frame just before it,
+        None if that frame has no pose.
+        """
         count = len(self._waiting)
-        pose, last = np.eye(4), None
-        for number, (timestamp_s, features) in enumerate(self._waiting[1:], start=1):
+        pose, newest = np.eye(4), None
+        for number, (timestamp_s, view) in enumerate(self._waiting[1:], start=1):
             guess = pose.copy()
             guess[:3, 3] += (T_second[:3, 3] - pose[:3, 3]) / (count - number + 1)
-            posed = self._fit(own, features, guess, self.options.search_px)
-            last = None
+            posed = self._fit(segment, view, guess, self.options.search_px)
+            newest = None
             if posed is not None:
-                last = pose = posed.T_camera_world
-                own.place(timestamp_s, pose, 0)
+                newest = pose = posed.T_camera_world
+                segment.add_frame(timestamp_s, pose, 0)
         self._waiting = []
-        return last
+        return newest
 
-    # --- results ---
+    # --- Keep ---
 
-    def _keep(self, posed: _Posed) -> bool:
-        """Take a posed frame as the last one, and into the map; say whether it became a keyframe."""
-        own, T = self._own, posed.T_camera_world
-        self._motion = np.eye(4) if self._last is None else T @ inverse(self._last.T_camera_world)
-        self.unrecognised = 0
-        keyframe = not posed.is_weak and self._is_keyframe(posed)
-        if keyframe:
-            number = own.map.add_keyframe(posed.features, T, posed.landmarks)
-            own.map.extend(number)
-            own.map.adjust_around(number)
-            own.map.cull()
-            own.refer_to(number)
-            made = own.map.keyframes[number]
-            posed = replace(posed, T_camera_world=made.T_camera_world, landmarks=made.landmarks)
-        if self._slots.motion is not None:
-            if self._last is None or keyframe:  # lost before, or the map was adjusted
-                self._slots.motion.clear()
-            self._slots.motion.add(self._frame.timestamp_s, inverse(posed.T_camera_world))
-        self._last, self._last_s = posed, self._frame.timestamp_s
-        return keyframe
+    def _keep(self, posed: _PosedView) -> bool:
+        """Take a frame with a verified pose as the last one, and into the map; return if it is a keyframe."""
+        segment, last = self._present, self._state.last
+        # 1. Update the motion model; after a loss the motion is not known.
+        T_next_last = np.eye(4) if last is None else posed.T_camera_world @ inverse(last.T_camera_world)
+        # 2. Extend and adjust the map.
+        is_keyframe = not posed.is_weak and self._is_keyframe(posed)
+        if is_keyframe:
+            number = segment.map.add_keyframe(posed.view, posed.T_camera_world, posed.landmarks)
+            segment.map.extend(number)
+            segment.map.adjust_around(number)
+            segment.map.cull()
+            segment.set_reference(number)
+            keyframe = segment.map.keyframes[number]
+            posed = replace(posed, T_camera_world=keyframe.T_camera_world, landmarks=keyframe.landmarks)
+        # 3. The frame is the last one now.
+        if last is None or is_keyframe:  # the camera was lost before, or the map was adjusted
+            self._plugins.forget_poses()
+        self._plugins.add_pose(self._frame.timestamp_s, inverse(posed.T_camera_world))
+        self._state = replace(
+            self._state,
+            last=posed,
+            timestamp_s=self._frame.timestamp_s,
+            T_next_last=T_next_last,
+            unrecognised=0,
+        )
+        return is_keyframe
 
-    def _is_keyframe(self, posed: _Posed) -> bool:
-        options, own = self.options, self._own
-        if len(own.map.keyframes) >= options.limits.max_keyframes:
+    def _is_keyframe(self, posed: _PosedView) -> bool:
+        """Return whether a frame differs much from the reference keyframe, and the map may grow."""
+        options, segment = self.options, self._present
+        if segment.map.keyframe_count >= options.limits.max_keyframes:
             return False
-        reference = own.map.keyframes[own.reference].T_camera_world
-        moved, turned_deg = pose_difference(posed.T_camera_world, reference)
-        depth = own.map.median_depth(own.reference)
+        reference = segment.map.keyframes[segment.reference].T_camera_world
+        moved, rotated_deg = pose_difference(posed.T_camera_world, reference)
+        depth = segment.map.median_depth(segment.reference)
         return (
-            posed.inliers < options.keyframe_share * own.reference_seen
-            or turned_deg > options.keyframe_deg
+            posed.inliers < options.keyframe_share * segment.reference_landmarks
+            or rotated_deg > options.keyframe_deg
             or moved > options.keyframe_depth_percent / 100 * depth
         )
 
-    def _result(self, posed: _Posed, *, keyframe: bool) -> TrackedFrame:
-        assert self._last is not None
-        T = self._last.T_camera_world
-        self._own.place(self._frame.timestamp_s, T, self._own.reference)
-        is_apart = self._segment != min(self._segments)
+    def _make_result(self, posed: _PosedView, *, is_keyframe: bool) -> TrackedFrame:
+        """Add the last pose to its segment, and return it as the result of the frame."""
+        last = self._state.last
+        assert last is not None
+        segment = self._present
+        segment.add_frame(self._frame.timestamp_s, last.T_camera_world, segment.reference)
+        is_joined = self._state.segment == min(self._segments)
         return TrackedFrame(
-            frame=self._frame, T_world_camera=self._T_world_start @ inverse(T), keyframe=keyframe,
-            inliers=posed.inliers, matches=posed.matches, segment=self._segment, scale="up to scale",
+            frame=self._frame,
+            T_world_camera=self._T_world_start @ inverse(last.T_camera_world),
+            keyframe=is_keyframe,
+            inliers=posed.inliers,
+            matches=posed.matches,
+            segment=self._state.segment,
+            scale="up to scale",
             features=self._raw,
-            reason="in a segment that is not joined to the first one yet" if is_apart else "",
-        )  # fmt: skip
+            reason="" if is_joined else NOT_JOINED,
+        )
 
-    def _without_pose(self, status: Literal["lost", "starting"], reason: str) -> TrackedFrame:
+    def _make_result_without_pose(self, status: Literal["lost", "starting"], reason: str) -> TrackedFrame:
         return TrackedFrame(
-            frame=self._frame, T_world_camera=None, keyframe=False, inliers=0, matches=0, status=status,
-            reason=reason, segment=self._segment, scale="up to scale", features=self._raw,
-        )  # fmt: skip
+            frame=self._frame,
+            T_world_camera=None,
+            keyframe=False,
+            inliers=0,
+            matches=0,
+            status=status,
+            reason=reason,
+            segment=self._state.segment,
+            scale="up to scale",
+            features=self._raw,
+        )
 
 
-def _matched_near(
-    segment: _Segment, features: ViewFeatures, T_camera_world: Array, limits: NearLimits,
+def _match_guided(
+    segment: _Segment,
+    view: MonocularView,
+    T_camera_world: Array,
+    limits: GuidedMatchLimits,
     around: int | None = None,
-) -> _Matched:  # fmt: skip
-    """Match the landmarks around a keyframe, that of reference by default, near the pixels of a pose."""
+) -> Matches:
+    """Match the landmarks around a keyframe with an image near the pixels at which a pose predicts them.
+
+    The keyframe is the reference keyframe for None.
+    """
     own = segment.map
-    numbers = own.around(segment.reference if around is None else around)
-    rows, columns = own.landmarks(numbers).seek(
-        T_camera_world, own.camera, features.image, limits, limits.radius_px
-    )
-    return _Matched(landmarks=numbers[rows], features=columns)
-
-
-def _agree(one: _Similarity, two: _Similarity, centre: Array, depth: float) -> bool:
-    """Say whether two measurements move the camera's centre to one place, turned and scaled alike."""
-    places = [transform(similar.T, similar.scale * centre[None])[0] for similar in (one, two)]
-    _, apart_deg = pose_difference(one.T, two.T)
-    ratio = max(one.scale / two.scale, two.scale / one.scale)
-    apart = float(np.linalg.norm(places[0] - places[1]))
-    return apart <= _AGREE_DEPTH * depth and apart_deg <= _AGREE_DEG and ratio <= _AGREE_SCALE
-
-
-def _found(frame: Frame, count: int, slots: Slots) -> Features:
-    """Return features that are spread over the image, without points."""
-    described = describe(frame.rgb, count, slot=slots.features)
-    return Features(
-        pixels=described.pixels, descriptors=described.descriptors, turns=described.turns,
-        sizes=described.sizes, points_camera=np.full((len(described.pixels), 3), np.nan), kind=described.kind,
-        is_oriented=described.is_oriented, is_scaled=described.is_scaled,
-    )  # fmt: skip
-
-
-def _looked_up(frame: Frame, found: Features, slots: Slots) -> ViewFeatures:
-    """Return features with their colours and the place that they show."""
-    last = np.array([frame.camera.width - 1, frame.camera.height - 1])
-    columns, rows = np.clip(np.rint(found.pixels).astype(np.int64), 0, last).T
-    image = ImageFeatures(
-        pixels=found.pixels, descriptors=found.descriptors, turns=found.turns, sizes=found.sizes,
-        distinct=distinct_distances(found.descriptors, found.pixels),
-        is_oriented=found.is_oriented, is_scaled=found.is_scaled,
-    )  # fmt: skip
-    place = place_of(found.descriptors, frame.rgb, slots.loops)
-    return ViewFeatures(image=image, colours=frame.rgb[rows, columns], place=place)
+    numbers = own.local_landmarks(segment.reference if around is None else around)
+    return own.landmarks(numbers).match(T_camera_world, own.camera, view.features, limits, limits.radius_px)

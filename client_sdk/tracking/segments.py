@@ -1,6 +1,7 @@
-"""What a mapper keeps of each segment of a drive: poses, cloud and keyframes, until segments are joined.
+"""Records of the segments of a drive that a mapper keeps: poses, point cloud and keyframes, until a join.
 
-A tracker without depth keeps its segments itself, since each keyframe corrects them; here is their record.
+A tracker without depth keeps its segments itself, because every new keyframe corrects them; here are
+functions that read them out.
 """
 
 from __future__ import annotations
@@ -15,30 +16,40 @@ from client_sdk.frontend import Features, Frame, TrackedFrame
 from client_sdk.point_map import MapOptions, PointMap
 from client_sdk.stereo.depth import with_offset
 from client_sdk.tracking.monocular_tracker import MonocularTracker
-from client_sdk.tracking.stereo_adjustment import MOST_KEYFRAMES, StereoAdjustment
-from client_sdk.tracking.tracker import Join
+from client_sdk.tracking.segment_join import Join
+from client_sdk.tracking.stereo_adjustment import MAX_ADJUSTED_KEYFRAMES, StereoAdjustment
 from client_sdk.trajectory import Trajectory
 from rse_pf.geometry import Array, Camera, inverse, rigid, transform
 from rse_pf.maps.format import Keyframe
 
 __all__ = [
     "DriveRecords",
-    "SeenPoints",
+    "KeyframePoints",
     "SegmentRecord",
     "add_to_cloud",
-    "certain_rows",
-    "keyframe_of",
     "landmark_keyframes",
-    "tracker_record",
+    "make_keyframe",
+    "read_segment",
+    "select_certain_rows",
 ]
 
-_CLOUD_SHARE = 0.05
-"""Largest deviation of a stereo pair's depth in the cloud, as a share of the depth."""
+_MAX_DEPTH_DEVIATION = 0.05
+"""Largest deviation of a stereo pair's depth in a point cloud, as a share of the depth."""
+_DISPARITY_SIGMAS = 2.0
+"""Number of standard deviations of a stereo pair's depth in a sharp image that are compared with that share:
+images are about twice as noisy."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SeenPoints:
-    """What a stereo keyframe adds to a cloud: its pose, ``(n, 3)`` points and colours."""
+class KeyframePoints:
+    """Points that one stereo keyframe added to a cloud.
+
+    Attributes:
+        timestamp_s: Time of the keyframe, in seconds.
+        T_world_camera: ``(4, 4)``, its pose in the frame of the segment.
+        points_camera: ``(n, 3)`` metres in the camera's frame.
+        colours: ``(n, 3)`` uint8, red first.
+    """
 
     timestamp_s: float
     T_world_camera: Array
@@ -48,71 +59,92 @@ class SeenPoints:
 
 @dataclass(slots=True, kw_only=True, eq=False)
 class SegmentRecord:
-    """One segment: stamps in seconds, ``(4, 4)`` poses in its own frame, its cloud and its keyframes.
+    """The record of one segment, in the frame of the segment.
 
-    ``seen`` are the points that stereo keyframes added to the cloud, so that it follows these; None once they
-    are too many to be adjusted.
+    Attributes:
+        cloud: Point cloud.
+        stamps_s: Times of the frames with a pose, in seconds.
+        poses: ``T_world_camera`` ``(4, 4)`` of these frames.
+        keyframes: Keyframes of a map, if the mapper keeps them.
+        keyframe_points: Points that stereo keyframes added to the cloud, by which it is made again after an
+            adjustment; None once there are more than `MAX_ADJUSTED_KEYFRAMES`.
     """
 
     cloud: PointMap
     stamps_s: list[float] = field(default_factory=list)
     poses: list[Array] = field(default_factory=list)
     keyframes: list[Keyframe] = field(default_factory=list)
-    seen: list[SeenPoints] | None = field(default_factory=list)
+    keyframe_points: list[KeyframePoints] | None = field(default_factory=list)
 
-    def take(self, other: SegmentRecord, T_own_other: Array) -> None:
-        """Add all of another segment."""
+    def append(self, other: SegmentRecord, T_own_other: Array) -> None:
+        """Add all of another segment, moved by ``T_own_other`` ``(4, 4)`` into the frame of this one."""
         self.stamps_s += other.stamps_s
-        self.poses += [_moved(T_own_other, pose) for pose in other.poses]
+        self.poses += [_move_pose(T_own_other, pose) for pose in other.poses]
         self.cloud.add_map(other.cloud, T_own_other)
         self.keyframes += [
-            replace(keyframe, T_world_camera=_moved(T_own_other, keyframe.T_world_camera))
+            replace(keyframe, T_world_camera=_move_pose(T_own_other, keyframe.T_world_camera))
             for keyframe in other.keyframes
         ]
-        self.note(
-            None if other.seen is None else
-            [replace(seen, T_world_camera=_moved(T_own_other, seen.T_world_camera)) for seen in other.seen]
-        )  # fmt: skip
+        moved = other.keyframe_points
+        if moved is not None:
+            moved = [
+                replace(points, T_world_camera=_move_pose(T_own_other, points.T_world_camera))
+                for points in moved
+            ]
+        self.add_keyframe_points(moved)
 
-    def note(self, seen: list[SeenPoints] | None) -> None:
-        """Remember what stereo keyframes added to the cloud, None for too many."""
-        kept = None if self.seen is None or seen is None else self.seen + seen
-        self.seen = None if kept is None or len(kept) > MOST_KEYFRAMES else kept
+    def add_keyframe_points(self, added: list[KeyframePoints] | None) -> None:
+        """Keep the points of stereo keyframes; None, or too many of them, forget all for good."""
+        points = None if self.keyframe_points is None or added is None else self.keyframe_points + added
+        is_adjustable = points is not None and len(points) <= MAX_ADJUSTED_KEYFRAMES
+        self.keyframe_points = points if is_adjustable else None
 
-    def corrected(self, found: StereoAdjustment) -> SegmentRecord:
-        """Return the segment as an adjustment of its keyframes has it; a cloud that others made stays."""
+    def corrected(self, adjustment: StereoAdjustment) -> SegmentRecord:
+        """Return the segment after an adjustment of its stereo keyframes.
+
+        A cloud whose points were forgotten, or come from other sources, stays as it is.
+        """
 
         def moved(stamp_s: float, pose: Array) -> Array:
-            T = found.moved(np.array([stamp_s]), pose[None])[0]
-            return _moved(T @ inverse(pose), pose)
+            T = adjustment.moved(np.array([stamp_s]), pose[None])[0]
+            return _move_pose(T @ inverse(pose), pose)
 
-        def shown(points_camera: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-            points = with_offset(points_camera.astype(np.float64), found.f_baseline, found.offset_px)
+        def with_corrected_depth(points_camera: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+            points = with_offset(
+                points_camera.astype(np.float64), adjustment.f_baseline, adjustment.offset_px
+            )
             return points.astype(np.float32)
 
-        corrected = SegmentRecord(
-            cloud=PointMap(self.cloud.options) if self.seen else self.cloud, stamps_s=self.stamps_s,
-            poses=[moved(*each) for each in zip(self.stamps_s, self.poses, strict=True)],
-            keyframes=[
+        keyframes = [
+            replace(
+                keyframe,
+                T_world_camera=moved(keyframe.timestamp_s, keyframe.T_world_camera),
+                points_camera=with_corrected_depth(keyframe.points_camera),
+            )
+            for keyframe in self.keyframes
+        ]
+        keyframe_points = self.keyframe_points
+        if keyframe_points is not None:
+            keyframe_points = [
                 replace(
-                    each, T_world_camera=moved(each.timestamp_s, each.T_world_camera),
-                    points_camera=shown(each.points_camera),
+                    points,
+                    T_world_camera=moved(points.timestamp_s, points.T_world_camera),
+                    points_camera=with_corrected_depth(points.points_camera),
                 )
-                for each in self.keyframes
-            ],
-            seen=None if self.seen is None else [
-                replace(
-                    each, T_world_camera=moved(each.timestamp_s, each.T_world_camera),
-                    points_camera=shown(each.points_camera),
-                )
-                for each in self.seen
-            ],
-        )  # fmt: skip
-        for each in corrected.seen or ():
-            is_known = np.isfinite(each.points_camera[:, 2])
-            points = transform(each.T_world_camera, each.points_camera[is_known].astype(np.float64))
-            corrected.cloud.add_points(points, each.colours[is_known])
-        return corrected
+                for points in keyframe_points
+            ]
+        cloud = PointMap(self.cloud.options) if keyframe_points else self.cloud
+        for points in keyframe_points or ():
+            has_depth = np.isfinite(points.points_camera[:, 2])
+            local = points.points_camera[has_depth].astype(np.float64)
+            cloud.add_points(transform(points.T_world_camera, local), points.colours[has_depth])
+        return SegmentRecord(
+            cloud=cloud,
+            stamps_s=self.stamps_s,
+            poses=[moved(stamp_s, pose) for stamp_s, pose in zip(self.stamps_s, self.poses, strict=True)],
+            keyframes=keyframes,
+            keyframe_points=keyframe_points,
+        )
 
     def trajectory(self) -> Trajectory:
         """Return the poses in the order of time."""
@@ -121,7 +153,7 @@ class SegmentRecord:
 
 
 class DriveRecords:
-    """The segments of one drive; the first one, 0, is what its user sees."""
+    """The records of all segments of one drive; the first segment, 0, is what the user of a mapper sees."""
 
     def __init__(self, options: MapOptions) -> None:
         self._options = options
@@ -129,53 +161,54 @@ class DriveRecords:
 
     @property
     def first(self) -> SegmentRecord:
-        """The first segment, with all that was joined to it."""
+        """The first segment, with all segments that were joined to it."""
         return self._segments[0]
 
     @property
     def apart(self) -> list[SegmentRecord]:
-        """The segments that were not joined to the first one, in their order."""
+        """The segments with poses that were not joined to the first one, in the order of their numbers."""
         return [record for number, record in sorted(self._segments.items()) if number and record.poses]
 
     def add(self, tracked: TrackedFrame, pose: Array) -> SegmentRecord:
-        """Add a frame with its pose to its segment."""
+        """Add a frame with its pose ``(4, 4)`` to its segment, and return the record of the segment."""
         record = self._segments.setdefault(tracked.segment, SegmentRecord(cloud=PointMap(self._options)))
         record.stamps_s.append(tracked.frame.timestamp_s)
         record.poses.append(pose)
         return record
 
     def add_to_cloud(self, tracked: TrackedFrame, pose: Array, features: Features | None) -> None:
-        """Add what a frame shows to the cloud of its segment, see the function."""
+        """Add the points that a frame measured to the cloud of its segment, see the function
+        `add_to_cloud`."""
         record = self._segments[tracked.segment]
         add_to_cloud(record.cloud, tracked.frame, pose, features, tracked.keyframe)
         if tracked.frame.stereo is not None and features is not None and tracked.keyframe:
-            points, colours = _pair_points(tracked.frame, features)
+            points, colours = _points_of_pair(tracked.frame, features)
             stamp_s = tracked.frame.timestamp_s
-            record.note([SeenPoints(stamp_s, pose, points.astype(np.float32), colours)])
+            record.add_keyframe_points([KeyframePoints(stamp_s, pose, points.astype(np.float32), colours)])
 
     def correct(self, adjusted: Mapping[int, StereoAdjustment]) -> None:
-        """Move segments as an adjustment of their keyframes has them."""
-        for number, found in adjusted.items():
+        """Replace segments by their records after an adjustment of their stereo keyframes."""
+        for number, adjustment in adjusted.items():
             if number in self._segments:
-                self._segments[number] = self._segments[number].corrected(found)
+                self._segments[number] = self._segments[number].corrected(adjustment)
 
     def join(self, join: Join) -> None:
-        """Move all of a segment into the one that it lies in."""
+        """Move all of a segment into the record of the segment that it was joined to."""
         record = self._segments.pop(join.segment, None)
         if record is None:
             return
         into = self._segments.setdefault(join.into, SegmentRecord(cloud=PointMap(self._options)))
-        into.take(record, join.T_into_segment)
+        into.append(record, join.T_into_segment)
 
     def turn(self, T_new_old: Array) -> None:
-        """Turn the world of all segments."""
+        """Express all segments in a rotated world, by ``T_new_old`` ``(4, 4)``."""
         for number, record in self._segments.items():
             self._segments[number] = SegmentRecord(cloud=PointMap(self._options))
-            self._segments[number].take(record, T_new_old)
+            self._segments[number].append(record, T_new_old)
 
 
-def tracker_record(tracker: MonocularTracker, segment: int, options: MapOptions) -> SegmentRecord:
-    """Return a segment of a tracker without depth, as it is corrected now; its cloud are the landmarks."""
+def read_segment(tracker: MonocularTracker, segment: int, options: MapOptions) -> SegmentRecord:
+    """Return a segment of a tracker without depth as it is adjusted now; its landmarks are the cloud."""
     cloud = PointMap(options)
     cloud.add_points(*tracker.points(segment))
     path = tracker.trajectory(segment)
@@ -185,61 +218,91 @@ def tracker_record(tracker: MonocularTracker, segment: int, options: MapOptions)
 def add_to_cloud(
     cloud: PointMap, frame: Frame, pose: Array, features: Features | None, is_keyframe: bool
 ) -> None:
-    """Add what a frame shows at a pose to a cloud.
+    """Add the points that a frame measured to a cloud.
 
-    Of a stereo pair these are the points of a keyframe's features whose depth is known to 5 %: they are what
-    it has measured, and a dense match of both images would take longer than all else.
+    A frame with depth adds its depth image.  A stereo pair adds the features whose depth is known to 5 %, and
+    only if it is a keyframe: a dense match of both images would take longer than all other steps.
+
+    Args:
+        cloud: The cloud, which is changed.
+        frame: Image with depth, or a stereo pair.
+        pose: ``T_world_camera`` ``(4, 4)``.
+        features: Features of the frame; None adds nothing of a stereo pair.
+        is_keyframe: Whether the frame is a keyframe.
     """
     if frame.stereo is None:
         cloud.add(frame, pose)
     elif features is not None and is_keyframe:
-        points, colours = _pair_points(frame, features)
+        points, colours = _points_of_pair(frame, features)
         cloud.add_points(transform(pose, points), colours)
 
 
-def _pair_points(frame: Frame, features: Features) -> tuple[Array, npt.NDArray[np.uint8]]:
-    """Return the ``(n, 3)`` points of a pair whose depth is known to 5 %, and their colours."""
-    rows = certain_rows(frame, features)
+def _points_of_pair(frame: Frame, features: Features) -> tuple[Array, npt.NDArray[np.uint8]]:
+    """Return the ``(n, 3)`` points of a stereo pair whose depth is known to 5 %, and their colours."""
+    rows = select_certain_rows(frame, features)
     columns, lines = np.rint(features.pixels[rows]).astype(np.int64).T
-    size = np.array([frame.camera.width, frame.camera.height]) - 1
-    colours = frame.rgb[np.clip(lines, 0, size[1]), np.clip(columns, 0, size[0])]
-    return features.points_camera[rows], colours
+    columns, lines = np.clip(columns, 0, frame.camera.width - 1), np.clip(lines, 0, frame.camera.height - 1)
+    return features.points_camera[rows], frame.rgb[lines, columns]
 
 
-def certain_rows(frame: Frame, features: Features) -> npt.NDArray[np.int64]:
+def select_certain_rows(frame: Frame, features: Features) -> npt.NDArray[np.int64]:
     """Return the rows of the features of a stereo pair whose depth is known to 5 %."""
     depths_m = features.points_camera[:, 2]
     with np.errstate(invalid="ignore"):
-        deviation_m = 2.0 * np.sqrt(frame.depth_noise.variance_m2(depths_m))
-        return np.flatnonzero(deviation_m <= _CLOUD_SHARE * depths_m)
+        deviation_m = _DISPARITY_SIGMAS * np.sqrt(frame.depth_noise.variance_m2(depths_m))
+        return np.flatnonzero(deviation_m <= _MAX_DEPTH_DEVIATION * depths_m)
 
 
-def keyframe_of(tracked: TrackedFrame, pose: Array, features: Features, robot: str) -> Keyframe:
-    """Return a tracked frame as a keyframe of a map, without its number."""
+def make_keyframe(tracked: TrackedFrame, pose: Array, features: Features, robot: str) -> Keyframe:
+    """Return a tracked frame as a keyframe of a map, with the number 0.
+
+    Args:
+        tracked: The frame.
+        pose: ``T_world_camera`` ``(4, 4)`` in the map.
+        features: Features of the frame with their points.
+        robot: Name of the robot.
+    """
     return Keyframe(
-        id=0, robot=robot, timestamp_s=tracked.frame.timestamp_s, T_world_camera=pose,
-        camera=tracked.frame.camera, pixels=features.pixels.astype(np.float32),
-        descriptors=features.descriptors, points_camera=features.points_camera.astype(np.float32),
+        id=0,
+        robot=robot,
+        timestamp_s=tracked.frame.timestamp_s,
+        T_world_camera=pose,
+        camera=tracked.frame.camera,
+        pixels=features.pixels.astype(np.float32),
+        descriptors=features.descriptors,
+        points_camera=features.points_camera.astype(np.float32),
         kind=features.kind,
-    )  # fmt: skip
+    )
 
 
 def landmark_keyframes(tracker: MonocularTracker, camera: Camera, robot: str) -> list[Keyframe]:
-    """Return the keyframes of the first segment of a camera without depth, as they are corrected now.
+    """Return the keyframes of the first segment of a tracker without depth, as they are adjusted now.
 
-    Features without a landmark have no point.
+    Features without a landmark have no point (NaN).
+
+    Args:
+        tracker: The tracker.
+        camera: Intrinsics of its frames.
+        robot: Name of the robot.
     """
     return [
         Keyframe(
-            id=0, robot=robot, timestamp_s=seen.timestamp_s, T_world_camera=seen.T_world_camera,
-            camera=camera, pixels=seen.image.pixels.astype(np.float32), descriptors=seen.image.descriptors,
-            points_camera=camera.back_project(seen.image.pixels, seen.depths).astype(np.float32),
-            kind=seen.kind,
+            id=0,
+            robot=robot,
+            timestamp_s=adjusted.timestamp_s,
+            T_world_camera=adjusted.T_world_camera,
+            camera=camera,
+            pixels=adjusted.features.pixels.astype(np.float32),
+            descriptors=adjusted.features.descriptors,
+            points_camera=camera.back_project(adjusted.features.pixels, adjusted.depths).astype(np.float32),
+            kind=adjusted.kind,
         )
-        for seen in tracker.keyframes_of(min(tracker.segments, default=0))
-    ]  # fmt: skip
+        for adjusted in tracker.keyframes_of(min(tracker.segments, default=0))
+    ]
 
 
-def _moved(T_into_segment: Array, pose: Array) -> Array:
-    moved = rigid(T_into_segment @ pose)
-    return T_into_segment @ pose if moved is None else moved
+def _move_pose(T_into_segment: Array, pose: Array) -> Array:
+    """Return a moved pose with a true rotation, where that can be made."""
+    moved = T_into_segment @ pose
+    rigid_pose = rigid(moved)
+    return moved if rigid_pose is None else rigid_pose

@@ -1,7 +1,8 @@
 """Adjust the keyframes of a stereo drive together with their landmarks and the offset of its disparities.
 
-A calibration whose disparities are all a little too small makes far points too far, and a drive too long.
-What is seen both near and far tells the offset, but only if poses and landmarks may move with it.
+A calibration whose disparities are all a little too small makes far points too far, and a path too long.
+Points that are seen both near and far determine the offset, but only if poses and landmarks are adjusted with
+it.
 """
 
 from __future__ import annotations
@@ -11,7 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from client_sdk.tracking.keyframe_map import NO_LANDMARK, KeyframeMap, between
+from client_sdk.tracking.keyframe_map import KeyframeMap, depths_for_noise
+from client_sdk.tracking.landmarks import NO_LANDMARK
 from client_sdk.trajectory import Trajectory
 from rse_pf.errors import DegenerateGeometry
 from rse_pf.geometry import Array, inverse
@@ -23,32 +25,47 @@ from rse_pf.slam.self_calibration import (
     triangulate_landmarks,
 )
 
-__all__ = ["MOST_KEYFRAMES", "StereoAdjustment", "adjust_stereo"]
+__all__ = ["MAX_ADJUSTED_KEYFRAMES", "StereoAdjustment", "adjust_stereo"]
 
 Rows = npt.NDArray[np.int64]
 
-_DISPARITY_PX, _PRIOR_PX = 0.1, 0.5
-_LEAST_KEYFRAMES, MOST_KEYFRAMES = 5, 150
-_LEAST_LANDMARKS, _MOST_LANDMARKS = 50, 2500
+_DISPARITY_SIGMA_PX = 0.1
+"""Standard deviation, in pixels, of a disparity in the adjustment of a stereo drive."""
+_OFFSET_PRIOR_PX = 0.5
+"""Standard deviation, in pixels, of the disparity offset around 0 before the adjustment of a stereo drive."""
+_MIN_KEYFRAMES = 5
+"""Fewest keyframes of a stereo segment that are adjusted: fewer do not determine the offset."""
+MAX_ADJUSTED_KEYFRAMES = 150
+"""Largest number of keyframes of a stereo segment that are adjusted together: bounds the time to seconds."""
+_MIN_LANDMARKS = 50
+"""Fewest landmarks, seen by two keyframes or more, with which a stereo segment is adjusted."""
+_MAX_LANDMARKS = 2500
+"""Largest number of landmarks that the adjustment of a stereo segment takes, those seen most often first."""
 _ROUNDS = 2
-_LEAST_PX, _LEAST_DEVIATIONS = 0.1, 4.0
-"""Smaller offsets are those of good calibrations, whose drives an adjustment makes no better."""
+"""Number of adjustments in a row; the second one evaluates the noise of depths at the result of the first."""
+_MIN_CLEAR_OFFSET_PX = 0.1
+"""Smallest disparity offset, in pixels, that changes a map: good calibrations have smaller ones, and an
+adjustment does not improve their drives."""
+_MIN_CLEAR_SIGMAS = 4.0
+"""Smallest disparity offset that changes a map, in its own standard deviations."""
 _CURVE = UNKNOWNS.index("curve")
+"""Index of the error of inverse depths among the unknowns of a self-calibration; times focal length and
+baseline it is the disparity offset."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class StereoAdjustment:
-    """How the keyframes of a map move, and what all its disparities lack.
+    """The result of adjusting one stereo segment: how its keyframes move, and the offset of its disparities.
 
     Attributes:
-        stamps_s: ``(k,)``, seconds.
-        T_new_old: ``(k, 4, 4)``, which a pose of each keyframe's time is multiplied with.
+        stamps_s: ``(k,)``, times of the keyframes, in seconds.
+        T_new_old: ``(k, 4, 4)``; the corrected pose of keyframe *i* is ``T_new_old[i] @ T_world_camera``.
         f_baseline: Focal length in pixels times the baseline in metres.
-        offset_px: Pixels by which disparities are too small.
-        deviation_px: Standard deviation of the offset.
-        bend_m_per_px: By how much an offset of a pixel bends the path, see `Calibrated.bend_m`.
-        growth_per_px: By how much the path grows, relative, if a pixel more is taken for the offset.
-        noise_m: How well the keyframes tell their positions.
+        offset_px: Pixels by which all disparities are too small.
+        deviation_px: Standard deviation of the offset, in pixels.
+        bend_m_per_px: Metres by which an offset of a pixel bends the path, see `Calibrated.bend_m`.
+        growth_per_px: Relative growth of the path if the offset were larger by a pixel.
+        noise_m: Standard deviation of the keyframes' positions, in metres.
     """
 
     stamps_s: Array
@@ -62,94 +79,116 @@ class StereoAdjustment:
 
     @property
     def is_clear(self) -> bool:
-        """Whether the offset is large enough to move a map: 0.1 px and 4 deviations."""
-        return abs(self.offset_px) >= max(_LEAST_PX, _LEAST_DEVIATIONS * self.deviation_px)
+        """Whether the offset is large enough to change a map: at least 0.1 px and 4 standard deviations."""
+        return abs(self.offset_px) >= max(_MIN_CLEAR_OFFSET_PX, _MIN_CLEAR_SIGMAS * self.deviation_px)
 
     def moved(self, stamps_s: Array, T_world_camera: Array) -> Array:
-        """Return ``(n, 4, 4)`` poses of other times, moved as the keyframes around them."""
+        """Return ``(n, 4, 4)`` poses at any times ``(n,)`` in seconds, moved like the keyframes around
+        them."""
         return Trajectory(self.stamps_s, self.T_new_old).at(stamps_s) @ T_world_camera
 
 
-def adjust_stereo(known: KeyframeMap, f_baseline: float) -> StereoAdjustment | None:
-    """Move the keyframes of a map to where they agree best with all that they see; the first one stays.
+def adjust_stereo(segment_map: KeyframeMap, f_baseline: float) -> StereoAdjustment | None:
+    """Adjust the keyframes, landmarks and the disparity offset of a stereo segment; the first keyframe stays.
 
-    Nothing moves where the offset of the disparities is not clear.  None is returned where there are fewer
-    than 5 or more than 150 keyframes, or fewer than 50 landmarks that two of them see.
+    The map is changed only if the offset is clear, see `StereoAdjustment.is_clear`.
 
     Args:
-        known: The map.
+        segment_map: The map of the segment.
         f_baseline: Focal length in pixels times the baseline in metres.
+
+    Returns:
+        None if the segment has fewer than 5 or more than 150 keyframes, fewer than 50 landmarks that two
+        keyframes see, or a geometry that does not determine the offset.
     """
-    if not _LEAST_KEYFRAMES <= len(known) <= MOST_KEYFRAMES:
+    count = segment_map.keyframe_count
+    if not _MIN_KEYFRAMES <= count <= MAX_ADJUSTED_KEYFRAMES:
         return None
-    numbers, observed = _observed(known)
-    if len(numbers) < _LEAST_LANDMARKS:
+    landmark_count, observed = _collect_observations(segment_map)
+    if landmark_count < _MIN_LANDMARKS:
         return None
-    T = inverse(np.array([known.pose(row) for row in range(len(known))]))
-    found: Calibrated | None = None
-    points = triangulate_landmarks(observed, T, len(numbers))
+    # 1. Adjust twice, with the noise of depths at the expected depths.
+    old = segment_map.poses()
+    T_camera_world = inverse(old)
+    points = triangulate_landmarks(observed, T_camera_world, landmark_count)
+    calibrated: Calibrated | None = None
     try:
         for _ in range(_ROUNDS):
-            observed = _with_noise(observed, T, points, f_baseline)
-            values = None if found is None else found.values
-            found = adjust_with_calibration(observed, T, points, ("curve",), values=values)
-            T, points = found.T_camera_world, found.points_world
+            observed = _set_depth_noise(observed, T_camera_world, points, f_baseline)
+            values = None if calibrated is None else calibrated.values
+            calibrated = adjust_with_calibration(observed, T_camera_world, points, ("curve",), values=values)
+            T_camera_world, points = calibrated.T_camera_world, calibrated.points_world
     except DegenerateGeometry:
         return None
-    assert found is not None
-    T_new = known.pose(0) @ T[0] @ inverse(T)
-    old = np.array([known.pose(row) for row in range(len(known))])
-    pixel = np.zeros(len(UNKNOWNS))
-    pixel[_CURVE] = 1.0 / f_baseline
-    at = inverse(T)[:, :3, 3]
-    at -= at.mean(axis=0)
-    moved = found.bends_m[_CURVE] / f_baseline
-    adjusted = StereoAdjustment(
-        stamps_s=np.array([known.view(row).timestamp_s for row in range(len(known))]),
-        T_new_old=T_new @ inverse(old), f_baseline=f_baseline,
-        offset_px=float(found.values[_CURVE]) * f_baseline,
-        deviation_px=float(found.deviations[_CURVE]) * f_baseline, bend_m_per_px=found.bend_m(pixel),
-        growth_per_px=float((moved * at).sum() / max(float((at**2).sum()), 1e-12)), noise_m=found.noise_m,
-    )  # fmt: skip
-    if adjusted.is_clear:
-        known.correct(T_new, f_baseline, adjusted.offset_px)
-    return adjusted
+    assert calibrated is not None
+    # 2. Move the result so that the first keyframe stays.
+    new = segment_map.pose(0) @ T_camera_world[0] @ inverse(T_camera_world)
+    # 3. Measure how the path changes with the offset.
+    one_pixel = np.zeros(len(UNKNOWNS))
+    one_pixel[_CURVE] = 1.0 / f_baseline
+    positions = inverse(T_camera_world)[:, :3, 3]
+    positions -= positions.mean(axis=0)
+    bends_m = calibrated.bends_m[_CURVE] / f_baseline
+    adjustment = StereoAdjustment(
+        stamps_s=np.array([segment_map.view(k).timestamp_s for k in range(count)]),
+        T_new_old=new @ inverse(old),
+        f_baseline=f_baseline,
+        offset_px=float(calibrated.values[_CURVE]) * f_baseline,
+        deviation_px=float(calibrated.deviations[_CURVE]) * f_baseline,
+        bend_m_per_px=calibrated.bend_m(one_pixel),
+        growth_per_px=float((bends_m * positions).sum() / max(float((positions**2).sum()), 1e-12)),
+        noise_m=calibrated.noise_m,
+    )
+    # 4. Change the map if the offset is clear.
+    if adjustment.is_clear:
+        segment_map.correct(new, f_baseline, adjustment.offset_px)
+    return adjustment
 
 
-def _observed(known: KeyframeMap) -> tuple[Rows, DriveObservations]:
-    """Return the numbers of the landmarks that two keyframes see, at most 2,500, and all looks at them.
+def _collect_observations(segment_map: KeyframeMap) -> tuple[int, DriveObservations]:
+    """Return the number of landmarks that two keyframes see, at most 2,500, and all observations of them.
 
-    Those that are seen most are taken, and of those seen alike the nearest: they tell metres.
+    Landmarks that are seen most often are taken first, and of those the nearest: they determine the scale.
     """
-    views = [known.view(row) for row in range(len(known))]
-    seen = np.concatenate([known.seen_in(row) for row in range(len(known))])
+    # 1. Landmark, keyframe and depth of every feature of every keyframe.
+    views = [segment_map.view(k) for k in range(segment_map.keyframe_count)]
+    seen = np.concatenate([segment_map.landmarks_of_features(k) for k in range(len(views))])
     keyframes = np.repeat(np.arange(len(views)), [len(view.features) for view in views])
     depths_m = np.concatenate([view.points_camera[:, 2] for view in views])
-    looks = np.bincount(seen[seen != NO_LANDMARK], minlength=known.landmark_count)
-    nearest = np.full(known.landmark_count, np.inf)
+    # 2. Choose landmarks.
+    total = segment_map.landmark_count
+    observation_counts = np.bincount(seen[seen != NO_LANDMARK], minlength=total)
+    smallest_depths_m = np.full(total, np.inf)
     has_depth = (seen != NO_LANDMARK) & np.isfinite(depths_m)
-    np.minimum.at(nearest, seen[has_depth], depths_m[has_depth])
-    order = np.lexsort((nearest, -looks))
-    numbers = np.sort(order[looks[order] > 1][:_MOST_LANDMARKS])
-    rows = np.full(known.landmark_count + 1, NO_LANDMARK)
-    rows[numbers] = np.arange(len(numbers))
-    kept = np.flatnonzero(rows[seen] != NO_LANDMARK)
-    pixels = np.concatenate([view.features.pixels for view in views])[kept]
-    sizes = np.concatenate([view.features.sizes for view in views])[kept]
-    return numbers, DriveObservations(
-        camera=views[0].camera, keyframes=keyframes[kept], landmarks=rows[seen[kept]], pixels=pixels,
-        pixels_px=sizes, depths_m=depths_m[kept], depths_dev_m=np.maximum(depths_m[kept], 1e-3),
-        rates_m_s=np.zeros(len(kept)), twists_s=np.zeros((len(views), 6)),
-    )  # fmt: skip
+    np.minimum.at(smallest_depths_m, seen[has_depth], depths_m[has_depth])
+    order = np.lexsort((smallest_depths_m, -observation_counts))
+    chosen = np.sort(order[observation_counts[order] > 1][:_MAX_LANDMARKS])
+    # 3. Keep the observations of the chosen landmarks, numbered anew.
+    new_numbers = np.full(total + 1, NO_LANDMARK)  # the last row is that of NO_LANDMARK
+    new_numbers[chosen] = np.arange(len(chosen))
+    rows = np.flatnonzero(new_numbers[seen] != NO_LANDMARK)
+    return len(chosen), DriveObservations(
+        camera=views[0].camera,
+        keyframes=keyframes[rows],
+        landmarks=new_numbers[seen[rows]],
+        pixels=np.concatenate([view.features.pixels for view in views])[rows],
+        pixels_px=np.concatenate([view.features.sizes for view in views])[rows],
+        depths_m=depths_m[rows],
+        depths_dev_m=np.maximum(depths_m[rows], 1e-3),
+        rates_m_s=np.zeros(len(rows)),
+        twists_s=np.zeros((len(views), 6)),
+    )
 
 
-def _with_noise(
+def _set_depth_noise(
     observed: DriveObservations, T_camera_world: Array, points: Array, f_baseline: float
 ) -> DriveObservations:
-    """Return observations whose depths have the noise of their disparities, see `between`."""
+    """Return observations whose depths have the noise of their disparities, see `depths_for_noise`."""
     T = T_camera_world[observed.keyframes]
     expected_m = np.einsum("ni,ni->n", T[:, 2, :3], points[observed.landmarks]) + T[:, 2, 3]
-    at_m = between(np.nan_to_num(observed.depths_m, nan=1.0), expected_m)
+    noise_depths_m = depths_for_noise(np.nan_to_num(observed.depths_m, nan=1.0), expected_m)
     return replace(
-        observed, depths_dev_m=_DISPARITY_PX * at_m**2 / f_baseline, curve_dev_per_m=_PRIOR_PX / f_baseline
+        observed,
+        depths_dev_m=_DISPARITY_SIGMA_PX * noise_depths_m**2 / f_baseline,
+        curve_dev_per_m=_OFFSET_PRIOR_PX / f_baseline,
     )

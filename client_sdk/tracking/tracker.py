@@ -1,127 +1,115 @@
-"""Track a camera with depth against the map of its keyframes, as a state machine without input or output.
+"""Track a camera with depth, or a stereo pair, against the map of its keyframes.
 
-Frames and answers go in, pose queries and tracked frames come out; there is one query at a time.  Its numbers
-are rounded exactly as they are sent.  Poses are solved elsewhere, and drawn elsewhere.
+`Tracker` is a state machine without input or output: frames and answers go in, pose queries and tracked
+frames come out.  A frame takes these steps: extract features, predict the pose, match landmarks, solve the
+pose (elsewhere, by a query), verify it, decide what becomes of the frame, and keep it in the map.
 """
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Generator
+from dataclasses import dataclass, field, replace
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
 
-from client_sdk.frontend import (
-    Correspondences,
-    Features,
-    Frame,
-    FrontEndOptions,
-    PoseQuery,
-    TrackedFrame,
-    extract,
-    round_for_wire,
-)
-from client_sdk.slots import Slots
+from client_sdk.frontend import Features, Frame, FrontEndOptions, PoseQuery, TrackedFrame, extract
+from client_sdk.plugins import Plugins
 from client_sdk.stereo.depth import with_offset
-from client_sdk.tracking.keyframe_map import NO_LANDMARK, KeyframeMap, Landmarks, View, between
-from client_sdk.tracking.looks import share_alike
-from client_sdk.tracking.noise import NoiseEstimate
-from client_sdk.tracking.place import place_of
-from client_sdk.tracking.queries import Answer, OneQuery, Steps
-from client_sdk.tracking.shutter import ReadoutEstimate, sways, turn_rate, without_shutter
+from client_sdk.tracking.appearance_check import has_predicted_appearance
+from client_sdk.tracking.depth_noise import NoiseEstimate
+from client_sdk.tracking.keyframe_map import PIXEL_SIGMA_PX, KeyframeMap, View, depths_for_noise
+from client_sdk.tracking.landmarks import (
+    NO_LANDMARK,
+    Landmarks,
+    Matches,
+    match_by_appearance,
+    shift_landmarks,
+)
+from client_sdk.tracking.place_recognition import (
+    list_other_segments,
+    list_relocalisation_candidates,
+    make_place_vector,
+    match_candidates,
+)
+from client_sdk.tracking.pose_queries import CLEAR_INLIERS, FrameSteps, OpenQuery, QueryAnswer, make_query
+from client_sdk.tracking.rolling_shutter import (
+    ReadoutEstimate,
+    correct_view,
+    measure_readout_change,
+    rotation_rate,
+)
+from client_sdk.tracking.segment_join import NOT_JOINED, Join
 from client_sdk.tracking.stereo_adjustment import StereoAdjustment, adjust_stereo
 from rse_pf.geometry import Array, inverse, pose_difference, rigid, transform
-from rse_pf.maps.descriptors import Descriptors
-from rse_pf.pnp import DepthNoise
-from rse_pf.slam.descriptors import match_all
-from rse_pf.slam.tracking import (
-    FittedPose,
-    ImageFeatures,
-    NearLimits,
-    Observations,
-    distinct_distances,
-    fit_pose,
-    fit_sway,
-)
+from rse_pf.slam.tracking import GuidedMatchLimits, Observations, fit_pose
 
-__all__ = ["Join", "Tracker"]
+__all__ = ["Tracker"]
 
 Rows = npt.NDArray[np.int64]
 
-_PIXEL_PX = 1.0
-"""Deviation of a feature's pixel on the finest level; it grows with the size of the feature."""
-_LOCAL = 6  # keyframes next to a predicted pose whose landmarks are matched
-_LATEST = 3  # newest keyframes that a camera which was lost just now is compared with first
-_ALIKE = 5  # keyframes that place recognition proposes
-_MANY = 3
-"""A guided match with so many times the fewest inliers is worth a query."""
-_GUIDED_RATIO = 0.35  # share of the matches that must be inliers of a query guided by a predicted pose
-_FOLLOWED_RATIO = 0.4  # of a query against the last frame
-_NEAR_RATIO = 0.25  # of a query against a keyframe of the place where the camera was just now
-_CONFIRMED_RATIO = 0.3  # of the landmarks around a recognised pose
-_CLEAR_RATIO = 0.5  # of a query against a keyframe of any other place, which may be an alias
-_CLEAR_INLIERS = 40
-_ALIKE_SHARE = 0.25
-"""Of the landmarks that the pose of a recognised place expects, so many look as expected at their pixels."""
-_CONFIRM_PX = 8.0
-_NEAR_LOWE_RATIO = 0.8  # largest ratio of the best and the second distance around a predicted pixel
-_CONFIRM_LOWE_RATIO = 0.9  # the same around a pose to confirm, where the radius is small
-_FAR_PX = 160.0
-"""Radius of the last search around the last pose: a camera that turned otherwise is 10 degrees off."""
-_ALL_RATIO = 0.8  # largest ratio of the best and the second distance where all features are compared
-_ALL_DISTANCE = 64  # largest distance of a match there, in bits of 256
-_ENOUGH = 120
-"""With so many landmarks of the map a pose needs no points of the last frame: a chain of frames drifts."""
-_MOST_JUMPS = 4
-"""A camera that was lost for long may have moved by so many limits, or its place must be clear."""
-_LEAST_ROWS = 30  # an image with fewer landmarks with depth does not determine the rate of its shutter
-_LEAST_INTERVAL_S = 1e-3  # between two frames, so that stamps which repeat give no infinite rate
-_MOST_RATE = 3.0
-"""Radians a second.  A rate that a cut only seems to have would turn an image of 20 ms by 3.4 degrees."""
-_QUERIES = 3
-"""So many keyframes are asked for the place of one frame, those with the most matches first."""
-_STEREO_MATCHES = 250
-"""Of one query: a stereo pair has depths at many features, and the robot fits all of them itself."""
-_JUMP_SHARE = 0.15
-"""Of the median depth."""
-_JOIN_EVERY = 3
-_JOIN_M = 0.15  # two measurements of the pose of a segment agree within this translation
-_JOIN_DEG = 4.0  # and within this rotation
-
-
-@dataclass(frozen=True, slots=True)
-class Join:
-    """A segment lies in another one: poses of *segment* are ``T_into_segment @ pose`` in *into*.
-
-    Without depth the lengths of *segment* are multiplied by *scale* before.
-    """
-
-    segment: int
-    into: int
-    T_into_segment: Array
-    scale: float = 1.0
+_LOCAL_KEYFRAMES = 6
+"""Number of keyframes nearest to a predicted pose whose landmarks are matched with a frame."""
+_GUIDED_MATCHES_FACTOR = 3
+"""A frame is asked for near its predicted pose only with this many times ``min_inliers`` matches: with fewer,
+the prediction is wrong, and a match with the last frame is cheaper than a query that fails."""
+_GUIDED_RATIO = 0.35
+"""Smallest share of inliers among the matches near a predicted pose."""
+_LAST_FRAME_RATIO = 0.4
+"""Smallest share of inliers among the matches with the last frame, which no prediction supports."""
+_NEARBY_RATIO = 0.25
+"""Smallest share of inliers among the matches with a keyframe near the camera's last pose."""
+_VERIFIED_RATIO = 0.3
+"""Smallest share of the landmarks matched around a solved pose that must agree with the fitted pose."""
+_VERIFY_RADIUS_PX = 8.0
+"""Radius around predicted pixels in which landmarks are matched to verify a solved pose."""
+_GUIDED_LOWE_RATIO = 0.8
+"""Lowe's ratio for matches around the pixels of a predicted pose."""
+_VERIFY_LOWE_RATIO = 0.9
+"""Lowe's ratio for matches around the pixels of a solved pose: looser, since the radius is small."""
+_WIDE_RADIUS_PX = 160.0
+"""Radius of the last search of a stereo pair around its last pose: 10 degrees of unexpected rotation of a
+car's camera."""
+_ENOUGH_MAP_MATCHES = 120
+"""With this many matched landmarks of the map, a pose is verified without points of the last frame: a chain
+of frames drifts, the map does not."""
+_MAX_JUMPS = 4
+"""Largest number of frames for which the limit of plausible motion grows after a loss; farther away a place
+must be clear to be accepted."""
+_STEREO_JUMP_SHARE = 0.15
+"""Plausible motion of a stereo pair between two frames as a share of the median depth that it sees: a fast
+car sees far."""
+_MIN_INTERVAL_S = 1e-3
+"""Smallest time between two frames, in seconds, by which a rotation is divided: time stamps may repeat."""
+_MAX_RATE_RAD_S = 3.0
+"""Largest rotation rate, in rad/s, that is taken for a motion and not for a cut in a video: with a readout of
+20 ms it would shear an image by 3.4 degrees."""
+_MAX_RELOCALISATION_QUERIES = 3
+"""Largest number of keyframes that are asked for the place of one frame, those with the most matches
+first."""
+_MAX_STEREO_MATCHES = 250
+"""Largest number of matches in a query of a stereo pair: the robot itself fits the pose to all of them."""
+_JOIN_INTERVAL_FRAMES = 3
+"""Every third frame is compared with other segments, if there are any: bounds the time of a frame."""
+_JOIN_AGREEMENT_M = 0.15
+"""Largest translation, in metres, between two measurements of one segment's pose that confirm each other."""
+_JOIN_AGREEMENT_DEG = 4.0
+"""Largest rotation, in degrees, between two measurements of one segment's pose that confirm each other."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Seen:
-    """Landmarks that an image shows, and the rows of its features that show them; rows as in `Landmarks`."""
+class _PosedView:
+    """An image with its verified pose.
 
-    points: Array
-    spreads: Array
-    sways: Array
-    numbers: Rows
-    features: Rows
-
-    def __len__(self) -> int:
-        return len(self.features)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Posed:
-    """An image with its pose, the landmark of each feature, and whether its pose may be trusted.
-
-    ``is_next`` says that the camera moved there from its last pose, so that its motion is known.
+    Attributes:
+        view: The image.
+        T_world_camera: ``(4, 4)``.
+        landmarks: ``(n,)``, landmark of each feature, or NO_LANDMARK.
+        inliers: Number of landmarks that agree with the pose.
+        matches: Number of matches of the image.
+        is_weak: Whether the solver calls the pose weak; the image never becomes a keyframe then.
+        is_continuous: Whether the camera moved there from its last pose, so that its motion is known.
     """
 
     view: View
@@ -130,11 +118,64 @@ class _Posed:
     inliers: int
     matches: int
     is_weak: bool
-    is_next: bool = False
+    is_continuous: bool = False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _TrackState:
+    """What a tracker knows of the camera between two frames.
+
+    Attributes:
+        T_world_camera: ``(4, 4)``, the last accepted pose, also after a loss.
+        timestamp_s: Time of that pose, in seconds.
+        T_last_next: ``(4, 4)``, motion from one frame to the next, assumed constant.
+        rotation_rate: ``(3,)`` rad/s, mean rotation rate between the last two frames; zeros if not known.
+        last: The last frame; None after a loss.
+        features: Features of the last frame, without rolling shutter; None after a loss.
+        first: Features and image of a segment's first frame until a second one shows its rolling shutter.
+        keyframe_inliers: Number of landmarks that the newest keyframe saw.
+        lost_in_a_row: Number of frames without a pose since the last accepted one.
+        unrecognised: Number of frames since the last accepted pose that show enough features and no known
+            place.
+        segment: Number of the present segment, -1 before the first.
+        join_candidate: Another segment and ``T_other_present`` ``(4, 4)``, measured once and not confirmed.
+    """
+
+    T_world_camera: Array
+    timestamp_s: float = 0.0
+    T_last_next: Array = field(default_factory=lambda: np.eye(4))
+    rotation_rate: Array = field(default_factory=lambda: np.zeros(3))
+    last: _PosedView | None = None
+    features: Features | None = None
+    first: tuple[Features, View] | None = None
+    keyframe_inliers: int = 0
+    lost_in_a_row: int = 0
+    unrecognised: int = 0
+    segment: int = -1
+    join_candidate: tuple[int, Array] | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Attempt:
+    """Matches of a frame with landmarks around its last pose, and the conditions for a query.
+
+    Attributes:
+        matches: Landmarks that the frame shows.
+        T_world_reference: ``(4, 4)``, pose in whose frame the points are sent.
+        against: Source of the landmarks, see `PoseQuery`.
+        min_matches: Fewest matches for a query.
+        min_ratio: Smallest share of inliers of an accepted answer.
+    """
+
+    matches: Matches
+    T_world_reference: Array
+    against: Literal["map", "frame"]
+    min_matches: int
+    min_ratio: float
 
 
 class Tracker:
-    """Visual odometry that knows where it has been; one frame and one query at a time.
+    """Visual odometry with relocalisation; takes one frame and one query at a time.
 
     ::
 
@@ -145,645 +186,718 @@ class Tracker:
         # step is now the TrackedFrame
 
     A frame is matched near the pixels at which a constant velocity predicts the landmarks of the nearest
-    keyframes and of the last frame.  If no pose fits, it is matched with the last frame, then with the latest
-    keyframes and those that look most alike, wherever they are.  If nothing fits, the frame is lost, and the
-    next one is tried in the same order.  After `FrontEndOptions.segment_after` unrecognised frames a new
-    segment begins; it is joined to an older one when two images of it were found there.  A weak pose never
-    becomes a keyframe.
+    keyframes and of the last frame.  If no pose fits, it is matched with the last frame by appearance; a
+    stereo pair is then matched in a wide radius around its last pose.  If no pose fits again, it is matched
+    with the newest keyframes and with the most similar keyframes of all segments.  Otherwise the frame is
+    lost, and the next one is tried in the same order.  After `FrontEndOptions.segment_after` unrecognised
+    frames a new segment begins; it is joined to an older one when two frames in a row were found there.  A
+    frame with a weak pose never becomes a keyframe.
 
-    ``frames`` counts the frames prepared so far, ``lost_frames`` those of them without an accepted pose, and
-    ``unrecognised`` those since the last pose that show enough and no known place; a covered lens is none.
-    ``joins`` are the joins so far, in their order; ``noise`` and ``readout`` are estimates of the camera's,
-    and ``disparity_offset_px`` what the disparities of a stereo pair lack, which `adjust_pairs` finds;
-    ``pair_offsets`` is what it found last, by segment.
+    Attributes:
+        options: Options of the front end.
+        frames: Number of frames so far.
+        lost_frames: Number of frames without a pose so far.
+        keyframes: Number of keyframes so far, also of those that were thinned out.
+        joins: All joins of segments so far, in their order.
+        noise: Estimate of the noise of the camera's depths.
+        readout: Estimate of the readout time of the camera's rolling shutter.
+        disparity_offset_px: Pixels by which the disparities of a stereo pair are too small, as `adjust_pairs`
+            found it.
+        pair_offsets: Result of the last `adjust_pairs` by segment, also where nothing was changed.
     """
 
     def __init__(
         self,
         options: FrontEndOptions | None = None,
         T_world_start: Array | None = None,
-        slots: Slots | None = None,
+        plugins: Plugins | None = None,
     ) -> None:
         self.options = options or FrontEndOptions()
-        self._slots = slots or Slots()
         self.frames = 0
         self.lost_frames = 0
         self.keyframes = 0
-        self.unrecognised = 0
         self.joins: list[Join] = []
         self.noise = NoiseEstimate()
+        self.readout = ReadoutEstimate()
         self.disparity_offset_px = 0.0
         self.pair_offsets: dict[int, StereoAdjustment] = {}
-        self.readout = ReadoutEstimate()
+        self._plugins = plugins or Plugins()
         self._T_world_start = np.eye(4) if T_world_start is None else T_world_start
+        self._state = _TrackState(T_world_camera=self._T_world_start)
         self._segments: dict[int, KeyframeMap] = {}
-        self._segment = -1
-        self._begun = self._adjusted = 0
-        self._last: _Posed | None = None
-        self._T_last: Array = self._T_world_start
-        self._last_s, self._more_s = 0.0, 0.0
-        self._motion: Array = np.eye(4)
-        self._rate: Array = np.zeros(3)
-        self._first: tuple[Features, View] | None = None
-        self._reference_seen = 0
-        self._lost_in_a_row = 0
-        self._place: tuple[int, Array] | None = None
-        self._frame: Frame  # set by `prepare`
-        self._raw: Features
-        self._features: Features
-        self._open = OneQuery()
+        self._next_segment = 0
+        self._adjusted_frames = 0
+        self._pending_readout_s = 0.0
+        self._frame: Frame  # the frame that is tracked, set by `prepare`
+        self._raw: Features  # its features, with rolling shutter
+        self._open = OpenQuery()
 
     @property
     def last_features(self) -> Features | None:
-        """The features of the last frame, without its rolling shutter, if that has a pose."""
-        return self._features if self._last is not None else None
+        """Features of the last frame without its rolling shutter; None if that frame has no pose."""
+        return self._state.features if self._state.last is not None else None
 
     @property
     def segment(self) -> int:
         """The number of the present segment, from 0."""
-        return max(0, self._segment)
+        return max(0, self._state.segment)
+
+    @property
+    def unrecognised(self) -> int:
+        """Number of frames since the last pose that show enough features and no known place.
+
+        An image with few features, such as that of a covered lens, does not count.
+        """
+        return self._state.unrecognised
 
     def restart(self, T_world_start: Array) -> None:
-        """Forget what frames are matched against: the next frame with enough features is at *T_world_start*.
+        """Forget all segments: the next frame with enough features begins a new one at *T_world_start*.
 
         Raises:
             UsageError: A query is open.
         """
         self._open.refuse_open()
-        self._T_world_start = self._T_last = T_world_start
+        self._T_world_start = T_world_start
         self._segments.clear()
-        self._segment, self._last, self._place = -1, None, None
-        self._motion, self._lost_in_a_row, self._begun, self.unrecognised = np.eye(4), 0, 0, 0
-        self._rate, self._first = np.zeros(3), None
+        self._next_segment = 0
+        self._state = _TrackState(T_world_camera=T_world_start, timestamp_s=self._state.timestamp_s)
 
     def turn(self, T_new_old: Array) -> None:
-        """Turn the world, such as after gravity became known; poses that were returned before change.
+        """Express all poses in a rotated world, such as after gravity became known.
+
+        Poses that were returned before are ``T_new_old @ T_world_camera`` in the new world.
 
         Raises:
             UsageError: A query is open.
         """
         self._open.refuse_open()
-        self._T_world_start = _rotation_made(T_new_old @ self._T_world_start)
-        self._T_last = _rotation_made(T_new_old @ self._T_last)
-        for known in self._segments.values():
-            known.move(T_new_old)
-        self._place = None
-        if self._last is not None:
-            self._last = replace(self._last, T_world_camera=self._T_last)
-        if self._slots.motion is not None:
-            self._slots.motion.clear()
+        self._T_world_start = _orthonormalise(T_new_old @ self._T_world_start)
+        for segment_map in self._segments.values():
+            segment_map.move(T_new_old)
+        self._move_state(T_new_old)
 
     def adjust_pairs(self) -> dict[int, StereoAdjustment]:
         """Adjust all keyframes of each segment of a stereo drive together, such as at its end.
 
-        It takes seconds.  Returned is by segment how poses change that were returned before, nothing if no
-        frame came since the last time; ``pair_offsets`` has also what was not clear enough to change them.
-        The next frame is recognised.
+        This takes seconds.  The next frame is relocalised afterwards.
+
+        Returns:
+            By segment, how poses change that were returned before.  Segments in which nothing is clear enough
+            to be changed are left out.  Empty without stereo pairs, and if no frame came since the last call.
 
         Raises:
             UsageError: A query is open.
         """
         self._open.refuse_open()
         stereo = self._frame.stereo if self._segments else None
-        if stereo is None or self._adjusted == self.frames:
+        if stereo is None or self._adjusted_frames == self.frames:
             return {}
-        self._adjusted, self.pair_offsets = self.frames, {}
-        adjusted = {}
-        for number, known in self._segments.items():
-            found = adjust_stereo(known, self._frame.camera.fx * stereo.baseline_m)
-            if found is not None:
-                self.pair_offsets[number] = found
-                if found.is_clear:
-                    adjusted[number] = found
-        own = adjusted.get(self._segment)
+        self._adjusted_frames, self.pair_offsets = self.frames, {}
+        for segment, segment_map in self._segments.items():
+            adjustment = adjust_stereo(segment_map, self._frame.camera.fx * stereo.baseline_m)
+            if adjustment is not None:
+                self.pair_offsets[segment] = adjustment
+        clear = {segment: found for segment, found in self.pair_offsets.items() if found.is_clear}
+        state = replace(self._state, last=None, join_candidate=None, first=None)
+        own = clear.get(state.segment)
         if own is not None:
             self.disparity_offset_px += own.offset_px
-            self._T_last = _rotation_made(own.moved(np.array([self._last_s]), self._T_last[None])[0])
-        self._last, self._place, self._first = None, None, None
-        if self._slots.motion is not None:
-            self._slots.motion.clear()
-        return adjusted
+            moved = own.moved(np.array([state.timestamp_s]), state.T_world_camera[None])[0]
+            state = replace(state, T_world_camera=_orthonormalise(moved))
+        self._state = state
+        self._plugins.forget_poses()
+        return clear
 
     def prepare(self, frame: Frame) -> PoseQuery | TrackedFrame:
-        """Take the next frame; return a query, or the result for the frame if none is needed.
+        """Take the next frame; return a query for its pose, or its result if no query is needed.
 
-        The first frame with enough features is the start and needs no query; a frame without enough
-        matches is lost without one.
+        The first frame with enough features is the start and needs no query; a frame without enough matches
+        is lost without a query.
 
         Raises:
-            UsageError: The last query was not answered yet.
+            UsageError: The last query was not answered yet, or a user's feature extractor failed.
         """
         self._open.refuse_open()
         self.frames += 1
-        self._frame, self._raw = frame, extract(frame, self.options, self._slots.features)
+        self._frame, self._raw = frame, extract(frame, self.options, self._plugins.features)
         if self.disparity_offset_px and frame.stereo is not None:
             f_baseline = frame.camera.fx * frame.stereo.baseline_m
             points_camera = with_offset(self._raw.points_camera, f_baseline, self.disparity_offset_px)
             self._raw = replace(self._raw, points_camera=points_camera)
-        self._features = self._raw
         self.noise.model = frame.depth_noise
-        return self._open.begin(self._track(self._turned(self._view(), self._raw, self._rate)))
+        return self._open.begin(self._track())
 
     def accept(
         self, query: PoseQuery, T_camera_world: Array | None, inliers: int = 0, *, is_weak: bool = False
     ) -> PoseQuery | TrackedFrame:
-        """Take the answer to *query*; return another query, or the result for the frame.
+        """Take the answer to *query*; return another query, or the result of the frame.
 
         Args:
             query: The query that `prepare` or `accept` returned last.
-            T_camera_world: ``(4, 4)`` as the PnP service returns it, where world is the world of
-                the query (its reference camera); ``None`` if there was no answer.
-            inliers: How many correspondences agree with it.
-            is_weak: Whether its evidence is weak.
+            T_camera_world: ``(4, 4)`` as the PnP service returns it, where world is the frame of the query's
+                reference camera; None if there was no answer.
+            inliers: Number of correspondences that agree with the pose.
+            is_weak: Whether the service calls the evidence for the pose weak.
 
         Raises:
             UsageError: *query* is not the open one.
         """
-        return self._open.answer(query, Answer(T_camera_world, inliers, is_weak))
+        return self._open.answer(query, QueryAnswer(T_camera_world, inliers, is_weak))
 
-    # --- one frame ---
+    # --- The steps of one frame ---
 
-    def _track(self, view: View) -> Steps:
-        """Return the result of a frame, and yield the queries that it needs."""
+    def _track(self) -> FrameSteps:
+        """Yield the queries of the present frame, and return its result."""
+        # 1. Extract: `prepare` did; undo the rolling shutter at the last rotation rate.
+        view = self._correct_view(self._make_view(), self._state.rotation_rate)
         if not self._segments:
-            return self._begin_or_lose(view, matches=0)
-        posed, matches = None, 0
-        if self._last is not None:
-            for how in ("map", "frame", "far") if self._frame.stereo is not None else ("map", "frame"):
-                posed, tried = yield from self._follow(view, how)
-                matches = max(matches, tried)
-                if posed is not None:
-                    break
+            return self._begin_or_lose(view, match_count=0)
+        # 2. Predict, match, solve and verify around the last pose, then at all known places.
+        posed, match_count = None, 0
+        if self._state.last is not None:
+            posed, match_count = yield from self._track_from_last_pose(view)
         if posed is None:
-            posed, tried = yield from self._recognise(view)
-            matches = max(matches, tried)
+            posed, candidate_matches = yield from self._relocalise(view)
+            match_count = max(match_count, candidate_matches)
+        # 3. Decide: without a pose, the frame is lost or begins a segment.
         if posed is None:
-            return self._begin_or_lose(view, matches)
-        keyframe = self._keep(posed)
-        if len(self._segments) > 1 and self.frames % _JOIN_EVERY == 0:
-            yield from self._seek_join(posed)
-        return self._result(posed, keyframe=keyframe)
+            return self._begin_or_lose(view, match_count)
+        # 4. Keep the frame in the map, and look for its place in other segments.
+        is_keyframe = self._keep(posed)
+        if len(self._segments) > 1 and self.frames % _JOIN_INTERVAL_FRAMES == 0:
+            yield from self._find_join(posed)
+        return self._make_result(posed, is_keyframe=is_keyframe)
 
-    def _follow(self, view: View, how: str) -> Generator[PoseQuery, Answer, tuple[_Posed | None, int]]:
-        """Yield a query against what the last pose predicts, or against the last frame alone."""
-        assert self._last is not None
-        least = self.options.min_inliers
-        T_reference = self._expected() if how == "map" else self._T_last
-        if how != "frame":
-            radius_px = self.options.search_px if how == "map" else _FAR_PX
-            seen = self._seen(view, T_reference, radius_px, _NEAR_LOWE_RATIO)
-            if len(seen) < (_MANY if how == "map" else 1) * least:
-                return None, len(seen)
-        else:
-            seen = _seen_anywhere(self._of_last(), self._last_descriptors(), view)
-            if len(seen) < least:
-                return None, len(seen)
-        answer = yield self._make_query(view, seen, T_reference, "frame" if how == "frame" else "map")
-        ratio = _FOLLOWED_RATIO if how == "frame" else _GUIDED_RATIO
-        T = self._placed(answer, T_reference, len(seen), ratio)
-        if T is None or not self._is_plausible(T):
-            return None, len(seen)
-        image, is_next = self._image_at(view, T, is_near=True)
-        return self._confirm(image, T, answer, len(seen), self._map(), is_next=is_next), len(seen)
+    def _make_view(self) -> View:
+        """Return the image of the present frame, with its rolling shutter."""
+        features, frame = self._raw, self._frame
+        return View(
+            features=features.for_matching(),
+            points_camera=features.points_camera,
+            shutter_displacements=np.zeros_like(features.points_camera),
+            camera=frame.camera,
+            place_vector=make_place_vector(features.descriptors, frame.rgb, self._plugins.loops),
+            is_stereo=frame.stereo is not None,
+            timestamp_s=frame.timestamp_s,
+        )
 
-    def _expected(self) -> Array:
-        """Return ``T_world_camera`` as a user's motion function expects it, else by a constant velocity.
+    # --- Predict and match ---
 
-        With an IMU the camera turns as the gyroscope measured it.
+    def _track_from_last_pose(
+        self, view: View
+    ) -> Generator[PoseQuery, QueryAnswer, tuple[_PosedView | None, int]]:
+        """Ask for the pose of a frame around its last pose; return it, and the largest number of matches."""
+        max_count = 0
+        ways = [self._match_predicted, self._match_last_frame]
+        if view.is_stereo:
+            ways.append(self._match_widely)
+        for match in ways:
+            attempt = match(view)
+            count = len(attempt.matches)
+            max_count = max(max_count, count)
+            if count < attempt.min_matches:
+                continue
+            reference = attempt.T_world_reference
+            answer = yield self._make_query(view, attempt.matches, reference, attempt.against)
+            T_world_camera = self._read_pose(answer, reference, count, attempt.min_ratio)
+            if T_world_camera is None or not self._is_plausible(T_world_camera):
+                continue
+            image, is_continuous = self._correct_view_at(view, T_world_camera, is_near=True)
+            posed = self._verify(image, T_world_camera, answer, count, self._map, is_continuous=is_continuous)
+            if posed is not None:
+                return posed, max_count
+        return None, max_count
+
+    def _match_predicted(self, view: View) -> _Attempt:
+        """Match landmarks near the pixels at which the predicted motion shows them."""
+        T_world_camera = self._predict_pose()
+        return _Attempt(
+            matches=self._match_guided(view, T_world_camera, self.options.search_px, _GUIDED_LOWE_RATIO),
+            T_world_reference=T_world_camera,
+            against="map",
+            min_matches=_GUIDED_MATCHES_FACTOR * self.options.min_inliers,
+            min_ratio=_GUIDED_RATIO,
+        )
+
+    def _match_last_frame(self, view: View) -> _Attempt:
+        """Match the landmarks of the last frame by appearance, wherever they are."""
+        landmarks = self._landmarks_of_last_frame()
+        return _Attempt(
+            matches=match_by_appearance(landmarks, landmarks.descriptors, view.features),
+            T_world_reference=self._state.T_world_camera,
+            against="frame",
+            min_matches=self.options.min_inliers,
+            min_ratio=_LAST_FRAME_RATIO,
+        )
+
+    def _match_widely(self, view: View) -> _Attempt:
+        """Match landmarks in a wide radius around the pixels at which the last pose shows them."""
+        T_world_camera = self._state.T_world_camera
+        return _Attempt(
+            matches=self._match_guided(view, T_world_camera, _WIDE_RADIUS_PX, _GUIDED_LOWE_RATIO),
+            T_world_reference=T_world_camera,
+            against="map",
+            min_matches=self.options.min_inliers,
+            min_ratio=_GUIDED_RATIO,
+        )
+
+    def _predict_pose(self) -> Array:
+        """Predict ``T_world_camera`` of the frame: by a user's motion model, or by a constant velocity.
+
+        With an IMU the rotation is that of the gyroscope.
         """
-        motion, inertial = self._slots.motion, self._slots.inertial
-        T = None if motion is None else motion.expected(self._frame.timestamp_s)
-        if T is not None:
-            return T
-        T_last_now = self._motion.copy()
-        turned = None if inertial is None else inertial.camera_rotation(self._last_s, self._frame.timestamp_s)
-        if turned is not None:
-            T_last_now[:3, :3] = turned
-        return _rotation_made(self._T_last @ T_last_now)
+        state, now_s = self._state, self._frame.timestamp_s
+        T_world_camera = self._plugins.predict_pose(now_s)
+        if T_world_camera is not None:
+            return T_world_camera
+        T_last_next = self._plugins.predict_motion(state.T_last_next.copy(), state.timestamp_s, now_s)
+        return _orthonormalise(state.T_world_camera @ T_last_next)
 
-    def _recognise(self, view: View) -> Generator[PoseQuery, Answer, tuple[_Posed | None, int]]:
-        """Yield queries against the latest and the most alike keyframes of all segments."""
-        candidates = []
-        for segment, number in self._candidates(view):
-            landmarks, descriptors = self._segments[segment].landmarks_in(number)
-            candidates.append((segment, number, _seen_anywhere(landmarks, descriptors, view)))
-        candidates.sort(key=lambda candidate: -len(candidate[2]))
-        most = len(candidates[0][2]) if candidates else 0
-        for segment, number, seen in candidates[:_QUERIES]:
-            if len(seen) < self.options.min_inliers:
+    def _match_guided(
+        self,
+        view: View,
+        T_world_camera: Array,
+        radius_px: float,
+        lowe_ratio: float,
+        segment_map: KeyframeMap | None = None,
+        enough: float = np.inf,
+    ) -> Matches:
+        """Match landmarks of the nearest keyframes and of the last frame near the pixels of a pose.
+
+        Features that the last frame shows, too, are matched as it shows them.
+
+        Args:
+            view: The image.
+            T_world_camera: ``(4, 4)``, its predicted pose.
+            radius_px: Radius around predicted pixels.
+            lowe_ratio: Lowe's ratio.
+            segment_map: The map; None for that of the present segment.
+            enough: Number of matches of the map with which the last frame is not matched.
+        """
+        state, segment_map = self._state, segment_map or self._map
+        T_camera_world = inverse(T_world_camera)
+        limits = GuidedMatchLimits(radius_px=radius_px, lowe_ratio=lowe_ratio)
+        nearest = segment_map.nearest(T_world_camera, _LOCAL_KEYFRAMES)
+        matches = segment_map.match(nearest, T_camera_world, view, limits, radius_px)
+        is_elsewhere = segment_map is not self._map or state.last is None or state.lost_in_a_row > 0
+        if is_elsewhere or len(matches) >= enough:
+            return matches
+        recent = self._landmarks_of_last_frame().match(
+            T_camera_world, view.camera, view.features, limits, radius_px
+        )
+        return matches.replace_by(recent, len(view.features), segment_map.landmark_count)
+
+    def _landmarks_of_last_frame(self) -> Landmarks:
+        last = self._state.last
+        assert last is not None
+        return self._map.landmarks_of_view(last.view, last.T_world_camera, last.landmarks, self.noise.noise)
+
+    # --- Recognise known places ---
+
+    def _relocalise(self, view: View) -> Generator[PoseQuery, QueryAnswer, tuple[_PosedView | None, int]]:
+        """Ask for the pose of a frame at known places; return it, and the largest number of matches."""
+        segment = self._state.segment
+        keyframes = list_relocalisation_candidates(self._segments, view.place_vector, segment)
+        candidates = match_candidates(self._segments, keyframes, view.features)
+        max_count = len(candidates[0].matches) if candidates else 0
+        for candidate in candidates[:_MAX_RELOCALISATION_QUERIES]:
+            count = len(candidate.matches)
+            if count < self.options.min_inliers:
                 break
-            known = self._segments[segment]
-            T_reference = known.pose(number)
-            answer = yield self._make_query(view, seen, T_reference, "keyframe")
-            T = self._placed(answer, T_reference, len(seen), 0.0)
-            if T is None:
+            # 1. Solve the pose against the keyframe.
+            segment_map = self._segments[candidate.segment]
+            T_world_reference = segment_map.pose(candidate.keyframe)
+            answer = yield self._make_query(view, candidate.matches, T_world_reference, "keyframe")
+            T_world_camera = self._read_pose(answer, T_world_reference, count, 0.0)
+            if T_world_camera is None:
                 continue
-            is_clear = answer.inliers >= max(_CLEAR_INLIERS, _CLEAR_RATIO * len(seen)) and not answer.is_weak
-            is_near = segment == self._segment and self._is_plausible(T)
-            if not (is_clear or (is_near and answer.inliers >= _NEAR_RATIO * len(seen))):
+            # 2. Far from the last pose, only a clear answer is accepted: perceptual aliases exist.
+            is_near = candidate.segment == segment and self._is_plausible(T_world_camera)
+            if not (answer.is_clear(count) or (is_near and answer.inliers >= _NEARBY_RATIO * count)):
                 continue
-            image, is_next = self._image_at(view, T, is_near=is_near)
-            posed = self._confirm(image, T, answer, len(seen), known, is_next=is_next)
-            if posed is not None and self._looks_right(posed.T_world_camera, known):
-                if segment != self._segment:
-                    self._segment, self._last, self._place = segment, None, None
-                return posed, most
-        return None, most
+            # 3. Verify the pose by the landmarks around it, and by the appearance of the image.
+            image, is_continuous = self._correct_view_at(view, T_world_camera, is_near=is_near)
+            posed = self._verify(
+                image, T_world_camera, answer, count, segment_map, is_continuous=is_continuous
+            )
+            if posed is not None and self._has_predicted_appearance(posed.T_world_camera, segment_map):
+                if candidate.segment != segment:
+                    self._state = replace(
+                        self._state, segment=candidate.segment, last=None, join_candidate=None
+                    )
+                return posed, max_count
+        return None, max_count
 
-    def _candidates(self, view: View) -> Iterator[tuple[int, int]]:
-        """Yield the keyframes that may show what a frame shows: (segment, number)."""
-        for segment, known in self._segments.items():
-            numbers = known.most_alike(view.place, _ALIKE)
-            if segment == self._segment:
-                numbers = [*range(len(known) - 1, max(-1, len(known) - 1 - _LATEST), -1), *numbers]
-            yield from ((segment, number) for number in dict.fromkeys(numbers))
-
-    def _seek_join(self, posed: _Posed) -> Generator[PoseQuery, Answer, None]:
-        """Yield a query for the place of a tracked frame in another segment; join the two when two agree."""
-        options = []
-        for segment, known in self._segments.items():
-            if segment == self._segment:
-                continue
-            for number in known.most_alike(posed.view.place, _ALIKE):
-                landmarks, descriptors = known.landmarks_in(number)
-                options.append((segment, number, _seen_anywhere(landmarks, descriptors, posed.view)))
-        segment, number, seen = max(options, key=lambda option: len(option[2]))
-        if len(seen) < _CLEAR_INLIERS:
+    def _find_join(self, posed: _PosedView) -> Generator[PoseQuery, QueryAnswer, None]:
+        """Ask for the place of a tracked frame in other segments; join two segments if two frames agree."""
+        # 1. Solve and verify the pose in the segment with the most matches.
+        keyframes = list_other_segments(self._segments, posed.view.place_vector, self._state.segment)
+        best = match_candidates(self._segments, keyframes, posed.view.features)[0]
+        count, segment_map = len(best.matches), self._segments[best.segment]
+        if count < CLEAR_INLIERS:
             return
-        T_reference = self._segments[segment].pose(number)
-        answer = yield self._make_query(posed.view, seen, T_reference, "segment")
-        T = self._placed(answer, T_reference, len(seen), _CLEAR_RATIO)
-        if T is None or answer.inliers < _CLEAR_INLIERS or answer.is_weak:
+        T_other_reference = segment_map.pose(best.keyframe)
+        answer = yield self._make_query(posed.view, best.matches, T_other_reference, "segment")
+        T_other_camera = self._read_pose(answer, T_other_reference, count, 0.0)
+        if T_other_camera is None or not answer.is_clear(min(count, self._max_matches)):
             return
-        other = self._confirm(posed.view, T, answer, len(seen), self._segments[segment])
-        if other is None or not self._looks_right(other.T_world_camera, self._segments[segment]):
+        there = self._verify(posed.view, T_other_camera, answer, count, segment_map)
+        if there is None or not self._has_predicted_appearance(there.T_world_camera, segment_map):
             return
-        T_into_segment = _rotation_made(other.T_world_camera @ inverse(posed.T_world_camera))
-        before, self._place = self._place, (segment, T_into_segment)
-        if before is None or before[0] != segment:
+        # 2. Compare the measurement with that of an earlier frame.
+        T_other_present = _orthonormalise(there.T_world_camera @ inverse(posed.T_world_camera))
+        previous = self._state.join_candidate
+        self._state = replace(self._state, join_candidate=(best.segment, T_other_present))
+        if previous is None or previous[0] != best.segment:
             return
-        apart_m, apart_deg = pose_difference(before[1], T_into_segment)
-        if apart_m <= _JOIN_M and apart_deg <= _JOIN_DEG:
-            if segment < self._segment:
-                self._join(self._segment, segment, T_into_segment)
-            else:  # the camera is back in the older segment: its poses stay
-                self._join(segment, self._segment, inverse(T_into_segment))
+        apart_m, apart_deg = pose_difference(previous[1], T_other_present)
+        if apart_m > _JOIN_AGREEMENT_M or apart_deg > _JOIN_AGREEMENT_DEG:
+            return
+        # 3. The older segment keeps its frame: in it, the camera's poses stay.
+        if best.segment < self._state.segment:
+            self._join(self._state.segment, best.segment, T_other_present)
+        else:
+            self._join(best.segment, self._state.segment, inverse(T_other_present))
 
     def _join(self, segment: int, into: int, T_into_segment: Array) -> None:
-        """Move all of *segment*, the newer one, into *into*, which keeps its frame."""
-        own = self._segments.pop(segment)
-        own.move(T_into_segment)
-        first = self._segments[into].take(own)
+        """Move all of *segment*, the newer one, into the map of *into*, which keeps its frame."""
+        segment_map = self._segments.pop(segment)
+        segment_map.move(T_into_segment)
+        first_landmark = self._segments[into].append(segment_map)
         self.joins.append(Join(segment, into, T_into_segment))
-        self._place = None
-        if segment != self._segment or self._last is None:
-            return
-        self._segment = into
-        if self._slots.motion is not None:
-            self._slots.motion.clear()
-        self._T_last = _rotation_made(T_into_segment @ self._T_last)
-        last = self._last
-        moved = np.where(last.landmarks == NO_LANDMARK, NO_LANDMARK, last.landmarks + first)
-        self._last = replace(last, T_world_camera=self._T_last, landmarks=moved)
+        if segment == self._state.segment and self._state.last is not None:
+            self._state = replace(self._state, segment=into)
+            self._move_state(T_into_segment, first_landmark)
+        else:
+            self._state = replace(self._state, join_candidate=None)
 
-    # --- matches and poses ---
+    def _move_state(self, T_new_old: Array, first_landmark: int = 0) -> None:
+        """Express the last pose in another frame, and its landmarks in a map where they begin at a number."""
+        T_world_camera = _orthonormalise(T_new_old @ self._state.T_world_camera)
+        last = self._state.last
+        if last is not None:
+            landmarks = shift_landmarks(last.landmarks, first_landmark)
+            last = replace(last, T_world_camera=T_world_camera, landmarks=landmarks)
+        self._state = replace(self._state, T_world_camera=T_world_camera, last=last, join_candidate=None)
+        self._plugins.forget_poses()
 
+    # --- Solve ---
+
+    @property
     def _map(self) -> KeyframeMap:
-        return self._segments[self._segment]
+        """The map of the present segment."""
+        return self._segments[self._state.segment]
 
-    def _of_last(self) -> Landmarks:
-        assert self._last is not None
-        return self._map().landmarks_of_view(
-            self._last.view, self._T_last, self._last.landmarks, self.noise.noise, _PIXEL_PX
-        )
+    @property
+    def _max_matches(self) -> int:
+        """Largest number of matches in a query."""
+        most = self.options.max_matches
+        return most if self._frame.stereo is None else min(most, _MAX_STEREO_MATCHES)
 
-    def _last_descriptors(self) -> Descriptors:
-        return self._of_last().descriptors
-
-    def _seen(
-        self, view: View, T_world_camera: Array, radius_px: float, ratio: float,
-        known: KeyframeMap | None = None, enough: int = 1_000_000,
-    ) -> _Seen:  # fmt: skip
-        """Match landmarks of the nearest keyframes and of the last frame near the pixels that a pose expects.
-
-        A feature that both show is taken as the last frame shows it.
-        """
-        T_camera_world = inverse(T_world_camera)
-        limits = NearLimits(radius_px=radius_px, ratio=ratio)
-        own = known is None or known is self._map()
-        if known is None:
-            known = self._map()
-        nearest = known.nearest(T_world_camera, _LOCAL)
-        numbers, features = known.seek(nearest, T_camera_world, view, limits, radius_px)
-        if self._last is None or not own or self._lost_in_a_row or len(features) >= enough:
-            return _seen_rows(known.landmarks(numbers), np.arange(len(numbers)), features)
-        recent = self._of_last()
-        rows, recent_features = recent.seek(T_camera_world, view.camera, view.features, limits, radius_px)
-        is_new, is_new_landmark = np.ones(len(view.features), bool), np.ones(known.landmark_count + 1, bool)
-        is_new[recent_features] = is_new_landmark[recent.numbers[rows]] = False  # NO_LANDMARK is the last row
-        stays = is_new[features] & is_new_landmark[numbers]
-        numbers, features = numbers[stays], features[stays]
-        first = _seen_rows(known.landmarks(numbers), np.arange(len(numbers)), features)
-        second = _seen_rows(recent, rows, recent_features)
-        return _Seen(
-            points=np.concatenate([first.points, second.points]),
-            spreads=np.concatenate([first.spreads, second.spreads]),
-            sways=np.concatenate([first.sways, second.sways]),
-            numbers=np.concatenate([first.numbers, second.numbers]),
-            features=np.concatenate([first.features, second.features]),
-        )
-
-    def _make_query(self, view: View, seen: _Seen, T_reference: Array, against: str) -> PoseQuery:
-        rows, most = np.arange(len(seen)), self._most_matches()
-        if len(rows) > most:
-            rows = np.linspace(0, len(rows) - 1, most).astype(np.int64)
-        rows = rows[np.argsort(view.features.pixels[seen.features[rows], 0], kind="stable")]
-        features = seen.features[rows]
-        points, pixels = round_for_wire(
-            transform(inverse(T_reference), seen.points[rows]), view.features.pixels[features]
-        )
-        depths_m = np.nan_to_num(view.points_camera[features, 2], posinf=0.0, neginf=0.0).round(3)
-        if len(points) and points[:, 2].min() <= 0.01:
-            depths_m = np.zeros(len(points))  # a depth is compared with that of the reference camera
-        return PoseQuery(
-            timestamp_s=self._frame.timestamp_s,
-            correspondences=Correspondences(points_world=points, pixels=pixels, depths_m=depths_m),
-            camera=view.camera,
-            inlier_px=self.options.inlier_px,
-            max_iterations=self.options.max_iterations,
-            against=against,  # type: ignore[arg-type]
+    def _make_query(
+        self,
+        view: View,
+        matches: Matches,
+        T_world_reference: Array,
+        against: Literal["map", "frame", "keyframe", "segment"],
+    ) -> PoseQuery:
+        return make_query(
+            self._frame,
+            matches,
+            view.features,
+            self.options,
+            max_matches=self._max_matches,
+            against=against,
+            T_world_reference=T_world_reference,
+            depths_m=view.points_camera[:, 2],
             depth_noise=None if self._frame.stereo is None else self.noise.noise,
         )
 
-    def _most_matches(self) -> int:
-        most = self.options.max_matches
-        return most if self._frame.stereo is None else min(most, _STEREO_MATCHES)
+    def _read_pose(
+        self, answer: QueryAnswer, T_world_reference: Array, match_count: int, min_ratio: float
+    ) -> Array | None:
+        """Return ``T_world_camera`` of an answer; None if too few matches agree or it is no rigid pose."""
+        sent = min(match_count, self._max_matches)
+        T_camera_reference = answer.accepted_pose(max(self.options.min_inliers, min_ratio * sent))
+        return None if T_camera_reference is None else T_world_reference @ inverse(T_camera_reference)
 
-    def _placed(self, answer: Answer, T_reference: Array, matches: int, ratio: float) -> Array | None:
-        """Return ``T_world_camera`` of an answer, None if too few agree or it is no pose."""
-        asked = min(matches, self._most_matches())
-        if answer.T_camera_world is None or answer.inliers < max(self.options.min_inliers, ratio * asked):
-            return None
-        T_camera_reference = rigid(answer.T_camera_world)
-        return None if T_camera_reference is None else T_reference @ inverse(T_camera_reference)
+    # --- Verify ---
 
     def _is_plausible(self, T_world_camera: Array) -> bool:
-        jump_m = max(self.options.max_jump_m, self._scene_jump_m())
-        limit_m = jump_m * min(1 + self._lost_in_a_row, _MOST_JUMPS)
-        moved_m = float(np.linalg.norm(T_world_camera[:3, 3] - self._T_last[:3, 3]))
+        """Return whether the camera can have moved to a pose since its last one."""
+        jump_m = self.options.max_jump_m
+        depths_m = self._raw.points_camera[:, 2]
+        if self._frame.stereo is not None and np.isfinite(depths_m).any():
+            median_m = float(np.median(depths_m[np.isfinite(depths_m)]))
+            jump_m = max(jump_m, _STEREO_JUMP_SHARE * median_m)
+        limit_m = jump_m * min(1 + self._state.lost_in_a_row, _MAX_JUMPS)
+        moved_m = float(np.linalg.norm(T_world_camera[:3, 3] - self._state.T_world_camera[:3, 3]))
         return moved_m <= limit_m
 
-    def _scene_jump_m(self) -> float:
-        """Return how far a stereo pair may move at once among what it sees: that of a car sees far."""
-        z = self._raw.points_camera[:, 2]
-        if self._frame.stereo is None or not np.isfinite(z).any():
-            return 0.0
-        return _JUMP_SHARE * float(np.median(z[np.isfinite(z)]))
+    def _correct_view_at(self, view: View, T_world_camera: Array, *, is_near: bool) -> tuple[View, bool]:
+        """Return a frame's image at a solved pose, and whether the camera moved there from its last pose.
 
-    def _image_at(self, view: View, T_world_camera: Array, *, is_near: bool) -> tuple[View, bool]:
-        """Return a frame's image at a pose, and whether the camera moved there from its last pose.
-
-        After a cut in a video it did not, and nothing is known of how fast it turns: its shutter stays.
+        After a cut in a video it did not: its rotation rate is unknown, and the rolling shutter stays.
         """
-        rate = turn_rate(self._T_last, T_world_camera, self._interval_s(), np.zeros(3))
-        if is_near and self._last is not None and float(np.linalg.norm(rate)) <= _MOST_RATE:
+        rate = self._rate_at(T_world_camera, np.zeros(3))
+        is_slow = float(np.linalg.norm(rate)) <= _MAX_RATE_RAD_S
+        if is_near and self._state.last is not None and is_slow:
             return view, True
-        return self._turned(view, self._raw, np.zeros(3)), False
+        return self._correct_view(view, np.zeros(3)), False
 
-    def _confirm(
-        self, view: View, T_world_camera: Array, answer: Answer, matches: int, known: KeyframeMap,
-        *, is_next: bool = False,
-    ) -> _Posed | None:  # fmt: skip
-        """Match the local map near the pose, and fit the pose to all that agrees; None if little does.
+    def _rate_at(self, T_world_camera: Array, previous_rate: Array) -> Array:
+        """Return the rotation rate in rad/s of a camera that moved from the last pose to this one."""
+        state = self._state
+        interval_s = max(_MIN_INTERVAL_S, self._frame.timestamp_s - state.timestamp_s)
+        return rotation_rate(state.T_world_camera, T_world_camera, interval_s, previous_rate)
 
-        *is_next* says that the camera moved here from its last pose.
+    def _correct_view(self, view: View, rate: Array) -> View:
+        """Return the present image without the rolling shutter of a camera that rotates at *rate* rad/s."""
+        return correct_view(view, self._raw, self.readout.readout_s, rate)
+
+    def _verify(
+        self,
+        view: View,
+        T_world_camera: Array,
+        answer: QueryAnswer,
+        match_count: int,
+        segment_map: KeyframeMap,
+        *,
+        is_continuous: bool = False,
+    ) -> _PosedView | None:
+        """Fit a solved pose to all landmarks of the map around it; None if too few agree.
+
+        Args:
+            view: The image.
+            T_world_camera: ``(4, 4)``, the solved pose.
+            answer: The answer that it comes from.
+            match_count: Number of matches of the query.
+            segment_map: The map in which the pose was solved.
+            is_continuous: Whether the camera moved there from its last pose; then its rolling shutter is
+                undone by that motion.
         """
-        seen = self._seen(view, T_world_camera, _CONFIRM_PX, _CONFIRM_LOWE_RATIO, known, _ENOUGH)
-        least = self.options.min_inliers
-        if len(seen) < least:
+        # 1. Match the landmarks around the pose, and fit the pose to them.
+        matches = self._match_guided(
+            view, T_world_camera, _VERIFY_RADIUS_PX, _VERIFY_LOWE_RATIO, segment_map, _ENOUGH_MAP_MATCHES
+        )
+        min_inliers = self.options.min_inliers
+        if len(matches) < min_inliers:
             return None
-        observed = self._observe(view, seen, T_world_camera)
+        observed = self._observe(view, matches, T_world_camera)
         fitted = fit_pose(observed, view.camera, inverse(T_world_camera))
-        if fitted is not None and is_next:
+        # 2. Undo the rolling shutter at the rate of the fitted pose, and fit again.
+        if fitted is not None and is_continuous:
             T_fitted = inverse(fitted.T_camera_world)
-            rate = turn_rate(self._T_last, T_fitted, self._interval_s(), self._rate)
-            if self._first is not None and int(fitted.is_inlier.sum()) >= _CLEAR_INLIERS:
-                self._turn_first(*self._first, rate)
-                return self._confirm(view, T_fitted, answer, matches, self._map(), is_next=True)
-            view = self._turned(view, self._raw, rate)
-            observed = self._observe(view, seen, T_fitted)
+            rate = self._rate_at(T_fitted, self._state.rotation_rate)
+            if self._state.first is not None and int(fitted.is_inlier.sum()) >= CLEAR_INLIERS:
+                self._correct_first_keyframe(*self._state.first, rate)
+                return self._verify(view, T_fitted, answer, match_count, self._map, is_continuous=True)
+            view = self._correct_view(view, rate)
+            observed = self._observe(view, matches, T_fitted)
             fitted = fit_pose(observed, view.camera, fitted.T_camera_world)
-            if fitted is not None and self._frame.stereo is None:
-                self._learn_readout(view, seen, observed, fitted, rate)
-        agreeing = 0 if fitted is None else int(fitted.is_inlier.sum())
-        if fitted is None or agreeing < max(least, _CONFIRMED_RATIO * len(seen)):
+            if fitted is not None and not view.is_stereo:
+                # Stereo cameras have global shutters, and a pair that is not simultaneous looks like a
+                # readout.
+                change = measure_readout_change(view, matches, observed, fitted)
+                self._pending_readout_s += self.readout.update(*change, rate)
+        # 3. Accept the pose if enough landmarks agree.
+        inlier_count = 0 if fitted is None else int(fitted.is_inlier.sum())
+        if fitted is None or inlier_count < max(min_inliers, _VERIFIED_RATIO * len(matches)):
             return None
         T_camera_world = rigid(fitted.T_camera_world)
         if T_camera_world is None:
             return None
+        # 4. Update the noise estimate, and note which features show which landmarks.
         inliers = np.flatnonzero(fitted.is_inlier)
         self.noise.add(observed, inliers, T_camera_world)
         landmarks = np.full(len(view.features), NO_LANDMARK)
-        landmarks[seen.features[inliers]] = seen.numbers[inliers]
-        return _Posed(
-            view=view, T_world_camera=inverse(T_camera_world), landmarks=landmarks, inliers=agreeing,
-            matches=max(matches, len(seen)), is_weak=answer.is_weak, is_next=is_next,
-        )  # fmt: skip
+        landmarks[matches.features[inliers]] = matches.landmarks.numbers[inliers]
+        return _PosedView(
+            view=view,
+            T_world_camera=inverse(T_camera_world),
+            landmarks=landmarks,
+            inliers=inlier_count,
+            matches=max(match_count, len(matches)),
+            is_weak=answer.is_weak,
+            is_continuous=is_continuous,
+        )
 
-    def _looks_right(self, T_world_camera: Array, known: KeyframeMap) -> bool:
-        """Return whether a frame shows what a pose expects: matches alone never speak against one.
-
-        A user's features cannot be described where they were not found: they are believed.
-        """
-        if self._slots.features is not None:
-            return True
-        landmarks = known.landmarks_of(known.nearest(T_world_camera, _LOCAL))
-        share, count = share_alike(self._frame, landmarks, T_world_camera)
-        return count >= self.options.min_inliers and share >= _ALIKE_SHARE
-
-    def _observe(self, view: View, seen: _Seen, T_world_camera: Array) -> Observations:
-        z = np.nan_to_num(view.points_camera[seen.features, 2], posinf=0.0, neginf=0.0)
-        noise: DepthNoise = self.noise.noise
-        at_m = z
+    def _observe(self, view: View, matches: Matches, T_world_camera: Array) -> Observations:
+        """Return what an image measured of matched landmarks, with the noise of each measurement."""
+        depths_m = np.nan_to_num(view.points_camera[matches.features, 2], posinf=0.0, neginf=0.0)
+        noise_depths_m = depths_m
         if view.is_stereo:
-            at_m = between(z, transform(inverse(T_world_camera), seen.points)[:, 2])
+            expected_m = transform(inverse(T_world_camera), matches.landmarks.points)[:, 2]
+            noise_depths_m = depths_for_noise(depths_m, expected_m)
         return Observations(
-            points=seen.points,
-            spreads=seen.spreads,
-            pixels=view.features.pixels[seen.features],
-            pixels_px=_PIXEL_PX * view.features.sizes[seen.features],
-            depths_m=z,
-            depths_dev_m=np.sqrt(noise.variance_m2(at_m)),
+            points=matches.landmarks.points,
+            covariances=matches.landmarks.covariances,
+            pixels=view.features.pixels[matches.features],
+            pixel_sigmas_px=PIXEL_SIGMA_PX * view.features.sizes[matches.features],
+            depths_m=depths_m,
+            depth_sigmas_m=np.sqrt(self.noise.noise.variance_m2(noise_depths_m)),
         )
 
-    # --- the shutter ---
+    def _correct_first_keyframe(self, raw: Features, view: View, rate: Array) -> None:
+        """Make the first keyframe of a segment again without its rolling shutter.
 
-    def _view(self) -> View:
-        """Return the image of the present frame, with its rolling shutter."""
-        features = self._raw
-        image = ImageFeatures(
-            pixels=features.pixels, descriptors=features.descriptors, turns=features.turns,
-            sizes=features.sizes, distinct=distinct_distances(features.descriptors, features.pixels),
-            is_oriented=features.is_oriented, is_scaled=features.is_scaled,
-        )  # fmt: skip
-        return View(
-            features=image, points_camera=features.points_camera, sways=np.zeros_like(features.points_camera),
-            camera=self._frame.camera,
-            place=place_of(features.descriptors, self._frame.rgb, self._slots.loops),
-            is_stereo=self._frame.stereo is not None, timestamp_s=self._frame.timestamp_s,
-        )  # fmt: skip
-
-    def _interval_s(self) -> float:
-        return max(_LEAST_INTERVAL_S, self._frame.timestamp_s - self._last_s)
-
-    def _turned(self, view: View, raw: Features, rate: Array) -> View:
-        """Return an image without its rolling shutter, of a camera that turns at *rate*."""
-        features = without_shutter(raw, view.camera, self.readout.readout_s * rate)
-        return replace(
-            view,
-            features=replace(view.features, pixels=features.pixels),
-            points_camera=features.points_camera,
-            sways=sways(raw, features.points_camera, view.camera, rate),
-        )
-
-    def _turn_first(self, raw: Features, view: View, rate: Array) -> None:
-        """Make the first keyframe of a segment again, now that a second image tells how the camera turned."""
-        assert self._last is not None
-        first = self._turned(view, raw, rate)
-        known = self._segments[self._segment] = KeyframeMap(self.options.max_keyframes)
-        none = np.full(len(first.features), NO_LANDMARK)
-        landmarks = known.add_keyframe(first, self._T_last, none, self.noise.noise, _PIXEL_PX)
-        self._last, self._first = replace(self._last, view=first, landmarks=landmarks), None
-
-    def _learn_readout(
-        self, view: View, seen: _Seen, observed: Observations, fitted: FittedPose, rate: Array
-    ) -> None:
-        """Correct the estimate of the readout by what an image with its pose tells.
-
-        Stereo cameras have global shutters, and a pair that is not simultaneous would look like a readout.
+        Its rotation rate *rate* (rad/s) is known only after the second frame.
         """
-        rows = np.flatnonzero(fitted.is_inlier & (observed.depths_m > 0.0))
-        if len(rows) < _LEAST_ROWS:
-            return
-        known = seen.sways[rows] @ fitted.T_camera_world[:3, :3].T
-        more_s, information = fit_sway(
-            observed.only(rows), known - view.sways[seen.features[rows]], view.camera, fitted.T_camera_world
-        )
-        self._more_s += self.readout.add(more_s, information, rate)
+        state = self._state
+        assert state.last is not None
+        view = correct_view(view, raw, self.readout.readout_s, rate)
+        self._segments[state.segment] = KeyframeMap(self.options.max_keyframes)
+        landmarks = self._add_first_keyframe(view, state.T_world_camera)
+        self._state = replace(state, last=replace(state.last, view=view, landmarks=landmarks), first=None)
 
-    # --- results ---
+    def _has_predicted_appearance(self, T_world_camera: Array, segment_map: KeyframeMap) -> bool:
+        """Return whether the frame looks as the landmarks around a recognised place predict.
 
-    def _keep(self, posed: _Posed) -> bool:
-        """Take a posed frame as the last one, and into the map; say whether it became a keyframe."""
-        known, T = self._map(), posed.T_world_camera
-        if self._lost_in_a_row or self._last is None:
-            self._motion = np.eye(4)
+        A user's features cannot be computed at given pixels, so that they pass without a check.
+        """
+        if self._plugins.features is not None:
+            return True
+        landmarks = segment_map.landmarks_seen_by(segment_map.nearest(T_world_camera, _LOCAL_KEYFRAMES))
+        return has_predicted_appearance(self._frame, landmarks, T_world_camera, self.options.min_inliers)
+
+    # --- Decide and keep ---
+
+    def _keep(self, posed: _PosedView) -> bool:
+        """Take a frame with a verified pose as the last one, and into the map; return if it is a keyframe."""
+        state, T_world_camera, timestamp_s = self._state, posed.T_world_camera, self._frame.timestamp_s
+        # 1. Update the motion model; after a loss the motion is not known.
+        T_last_next, rate = np.eye(4), state.rotation_rate
+        if state.lost_in_a_row or state.last is None:
+            self._plugins.forget_poses()
         else:
-            self._motion = _rotation_made(inverse(self._T_last) @ T)
-            if not posed.is_next:
-                self._rate = np.zeros(3)
-            else:
-                self._rate = turn_rate(self._T_last, T, self._interval_s(), np.zeros(3))
-        self._last_s, self._first = self._frame.timestamp_s, None
-        if self._slots.motion is not None:
-            if self._lost_in_a_row or self._last is None:
-                self._slots.motion.clear()
-            self._slots.motion.add(self._frame.timestamp_s, T)
-        self._features = replace(
+            T_last_next = _orthonormalise(inverse(state.T_world_camera) @ T_world_camera)
+            rate = self._rate_at(T_world_camera, np.zeros(3)) if posed.is_continuous else np.zeros(3)
+        self._plugins.add_pose(timestamp_s, T_world_camera)
+        # 2. Fuse the measurements into the map; a weak pose changes nothing there.
+        is_keyframe, keyframe_inliers = self._is_keyframe(posed), state.keyframe_inliers
+        landmarks = posed.landmarks
+        if not posed.is_weak:
+            self._map.fuse(posed.view, T_world_camera, landmarks, self.noise.noise)
+        if is_keyframe:
+            landmarks = self._map.add_keyframe(posed.view, T_world_camera, landmarks, self.noise.noise)
+            self.keyframes += 1
+            keyframe_inliers = posed.inliers
+        # 3. Move the maps by the change of the readout time, after this image was measured with the old one.
+        for segment_map in self._segments.values():
+            segment_map.change_readout(self._pending_readout_s)
+        self._pending_readout_s = 0.0
+        # 4. The frame is the last one now.
+        features = replace(
             self._raw, pixels=posed.view.features.pixels, points_camera=posed.view.points_camera
         )
-        self._lost_in_a_row, self.unrecognised, self._T_last = 0, 0, T
-        keyframe = self._is_keyframe(posed)
-        if not posed.is_weak:
-            known.fuse(posed.view, T, posed.landmarks, self.noise.noise, _PIXEL_PX)
-        landmarks = posed.landmarks
-        if keyframe:
-            landmarks = known.add_keyframe(posed.view, T, landmarks, self.noise.noise, _PIXEL_PX)
-            self.keyframes += 1
-            self._reference_seen = posed.inliers
-        self._last = _Posed(
-            view=posed.view, T_world_camera=T, landmarks=landmarks, inliers=posed.inliers,
-            matches=posed.matches, is_weak=posed.is_weak,
-        )  # fmt: skip
-        # After the image, which was measured with the readout of before, has become part of the map.
-        for segment in self._segments.values():
-            segment.lengthen_readout(self._more_s)
-        self._more_s = 0.0
-        return keyframe
+        self._state = replace(
+            state,
+            T_world_camera=T_world_camera,
+            timestamp_s=timestamp_s,
+            T_last_next=T_last_next,
+            rotation_rate=rate,
+            last=replace(posed, landmarks=landmarks),
+            features=features,
+            first=None,
+            keyframe_inliers=keyframe_inliers,
+            lost_in_a_row=0,
+            unrecognised=0,
+        )
+        return is_keyframe
 
-    def _is_keyframe(self, posed: _Posed) -> bool:
+    def _is_keyframe(self, posed: _PosedView) -> bool:
+        """Return whether a frame is far from all keyframes, or sees much fewer landmarks than the newest."""
         options = self.options
         if posed.is_weak or posed.inliers < 2 * options.min_inliers:
             return False
-        metres, degrees = self._map().distances(posed.T_world_camera)
-        is_new = bool(((metres > options.keyframe_m) | (degrees > options.keyframe_deg)).all())
-        landmarks = int((posed.landmarks != NO_LANDMARK).sum())
-        return is_new or landmarks < options.keyframe_share * self._reference_seen
+        metres, degrees = self._map.distances(posed.T_world_camera)
+        is_far = bool(((metres > options.keyframe_m) | (degrees > options.keyframe_deg)).all())
+        landmark_count = int((posed.landmarks != NO_LANDMARK).sum())
+        return is_far or landmark_count < options.keyframe_share * self._state.keyframe_inliers
 
-    def _begin_or_lose(self, view: View, matches: int) -> TrackedFrame:
-        """Begin a segment with a frame that has enough features with depth, if so many before were lost."""
-        usable = int(np.isfinite(view.points_camera[:, 2]).sum())
-        if usable < (_MANY if self._segments else 1) * self.options.min_inliers:
-            return self._lose(matches)
+    def _begin_or_lose(self, view: View, match_count: int) -> TrackedFrame:
+        """Lose a frame without a pose; or begin a segment with it, if enough frames before it were lost.
+
+        A segment begins only with enough features with depth.
+        """
+        feature_count = int(np.isfinite(view.points_camera[:, 2]).sum())
+        factor = _GUIDED_MATCHES_FACTOR if self._segments else 1
+        if feature_count < factor * self.options.min_inliers:
+            return self._lose(match_count)
         if self._segments:
-            self.unrecognised += 1
-            if self.unrecognised <= self.options.segment_after:
-                return self._lose(matches)
-        start = self._T_world_start if not self._segments else self._T_last
-        self._segment = self._begun
-        self._begun += 1
-        self._segments[self._segment] = KeyframeMap(self.options.max_keyframes)
-        none = np.full(len(view.features), NO_LANDMARK)
-        landmarks = self._map().add_keyframe(view, start, none, self.noise.noise, _PIXEL_PX)
-        self.keyframes += 1
-        self._last = _Posed(
-            view=view, T_world_camera=start, landmarks=landmarks, inliers=0, matches=0, is_weak=False
+            self._state = replace(self._state, unrecognised=self._state.unrecognised + 1)
+            if self._state.unrecognised <= self.options.segment_after:
+                return self._lose(match_count)
+        start = self._state.T_world_camera if self._segments else self._T_world_start
+        return self._begin_segment(view, start, feature_count)
+
+    def _begin_segment(self, view: View, T_world_camera: Array, feature_count: int) -> TrackedFrame:
+        """Begin a segment with a frame at a pose."""
+        segment, timestamp_s = self._next_segment, self._frame.timestamp_s
+        self._next_segment += 1
+        self._segments[segment] = KeyframeMap(self.options.max_keyframes)
+        self._state = _TrackState(T_world_camera=T_world_camera, timestamp_s=timestamp_s, segment=segment)
+        posed = _PosedView(
+            view=view,
+            T_world_camera=T_world_camera,
+            landmarks=self._add_first_keyframe(view, T_world_camera),
+            inliers=0,
+            matches=0,
+            is_weak=False,
         )
-        self._first, self._last_s, self._rate = (self._raw, view), self._frame.timestamp_s, np.zeros(3)
-        if self._slots.motion is not None:
-            self._slots.motion.clear()
-            self._slots.motion.add(self._frame.timestamp_s, start)
-        self._T_last, self._motion, self._place = start, np.eye(4), None
-        self._lost_in_a_row, self.unrecognised, self._reference_seen = 0, 0, usable // 2
-        return self._result(self._last, keyframe=True)
+        self.keyframes += 1
+        self._state = replace(
+            self._state,
+            last=posed,
+            features=self._raw,
+            first=(self._raw, view),
+            keyframe_inliers=feature_count // 2,
+        )
+        self._plugins.forget_poses()
+        self._plugins.add_pose(timestamp_s, T_world_camera)
+        return self._make_result(posed, is_keyframe=True)
 
-    def _result(self, posed: _Posed, *, keyframe: bool) -> TrackedFrame:
-        is_apart = self._segment != min(self._segments)
-        return TrackedFrame(
-            frame=self._frame, T_world_camera=self._T_last, keyframe=keyframe, inliers=posed.inliers,
-            matches=posed.matches, segment=self.segment, features=self._raw,
-            reason="in a segment that is not joined to the first one yet" if is_apart else "",
-        )  # fmt: skip
+    def _add_first_keyframe(self, view: View, T_world_camera: Array) -> Rows:
+        """Add the first keyframe of the present segment; return the landmark of each feature."""
+        none = np.full(len(view.features), NO_LANDMARK)
+        return self._map.add_keyframe(view, T_world_camera, none, self.noise.noise)
 
-    def _lose(self, matches: int) -> TrackedFrame:
+    def _lose(self, match_count: int) -> TrackedFrame:
         self.lost_frames += 1
-        self._lost_in_a_row += 1
-        self._last, self._rate = None, np.zeros(3)
+        self._state = replace(
+            self._state,
+            last=None,
+            rotation_rate=np.zeros(3),
+            lost_in_a_row=self._state.lost_in_a_row + 1,
+        )
         return TrackedFrame(
-            frame=self._frame, T_world_camera=None, keyframe=False, inliers=0, matches=matches,
-            segment=self.segment, features=self._raw,
-        )  # fmt: skip
+            frame=self._frame,
+            T_world_camera=None,
+            keyframe=False,
+            inliers=0,
+            matches=match_count,
+            segment=self.segment,
+            features=self._raw,
+        )
+
+    def _make_result(self, posed: _PosedView, *, is_keyframe: bool) -> TrackedFrame:
+        is_joined = self._state.segment == min(self._segments)
+        return TrackedFrame(
+            frame=self._frame,
+            T_world_camera=self._state.T_world_camera,
+            keyframe=is_keyframe,
+            inliers=posed.inliers,
+            matches=posed.matches,
+            segment=self.segment,
+            features=self._raw,
+            reason="" if is_joined else NOT_JOINED,
+        )
 
 
-def _seen_anywhere(landmarks: Landmarks, descriptors: Descriptors, view: View) -> _Seen:
-    """Match landmarks with the features of an image by appearance alone."""
-    rows, features = match_all(
-        descriptors, view.features.descriptors, ratio=_ALL_RATIO, max_distance=_ALL_DISTANCE
-    )
-    return _seen_rows(landmarks, rows, features)
-
-
-def _seen_rows(landmarks: Landmarks, rows: Rows, features: Rows) -> _Seen:
-    """Return some rows of landmarks as an image shows them."""
-    return _Seen(
-        points=landmarks.points[rows], spreads=landmarks.spreads[rows], sways=landmarks.sways[rows],
-        numbers=landmarks.numbers[rows], features=features,
-    )  # fmt: skip
-
-
-def _rotation_made(T: Array) -> Array:
-    """Return a pose with a true rotation: products drift from it, and `inverse` doubles the error."""
+def _orthonormalise(T: Array) -> Array:
+    """Return a pose with the nearest true rotation: products of poses drift, and `inverse` doubles the
+    error."""
     U, _, Vt = np.linalg.svd(T[:3, :3])
-    made: Array = T.copy()
-    made[:3, :3] = U @ Vt
-    return made
+    orthonormal: Array = T.copy()
+    orthonormal[:3, :3] = U @ Vt
+    return orthonormal

@@ -120,7 +120,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
     if args.live and args.merge:
         raise UsageError("--live and --merge exclude each other", hint="a live map needs no merge")
     require("demo --merge" if args.merge else "demo")
-    from client_sdk.slots import load_features
+    from client_sdk.plugins import load_features
 
     load_features(args.features)
     settings = with_recordings(settings, args.record)

@@ -1,9 +1,9 @@
-"""Descriptors of any kind and their matches between two views; deterministic, one thread.
+"""Distances of descriptors, and matches between two sets of them; deterministic, one thread.
 
-The native core matches ORB descriptors; numpy matches all other kinds, which a user's function computes.  A
-descriptor is binary (uint8, compared by its Hamming distance) or a vector of whole numbers (int8, compared
-by its squared Euclidean distance).  The array says which: nothing else has to be carried along to compare two
-of them.  The Hamming distance is a quarter of the squared one of bits as -1 and 1, so one ratio fits both.
+A descriptor is binary (uint8, compared by the Hamming distance) or a vector of whole numbers (int8, compared
+by the squared Euclidean distance); the type of the array decides.  The Hamming distance is a quarter of the
+squared Euclidean distance of bits written as -1 and 1, so that one ratio test fits both.  The native core
+matches ORB descriptors; numpy matches all other kinds, which a user's feature extractor computes.
 """
 
 from __future__ import annotations
@@ -31,31 +31,35 @@ __all__ = [
 
 Rows = npt.NDArray[np.int64]
 
-_LANES = {"portable": 1, "avx2": 2, "avx512": 0}  # the flags of `rse_pf_match`
-
-_BLOCK = 4_000_000
-"""Distances that are held at a time, 16 MB."""
-_BITS = np.array([bin(value).count("1") for value in range(256)], dtype=np.uint8)
+_INSTRUCTION_FLAGS = {"portable": 1, "avx2": 2, "avx512": 0}
+"""Flags of the native core's ``rse_pf_match`` by the widest instructions that it may use."""
+_BLOCK_DISTANCES = 4_000_000
+"""Distances that are in memory at a time where numpy matches descriptors: 16 MB of float32."""
+_BIT_COUNTS = np.array([bin(value).count("1") for value in range(256)], dtype=np.uint8)
+_WORKSPACE = Workspace()
 
 
 def no_distance(descriptors: Descriptors) -> int:
-    """Return a number above every distance of such descriptors: 256 for 32 bytes."""
+    """Return a number that no distance of such ``(n, d)`` descriptors exceeds: 256 for 32 bytes."""
     size = int(descriptors.shape[1])
     return 8 * size if descriptors.dtype == np.uint8 else 4 * 128 * 128 * size
 
 
 def distances_of_pairs(first: Descriptors, second: Descriptors) -> npt.NDArray[np.int64]:
-    """Return the ``(n,)`` distances of the rows of two ``(n, d)`` arrays."""
+    """Return the ``(n,)`` distances between row *i* of one and row *i* of another ``(n, d)`` array."""
     if first.dtype == np.uint8:
-        bits: npt.NDArray[np.int64] = _BITS[first ^ second].sum(axis=1, dtype=np.int64)
+        bits: npt.NDArray[np.int64] = _BIT_COUNTS[first ^ second].sum(axis=1, dtype=np.int64)
         return bits
-    apart = first.astype(np.int32) - second.astype(np.int32)
-    squares: npt.NDArray[np.int64] = np.einsum("nd,nd->n", apart, apart).astype(np.int64)
+    differences = first.astype(np.int32) - second.astype(np.int32)
+    squares: npt.NDArray[np.int64] = np.einsum("nd,nd->n", differences, differences).astype(np.int64)
     return squares
 
 
 def distance_matrix(first: Descriptors, second: Descriptors) -> npt.NDArray[np.float32]:
-    """Return the ``(n, m)`` distances of all rows; whole numbers, exact in float32 by whatever order."""
+    """Return the ``(n, m)`` distances between all rows of ``(n, d)`` and all rows of ``(m, d)`` descriptors.
+
+    The distances are whole numbers and exact in float32, whatever the order of summation.
+    """
     a, b = as_vectors(first), as_vectors(second)
     distances: npt.NDArray[np.float32]
     if first.dtype == np.uint8:
@@ -67,7 +71,11 @@ def distance_matrix(first: Descriptors, second: Descriptors) -> npt.NDArray[np.f
 
 
 def as_vectors(descriptors: Descriptors) -> npt.NDArray[np.float32]:
-    """Return ``(n, 8 d)`` bits as -1 and 1 of binary descriptors, ``(n, d)`` numbers of vectors."""
+    """Return descriptors as float32 vectors.
+
+    Returns:
+        ``(n, 8 d)`` bits written as -1 and 1 of binary ``(n, d)`` descriptors; ``(n, d)`` numbers of others.
+    """
     if descriptors.dtype != np.uint8:
         return descriptors.astype(np.float32)
     bits = np.unpackbits(descriptors, axis=1).astype(np.float32)
@@ -77,16 +85,21 @@ def as_vectors(descriptors: Descriptors) -> npt.NDArray[np.float32]:
 
 
 def best_matches(reference: Descriptors, view: Descriptors, ratio: float) -> tuple[Rows, Rows]:
-    """Match ``(n, d)`` reference rows to ``(m, d)`` view rows; best match first.
+    """Match the descriptors of a reference with those of a view by Lowe's ratio test; best match first.
 
-    A match is accepted if its distance is below *ratio* times that of the second best, and each row of
-    the view is matched once, by the closest.
+    A match is accepted if its distance is below *ratio* times the distance of the second most similar
+    descriptor of the view.  Each descriptor of the view is matched once, with the most similar one.
+
+    Args:
+        reference: ``(n, d)``.
+        view: ``(m, d)``.
+        ratio: Largest accepted ratio of the best and the second best distance, above 0.
 
     Returns:
-        Row numbers of the reference and of the view, of equal length.
+        Rows of the reference, and the row of the view that matches each of them.
 
     Raises:
-        BadRequest: The two are descriptors of different kinds.
+        BadRequest: The two arrays hold descriptors of different types or lengths.
         MissingExtra: They are ORB descriptors, and the native core is not installed.
     """
     if reference.dtype != view.dtype or reference.shape[1:] != view.shape[1:]:
@@ -95,13 +108,13 @@ def best_matches(reference: Descriptors, view: Descriptors, ratio: float) -> tup
             "cannot be compared",
             hint="use features of one kind",
         )
-    none: Rows = np.empty(0, dtype=np.int64)
+    empty: Rows = np.empty(0, dtype=np.int64)
     if len(reference) == 0 or len(view) < 2:
-        return none, none
+        return empty, empty
     if ORB.is_kind_of(reference):
         return match_orb(reference, view, ratio)
-    step = max(1, _BLOCK // len(view))
-    blocks = [_two_nearest(reference[row : row + step], view) for row in range(0, len(reference), step)]
+    step = max(1, _BLOCK_DISTANCES // len(view))
+    blocks = [_find_two_nearest(reference[row : row + step], view) for row in range(0, len(reference), step)]
     best, second, nearest = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
     is_clear = np.flatnonzero(best < ratio * second)
     best_first = is_clear[np.argsort(best[is_clear], kind="stable")]
@@ -110,10 +123,10 @@ def best_matches(reference: Descriptors, view: Descriptors, ratio: float) -> tup
     return chosen, nearest[chosen].astype(np.int64)
 
 
-def _two_nearest(
+def _find_two_nearest(
     reference: Descriptors, view: Descriptors
 ) -> tuple[npt.NDArray[Any], npt.NDArray[Any], npt.NDArray[Any]]:
-    """Return the ``(n,)`` distances of the nearest and second nearest of *view*, and the nearest rows."""
+    """Return the ``(n,)`` smallest and second smallest distances to *view*, and the rows of the nearest."""
     distances = distance_matrix(reference, view)
     rows = np.arange(len(distances))
     nearest = np.argmin(distances, axis=1)
@@ -138,19 +151,16 @@ def match_orb(
     """
     reference, view = aligned(reference), aligned(view)
     n, m = len(reference), len(view)
-    rows, columns = np.empty((2, min(n, m)), dtype=np.int64)
-    count = _match_function()(
-        address_of(reference), n, address_of(view), m, ratio, _LANES[lanes],
-        address_of(_WORKSPACE.words(n + 5 * m + 64)), address_of(rows), address_of(columns),
+    rows, view_rows = np.empty((2, min(n, m)), dtype=np.int64)
+    count = _core_match()(
+        address_of(reference), n, address_of(view), m, ratio, _INSTRUCTION_FLAGS[lanes],
+        address_of(_WORKSPACE.words(n + 5 * m + 64)), address_of(rows), address_of(view_rows),
     )  # fmt: skip
-    return rows[:count], columns[:count]
-
-
-_WORKSPACE = Workspace()
+    return rows[:count], view_rows[:count]
 
 
 @cache
-def _match_function() -> Any:
+def _core_match() -> Any:
     pointer, size = ctypes.c_void_p, ctypes.c_int64
     arguments = (pointer, size, pointer, size, ctypes.c_double, ctypes.c_uint32, pointer, pointer, pointer)
     return core_function("match", "rse_pf_match", arguments, size)
@@ -159,22 +169,27 @@ def _match_function() -> Any:
 def match_all(
     first: Descriptors, second: Descriptors, *, ratio: float = 0.8, max_distance: int = 64
 ) -> tuple[Rows, Rows]:
-    """Return rows of *first* and of *second* that match, by ascending rows of *first*.
+    """Match all descriptors of two images by appearance alone, whatever their pixels.
 
     Args:
         first: ``(n, d)``.
         second: ``(m, d)``.
-        ratio: As in `best_matches`.
-        max_distance: Of 256 bits; other binary descriptors by their bits, vectors have no limit.
+        ratio: Lowe's ratio test, as in `best_matches`.
+        max_distance: Largest Hamming distance in bits of 256; scaled for binary descriptors of other lengths,
+            not used for vectors.
+
+    Returns:
+        Ascending rows of *first*, and the row of *second* that matches each of them.
 
     Raises:
-        As `best_matches`.
+        BadRequest: The two arrays hold descriptors of different types or lengths.
+        MissingExtra: They are ORB descriptors, and the native core is not installed.
     """
-    rows, columns = best_matches(first, second, ratio)
+    rows, second_rows = best_matches(first, second, ratio)
     if first.dtype == np.uint8:
         is_near = (
-            distances_of_pairs(first[rows], second[columns]) <= max_distance * first.shape[1] // ORB.size
+            distances_of_pairs(first[rows], second[second_rows]) <= max_distance * first.shape[1] // ORB.size
         )
-        rows, columns = rows[is_near], columns[is_near]
+        rows, second_rows = rows[is_near], second_rows[is_near]
     order = np.argsort(rows, kind="stable")
-    return rows[order], columns[order]
+    return rows[order], second_rows[order]

@@ -1,8 +1,8 @@
-"""ORB features of one image, as robots find them and as keyframes hold them.
+"""ORB features of one image: detected, spread over the image, and described.
 
-Every part of the platform that compares an image with keyframes finds its features here.  The native core
-finds and describes them.  OpenCV, whose bytes are the same, does so on processors without AVX2 and FMA, and
-it describes pixels near the edge of an image.
+Every part of the platform that compares an image with keyframes gets its ORB features here.  The native core
+detects and describes them.  OpenCV, whose results are the same to the byte, does so on processors without
+AVX2 and FMA, and for keypoints near the edge of an image.
 """
 
 from __future__ import annotations
@@ -24,32 +24,49 @@ from rse_pf.maps.descriptors import ORB, DescriptorKind, Descriptors
 from rse_pf.native import Workspace, address_of, aligned, core_function
 
 __all__ = [
-    "DescribedPixels",
+    "DescribedKeypoints",
     "Keypoints",
     "describe_at",
     "describe_keypoints",
     "describe_orb",
     "detect_keypoints",
-    "spread_rows",
+    "select_spread_rows",
 ]
 
 _Floats = npt.NDArray[np.floating[Any]]
 
-# ORB's pyramid.
-_SCALE, _LEVELS = 1.2, 8
-_SCALES: Array = np.power(_SCALE, np.arange(_LEVELS, dtype=np.float64))
-_CORE_SCALES = np.array([float(np.float32(_SCALE)) ** level for level in range(_LEVELS)], dtype=np.float32)
-_FAST, _FAST_SPREAD = 10, 7
+_PYRAMID_SCALE = 1.2
+"""Ratio of the sizes of two neighbouring levels of ORB's image pyramid, as in Rublee et al., ICCV 2011."""
+_PYRAMID_LEVELS = 8
+"""Number of levels of ORB's image pyramid, as in Rublee et al., ICCV 2011."""
+_LEVEL_SIZES: Array = np.power(_PYRAMID_SCALE, np.arange(_PYRAMID_LEVELS, dtype=np.float64))
+_CORE_LEVEL_SIZES = np.array(
+    [float(np.float32(_PYRAMID_SCALE)) ** level for level in range(_PYRAMID_LEVELS)], dtype=np.float32
+)
+"""Scale of each pyramid level with the rounding of OpenCV, as the native core needs it for equal results."""
+_FAST_THRESHOLD = 10
+"""Grey levels: threshold of the FAST corner detector where the strongest features of the image are taken."""
+_FAST_THRESHOLD_SPREAD = 7
+"""Grey levels: threshold of the FAST corner detector where features are spread, so that dark cells have
+some."""
 _PATCH_PX = 31.0
-_SOUGHT, _CELL_PX = 3, 40
-"""So many times the features are sought, and spread over cells of this size."""
+"""Width of ORB's patch on the finest pyramid level, in pixels."""
+_DETECTED_PER_FEATURE = 3
+"""Keypoints that are detected for each feature that is wanted, where features are spread over the image."""
+_CELL_PX = 40
+"""Width and height of the image cells over which features are spread, in pixels."""
+_RADIANS_PER_DEGREE = np.float32(math.pi / 180)
+_WORKSPACE = Workspace()
 
 
 class Keypoints(NamedTuple):
-    """Keypoints of one image in OpenCV's order: all arrays are those of its numbers, row by row.
+    """Keypoints of one image, in the number types of OpenCV.
 
-    ``pixels`` ``(n, 2)`` float32, of the whole image; ``responses`` ``(n,)`` float32, the Harris measure;
-    ``angles_deg`` ``(n,)`` float32, the orientation; ``octaves`` ``(n,)`` int32, the level of the pyramid.
+    Attributes:
+        pixels: ``(n, 2)`` float32, column and row in the whole image.
+        responses: ``(n,)`` float32, Harris corner measure.
+        angles_deg: ``(n,)`` float32, orientation, clockwise from the x axis.
+        octaves: ``(n,)`` int32, level of the pyramid, 0 for the finest.
     """
 
     pixels: npt.NDArray[np.float32]
@@ -57,108 +74,126 @@ class Keypoints(NamedTuple):
     angles_deg: npt.NDArray[np.float32]
     octaves: npt.NDArray[np.int32]
 
-    def only(self, rows: Sequence[int] | slice) -> Keypoints:
-        """Return these rows."""
+    def select(self, rows: Sequence[int] | slice) -> Keypoints:
+        """Return the keypoints of *rows*."""
         return Keypoints(self.pixels[rows], self.responses[rows], self.angles_deg[rows], self.octaves[rows])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class DescribedPixels:
-    """Keypoints of one image as `Features` has them, without depth."""
+class DescribedKeypoints:
+    """Keypoints of one image with their descriptors.
+
+    Attributes:
+        pixels: ``(n, 2)``, column and row.
+        descriptors: ``(n, d)`` of one *kind*.
+        orientations: ``(n, 2)``, cosine and sine of each keypoint's angle in the image.
+        sizes: ``(n,)``, scale of each keypoint, 1 for the finest pyramid level.
+        kind: Name, type and length of the descriptors.
+        is_oriented: Whether *orientations* were measured; otherwise they are meaningless.
+        is_scaled: Whether *sizes* were measured; otherwise they are meaningless.
+    """
 
     pixels: Array
     descriptors: Descriptors
-    turns: Array
+    orientations: Array
     sizes: Array
     kind: DescriptorKind = ORB
     is_oriented: bool = True
     is_scaled: bool = True
 
 
-def describe_orb(rgb: npt.NDArray[np.uint8], count: int, *, is_spread: bool = True) -> DescribedPixels:
-    """Return *count* ORB features of an ``(h, w, 3)`` image; deterministic.
+def describe_orb(rgb: npt.NDArray[np.uint8], count: int, *, is_spread: bool = True) -> DescribedKeypoints:
+    """Detect and describe ORB features of an image; deterministic.
 
     Args:
-        rgb: ``(h, w, 3)``.
-        count: The most features.
-        is_spread: Take the strongest of each cell of 40 px, with weak ones where there are no others; else
-            the strongest of the image.
+        rgb: ``(h, w, 3)``, red first.
+        count: Largest number of features.
+        is_spread: Take the strongest features of each cell of 40 px, also weak ones where a cell has no
+            others; otherwise take the strongest of the image.
 
     Raises:
         MissingExtra: OpenCV or the native core is not installed.
 
     Source:
-        Rublee et al., ICCV 2011; scale 1.2, 8 levels, FAST threshold 7, and 10 where features are not spread.
+        Rublee et al., "ORB: an efficient alternative to SIFT or SURF", ICCV 2011; pyramid scale 1.2, 8
+        levels, FAST threshold 7 where features are spread, and 10 where they are not.
     """
     cv2 = load_opencv()
     gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
-    sought, threshold = (_SOUGHT * count, _FAST_SPREAD) if is_spread else (count, _FAST)
-    found = detect_keypoints(gray, sought, threshold)
-    if found is None:
-        found = _detected_by_opencv(cv2, gray, sought, threshold)
-    if is_spread and len(found.pixels):
-        found = found.only(spread_rows(found.pixels, found.responses, gray.shape, count))
-    found, descriptors = _described(cv2, gray, found)
-    angles = np.radians(found.angles_deg.astype(np.float64))
-    return DescribedPixels(
-        pixels=found.pixels.astype(np.float64),
+    detected, threshold = count, _FAST_THRESHOLD
+    if is_spread:
+        detected, threshold = _DETECTED_PER_FEATURE * count, _FAST_THRESHOLD_SPREAD
+    keypoints = detect_keypoints(gray, detected, threshold)
+    if keypoints is None:
+        keypoints = _detect_by_opencv(cv2, gray, detected, threshold)
+    if is_spread and len(keypoints.pixels):
+        keypoints = keypoints.select(
+            select_spread_rows(keypoints.pixels, keypoints.responses, gray.shape, count)
+        )
+    keypoints, descriptors = _describe(cv2, gray, keypoints)
+    angles = np.radians(keypoints.angles_deg.astype(np.float64))
+    return DescribedKeypoints(
+        pixels=keypoints.pixels.astype(np.float64),
         descriptors=descriptors,
-        turns=np.stack([np.cos(angles), np.sin(angles)], axis=1),
-        sizes=_SCALES[found.octaves],
+        orientations=np.stack([np.cos(angles), np.sin(angles)], axis=1),
+        sizes=_LEVEL_SIZES[keypoints.octaves],
     )
 
 
 def describe_at(
-    rgb: npt.NDArray[np.uint8], pixels: Array, turns: Array, sizes: Array
+    rgb: npt.NDArray[np.uint8], pixels: Array, orientations: Array, sizes: Array
 ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.uint8]]:
-    """Return the ORB descriptors that an image has at given pixels, whether it has features there or not.
+    """Compute ORB descriptors at given pixels of an image, whether or not a corner was detected there.
 
     Args:
-        rgb: ``(h, w, 3)``.
-        pixels: ``(n, 2)``.
-        turns: ``(n, 2)``, cosine and sine of the orientations.
-        sizes: ``(n,)``, as `Features` has them; the nearest level of the pyramid is taken.
+        rgb: ``(h, w, 3)``, red first.
+        pixels: ``(n, 2)``, column and row.
+        orientations: ``(n, 2)``, cosine and sine of the angle of each patch.
+        sizes: ``(n,)``, scale of each patch; the nearest level of the pyramid is taken.
 
     Returns:
-        The rows that could be described, none of which is near the edge, and ``(k, 32)`` descriptors.
+        The ``(k,)`` rows of *pixels* that could be described, which excludes those near the edge of the
+        image, and their ``(k, 32)`` descriptors.
 
     Raises:
         MissingExtra: OpenCV is not installed.
     """
     cv2 = load_opencv()
-    levels = np.clip(np.rint(np.log(sizes) / np.log(_SCALE)), 0, _LEVELS - 1).astype(int)
-    angles_deg = np.degrees(np.arctan2(turns[:, 1], turns[:, 0])) % 360.0
-    none = np.empty(0, dtype=np.int64), np.empty((0, 32), dtype=np.uint8)
+    levels = np.clip(np.rint(np.log(sizes) / np.log(_PYRAMID_SCALE)), 0, _PYRAMID_LEVELS - 1).astype(int)
+    angles_deg = np.degrees(np.arctan2(orientations[:, 1], orientations[:, 0])) % 360.0
+    nothing = np.empty(0, dtype=np.int64), np.empty((0, ORB.size), dtype=np.uint8)
     if not len(pixels):
-        return none
+        return nothing
     gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
-    keypoints, descriptors = _computed(cv2, gray, pixels, angles_deg, levels)
+    keypoints, descriptors = _describe_by_opencv(cv2, gray, pixels, angles_deg, levels)
     if not keypoints:
-        return none
+        return nothing
     return np.fromiter(map(attrgetter("class_id"), keypoints), np.int64, len(keypoints)), descriptors
 
 
-def spread_rows(pixels: _Floats, responses: _Floats, size: tuple[int, int], count: int) -> list[int]:
-    """Return the rows of the strongest keypoints of each cell of the image, *count* in all, ascending.
+def select_spread_rows(pixels: _Floats, responses: _Floats, size: tuple[int, int], count: int) -> list[int]:
+    """Select keypoints that are spread over the image.
+
+    The strongest keypoint of every cell of 40 px is taken first, then the second strongest of every cell, and
+    so on, until there are *count*.
 
     Args:
-        pixels: ``(n, 2)``.
-        responses: ``(n,)``, how strong a keypoint is.
-        size: Height and width of the image.
-        count: Rows of the first, then the second strongest of all cells, and so on.
+        pixels: ``(n, 2)``, column and row.
+        responses: ``(n,)``, strength of each keypoint.
+        size: Height and width of the image, in pixels.
+        count: Largest number of rows.
+
+    Returns:
+        Ascending rows of *pixels*.
     """
-    across = -(-size[1] // _CELL_PX)
-    cells = (pixels[:, 1] // _CELL_PX * across + pixels[:, 0] // _CELL_PX).astype(np.int64)
+    cells_across = -(-size[1] // _CELL_PX)
+    cells = (pixels[:, 1] // _CELL_PX * cells_across + pixels[:, 0] // _CELL_PX).astype(np.int64)
     order = np.lexsort((-responses, cells))
     starts = np.flatnonzero(np.concatenate(([True], np.diff(cells[order]) != 0)))
-    rank = np.arange(len(order)) - np.repeat(starts, np.diff(np.append(starts, len(order))))
-    best = order[np.lexsort((-responses[order], rank))][:count]
+    rank_in_cell = np.arange(len(order)) - np.repeat(starts, np.diff(np.append(starts, len(order))))
+    best = order[np.lexsort((-responses[order], rank_in_cell))][:count]
     rows: list[int] = np.sort(best).tolist()
     return rows
-
-
-def _orb(cv2: Any, count: int, threshold: int) -> Any:
-    return cv2.ORB_create(nfeatures=count, scaleFactor=_SCALE, nlevels=_LEVELS, fastThreshold=threshold)
 
 
 class _DetectRequest(ctypes.Structure):
@@ -172,91 +207,110 @@ class _DetectRequest(ctypes.Structure):
 
 
 def detect_keypoints(gray: npt.NDArray[np.uint8], count: int, threshold: int) -> Keypoints | None:
-    """Return ORB's keypoints as the native core finds them.
+    """Detect ORB's keypoints by the native core.
 
     Args:
         gray: ``(h, w)``.
-        count: The most keypoints; those that equal the last one are returned as well.
-        threshold: FAST's, 0 to 255.
+        count: Number of keypoints; those that are as strong as the weakest of them are returned as well.
+        threshold: Threshold of the FAST corner detector, 0 to 255 grey levels.
 
     Returns:
-        None where the processor lacks AVX2, where more than twice as many equal each other, or where a side
-        of the image is below 2 or above 16,384 px.
+        None where the processor lacks AVX2, where more than twice *count* keypoints are equally strong, or
+        where a side of the image is below 2 or above 16,384 px.
 
     Raises:
         MissingExtra: The native core is not installed.
     """
     gray = aligned(gray)
     height, width = gray.shape
-    wanted, room = _wanted(count), 2 * count + 64
-    found = Keypoints(
-        np.empty((room, 2), dtype=np.float32), np.empty(room, dtype=np.float32),
-        np.empty(room, dtype=np.float32), np.empty(room, dtype=np.int32),
-    )  # fmt: skip
+    wanted, capacity = _keypoints_per_level(count), 2 * count + 64
+    keypoints = Keypoints(
+        np.empty((capacity, 2), dtype=np.float32),
+        np.empty(capacity, dtype=np.float32),
+        np.empty(capacity, dtype=np.float32),
+        np.empty(capacity, dtype=np.int32),
+    )
     request = _DetectRequest(
-        address_of(gray), width, height, address_of(_CORE_SCALES), address_of(wanted), _LEVELS, threshold,
-        room, address_of(_WORKSPACE.words(width * height // 2 + 8 * width + height + 64)),
+        address_of(gray), width, height, address_of(_CORE_LEVEL_SIZES), address_of(wanted), _PYRAMID_LEVELS,
+        threshold, capacity, address_of(_WORKSPACE.words(width * height // 2 + 8 * width + height + 64)),
     )  # fmt: skip
-    rows = _detect()(ctypes.byref(request), *map(address_of, found))
-    return None if rows < 0 else found.only(slice(rows))
+    detected = _core_detect()(ctypes.byref(request), *map(address_of, keypoints))
+    return None if detected < 0 else keypoints.select(slice(detected))
 
 
 def describe_keypoints(gray: npt.NDArray[np.uint8], keypoints: Keypoints) -> npt.NDArray[np.uint8] | None:
-    """Return ORB's ``(n, 32)`` descriptors of keypoints of an ``(h, w)`` image by the native core.
+    """Compute the ``(n, 32)`` ORB descriptors of keypoints of an ``(h, w)`` image by the native core.
 
     Returns:
         None where the processor lacks AVX2 or FMA, or a keypoint is nearer than 22 px to the edge of its
-        level.
+        pyramid level.
 
     Raises:
         MissingExtra: The native core is not installed.
     """
     gray, pixels, octaves = aligned(gray), aligned(keypoints.pixels), aligned(keypoints.octaves)
     height, width = gray.shape
-    angles = (keypoints.angles_deg * _RADIANS).astype(np.float64)
-    with np.errstate(invalid="ignore"):  # the library refuses what is not finite
+    angles = (keypoints.angles_deg * _RADIANS_PER_DEGREE).astype(np.float64)
+    with np.errstate(invalid="ignore"):  # the native core refuses angles that are not finite
         cosines, sines = np.cos(angles).astype(np.float32), np.sin(angles).astype(np.float32)
     descriptors = np.empty((len(pixels), ORB.size), dtype=np.uint8)
     workspace = _WORKSPACE.words(3 * width * height // 8 + 7 * width + 64)
-    refused = _describe()(
-        address_of(gray), width, height, address_of(_CORE_SCALES), _LEVELS, address_of(pixels),
+    refused = _core_describe()(
+        address_of(gray), width, height, address_of(_CORE_LEVEL_SIZES), _PYRAMID_LEVELS, address_of(pixels),
         address_of(cosines), address_of(sines), address_of(octaves), len(pixels), address_of(workspace),
         address_of(descriptors),
     )  # fmt: skip
     return None if refused else descriptors
 
 
-_WORKSPACE = Workspace()
-_RADIANS = np.float32(math.pi / 180)
-
-
 @cache
-def _detect() -> Any:
+def _core_detect() -> Any:
     return core_function("match", "rse_pf_detect", (ctypes.c_void_p,) * 5, ctypes.c_int64)
 
 
 @cache
-def _describe() -> Any:
+def _core_describe() -> Any:
     pointer, size, count = ctypes.c_void_p, ctypes.c_int64, ctypes.c_int32
     arguments = (pointer, size, size, pointer, count, *[pointer] * 4, size, pointer, pointer)
     return core_function("match", "rse_pf_describe", arguments, count)
 
 
 @lru_cache(maxsize=16)
-def _wanted(count: int) -> npt.NDArray[np.int64]:
-    """Return how many keypoints each level gives, in the shares and with the rounding of OpenCV."""
-    factor, one = np.float32(1.0 / float(np.float32(_SCALE))), np.float32(1.0)
-    share = np.float32(count) * (one - factor) / (one - np.float32(float(factor) ** _LEVELS))
+def _keypoints_per_level(count: int) -> npt.NDArray[np.int64]:
+    """Return how many of *count* keypoints each pyramid level contributes, with the rounding of OpenCV."""
+    factor, one = np.float32(1.0 / float(np.float32(_PYRAMID_SCALE))), np.float32(1.0)
+    share = np.float32(count) * (one - factor) / (one - np.float32(float(factor) ** _PYRAMID_LEVELS))
     wanted = []
-    for _ in range(_LEVELS - 1):
+    for _ in range(_PYRAMID_LEVELS - 1):
         wanted.append(int(np.rint(share)))
         share *= factor
     wanted.append(max(0, count - sum(wanted)))
     return np.array(wanted, dtype=np.int64)
 
 
-def _detected_by_opencv(cv2: Any, gray: npt.NDArray[np.uint8], count: int, threshold: int) -> Keypoints:
-    keypoints = _orb(cv2, count, threshold).detect(gray, None)
+def _describe(
+    cv2: Any, gray: npt.NDArray[np.uint8], keypoints: Keypoints
+) -> tuple[Keypoints, npt.NDArray[np.uint8]]:
+    """Return the keypoints that can be described, and their descriptors."""
+    descriptors = describe_keypoints(gray, keypoints)
+    if descriptors is not None:
+        return keypoints, descriptors
+    if not len(keypoints.pixels):
+        return keypoints, np.empty((0, ORB.size), dtype=np.uint8)
+    described, descriptors = _describe_by_opencv(
+        cv2, gray, keypoints.pixels, keypoints.angles_deg, keypoints.octaves
+    )
+    return keypoints.select(list(map(attrgetter("class_id"), described))), descriptors
+
+
+def _make_opencv_orb(cv2: Any, count: int, threshold: int) -> Any:
+    return cv2.ORB_create(
+        nfeatures=count, scaleFactor=_PYRAMID_SCALE, nlevels=_PYRAMID_LEVELS, fastThreshold=threshold
+    )
+
+
+def _detect_by_opencv(cv2: Any, gray: npt.NDArray[np.uint8], count: int, threshold: int) -> Keypoints:
+    keypoints = _make_opencv_orb(cv2, count, threshold).detect(gray, None)
     n = len(keypoints)
     return Keypoints(
         cv2.KeyPoint_convert(keypoints) if n else np.empty((0, 2), dtype=np.float32),
@@ -266,29 +320,21 @@ def _detected_by_opencv(cv2: Any, gray: npt.NDArray[np.uint8], count: int, thres
     )
 
 
-def _described(
-    cv2: Any, gray: npt.NDArray[np.uint8], found: Keypoints
-) -> tuple[Keypoints, npt.NDArray[np.uint8]]:
-    """Return the keypoints that can be described, and their descriptors."""
-    descriptors = describe_keypoints(gray, found)
-    if descriptors is not None:
-        return found, descriptors
-    if not len(found.pixels):
-        return found, np.empty((0, 32), dtype=np.uint8)
-    keypoints, descriptors = _computed(cv2, gray, found.pixels, found.angles_deg, found.octaves)
-    return found.only(list(map(attrgetter("class_id"), keypoints))), descriptors
-
-
-def _computed(
-    cv2: Any, gray: npt.NDArray[np.uint8], pixels: npt.NDArray[Any], angles_deg: npt.NDArray[Any],
+def _describe_by_opencv(
+    cv2: Any,
+    gray: npt.NDArray[np.uint8],
+    pixels: npt.NDArray[Any],
+    angles_deg: npt.NDArray[Any],
     octaves: npt.NDArray[Any],
-) -> tuple[Any, npt.NDArray[np.uint8]]:  # fmt: skip
-    """Return OpenCV's keypoints that it can describe, the class of each of which is its row."""
+) -> tuple[Any, npt.NDArray[np.uint8]]:
+    """Return OpenCV's keypoints that it can describe, whose ``class_id`` is the row of *pixels*."""
     keypoints = [
         cv2.KeyPoint(
-            float(u), float(v), float(_PATCH_PX * _SCALES[octave]), float(angle), 1.0, int(octave), row
+            float(u), float(v), float(_PATCH_PX * _LEVEL_SIZES[octave]), float(angle), 1.0, int(octave), row
         )
         for row, ((u, v), angle, octave) in enumerate(zip(pixels, angles_deg, octaves, strict=True))
     ]
-    computed: tuple[Any, npt.NDArray[np.uint8]] = _orb(cv2, len(keypoints), _FAST).compute(gray, keypoints)
-    return computed
+    described: tuple[Any, npt.NDArray[np.uint8]] = _make_opencv_orb(
+        cv2, len(keypoints), _FAST_THRESHOLD
+    ).compute(gray, keypoints)
+    return described

@@ -1,7 +1,8 @@
-"""What a tracker computes for each frame: matches near predicted pixels, and the pose that fits landmarks.
+"""Guided matching of landmarks with the features of an image, and the pose that fits matched landmarks.
 
-The native core does both.  Features of other kinds than ORB, which a user's function computes, are matched by
-numpy.  Which landmarks are sought, and what is done with a pose, is decided elsewhere.
+The native core (``rse_pf_track.h``) does both.  Descriptors of other kinds than ORB, which a user's feature
+extractor computes, are matched by numpy.  The trackers of `client_sdk.tracking` decide which landmarks are
+matched and which poses are accepted.
 """
 
 from __future__ import annotations
@@ -22,49 +23,65 @@ from rse_pf.native import PART_ABIS, Workspace, address_of, aligned, core_functi
 from rse_pf.slam.descriptors import distance_matrix, distances_of_pairs, no_distance
 
 __all__ = [
-    "ExpectedFeatures",
     "FittedPose",
+    "GuidedMatchLimits",
     "ImageFeatures",
-    "LandmarkLooks",
-    "NearLimits",
+    "LandmarkAppearance",
     "Observations",
-    "SoughtFeatures",
-    "distinct_distances",
-    "expect",
+    "PredictedFeatures",
     "fit_pose",
-    "fit_sway",
-    "match_near",
-    "seek_near",
+    "fit_readout_change",
+    "match_landmarks",
+    "match_predictions",
+    "measure_distinctiveness",
+    "predict_features",
 ]
 
 Rows = npt.NDArray[np.int64]
 
 _ABI = PART_ABIS["track"]
-_CELL_WORDS = 16_400  # of the grid of cells in which `rse_pf_match_near` sorts features
-_NO_ORB_DISTANCE = 256  # above every distance of two descriptors that differ
-_DTYPES = (np.uint8, np.int8)
-_BAND = 1e6  # between the sort keys of two rows of bands; no image is wider
-_MAX_ABS = 1e9  # px: features farther out match nothing
-_NEAREST_M = 0.1  # nearer landmarks are not sought
-_MIN_COSINE = 0.6  # between the rays of two looks: from other directions a landmark looks different
-_MAX_NEARER, _MAX_FARTHER = 2.0, 2.0  # ratios of distances: from others a landmark looks different
+_GRID_WORDS = 16_400
+"""Words of 8 bytes that the native core's guided matcher needs for its grid of image cells."""
+_ORB_DISTANCE_LIMIT = 256
+"""Bits: largest Hamming distance of two ORB descriptors; stands for "no other feature to compare with"."""
+_DESCRIPTOR_DTYPES = (np.uint8, np.int8)
+_BAND_KEY_STEP = 1e6
+"""Step between the sort keys of two horizontal bands of an image, in pixels: wider than any image."""
+_MAX_PIXEL_PX = 1e9
+"""Features and predictions whose pixel coordinates exceed this absolute value match nothing."""
+_MIN_LANDMARK_DEPTH_M = 0.1
+"""Smallest depth of a landmark that is predicted: nearer, a small error of the pose moves its pixel far."""
+_MIN_VIEW_COSINE = 0.6
+"""Smallest cosine between the present and the last viewing ray of a landmark (53 degrees): seen from another
+direction, a landmark has another descriptor."""
+_MAX_APPROACH_RATIO = 2.0
+"""A landmark is not predicted where its distance is less than the last one divided by this ratio."""
+_MAX_RETREAT_RATIO = 2.0
+"""A landmark is not predicted where its distance is more than the last one times this ratio."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ImageFeatures:
-    """Features of one image.
+    """Features of one image, ready to be matched.
 
-    ``pixels`` ``(n, 2)``, undistorted; ``descriptors`` ``(n, d)``; ``turns`` ``(n, 2)``, cosine and sine of
-    the orientation; ``sizes`` ``(n,)``, the scale of the pyramid's level, 1 for the finest; ``distinct``
-    ``(n,)`` as `distinct_distances` returns it.  Turns and sizes tell nothing unless the features are
-    *is_oriented* and *is_scaled*.
+    Attributes:
+        pixels: ``(n, 2)``, undistorted, column and row.
+        descriptors: ``(n, d)``.
+        orientations: ``(n, 2)``, cosine and sine of each feature's angle in the image; meaningless unless
+            *is_oriented*.
+        sizes: ``(n,)``, the scale of each feature, 1 for the finest pyramid level; meaningless unless
+            *is_scaled*.
+        distinctiveness: ``(n,)``, distance of each descriptor to the most similar other one of the same
+            image, see `measure_distinctiveness`.
+        is_oriented: Whether the feature extractor measures orientations.
+        is_scaled: Whether the feature extractor measures sizes.
     """
 
     pixels: Array
     descriptors: Descriptors
-    turns: Array
+    orientations: Array
     sizes: Array
-    distinct: npt.NDArray[np.int32]
+    distinctiveness: npt.NDArray[np.int32]
     is_oriented: bool = True
     is_scaled: bool = True
 
@@ -73,96 +90,107 @@ class ImageFeatures:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class SoughtFeatures:
-    """Features that are expected in an image: their ``(m, 2)`` pixels, ``(m, 2)`` turns and ``(m,)`` sizes.
+class PredictedFeatures:
+    """Features as a pose predicts them in an image.
 
-    ``turns`` are cosine and sine of the expected orientation.
+    Attributes:
+        pixels: ``(m, 2)``, column and row.
+        descriptors: ``(m, d)``.
+        orientations: ``(m, 2)``, cosine and sine of the predicted angle in the image.
+        sizes: ``(m,)``, predicted scale, 1 for the finest pyramid level.
     """
 
     pixels: Array
     descriptors: Descriptors
-    turns: Array
+    orientations: Array
     sizes: Array
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class LandmarkLooks:
-    """Points of the world, and how they looked in the last image that showed them.
+class LandmarkAppearance:
+    """Landmarks, and how each of them looked in the last image that showed it.
 
-    ``points`` ``(n, 3)``; ``rays`` ``(n, 3)`` from the camera that saw them last, and ``turns`` ``(n, 3)``
-    their orientation there, in the world; ``sizes`` ``(n,)``; ``descriptors`` ``(n, d)``.
+    Attributes:
+        points: ``(n, 3)`` positions in the world, in metres or in the map's unit.
+        rays: ``(n, 3)``, from the centre of the camera of that last image to the landmark, world axes.
+        orientations: ``(n, 3)``, the feature's orientation in that image as a direction in the world.
+        sizes: ``(n,)``, the feature's scale in that image.
+        descriptors: ``(n, d)``.
     """
 
     points: Array
     rays: Array
-    turns: Array
+    orientations: Array
     sizes: Array
     descriptors: Descriptors
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class ExpectedFeatures:
-    """Landmarks as a pose expects them in its image: ``rows`` of the landmarks, and the features."""
-
-    rows: Rows
-    features: SoughtFeatures
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
-class NearLimits:
-    """When a feature is the expected one.
+class GuidedMatchLimits:
+    """Conditions under which a feature of an image matches a predicted feature.
 
     Attributes:
-        radius_px: Around the expected pixel.
-        ratio: The most similar feature must be this much nearer than the second within the radius.
-        distinct_ratio: And this much nearer than the feature of its own image that resembles it most: a
-            carpet or a wall of tiles looks alike beyond the radius, too.
-        min_cosine: Between the expected orientation and its own.
-        max_size_ratio: Between the expected size and its own, either way.
-        max_distance: Largest Hamming distance, of 256 bits; other binary descriptors by their bits.  Vectors
-            have none.
+        radius_px: Largest distance between the feature and the predicted pixel.
+        lowe_ratio: Lowe's ratio test: the best descriptor distance must be below this share of the second
+            best within the radius.
+        distinctiveness_ratio: The best descriptor distance must be below this share of the feature's
+            distinctiveness: tiles and carpets repeat beyond the radius, too.
+        min_orientation_cosine: Smallest cosine between the predicted and the measured orientation.
+        max_size_ratio: Largest ratio of the predicted and the measured size, either way.
+        max_distance: Largest Hamming distance in bits of 256; scaled for binary descriptors of other lengths,
+            not used for vectors.
     """
 
     radius_px: float
-    ratio: float = 0.8
-    distinct_ratio: float = 0.8
-    min_cosine: float = 0.9
+    lowe_ratio: float = 0.8
+    distinctiveness_ratio: float = 0.8
+    min_orientation_cosine: float = 0.9
     max_size_ratio: float = 1.35
     max_distance: int = 60
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Observations:
-    """Landmarks and what one image measured of them.
+    """Landmarks, and the measurements that one image has of them.
 
     Attributes:
         points: ``(n, 3)`` metres, world.
-        spreads: ``(n, 3, 3)`` covariances of the points, square metres, world.
-        pixels: ``(n, 2)``.
-        pixels_px: ``(n,)`` deviations of the pixels.
-        depths_m: ``(n,)`` along the optical axis, 0 where there is none.
-        depths_dev_m: ``(n,)`` deviations of the depths; not read where there is none.
+        covariances: ``(n, 3, 3)`` of the points, square metres, world axes.
+        pixels: ``(n, 2)``, measured.
+        pixel_sigmas_px: ``(n,)``, standard deviations of the pixels.
+        depths_m: ``(n,)``, measured along the optical axis, 0 where there is no depth.
+        depth_sigmas_m: ``(n,)``, standard deviations of the depths; not read where there is no depth.
     """
 
     points: Array
-    spreads: Array
+    covariances: Array
     pixels: Array
-    pixels_px: Array
+    pixel_sigmas_px: Array
     depths_m: Array
-    depths_dev_m: Array
+    depth_sigmas_m: Array
 
-    def only(self, rows: Rows) -> Observations:
-        """Return some of the rows."""
+    def select(self, rows: Rows) -> Observations:
+        """Return the observations of *rows*."""
         return Observations(
-            points=self.points[rows], spreads=self.spreads[rows], pixels=self.pixels[rows],
-            pixels_px=self.pixels_px[rows], depths_m=self.depths_m[rows],
-            depths_dev_m=self.depths_dev_m[rows],
-        )  # fmt: skip
+            points=self.points[rows],
+            covariances=self.covariances[rows],
+            pixels=self.pixels[rows],
+            pixel_sigmas_px=self.pixel_sigmas_px[rows],
+            depths_m=self.depths_m[rows],
+            depth_sigmas_m=self.depth_sigmas_m[rows],
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class FittedPose:
-    """``T_camera_world``, the ``(6, 6)`` information of the twist on its left, and ``(n,)`` who agrees."""
+    """A pose that was fitted to observations.
+
+    Attributes:
+        T_camera_world: ``(4, 4)``.
+        information: ``(6, 6)``, inverse covariance of the pose's twist (translation, rotation), applied on
+            the left of ``T_camera_world``.
+        is_inlier: ``(n,)``, whether each observation agrees with the pose.
+    """
 
     T_camera_world: Array
     information: Array
@@ -212,7 +240,7 @@ class _FitResult(ctypes.Structure):
     _fields_ = (("inliers", _I), ("T_camera_world", _D * 16), ("information", _D * 36))
 
 
-_SIGNATURES = {
+_CORE_SIGNATURES = {
     "distinct": ((_P, _P, _I, _D, _P), ctypes.c_int32),
     "match_near": ((_P,) * 4, _I),
     "seek": ((_P,) * 5, _I),
@@ -222,267 +250,352 @@ _SIGNATURES = {
 
 
 @cache
-def _function(name: str) -> Any:
-    return core_function("track", f"rse_pf_{name}", *_SIGNATURES[name])
+def _core(name: str) -> Any:
+    return core_function("track", f"rse_pf_{name}", *_CORE_SIGNATURES[name])
 
 
-def distinct_distances(
-    descriptors: Descriptors, pixels: Array, apart_px: float = 6.0
+def measure_distinctiveness(
+    descriptors: Descriptors, pixels: Array, min_separation_px: float = 6.0
 ) -> npt.NDArray[np.int32]:
-    """Return the distance of each feature to the most similar other one of its image.
+    """Return the distance of each descriptor to the most similar other one of the same image.
 
-    Features that are closer than *apart_px* in rows and columns are the same point, and are not compared.
+    Two features that are closer than *min_separation_px* both in columns and in rows show the same point, and
+    are not compared.
 
     Args:
-        descriptors: ``(n, d)``.
+        descriptors: ``(n, d)``, uint8 (Hamming distance) or int8 (squared Euclidean distance).
         pixels: ``(n, 2)``.
-        apart_px: Of two features that are compared.
+        min_separation_px: Pixels.
 
     Returns:
-        ``(n,)``; where there is no other one a number above all distances, 256 of ORB.
+        ``(n,)`` distances; where a feature is compared with no other one, a number above all distances (256
+        for ORB).
 
     Raises:
         BadRequest: Shapes do not fit, or descriptors are neither uint8 nor int8.
+        MissingExtra: The descriptors are ORB, and the native core is not installed.
     """
     is_fit = descriptors.ndim == 2 and len(descriptors) == len(pixels) and pixels.shape[1:] == (2,)
-    if not is_fit or descriptors.dtype not in _DTYPES:
+    if not is_fit or descriptors.dtype not in _DESCRIPTOR_DTYPES:
         raise BadRequest(
-            f"{len(pixels)} features with descriptors of shape {descriptors.shape}, {descriptors.dtype}",
-            hint="give a descriptor and two pixel coordinates for each feature",
+            f"{len(pixels)} features cannot have descriptors of shape {descriptors.shape} and type "
+            f"{descriptors.dtype}",
+            hint="give one descriptor of uint8 or int8 and two pixel coordinates for each feature",
         )
     if ORB.is_kind_of(descriptors):
         descriptors, pixels = aligned(descriptors), aligned(pixels, np.float64)
-        nearest = np.full(len(pixels), _NO_ORB_DISTANCE, dtype=np.int32)
-        _function("distinct")(
-            address_of(descriptors), address_of(pixels), len(pixels), float(apart_px), address_of(nearest)
+        nearest = np.full(len(pixels), _ORB_DISTANCE_LIMIT, dtype=np.int32)
+        _core("distinct")(
+            address_of(descriptors),
+            address_of(pixels),
+            len(pixels),
+            float(min_separation_px),
+            address_of(nearest),
         )
         return nearest
     pixels = np.asarray(pixels, dtype=np.float64)
     distances, none = distance_matrix(descriptors, descriptors), no_distance(descriptors)
     with np.errstate(invalid="ignore", over="ignore"):
-        apart = (np.abs(pixels[:, None] - pixels[None]) >= apart_px).any(axis=2)
-    distances[~apart | np.eye(len(pixels), dtype=bool)] = none
-    similar: npt.NDArray[np.int32] = distances.min(axis=1, initial=none).astype(np.int32)
-    return similar
+        is_apart = (np.abs(pixels[:, None] - pixels[None]) >= min_separation_px).any(axis=2)
+    distances[~is_apart | np.eye(len(pixels), dtype=bool)] = none
+    most_similar: npt.NDArray[np.int32] = distances.min(axis=1, initial=none).astype(np.int32)
+    return most_similar
 
 
-def match_near(sought: SoughtFeatures, image: ImageFeatures, limits: NearLimits) -> tuple[Rows, Rows]:
-    """Return rows of *sought* and of *image* that match, by the rows of *sought*; deterministic, one to one.
+def predict_features(
+    landmarks: LandmarkAppearance, numbers: Rows, T_camera_world: Array, camera: Camera, margin_px: float
+) -> tuple[Rows, PredictedFeatures]:
+    """Predict how a camera at a pose sees landmarks.
 
-    A feature or prediction at no finite place, or beyond 1e9 px, matches nothing.
-
-    Raises:
-        BadRequest: Shapes or the radius do not fit, or descriptors are no bytes.
-    """
-    m, n = len(sought.pixels), len(image)
-    d = sought.descriptors.shape[1:]
-    shapes = (
-        sought.pixels.shape, sought.descriptors.shape, sought.turns.shape, sought.sizes.shape,
-        image.pixels.shape, image.descriptors.shape, image.turns.shape, image.sizes.shape,
-        image.distinct.shape,
-    )  # fmt: skip
-    if len(d) != 1 or shapes != ((m, 2), (m, *d), (m, 2), (m,), (n, 2), (n, *d), (n, 2), (n,), (n,)):
-        raise BadRequest(
-            "features of different numbers of rows, or kinds", hint="give one row of each for each feature"
-        )
-    if sought.descriptors.dtype not in _DTYPES or image.descriptors.dtype != sought.descriptors.dtype:
-        raise BadRequest(
-            f"descriptors of {sought.descriptors.dtype} and {image.descriptors.dtype}",
-            hint="give uint8 or int8 of both",
-        )
-    if not 0.0 <= limits.radius_px <= _MAX_ABS:
-        raise BadRequest(f"a radius of {limits.radius_px:g} px", hint="give 0 to 1e9 px")
-    if not ORB.is_kind_of(image.descriptors):
-        return _match_near_by_numpy(sought, image, limits)
-    arrays = _aligned(sought.pixels, sought.turns, sought.sizes, descriptors=sought.descriptors)
-    request, _held = _near_request(image, limits, arrays, m)
-    return _core_matches(_function("match_near"), (request,), m, n)
-
-
-def expect(
-    looks: LandmarkLooks, numbers: Rows, T_camera_world: Array, camera: Camera, margin_px: float
-) -> ExpectedFeatures:
-    """Return what a pose sees of landmarks: those ahead, in the image, and seen from such a place before.
+    A landmark is predicted if it lies before the camera, within the image and its margin, and is seen from a
+    similar direction and distance as in the last image that showed it.
 
     Args:
-        looks: Of landmarks.
-        numbers: ``(m,)`` rows of *looks*.
+        landmarks: All landmarks.
+        numbers: ``(m,)`` rows of *landmarks* that are considered.
         T_camera_world: ``(4, 4)``.
         camera: Its intrinsics.
-        margin_px: Around its image.
+        margin_px: Width of the border around the image that counts as image; negative to leave a border out.
+
+    Returns:
+        The ``(k,)`` rows of *numbers* that are predicted, and their predicted features.
     """
-    points = transform(T_camera_world, looks.points[numbers])
-    ahead = np.flatnonzero(points[:, 2] > _NEAREST_M)
-    pixels = camera.project(points[ahead])
+    # 1. Project the landmarks; keep those before the camera and in the image.
+    points = transform(T_camera_world, landmarks.points[numbers])
+    rows = np.flatnonzero(points[:, 2] > _MIN_LANDMARK_DEPTH_M)
+    pixels = camera.project(points[rows])
     u, v = pixels.T
-    inside = (
+    is_inside = (
         (u > -margin_px) & (u < camera.width + margin_px) & (v > -margin_px) & (v < camera.height + margin_px)
     )
-    ahead, pixels = ahead[inside], pixels[inside]
-    distances = np.linalg.norm(points[ahead], axis=1)
-    # The ray of the last look, in this camera's frame.
-    rays = looks.rays[numbers[ahead]] @ T_camera_world[:3, :3].T
-    before = np.linalg.norm(rays, axis=1)
-    cosines = (rays * points[ahead]).sum(axis=1) / np.maximum(distances * before, 1e-9)
-    is_alike = (
-        (cosines > _MIN_COSINE) & (distances < _MAX_FARTHER * before) & (before < _MAX_NEARER * distances)
+    rows, pixels = rows[is_inside], pixels[is_inside]
+    # 2. Compare the viewing ray with that of the last image, in the axes of this camera.
+    distances = np.linalg.norm(points[rows], axis=1)
+    last_rays = landmarks.rays[numbers[rows]] @ T_camera_world[:3, :3].T
+    last_distances = np.linalg.norm(last_rays, axis=1)
+    cosines = (last_rays * points[rows]).sum(axis=1) / np.maximum(distances * last_distances, 1e-9)
+    is_similar = (
+        (cosines > _MIN_VIEW_COSINE)
+        & (distances < _MAX_RETREAT_RATIO * last_distances)
+        & (last_distances < _MAX_APPROACH_RATIO * distances)
     )
-    rows, pixels = ahead[is_alike], pixels[is_alike]
-    turns = looks.turns[numbers[rows]] @ T_camera_world[:2, :3].T
-    features = SoughtFeatures(
+    rows, pixels = rows[is_similar], pixels[is_similar]
+    # 3. Turn the orientation into this image, and scale the size by the change of distance.
+    orientations = landmarks.orientations[numbers[rows]] @ T_camera_world[:2, :3].T
+    sizes = landmarks.sizes[numbers[rows]] * last_distances[is_similar]
+    return rows, PredictedFeatures(
         pixels=pixels,
-        descriptors=looks.descriptors[numbers[rows]],
-        turns=turns / np.maximum(np.linalg.norm(turns, axis=1), 1e-9)[:, None],
-        sizes=looks.sizes[numbers[rows]] * before[is_alike] / np.maximum(distances[is_alike], 1e-9),
+        descriptors=landmarks.descriptors[numbers[rows]],
+        orientations=orientations / np.maximum(np.linalg.norm(orientations, axis=1), 1e-9)[:, None],
+        sizes=sizes / np.maximum(distances[is_similar], 1e-9),
     )
-    return ExpectedFeatures(rows=rows, features=features)
 
 
-def seek_near(
-    looks: LandmarkLooks, numbers: Rows, T_camera_world: Array, camera: Camera, image: ImageFeatures,
-    limits: NearLimits, margin_px: float,
-) -> tuple[Rows, Rows]:  # fmt: skip
-    """Return rows of *numbers* and of *image* that match where a pose expects landmarks, as `match_near`.
+def match_landmarks(
+    landmarks: LandmarkAppearance,
+    numbers: Rows,
+    T_camera_world: Array,
+    camera: Camera,
+    image: ImageFeatures,
+    limits: GuidedMatchLimits,
+    margin_px: float,
+) -> tuple[Rows, Rows]:
+    """Match landmarks with the features of an image near the pixels at which a pose predicts them.
+
+    The result is that of `predict_features` followed by `match_predictions`; for ORB the native core does
+    both in one call.
 
     Args:
-        looks: Of landmarks.
-        numbers: ``(m,)`` rows of *looks* that are sought.
-        T_camera_world: ``(4, 4)``.
-        camera: Its intrinsics.
-        image: Where they are sought.
-        limits: When a feature is the expected one.
-        margin_px: Landmarks are expected so far around the image, too.
+        landmarks: All landmarks.
+        numbers: ``(m,)`` rows of *landmarks* that are considered.
+        T_camera_world: ``(4, 4)``, the predicted pose.
+        camera: Intrinsics of the image.
+        image: Features of the image.
+        limits: Conditions of a match.
+        margin_px: Width of the border around the image in which landmarks are predicted, too.
+
+    Returns:
+        Rows of *numbers*, and the row of *image* that matches each of them.
+
+    Raises:
+        BadRequest: Shapes or the radius do not fit, or descriptors are neither uint8 nor int8.
+        MissingExtra: The descriptors are ORB, and the native core is not installed.
     """
     if not ORB.is_kind_of(image.descriptors):
-        expected = expect(looks, numbers, T_camera_world, camera, margin_px)
-        rows, features = match_near(expected.features, image, limits)
-        return expected.rows[rows], features
+        predicted_rows, predicted = predict_features(landmarks, numbers, T_camera_world, camera, margin_px)
+        rows, features = match_predictions(predicted, image, limits)
+        return predicted_rows[rows], features
     chosen = aligned(numbers, np.int64)
-    arrays = _aligned(looks.points, looks.rays, looks.turns, looks.sizes, descriptors=looks.descriptors)
+    arrays = _align_arrays(
+        landmarks.points,
+        landmarks.rays,
+        landmarks.orientations,
+        landmarks.sizes,
+        descriptors=landmarks.descriptors,
+    )
     request = _SeekRequest(
-        _ABI, 0, len(chosen), len(looks.points), address_of(chosen), *map(address_of, arrays),
+        _ABI, 0, len(chosen), len(landmarks.points), address_of(chosen), *map(address_of, arrays),
         camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, margin_px,
-        _NEAREST_M, _MIN_COSINE, _MAX_NEARER, _MAX_FARTHER, (_D * 16)(*T_camera_world.ravel().tolist()),
+        _MIN_LANDMARK_DEPTH_M, _MIN_VIEW_COSINE, _MAX_APPROACH_RATIO, _MAX_RETREAT_RATIO,
+        (_D * 16)(*T_camera_world.ravel().tolist()),
     )  # fmt: skip
-    near, _held = _near_request(image, limits)
-    return _core_matches(_function("seek"), (request, near), len(chosen), len(image))
+    near, _referenced = _make_near_request(image, limits)
+    return _call_matcher(_core("seek"), (request, near), len(chosen), len(image))
 
 
-def _aligned(*arrays: Array, descriptors: npt.NDArray[np.uint8]) -> list[npt.NDArray[Any]]:
-    """Return arrays of numbers and their descriptors as the native core reads them."""
+def match_predictions(
+    predicted: PredictedFeatures, image: ImageFeatures, limits: GuidedMatchLimits
+) -> tuple[Rows, Rows]:
+    """Match predicted features with features of an image; deterministic, one to one.
+
+    A feature or prediction with a pixel coordinate that is not finite, or beyond 1e9 px, matches nothing.
+
+    Returns:
+        Ascending rows of *predicted*, and the row of *image* that matches each of them.
+
+    Raises:
+        BadRequest: Shapes or the radius do not fit, or descriptors are neither uint8 nor int8.
+        MissingExtra: The descriptors are ORB, and the native core is not installed.
+    """
+    m, n = len(predicted.pixels), len(image)
+    d = predicted.descriptors.shape[1:]
+    shapes = (
+        predicted.pixels.shape,
+        predicted.descriptors.shape,
+        predicted.orientations.shape,
+        predicted.sizes.shape,
+        image.pixels.shape,
+        image.descriptors.shape,
+        image.orientations.shape,
+        image.sizes.shape,
+        image.distinctiveness.shape,
+    )
+    if len(d) != 1 or shapes != ((m, 2), (m, *d), (m, 2), (m,), (n, 2), (n, *d), (n, 2), (n,), (n,)):
+        raise BadRequest(
+            f"arrays of {m} predicted features and {n} features of an image have shapes {shapes}, which do "
+            "not fit together",
+            hint="give one row for each feature in every array, and descriptors of one length",
+        )
+    dtypes = predicted.descriptors.dtype, image.descriptors.dtype
+    if dtypes[0] not in _DESCRIPTOR_DTYPES or dtypes[1] != dtypes[0]:
+        raise BadRequest(
+            f"descriptors of {dtypes[0]} and {dtypes[1]} cannot be compared",
+            hint="give descriptors of uint8 or int8 on both sides",
+        )
+    if not 0.0 <= limits.radius_px <= _MAX_PIXEL_PX:
+        raise BadRequest(
+            f"a search radius of {limits.radius_px:g} px is not within 0 to {_MAX_PIXEL_PX:g} px",
+            hint="give a radius of 0 to 1e9 px",
+        )
+    if not ORB.is_kind_of(image.descriptors):
+        return _match_by_numpy(predicted, image, limits)
+    arrays = _align_arrays(
+        predicted.pixels, predicted.orientations, predicted.sizes, descriptors=predicted.descriptors
+    )
+    request, _referenced = _make_near_request(image, limits, arrays, m)
+    return _call_matcher(_core("match_near"), (request,), m, n)
+
+
+def _align_arrays(*arrays: Array, descriptors: npt.NDArray[np.uint8]) -> list[npt.NDArray[Any]]:
+    """Return arrays as the native core reads them: float64 and contiguous, the descriptors last."""
     return [*(aligned(array, np.float64) for array in arrays), aligned(descriptors)]
 
 
-def _near_request(
-    image: ImageFeatures, limits: NearLimits, sought: Sequence[npt.NDArray[Any]] = (), sought_rows: int = 0
+def _make_near_request(
+    image: ImageFeatures,
+    limits: GuidedMatchLimits,
+    predicted: Sequence[npt.NDArray[Any]] = (),
+    predicted_count: int = 0,
 ) -> tuple[_NearRequest, list[npt.NDArray[Any]]]:
-    """Return a request, and the arrays of *image* that it points to, which must live as long."""
-    arrays = _aligned(image.pixels, image.turns, image.sizes, descriptors=image.descriptors)
-    arrays.append(aligned(image.distinct, np.int32))
-    sought_at: list[int | None] = [None] * 4
-    sought_at[: len(sought)] = map(address_of, sought)
-    *numbers, max_distance = _numbers_of(limits, image)
+    """Return a request for the native core, and the arrays that it points to, which must outlive the call."""
+    arrays = _align_arrays(image.pixels, image.orientations, image.sizes, descriptors=image.descriptors)
+    arrays.append(aligned(image.distinctiveness, np.int32))
+    predicted_addresses: list[int | None] = [None] * 4
+    predicted_addresses[: len(predicted)] = map(address_of, predicted)
+    *thresholds, max_distance = _thresholds(limits, image)
     request = _NearRequest(
-        _ABI, 0, sought_rows, len(image), *sought_at, *map(address_of, arrays), *map(float, numbers),
-        int(min(max(max_distance, -1), _NO_ORB_DISTANCE)),
-    )  # fmt: skip
+        _ABI,
+        0,
+        predicted_count,
+        len(image),
+        *predicted_addresses,
+        *map(address_of, arrays),
+        *map(float, thresholds),
+        int(min(max(max_distance, -1), _ORB_DISTANCE_LIMIT)),
+    )
     return request, arrays
 
 
-def _core_matches(
-    function: Any, requests: Sequence[ctypes.Structure], sought_rows: int, image_rows: int
+def _call_matcher(
+    function: Any, requests: Sequence[ctypes.Structure], predicted_count: int, feature_count: int
 ) -> tuple[Rows, Rows]:
-    """Return the rows that a function of the native core matches."""
-    rows, columns = np.empty((2, min(sought_rows, image_rows)), dtype=np.int64)
-    workspace = _WORKSPACE.words(11 * sought_rows + 12 * image_rows + _CELL_WORDS)
-    count = function(*map(ctypes.byref, requests), *map(address_of, (workspace, rows, columns)))
-    return rows[: max(0, count)], columns[: max(0, count)]
+    """Call a matching function of the native core; return the rows that match on both sides."""
+    rows, features = np.empty((2, min(predicted_count, feature_count)), dtype=np.int64)
+    workspace = _WORKSPACE.words(11 * predicted_count + 12 * feature_count + _GRID_WORDS)
+    count = function(*map(ctypes.byref, requests), *map(address_of, (workspace, rows, features)))
+    return rows[: max(0, count)], features[: max(0, count)]
 
 
-def _numbers_of(limits: NearLimits, image: ImageFeatures) -> tuple[float, float, float, float, float, int]:
-    """Return the limits in the order of the native core; features without turns have no limit of them."""
+def _thresholds(
+    limits: GuidedMatchLimits, image: ImageFeatures
+) -> tuple[float, float, float, float, float, int]:
+    """Return the limits in the native core's order, without those that the image's features cannot meet.
+
+    Features without orientations or sizes are not limited by them.
+    """
     return (
-        limits.radius_px, limits.ratio, limits.distinct_ratio,
-        limits.min_cosine if image.is_oriented else -np.inf,
-        limits.max_size_ratio if image.is_scaled else np.inf, limits.max_distance,
-    )  # fmt: skip
+        limits.radius_px,
+        limits.lowe_ratio,
+        limits.distinctiveness_ratio,
+        limits.min_orientation_cosine if image.is_oriented else -np.inf,
+        limits.max_size_ratio if image.is_scaled else np.inf,
+        limits.max_distance,
+    )
 
 
-def _match_near_by_numpy(
-    sought: SoughtFeatures, image: ImageFeatures, limits: NearLimits
+def _match_by_numpy(
+    predicted: PredictedFeatures, image: ImageFeatures, limits: GuidedMatchLimits
 ) -> tuple[Rows, Rows]:
-    """Return what `match_near` does of descriptors of any kind."""
-    radius_px, ratio, distinct_ratio, min_cosine, max_size_ratio, max_distance = _numbers_of(limits, image)
+    """Match predicted features with descriptors of any kind, as `match_predictions` describes."""
+    radius_px, lowe_ratio, distinctiveness_ratio, min_cosine, max_size_ratio, max_bits = _thresholds(
+        limits, image
+    )
     empty = np.empty(0, dtype=np.int64)
-    if not len(sought.pixels) or not len(image):
+    if not len(predicted.pixels) or not len(image):
         return empty, empty
+    # 1. Pairs within the radius whose orientations and sizes are similar.
     with np.errstate(invalid="ignore", over="ignore"):
-        rows, columns = _pairs_within(
-            np.asarray(sought.pixels, np.float64), np.asarray(image.pixels, np.float64), radius_px
+        rows, features = _find_pairs_within(
+            np.asarray(predicted.pixels, np.float64), np.asarray(image.pixels, np.float64), radius_px
         )
-        a, b = np.asarray(sought.turns, np.float64)[rows], np.asarray(image.turns, np.float64)[columns]
-        expected = np.asarray(sought.sizes, np.float64)[rows]
-        size = np.asarray(image.sizes, np.float64)[columns]
-        fits = (
+        a = np.asarray(predicted.orientations, np.float64)[rows]
+        b = np.asarray(image.orientations, np.float64)[features]
+        predicted_size = np.asarray(predicted.sizes, np.float64)[rows]
+        size = np.asarray(image.sizes, np.float64)[features]
+        is_similar = (
             (a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1] >= min_cosine)
-            & (size <= max_size_ratio * expected) & (expected <= max_size_ratio * size)
-        )  # fmt: skip
-    rows, columns = rows[fits], columns[fits]
+            & (size <= max_size_ratio * predicted_size)
+            & (predicted_size <= max_size_ratio * size)
+        )
+    rows, features = rows[is_similar], features[is_similar]
     if not len(rows):
         return empty, empty
-    distances = distances_of_pairs(sought.descriptors[rows], image.descriptors[columns])
-    most = max_distance * image.descriptors.shape[1] // ORB.size
-    if image.descriptors.dtype != np.uint8:
-        most = no_distance(image.descriptors)
-    order = np.lexsort((columns, distances, rows))
-    rows, columns, distances = rows[order], columns[order], distances[order]
+    # 2. The best and the second best feature of each prediction.
+    distances = distances_of_pairs(predicted.descriptors[rows], image.descriptors[features])
+    order = np.lexsort((features, distances, rows))
+    rows, features, distances = rows[order], features[order], distances[order]
     starts = np.flatnonzero(np.concatenate(([True], rows[1:] != rows[:-1])))
-    follows = np.minimum(starts + 1, len(rows) - 1)
-    has_second = (rows[follows] == rows[starts]) & (follows > starts)
+    seconds = np.minimum(starts + 1, len(rows) - 1)
+    has_second = (rows[seconds] == rows[starts]) & (seconds > starts)
     best = distances[starts]
-    clear = (
-        (best <= most)
-        & (best < distinct_ratio * image.distinct[columns[starts]])
-        & (~has_second | (best < ratio * distances[follows]))
+    # 3. The tests of distance, of distinctiveness and of Lowe's ratio.
+    max_distance = max_bits * image.descriptors.shape[1] // ORB.size
+    if image.descriptors.dtype != np.uint8:
+        max_distance = no_distance(image.descriptors)
+    is_clear = (
+        (best <= max_distance)
+        & (best < distinctiveness_ratio * image.distinctiveness[features[starts]])
+        & (~has_second | (best < lowe_ratio * distances[seconds]))
     )
-    rows, columns, best = rows[starts][clear], columns[starts][clear], best[clear]
+    rows, features, best = rows[starts][is_clear], features[starts][is_clear], best[is_clear]
+    # 4. Each feature goes to the prediction that is most similar to it.
     nearest_first = np.argsort(best, kind="stable")
-    _, firsts = np.unique(columns[nearest_first], return_index=True)
+    _, firsts = np.unique(features[nearest_first], return_index=True)
     chosen = np.sort(nearest_first[firsts])
-    return rows[chosen].astype(np.int64), columns[chosen]
+    return rows[chosen].astype(np.int64), features[chosen]
 
 
-def _pairs_within(predicted: Array, pixels: Array, radius_px: float) -> tuple[Rows, Rows]:
-    """Return all pairs (row of predicted, row of pixels) within the radius.
+def _find_pairs_within(predicted: Array, pixels: Array, radius_px: float) -> tuple[Rows, Rows]:
+    """Return all pairs (row of *predicted*, row of *pixels*) that are at most *radius_px* apart.
 
-    The pixels are sorted by bands of rows, and by column within a band, so that each prediction looks at a
-    stretch of three bands only.
+    The pixels are sorted by horizontal bands, and by column within a band, so that each prediction is
+    compared with a stretch of three bands only.
     """
-    reach = radius_px + 1.0  # the sum of a pixel and a radius is rounded
-    known = np.flatnonzero((np.abs(predicted) <= _MAX_ABS).all(axis=1))
-    predicted = predicted[known]
-    key = _key(np.floor(pixels[:, 1] / reach), pixels[:, 0])
-    order = np.argsort(key, kind="stable")
-    key = key[order]
-    band = np.floor(predicted[:, 1] / reach)
+    reach = radius_px + 1.0  # a pixel more, since the sum of a coordinate and the radius is rounded
+    finite = np.flatnonzero((np.abs(predicted) <= _MAX_PIXEL_PX).all(axis=1))
+    predicted = predicted[finite]
+    keys = _band_keys(np.floor(pixels[:, 1] / reach), pixels[:, 0])
+    order = np.argsort(keys, kind="stable")
+    keys = keys[order]
+    bands = np.floor(predicted[:, 1] / reach)
     pairs: list[tuple[Rows, Rows]] = []
     for offset in (-1, 0, 1):
-        first = np.searchsorted(key, _key(band + offset, predicted[:, 0] - reach))
-        last = np.searchsorted(key, _key(band + offset, predicted[:, 0] + reach), side="right")
+        first = np.searchsorted(keys, _band_keys(bands + offset, predicted[:, 0] - reach))
+        last = np.searchsorted(keys, _band_keys(bands + offset, predicted[:, 0] + reach), side="right")
         counts = last - first
         rows = np.repeat(np.arange(len(predicted)), counts)
-        offsets = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)
-        columns = order[np.repeat(first, counts) + offsets]
-        apart = pixels[columns] - predicted[rows]
-        near = apart[:, 0] * apart[:, 0] + apart[:, 1] * apart[:, 1] <= radius_px * radius_px
-        pairs.append((known[rows[near]], columns[near].astype(np.int64)))
-    return np.concatenate([rows for rows, _ in pairs]), np.concatenate([columns for _, columns in pairs])
+        within_stretch = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)
+        features = order[np.repeat(first, counts) + within_stretch]
+        apart = pixels[features] - predicted[rows]
+        is_near = apart[:, 0] * apart[:, 0] + apart[:, 1] * apart[:, 1] <= radius_px * radius_px
+        pairs.append((finite[rows[is_near]], features[is_near].astype(np.int64)))
+    return np.concatenate([rows for rows, _ in pairs]), np.concatenate([features for _, features in pairs])
 
 
-def _key(band: Array, x: Array) -> Array:
-    """Return numbers that sort by band, then by column; columns far outside stay in their band."""
-    key: Array = band * _BAND + np.clip(x, -0.4 * _BAND, 0.4 * _BAND)
-    return key
+def _band_keys(bands: Array, columns: Array) -> Array:
+    """Return numbers that sort pixels by band, then by column; columns far outside stay in their band."""
+    keys: Array = bands * _BAND_KEY_STEP + np.clip(columns, -0.4 * _BAND_KEY_STEP, 0.4 * _BAND_KEY_STEP)
+    return keys
 
 
 def fit_pose(
@@ -493,51 +606,64 @@ def fit_pose(
     cauchy: float = 2.5,
     gate2: float = 11.3,
 ) -> FittedPose | None:
-    """Return the pose that fits pixels, depths and landmarks by the noise of all; None if it is free.
+    """Fit a pose to the pixels and depths of landmarks, weighted by the noise of all three.
 
-    Iterated least squares with a Cauchy weight; after three steps only rows within the gate count.  None as
-    well where a number is not finite, or beyond what any camera measures: 1e9 m or px, depths of 1 km.
+    The method is iteratively reweighted least squares with Cauchy weights; after three iterations only
+    observations within the gate count.
 
     Args:
-        observed: Of one image.
+        observed: Observations of one image.
         camera: Its intrinsics.
-        T_camera_world: ``(4, 4)``, where the fit begins.
-        cauchy: Distance in standard deviations at which a row weighs half.
-        gate2: Squared distance beyond which a row does not agree: 11.3 keeps 99 % of three numbers.
+        T_camera_world: ``(4, 4)``, the initial pose.
+        cauchy: Distance, in standard deviations, at which an observation has half its weight.
+        gate2: Squared distance, in variances, beyond which an observation is an outlier; 11.3 keeps 99 % of
+            Gaussian observations of three numbers.
+
+    Returns:
+        None where the observations do not determine the pose, where a number is not finite, or where it is
+        beyond what cameras measure: 1e9 m, 1e9 px, depths of 1 km.
 
     Raises:
         BadRequest: Shapes do not fit.
+        MissingExtra: The native core is not installed.
 
     Source:
-        Errors in variables after Segal et al., Generalized-ICP (RSS 2009), here with pixels and depths.
+        Errors in variables after Segal et al., "Generalized-ICP", RSS 2009, here with pixels and depths.
     """
     n = len(observed.points)
     shapes = (
-        observed.points.shape, observed.spreads.shape, observed.pixels.shape, observed.pixels_px.shape,
-        observed.depths_m.shape, observed.depths_dev_m.shape, T_camera_world.shape,
-    )  # fmt: skip
+        observed.points.shape,
+        observed.covariances.shape,
+        observed.pixels.shape,
+        observed.pixel_sigmas_px.shape,
+        observed.depths_m.shape,
+        observed.depth_sigmas_m.shape,
+        T_camera_world.shape,
+    )
     if shapes != ((n, 3), (n, 3, 3), (n, 2), (n,), (n,), (n,), (4, 4)):
         raise BadRequest(
-            "observations of different numbers of rows", hint="give one row for each landmark, and a 4x4 pose"
+            f"observations of {n} landmarks and a pose have shapes {shapes}, which do not fit together",
+            hint="give one row for each landmark in every array, and a 4x4 pose",
         )
     is_inlier = np.zeros(n, dtype=np.uint8)
     result = _FitResult()
-    request, _held = _fit_request(observed, camera, T_camera_world, cauchy, gate2)
-    if _function("fit_pose")(ctypes.byref(request), address_of(is_inlier), ctypes.byref(result)):
+    request, _referenced = _make_fit_request(observed, camera, T_camera_world, cauchy, gate2)
+    if _core("fit_pose")(ctypes.byref(request), address_of(is_inlier), ctypes.byref(result)):
         return None
     return FittedPose(
         T_camera_world=np.array(result.T_camera_world).reshape(4, 4),
-        information=np.array(result.information).reshape(6, 6), is_inlier=is_inlier.view(bool),
-    )  # fmt: skip
+        information=np.array(result.information).reshape(6, 6),
+        is_inlier=is_inlier.view(bool),
+    )
 
 
-def _fit_request(
+def _make_fit_request(
     observed: Observations, camera: Camera, T_camera_world: Array, cauchy: float, gate2: float
 ) -> tuple[_FitRequest, list[Array]]:
-    """Return a request, and the arrays that it points to, which must live as long."""
-    upper = observed.spreads.reshape(-1, 9)[:, (0, 1, 2, 4, 5, 8)]
-    measured = observed.pixels, observed.pixels_px, observed.depths_m, observed.depths_dev_m
-    arrays = [aligned(array, np.float64) for array in (observed.points, upper, *measured)]
+    """Return a request for the native core, and the arrays that it points to, which must outlive the call."""
+    upper_triangles = observed.covariances.reshape(-1, 9)[:, (0, 1, 2, 4, 5, 8)]
+    measured = observed.pixels, observed.pixel_sigmas_px, observed.depths_m, observed.depth_sigmas_m
+    arrays = [aligned(array, np.float64) for array in (observed.points, upper_triangles, *measured)]
     request = _FitRequest(
         _ABI, 0, len(arrays[0]), *map(address_of, arrays), camera.fx, camera.fy, camera.cx, camera.cy,
         float(cauchy * cauchy), float(gate2), (_D * 16)(*T_camera_world.ravel().tolist()),
@@ -545,23 +671,37 @@ def _fit_request(
     return request, arrays
 
 
-def fit_sway(
-    observed: Observations, sways: Array, camera: Camera, T_camera_world: Array, *, cauchy: float = 2.5
+def fit_readout_change(
+    observed: Observations,
+    displacements: Array,
+    camera: Camera,
+    T_camera_world: Array,
+    *,
+    cauchy: float = 2.5,
 ) -> tuple[float, float]:
-    """Return by how much ``(n, 3)`` motions of the points explain what an image shows, and the information.
+    """Estimate by how many seconds a rolling shutter's readout time is wrong, from one image.
 
-    It is solved beside the pose, by one step from the pose that fits; 0 and 0 where nothing can be said.
+    The change of the readout time and the change of the pose are solved together by one Gauss-Newton step
+    from the pose that fits.
 
     Args:
-        observed: Of one image; rows that agree with the pose.
-        sways: ``(n, 3)``, how landmarks move in the camera's frame for a unit, less how measured points do.
-        camera: Its intrinsics.
+        observed: Inliers of one image.
+        displacements: ``(n, 3)`` metres for each second that the readout takes longer, camera axes: the
+            displacement of the landmark in the map minus that of its measured point.
+        camera: Intrinsics.
         T_camera_world: ``(4, 4)``, the pose that fits.
-        cauchy: As in `fit_pose`.
+        cauchy: Distance, in standard deviations, at which an observation has half its weight.
+
+    Returns:
+        The change in seconds, and its information (inverse variance, 1/s^2); 0 and 0 where the image does not
+        determine it.
+
+    Raises:
+        MissingExtra: The native core is not installed.
     """
-    sways = aligned(sways, np.float64)
-    request, _held = _fit_request(observed, camera, T_camera_world, cauchy, 0.0)
+    displacements = aligned(displacements, np.float64)
+    request, _referenced = _make_fit_request(observed, camera, T_camera_world, cauchy, 0.0)
     fitted = np.zeros(2)
-    at = address_of(fitted)
-    _function("fit_sway")(ctypes.byref(request), address_of(sways), at, at + fitted.itemsize)
+    address = address_of(fitted)
+    _core("fit_sway")(ctypes.byref(request), address_of(displacements), address, address + fitted.itemsize)
     return float(fitted[0]), float(fitted[1])

@@ -1,7 +1,4 @@
-"""Points that two views of one camera see, and how far points lie from the pixels that show them.
-
-Which views are compared, and which points are used, is decided elsewhere.
-"""
+"""Triangulation of points from two views of one camera, and reprojection errors."""
 
 from __future__ import annotations
 
@@ -13,6 +10,10 @@ from rse_pf.geometry import Array, Camera, transform
 __all__ = ["parallax_deg", "reprojection_errors", "triangulate"]
 
 _MIN_DEPTH = 1e-3
+"""Smallest depth of a point before a camera, in the unit of the poses: nearer, a projection is
+meaningless."""
+_MIN_HOMOGENEOUS_SCALE = 1e-9
+"""A triangulated point whose fourth homogeneous coordinate is smaller lies at infinity."""
 
 
 def triangulate(
@@ -24,36 +25,48 @@ def triangulate(
     *,
     max_error_px: float | Array = 2.0,
 ) -> tuple[Array, npt.NDArray[np.bool_]]:
-    """Return the ``(n, 3)`` points that two views see, and which lie before both and agree with both.
+    """Triangulate points from their pixels in two views.
+
+    Args:
+        T_first_world: ``(4, 4)``, pose of the first view.
+        T_second_world: ``(4, 4)``, pose of the second view.
+        first: ``(n, 2)`` undistorted pixels in the first view.
+        second: ``(n, 2)`` pixels of the same points in the second view.
+        camera: Intrinsics of both views.
+        max_error_px: Largest reprojection error of an accepted point, one number or ``(n,)``.
+
+    Returns:
+        ``(n, 3)`` points in the world, and ``(n,)`` whether each point is accepted: finite, before both
+        cameras, and within the reprojection error in both views.
 
     Source:
         Hartley and Zisserman 2004, Sect. 12.2 (linear triangulation, in normalised coordinates).
     """
-    rays = [_normalised(pixels, camera) for pixels in (first, second)]
+    rays = [_normalise(pixels, camera) for pixels in (first, second)]
     A = np.empty((len(first), 4, 4))
-    for row, (pose, ray) in enumerate(zip((T_first_world, T_second_world), rays, strict=True)):
-        A[:, 2 * row] = ray[:, :1] * pose[2] - pose[0]
-        A[:, 2 * row + 1] = ray[:, 1:] * pose[2] - pose[1]
-    # The smallest eigenvector of A^T A: with four well-scaled rows as good as the SVD, and faster.
+    for view, (pose, ray) in enumerate(zip((T_first_world, T_second_world), rays, strict=True)):
+        A[:, 2 * view] = ray[:, :1] * pose[2] - pose[0]
+        A[:, 2 * view + 1] = ray[:, 1:] * pose[2] - pose[1]
+    # The smallest eigenvector of A^T A: with four well-scaled rows as accurate as the SVD, and faster.
     homogeneous = np.linalg.eigh(A.transpose(0, 2, 1) @ A)[1][:, :, 0]
     w = homogeneous[:, 3]
-    far = np.abs(w) < 1e-9
-    points = homogeneous[:, :3] / np.where(far, 1.0, w)[:, None]
-    good = ~far
+    is_at_infinity = np.abs(w) < _MIN_HOMOGENEOUS_SCALE
+    points = homogeneous[:, :3] / np.where(is_at_infinity, 1.0, w)[:, None]
+    is_accepted = ~is_at_infinity
     for pose, pixels in ((T_first_world, first), (T_second_world, second)):
-        moved = transform(pose, points)
-        ahead = moved[:, 2] > _MIN_DEPTH
-        moved[~ahead, 2] = 1.0
-        errors = np.linalg.norm(camera.project(moved) - pixels, axis=1)
-        good &= ahead & (errors <= max_error_px)
-    return points, good
+        camera_points = transform(pose, points)
+        is_ahead = camera_points[:, 2] > _MIN_DEPTH
+        camera_points[~is_ahead, 2] = 1.0
+        errors_px = np.linalg.norm(camera.project(camera_points) - pixels, axis=1)
+        is_accepted &= is_ahead & (errors_px <= max_error_px)
+    return points, is_accepted
 
 
 def parallax_deg(points: Array, first_centre: Array, second_centre: Array) -> Array:
-    """Return the ``(n,)`` degrees between the rays from two camera centres to ``(n, 3)`` points."""
-    one, two = points - first_centre, points - second_centre
-    lengths = np.linalg.norm(one, axis=1) * np.linalg.norm(two, axis=1)
-    cosines = np.einsum("ij,ij->i", one, two) / np.maximum(lengths, 1e-12)
+    """Return the ``(n,)`` angles in degrees between the rays from two camera centres to ``(n, 3)`` points."""
+    first_rays, second_rays = points - first_centre, points - second_centre
+    lengths = np.linalg.norm(first_rays, axis=1) * np.linalg.norm(second_rays, axis=1)
+    cosines = np.einsum("ij,ij->i", first_rays, second_rays) / np.maximum(lengths, 1e-12)
     angles: Array = np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0)))
     return angles
 
@@ -61,18 +74,28 @@ def parallax_deg(points: Array, first_centre: Array, second_centre: Array) -> Ar
 def reprojection_errors(
     T_camera_world: Array, points_world: Array, pixels: Array, camera: Camera
 ) -> tuple[Array, Array]:
-    """Return the ``(n,)`` distances in pixels and depths of ``(n, 3)`` points, each with its own pose.
+    """Return the reprojection errors and the depths of points.
 
-    *T_camera_world* is ``(n, 4, 4)`` or ``(4, 4)``; the distance of a point behind the camera is infinite.
+    Args:
+        T_camera_world: ``(n, 4, 4)``, a pose for each point, or ``(4, 4)``, one pose for all.
+        points_world: ``(n, 3)``.
+        pixels: ``(n, 2)``, measured.
+        camera: Intrinsics.
+
+    Returns:
+        ``(n,)`` errors in pixels, infinite for points behind the camera, and ``(n,)`` depths along the
+        optical axis, in the unit of the points.
     """
     points = np.einsum("...ij,...j->...i", T_camera_world[..., :3, :3], points_world)
     points += T_camera_world[..., :3, 3]
-    z = points[:, 2]
-    ahead = points.copy()
-    ahead[:, 2] = np.maximum(z, _MIN_DEPTH)
-    distances = np.where(z > _MIN_DEPTH, np.linalg.norm(camera.project(ahead) - pixels, axis=1), np.inf)
-    return distances, z
+    depths = points[:, 2]
+    clipped = points.copy()
+    clipped[:, 2] = np.maximum(depths, _MIN_DEPTH)
+    errors_px = np.where(
+        depths > _MIN_DEPTH, np.linalg.norm(camera.project(clipped) - pixels, axis=1), np.inf
+    )
+    return errors_px, depths
 
 
-def _normalised(pixels: Array, camera: Camera) -> Array:
+def _normalise(pixels: Array, camera: Camera) -> Array:
     return (pixels - [camera.cx, camera.cy]) / [camera.fx, camera.fy]

@@ -115,7 +115,7 @@ def test_numbers_are_rounded_for_the_wire():
 
 
 def test_options_that_cannot_work_and_frames_that_do_not_fit_are_refused():
-    for bad in ({"min_inliers": 3}, {"ratio": 0.0}, {"max_matches": 5}, {"max_depth_m": 0.1}):
+    for bad in ({"min_inliers": 3}, {"inlier_px": 0.0}, {"max_matches": 5}, {"max_depth_m": 0.1}):
         with pytest.raises(UsageError):
             FrontEndOptions(**bad)
     with pytest.raises(UsageError, match="do not fit"):
@@ -158,7 +158,7 @@ def test_pixels_are_described_as_the_features_that_were_found_there():
     rgb = wall_frame(0).rgb
     found = describe(rgb, 300)
 
-    rows, descriptors = describe_at(rgb, found.pixels, found.turns, found.sizes)
+    rows, descriptors = describe_at(rgb, found.pixels, found.orientations, found.sizes)
 
     assert len(rows) > 200
     assert np.median(distances_of_pairs(descriptors, found.descriptors[rows])) <= 2  # angles are rounded

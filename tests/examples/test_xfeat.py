@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from client_sdk.slots import FeaturesFunction, FeaturesSlot, FoundFeatures
+from client_sdk.plugins import FeaturesFunction, FeaturesPlugin, FoundFeatures
 from rse_pf.slam.descriptors import match_all
 
 FOLDER = Path(__file__).parents[2] / "examples" / "features"
@@ -62,7 +62,7 @@ def test_it_finds_the_same_points_in_a_warped_image(xfeat: FeaturesFunction, sha
     image = picture(*shape)
     warp = cv2.getRotationMatrix2D((shape[1] / 2, shape[0] / 2), 6.0, 1.1)
     warped = cv2.warpAffine(image, warp, shape[::-1], borderMode=cv2.BORDER_REFLECT)
-    slot = FeaturesSlot(xfeat)
+    slot = FeaturesPlugin(xfeat)
 
     first, second = slot(image), slot(warped)
     rows, columns = match_all(first.descriptors, second.descriptors)
@@ -80,4 +80,4 @@ def test_an_image_without_anything_has_no_features(xfeat: FeaturesFunction) -> N
     found: Any = xfeat(np.full((64, 96, 3), 90, dtype=np.uint8))
 
     assert isinstance(found, FoundFeatures)
-    assert len(FeaturesSlot(xfeat)(np.full((64, 96, 3), 90, dtype=np.uint8)).pixels) == len(found.pixels)
+    assert len(FeaturesPlugin(xfeat)(np.full((64, 96, 3), 90, dtype=np.uint8)).pixels) == len(found.pixels)

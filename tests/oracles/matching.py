@@ -31,7 +31,7 @@ def best_matches(
     return rows[:, 0], rows[:, 1]
 
 
-def distinct_distances(
+def measure_distinctiveness(
     descriptors: npt.NDArray[np.uint8], pixels: npt.NDArray[Any], apart_px: float
 ) -> npt.NDArray[np.int64]:
     """Return the distance of each feature to the most similar one at another place, 256 without any."""
@@ -41,8 +41,8 @@ def distinct_distances(
     return np.where(is_apart, hamming(descriptors, descriptors), 256).min(axis=1, initial=256)
 
 
-def match_near(sought: Any, image: Any, limits: Any) -> tuple[Rows, Rows]:
-    """Return what `rse_pf.slam.tracking.match_near` does of ORB descriptors."""
+def match_predictions(sought: Any, image: Any, limits: Any) -> tuple[Rows, Rows]:
+    """Return what `rse_pf.slam.tracking.match_predictions` does of ORB descriptors."""
     x, y = np.asarray(sought.pixels, np.float64), np.asarray(image.pixels, np.float64)
     with np.errstate(invalid="ignore", over="ignore"):
         u, v = np.moveaxis(y - x[:, None], 2, 0)
@@ -54,8 +54,11 @@ def match_near(sought: Any, image: Any, limits: Any) -> tuple[Rows, Rows]:
             is_candidate &= image.sizes <= limits.max_size_ratio * expected
             is_candidate &= expected <= limits.max_size_ratio * image.sizes
         if image.is_oriented:
-            a, b = np.asarray(sought.turns, np.float64)[:, None], np.asarray(image.turns, np.float64)
-            is_candidate &= a[..., 0] * b[:, 0] + a[..., 1] * b[:, 1] >= limits.min_cosine
+            a, b = (
+                np.asarray(sought.orientations, np.float64)[:, None],
+                np.asarray(image.orientations, np.float64),
+            )
+            is_candidate &= a[..., 0] * b[:, 0] + a[..., 1] * b[:, 1] >= limits.min_orientation_cosine
     taken: dict[int, tuple[int, int]] = {}
     for row, distances in enumerate(hamming(sought.descriptors, image.descriptors)):
         near = np.flatnonzero(is_candidate[row])
@@ -63,8 +66,8 @@ def match_near(sought: Any, image: Any, limits: Any) -> tuple[Rows, Rows]:
         if not len(near) or distances[near[0]] > limits.max_distance:
             continue
         least = distances[near[0]]
-        is_clear = len(near) == 1 or least < limits.ratio * distances[near[1]]
-        if is_clear and least < limits.distinct_ratio * image.distinct[near[0]]:
+        is_clear = len(near) == 1 or least < limits.lowe_ratio * distances[near[1]]
+        if is_clear and least < limits.distinctiveness_ratio * image.distinctiveness[near[0]]:
             _take(taken, int(near[0]), (int(least), row))
     rows = np.array(sorted((row, column) for column, (_, row) in taken.items()), dtype=np.int64).reshape(
         -1, 2

@@ -45,9 +45,9 @@ def linearised(observed: Any, camera: Any, T: Array, near_m: float) -> tuple[Arr
     moved[:, 0, 4], moved[:, 0, 5], moved[:, 1, 3] = z, -y, -z
     moved[:, 1, 5], moved[:, 2, 3], moved[:, 2, 4] = x, y, -x
     by_world = by_point @ T[:3, :3]
-    variance = by_world @ observed.spreads @ by_world.transpose(0, 2, 1)
-    variance[:, (0, 1), (0, 1)] += np.square(observed.pixels_px)[:, None]
-    variance[:, 2, 2] = np.where(has_depth, variance[:, 2, 2] + observed.depths_dev_m**2, 1.0)
+    variance = by_world @ observed.covariances @ by_world.transpose(0, 2, 1)
+    variance[:, (0, 1), (0, 1)] += np.square(observed.pixel_sigmas_px)[:, None]
+    variance[:, 2, 2] = np.where(has_depth, variance[:, 2, 2] + observed.depth_sigmas_m**2, 1.0)
     W = np.linalg.inv(variance)
     return by_point @ moved, by_point, W, residual, np.einsum("ni,nij,nj->n", residual, W, residual)
 
@@ -88,10 +88,12 @@ def _is_inlier(observed: Any, T: Array, distance2: Array, gate2: float) -> npt.N
     return (distance2 < gate2) & (observed.points @ T[2, :3] + T[2, 3] > 0.05)
 
 
-def fit_sway(observed: Any, sways: Array, camera: Any, T: Array, cauchy: float = 2.5) -> tuple[float, float]:
+def fit_readout_change(
+    observed: Any, displacements: Array, camera: Any, T: Array, cauchy: float = 2.5
+) -> tuple[float, float]:
     """Return the amount of a motion of the points that is solved beside the pose, and its information."""
     J, by_point, W, residual, distance2 = linearised(observed, camera, T, 0.05)
-    J = np.concatenate([J, by_point @ sways[:, :, None]], axis=2)
+    J = np.concatenate([J, by_point @ displacements[:, :, None]], axis=2)
     information, gradient = normal(J, W, residual, 1.0 / (1.0 + distance2 / cauchy**2))
     covariance = np.linalg.inv(information)
     return float((covariance @ gradient)[6]), float(1.0 / covariance[6, 6])
@@ -112,16 +114,20 @@ def refine_with_depth(
     T, z = solution.T_camera_world, points[:, 2]
     pixel_px = max(0.05, 0.5 * solution.rmse_px)
     along = points / z[:, None]
-    spreads = along[:, :, None] * along[:, None] * np.square(deviation_m(z))[:, None, None]
-    spreads[:, 0, 0] += (pixel_px * z / camera.fx) ** 2
-    spreads[:, 1, 1] += (pixel_px * z / camera.fy) ** 2
+    covariances = along[:, :, None] * along[:, None] * np.square(deviation_m(z))[:, None, None]
+    covariances[:, 0, 0] += (pixel_px * z / camera.fx) ** 2
+    covariances[:, 1, 1] += (pixel_px * z / camera.fy) ** 2
     last = False
     for step in range(7):  # six steps at most, and the errors at the last pose
         expected_m = np.maximum(points @ T[2, :3] + T[2, 3], 1e-3)
         observed = SimpleNamespace(
-            points=points, spreads=spreads, pixels=pixels, pixels_px=np.full(len(rows), pixel_px),
-            depths_m=depths_m, depths_dev_m=deviation_m(expected_m),
-        )  # fmt: skip
+            points=points,
+            covariances=covariances,
+            pixels=pixels,
+            pixel_sigmas_px=np.full(len(rows), pixel_px),
+            depths_m=depths_m,
+            depth_sigmas_m=deviation_m(expected_m),
+        )
         J, _, W, residual, distance2 = linearised(observed, camera, T, 1e-3)
         weight = 1.0 / (1.0 + distance2 / 2.5**2)
         if last:

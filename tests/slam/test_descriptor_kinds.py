@@ -35,7 +35,13 @@ from rse_pf.slam.keyframe import (
 )
 from rse_pf.slam.links import Atlas
 from rse_pf.slam.place_recognition import place_vector
-from rse_pf.slam.tracking import ImageFeatures, NearLimits, SoughtFeatures, distinct_distances, match_near
+from rse_pf.slam.tracking import (
+    GuidedMatchLimits,
+    ImageFeatures,
+    PredictedFeatures,
+    match_predictions,
+    measure_distinctiveness,
+)
 from rse_pf.wire import Command, Failure, Result
 from tests.live_map.generated_drives import GeneratedWorld, circle
 
@@ -111,7 +117,7 @@ def test_many_vectors_are_matched_in_blocks(monkeypatch: pytest.MonkeyPatch) -> 
     view, reference = random_descriptors(XFEAT, 90, 3), random_descriptors(XFEAT, 50, 4)
     whole = best_matches(reference, view, 0.95)
 
-    monkeypatch.setattr("rse_pf.slam.descriptors._BLOCK", 200)
+    monkeypatch.setattr("rse_pf.slam.descriptors._BLOCK_DISTANCES", 200)
 
     assert len(whole[0])
     assert all(map(np.array_equal, best_matches(reference, view, 0.95), whole))
@@ -133,23 +139,28 @@ def test_features_near_a_pixel_are_matched_by_their_own_metric(kind: DescriptorK
     descriptors = random_descriptors(kind, n, 5)
     pixels = np.stack([40.0 * np.arange(n), np.full(n, 50.0)], axis=1)
     image = ImageFeatures(
-        pixels=pixels, descriptors=descriptors, turns=np.zeros((n, 2)), sizes=np.full(n, 9.0),
-        distinct=distinct_distances(descriptors, pixels), is_oriented=False, is_scaled=False,
+        pixels=pixels, descriptors=descriptors, orientations=np.zeros((n, 2)), sizes=np.full(n, 9.0),
+        distinctiveness=measure_distinctiveness(descriptors, pixels), is_oriented=False, is_scaled=False,
     )  # fmt: skip
     seen_again = descriptors.copy()
     seen_again[:, :8] ^= 7  # as far as another look of the same point: above 60 for a vector
-    sought = SoughtFeatures(
-        pixels=pixels + 3.0, descriptors=seen_again, turns=np.tile([0.0, 1.0], (n, 1)), sizes=np.ones(n)
+    sought = PredictedFeatures(
+        pixels=pixels + 3.0,
+        descriptors=seen_again,
+        orientations=np.tile([0.0, 1.0], (n, 1)),
+        sizes=np.ones(n),
     )
 
-    rows, columns = match_near(sought, image, NearLimits(radius_px=10.0))
-    oriented, _ = match_near(sought, replace(image, is_oriented=True), NearLimits(radius_px=10.0))
-    scaled, _ = match_near(sought, replace(image, is_scaled=True), NearLimits(radius_px=10.0))
+    rows, columns = match_predictions(sought, image, GuidedMatchLimits(radius_px=10.0))
+    oriented, _ = match_predictions(
+        sought, replace(image, is_oriented=True), GuidedMatchLimits(radius_px=10.0)
+    )
+    scaled, _ = match_predictions(sought, replace(image, is_scaled=True), GuidedMatchLimits(radius_px=10.0))
     other = replace(sought, descriptors=random_descriptors(kind, n, 6))
 
     assert rows.tolist() == columns.tolist() == list(range(n))
     assert len(oriented) == len(scaled) == 0
-    assert len(match_near(other, image, NearLimits(radius_px=10.0))[0]) < 3
+    assert len(match_predictions(other, image, GuidedMatchLimits(radius_px=10.0))[0]) < 3
 
 
 @pytest.mark.parametrize("kind", [SIFT, XFEAT, AKAZE], ids=str)

@@ -14,17 +14,17 @@ from rse_pf.errors import BadRequest
 from rse_pf.geometry import Array, Camera, exp_se3, inverse, log_se3, transform
 from rse_pf.slam.tracking import (
     FittedPose,
+    GuidedMatchLimits,
     ImageFeatures,
-    LandmarkLooks,
-    NearLimits,
+    LandmarkAppearance,
     Observations,
-    SoughtFeatures,
-    distinct_distances,
-    expect,
+    PredictedFeatures,
     fit_pose,
-    fit_sway,
-    match_near,
-    seek_near,
+    fit_readout_change,
+    match_landmarks,
+    match_predictions,
+    measure_distinctiveness,
+    predict_features,
 )
 from tests.oracles import matching, pose_fit
 
@@ -34,14 +34,14 @@ CAMERA = Camera(fx=525.0, fy=520.0, cx=319.5, cy=239.5, width=640, height=480)
 # --- landmarks where a pose expects them ---------------------------------------------------------
 
 
-def looks_of(rng: np.random.Generator, n: int) -> LandmarkLooks:
+def landmarks_of(rng: np.random.Generator, n: int) -> LandmarkAppearance:
     """Return landmarks around a camera at the origin, seen before from cameras near and far from it."""
     points = rng.uniform((-3.0, -3.0, -1.0), (3.0, 3.0, 6.0), (n, 3))
     points[rng.random(n) < 0.05] = np.nan
     angle = rng.uniform(-0.5, 0.5, n)
-    return LandmarkLooks(
+    return LandmarkAppearance(
         points=points, rays=points * rng.choice([0.3, 0.9, 1.1, 3.0, -1.0], (n, 1)),
-        turns=np.column_stack([np.cos(angle), np.sin(angle), 0.1 * angle]),
+        orientations=np.column_stack([np.cos(angle), np.sin(angle), 0.1 * angle]),
         sizes=rng.choice([1.0, 1.2, 2.0], n), descriptors=descriptors_of(rng, n, n // 3 + 1),
     )  # fmt: skip
 
@@ -49,25 +49,25 @@ def looks_of(rng: np.random.Generator, n: int) -> LandmarkLooks:
 @pytest.mark.parametrize("seed", range(20))
 def test_landmarks_are_matched_where_a_pose_expects_them(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    looks = looks_of(rng, 400)
+    landmarks = landmarks_of(rng, 400)
     T = exp_se3(rng.normal(0.0, 0.1, 6))
-    seen = expect(looks, np.arange(400), T, CAMERA, 10.0)
-    shown = rng.permutation(len(seen.rows))[:100]
+    _, seen = predict_features(landmarks, np.arange(400), T, CAMERA, 10.0)
+    shown = rng.permutation(len(seen.pixels))[:100]
     image = ImageFeatures(
-        pixels=seen.features.pixels[shown] + rng.normal(0.0, 3.0, (len(shown), 2)),
-        descriptors=seen.features.descriptors[shown], turns=seen.features.turns[shown],
-        sizes=seen.features.sizes[shown], distinct=np.full(len(shown), 256, dtype=np.int32),
+        pixels=seen.pixels[shown] + rng.normal(0.0, 3.0, (len(shown), 2)),
+        descriptors=seen.descriptors[shown], orientations=seen.orientations[shown],
+        sizes=seen.sizes[shown], distinctiveness=np.full(len(shown), 256, dtype=np.int32),
         is_oriented=seed % 2 == 0, is_scaled=seed % 3 == 0,
     )  # fmt: skip
     numbers = np.sort(rng.choice(400, 300, replace=False))
-    limits = NearLimits(radius_px=8.0)
+    limits = GuidedMatchLimits(radius_px=8.0)
 
-    rows, features = seek_near(looks, numbers, T, CAMERA, image, limits, 10.0)
+    rows, features = match_landmarks(landmarks, numbers, T, CAMERA, image, limits, 10.0)
 
-    expected = expect(looks, numbers, T, CAMERA, 10.0)
-    sought, columns = matching.match_near(expected.features, image, limits)
+    predicted_rows, predicted = predict_features(landmarks, numbers, T, CAMERA, 10.0)
+    sought, columns = matching.match_predictions(predicted, image, limits)
     assert len(rows) > 5
-    np.testing.assert_array_equal(rows, expected.rows[sought])
+    np.testing.assert_array_equal(rows, predicted_rows[sought])
     np.testing.assert_array_equal(features, columns)
 
 
@@ -103,7 +103,7 @@ def angles(rng: np.random.Generator, n: int) -> Array:
     return np.column_stack([np.cos(turn), np.sin(turn)])
 
 
-def request_of(seed: int) -> tuple[SoughtFeatures, ImageFeatures, NearLimits]:
+def request_of(seed: int) -> tuple[PredictedFeatures, ImageFeatures, GuidedMatchLimits]:
     rng = np.random.default_rng(seed)
     m, n = (int(rng.choice([0, 1, 2, 40, 300])) for _ in range(2))
     kind = ("lattice", "anywhere", "cells", "outside", "strange")[seed % 5]
@@ -117,18 +117,18 @@ def request_of(seed: int) -> tuple[SoughtFeatures, ImageFeatures, NearLimits]:
     like = np.flatnonzero(rng.random(len(of)) < 0.7)
     expected_bits[like] = bits[of[like]]
     expected_bits[like, rng.integers(0, 32, len(like))] ^= rng.choice(np.uint8([0, 1, 7]), len(like))
-    sought = SoughtFeatures(
-        pixels=predicted, descriptors=expected_bits, turns=angles(rng, m),
+    sought = PredictedFeatures(
+        pixels=predicted, descriptors=expected_bits, orientations=angles(rng, m),
         sizes=1.2 ** rng.integers(0, 4, m),
     )  # fmt: skip
     image = ImageFeatures(
-        pixels=pixels, descriptors=bits, turns=angles(rng, n), sizes=1.2 ** rng.integers(0, 4, n),
-        distinct=matching.distinct_distances(bits, pixels, 6.0).astype(np.int32),
+        pixels=pixels, descriptors=bits, orientations=angles(rng, n), sizes=1.2 ** rng.integers(0, 4, n),
+        distinctiveness=matching.measure_distinctiveness(bits, pixels, 6.0).astype(np.int32),
     )  # fmt: skip
-    limits = NearLimits(
+    limits = GuidedMatchLimits(
         radius_px=float(rng.choice([0.0, 3.0, 8.0, 40.0, 5000.0, 1e9])),
-        ratio=float(rng.choice([0.8, 1.0, 1.5])), distinct_ratio=float(rng.choice([0.8, 2.0])),
-        min_cosine=float(rng.choice([0.9, -1.0])), max_size_ratio=float(rng.choice([1.35, 9.0])),
+        lowe_ratio=float(rng.choice([0.8, 1.0, 1.5])), distinctiveness_ratio=float(rng.choice([0.8, 2.0])),
+        min_orientation_cosine=float(rng.choice([0.9, -1.0])), max_size_ratio=float(rng.choice([1.35, 9.0])),
         max_distance=int(rng.choice([0, 60, 256])),
     )  # fmt: skip
     return sought, image, limits
@@ -139,15 +139,15 @@ def test_matches_and_distances_are_those_of_the_definition() -> None:
     for seed in range(600):
         sought, image, limits = request_of(seed)
 
-        rows, columns = match_near(sought, image, limits)
+        rows, columns = match_predictions(sought, image, limits)
         apart_px = (0.0, 6.0, 40.0, np.nan)[seed % 4]
-        distances = distinct_distances(image.descriptors, image.pixels, apart_px)
+        distances = measure_distinctiveness(image.descriptors, image.pixels, apart_px)
 
-        expected = matching.match_near(sought, image, limits)
+        expected = matching.match_predictions(sought, image, limits)
         assert (rows.tolist(), columns.tolist()) == tuple(each.tolist() for each in expected), seed
         assert rows.dtype == columns.dtype == np.int64
         assert distances.dtype == np.int32
-        of_all = matching.distinct_distances(image.descriptors, image.pixels, apart_px)
+        of_all = matching.measure_distinctiveness(image.descriptors, image.pixels, apart_px)
         assert distances.tolist() == of_all.tolist()
         counts.append(len(rows))
         similar += int((distances < 256).sum())
@@ -163,20 +163,20 @@ def flat(pixels: list[tuple[float, float]], bits: list[int]) -> dict[str, Any]:
     return {
         "pixels": np.array(pixels, dtype=float).reshape(-1, 2),
         "descriptors": descriptors.astype(np.uint8).reshape(-1, 32),
-        "turns": np.tile([1.0, 0.0], (len(bits), 1)),
+        "orientations": np.tile([1.0, 0.0], (len(bits), 1)),
         "sizes": np.ones(len(bits)),
     }
 
 
 def image_of(pixels: list[tuple[float, float]], bits: list[int], distinct: int = 256) -> ImageFeatures:
-    return ImageFeatures(**flat(pixels, bits), distinct=np.full(len(bits), distinct, dtype=np.int32))
+    return ImageFeatures(**flat(pixels, bits), distinctiveness=np.full(len(bits), distinct, dtype=np.int32))
 
 
 def matched(sought: dict[str, Any], image: ImageFeatures, **limits: float) -> list[tuple[int, int]]:
-    rows, columns = match_near(
-        SoughtFeatures(**sought),
+    rows, columns = match_predictions(
+        PredictedFeatures(**sought),
         image,
-        NearLimits(**{"radius_px": 10.0, **limits}),  # type: ignore[arg-type]
+        GuidedMatchLimits(**{"radius_px": 10.0, **limits}),  # type: ignore[arg-type]
     )
     return list(zip(rows.tolist(), columns.tolist(), strict=True))
 
@@ -191,9 +191,9 @@ def test_the_nearest_within_the_radius_and_every_limit_is_taken() -> None:
     assert matched(sought, image_of([(100, 100), (101, 100)], [40, 50])) == []  # not clearly the nearest
     assert matched(sought, image_of([(100, 100)], [39], distinct=50)) == [(0, 0)]
     assert matched(sought, image_of([(100, 100)], [40], distinct=50)) == []
-    turned = replace(image_of([(100, 100)], [0]), turns=np.array([[0.8, 0.6]]))
+    turned = replace(image_of([(100, 100)], [0]), orientations=np.array([[0.8, 0.6]]))
     assert matched(sought, turned) == []
-    assert matched(sought, turned, min_cosine=0.8) == [(0, 0)]
+    assert matched(sought, turned, min_orientation_cosine=0.8) == [(0, 0)]
     for size, is_like in ((1.35, True), (1.4, False), (1 / 1.3, True), (0.7, False)):
         assert bool(matched(sought, replace(image_of([(100, 100)], [0]), sizes=np.array([size])))) == is_like
 
@@ -202,7 +202,7 @@ def test_one_feature_goes_to_the_nearest_and_to_the_first_of_equals() -> None:
     image = image_of([(50, 50)], [0])
 
     assert matched(flat([(50, 50)] * 3, [9, 5, 5]), image) == [(1, 0)]
-    assert matched(flat([(50, 50)], [5]), image_of([(50, 51), (50, 50)], [0, 0]), ratio=1.5) == [(0, 0)]
+    assert matched(flat([(50, 50)], [5]), image_of([(50, 51), (50, 50)], [0, 0]), lowe_ratio=1.5) == [(0, 0)]
 
 
 def test_places_that_are_none_match_nothing_and_disturb_nothing() -> None:
@@ -225,52 +225,62 @@ def test_other_numbers_and_gaps_in_memory_give_the_same() -> None:
     )
     assert len(sought.pixels)
     assert len(image)
-    limits = replace(limits, radius_px=40.0, min_cosine=-1.0, max_size_ratio=9.0, max_distance=256, ratio=1.5)
+    limits = replace(
+        limits,
+        radius_px=40.0,
+        min_orientation_cosine=-1.0,
+        max_size_ratio=9.0,
+        max_distance=256,
+        lowe_ratio=1.5,
+    )
     sought, image = (
         replace(
-            each, pixels=np.round(each.pixels), turns=np.round(each.turns), sizes=np.ones(len(each.sizes))
+            each,
+            pixels=np.round(each.pixels),
+            orientations=np.round(each.orientations),
+            sizes=np.ones(len(each.sizes)),
         )
         for each in (sought, image)
     )
-    expected = match_near(sought, image, limits)
+    expected = match_predictions(sought, image, limits)
 
     def other(each: Any, kind: type) -> Any:
         return replace(
             each,
             pixels=np.asfortranarray(each.pixels.astype(kind)),
-            turns=np.repeat(each.turns.astype(kind), 2, axis=0)[::2],
+            orientations=np.repeat(each.orientations.astype(kind), 2, axis=0)[::2],
             sizes=each.sizes[::-1].astype(kind)[::-1],
             descriptors=np.asfortranarray(each.descriptors),
         )
 
     for kind in (np.float32, np.int64, np.float64):
-        changed = replace(other(image, kind), distinct=image.distinct.astype(np.int64))
-        found = match_near(other(sought, kind), changed, limits)
+        changed = replace(other(image, kind), distinctiveness=image.distinctiveness.astype(np.int64))
+        found = match_predictions(other(sought, kind), changed, limits)
         assert [each.tolist() for each in found] == [each.tolist() for each in expected]
     np.testing.assert_array_equal(
-        distinct_distances(np.asfortranarray(image.descriptors), image.pixels.astype(np.float32)),
-        distinct_distances(image.descriptors, image.pixels),
+        measure_distinctiveness(np.asfortranarray(image.descriptors), image.pixels.astype(np.float32)),
+        measure_distinctiveness(image.descriptors, image.pixels),
     )
 
 
 @pytest.mark.parametrize(
     "change",
     [
-        {"pixels": np.zeros((3, 2))}, {"pixels": np.zeros((4, 3))}, {"turns": np.zeros((4, 1))},
+        {"pixels": np.zeros((3, 2))}, {"pixels": np.zeros((4, 3))}, {"orientations": np.zeros((4, 1))},
         {"sizes": np.zeros((4, 1))}, {"sizes": np.zeros(5)}, {"descriptors": np.zeros((4, 16), np.uint8)},
         {"descriptors": np.zeros((4, 32))}, {"descriptors": np.zeros((4, 32), np.int8)},
-        {"distinct": np.zeros(3, np.int32)},
+        {"distinctiveness": np.zeros(3, np.int32)},
     ],
 )  # fmt: skip
 def test_features_that_do_not_fit_are_refused(change: dict[str, Array]) -> None:
     spots = [(0.0, 0.0)] * 4
-    sought, image = SoughtFeatures(**flat(spots, [0] * 4)), image_of(spots, [0] * 4)
+    sought, image = PredictedFeatures(**flat(spots, [0] * 4)), image_of(spots, [0] * 4)
 
     with pytest.raises(BadRequest, match=r"features|descriptors"):
-        match_near(sought, replace(image, **change), NearLimits(radius_px=3.0))
-    if "distinct" not in change:
+        match_predictions(sought, replace(image, **change), GuidedMatchLimits(radius_px=3.0))
+    if "distinctiveness" not in change:
         with pytest.raises(BadRequest, match=r"features|descriptors"):
-            match_near(replace(sought, **change), image, NearLimits(radius_px=3.0))
+            match_predictions(replace(sought, **change), image, GuidedMatchLimits(radius_px=3.0))
 
 
 @pytest.mark.parametrize("radius_px", [-1.0, np.nan, np.inf, 1e10])
@@ -282,16 +292,16 @@ def test_a_radius_that_is_none_is_refused(radius_px: float) -> None:
 def test_the_most_similar_feature_that_is_another_point_counts() -> None:
     features = flat([(10, 10), (13, 10), (10, 16), (300, 10)], [0, 1, 20, 50])
 
-    distances = distinct_distances(features["descriptors"], features["pixels"])
+    distances = measure_distinctiveness(features["descriptors"], features["pixels"])
 
     assert distances.tolist() == [20, 19, 19, 30]
-    assert distinct_distances(np.zeros((1, 32), np.uint8), np.zeros((1, 2)), 0.0).tolist() == [256]
-    assert distinct_distances(np.zeros((0, 32), np.uint8), np.zeros((0, 2))).tolist() == []
+    assert measure_distinctiveness(np.zeros((1, 32), np.uint8), np.zeros((1, 2)), 0.0).tolist() == [256]
+    assert measure_distinctiveness(np.zeros((0, 32), np.uint8), np.zeros((0, 2))).tolist() == []
     nowhere = np.array([[np.nan, np.nan], [0.0, 0.0], [np.nan, 90.0]])
-    assert distinct_distances(np.zeros((3, 32), np.uint8), nowhere).tolist() == [256, 0, 0]
+    assert measure_distinctiveness(np.zeros((3, 32), np.uint8), nowhere).tolist() == [256, 0, 0]
     for wrong in (np.zeros(3, np.uint8), np.zeros((2, 32), np.uint8), np.zeros((3, 32))):
         with pytest.raises(BadRequest, match="3 features"):
-            distinct_distances(wrong, np.zeros((3, 2)))
+            measure_distinctiveness(wrong, np.zeros((3, 2)))
 
 
 # --- poses -------------------------------------------------------------------------------------
@@ -310,21 +320,25 @@ def observations(
         seen = np.array([0.1, 0.2, 3.0]) + np.outer(rng.uniform(-1, 1, n), along)
     points = transform(inverse(truth), seen)
     factors = rng.normal(size=(n, 3, 3)) * 0.004
-    spreads = factors @ factors.transpose(0, 2, 1) + 1e-8 * np.eye(3)
-    known = points + np.einsum("nij,nj->ni", np.linalg.cholesky(spreads), rng.normal(size=(n, 3)))
-    pixels_px = rng.choice([0.7, 1.0, 1.44], n)
-    depths_dev_m = 0.003 + 0.0019 * (seen[:, 2] - 0.4) ** 2
-    measured = CAMERA.project(seen) + pixels_px[:, None] * rng.normal(size=(n, 2))
-    depths_m = seen[:, 2] + depths_dev_m * rng.normal(size=n)
+    covariances = factors @ factors.transpose(0, 2, 1) + 1e-8 * np.eye(3)
+    known = points + np.einsum("nij,nj->ni", np.linalg.cholesky(covariances), rng.normal(size=(n, 3)))
+    pixel_sigmas_px = rng.choice([0.7, 1.0, 1.44], n)
+    depth_sigmas_m = 0.003 + 0.0019 * (seen[:, 2] - 0.4) ** 2
+    measured = CAMERA.project(seen) + pixel_sigmas_px[:, None] * rng.normal(size=(n, 2))
+    depths_m = seen[:, 2] + depth_sigmas_m * rng.normal(size=n)
     depths_m[rng.random(n) < (0.3 if has_depth else 2.0)] = 0.0
     if line:  # without noise: nothing but the free motion keeps the pose from being fitted
         measured, depths_m = CAMERA.project(seen), np.where(depths_m > 0.0, seen[:, 2], 0.0)
     wrong = rng.random(n) < outliers
     measured[wrong] += rng.normal(size=(wrong.sum(), 2)) * 80.0
     observed = Observations(
-        points=points if line else known, spreads=spreads, pixels=measured, pixels_px=pixels_px,
-        depths_m=depths_m, depths_dev_m=np.where(depths_m > 0.0, depths_dev_m, np.nan),
-    )  # fmt: skip
+        points=points if line else known,
+        covariances=covariances,
+        pixels=measured,
+        pixel_sigmas_px=pixel_sigmas_px,
+        depths_m=depths_m,
+        depth_sigmas_m=np.where(depths_m > 0.0, depth_sigmas_m, np.nan),
+    )
     return observed, truth, exp_se3(rng.normal(size=6) * 0.01) @ truth
 
 
@@ -351,11 +365,11 @@ def test_poses_are_those_of_the_definition(has_depth: bool, outliers: float) -> 
 @pytest.mark.parametrize("has_depth", [True, False])
 def test_motions_of_points_are_fitted_beside_the_pose(has_depth: bool) -> None:
     observed, T, _ = observations(5, n=80, has_depth=has_depth)
-    sways = np.random.default_rng(5).normal(0.0, 1.0, (80, 3))
+    displacements = np.random.default_rng(5).normal(0.0, 1.0, (80, 3))
 
-    more, information = fit_sway(observed, sways, CAMERA, T)
+    more, information = fit_readout_change(observed, displacements, CAMERA, T)
 
-    expected = pose_fit.fit_sway(observed, sways, CAMERA, T)
+    expected = pose_fit.fit_readout_change(observed, displacements, CAMERA, T)
     assert information > 0.0
     assert (more, information) == pytest.approx(expected, rel=1e-8)
 
@@ -405,10 +419,10 @@ NAN, INF = float("nan"), float("inf")
     ("name", "number"),
     [
         *((name, number) for name in ("points", "pixels") for number in (NAN, INF, -INF, 2e9, -1e300)),
-        *(("spreads", number) for number in (NAN, INF, -INF, 2e9, -1.0)),
-        *(("pixels_px", number) for number in (NAN, INF, 0.0, -1.0, 1e7)),
+        *(("covariances", number) for number in (NAN, INF, -INF, 2e9, -1.0)),
+        *(("pixel_sigmas_px", number) for number in (NAN, INF, 0.0, -1.0, 1e7)),
         *(("depths_m", number) for number in (NAN, INF, -INF, -1e-9, 1000.1)),
-        *(("depths_dev_m", number) for number in (NAN, INF, 0.0, -1.0, 1e4)),
+        *(("depth_sigmas_m", number) for number in (NAN, INF, 0.0, -1.0, 1e4)),
     ],
 )
 def test_numbers_that_no_camera_measures_give_no_pose(name: str, number: float) -> None:
@@ -435,9 +449,9 @@ def test_a_start_or_a_limit_that_is_none_gives_no_pose(number: float) -> None:
 @pytest.mark.parametrize(
     "change",
     [
-        {"points": np.zeros((119, 3))}, {"points": np.zeros((120, 2))}, {"spreads": np.zeros((120, 6))},
-        {"spreads": np.zeros((1, 3, 3))}, {"pixels": np.zeros((120, 3))}, {"pixels_px": np.ones(1)},
-        {"depths_m": np.zeros((120, 1))}, {"depths_dev_m": np.zeros(0)},
+        {"points": np.zeros((119, 3))}, {"points": np.zeros((120, 2))}, {"covariances": np.zeros((120, 6))},
+        {"covariances": np.zeros((1, 3, 3))}, {"pixels": np.zeros((120, 3))}, {"pixel_sigmas_px": np.ones(1)},
+        {"depths_m": np.zeros((120, 1))}, {"depth_sigmas_m": np.zeros(0)},
     ],
 )  # fmt: skip
 def test_observations_that_do_not_fit_are_refused(change: dict[str, Array]) -> None:
@@ -454,11 +468,11 @@ def test_covariances_that_are_none_never_make_an_inlier_or_an_infinite_pose() ->
     for seed in range(60):
         rng = np.random.default_rng(seed)
         observed, _, start = observations(seed, n=30)
-        spreads = observed.spreads.copy()
+        covariances = observed.covariances.copy()
         spoilt = rng.random(30) < 0.4
-        spreads[spoilt, 0, 1] = spreads[spoilt, 1, 0] = 10.0 ** rng.uniform(-3, 8)
+        covariances[spoilt, 0, 1] = covariances[spoilt, 1, 0] = 10.0 ** rng.uniform(-3, 8)
 
-        fitted = fit_pose(replace(observed, spreads=spreads), CAMERA, start)
+        fitted = fit_pose(replace(observed, covariances=covariances), CAMERA, start)
 
         if fitted is not None:
             assert np.isfinite(fitted.T_camera_world).all()
@@ -467,13 +481,13 @@ def test_covariances_that_are_none_never_make_an_inlier_or_an_infinite_pose() ->
 
 def test_a_squared_distance_below_zero_is_no_small_one() -> None:
     observed, truth, _ = observations(5, has_depth=False)
-    spreads, pixels = observed.spreads.copy(), CAMERA.project(transform(truth, observed.points))
+    covariances, pixels = observed.covariances.copy(), CAMERA.project(transform(truth, observed.points))
     # In the camera's frame no covariance: x + y varies, x - y by less than nothing; and the pixel is off so.
-    spreads[7] = truth[:3, :3].T @ np.array([[0, 1e-2, 0], [1e-2, 0, 0], [0, 0, 0]]) @ truth[:3, :3]
-    spreads[7, (0, 1, 2), (0, 1, 2)] = np.maximum(spreads[7, (0, 1, 2), (0, 1, 2)], 0.0)
+    covariances[7] = truth[:3, :3].T @ np.array([[0, 1e-2, 0], [1e-2, 0, 0], [0, 0, 0]]) @ truth[:3, :3]
+    covariances[7, (0, 1, 2), (0, 1, 2)] = np.maximum(covariances[7, (0, 1, 2), (0, 1, 2)], 0.0)
     pixels[7] += (200.0, -200.0)
 
-    fitted = fit_pose(replace(observed, spreads=spreads, pixels=pixels), CAMERA, truth)
+    fitted = fit_pose(replace(observed, covariances=covariances, pixels=pixels), CAMERA, truth)
 
     assert fitted is not None
     assert np.flatnonzero(~fitted.is_inlier).tolist() == [7]
@@ -485,7 +499,7 @@ def test_float32_and_gaps_in_memory_give_the_same_pose() -> None:
         observed,
         **{
             name: getattr(observed, name).astype(np.float32).astype(np.float64)
-            for name in ("points", "pixels", "pixels_px", "depths_m", "depths_dev_m")
+            for name in ("points", "pixels", "pixel_sigmas_px", "depths_m", "depth_sigmas_m")
         },
     )
     other = replace(
@@ -502,12 +516,12 @@ def test_float32_and_gaps_in_memory_give_the_same_pose() -> None:
 
 def test_threads_do_not_share_memory() -> None:
     requests = [request_of(seed) for seed in range(100, 108)]
-    expected = [matching.match_near(*request) for request in requests]
+    expected = [matching.match_predictions(*request) for request in requests]
     wrong: list[int] = []
 
     def check(which: int) -> None:
         for _ in range(100):
-            found = match_near(*requests[which])
+            found = match_predictions(*requests[which])
             if any(a.tolist() != b.tolist() for a, b in zip(found, expected[which], strict=True)):
                 wrong.append(which)
 

@@ -290,7 +290,7 @@ def _keep(
 
 def check_drive(args: argparse.Namespace) -> OdometryScale | MarkerScale | None:
     """Refuse options that contradict each other, and return the scale; raises UsageError."""
-    from client_sdk.slots import load_features
+    from client_sdk.plugins import load_features
 
     load_features(args.features)
     map_name(args)
@@ -342,7 +342,7 @@ async def _drive(
 
     Ctrl-C, or a source that fails, ends the drive, and what was mapped is kept.
     """
-    from client_sdk.slots import load_features
+    from client_sdk.plugins import load_features
 
     stop = asyncio.Event()
     with contextlib.suppress(NotImplementedError, ValueError, RuntimeError):  # not in the main thread

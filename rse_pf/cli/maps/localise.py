@@ -24,7 +24,7 @@ from rse_pf.terminal import at_work, show, show_json
 
 if TYPE_CHECKING:
     from client_sdk.datasets import Dataset
-    from client_sdk.slots import FeaturesSlot
+    from client_sdk.plugins import FeaturesPlugin
     from client_sdk.transfer.data_client import DataClient
     from rse_pf.slam.relative_pose import View
 
@@ -86,10 +86,10 @@ def localise_frames(args: argparse.Namespace, maps: MapRegistry) -> int:
         )
     if args.every < 1:
         raise UsageError(f"--every {args.every} is below 1", hint="1 takes every frame")
-    from client_sdk.slots import FeaturesSlot, load_features
+    from client_sdk.plugins import FeaturesPlugin, load_features
 
     features = load_features(args.features)
-    slot = None if features is None else FeaturesSlot(features)
+    plugin = None if features is None else FeaturesPlugin(features)
     name, _, version = args.name.partition("@")
     data = maps.data(name, version or "head")
     with at_work(f"reading {args.name}"):
@@ -97,7 +97,7 @@ def localise_frames(args: argparse.Namespace, maps: MapRegistry) -> int:
     frames = [each for word in args.frames for each in _frames(word, args.every)]
     found: list[dict[str, Any]] = []
     for each in frames:
-        reply = locate(index, _view_of(each, version_map, args.camera, slot))
+        reply = locate(index, _view_of(each, version_map, args.camera, plugin))
         found.append(_location_document(each.label, location_of(reply, version or "head")))
         if not args.json:
             show(_location_line(found[-1]))
@@ -239,7 +239,9 @@ def _frames(word: str, every: int) -> Iterator[_NamedFrame]:
         yield _NamedFrame(label=f"{path.name}:{row}", path=path, recording=recording, row=row)
 
 
-def _view_of(named: _NamedFrame, version: MapVersion, camera: str | None, slot: FeaturesSlot | None) -> View:
+def _view_of(
+    named: _NamedFrame, version: MapVersion, camera: str | None, plugin: FeaturesPlugin | None
+) -> View:
     from client_sdk.datasets import read_colour
     from client_sdk.frontend import Frame, FrontEndOptions, extract
     from rse_pf.slam.relative_pose import View
@@ -256,7 +258,7 @@ def _view_of(named: _NamedFrame, version: MapVersion, camera: str | None, slot: 
         )
         nothing = np.zeros((height, width), dtype=np.float32)
         frame = Frame(timestamp_s=0.0, rgb=rgb, depth_m=nothing, camera=lens)
-    features = extract(frame, FrontEndOptions(), slot)
+    features = extract(frame, FrontEndOptions(), plugin)
     check_same_kind(version.kind, features.kind, "the map")
     return View(camera=frame.camera, pixels=features.pixels, descriptors=features.descriptors)
 

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from client_sdk.frontend import FrontEndOptions
-from client_sdk.slots import load_features
+from client_sdk.plugins import load_features
 from client_sdk.tracking.monocular_tracker import MonocularOptions
 from rse_pf.config.validation import did_you_mean
 from rse_pf.errors import RsePfError, UsageError

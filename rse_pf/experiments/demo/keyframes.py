@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from client_sdk.frontend import FrontEndOptions, TrackedFrame, extract
-from client_sdk.slots import FeaturesFunction, FeaturesSlot
+from client_sdk.plugins import FeaturesFunction, FeaturesPlugin
 from client_sdk.transfer.background_upload import BackgroundUploader
 from client_sdk.transfer.data_client import DataClient
 from rse_pf.experiments.demo.merge import commit
@@ -79,7 +79,7 @@ class KeyframeCollector:
             uploads: Takes each keyframe, encoded as a map of one, and the map.
             features: Its features function; None for ORB.
         """
-        self._slot = None if features is None else FeaturesSlot(features)
+        self._plugin = None if features is None else FeaturesPlugin(features)
         self._robot = robot
         self._options = options
         self._uploads = uploads
@@ -92,7 +92,7 @@ class KeyframeCollector:
         """Add *tracked* if it is a keyframe."""
         if not tracked.keyframe or tracked.T_world_camera is None:
             return
-        features = extract(tracked.frame, self._options, self._slot)
+        features = extract(tracked.frame, self._options, self._plugin)
         keyframe = Keyframe(
             id=len(self._keyframes),
             robot=self._robot,

@@ -13,7 +13,7 @@ from client_sdk.frontend import Frame, TrackedFrame
 from client_sdk.live import LiveMapper, LiveOptions
 from client_sdk.live.monocular_odometry import MonocularOdometry
 from client_sdk.simulator.renderer import add_image_noise
-from client_sdk.tracking.monocular_tracker import SeenKeyframe
+from client_sdk.tracking.monocular_tracker import AdjustedKeyframe
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Array, exp_se3, inverse, pose_difference, scaled
 from rse_pf.maps.descriptors import ORB
@@ -172,7 +172,7 @@ class MovingTracker:
     """A tracker whose keyframes the test moves; one metre is ``unit`` units of length."""
 
     def __init__(self) -> None:
-        self.segment, self.unit = 0, 1.0
+        self.segment, self.length_factor = 0, 1.0
         self.joins: list[Any] = []
         self.loop_scales: list[float] = []
         self.poses: list[Array] = []
@@ -184,19 +184,20 @@ class MovingTracker:
     def keyframe_pose(self, number: int) -> Array:
         return self.poses[number]
 
-    def keyframe(self, number: int) -> SeenKeyframe:
+    def keyframe(self, number: int) -> AdjustedKeyframe:
         none = np.empty((0, 2))
         image = ImageFeatures(
-            pixels=none, descriptors=np.empty((0, 32), np.uint8), turns=none, sizes=none[:, 0],
-            distinct=none[:, 0],
+            pixels=none, descriptors=np.empty((0, 32), np.uint8), orientations=none, sizes=none[:, 0],
+            distinctiveness=none[:, 0],
         )  # fmt: skip
-        return SeenKeyframe(
-            timestamp_s=float(number), T_world_camera=self.poses[number], image=image, kind=ORB,
-            depths=np.array([2.0 * self.unit, np.nan]),
+        return AdjustedKeyframe(
+            timestamp_s=float(number), T_world_camera=self.poses[number], features=image, kind=ORB,
+            depths=np.array([2.0 * self.length_factor, np.nan]),
         )  # fmt: skip
 
     def rescale(self, scale: float) -> None:
-        self.poses, self.unit = [scaled(pose, scale) for pose in self.poses], self.unit * scale
+        self.poses = [scaled(pose, scale) for pose in self.poses]
+        self.length_factor *= scale
 
     def turn(self, T: Array) -> None:
         """Adjust all keyframes: they move together."""
@@ -211,7 +212,7 @@ def test_an_odometry_keeps_its_unit_and_its_sent_poses_through_adjustments() -> 
     tracker: Any = MovingTracker()
     odometry, sent = MonocularOdometry(tracker), []
     for number in range(8):
-        tracker.poses.append(scaled(at(number), tracker.unit))
+        tracker.poses.append(scaled(at(number), tracker.length_factor))
         if number == 3:
             tracker.rescale(0.2)
         if number == 5:
@@ -254,7 +255,7 @@ def test_an_older_segment_continues_with_its_next_keyframes() -> None:
     old = tracker.poses = [at(number) for number in range(5)]
     assert not odometry.start_if_broken()
     assert len(list(odometry.take_settled())) == 3
-    tracker.segment, tracker.poses, tracker.unit = 1, [at(0.0), at(1.0), at(2.0)], 7.0
+    tracker.segment, tracker.poses, tracker.length_factor = 1, [at(0.0), at(1.0), at(2.0)], 7.0
     assert odometry.start_if_broken()
     [(first, T_odom_camera)] = odometry.take_settled()
     assert first.timestamp_s == 0.0
@@ -263,7 +264,7 @@ def test_an_older_segment_continues_with_its_next_keyframes() -> None:
     np.testing.assert_allclose(odometry.pose_in_odometry(at(2.0)), at(2.0), atol=1e-9)
     assert not odometry.start_if_broken()
 
-    tracker.segment, tracker.poses, tracker.unit = 0, old, 1.0
+    tracker.segment, tracker.poses, tracker.length_factor = 0, old, 1.0
     assert odometry.start_if_broken()
     assert not list(odometry.take_settled())
     tracker.poses += [at(5.0), at(6.0), at(7.0)]

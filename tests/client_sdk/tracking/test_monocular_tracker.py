@@ -11,15 +11,15 @@ import pytest
 
 from client_sdk.datasets.rig_recordings import open_kitti
 from client_sdk.frontend import Frame, PoseQuery, TrackedFrame
-from client_sdk.tracking.keyframe_map import NO_LANDMARK
-from client_sdk.tracking.landmark_map import LandmarkMap, ViewFeatures
+from client_sdk.tracking.landmark_map import LandmarkMap, MonocularView
+from client_sdk.tracking.landmarks import NO_LANDMARK
 from client_sdk.tracking.monocular_tracker import MonocularOptions, MonocularTracker
-from client_sdk.tracking.place import place_of
+from client_sdk.tracking.place_recognition import make_place_vector
 from client_sdk.trajectory import Trajectory
 from rse_pf.errors import UsageError
 from rse_pf.experiments.results.trajectory_error import accuracy
 from rse_pf.geometry import Array, Camera, exp_se3, inverse, pose_difference, transform
-from rse_pf.slam.tracking import ImageFeatures, distinct_distances
+from rse_pf.slam.tracking import ImageFeatures, measure_distinctiveness
 from tests.client_sdk.mapper.flat_world import CAMERA, covered, foreign, frame_at
 from tests.client_sdk.tracking.driving import run, run_all, solve
 
@@ -151,7 +151,7 @@ def test_an_older_place_that_is_seen_again_moves_what_drifted_away_from_it() -> 
     run_all(tracker, (both(row) for row in range(45, 58)))
 
     assert tracker.loops == 1
-    assert tracker.unit == pytest.approx(tracker.loop_scales[0])
+    assert tracker.length_factor == pytest.approx(tracker.loop_scales[0])
     path = tracker.trajectory()
     assert path.positions[0] == pytest.approx(np.zeros(3), abs=2 * step_of)
     assert path.positions[-1, 0] < 30 * step_of  # and not 57
@@ -204,13 +204,15 @@ def map_of(poses: Array, world: Array) -> LandmarkMap:
     for pose in poses:
         pixels = CAMERA.project(transform(pose, world))
         image = ImageFeatures(
-            pixels=pixels, descriptors=descriptors, turns=np.tile([1.0, 0.0], (len(world), 1)),
-            sizes=np.ones(len(world)), distinct=distinct_distances(descriptors, pixels),
+            pixels=pixels, descriptors=descriptors, orientations=np.tile([1.0, 0.0], (len(world), 1)),
+            sizes=np.ones(len(world)), distinctiveness=measure_distinctiveness(descriptors, pixels),
         )  # fmt: skip
         colours = np.zeros((len(world), 3), dtype=np.uint8)
-        place = place_of(image.descriptors, np.empty((0, 0, 3), dtype=np.uint8), None)
+        place = make_place_vector(image.descriptors, np.empty((0, 0, 3), dtype=np.uint8), None)
         made.add_keyframe(
-            ViewFeatures(image=image, colours=colours, place=place), pose, np.full(len(world), NO_LANDMARK)
+            MonocularView(features=image, colours=colours, place_vector=place),
+            pose,
+            np.full(len(world), NO_LANDMARK),
         )
     rows = np.arange(len(world))
     made.add_landmarks(world, (0, rows), (1, rows))
@@ -231,7 +233,7 @@ def test_a_map_that_moves_sees_its_points_at_the_same_pixels() -> None:
 
     for keyframe in made.keyframes:
         seen = CAMERA.project(transform(keyframe.T_camera_world, made.points))
-        np.testing.assert_allclose(seen, keyframe.features.image.pixels, atol=1e-6)
+        np.testing.assert_allclose(seen, keyframe.view.features.pixels, atol=1e-6)
 
 
 def test_a_map_is_bent_by_all_at_its_newer_end_and_by_nothing_at_its_older_one() -> None:
@@ -261,8 +263,8 @@ def test_two_landmarks_at_one_feature_become_one_that_all_keyframes_see() -> Non
     count = made.fuse(3, made.landmarks_of(0), 3.0)
 
     assert count > 50
-    assert len(made) == 2 * len(world) - count
-    assert made.shared_with(2)[0] == made.shared_with(3)[0] == count
+    assert made.landmark_count == 2 * len(world) - count
+    assert made.count_shared_landmarks(2)[0] == made.count_shared_landmarks(3)[0] == count
 
 
 def test_new_landmarks_are_found_near_and_far_by_the_depths_of_those_around_them() -> None:

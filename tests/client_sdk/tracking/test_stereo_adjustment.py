@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from client_sdk.stereo.depth import with_offset
-from client_sdk.tracking.keyframe_map import NO_LANDMARK, KeyframeMap, View
-from client_sdk.tracking.place import Place
+from client_sdk.tracking.keyframe_map import KeyframeMap, View
+from client_sdk.tracking.landmarks import NO_LANDMARK
+from client_sdk.tracking.place_recognition import LazyPlaceVector
 from client_sdk.tracking.stereo_adjustment import adjust_stereo
 from rse_pf.geometry import Array, Camera, exp_se3, inverse, transform
 from rse_pf.slam.stereo import stereo_noise
@@ -33,17 +34,21 @@ def drive(offset_px: float, keyframes: int = 8, noise_px: float = 0.05) -> tuple
         disparities = F_BASELINE / seen[:, 2] - offset_px + rng.normal(0.0, noise_px, len(points))
         features = ImageFeatures(
             pixels=pixels, descriptors=np.zeros((len(points), 32), dtype=np.uint8),
-            turns=np.tile([1.0, 0.0], (len(points), 1)), sizes=np.ones(len(points)),
-            distinct=np.zeros(len(points), dtype=np.int32),
+            orientations=np.tile([1.0, 0.0], (len(points), 1)), sizes=np.ones(len(points)),
+            distinctiveness=np.zeros(len(points), dtype=np.int32),
         )  # fmt: skip
         view = View(
-            features=features, points_camera=CAMERA.back_project(pixels, F_BASELINE / disparities),
-            sways=np.zeros((len(points), 3)), camera=CAMERA, place=Place(lambda: np.ones(4, np.float32)),
-            is_stereo=True, timestamp_s=0.5 * number,
-        )  # fmt: skip
+            features=features,
+            points_camera=CAMERA.back_project(pixels, F_BASELINE / disparities),
+            shutter_displacements=np.zeros((len(points), 3)),
+            camera=CAMERA,
+            place_vector=LazyPlaceVector(lambda: np.ones(4, np.float32)),
+            is_stereo=True,
+            timestamp_s=0.5 * number,
+        )
         tracked = T.copy()
         tracked[:3, 3] *= SCALE
-        landmarks = known.add_keyframe(view, tracked, landmarks, stereo_noise(F_BASELINE, 0.1), 1.0)
+        landmarks = known.add_keyframe(view, tracked, landmarks, stereo_noise(F_BASELINE, 0.1))
     return known, truth, points
 
 
@@ -56,9 +61,9 @@ def test_the_offset_of_disparities_and_the_metres_are_found(offset_px: float) ->
     assert found is not None
     assert found.offset_px == pytest.approx(offset_px, abs=4.0 * found.deviation_px + 0.01)
     assert found.deviation_px < 0.05
-    poses = np.array([known.pose(row) for row in range(len(known))])
+    poses = np.array([known.pose(row) for row in range(known.keyframe_count)])
     assert np.abs(poses[:, :3, 3] - truth[:, :3, 3]).max() < 0.01  # 4 cm before
-    landmarks = known.landmarks_of(list(range(len(known)))).points
+    landmarks = known.landmarks_seen_by(list(range(known.keyframe_count))).points
     assert np.median(np.linalg.norm(landmarks - points, axis=1) / points[:, 2]) < 0.03
     measured = known.view(3).points_camera[:, 2]
     expected = transform(inverse(truth[3]), points)[:, 2]
@@ -100,7 +105,7 @@ def test_a_good_calibration_moves_nothing() -> None:
 @pytest.mark.parametrize("offset_px", [OFFSET_PX, -OFFSET_PX])
 def test_what_an_offset_costs_is_what_the_path_moves_by(offset_px: float) -> None:
     known, _, _ = drive(offset_px)
-    tracked = np.array([known.pose(row) for row in range(len(known))])[:, :3, 3]
+    tracked = np.array([known.pose(row) for row in range(known.keyframe_count)])[:, :3, 3]
 
     found = adjust_stereo(known, F_BASELINE)
 

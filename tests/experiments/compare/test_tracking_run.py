@@ -106,7 +106,7 @@ def test_depth_that_is_asked_for_and_missing_is_refused() -> None:
 
 OWN = """
 import cv2
-from client_sdk.slots import FoundFeatures
+from client_sdk.plugins import FoundFeatures
 
 def features(rgb):
     points, descriptors = cv2.ORB_create(700).detectAndCompute(rgb, None)

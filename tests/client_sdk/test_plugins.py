@@ -16,16 +16,16 @@ from client_sdk.commands.answer_types import PoseAnswer
 from client_sdk.frontend import FrontEndOptions, PoseQuery, TrackedFrame, describe
 from client_sdk.mapper import Mapper
 from client_sdk.monocular.bundle import Bundle, adjust
-from client_sdk.slots import (
-    FeaturesSlot,
+from client_sdk.plugins import (
+    FeaturesPlugin,
     FoundFeatures,
-    LoopsSlot,
-    OptimiserSlot,
-    Slots,
+    LoopsPlugin,
+    OptimiserPlugin,
+    Plugins,
     load_features,
     load_function,
 )
-from client_sdk.tracking.place import place_of
+from client_sdk.tracking.place_recognition import make_place_vector
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Camera, exp_se3
 from rse_pf.maps.descriptors import ORB, DescriptorKind
@@ -45,12 +45,12 @@ def found(n: int = 6, **other: Any) -> FoundFeatures:
     return FoundFeatures(**fields)
 
 
-def slot_of(result: Any, name: str = "mine") -> FeaturesSlot:
+def plugin_of(result: Any, name: str = "mine") -> FeaturesPlugin:
     def function(_: npt.NDArray[np.uint8]) -> Any:
         return result
 
     function.__name__ = name
-    return FeaturesSlot(function)
+    return FeaturesPlugin(function)
 
 
 def orb_by_hand(rgb: npt.NDArray[np.uint8]) -> FoundFeatures:
@@ -59,7 +59,7 @@ def orb_by_hand(rgb: npt.NDArray[np.uint8]) -> FoundFeatures:
     points, descriptors = cv2.ORB_create(1500).detectAndCompute(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), None)
     return FoundFeatures(
         pixels=cv2.KeyPoint_convert(points), scores=[p.response for p in points], descriptors=descriptors,
-        turns_deg=[p.angle for p in points], sizes=[1.2**p.octave for p in points],
+        orientations_deg=[p.angle for p in points], sizes=[1.2**p.octave for p in points],
     )  # fmt: skip
 
 
@@ -74,19 +74,23 @@ def sift(rgb: npt.NDArray[np.uint8]) -> FoundFeatures:
 
 
 def test_features_come_back_best_first() -> None:
-    slot = slot_of(found(scores=[0.1, 0.9, 0.5, 0.2, 0.3, 0.4]))
+    plugin = plugin_of(found(scores=[0.1, 0.9, 0.5, 0.2, 0.3, 0.4]))
 
-    features = slot(IMAGE)
+    features = plugin(IMAGE)
 
     assert features.scores.tolist() == [0.9, 0.5, 0.4, 0.3, 0.2, 0.1]
     assert np.array_equal(features.pixels[0], np.asarray(found().pixels)[1])
-    assert (slot.kind, slot.is_oriented, slot.is_scaled) == (DescriptorKind("mine", "int8", 64), False, False)
+    assert (plugin.kind, plugin.is_oriented, plugin.is_scaled) == (
+        DescriptorKind("mine", "int8", 64),
+        False,
+        False,
+    )
 
 
 def test_floats_become_int8_of_one_length_and_keep_their_angles() -> None:
     vectors = np.abs(np.random.default_rng(1).standard_normal((50, 128))) * np.linspace(1, 90, 50)[:, None]
 
-    short = slot_of(found(50, descriptors=vectors, scores=np.arange(50)[::-1]))(IMAGE).descriptors
+    short = plugin_of(found(50, descriptors=vectors, scores=np.arange(50)[::-1]))(IMAGE).descriptors
 
     assert short.dtype == np.int8
     lengths = np.linalg.norm(short.astype(float), axis=1)
@@ -100,10 +104,10 @@ def test_floats_become_int8_of_one_length_and_keep_their_angles() -> None:
 def test_bytes_stay_as_they_are(dtype: type) -> None:
     bytes_ = np.random.default_rng(1).integers(0, 100, (6, 40)).astype(dtype)
 
-    slot = slot_of(found(descriptors=bytes_, scores=np.arange(6)[::-1]))
+    plugin = plugin_of(found(descriptors=bytes_, scores=np.arange(6)[::-1]))
 
-    assert np.array_equal(slot(IMAGE).descriptors, bytes_)
-    assert slot.kind == DescriptorKind("mine", np.dtype(dtype).name, 40)
+    assert np.array_equal(plugin(IMAGE).descriptors, bytes_)
+    assert plugin.kind == DescriptorKind("mine", np.dtype(dtype).name, 40)
 
 
 HOSTILE: dict[str, tuple[Any, str]] = {
@@ -128,16 +132,19 @@ HOSTILE: dict[str, tuple[Any, str]] = {
     "NaN": (found(descriptors=np.full((6, 64), np.nan)), "descriptors that are not finite"),
     "infinite": (found(descriptors=np.full((6, 64), np.inf)), "descriptors that are not finite"),
     "zero": (found(descriptors=np.zeros((6, 64))), "not finite, or zero"),
-    "turns of another number": (found(turns_deg=[0.0]), "turns_deg of shape"),
-    "turns that are not finite": (found(turns_deg=[np.nan] * 6), "turns_deg that are not finite"),
+    "orientations of another number": (found(orientations_deg=[0.0]), "orientations_deg of shape"),
+    "orientations that are not finite": (
+        found(orientations_deg=[np.nan] * 6),
+        "orientations_deg that are not",
+    ),
     "sizes of zero": (found(sizes=np.zeros(6)), "sizes that are not above 0"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize(("result", "why"), HOSTILE.values(), ids=HOSTILE)
 def test_what_cannot_be_features_is_refused_in_one_line(result: Any, why: str) -> None:
     with pytest.raises(UsageError, match=f"the features function mine {why}|{why}") as refused:
-        slot_of(result)(IMAGE)
+        plugin_of(result)(IMAGE)
     assert refused.value.hint
     assert "\n" not in refused.value.message
 
@@ -146,9 +153,9 @@ def test_a_function_that_fails_is_named_with_its_error() -> None:
     def broken(_: npt.NDArray[np.uint8]) -> FoundFeatures:
         raise ZeroDivisionError("by\nzero")
 
-    where = r"by zero \(test_slots.py, line \d+\)"
+    where = r"by zero \(test_plugins.py, line \d+\)"
     with pytest.raises(UsageError, match=f"broken failed: ZeroDivisionError: {where}") as refused:
-        FeaturesSlot(broken)(IMAGE)
+        FeaturesPlugin(broken)(IMAGE)
     assert "\n" not in refused.value.message
     assert isinstance(refused.value.__cause__, ZeroDivisionError)
 
@@ -159,34 +166,34 @@ def test_the_kind_must_not_change_on_the_way() -> None:
     def changing(_: npt.NDArray[np.uint8]) -> FoundFeatures:
         return results.pop(0)
 
-    slot = FeaturesSlot(changing)
-    slot(IMAGE)
-    assert len(slot(IMAGE).pixels) == 0
+    plugin = FeaturesPlugin(changing)
+    plugin(IMAGE)
+    assert len(plugin(IMAGE).pixels) == 0
     with pytest.raises(UsageError, match=r"returned changing \(32 bytes\) after changing \(64 dimensions\)"):
-        slot(IMAGE)
+        plugin(IMAGE)
 
 
 @pytest.mark.parametrize("name", ["<lambda>", "a b", "x" * 33, "orb", "ORB"])
 def test_a_function_needs_a_name_that_features_can_have(name: str) -> None:
     with pytest.raises(UsageError, match="name"):
-        slot_of(found(), name)
+        plugin_of(found(), name)
     with pytest.raises(UsageError, match="takes a function, not a int"):
-        FeaturesSlot(3)  # type: ignore[arg-type]
+        FeaturesPlugin(3)  # type: ignore[arg-type]
 
 
 def test_features_are_spread_and_the_strongest_are_kept() -> None:
     pixels = np.concatenate([np.full((50, 2), 10.0), [[500.0, 300.0]]])
-    slot = slot_of(
+    plugin = plugin_of(
         found(51, pixels=pixels, scores=np.linspace(1.0, 0.1, 51), descriptors=np.ones((51, 8), np.uint8))
     )
 
-    spread = describe(IMAGE, 10, slot=slot)
-    strongest = describe(IMAGE, 10, is_spread=False, slot=slot)
+    spread = describe(IMAGE, 10, plugin=plugin)
+    strongest = describe(IMAGE, 10, is_spread=False, plugin=plugin)
 
     assert len(spread.pixels) == len(strongest.pixels) == 10
     assert [500.0, 300.0] in spread.pixels.tolist()
     assert [500.0, 300.0] not in strongest.pixels.tolist()
-    assert spread.kind == slot.kind
+    assert spread.kind == plugin.kind
 
 
 @pytest.mark.parametrize("function", [orb_by_hand, sift])
@@ -322,10 +329,10 @@ def test_the_place_of_an_image_is_computed_once() -> None:
         calls.append(len(rgb))
         return np.ones(16)
 
-    place = place_of(ORB.empty(), IMAGE, LoopsSlot(loops))
+    place = make_place_vector(ORB.empty(), IMAGE, LoopsPlugin(loops))
 
     assert calls == []
-    assert np.array_equal(place.vector(), place.vector())
+    assert np.array_equal(place.get(), place.get())
     assert calls == [480]
 
 
@@ -341,10 +348,10 @@ def test_the_place_of_an_image_is_computed_once() -> None:
 )
 def test_what_is_no_place_is_refused(returned: Any, why: str) -> None:
     with pytest.raises(UsageError, match=why) as refused:
-        LoopsSlot(lambda _: returned)(IMAGE)
+        LoopsPlugin(lambda _: returned)(IMAGE)
     assert "\n" not in refused.value.message
     sizes = [64, 65]
-    changing = LoopsSlot(lambda _: np.ones(sizes.pop(0)))
+    changing = LoopsPlugin(lambda _: np.ones(sizes.pop(0)))
     assert float(np.linalg.norm(changing(IMAGE))) == pytest.approx(1.0)
     with pytest.raises(UsageError, match="65 numbers"):
         changing(IMAGE)
@@ -383,14 +390,14 @@ def test_an_optimiser_must_return_all_poses_and_points(returned: Any, why: str) 
         pixels=np.zeros((0, 2)), sigma_px=np.zeros(0),
     )  # fmt: skip
     with pytest.raises(UsageError, match=why) as refused:
-        OptimiserSlot(lambda *_: returned)(bundle, frame_at(0, depth=True).camera)
+        OptimiserPlugin(lambda *_: returned)(bundle, frame_at(0, depth=True).camera)
     assert "\n" not in refused.value.message
 
 
-def test_only_functions_are_slots() -> None:
-    for slot in ("motion", "loops", "optimiser"):
-        with pytest.raises(UsageError, match=f"{slot}= takes a function, not a int"):
-            Slots.of(**{slot: 3})  # type: ignore[arg-type]
+def test_only_functions_are_plugins() -> None:
+    for plugin in ("motion", "loops", "optimiser"):
+        with pytest.raises(UsageError, match=f"{plugin}= takes a function, not a int"):
+            Plugins.wrap(**{plugin: 3})  # type: ignore[arg-type]
 
 
 # --- names on the command line -----------------------------------------------------------------
@@ -442,4 +449,4 @@ def test_a_function_that_raises_what_would_end_a_task_or_a_thread_is_named(error
         raise error
 
     with pytest.raises(UsageError, match="the features function features failed"):
-        FeaturesSlot(features)(np.zeros((48, 64, 3), np.uint8))
+        FeaturesPlugin(features)(np.zeros((48, 64, 3), np.uint8))

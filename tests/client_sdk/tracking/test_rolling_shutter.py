@@ -7,11 +7,16 @@ import pytest
 
 from client_sdk.frontend import Features, Frame, FrontEndOptions
 from client_sdk.tracking import tracker as tracker_module
-from client_sdk.tracking.shutter import ReadoutEstimate, sways, turn_rate, without_shutter
+from client_sdk.tracking.rolling_shutter import (
+    ReadoutEstimate,
+    rotation_rate,
+    shutter_displacements,
+    undo_rolling_shutter,
+)
 from client_sdk.tracking.tracker import Tracker
 from rse_pf.geometry import Array, exp_se3, inverse, pose_difference, transform
 from rse_pf.pnp.problems import KINECT
-from rse_pf.slam.tracking import Observations, fit_sway
+from rse_pf.slam.tracking import Observations, fit_readout_change
 from tests.client_sdk.tracking.driving import run
 
 READOUT_S, INTERVAL_S = 0.03, 1.0 / 30.0
@@ -48,9 +53,12 @@ class Room:
         pixels = pixels[rows] + 0.3 * self.rng.normal(size=(len(rows), 2))
         depth_m = local[rows, 2] + 0.004 * self.rng.normal(size=len(rows))
         return Features(
-            pixels=pixels, descriptors=self.descriptors[rows], sizes=np.ones(len(rows)),
-            points_camera=KINECT.back_project(pixels, depth_m), turns=np.tile([1.0, 0.0], (len(rows), 1)),
-        )  # fmt: skip
+            pixels=pixels,
+            descriptors=self.descriptors[rows],
+            sizes=np.ones(len(rows)),
+            points_camera=KINECT.back_project(pixels, depth_m),
+            orientations=np.tile([1.0, 0.0], (len(rows), 1)),
+        )
 
 
 def drive(monkeypatch: pytest.MonkeyPatch, readout_s: float, frames: int) -> tuple[Tracker, list[Array]]:
@@ -64,7 +72,7 @@ def drive(monkeypatch: pytest.MonkeyPatch, readout_s: float, frames: int) -> tup
 def track(monkeypatch: pytest.MonkeyPatch, tracker: Tracker, number: int, features: Features) -> Array:
     """Track the image that shows the features; return its pose."""
 
-    def extract(frame: Frame, options: FrontEndOptions, slot: object = None) -> Features:
+    def extract(frame: Frame, options: FrontEndOptions, plugin: object = None) -> Features:
         return features
 
     monkeypatch.setattr(tracker_module, "extract", extract)
@@ -87,18 +95,20 @@ def test_features_of_a_turning_camera_are_where_a_global_shutter_shows_them() ->
     true = np.einsum("nij,nj->ni", turns[:, :3, :3], read)
     raw = Features(
         pixels=pixels, descriptors=np.zeros((200, 32), np.uint8), points_camera=read,
-        turns=np.ones((200, 2)), sizes=np.ones(200),
+        orientations=np.ones((200, 2)), sizes=np.ones(200),
     )  # fmt: skip
 
-    corrected = without_shutter(raw, KINECT, READOUT_S * RATE)
+    corrected = undo_rolling_shutter(raw, KINECT, READOUT_S * RATE)
 
     np.testing.assert_allclose(corrected.points_camera, true, atol=1e-5)
     np.testing.assert_allclose(corrected.pixels, KINECT.project(true), atol=1e-2)
     assert np.abs(corrected.pixels - pixels).max() > 5.0
-    assert without_shutter(raw, KINECT, np.zeros(3)) is raw
-    longer = without_shutter(raw, KINECT, (READOUT_S + 1e-3) * RATE).points_camera - corrected.points_camera
+    assert undo_rolling_shutter(raw, KINECT, np.zeros(3)) is raw
+    longer = (
+        undo_rolling_shutter(raw, KINECT, (READOUT_S + 1e-3) * RATE).points_camera - corrected.points_camera
+    )
     np.testing.assert_allclose(
-        longer, 1e-3 * sways(raw, corrected.points_camera, KINECT, RATE), atol=1e-6
+        longer, 1e-3 * shutter_displacements(raw, corrected.points_camera, KINECT, RATE), atol=1e-6
     )  # fmt: skip
 
 
@@ -106,8 +116,8 @@ def test_the_rate_is_that_in_the_second_pose() -> None:
     def turned(angle: float) -> Array:
         return exp_se3([1.0, 2.0, 3.0, 0.0, angle, 0.0])
 
-    steady = turn_rate(turned(0.3), turned(0.5), 0.1, np.zeros(3))
-    faster = turn_rate(turned(0.3), turned(0.5), 0.1, np.array([0.0, 1.0, 0.0]))
+    steady = rotation_rate(turned(0.3), turned(0.5), 0.1, np.zeros(3))
+    faster = rotation_rate(turned(0.3), turned(0.5), 0.1, np.array([0.0, 1.0, 0.0]))
 
     np.testing.assert_allclose(steady, [0.0, 2.0, 0.0], atol=1e-12)
     np.testing.assert_allclose(faster, [0.0, 2.5, 0.0], atol=1e-12)
@@ -120,31 +130,34 @@ def test_the_sway_that_was_planted_is_measured_beside_the_pose(planted_s: float)
     motions = ((KINECT.project(points)[:, 1] - 239.5) / 480.0)[:, None] * np.cross(RATE, points)
     shown = transform(exp_se3([0.004, -0.002, 0.003, 0.002, 0.001, -0.003]), points + planted_s * motions)
     observed = Observations(
-        points=points, spreads=np.tile(1e-6 * np.eye(3), (150, 1, 1)),
-        pixels=KINECT.project(shown) + 0.3 * rng.normal(size=(150, 2)), pixels_px=np.ones(150),
-        depths_m=shown[:, 2], depths_dev_m=np.full(150, 0.01),
+        points=points, covariances=np.tile(1e-6 * np.eye(3), (150, 1, 1)),
+        pixels=KINECT.project(shown) + 0.3 * rng.normal(size=(150, 2)), pixel_sigmas_px=np.ones(150),
+        depths_m=shown[:, 2], depth_sigmas_m=np.full(150, 0.01),
     )  # fmt: skip
 
-    measured_s, information = fit_sway(observed, motions, KINECT, np.eye(4))
+    measured_s, information = fit_readout_change(observed, motions, KINECT, np.eye(4))
 
     assert abs(measured_s - planted_s) < 0.002
     assert 1e5 < information < 1e8
-    assert fit_sway(observed, np.tile([0.1, 0.0, 0.2], (150, 1)), KINECT, np.eye(4)) == (0.0, 0.0)  # a motion
+    assert fit_readout_change(observed, np.tile([0.1, 0.0, 0.2], (150, 1)), KINECT, np.eye(4)) == (
+        0.0,
+        0.0,
+    )  # a motion
 
 
 def test_the_estimate_is_within_what_cameras_have_and_ignores_a_camera_that_stands() -> None:
     estimate = ReadoutEstimate()
 
-    assert estimate.add(0.03, 1e6, np.full(3, 1e-3)) == 0.0
-    assert estimate.add(0.03, 0.0, RATE) == 0.0
+    assert estimate.update(0.03, 1e6, np.full(3, 1e-3)) == 0.0
+    assert estimate.update(0.03, 0.0, RATE) == 0.0
     for _ in range(50):
-        estimate.add(0.03 - estimate.readout_s, 1e6, RATE)
+        estimate.update(0.03 - estimate.readout_s, 1e6, RATE)
     assert abs(estimate.readout_s - 0.03) < 0.001
     for _ in range(500):
-        estimate.add(-0.1, 1e6, RATE)
+        estimate.update(-0.1, 1e6, RATE)
     assert estimate.readout_s == 0.0
     for _ in range(500):
-        estimate.add(0.1, 1e6, RATE)
+        estimate.update(0.1, 1e6, RATE)
     assert estimate.readout_s == 0.05
 
 
@@ -173,4 +186,4 @@ def test_a_cut_in_a_video_is_no_turn(monkeypatch: pytest.MonkeyPatch) -> None:
     _, apart_deg = pose_difference(pose, inverse(first) @ now)
     assert pose_difference(inverse(first) @ now, np.eye(4))[1] > 15.0
     assert apart_deg < 1.0
-    assert not tracker._rate.any()
+    assert not tracker._state.rotation_rate.any()

@@ -1,0 +1,160 @@
+"""Pose queries of a tracker: made of matches, answered elsewhere, one open at a time.
+
+The steps of a frame are a generator that yields queries and is sent their answers.  The trackers decide what
+is asked, and what follows from an answer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from dataclasses import dataclass
+from typing import Literal, Protocol
+
+import numpy as np
+
+from client_sdk.frontend import Correspondences, Frame, PoseQuery, TrackedFrame, round_for_wire
+from client_sdk.tracking.landmarks import Matches
+from rse_pf.errors import UsageError
+from rse_pf.geometry import Array, inverse, rigid, transform
+from rse_pf.pnp import DepthNoise
+from rse_pf.slam.tracking import ImageFeatures
+
+__all__ = ["CLEAR_INLIERS", "FrameSteps", "OpenQuery", "QueryAnswer", "make_query"]
+
+CLEAR_INLIERS = 40
+"""Fewest inliers of an answer that recognises a place which the camera did not see just before."""
+_CLEAR_RATIO = 0.5
+"""Smallest share of inliers among the matches of such an answer: perceptual aliases have fewer."""
+_MIN_REFERENCE_DEPTH_M = 0.01
+"""Depths are sent only if all points are farther from the reference camera than this, in metres."""
+
+
+@dataclass(frozen=True, slots=True)
+class QueryAnswer:
+    """The answer to a pose query.
+
+    Attributes:
+        T_camera_world: ``(4, 4)``, pose of the camera in the query's world; None if there is no pose.
+        inliers: Number of correspondences that agree with the pose.
+        is_weak: Whether the solver calls the evidence for the pose weak.
+    """
+
+    T_camera_world: Array | None
+    inliers: int
+    is_weak: bool
+
+    def accepted_pose(self, min_inliers: float) -> Array | None:
+        """Return the pose with a true rotation; None if fewer than *min_inliers* agree, or it is not
+        rigid."""
+        if self.T_camera_world is None or self.inliers < min_inliers:
+            return None
+        return rigid(self.T_camera_world)
+
+    def is_clear(self, match_count: int) -> bool:
+        """Return whether the answer alone proves a place: enough of its *match_count* matches are inliers."""
+        return not self.is_weak and self.inliers >= max(CLEAR_INLIERS, _CLEAR_RATIO * match_count)
+
+
+FrameSteps = Generator[PoseQuery, QueryAnswer, TrackedFrame]
+
+
+class _QueryOptions(Protocol):
+    """The options of a tracker that its queries need."""
+
+    @property
+    def inlier_px(self) -> float: ...
+    @property
+    def max_iterations(self) -> int: ...
+
+
+def make_query(
+    frame: Frame,
+    matches: Matches,
+    image: ImageFeatures,
+    options: _QueryOptions,
+    *,
+    max_matches: int,
+    against: Literal["map", "frame", "keyframe", "segment"],
+    T_world_reference: Array | None = None,
+    depths_m: Array | None = None,
+    depth_noise: DepthNoise | None = None,
+) -> PoseQuery:
+    """Make the query for the pose of a frame from its matches.
+
+    Args:
+        frame: The frame whose pose is asked for.
+        matches: Landmarks that the frame shows.
+        image: Features of the frame.
+        options: Options of the tracker.
+        max_matches: Largest number of matches that are sent; an even sample is taken of more.
+        against: The source of the landmarks, see `PoseQuery`.
+        T_world_reference: ``(4, 4)``, pose of the reference camera, in whose frame points are sent; None
+            sends them in the frame of the map.
+        depths_m: ``(n,)``, depths of the features of *image*, NaN where there is none; None for no depths.
+        depth_noise: Noise model of the depths; None for a Kinect's.
+    """
+    rows = np.arange(len(matches))
+    if len(rows) > max_matches:
+        rows = np.linspace(0, len(rows) - 1, max_matches).astype(np.int64)
+    # From left to right: neighbours share digits, so that the message compresses better.
+    rows = rows[np.argsort(image.pixels[matches.features[rows], 0], kind="stable")]
+    features, points = matches.features[rows], matches.landmarks.points[rows]
+    if T_world_reference is not None:
+        points = transform(inverse(T_world_reference), points)
+    points, pixels = round_for_wire(points, image.pixels[features])
+    sent_depths_m = np.zeros(len(points))
+    # The solver compares depths with those of the reference camera, so all points must lie before that
+    # camera.
+    if depths_m is not None and not (len(points) and points[:, 2].min() <= _MIN_REFERENCE_DEPTH_M):
+        sent_depths_m = np.nan_to_num(depths_m[features], posinf=0.0, neginf=0.0).round(3)
+    return PoseQuery(
+        timestamp_s=frame.timestamp_s,
+        correspondences=Correspondences(points_world=points, pixels=pixels, depths_m=sent_depths_m),
+        camera=frame.camera,
+        inlier_px=options.inlier_px,
+        max_iterations=options.max_iterations,
+        against=against,
+        depth_noise=depth_noise,
+    )
+
+
+class OpenQuery:
+    """The steps of the present frame, and the query that waits for its answer."""
+
+    def __init__(self) -> None:
+        self._steps: FrameSteps | None = None
+        self._query: PoseQuery | None = None
+
+    def refuse_open(self) -> None:
+        """Raise UsageError if a query waits for its answer."""
+        if self._query is not None:
+            raise UsageError(
+                f"the query of frame {self._query.timestamp_s:.3f} s is open",
+                hint="call accept with its answer, or with None",
+            )
+
+    def begin(self, steps: FrameSteps) -> PoseQuery | TrackedFrame:
+        """Run the steps of a frame up to the first query, which is returned; or return the frame's result."""
+        self._steps = steps
+        return self._advance(None)
+
+    def answer(self, query: PoseQuery, answer: QueryAnswer) -> PoseQuery | TrackedFrame:
+        """Run the steps with the answer to *query* up to the next query or the frame's result.
+
+        Raises:
+            UsageError: *query* is not the one that waits.
+        """
+        if query is not self._query:
+            raise UsageError("this query is not the open one", hint="answer each query once, in order")
+        self._query = None
+        return self._advance(answer)
+
+    def _advance(self, answer: QueryAnswer | None) -> PoseQuery | TrackedFrame:
+        assert self._steps is not None
+        try:
+            self._query = next(self._steps) if answer is None else self._steps.send(answer)
+        except StopIteration as end:
+            self._steps = None
+            result: TrackedFrame = end.value
+            return result
+        return self._query

@@ -1,0 +1,25 @@
+"""The result of joining two segments of a drive."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from rse_pf.geometry import Array
+
+__all__ = ["NOT_JOINED", "Join"]
+
+NOT_JOINED = "in a segment that is not joined to the first one yet"
+"""Reason in the result of a frame whose pose is not in the frame of the first segment."""
+
+
+@dataclass(frozen=True, slots=True)
+class Join:
+    """A segment became part of another one: poses of *segment* are ``T_into_segment @ pose`` in *into*.
+
+    Of a camera without depth, all lengths of *segment* are multiplied by *scale* before.
+    """
+
+    segment: int
+    into: int
+    T_into_segment: Array
+    scale: float = 1.0
