@@ -54,7 +54,7 @@ _FLOOR_SHARE = 0.3
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GridOptions:
-    """Say which points of a map are floor and which are obstacles.
+    """Limits that say which points of a map are floor and which are obstacles.
 
     Attributes:
         resolution_m: Length of a cell's edge.
@@ -99,7 +99,7 @@ class GridOptions:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class OccupancyGrid:
-    """Hold the floor plan of a map.
+    """The floor plan of a map.
 
     Attributes:
         cells: ``(h, w)`` uint8, `OCCUPIED`, `UNKNOWN` or `FREE`; row 0 has the lowest y, column 0 the

@@ -59,13 +59,13 @@ UP = (0.0, 0.0, 1.0)
 """Value of the provenance field ``up`` in a map whose world was rotated so that its z axis points up."""
 
 _MAGIC = b"RSEMAP1\n"  # the first bytes of a map file, with the version of the format
-_MAX_BYTES = 1 << 30  # size of a decompressed map: 1 GiB
+_MAX_BYTES = 1 << 30  # largest size of a decompressed map file: 1 GiB
 _MAX_COMPRESSION_RATIO = 50.0
 """Decompressed size of a map over its compressed size; features and point clouds only compress to half their
 size, so that a larger ratio means an empty or a hostile map."""
-_UNCHECKED_BYTES = 1 << 20  # decompressed size up to which the compression ratio is not limited
+_UNCHECKED_BYTES = 1 << 20  # size of a decompressed map file up to which its compression ratio is not limited
 _MAX_ID = 2**63 - 1  # the largest id of a keyframe: an int64
-_MAX_NAME_LENGTH = 64  # characters of the name of a keyframe's robot
+_MAX_NAME_LENGTH = 64  # largest number of characters of the name of a keyframe's robot
 _MAX_COORDINATE_M = (
     1e9  # largest coordinate of a map's points in metres; larger ones overflow in later computations
 )
@@ -79,7 +79,7 @@ _MAX_INFORMATION = (
 _ITEM_VALUES = {"keyframes": 100, "edges": 40}
 """MessagePack values that one keyframe or one edge may have: more than today, so that fields can be added."""
 _OTHER_FIELD_VALUES = (
-    1000  # MessagePack values in any other field of a map file, such as one of a later release
+    1000  # MessagePack values that a field of a map file may have which this release does not know
 )
 _UNSAFE_IN_FILE_NAMES = re.compile(r"[^A-Za-z0-9._-]+")
 
@@ -161,7 +161,7 @@ class Keyframe:
                 hint="leave this keyframe out",
             )
         pose = _checked_pose(f"keyframe {self.id}", self.T_world_camera)
-        object.__setattr__(self, "T_world_camera", pose)  # This class is frozen.
+        object.__setattr__(self, "T_world_camera", pose)  # A frozen dataclass allows no other way.
 
     @property
     def image_name(self) -> str:
@@ -422,8 +422,9 @@ def _check_fields(content: bytes | bytearray, limits: MapLimits) -> None:
         begin, offset = offset, measure_msgpack(content, offset, _field_budget(name, items))
         if name == "provenance" and offset - begin > PROVENANCE.wire_bytes:
             raise LimitExceeded(
-                f"a provenance of {offset - begin} bytes is above {PROVENANCE.wire_bytes}",
-                hint="leave it out",
+                f"the provenance of the map has {offset - begin} bytes, which is above "
+                f"{PROVENANCE.wire_bytes}",
+                hint="leave fields of the provenance out",
             )
 
 

@@ -46,7 +46,7 @@ class Mark:
     """A mark in the store.
 
     Attributes:
-        name: Name of its object.
+        name: Name of the object in the store.
         kind: `HELD` or `REMOVING`.
         digest: The sha256 of the marked bytes.
         set_s: When it was set, Unix seconds.
@@ -129,7 +129,7 @@ def choose_superseded(
     Args:
         records: All versions of a map.
         head: Id of the head.
-        keep: The number of counted versions that stay besides the head.
+        keep: The number of newest counted versions that stay, whether or not the head is one of them.
         max_bytes: Bytes that the counted versions that stay may be charged with together; the newest one
             stays in any case.
         is_counted: Returns whether a version is counted; versions that are not counted stay.

@@ -16,7 +16,9 @@ __all__ = ["deform_cloud", "deform_clouds", "find_observers", "merge_clouds", "v
 _VOXEL_M = 0.01  # edge in metres of the voxels to which a merged cloud is thinned
 _MIN_DEPTH_M = 0.2  # smallest depth in metres at which a keyframe can have observed a point of the cloud
 _MAX_DEPTH_M = 6.0  # largest depth in metres at which a keyframe can have observed a point of the cloud
-_UNOBSERVED_COST = 1e3  # added to the distance of a keyframe that does not see a point; above any depth
+_UNOBSERVED_COST = 1e3
+"""Metres that are added to the distance of a point from a keyframe that does not see it, so that every
+keyframe that sees the point is preferred."""
 
 
 def deform_clouds(

@@ -38,24 +38,22 @@ _GRAVITY_STRUCT = struct.Struct("<4f")
 _MOUNT_STRUCT = struct.Struct("<6f")
 _MOTION_STRUCT = struct.Struct("<61f")
 _TRIANGLE = np.triu_indices(9)
-_MIN_GRAVITY_DEVIATION_RAD = 1e-4  # standard deviation of a gravity direction: no IMU is more accurate
-_MAX_GRAVITY_DEVIATION_RAD = (
-    0.35  # standard deviation of a gravity direction: beyond 20 degrees it is useless
-)
-_MAX_ROTATION_RAD = 3.2  # length of a rotation vector: pi, and some room for rounding
-_MAX_DURATION_S = 60.0  # of a preintegrated motion: an IMU drifts too far in a longer time
-_MAX_VELOCITY_M_S = 1e3  # largest coordinate of the velocity of a preintegrated motion
-_MAX_POSITION_M = 1e4  # largest coordinate of the position of a preintegrated motion
-_MAX_LEVER_ARM_M = 10.0  # distance of the IMU from the camera on one robot
+_MIN_GRAVITY_DEVIATION_RAD = 1e-4  # smallest standard deviation of gravity: no IMU is more accurate
+_MAX_GRAVITY_DEVIATION_RAD = 0.35  # largest standard deviation of gravity: 20 degrees say little
+_MAX_ROTATION_RAD = 3.2  # largest length of a rotation vector in radians: pi, and room for rounding
+_MAX_DURATION_S = 60.0  # longest preintegrated motion in seconds: an IMU drifts too far in a longer time
+_MAX_VELOCITY_M_S = 1e3  # largest coordinate of the velocity of a preintegrated motion in m/s
+_MAX_POSITION_M = 1e4  # largest coordinate of the position of a preintegrated motion in metres
+_MAX_LEVER_ARM_M = 10.0  # largest distance in metres of the IMU from the camera on one robot
 _MAX_BIAS = 10.0  # largest bias of a gyroscope in rad/s, or of an accelerometer in m/s^2
 _MAX_MOTION_DEVIATION = 1e3  # largest standard deviation of a rotation (rad), velocity (m/s) or position (m)
 _MAX_GRAVITY_DIFFERENCE_DEG = 5.0  # two robots agree on the direction of gravity up to this angle
-_MAX_DIRECTIONS = 200  # directions among which a median is looked for; bounds a matrix of n x n angles
+_MAX_DIRECTIONS = 200  # directions of gravity of one robot whose median is computed; bounds time and memory
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class InertialMotion:
-    """Hold a preintegrated motion in the axes of the IMU, as `client_sdk.imu.preintegration` defines it.
+    """A preintegrated motion in the axes of the IMU, as `client_sdk.imu.preintegration` defines it.
 
     Attributes:
         duration_s: Time between the two keyframes.
@@ -78,7 +76,7 @@ class InertialMotion:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class KeyframeImu:
-    """Hold the IMU measurements of one keyframe.
+    """The IMU measurements of one keyframe.
 
     Attributes:
         down_camera: ``(3,)`` unit vector in the direction of gravity, in the frame of the camera.
@@ -211,7 +209,9 @@ def _decode_motion(numbers: Array) -> InertialMotion:
         or np.abs(position).max() > _MAX_POSITION_M
         or np.abs(biases).max() > _MAX_BIAS
     ):
-        raise _bad_block("a rotation, velocity, position or bias of its motion is larger than any robot's")
+        raise _bad_block(
+            "a rotation, velocity, position or bias of its motion is larger than that of any robot"
+        )
     covariance = np.zeros((9, 9))
     covariance[_TRIANGLE] = numbers[16:]
     covariance = covariance + np.triu(covariance, 1).T

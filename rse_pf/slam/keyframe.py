@@ -81,7 +81,7 @@ _GEOMETRY_STRUCT = struct.Struct("<BBH")
 _SCALE_STRUCT = struct.Struct("<d")  # focal length times baseline of disparities, or the unit of depths
 _NOISE_STRUCT = struct.Struct("<3d")
 
-_REQUIRED = 1  # flag of a block without which a reader must not use the keyframe
+_REQUIRED = 1  # flag of a block that a reader must know, else it rejects the keyframe
 _CAMERA_BLOCK = 1
 _FEATURES_BLOCK = 2
 _GEOMETRY_BLOCK = 3
@@ -94,13 +94,16 @@ _REQUIRED_BLOCKS = {_CAMERA_BLOCK: "camera", _FEATURES_BLOCK: "features", _GEOME
 _OPTIONAL_BLOCKS = {_NOISE_BLOCK: "noise", _IMU_BLOCK: "IMU", _POINTS_BLOCK: "points", _IMAGE_BLOCK: "image"}
 """Names for error messages of the blocks that a keyframe may lack, by the number of their kind."""
 
-_PINHOLE = 1  # number of the pinhole model in the camera block
-_ORB_DETECTOR = 1  # number of ORB in the features block
-_NAMED_DETECTOR = 2  # number in the features block of features whose kind has a name
-_METRICS = {"uint8": 1, "int8": 2}  # number of the metric in the features block, by the dtype of descriptors
-_DEPTHS = 1  # type in the geometry block of depths in millimetres
-_DISPARITIES = 2  # type in the geometry block of disparities of a stereo pair
-_SCALELESS_DEPTHS = 3  # type in the geometry block of depths without metric scale
+_PINHOLE = 1  # number by which the camera block names the pinhole model
+_ORB_DETECTOR = 1  # number by which the features block names the detector ORB
+_NAMED_DETECTOR = 2  # number by which the features block announces the name of another kind of features
+_METRICS = {
+    "uint8": 1,
+    "int8": 2,
+}  # number of the metric in the features block by the dtype: Hamming, Euclidean
+_DEPTHS = 1  # number by which the geometry block announces depths in millimetres
+_DISPARITIES = 2  # number by which the geometry block announces disparities of a stereo pair
+_SCALELESS_DEPTHS = 3  # number by which the geometry block announces depths without metric scale
 
 _FEATURE_BYTES = 6  # encoded size of a feature without its descriptor: column, row and depth as uint16
 _MAX_FEATURES_BYTES = MAX_FEATURES * (_FEATURE_BYTES + ORB.size)  # encoded size of all features of a keyframe
@@ -460,7 +463,9 @@ def decode_keyframe(data: bytes) -> SentKeyframe:
     """
     # 1. Read the head.
     if not _HEAD_STRUCT.size <= len(data) <= MAX_KEYFRAME_BYTES:
-        raise _bad_keyframe(f"{len(data)} bytes are not within {_HEAD_STRUCT.size}..{MAX_KEYFRAME_BYTES}")
+        raise _bad_keyframe(
+            f"its size of {len(data)} bytes is not within {_HEAD_STRUCT.size}..{MAX_KEYFRAME_BYTES}"
+        )
     magic, version, block_count, timestamp_s, *pose_rows = _HEAD_STRUCT.unpack_from(data)
     if magic != _MAGIC or version != _VERSION:
         raise _bad_keyframe("it does not begin as a keyframe of version 2")
@@ -524,8 +529,8 @@ def check_odometry_range(keyframe: SentKeyframe, metres_per_unit: float = 1.0) -
     """
     if not (np.abs(metres_per_unit * keyframe.T_odom_camera[:3, 3]) <= _MAX_ODOMETRY_M).all():
         raise _bad_keyframe(
-            f"T_odom_camera is more than {_MAX_ODOMETRY_M:.0f} m from the start",
-            "send metres of the odometry",
+            f"a coordinate of T_odom_camera is more than {_MAX_ODOMETRY_M:.0f} m from the odometry's start",
+            "send the odometry in metres",
         )
 
 
@@ -536,7 +541,7 @@ def _find_blocks(data: bytes, block_count: int) -> Iterator[tuple[int, int, int]
         BadRequest: A block is malformed, repeated, out of order, or required and unknown.
     """
     if block_count > MAX_BLOCKS:
-        raise _bad_keyframe(f"{block_count} blocks are more than {MAX_BLOCKS}")
+        raise _bad_keyframe(f"it has {block_count} blocks, more than {MAX_BLOCKS}")
     end, last_kind = _HEAD_STRUCT.size, 0
     for _ in range(block_count):
         begin = end + _BLOCK_STRUCT.size
@@ -545,19 +550,19 @@ def _find_blocks(data: bytes, block_count: int) -> Iterator[tuple[int, int, int]
         kind, flags, size = _BLOCK_STRUCT.unpack_from(data, end)
         end = begin + size
         if end > len(data):
-            raise _bad_keyframe(f"a block of {size} bytes goes on beyond its end")
+            raise _bad_keyframe(f"block {kind} of {size} bytes goes on beyond the end of the keyframe")
         is_known = kind in _REQUIRED_BLOCKS or kind in _OPTIONAL_BLOCKS
         if kind < max(1, last_kind) or (kind == last_kind and is_known) or flags > _REQUIRED:
-            raise _bad_keyframe(f"block {kind} stands twice, after a later one, or has unknown flags")
+            raise _bad_keyframe(f"block {kind} is repeated, out of order, or has unknown flags {flags}")
         if kind in _OPTIONAL_BLOCKS and flags & _REQUIRED:
-            raise _bad_keyframe(f"the block of the {_OPTIONAL_BLOCKS[kind]} is optional")
+            raise _bad_keyframe(f"the optional block of the {_OPTIONAL_BLOCKS[kind]} is flagged as required")
         if kind not in _REQUIRED_BLOCKS and flags & _REQUIRED:
             raise _bad_keyframe(
                 f"it needs block {kind}, which this release does not know",
                 "update the server, or send the keyframe without this block",
             )
         if kind in _REQUIRED_BLOCKS and not flags & _REQUIRED:
-            raise _bad_keyframe(f"the block of the {_REQUIRED_BLOCKS[kind]} is not required")
+            raise _bad_keyframe(f"the block of the {_REQUIRED_BLOCKS[kind]} is not flagged as required")
         last_kind = kind
         yield kind, begin, end
     if end != len(data):
@@ -566,7 +571,7 @@ def _find_blocks(data: bytes, block_count: int) -> Iterator[tuple[int, int, int]
 
 def _decode_camera(data: bytes, begin: int, end: int) -> Camera:
     if end - begin != _CAMERA_STRUCT.size:
-        raise _bad_keyframe(f"a camera has {_CAMERA_STRUCT.size} bytes, not {end - begin}")
+        raise _bad_keyframe(f"the block of the camera has {end - begin} bytes, not {_CAMERA_STRUCT.size}")
     model, number, width, height, fx, fy, cx, cy = _CAMERA_STRUCT.unpack_from(data, begin)
     if (model, number) != (_PINHOLE, 0):
         raise _bad_keyframe(
@@ -577,7 +582,7 @@ def _decode_camera(data: bytes, begin: int, end: int) -> Camera:
 
 def _decode_noise(data: bytes, begin: int, end: int) -> DepthNoise:
     if end - begin != _NOISE_STRUCT.size:
-        raise _bad_keyframe(f"a noise has {_NOISE_STRUCT.size} bytes, not {end - begin}")
+        raise _bad_keyframe(f"the block of the noise has {end - begin} bytes, not {_NOISE_STRUCT.size}")
     base_m, growth_per_m, from_m = _NOISE_STRUCT.unpack_from(data, begin)
     return DepthNoise(base_m=base_m, growth_per_m=growth_per_m, from_m=from_m)
 

@@ -18,7 +18,9 @@ __all__ = ["ScaleTerms", "SmoothedPoses", "smooth"]
 Rows = npt.NDArray[np.int64]
 
 _MAX_ITERATIONS = 6  # Gauss-Newton steps of one call of `smooth`
-_MAX_STEP_TRIALS = 4  # lengths of a Gauss-Newton step that are tried until the cost does not increase
+_MAX_STEP_TRIALS = (
+    4  # number of lengths of a Gauss-Newton step that are tried until the cost does not increase
+)
 _STEP_REDUCTION = 0.25  # factor by which a Gauss-Newton step that increases the cost is shortened
 _CONVERGED_M = 6e-3
 """Largest translation in metres of a step after which no further step is made: the next step would be ten
@@ -31,8 +33,8 @@ _MAX_ROTATION_STEP_RAD = (
     0.5  # a step is shortened to this rotation, beyond which its linearisation is invalid
 )
 _DAMPING = 1e-6
-"""Share of the diagonal of the normal equations that is added to the diagonal, with a millionth: a free pose
-without an edge then stays where it is."""
+"""Levenberg damping: each diagonal element h of the normal equations becomes h + 1e-6 (h + 1), so that a free
+pose without an edge stays where it is."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -206,7 +206,7 @@ def test_a_robot_that_is_farther_than_any_way_is_refused_and_a_map_of_a_survey_i
     found = decode_keyframe(encode_keyframe(replace(keyframe(), T_odom_camera=far)))
 
     check_odometry_range(keyframe())
-    with pytest.raises(BadRequest, match="more than 1000000 m from the start"):
+    with pytest.raises(BadRequest, match="more than 1000000 m from"):
         check_odometry_range(found)
 
 
@@ -289,27 +289,27 @@ DISPARITIES_AT = FEATURES_AT + 8 + 20 * 36 + BLOCK + 4
 @pytest.mark.parametrize(
     ("data", "why"),
     [
-        (b"", "0 bytes are not within"),
-        (GOOD + bytes(MAX_KEYFRAME_BYTES), "bytes are not within"),
-        (with_blocks(2, 18_000), "bytes are not within"),
+        (b"", "0 bytes is not within"),
+        (GOOD + bytes(MAX_KEYFRAME_BYTES), "bytes is not within"),
+        (with_blocks(2, 18_000), "bytes is not within"),
         (changed(0, "<B", 1), "does not begin as a keyframe of version 2"),
         (changed(2, "<B", 3), "does not begin as a keyframe of version 2"),
         (changed(3, "<B", 2), "bytes follow the last block"),
         (changed(3, "<B", 4), "ends within the head of a block"),
-        (changed(3, "<B", 255), "255 blocks are more than 16"),
-        (with_blocks(MAX_BLOCKS - 2), "17 blocks are more than 16"),
+        (changed(3, "<B", 255), "255 blocks, more than 16"),
+        (with_blocks(MAX_BLOCKS - 2), "17 blocks, more than 16"),
         (changed(4, "<d", math.nan), "its time .* is not within"),
         (changed(4, "<d", 1e13), "its time .* is not within"),
         (changed(12, "<d", math.nan), "no rigid motion"),
         (changed(12 + 3 * 8, "<d", math.inf), "no rigid motion"),
         (changed(12, "<d", 2.0), "no rigid motion"),
-        (changed(HEAD, "<H", 0), "block 0 stands twice"),
-        (changed(HEAD, "<H", 2), "block 2 stands twice"),
+        (changed(HEAD, "<H", 0), "block 0 is repeated"),
+        (changed(HEAD, "<H", 2), "block 2 is repeated"),
         (changed(HEAD, "<H", 12), "block 12"),
-        (changed(HEAD + 2, "<H", 0), "block of the camera is not required"),
+        (changed(HEAD + 2, "<H", 0), "block of the camera is not flagged"),
         (changed(HEAD + 2, "<H", 2), "unknown flags"),
-        (changed(HEAD + 4, "<I", 2**32 - 1), "goes on beyond its end"),
-        (changed(HEAD + 4, "<I", 37), "goes on beyond its end"),
+        (changed(HEAD + 4, "<I", 2**32 - 1), "goes on beyond the end"),
+        (changed(HEAD + 4, "<I", 37), "goes on beyond the end"),
         (changed(CAMERA_AT, "<B", 2), "camera 0 of model 2 is not known"),
         (changed(CAMERA_AT + 1, "<B", 1), "camera 1 of model 1 is not known"),
         (changed(FEATURES_AT, "<B", 2), "'' is no name of features"),
