@@ -25,12 +25,13 @@ from rse_pf.terminal import at_work, counted, show, show_json, show_progress
 __all__ = ["add_export_arguments", "run_export"]
 
 _BAG_FORMAT = "mcap"  # the name of the format of bags that ROS 2 and Foxglove read
-_GRID_OPTIONS = ("resolution", "robot_height", "step", "floor", "up")  # options of format occupancy alone
+_GRID_OPTIONS = ("resolution", "robot_height", "step", "floor", "up")
+"""Names of the options that belong to the format occupancy alone."""
 _NO_IMAGES = (
     "this map names no images that are stored: set live.images for live maps, or name those of "
     "map from-camera --keep-images by --images"
 )
-_MAX_IMAGE_BYTES = 64 << 20  # size of one image file in the folder --images; a larger one is an error
+_MAX_IMAGE_BYTES = 64 << 20  # largest size in bytes of an image file in the folder --images: 64 MiB
 
 _Files = tuple[dict[str, bytes], list[str]]
 """The contents of the files of a folder by their names, and notes for the user about what is missing."""

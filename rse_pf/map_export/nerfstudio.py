@@ -23,8 +23,9 @@ from rse_pf.slam.ply import encode_ply
 
 __all__ = ["encode_nerfstudio"]
 
-_CAMERA_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # rotates OpenGL's camera axes to ours: x right, y down
-_CLOUD_FILE = "points.ply"  # name of the file of the point cloud, which transforms.json refers to
+_CAMERA_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+"""Converts points in OpenGL's camera axes (y up, z backwards) to ours (y down, z forwards)."""
+_CLOUD_FILE = "points.ply"  # name of the file with the point cloud, to which transforms.json refers
 
 
 def encode_nerfstudio(version: MapVersion) -> dict[str, bytes]:

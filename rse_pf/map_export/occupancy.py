@@ -36,18 +36,21 @@ OCCUPIED = 0  # grey level of a cell with an obstacle: black
 UNKNOWN = 205  # grey level of a cell that no camera has observed, as map_saver of ROS writes it
 FREE = 254  # grey level of a cell without an obstacle: white, as map_saver of ROS writes it
 
-_MAX_CELLS = 1 << 24  # an occupancy grid has at most this number of cells: 16 MiB of memory
+_MAX_CELLS = 1 << 24  # largest number of cells of an occupancy grid: 16 MiB of memory
 _MAX_DISTANCE_M = 30.0
 """Points of a map that are farther than this outside the box around all camera positions are left out of its
 floor plan: no camera has seen them."""
 _MAX_RAY_M = 10.0
 """A feature with a coordinate in the camera's frame above this many metres does not mark cells as free, since
 its depth is inaccurate."""
-_MAX_RAYS = 400_000  # lines of sight of the whole map that mark free cells; bounds the time of an export
-_RAYS_AT_ONCE = 20_000  # lines of sight that are rasterised in one array operation; bounds its memory
-_MIN_POINTS = 2  # points of the cloud that make a cell occupied; a single point may be an outlier
-_LAYER_M = 0.05  # height in metres of the horizontal layers among which the floor is looked for
-_AREA_CELL_M = 0.1  # edge in metres of the squares that measure the area of a horizontal layer
+_MAX_RAYS = 400_000
+"""Largest number of lines of sight of a map that mark cells as free; bounds the time of an export."""
+_RAYS_AT_ONCE = 20_000
+"""Number of lines of sight that are rasterised in one array operation; bounds its memory."""
+_MIN_POINTS = 2
+"""Smallest number of points of the cloud that make a cell occupied: a single point may be an outlier."""
+_LAYER_M = 0.05  # height in metres of the horizontal layers in which the floor is looked for
+_AREA_CELL_M = 0.1  # edge in metres of the squares whose number measures the area of a horizontal layer
 _FLOOR_SHARE = 0.3
 """The floor is the lowest layer whose area is at least this share of the area of the largest layer."""
 

@@ -27,13 +27,18 @@ from rse_pf.object_store import MIN_CHARGE_BYTES, ObjectStore, charge_of, name_s
 
 __all__ = ["BackupContent", "CheckedBackup", "check_backup", "restore_backup", "write_backup"]
 
-_CONTENT_FILE = "backup.json"  # name of the last member of a backup's archive: heads and charges
+_CONTENT_FILE = "backup.json"
+"""Name of the last member in the tar archive of a backup, with heads and charges."""
 _MEMBER = re.compile(r"(?P<map>[a-z0-9][a-z0-9-]{0,63})/(?P<kind>blobs|versions)/(?P<id>[0-9a-f]{64})")
 _CHARGE = re.compile(
     r"[A-Za-z0-9][A-Za-z0-9._=-]{0,127}/(?P<map>[a-z0-9-]{1,64})/(?P<id>[0-9a-f]{64})\.\d{1,15}"
 )
-_MAX_RECORD_BYTES = 1 << 20  # size of the record of a version in a backup; with many robots it has some KiB
-_MAX_CONTENT_BYTES = 256 << 20  # size of the list of heads and charges in a backup; enough for 10,000 maps
+_MAX_RECORD_BYTES = 1 << 20
+"""Largest size in bytes of the record of one version in a backup file: 1 MiB, though a record with many
+robots has some KiB only."""
+_MAX_CONTENT_BYTES = 256 << 20
+"""Largest size in bytes of the member of a backup file that lists heads and charges: 256 MiB, enough for
+10,000 maps with all their versions."""
 _CHUNK_BYTES = 1 << 20  # bytes of an archive's member that are read at once: 1 MiB
 
 

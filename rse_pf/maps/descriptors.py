@@ -28,7 +28,9 @@ Descriptors = npt.NDArray[Any]
 MAX_DESCRIPTOR_SIZE = 512
 """Largest size of a descriptor, in bytes if it is binary, else in dimensions: squared distances of int8
 vectors of this length stay below 2**24, where float32 is exact."""
-_MIN_DESCRIPTOR_SIZE = 4  # smallest size of a descriptor, in bytes if it is binary, else in dimensions
+_MIN_DESCRIPTOR_SIZE = 4
+"""Smallest size of a descriptor, in bytes if it is binary, else in dimensions: smaller ones do not
+distinguish features."""
 _KIND_NAME = re.compile(r"[a-z0-9][a-z0-9._-]{0,31}")
 
 

@@ -63,24 +63,22 @@ _MAX_BYTES = 1 << 30  # largest size of a decompressed map file: 1 GiB
 _MAX_COMPRESSION_RATIO = 50.0
 """Decompressed size of a map over its compressed size; features and point clouds only compress to half their
 size, so that a larger ratio means an empty or a hostile map."""
-_UNCHECKED_BYTES = 1 << 20  # size of a decompressed map file up to which its compression ratio is not limited
+_UNCHECKED_BYTES = 1 << 20
+"""Decompressed size in bytes up to which a map file may have any compression ratio: 1 MiB of memory harms
+nobody."""
 _MAX_ID = 2**63 - 1  # the largest id of a keyframe: an int64
 _MAX_NAME_LENGTH = 64  # largest number of characters of the name of a keyframe's robot
-_MAX_COORDINATE_M = (
-    1e9  # largest coordinate of a map's points in metres; larger ones overflow in later computations
-)
-_MAX_TIME_S = (
-    1e12  # largest time of a keyframe, seconds from 1970; larger ones overflow in later computations
-)
+_MAX_COORDINATE_M = 1e9
+"""Largest coordinate in metres of a point in a map; larger numbers overflow in later computations."""
+_MAX_TIME_S = 1e12
+"""Largest time of a keyframe in seconds from 1970; larger numbers overflow in later computations."""
 _MAX_PIXEL = 1e5  # largest coordinate of a feature in pixels: no camera has wider images
-_MAX_INFORMATION = (
-    1e18  # largest number of an edge's information matrix: standard deviations of 1 nm and 1 nrad
-)
+_MAX_INFORMATION = 1e18
+"""Largest number in the information matrix of an edge: a standard deviation of 1 nm or 1 nrad."""
 _ITEM_VALUES = {"keyframes": 100, "edges": 40}
 """MessagePack values that one keyframe or one edge may have: more than today, so that fields can be added."""
-_OTHER_FIELD_VALUES = (
-    1000  # MessagePack values that a field of a map file may have which this release does not know
-)
+_OTHER_FIELD_VALUES = 1000
+"""Number of MessagePack values that a field which this release does not know may have in a map file."""
 _UNSAFE_IN_FILE_NAMES = re.compile(r"[^A-Za-z0-9._-]+")
 
 

@@ -40,12 +40,18 @@ IMAGES_FIELD = "images"
 _NAME = re.compile(r"[a-z0-9][a-z0-9-]{0,63}")
 _ID = re.compile(r"[0-9a-f]{64}")
 _ROBOT = re.compile(r"[A-Za-z0-9][A-Za-z0-9._=-]*")
-_MIN_ID_DIGITS = 6  # hexadecimal digits that are enough to name a version by the beginning of its id
+_MIN_ID_DIGITS = 6
+"""Number of hexadecimal digits from which the beginning of an id is accepted as the name of a version."""
 _JPEG_MAGIC = b"\xff\xd8\xff"  # the first bytes of a JPEG file
-_MAX_IMAGE_BYTES = 64 << 20  # size of a stored image of a keyframe; a larger object is not read
-_MAX_MAPS = 10_000  # maps of one tenant, all of which are read when somebody lists them
-_MAX_VERSIONS = 10_000  # versions of one map, all of which are read when somebody lists them
-_CHUNK_BYTES = 1 << 20  # bytes of an object that are in memory at once while it is copied: 1 MiB
+_MAX_IMAGE_BYTES = 64 << 20
+"""Largest size in bytes of the stored image of a keyframe that is read: 64 MiB, since a robot may have
+stored any object."""
+_MAX_MAPS = 10_000
+"""Largest number of maps of one tenant: all of them are read when somebody lists maps."""
+_MAX_VERSIONS = 10_000
+"""Largest number of versions of one map: all of them are read when somebody lists versions."""
+_CHUNK_BYTES = 1 << 20
+"""Number of bytes of an object that are in memory at once while a map is committed from it: 1 MiB."""
 _REMOVED_AT_ONCE = 50
 """Versions that are marked and then removed together: also a slow store removes this number within a minute,
 after which a removal stops."""

@@ -33,11 +33,16 @@ __all__ = [
     "count_freed_bytes",
 ]
 
-HELD = "held"  # kind of the mark by which a rollback keeps the bytes of a version from being removed
-REMOVING = "removing"  # kind of the mark of a process that removes the bytes of a version
-MAX_REMOVAL_S = 60.0  # seconds after which a removal deletes nothing more; far less than `ABANDONED_S`
-ABANDONED_S = 600.0  # age in seconds from which a mark is ignored, since its process has crashed
-_RETRY_MS = 1000.0  # milliseconds after which a commit should be repeated whose bytes are being removed
+HELD = "held"  # kind of a mark by which a rollback protects the bytes of a version from removal
+REMOVING = "removing"  # kind of a mark of a process that removes the bytes of a version
+MAX_REMOVAL_S = 60.0
+"""Seconds after which a process that removes versions deletes nothing more, long before others ignore its
+marks."""
+ABANDONED_S = 600.0
+"""Age in seconds from which a mark in the store is ignored: its process has crashed, since it would have
+stopped earlier."""
+_RETRY_MS = 1000.0
+"""Milliseconds after which a client should repeat a commit whose bytes are just being removed."""
 _MARK = re.compile(rf"(?P<digest>[0-9a-f]{{64}})\.(?P<kind>{HELD}|{REMOVING})-(?P<set_s>\d+)-[0-9a-f]+")
 
 

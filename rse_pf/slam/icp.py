@@ -19,15 +19,19 @@ from rse_pf.geometry import Array, pose_difference, transform
 
 __all__ = ["CloudAlignment", "IcpOptions", "align_clouds", "load_small_gicp"]
 
-_MIN_POINTS = 100  # points of a thinned cloud, and correspondences, that an alignment needs
-_NEIGHBOURS = 20  # nearest points from which the normal and covariance of a point are estimated
+_MIN_POINTS = 100
+"""Smallest number of points of a thinned cloud, and of correspondences between two clouds, for an
+alignment."""
+_NEIGHBOURS = 20  # number of nearest points from which the normal and covariance of a point are estimated
 _MIN_GAIN = 0.02
 """Share by which the mean distance between the clouds must become smaller, for the refined pose to be
 accepted if it differs from the initial one."""
-_UNCHANGED_M = 0.002  # translation in metres up to which a refined pose counts as equal to the initial one
-_UNCHANGED_DEG = 0.1  # rotation in degrees up to which a refined pose counts as equal to the initial one
-_CONVERGED_M = 1e-4  # translation in metres of a step below which the solver has converged
-_CONVERGED_RAD = 1e-4  # rotation in radians of a step below which the solver has converged
+_UNCHANGED_M = 0.002
+"""Translation in metres up to which a pose refined by ICP counts as equal to the initial pose."""
+_UNCHANGED_DEG = 0.1
+"""Rotation in degrees up to which a pose refined by ICP counts as equal to the initial pose."""
+_CONVERGED_M = 1e-4  # translation in metres of an ICP step below which the solver has converged
+_CONVERGED_RAD = 1e-4  # rotation in radians of an ICP step below which the solver has converged
 _MAX_MISFIT_SHARE = 0.2
 """Mean distance between the clouds, as a share of the correspondence distance, above which their surfaces do
 not fit."""

@@ -38,17 +38,22 @@ _GRAVITY_STRUCT = struct.Struct("<4f")
 _MOUNT_STRUCT = struct.Struct("<6f")
 _MOTION_STRUCT = struct.Struct("<61f")
 _TRIANGLE = np.triu_indices(9)
-_MIN_GRAVITY_DEVIATION_RAD = 1e-4  # smallest standard deviation of gravity: no IMU is more accurate
-_MAX_GRAVITY_DEVIATION_RAD = 0.35  # largest standard deviation of gravity: 20 degrees say little
+_MIN_GRAVITY_DEVIATION_RAD = 1e-4
+"""Smallest standard deviation in radians of a direction of gravity: no IMU is more accurate."""
+_MAX_GRAVITY_DEVIATION_RAD = 0.35
+"""Largest standard deviation in radians of a direction of gravity: beyond 20 degrees it is useless."""
 _MAX_ROTATION_RAD = 3.2  # largest length of a rotation vector in radians: pi, and room for rounding
 _MAX_DURATION_S = 60.0  # longest preintegrated motion in seconds: an IMU drifts too far in a longer time
 _MAX_VELOCITY_M_S = 1e3  # largest coordinate of the velocity of a preintegrated motion in m/s
 _MAX_POSITION_M = 1e4  # largest coordinate of the position of a preintegrated motion in metres
 _MAX_LEVER_ARM_M = 10.0  # largest distance in metres of the IMU from the camera on one robot
 _MAX_BIAS = 10.0  # largest bias of a gyroscope in rad/s, or of an accelerometer in m/s^2
-_MAX_MOTION_DEVIATION = 1e3  # largest standard deviation of a rotation (rad), velocity (m/s) or position (m)
-_MAX_GRAVITY_DIFFERENCE_DEG = 5.0  # two robots agree on the direction of gravity up to this angle
-_MAX_DIRECTIONS = 200  # directions of gravity of one robot whose median is computed; bounds time and memory
+_MAX_MOTION_DEVIATION = 1e3
+"""Largest standard deviation of a preintegrated rotation (rad), velocity (m/s) or position (m)."""
+_MAX_GRAVITY_DIFFERENCE_DEG = 5.0
+"""Largest angle in degrees up to which two robots agree on the direction of gravity."""
+_MAX_DIRECTIONS = 200
+"""Largest number of directions of gravity of one robot whose median is computed; bounds time and memory."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -68,20 +68,23 @@ MAX_KEYFRAME_BYTES = 36_000
 """Size of one encoded keyframe in bytes; the 894 ORB features that a robot sends by default need 33.3 kB."""
 MAX_FEATURES = 894
 """Number of features of one keyframe with ORB descriptors; `max_features` gives it for larger descriptors."""
-MAX_BLOCKS = 16  # number of blocks in one encoded keyframe; this release knows seven kinds of blocks
+MAX_BLOCKS = 16
+"""Largest number of blocks in one encoded keyframe; this release knows seven kinds of blocks."""
 
 _MAGIC = b"KF"  # the first two bytes of an encoded keyframe
-_VERSION = 2  # the only version of the encoding of keyframes that is read and written
+_VERSION = 2  # version of the encoding of keyframes, the only one that is read and written
 
 _HEAD_STRUCT = struct.Struct("<2sBB13d")
 _BLOCK_STRUCT = struct.Struct("<HHI")
 _CAMERA_STRUCT = struct.Struct("<BBHH4d")
 _FEATURES_STRUCT = struct.Struct("<BBHHBB")
 _GEOMETRY_STRUCT = struct.Struct("<BBH")
-_SCALE_STRUCT = struct.Struct("<d")  # focal length times baseline of disparities, or the unit of depths
+_SCALE_STRUCT = struct.Struct("<d")
+"""Encoding of focal length times baseline before disparities, or of the unit before depths without
+scale."""
 _NOISE_STRUCT = struct.Struct("<3d")
 
-_REQUIRED = 1  # flag of a block that a reader must know, else it rejects the keyframe
+_REQUIRED = 1  # flag of a block: a reader that does not know its kind must reject the keyframe
 _CAMERA_BLOCK = 1
 _FEATURES_BLOCK = 2
 _GEOMETRY_BLOCK = 3
@@ -97,33 +100,45 @@ _OPTIONAL_BLOCKS = {_NOISE_BLOCK: "noise", _IMU_BLOCK: "IMU", _POINTS_BLOCK: "po
 _PINHOLE = 1  # number by which the camera block names the pinhole model
 _ORB_DETECTOR = 1  # number by which the features block names the detector ORB
 _NAMED_DETECTOR = 2  # number by which the features block announces the name of another kind of features
-_METRICS = {
-    "uint8": 1,
-    "int8": 2,
-}  # number of the metric in the features block by the dtype: Hamming, Euclidean
+_METRICS = {"uint8": 1, "int8": 2}
+"""Number of the metric in the features block by the dtype of descriptors: 1 is Hamming, 2 Euclidean distance."""
 _DEPTHS = 1  # number by which the geometry block announces depths in millimetres
 _DISPARITIES = 2  # number by which the geometry block announces disparities of a stereo pair
 _SCALELESS_DEPTHS = 3  # number by which the geometry block announces depths without metric scale
 
-_FEATURE_BYTES = 6  # encoded size of a feature without its descriptor: column, row and depth as uint16
-_MAX_FEATURES_BYTES = MAX_FEATURES * (_FEATURE_BYTES + ORB.size)  # encoded size of all features of a keyframe
-_FINEST_PIXEL_FRACTION = 4  # pixels are encoded in units of at least 2**-4 px
-_COARSEST_PIXEL_FRACTION = 2  # pixels of the widest images (16,383 px) are encoded in units of 2**-2 px
-_BORDER_PX = 64  # undistortion moves pixels outside the image by at most this number of pixels
+_FEATURE_BYTES = 6
+"""Encoded size in bytes of a feature without its descriptor: column, row and depth, 2 bytes each."""
+_MAX_FEATURES_BYTES = MAX_FEATURES * (_FEATURE_BYTES + ORB.size)
+"""Largest encoded size in bytes of all features of one keyframe, whatever their kind: that of 894 ORB
+features."""
+_FINEST_PIXEL_FRACTION = 4
+"""Exponent of the finest unit of encoded pixels: 2**-4 px, for images up to 4,095 px wide."""
+_COARSEST_PIXEL_FRACTION = 2
+"""Exponent of the coarsest unit of encoded pixels: 2**-2 px, for images up to 16,383 px wide."""
+_BORDER_PX = 64
+"""Distance in pixels by which an undistorted feature may lie outside the image."""
 _DISPARITY_STEPS_PER_PX = 64  # disparities are encoded in units of 1/64 px
-_MAX_STEPS = 65_535  # the largest encoded depth or disparity, a uint16
-_MIN_DEPTH_MM = 10  # smallest depth in millimetres that is encoded as a depth
-_MIN_DEPTH_M = 0.01  # smallest depth in metres that is encoded as a disparity
-_MAX_DEPTH_M = 1000.0  # largest depth in metres that is encoded as a disparity: poses are refined up to 1 km
-_MIN_F_BASELINE = 0.05  # focal length in px times baseline in m: 50 px and 1 mm
-_MAX_F_BASELINE = 1e5  # focal length in px times baseline in m: 10,000 px and 10 m
+_MAX_STEPS = 65_535  # largest number that encodes a depth or a disparity: a uint16
+_MIN_DEPTH_MM = 10  # smallest depth of a depth camera that is encoded, in millimetres
+_MIN_DEPTH_M = 0.01  # smallest depth of a stereo pair that is encoded, in metres
+_MAX_DEPTH_M = 1000.0
+"""Largest depth of a stereo pair that is encoded, in metres: poses are refined with depths up to 1 km."""
+_MIN_F_BASELINE = 0.05  # smallest focal length times baseline of a stereo pair, in px m: 50 px and 1 mm
+_MAX_F_BASELINE = 1e5  # largest focal length times baseline of a stereo pair, in px m: 10,000 px and 10 m
 _MAX_MEDIAN_DEPTHS = 16.0
 """A depth without metric scale is encoded as unknown if it is more than this multiple of the median depth of
 its keyframe: the position of such a far landmark is inaccurate."""
-_MIN_UNIT = 1e-9  # smallest unit of depth of a segment without metric scale, in the segment's unit of length
-_MAX_UNIT = 1e3  # largest unit of depth of a segment without metric scale, in the segment's unit of length
-_MAX_TIME_S = 1e12  # largest time of a keyframe in seconds from 1970; larger ones overflow later computations
-_MAX_ODOMETRY_M = 1e6  # largest coordinate of a robot in its odometry frame: 1,000 km
+_MIN_UNIT = 1e-9
+"""Smallest unit in which depths without metric scale are encoded, as a multiple of their segment's unit of
+length."""
+_MAX_UNIT = 1e3
+"""Largest unit in which depths without metric scale are encoded, as a multiple of their segment's unit of
+length."""
+_MAX_TIME_S = 1e12
+"""Largest time of a keyframe in seconds from 1970; larger numbers overflow in later computations."""
+_MAX_ODOMETRY_M = 1e6
+"""Largest coordinate in metres of a camera in the odometry of its robot: no robot drives 1,000 km in one
+run."""
 _KINECT_NOISE = DepthNoise()
 
 

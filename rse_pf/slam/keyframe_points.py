@@ -35,19 +35,20 @@ __all__ = [
     "encode_reference",
 ]
 
-MAX_POINTS = 16_000  # number of points of one keyframe
-MAX_POINTS_BYTES = (
-    160_000  # size of the object with the points of one keyframe; uncompressed they need 144,008
-)
-MAX_IMAGE_BYTES = 1 << 20  # size of an object that a keyframe may refer to, its image included: 1 MiB
+MAX_POINTS = 16_000  # largest number of coloured points of one keyframe
+MAX_POINTS_BYTES = 160_000
+"""Largest size in bytes of the object with the coloured points of one keyframe; 16,000 points without
+compression have 144,008."""
+MAX_IMAGE_BYTES = 1 << 20
+"""Largest size in bytes of an object that a keyframe may refer to, such as its image: 1 MiB."""
 _HEAD_STRUCT = struct.Struct("<2sBBI")
 _REFERENCE_STRUCT = struct.Struct("<32sI")
-REFERENCE_BYTES = _REFERENCE_STRUCT.size  # size of an encoded reference to an object
+REFERENCE_BYTES = _REFERENCE_STRUCT.size  # size in bytes of an encoded reference to an object
 _MAGIC = b"KP"  # the first two bytes of the points of a keyframe
-_VERSION = 1  # the only version of the encoding of points that is read and written
-_POINT_BYTES = 9  # uncompressed size of a point: index 4, depth 2, colour 3 bytes
-_MIN_DEPTH_MM = 10  # smallest depth of a point in millimetres
-_MAX_DEPTH_MM = 65_535  # largest depth of a point in millimetres: a uint16
+_VERSION = 1  # version of the encoding of coloured points, the only one that is read and written
+_POINT_BYTES = 9  # size in bytes of an uncompressed point: index 4, depth 2, colour 3
+_MIN_DEPTH_MM = 10  # smallest depth in millimetres of a coloured point
+_MAX_DEPTH_MM = 65_535  # largest depth in millimetres of a coloured point: a uint16
 _DIGEST = re.compile(r"[0-9a-f]{64}\Z")
 
 

@@ -22,26 +22,39 @@ the length is 1 if all cameras are held alike, and about 0 if they are held in a
 
 # --- Limits of `level_surface_normal`, which finds horizontal surfaces by the normals of small voxels ---
 _VOXEL_M = 0.15  # edge in metres of the voxels in which surface normals are estimated
-_MAX_POINTS = 500_000  # points of a cloud that are used; a larger cloud is thinned evenly, to bound the time
-_MIN_VOXEL_POINTS = 12  # points that a voxel needs for an estimate of its surface normal
-_MIN_VOXELS = 20  # voxels with a similar normal that are accepted as level surfaces
+_MAX_POINTS = 500_000
+"""Largest number of points in which level surfaces are looked for; a larger cloud is thinned evenly, to
+bound the time."""
+_MIN_VOXEL_POINTS = 12  # smallest number of points of a voxel from which a surface normal is estimated
+_MIN_VOXELS = 20  # smallest number of flat voxels with similar normals that count as level surfaces
 _MAX_FLATNESS_RATIO = 0.02
 """A voxel is flat if the variance of its points along the normal is at most this share of the second smallest
 variance."""
-_MAX_LEVEL_TILT_DEG = 30.0  # angle between a surface normal and the rough direction up: walls are beyond it
-_MAX_NORMAL_DIFFERENCE_DEG = 5.0  # angle up to which two surface normals are counted as the same direction
-_MAX_HYPOTHESES = 500  # normals that are tried as the common direction; bounds the time
+_MAX_LEVEL_TILT_DEG = 30.0
+"""Largest angle in degrees between the normal of a level surface and the rough direction up; walls are
+beyond it."""
+_MAX_NORMAL_DIFFERENCE_DEG = 5.0
+"""Largest angle in degrees between two surface normals that support the same direction."""
+_MAX_HYPOTHESES = 500  # largest number of normals that are tried as the common direction; bounds the time
 
 # --- Limits of `floor_normal`, which fits a plane to the lowest points ---
-_CELL_M = 0.25  # edge in metres of the horizontal cells, of each of which one low point is taken
-_MIN_CELL_POINTS = 10  # points that a cell needs, so that its low point is not an outlier
-_MIN_CELLS = 40  # cells that must lie on the plane of the floor
+_CELL_M = 0.25
+"""Edge in metres of the horizontal cells in which the floor is looked for; one low point of each cell is
+used."""
+_MIN_CELL_POINTS = 10
+"""Smallest number of points of a cell of the floor: of fewer, the lowest may be an outlier."""
+_MIN_CELLS = 40  # smallest number of cells that must lie on the plane of the floor
 _TUKEY_LIMITS_M = (0.4, 0.4, 0.2, 0.2, 0.1, 0.1, 0.05, 0.05, 0.05)
 """Distances in metres from the plane of the floor at which the weight of a cell becomes 0, for the successive
 iterations of its robust fit."""
-_MIN_INLIER_RATIO = 0.5  # share of the cells that must lie within 5 cm of the plane of the floor
-_MIN_WIDTH_M = 1.0  # width of the floor across its longer side: in a narrower strip its tilt is uncertain
-_MAX_FLOOR_TILT_DEG = 5.0  # angle between the floor's normal and the rough direction up; ramps are beyond it
+_MIN_INLIER_RATIO = 0.5
+"""Smallest share of the cells that must lie within 5 cm of the plane of the floor; stairs and storeys have
+less."""
+_MIN_WIDTH_M = 1.0
+"""Smallest width in metres of a floor across its longer side: the tilt of a narrower strip is uncertain."""
+_MAX_FLOOR_TILT_DEG = 5.0
+"""Largest angle in degrees between the normal of the floor and the rough direction up; ramps are beyond
+it."""
 
 
 def estimate_up(version: MapVersion) -> tuple[Array, UpSource] | None:

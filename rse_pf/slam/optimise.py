@@ -24,7 +24,8 @@ Rows = npt.NDArray[np.int64]
 _ANCHOR_SIGMA = 1e-6
 """Standard deviation in metres and radians of the prior that fixes the first pose of each component: small
 enough to hold it, and large enough for a well conditioned linear system."""
-_RELATIVE_COST_CHANGE = 1e-7  # relative decrease of the cost below which Levenberg-Marquardt has converged
+_RELATIVE_COST_CHANGE = 1e-7
+"""Relative decrease of the cost of a pose graph below which Levenberg-Marquardt has converged."""
 _GTSAM_ORDER = np.ix_([3, 4, 5, 0, 1, 2], [3, 4, 5, 0, 1, 2])
 """Index that reorders a 6x6 matrix of twists (translation, rotation) to GTSAM's (rotation, translation)."""
 

@@ -27,14 +27,16 @@ __all__ = ["PLACE_VECTOR_SIZE", "VOCABULARY_FILE", "PlaceIndex", "PlaceVector", 
 
 WORDS = 32  # number of visual words of a vocabulary
 DIRECTIONS = 16  # number of principal directions to which the residual of each word is reduced
-PLACE_VECTOR_SIZE = WORDS * DIRECTIONS  # number of elements of the vector of an image
+PLACE_VECTOR_SIZE = WORDS * DIRECTIONS  # number of elements of the place recognition vector of an image
 VOCABULARY_FILE = Path(__file__).with_name("place_words.bin")
 """The trained vocabulary of ORB, which ``scripts/train_places.py`` writes: 32 words of 256 bits as -1..1
 times 127, and 256 x 16 numbers of the principal directions of the residuals, all int8."""
 _ORB_BITS = 256  # number of bits of an ORB descriptor
-_WORD_SCALE = 127  # the words of the trained vocabulary are scaled by this factor to fit int8
-_DIRECTION_SCALE = 16  # directions are scaled by this factor before they are rounded to integers
-_INITIAL_ROWS = 64  # vectors for which an empty index has room; the room doubles when it is full
+_WORD_SCALE = 127
+"""Factor by which the words of the trained vocabulary are scaled, so that -1..1 fits int8."""
+_DIRECTION_SCALE = 16  # factor by which principal directions are scaled before they are rounded to integers
+_INITIAL_ROWS = 64
+"""Number of vectors for which a new index has memory; the memory is doubled whenever it is full."""
 _INDEX_ROW_BYTES = 8 + 4 * PLACE_VECTOR_SIZE
 """Size of an encoded index for each keyframe in bytes: its id (int64) and its vector (float32)."""
 _MAX_BLAS_PRODUCTS = 1 << 18

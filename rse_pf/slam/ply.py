@@ -20,7 +20,7 @@ Points = npt.NDArray[np.float32]
 Colours = npt.NDArray[np.uint8]
 """Colours of points ``(n, 3)``, red, green and blue."""
 
-_MAX_HEADER_BYTES = 4096  # length of the text header of a PLY file, within which its end is looked for
+_MAX_HEADER_BYTES = 4096  # largest length in bytes of the text header of a PLY file
 _DTYPES = {
     "char": "i1",
     "uchar": "u1",

@@ -30,7 +30,8 @@ _UPPER = np.triu_indices(6)
 _MAX_ID = 2**53  # largest id of a vertex in g2o text: JSON and float64 hold it exactly
 _MAX_COORDINATE_M = 1e9  # largest coordinate of a pose in metres; larger ones overflow in the optimiser
 _MAX_INFORMATION = 1e18  # largest number of an information matrix; larger ones overflow in the optimiser
-_MAX_ASYMMETRY = 1e-6  # largest difference from symmetry, as a share of a matrix's largest number
+_MAX_ASYMMETRY = 1e-6
+"""Largest difference between an information matrix and its transpose, as a share of the largest number."""
 _FROM_G2O = np.diag([1.0, 1.0, 1.0, 0.5, 0.5, 0.5])
 """Derivative of g2o's error (translation, vector part of a quaternion) by our twist: the vector part of a
 quaternion is half of a small rotation vector."""

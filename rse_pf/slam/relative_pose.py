@@ -45,7 +45,9 @@ _MAX_LANDMARK_M = 1e5
 one landmark beyond it."""
 _MIN_DEPTH_M = 0.01  # smallest depth in metres that is used as the measurement of a depth camera
 _MAX_DEPTH_M = 100.0  # largest depth in metres that is used as the measurement of a depth camera
-_MIN_SCALE_RATIOS = 12  # inliers with a depth in both images that are needed to estimate a ratio of scales
+_MIN_SCALE_RATIOS = 12
+"""Smallest number of inliers with a depth in both images from which a ratio of metric scales is
+estimated."""
 _MAX_SCALE_SPREAD = 0.15
 """Largest standard deviation of the logarithms of depth ratios at which their median is a ratio of scales."""
 _MIN_SCALE_DEVIATION = 0.01

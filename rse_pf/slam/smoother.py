@@ -17,21 +17,21 @@ __all__ = ["ScaleTerms", "SmoothedPoses", "smooth"]
 
 Rows = npt.NDArray[np.int64]
 
-_MAX_ITERATIONS = 6  # Gauss-Newton steps of one call of `smooth`
-_MAX_STEP_TRIALS = (
-    4  # number of lengths of a Gauss-Newton step that are tried until the cost does not increase
-)
+_MAX_ITERATIONS = 6  # largest number of Gauss-Newton steps of one call of `smooth`
+_MAX_STEP_TRIALS = 4
+"""Largest number of lengths of a Gauss-Newton step that are tried until the cost does not increase."""
 _STEP_REDUCTION = 0.25  # factor by which a Gauss-Newton step that increases the cost is shortened
 _CONVERGED_M = 6e-3
 """Largest translation in metres of a step after which no further step is made: the next step would be ten
 times shorter, and the next keyframe's call of `smooth` makes it."""
-_CONVERGED_RAD = 6e-3  # largest rotation in radians of a step after which no further step is made, likewise
-_MIN_RELATIVE_DECREASE = (
-    1e-3  # relative decrease of the cost below which a further step is not worth its time
-)
-_MAX_ROTATION_STEP_RAD = (
-    0.5  # a step is shortened to this rotation, beyond which its linearisation is invalid
-)
+_CONVERGED_RAD = 6e-3
+"""Largest rotation in radians of a Gauss-Newton step after which no further step is made: the next call
+makes it."""
+_MIN_RELATIVE_DECREASE = 1e-3
+"""Relative decrease of the cost below which a further Gauss-Newton step is not worth its time."""
+_MAX_ROTATION_STEP_RAD = 0.5
+"""Largest rotation in radians of a Gauss-Newton step; beyond it the linearisation is invalid, and the step
+is shortened."""
 _DAMPING = 1e-6
 """Levenberg damping: each diagonal element h of the normal equations becomes h + 1e-6 (h + 1), so that a free
 pose without an edge stays where it is."""
