@@ -101,7 +101,7 @@ _PINHOLE = 1  # number by which the camera block names the pinhole model
 _ORB_DETECTOR = 1  # number by which the features block names the detector ORB
 _NAMED_DETECTOR = 2  # number by which the features block announces the name of another kind of features
 _METRICS = {"uint8": 1, "int8": 2}
-"""Number of the metric in the features block by the dtype of descriptors: 1 is Hamming, 2 Euclidean distance."""
+"""Number of the metric in the features block by the dtype of descriptors: 1 Hamming, 2 Euclidean distance."""
 _DEPTHS = 1  # number by which the geometry block announces depths in millimetres
 _DISPARITIES = 2  # number by which the geometry block announces disparities of a stereo pair
 _SCALELESS_DEPTHS = 3  # number by which the geometry block announces depths without metric scale
