@@ -85,10 +85,10 @@ class FakeMap:
                 Corrected(robot=robot, segment=0, T_map_odom=T, covariance=np.eye(6), cause=(robot, number))
             ]
         if isinstance(event, MapStarted):
-            self._state["keyframes"] += [[each.robot, -1, 0.0] for each in event.keyframes]
+            self._state["keyframes"] += [[keyframe.robot, -1, 0.0] for keyframe in event.keyframes]
         if isinstance(event, RobotForgotten):
             rows = self._state["keyframes"]
-            self._state["keyframes"] = [each for each in rows if each[0] != event.robot]
+            self._state["keyframes"] = [row for row in rows if row[0] != event.robot]
             for table in ("numbers", "segments"):
                 self._state[table].pop(event.robot, None)
         return []
@@ -118,12 +118,17 @@ class FakeMap:
         camera = Camera(fx=500.0, fy=500.0, cx=320.0, cy=240.0, width=640, height=480)
         keyframes = [
             Keyframe(
-                id=row, robot=robot, timestamp_s=timestamp_s, T_world_camera=np.eye(4), camera=camera,
-                pixels=np.zeros((0, 2), np.float32), descriptors=np.zeros((0, 32), np.uint8),
+                id=row,
+                robot=robot,
+                timestamp_s=timestamp_s,
+                T_world_camera=np.eye(4),
+                camera=camera,
+                pixels=np.zeros((0, 2), np.float32),
+                descriptors=np.zeros((0, 32), np.uint8),
                 points_camera=np.zeros((0, 3), np.float32),
             )
             for row, (robot, _, timestamp_s) in enumerate(self._state["keyframes"])
-        ]  # fmt: skip
+        ]
         return MapVersion(keyframes=tuple(keyframes), edges=(), points=np.zeros((0, 3), np.float32))
 
     def point_sources(self, version: MapVersion) -> tuple[PointSource, ...]:
@@ -162,7 +167,8 @@ def _started(version: MapVersion, source: str) -> MapStarted:
     return MapStarted(
         source=source,
         keyframes=tuple(
-            StartKeyframe(robot=each.robot, data=keyframe_bytes(0.0, b"")) for each in version.keyframes
+            StartKeyframe(robot=keyframe.robot, data=keyframe_bytes(0.0, b""))
+            for keyframe in version.keyframes
         ),
     )
 
@@ -175,10 +181,13 @@ def keyframe_bytes(timestamp_s: float, content: bytes) -> bytes:
     features = make_features(np.zeros((0, 2)), np.zeros(0), np.zeros((0, 32), np.uint8))
     return encode_keyframe(
         SentKeyframe(
-            timestamp_s=timestamp_s, T_odom_camera=np.eye(4), camera=_CAMERA, features=features,
+            timestamp_s=timestamp_s,
+            T_odom_camera=np.eye(4),
+            camera=_CAMERA,
+            features=features,
             unknown_blocks=(UnknownBlock(_CONTENT_KIND, content),),
         )
-    )  # fmt: skip
+    )
 
 
 def content_of(event: KeyframeAdded) -> bytes:

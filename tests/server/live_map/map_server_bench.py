@@ -70,7 +70,7 @@ class HandClock:
         for due_s, future in self._sleepers:
             if due_s <= self.now_s and not future.done():
                 future.set_result(None)
-        self._sleepers = [each for each in self._sleepers if not each[1].done()]
+        self._sleepers = [sleeper for sleeper in self._sleepers if not sleeper[1].done()]
 
 
 class InlineThreads:
@@ -201,9 +201,9 @@ class Bench:
         return decode_lease(LEASE, data)
 
     async def start(self, name: str) -> RunningMapServer:
-        made = RunningMapServer(self, name)
+        server = RunningMapServer(self, name)
         await settle()
-        return made
+        return server
 
     def replayed(self) -> MapState:
         """Return the map that the entries of the log give, from the first one on."""

@@ -54,7 +54,7 @@ def worker(monkeypatch: pytest.MonkeyPatch) -> Iterator[Worker]:
 
 
 def keyframes(wire: Any) -> list[int]:
-    return [each.payload["keyframes"] for each in wire.sent if isinstance(each, Update)]
+    return [message.payload["keyframes"] for message in wire.sent if isinstance(message, Update)]
 
 
 def test_a_subscriber_gets_the_present_state_and_then_each_newer_one(worker: Worker) -> None:
@@ -65,7 +65,7 @@ def test_a_subscriber_gets_the_present_state_and_then_each_newer_one(worker: Wor
     worker.tell(2)
 
     assert keyframes(wire) == [1, 2]
-    assert [each.seq for each in wire.sent] == [2, 3]
+    assert [message.seq for message in wire.sent] == [2, 3]
     assert worker.dispatcher.snapshot()["gauges"]["subscriptions"] == 1.0
 
 
@@ -85,7 +85,9 @@ def test_a_ninth_subscription_is_above_the_quota_until_one_ends(worker: Worker) 
     connection, wire = worker.subscriber()
     for number in range(MAX_SUBSCRIPTIONS + 1):
         worker.say(connection, Subscribe(id=number, topic=f"live/m{number}"))
-    assert [(each.id, each.code) for each in wire.sent if isinstance(each, Failure)] == [(8, "quota")]
+    assert [(message.id, message.code) for message in wire.sent if isinstance(message, Failure)] == [
+        (8, "quota")
+    ]
 
     worker.say(connection, Unsubscribe(id=0))
     worker.say(connection, Subscribe(id=8, topic="live/m8"))
@@ -103,7 +105,7 @@ def test_a_subscription_of_a_live_id_begins_again(worker: Worker) -> None:
     worker.say(connection, Subscribe(id=4, topic="live/m"))
     worker.loop.advance(0.1)
 
-    assert [(each.id, each.seq) for each in wire.sent] == [(4, 1)]
+    assert [(message.id, message.seq) for message in wire.sent] == [(4, 1)]
     assert worker.dispatcher.snapshot()["gauges"]["subscriptions"] == 1.0
 
 
@@ -112,7 +114,7 @@ def test_a_refused_subscription_leaves_its_place_to_another(worker: Worker) -> N
     for _ in range(2 * MAX_SUBSCRIPTIONS):
         worker.say(connection, Subscribe(id=4, topic="platform"))
 
-    assert [each.code for each in wire.sent] == ["bad-request"] * 2 * MAX_SUBSCRIPTIONS
+    assert [message.code for message in wire.sent] == ["bad-request"] * 2 * MAX_SUBSCRIPTIONS
     assert connection.session is not None
     assert connection.session.topics == {}
 
@@ -164,7 +166,10 @@ def test_without_live_maps_topics_and_services_are_unknown() -> None:
         parts.say(connection, Subscribe(id=4, topic="live/m"))
         parts.say(connection, Command(id=5, service="live-keyframe", payload={}))
 
-        assert [(each.id, each.code) for each in wire.sent] == [(4, "not-found"), (5, "unknown-service")]
+        assert [(message.id, message.code) for message in wire.sent] == [
+            (4, "not-found"),
+            (5, "unknown-service"),
+        ]
 
 
 def test_a_subscription_before_hello_closes_the_connection(worker: Worker) -> None:

@@ -72,10 +72,16 @@ class Worker:
         self.updates: list[dict[str, Any]] = []
         self.pool = MapServerPool(self._spawn, max_processes=2, keeps_spare=False)
         context = ConnectionContext(
-            store=self.store, settings=PlatformSettings().live, server_id="here", log=FakeLog(),
-            call=self._call, key=lambda: b"k" * 32, pool=self.pool,
-            clock=time.monotonic, wall_clock=time.time,
-        )  # fmt: skip
+            store=self.store,
+            settings=PlatformSettings().live,
+            server_id="here",
+            log=FakeLog(),
+            call=self._call,
+            key=lambda: b"k" * 32,
+            pool=self.pool,
+            clock=time.monotonic,
+            wall_clock=time.time,
+        )
         self.map = MapConnection(
             context, "default", "warehouse", on_update=self.updates.append, on_end=lambda connection: None
         ).start()
@@ -118,7 +124,7 @@ async def test_a_process_is_started_as_soon_as_a_map_that_nobody_has_begun_is_wa
         assert worker.lease() is None  # the first keyframe begins the map
 
         sent = asyncio.ensure_future(worker.map.request(ROBOT, "live-keyframe", FIRST, 5.0))
-        await until(lambda: (found := worker.lease()) is not None and found.state == "serving")
+        await until(lambda: (lease := worker.lease()) is not None and lease.state == "serving")
         assert len(worker.started) == 1
         sent.cancel()
 
@@ -157,7 +163,7 @@ async def test_a_map_server_whose_port_is_closed_is_replaced_at_once_by_workers_
         sent = asyncio.ensure_future(worker.map.request(ROBOT, "live-keyframe", FIRST, 5.0))
         await until(lambda: worker.started)
         worker.started[0].tell("ready")
-        await until(lambda: (found := worker.lease()) is not None and found.epoch == 2)
+        await until(lambda: (lease := worker.lease()) is not None and lease.epoch == 2)
         assert time.monotonic() - began_s < PlatformSettings().live.lease_s
         sent.cancel()
 
@@ -212,7 +218,7 @@ async def test_who_may_only_watch_starts_no_process_and_gets_the_state_idle() ->
         worker.map.set_watched(True, may_start=True)
         await until(lambda: worker.started)
         worker.started[0].tell("ready")
-        await until(lambda: (found := worker.lease()) is not None and found.state == "serving")
+        await until(lambda: (lease := worker.lease()) is not None and lease.state == "serving")
         assert worker.updates[-1]["state"] == "moving"
 
 

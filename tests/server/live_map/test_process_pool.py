@@ -127,8 +127,8 @@ async def test_a_process_whose_map_gets_commands_is_not_the_first_to_be_released
         assert child is not None
         process = child._process
         assert isinstance(process, FakeProcess)
-        taken = worker.take("acme", is_watched_only=True)
-        assert taken is child
+        process_of_map = worker.take("acme", is_watched_only=True)
+        assert process_of_map is child
         assert child.unused_since_s == 0.0
         process.theirs.sendall(encode_message(["used", True]))
         while child.unused_since_s is not None:

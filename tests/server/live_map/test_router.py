@@ -43,10 +43,12 @@ POSE = [1, 0, 0, 0.5, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
 SEEN = np.full((300, 2), 7.5), np.full(300, 2.0), np.arange(9600, dtype=np.uint8).reshape(300, 32)
 KEYFRAME = encode_keyframe(
     SentKeyframe(
-        timestamp_s=1.5, T_odom_camera=np.array(POSE, dtype=float).reshape(4, 4), camera=Camera(**CAMERA),
+        timestamp_s=1.5,
+        T_odom_camera=np.array(POSE, dtype=float).reshape(4, 4),
+        camera=Camera(**CAMERA),
         features=make_features(*SEEN),
     )
-)  # fmt: skip
+)
 
 
 def keyframe(number: int = 0, **changes: Any) -> dict[str, Any]:
@@ -110,9 +112,12 @@ async def a_router(now: list[float] | None = None) -> AsyncIterator[Parts]:
     monotonic = time.monotonic if now is None else lambda: now[0]
     with quiet_log() as log:
         context = WorkerContext(
-            settings=PlatformSettings(), server_id="s-1", log=log, loop=asyncio.get_running_loop(),
+            settings=PlatformSettings(),
+            server_id="s-1",
+            log=log,
+            loop=asyncio.get_running_loop(),
             clocks=Clocks(monotonic=monotonic, wall=time.time, cpu=time.process_time),
-        )  # fmt: skip
+        )
         parts = Parts(context)
         yield parts
         await asyncio.wait_for(parts.router.wait_closed(), 20.0)
@@ -167,7 +172,7 @@ WRONG = [
     ({"segment": -1}, "bad-request"),
     ({"number": 1.5}, "bad-request"),
     ({"keyframe": with_head(timestamp_s=float("nan"))}, "bad-request"),
-    ({"keyframe": with_head(pose=[2 * each for each in POSE])}, "bad-request"),
+    ({"keyframe": with_head(pose=[2 * value for value in POSE])}, "bad-request"),
     ({"keyframe": with_head(pose=[-1, *POSE[1:]])}, "bad-request"),
     ({"keyframe": with_head(pose=[float("inf"), *POSE[1:]])}, "bad-request"),
     ({"keyframe": with_head(pose=[*POSE[:3], 2e6, *POSE[4:]])}, "bad-request"),
@@ -376,16 +381,19 @@ async def test_two_workers_tell_their_robots_the_same() -> None:
         parts.router.subscribe(here, 1, "live/m")
         other.router.subscribe(there, 2, "live/m")
         payload = {
-            "kind": "alignment", "robot": "here", "aligned": True,
-            "T_map_odom": np.eye(4).astype("<f8").tobytes(), "covariance": np.arange(21.0).tobytes(),
-        }  # fmt: skip
-        for each in (parts, other):
-            assert each.client.watched == [("default", "m")]
-            each.client.on_update("default", "m", payload)
-            each.client.on_update("default", "m", {"kind": "map", "keyframes": 3, "key": "map"})
+            "kind": "alignment",
+            "robot": "here",
+            "aligned": True,
+            "T_map_odom": np.eye(4).astype("<f8").tobytes(),
+            "covariance": np.arange(21.0).tobytes(),
+        }
+        for worker in (parts, other):
+            assert worker.client.watched == [("default", "m")]
+            worker.client.on_update("default", "m", payload)
+            worker.client.on_update("default", "m", {"kind": "map", "keyframes": 3, "key": "map"})
 
         for reader in (here, there):
-            updates = {each.key: each.payload for each in await settled(reader, 2)}
+            updates = {update.key: update.payload for update in await settled(reader, 2)}
             assert updates.keys() == {"map", "alignment/here"}
             assert updates["map"] == {"kind": "map", "keyframes": 3}
             np.testing.assert_array_equal(updates["alignment/here"]["T_map_odom"], np.eye(4).ravel())
@@ -447,7 +455,7 @@ async def test_a_token_to_watch_a_map_subscribes_to_it_and_starts_no_map_server(
         assert parts.client.may_start == {("default", "m"): False}
         parts.client.on_update("default", "m", {"kind": "map", "keyframes": 1})
 
-        [update] = [each for each in await settled(viewer, 1) if isinstance(each, Update)]
+        [update] = [message for message in await settled(viewer, 1) if isinstance(message, Update)]
         assert update.payload["keyframes"] == 1
         parts.router.subscribe(viewer, 10, "live/other")
         failure: Any = viewer.written[-1]
@@ -476,11 +484,14 @@ async def test_a_driver_whose_fresh_token_only_allows_to_watch_goes_on_reading_a
 @pytest.mark.parametrize(
     "error",
     [
-        BadRequest("the relative pose is no rotation"), LimitExceeded("too many versions"),
-        InvalidCamera("fx"), QuotaExceeded("the tenant is full"), StoreFull("the disk is full"),
+        BadRequest("the relative pose is no rotation"),
+        LimitExceeded("too many versions"),
+        InvalidCamera("fx"),
+        QuotaExceeded("the tenant is full"),
+        StoreFull("the disk is full"),
     ],
     ids=lambda error: error.code,
-)  # fmt: skip
+)
 @pytest.mark.parametrize("service", sorted(LIVE_SERVICES - {"live-keyframe", "live-relocalise", "live-list"}))
 async def test_an_error_of_the_map_never_counts_against_who_asked(service: str, error: RsePfError) -> None:
     async with a_router() as parts:
@@ -514,7 +525,7 @@ async def test_commands_that_wait_for_map_servers_are_bounded_for_each_tenant() 
         hostile, good = FakeReader("r", tenant="acme"), FakeReader("r", tenant="rival")
         for _ in range(20):
             parts.submit("live-show", {"map": "m"}, connection=hostile, size_bytes=1 << 20)
-        assert [each.code for each in parts.answers if isinstance(each, Failure)] == ["busy"] * 4
+        assert [answer.code for answer in parts.answers if isinstance(answer, Failure)] == ["busy"] * 4
 
         parts.submit("live-show", {"map": "m"}, connection=good, size_bytes=1 << 20)
 

@@ -32,16 +32,20 @@ CAMERA = {"fx": 525.0, "fy": 525.0, "cx": 319.5, "cy": 239.5, "width": 640, "hei
 
 
 def keyframe(number: int) -> dict[str, Any]:
-    """Return the request of a keyframe with features at random."""
+    """Return the request of a keyframe with random features."""
     noise = np.random.default_rng(number)
     seen = (
-        noise.uniform(10, 400, (300, 2)), np.full(300, 2.0), noise.integers(0, 255, (300, 32), dtype=np.uint8)
-    )  # fmt: skip
-    made = SentKeyframe(
-        timestamp_s=float(number), T_odom_camera=np.eye(4), camera=Camera(**CAMERA),
+        noise.uniform(10, 400, (300, 2)),
+        np.full(300, 2.0),
+        noise.integers(0, 255, (300, 32), dtype=np.uint8),
+    )
+    sent = SentKeyframe(
+        timestamp_s=float(number),
+        T_odom_camera=np.eye(4),
+        camera=Camera(**CAMERA),
         features=make_features(*seen),
-    )  # fmt: skip
-    return {"map": "m", "segment": 0, "number": number, "keyframe": encode_keyframe(made)}
+    )
+    return {"map": "m", "segment": 0, "number": number, "keyframe": encode_keyframe(sent)}
 
 
 def robot(server: GuardedServer, name: str, **claims: Any) -> client_sdk.Robot:
@@ -52,8 +56,8 @@ def robot(server: GuardedServer, name: str, **claims: Any) -> client_sdk.Robot:
 async def value(updates: client_sdk.Updates, key: str, fits: Callable[[Any], bool]) -> Any:
     """Return the first value of *key* that *fits*."""
     while True:
-        found, payload = await updates.next()
-        if found == key and fits(payload):
+        updated_key, payload = await updates.next()
+        if updated_key == key and fits(payload):
             return payload
 
 
@@ -68,10 +72,13 @@ def server(tmp_path: Path) -> Iterator[GuardedServer]:
 async def test_robots_of_all_workers_see_the_map_of_their_tenant_and_no_other(server: GuardedServer) -> None:
     async with (
         robot(server, "sender") as sender,
-        robot(server, "a") as a, robot(server, "b") as b, robot(server, "c") as c,
-        robot(server, "d") as d, robot(server, "stranger", tenant="other") as stranger,
-    ):  # fmt: skip
-        readers = [each.subscribe("live/m") for each in (a, b, c, d)]
+        robot(server, "a") as a,
+        robot(server, "b") as b,
+        robot(server, "c") as c,
+        robot(server, "d") as d,
+        robot(server, "stranger", tenant="other") as stranger,
+    ):
+        readers = [robot.subscribe("live/m") for robot in (a, b, c, d)]
         foreign = stranger.subscribe("live/m")
 
         for number in range(3):
@@ -81,12 +88,13 @@ async def test_robots_of_all_workers_see_the_map_of_their_tenant_and_no_other(se
         for updates in readers:
             pose = await value(updates, "pose/sender", lambda pose: pose["timestamp_s"] == 2.0)
             np.testing.assert_allclose(pose["T_map_camera"], np.eye(4).ravel())
-        assert [each["name"] for each in (await a.call("live-list", {})).reply["maps"]] == ["m"]
+        assert [entry["name"] for entry in (await a.call("live-list", {})).reply["maps"]] == ["m"]
         assert (await stranger.call("live-list", {})).reply["maps"] == []
         assert (await stranger.call("live-show", {"map": "m"})).reply["keyframes"] == 0
         assert await foreign.next() == (
-            "map", {"kind": "map", "keyframes": 0, "version": 0, "owner": "", "state": "moving"},
-        )  # fmt: skip
+            "map",
+            {"kind": "map", "keyframes": 0, "version": 0, "owner": "", "state": "moving"},
+        )
         with pytest.raises(asyncio.TimeoutError):
             await asyncio.wait_for(foreign.next(), 0.5)
 
@@ -107,7 +115,9 @@ async def test_a_token_to_watch_a_map_allows_to_subscribe_to_it_and_nothing_else
     async with robot(server, "v", scopes=("maps:watch/m",)) as viewer, robot(server, "r") as driver:
         updates = viewer.subscribe("live/m")
         assert (await updates.next())[0] == "map"
-        for service in sorted({*LIVE_SERVICES, *(each.name for each in builtin_services(server.settings))}):
+        for service in sorted(
+            {*LIVE_SERVICES, *(service.name for service in builtin_services(server.settings))}
+        ):
             if service == "live-list":
                 assert (await viewer.call(service, {})).reply == {"maps": []}
                 continue
@@ -222,14 +232,17 @@ SENT_BY_WATCHER: dict[type, Callable[[ClientConnection, GuardedServer], Awaitabl
         type(message): is_refused(message)
         for message in (
             messages.Welcome(server="s", session="s", robot="r", protocol=1, limits=LIMITS, clock_s=0.0),
-            messages.Result(id=1, reply={}), messages.Failure(code="busy", message="m"),
-            messages.Move(reason="drain", within_ms=1.0), messages.Progress(id=1, done=0.5),
-            messages.Pong(sent_s=0.0, received_s=0.0, answered_s=0.0), messages.Renewed(token_s=1e9),
+            messages.Result(id=1, reply={}),
+            messages.Failure(code="busy", message="m"),
+            messages.Move(reason="drain", within_ms=1.0),
+            messages.Progress(id=1, done=0.5),
+            messages.Pong(sent_s=0.0, received_s=0.0, answered_s=0.0),
+            messages.Renewed(token_s=1e9),
             messages.Update(id=300, topic="live/m", seq=1, key="map", payload={"kind": "map"}),
         )
     },
     messages.Hello: sends_hello,
-}  # fmt: skip
+}
 """What a robot that may only watch sends of each type, and what becomes of it; the last one ends the
 connection."""
 
@@ -245,9 +258,12 @@ async def test_a_token_to_watch_a_map_gets_no_message_of_any_type_past_its_right
     server.restart()  # the map has no owner now, and whoever may start one gets one
     before, token = lease.read_bytes(), server.token("v", scopes=("maps:watch/m",))
     async with connect(
-        server.url, subprotocols=[SUBPROTOCOLS["json"]], compression=None, ping_interval=None,
+        server.url,
+        subprotocols=[SUBPROTOCOLS["json"]],
+        compression=None,
+        ping_interval=None,
         additional_headers={"Authorization": f"Bearer {token}"},
-    ) as socket:  # fmt: skip
+    ) as socket:
         [welcome] = await ask_raw(socket, messages.Hello(capabilities=(UPDATES,)), messages.Welcome)
         assert welcome.robot == "v"
         for kind, send in SENT_BY_WATCHER.items():

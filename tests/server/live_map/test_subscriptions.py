@@ -44,11 +44,11 @@ def parts() -> Parts:
 
 
 def received(reader: FakeReader) -> list[tuple[int, str]]:
-    return [(each.seq, each.key) for each in reader.written if isinstance(each, Update)]
+    return [(update.seq, update.key) for update in reader.written if isinstance(update, Update)]
 
 
 def poses(reader: FakeReader) -> list[float]:
-    return [each.payload["x"] for each in reader.written if each.key != "map"]
+    return [update.payload["x"] for update in reader.written if update.key != "map"]
 
 
 def test_a_new_subscription_gets_the_present_value_of_every_key(parts: Parts) -> None:

@@ -546,7 +546,7 @@ class MapServer:
             await environment.sleep(wait_s)
 
     def _after_renewal(self) -> None:
-        """Do what is due at intervals, now that the lease is certainly held."""
+        """Send, publish or give up what is due, after each successful renewal of the lease."""
         environment = self._environment
         now = environment.clock()
         # 1. Replies and updates that waited for the renewal are sent.

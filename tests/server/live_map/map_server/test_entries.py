@@ -15,19 +15,19 @@ from rse_pf.server.live_map.map_server.log import LogWriter, SubmittedEvent
 
 
 class Taker:
-    """Records how many events each entry has, and applies none."""
+    """Records how many events submitted entry has, and applies none."""
 
     def __init__(self) -> None:
         self.sizes: list[int] = []
 
     async def apply_entry(self, position: int, batch: list[SubmittedEvent]) -> None:
         self.sizes.append(len(batch))
-        for each in batch:
-            each.applied.set_result([])
+        for submitted in batch:
+            submitted.applied.set_result([])
 
 
 class Store:
-    """Stands for a thread and for a log that writes each entry at once."""
+    """Stands for a thread and for a log that writes submitted entry at once."""
 
     def store(self, act: Callable[[], int]) -> Awaitable[int]:
         async def done() -> int:

@@ -67,12 +67,16 @@ def keyframe_request(
 ) -> bytes:
     noise = np.random.default_rng(number)
     seen = noise.uniform(10, 400, (50, 2)), np.full(50, 2.0), noise.integers(0, 255, (50, 32), dtype=np.uint8)
-    made = SentKeyframe(
-        timestamp_s=float(number), T_odom_camera=exp_se3([0.2 * number, 0, 0, 0, 0, 0]), camera=CAMERA,
-        features=make_features(*seen), points=reference, image=image,
-    )  # fmt: skip
+    keyframe = SentKeyframe(
+        timestamp_s=float(number),
+        T_odom_camera=exp_se3([0.2 * number, 0, 0, 0, 0, 0]),
+        camera=CAMERA,
+        features=make_features(*seen),
+        points=reference,
+        image=image,
+    )
     return msgspec.msgpack.encode(
-        KeyframeRequest(map=MAP, segment=0, number=number, keyframe=encode_keyframe(made))
+        KeyframeRequest(map=MAP, segment=0, number=number, keyframe=encode_keyframe(keyframe))
     )
 
 
@@ -93,9 +97,9 @@ def test_a_reference_to_an_object_of_another_robot_gives_nothing() -> None:
     store = MemoryStore()
     reference = stored(store, OTHER, some_points(2.0))
 
-    found = objects(store).build_cloud([source(ONE, reference)])
+    cloud = objects(store).build_cloud([source(ONE, reference)])
 
-    assert (len(found.points), found.keyframes, found.missing) == (0, 0, 1)
+    assert (len(cloud.points), cloud.keyframes, cloud.missing) == (0, 0, 1)
 
 
 def test_objects_that_are_no_points_are_left_out_and_the_rest_is_there() -> None:
@@ -109,10 +113,10 @@ def test_objects_that_are_no_points_are_left_out_and_the_rest_is_there() -> None
     store.put(object_name(ONE, changed.digest), some_points(1.0))
     wrong = [bomb, large, text, lying, ObjectReference(changed.digest, len(some_points(1.0)))]
 
-    found = objects(store).build_cloud([source(ONE, each) for each in [*wrong, good]])
+    cloud = objects(store).build_cloud([source(ONE, reference) for reference in [*wrong, good]])
 
-    assert (found.keyframes, found.missing) == (1, 5)
-    assert np.allclose(found.points[:, 2], 2.0)
+    assert (cloud.keyframes, cloud.missing) == (1, 5)
+    assert np.allclose(cloud.points[:, 2], 2.0)
 
 
 def test_a_camera_that_makes_metres_of_kilometres_adds_no_point_far_away() -> None:
@@ -133,10 +137,10 @@ def test_each_robot_has_its_share_of_a_map_with_many_keyframes(monkeypatch: pyte
     mine, theirs = stored(store, ONE, some_points(1.0)), stored(store, OTHER, some_points(3.0))
     many = [source(OTHER, theirs) for _ in range(100)]
 
-    found = objects(store).build_cloud([*many, source(ONE, mine), source(ONE, mine)])
+    cloud = objects(store).build_cloud([*many, source(ONE, mine), source(ONE, mine)])
 
-    assert found.keyframes == 10
-    assert {round(float(z)) for z in found.points[:, 2]} == {1, 3}
+    assert cloud.keyframes == 10
+    assert {round(float(z)) for z in cloud.points[:, 2]} == {1, 3}
 
 
 def test_many_keyframes_of_many_points_take_no_more_memory_than_a_few(
@@ -147,7 +151,7 @@ def test_many_keyframes_of_many_points_take_no_more_memory_than_a_few(
     store = MemoryStore()
     references = [stored(store, ONE, some_points(1.0 + 0.1 * number)) for number in range(10)]
     monkeypatch.setattr(f"{module}._MAX_POINTS", 5 * 12 * 16)
-    monkeypatch.setattr(f"{module}._MAX_CACHED_BYTES", 3 * max(each.size for each in references))
+    monkeypatch.setattr(f"{module}._MAX_CACHED_BYTES", 3 * max(reference.size for reference in references))
     keeper, joined = objects(store), []
 
     def join(clouds: list[np.ndarray], colours: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
@@ -155,11 +159,11 @@ def test_many_keyframes_of_many_points_take_no_more_memory_than_a_few(
         return merge_clouds(clouds, colours)
 
     monkeypatch.setattr(f"{module}.merge_clouds", join)
-    found = [keeper.build_cloud([source(ONE, each) for each in references]) for _ in range(2)]
+    clouds = [keeper.build_cloud([source(ONE, reference) for reference in references]) for _ in range(2)]
 
-    assert [each.keyframes for each in found] == [10, 10]
+    assert [cloud.keyframes for cloud in clouds] == [10, 10]
     assert joined == [5 * 12 * 16] * 2
-    assert sum(map(len, keeper._cache.values())) <= 3 * max(each.size for each in references)
+    assert sum(map(len, keeper._cache.values())) <= 3 * max(reference.size for reference in references)
     assert len(keeper._cache) == 3
 
 
@@ -168,7 +172,7 @@ def test_a_culled_keyframe_loses_its_objects_a_little_later() -> None:
     held = [stored(store, ONE, bytes([number])) for number in range(70)]
     keeper = KeyframeObjects(store, account)  # type: ignore[arg-type]
 
-    keeper.delete_of_culled([(ONE.folder, each.digest) for each in held])
+    keeper.delete_of_culled([(ONE.folder, reference.digest) for reference in held])
 
     assert account.released == 6
     assert len(list(store.list(f"objects/{ONE.folder}/"))) == 64
@@ -251,8 +255,8 @@ async def test_a_map_keeps_up_of_the_version_that_it_started_from(up: object) ->
 
     await drive(bench, True)
 
-    found = maps.load(MAP, "head").up
-    assert found is None if not isinstance(up, list) else np.allclose(found, up)
+    up_of_version = maps.load(MAP, "head").up
+    assert up_of_version is None if not isinstance(up, list) else np.allclose(up_of_version, up)
 
 
 async def test_the_next_map_server_deletes_objects_that_the_last_one_could_not() -> None:
@@ -299,7 +303,7 @@ async def test_live_show_has_whole_paths_in_the_map_where_they_are_asked_for() -
     await settle()
     shown = await server.ask("live-show", {"paths": True})
     assert "paths" not in await server.ask("live-show")
-    assert [(each["robot"], each["segment"]) for each in shown["paths"]] == [("one", 0)]
+    assert [(path["robot"], path["segment"]) for path in shown["paths"]] == [("one", 0)]
     assert np.allclose(shown["paths"][0]["points"], [[0.2 * n, 0, 0] for n in range(5)], atol=1e-3)
     first_and_last = server.state.live_map.paths(2)[0][2][:, 0]
     assert first_and_last[0] == 0.0

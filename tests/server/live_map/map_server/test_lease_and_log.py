@@ -42,7 +42,7 @@ def record(**changes: object) -> LeaseRecord:
 
 
 @pytest.mark.parametrize(
-    ("found", "unchanged_s", "verdict"),
+    ("lease", "unchanged_s", "action"),
     [
         (None, 0.0, "claim"),
         (record(state="released"), 0.0, "claim"),
@@ -59,9 +59,9 @@ def record(**changes: object) -> LeaseRecord:
     ],
 )
 def test_a_map_is_taken_over_when_its_lease_has_ended(
-    found: LeaseRecord | None, unchanged_s: float, verdict: str
+    lease: LeaseRecord | None, unchanged_s: float, action: str
 ) -> None:
-    assert next_action(found, unchanged_s=unchanged_s, lease_s=LEASE_S) == verdict
+    assert next_action(lease, unchanged_s=unchanged_s, lease_s=LEASE_S) == action
 
 
 def test_of_two_processes_that_claim_a_map_one_gets_it():
@@ -161,8 +161,8 @@ def test_two_snapshots_are_kept_and_a_damaged_one_is_passed_over():
 
 def parts_in(store: MemoryStore) -> list[str]:
     """Return epoch and name of the parts of snapshots that are stored."""
-    found = [info.name.removeprefix(f"{FOLDER}features/") for info in store.list(f"{FOLDER}features/")]
-    return [f"{int(name[:9])}{name[9:]}" for name in found]
+    parts = [info.name.removeprefix(f"{FOLDER}features/") for info in store.list(f"{FOLDER}features/")]
+    return [f"{int(name[:9])}{name[9:]}" for name in parts]
 
 
 def test_snapshots_share_their_parts_and_none_is_kept_that_no_snapshot_needs():

@@ -259,11 +259,11 @@ async def test_a_store_that_fails_three_times_in_ten_loses_and_doubles_nothing(s
     sent = [asyncio.ensure_future(server.keyframe(number)) for number in range(20)]
     for _ in range(400):
         await bench.clock.advance(0.1)
-        if all(each.done() for each in sent):
+        if all(request.done() for request in sent):
             break
     store.share = 0.0
     await bench.clock.advance(3.0)
-    assert [each.result()["number"] for each in sent] == list(range(1, 21))
+    assert [request.result()["number"] for request in sent] == list(range(1, 21))
     assert store.failures > 20
     assert not server.run.done()
     replayed = bench.replayed()
@@ -434,8 +434,8 @@ async def test_an_empty_map_logs_the_size_of_rooms_that_look_the_same():
         await server.ask("live-start", {"equal_rooms_m": -1.0})
     await server.ask("live-start", {"equal_rooms_m": 5.0})
     log = LiveLog(bench.store, FOLDER, owner="replay", epoch=1)
-    events = [each for entry in log.read_entries() for each in decode_events(entry.events)]
-    assert [each.equal_rooms_m for each in events if isinstance(each, MapStarted)] == [5.0]
+    events = [event for entry in log.read_entries() for event in decode_events(entry.events)]
+    assert [event.equal_rooms_m for event in events if isinstance(event, MapStarted)] == [5.0]
 
 
 async def test_a_map_server_that_nobody_uses_publishes_and_releases_its_map():

@@ -47,13 +47,13 @@ class Servers:
     b: LiveMapClient
     updates: list[dict[str, Any]]
 
-    async def send(self, links: LiveMapClient, number: int) -> dict[str, Any]:
-        return await links.request(
+    async def send(self, client: LiveMapClient, number: int) -> dict[str, Any]:
+        return await client.request(
             "default", MAP, ROBOT, "live-keyframe", keyframe_request(number), PATIENT_S
         )
 
-    async def show(self, links: LiveMapClient) -> dict[str, Any]:
-        return await links.request("default", MAP, ROBOT, "live-show", LiveMapRequest(map=MAP), PATIENT_S)
+    async def show(self, client: LiveMapClient) -> dict[str, Any]:
+        return await client.request("default", MAP, ROBOT, "live-show", LiveMapRequest(map=MAP), PATIENT_S)
 
     async def serving_process(self) -> MapServerProcess:
         """Return the process that serves the map; on a busy machine another one may be about to."""
@@ -80,23 +80,30 @@ class Servers:
 @asynccontextmanager
 async def servers(folder: Path, **live: Any) -> AsyncIterator[Servers]:
     settings = PlatformSettings.from_dict(
-        {"data": {"store": f"dir:{folder}"}, "live": {"keep_log": True, **live},
-         "serving": {"log_level": "error"}}
-    )  # fmt: skip
+        {
+            "data": {"store": f"dir:{folder}"},
+            "live": {"keep_log": True, **live},
+            "serving": {"log_level": "error"},
+        }
+    )
     store, updates = DirectoryStore(folder), []  # type: tuple[DirectoryStore, list[dict[str, Any]]]
     log = JsonLog(level="error", server="test", wall_clock=time.time).start()
-    made = [
+    clients = [
         LiveMapClient(
-            store=store, settings=settings, server_id=name, log=log,
-            on_update=lambda tenant, name, payload: updates.append(payload), implementation=KIND,
+            store=store,
+            settings=settings,
+            server_id=name,
+            log=log,
+            on_update=lambda tenant, name, payload: updates.append(payload),
+            implementation=KIND,
         )
         for name in ("a", "b")
-    ]  # fmt: skip
+    ]
     try:
-        yield Servers(store, made[0], made[1], updates)
+        yield Servers(store, clients[0], clients[1], updates)
     finally:
-        for links in made:
-            await links.close()
+        for client in clients:
+            await client.close()
         log.close()
 
 
@@ -173,8 +180,8 @@ async def test_a_tenant_with_most_map_servers_gives_one_up_within_seconds(
         assert time.monotonic() - began_s < 10.0
         assert (await drive(victim, "v1", number))["number"] == number + 1
         assert sorted(child.tenant for child in both.a.processes).count("rival") == 2
-        for each in driving:
-            each.cancel()
+        for task in driving:
+            task.cancel()
 
 
 @contextmanager
@@ -201,10 +208,10 @@ def test_one_tenant_fills_the_disk_and_is_refused_while_keyframes_of_the_other_a
         async with servers(disk, publish_pause_s=0.5) as both:
 
             async def ask(robot: RobotId, operation: str, request: LiveRequest) -> dict[str, Any]:
-                links = both.a if robot is hostile else both.b
-                return await links.request(robot.tenant, MAP, robot, operation, request, PATIENT_S)
+                client = both.a if robot is hostile else both.b
+                return await client.request(robot.tenant, MAP, robot, operation, request, PATIENT_S)
 
-            kept, number, refused = 0, 0, Counter[str]()
+            acknowledged, number, refused = 0, 0, Counter[str]()
             for turn in range(1500):
                 try:
                     await ask(hostile, "live-keyframe", keyframe_request(number, os.urandom(30_000)))
@@ -215,11 +222,13 @@ def test_one_tenant_fills_the_disk_and_is_refused_while_keyframes_of_the_other_a
                         break
                 await ask(hostile, "live-leave", LiveMapRequest(map=MAP))
                 if not turn % 10 or refused:
-                    answer = await ask(victim, "live-keyframe", keyframe_request(kept, os.urandom(30_000)))
-                    kept += 1
-                    assert answer["number"] == kept
+                    answer = await ask(
+                        victim, "live-keyframe", keyframe_request(acknowledged, os.urandom(30_000))
+                    )
+                    acknowledged += 1
+                    assert answer["number"] == acknowledged
             assert set(refused) == {"store-full"}
-            assert kept >= 50
+            assert acknowledged >= 50
             assert shutil.disk_usage(disk).free > 0
 
     with small_disk(tmp_path / "disk", "24m") as disk:
@@ -261,7 +270,7 @@ async def test_a_drained_server_gives_its_maps_to_the_next_one_at_once(tmp_path:
         assert (before["server"], after["server"]) == ("a", "b")
         assert after["epoch"] == 2
         assert after["keyframes"] == 6
-        assert [each["state"] for each in both.updates if each["kind"] == "map"][-1] == "live"
+        assert [update["state"] for update in both.updates if update["kind"] == "map"][-1] == "live"
 
 
 async def test_two_servers_that_begin_a_map_at_the_same_time_share_one_map_server(tmp_path: Path) -> None:

@@ -65,32 +65,32 @@ class NotingMap(FakeMap):
 
 
 def test_the_more_keyframes_wait_the_fewer_others_each_is_compared_with() -> None:
-    found = [choose_candidate_count(waiting) for waiting in range(40)]
-    assert found[0] is None
-    rest = [each for each in found if each is not None]
-    assert found == [None] * (40 - len(rest)) + rest
-    assert rest == sorted(rest, reverse=True)
-    assert min(rest) >= 4
+    counts = [choose_candidate_count(waiting) for waiting in range(40)]
+    assert counts[0] is None
+    limited = [count for count in counts if count is not None]
+    assert counts == [None] * (40 - len(limited)) + limited
+    assert limited == sorted(limited, reverse=True)
+    assert min(limited) >= 4
 
 
 async def test_waiting_keyframes_are_measured_two_at_a_time_and_one_alone_by_both_threads() -> None:
-    live_map, threads, taken = NotingMap(), HeldThreads(), list[Event]()
+    live_map, threads, submitted = NotingMap(), HeldThreads(), list[Event]()
     environment = SimpleNamespace(
         threads=threads, optimise=optimise_in_process, map_name="warehouse", log=FakeLog()
     )
-    measuring = KeyframeMeasurer(MapState(live_map, 0), environment, taken.append)
-    working = asyncio.ensure_future(measuring.run())
-    measuring.add_keyframes(range(20))
+    measurer = KeyframeMeasurer(MapState(live_map, 0), environment, submitted.append)
+    working = asyncio.ensure_future(measurer.run())
+    measurer.add_keyframes(range(20))
     await settle()
-    assert [each[:2] for each in live_map.asked] == [(0, 1), (1, 1)]
+    assert [arguments[:2] for arguments in live_map.asked] == [(0, 1), (1, 1)]
     assert all(candidates is not None for _, _, candidates in live_map.asked)
-    while len(taken) < 20:
+    while len(submitted) < 20:
         for held in threads.looking:
             held.set()
         await settle()
-    assert sorted(each.keyframe for each in taken) == list(range(20))  # type: ignore[union-attr]
+    assert sorted(event.keyframe for event in submitted) == list(range(20))  # type: ignore[union-attr]
     live_map.asked.clear()
-    measuring.add_keyframes([20])
+    measurer.add_keyframes([20])
     await settle()
     assert live_map.asked == [(20, 2, None)]
     working.cancel()
@@ -111,9 +111,13 @@ def _loop() -> PoseGraph:
     rng = np.random.default_rng(0)
     true: Array = np.array([exp_se3(np.array([0.3 * i, 0.0, 0.0, 0.0, 0.0, 0.5 * i])) for i in range(n)])
     a, b = np.arange(n), (np.arange(n) + 1) % n
-    drifted = np.array([each @ exp_se3(0.02 * i * rng.standard_normal(6)) for i, each in enumerate(true)])
+    drifted = np.array([pose @ exp_se3(0.02 * i * rng.standard_normal(6)) for i, pose in enumerate(true)])
     return PoseGraph(
-        T_world_pose=drifted, a=a, b=b, robust=a == n - 1, ids=a,
+        T_world_pose=drifted,
+        a=a,
+        b=b,
+        robust=a == n - 1,
+        ids=a,
         T_a_b=np.array([inverse(true[i]) @ true[j] for i, j in zip(a, b, strict=True)]),
         information=np.tile(1e4 * np.eye(6), (n, 1, 1)),
-    )  # fmt: skip
+    )

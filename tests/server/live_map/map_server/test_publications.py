@@ -22,11 +22,11 @@ async def test_robots_that_leave_again_and_again_publish_one_version_in_an_inter
         await server.keyframe(number)
         await server.ask("live-leave")
         await settle()
-    assert [each.keyframes for each in maps.versions(MAP)] == [1]
+    assert [record.keyframes for record in maps.versions(MAP)] == [1]
     await bench.clock.advance(9.0)
     assert len(maps.versions(MAP)) == 1
     await bench.clock.advance(2.0)
-    assert [each.keyframes for each in maps.versions(MAP)] == [1, 20]
+    assert [record.keyframes for record in maps.versions(MAP)] == [1, 20]
     for _ in range(5):
         await server.ask("live-leave")
         await bench.clock.advance(11.0)
@@ -43,9 +43,9 @@ async def test_who_asks_for_a_version_waits_for_the_interval_and_all_who_ask_get
     await server.keyframe(1)
     asked = [asyncio.ensure_future(server.ask("live-publish")) for _ in range(3)]
     await bench.clock.advance(4.0)
-    assert not any(each.done() for each in asked)
+    assert not any(request.done() for request in asked)
     await bench.clock.advance(2.0)
-    assert [(await each)["number"] for each in asked] == [2, 2, 2]
+    assert [(await request)["number"] for request in asked] == [2, 2, 2]
 
 
 async def test_a_request_that_would_wait_for_long_is_refused_with_a_time_and_the_map_goes_on():
@@ -166,10 +166,10 @@ async def test_of_versions_that_nobody_asked_for_the_newest_stay_and_the_others_
             await server.ask("live-publish")
         await server.ask("live-leave")
         await bench.clock.advance(1.0)
-        numbers.append([each.number for each in maps.versions(MAP)])
+        numbers.append([record.number for record in maps.versions(MAP)])
     assert numbers[2] == [1, 2, 3]
     assert numbers[-1] == [2, 6, 7, 8], "number 2 was asked for"
-    assert [maps.data(MAP, each.id) for each in maps.versions(MAP)]
+    assert [maps.data(MAP, record.id) for record in maps.versions(MAP)]
     assert len(list(bench.store.list(f"maps/default/{MAP}/blobs/"))) == 4
 
 
@@ -197,9 +197,9 @@ async def test_a_version_that_cannot_be_removed_is_no_failure_of_the_one_that_wa
         await server.keyframe(number)
         await server.ask("live-leave")
         await bench.clock.advance(1.0)
-    assert [each.number for each in maps.versions(MAP)] == [1, 2, 3]
+    assert [record.number for record in maps.versions(MAP)] == [1, 2, 3]
     store.is_slow = False
     await server.keyframe(3)
     await server.ask("live-leave")
     await bench.clock.advance(1.0)
-    assert [each.number for each in maps.versions(MAP)] == [4]
+    assert [record.number for record in maps.versions(MAP)] == [4]

@@ -72,9 +72,7 @@ async def test_over_the_quota_a_map_is_shown_forgotten_and_stopped_and_then_ther
 
 
 async def test_a_robot_that_always_drives_fills_a_quarter_of_the_quota_with_versions_and_no_more() -> None:
-    bench = Bench(
-        MemoryStore(), data={"tenant_quota_bytes": QUOTA}, publish_pause_s=0.0, keep_versions=1000
-    )  # fmt: skip
+    bench = Bench(MemoryStore(), data={"tenant_quota_bytes": QUOTA}, publish_pause_s=0.0, keep_versions=1000)
 
     server = await bench.start("a")
     server.map_server.users = 1
