@@ -308,7 +308,7 @@ class MapServer:
                 await reservation
             except StoreFull:
                 raise
-            except StoreError:  # the log entry waits until the store works, and is counted then
+            except StoreError:  # the log entry waits until the store works, and is counted later
                 pass
         self._bytes_since_snapshot += size_bytes
 
