@@ -6,8 +6,8 @@ The way of a keyframe, from the tracker to the live map and back:
 2. With depth or a stereo pair, a frame 0.1 m or 6 degrees from the last keyframe becomes a keyframe
    (`LiveOptions`).  Of a camera without depth, `monocular_odometry` takes the tracker's keyframes once they
    have settled.
-3. `LiveMapper` encodes features, pose, camera, gravity and references to the attachments
-   (`rse_pf.slam.keyframe`); `attachments` encodes coloured points and image.
+3. `keyframe_encoding` encodes features, pose, camera, gravity and references to the attachments, in the
+   format of `rse_pf.slam.keyframe`; `attachments` encodes coloured points and image.
 4. `keyframe_queue` holds the keyframe, in memory or on disk, until the map has acknowledged it.
 5. `attachments` uploads points and image to the object store while nothing more urgent waits.
 6. `keyframe_sender` asks for the robot's next keyframe number in the map (``live-show``), and sends the

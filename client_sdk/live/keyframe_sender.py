@@ -35,7 +35,15 @@ from rse_pf.errors import (
 from rse_pf.token_bucket import TokenBucket
 from rse_pf.wire.live_map import KeyframeKept, KeyframeRequest
 
-__all__ = ["REFUSALS", "KeyframeSender", "LiveRobot", "RobotInMap", "fetch_robot_in_map", "make_request"]
+__all__ = [
+    "REFUSALS",
+    "KeyframeSender",
+    "KeyframeSent",
+    "LiveRobot",
+    "RobotInMap",
+    "fetch_robot_in_map",
+    "make_request",
+]
 
 _MAX_POSE_WAIT_S = 1.0  # a keyframe waits no longer for open pose queries, which could else block it for ever
 _FIRST_PAUSE_S = 0.1  # pause after the first failed attempt to send a keyframe; it doubles with each failure
@@ -77,7 +85,7 @@ class RobotInMap:
     Attributes:
         name: Name of the robot in the map; empty while the map does not exist.
         next_number: Number that the map expects for the next keyframe of the robot.
-        unused_segment: Smallest segment number that no keyframe of the robot has used.
+        unused_segment: Segment number that no keyframe of the robot in the map has.
         map_keyframes: Number of keyframes of all robots in the map.
         allows_images: Whether the operator allows robots to store the images of keyframes.
     """
@@ -87,6 +95,21 @@ class RobotInMap:
     unused_segment: int
     map_keyframes: int
     allows_images: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class KeyframeSent:
+    """Times of a keyframe that the map has acknowledged.
+
+    Attributes:
+        number: The map's number of the keyframe among those of this robot.
+        sent_s: Time of the successful attempt to send the keyframe, by the clock of the sender.
+        kept_s: Time of the acknowledgement, by the same clock.
+    """
+
+    number: int
+    sent_s: float
+    kept_s: float
 
 
 async def fetch_robot_in_map(robot: LiveRobot, map_name: str, deadline_s: float) -> RobotInMap:
@@ -129,7 +152,7 @@ class KeyframeSender:
         bytes_per_s: float,
         clock: Callable[[], float],
         on_introduced: Callable[[RobotInMap, NumberOffset], None],
-        on_acknowledged: Callable[[int, float, float], None],
+        on_acknowledged: Callable[[KeyframeSent], None],
     ) -> None:
         """Describe the sender; only `introduce` and `run` use the network.
 
@@ -141,8 +164,7 @@ class KeyframeSender:
             bytes_per_s: Rate limit of the keyframes that are sent.
             clock: Monotonic time in seconds.
             on_introduced: Called after each `introduce` with the map's reply and the offset in use.
-            on_acknowledged: Called for each acknowledged keyframe with its number in the map, the time of
-                sending and the time of the acknowledgement, both by *clock*.
+            on_acknowledged: Called for each acknowledged keyframe with its number and times.
         """
         self.trouble = ""
         """Why the last attempt to send a keyframe failed, as ``code: sentence``; empty after a success."""
@@ -272,7 +294,7 @@ class KeyframeSender:
             raise
         # 3. Take the acknowledgement.
         queue.remove_first()
-        self._on_acknowledged(number, sent_s, self._clock())
+        self._on_acknowledged(KeyframeSent(number, sent_s, self._clock()))
         # 4. Compare the number that the map expects next with the robot's own.
         if answer.reply.number < number + 1:
             raise Conflict("the map was started again", hint="nothing: the robot renumbers its keyframes")

@@ -25,7 +25,7 @@ import contextlib
 import time
 from collections import deque
 from collections.abc import AsyncIterator, Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -36,8 +36,9 @@ from client_sdk.commands.answer_types import PoseAnswer
 from client_sdk.frontend import Features, Frame, FrontEndOptions, PoseQuery, TrackedFrame
 from client_sdk.live.alignments import Alignments, Correction, CorrectionStream, OtherRobot
 from client_sdk.live.attachments import Attachments, EncodedAttachments, StoreObject
+from client_sdk.live.keyframe_encoding import encode_depth_keyframe, encode_monocular_keyframe
 from client_sdk.live.keyframe_queue import KeyframeQueue, NumberOffset, QueuedKeyframe
-from client_sdk.live.keyframe_sender import REFUSALS, KeyframeSender, LiveRobot, RobotInMap
+from client_sdk.live.keyframe_sender import REFUSALS, KeyframeSender, KeyframeSent, LiveRobot, RobotInMap
 from client_sdk.live.monocular_odometry import MonocularOdometry
 from client_sdk.live.options import LiveOptions
 from client_sdk.live.relocaliser import Relocaliser
@@ -49,18 +50,9 @@ from client_sdk.tracking.segments import add_to_cloud
 from client_sdk.trajectory import Trajectory
 from rse_pf.errors import BadMessage, BadRequest, RsePfError, UnsupportedProtocol, UsageError
 from rse_pf.geometry import Array, Camera, pose_difference
-from rse_pf.maps.descriptors import DescriptorKind
-from rse_pf.slam.keyframe import (
-    MAX_FEATURES,
-    SentKeyframe,
-    encode_keyframe,
-    make_features,
-    make_scaleless_features,
-    max_features,
-)
 from rse_pf.wire.live_map import RelocaliseReply, live_topic
 
-__all__ = ["KeyframeSent", "LiveMapper"]
+__all__ = ["LiveMapper"]
 
 _JOIN_REFUSALS = (*REFUSALS, BadRequest, UnsupportedProtocol)
 """Errors with which a live map refuses to be joined for good: another attempt would fail in the same way."""
@@ -70,21 +62,6 @@ _NEVER = 1_000_000_000
 """Number of lost frames after which the tracker begins a segment by itself, which it must never do in a live
 map: `LiveMapper` begins each segment, and numbers it for the map."""
 _MAX_SENT_RECORDS = 100_000  # acknowledged keyframes whose times are kept for measurements
-
-
-@dataclass(frozen=True, slots=True)
-class KeyframeSent:
-    """Times of a keyframe that the map has acknowledged.
-
-    Attributes:
-        number: The map's number of the keyframe among those of this robot.
-        sent_s: Time of the successful attempt to send the keyframe, by the mapper's clock.
-        kept_s: Time of the acknowledgement, by the same clock.
-    """
-
-    number: int
-    sent_s: float
-    kept_s: float
 
 
 class LiveMapper:
@@ -212,7 +189,7 @@ class LiveMapper:
             bytes_per_s=self.options.bytes_per_s,
             clock=self._clock,
             on_introduced=self._apply_introduction,
-            on_acknowledged=lambda *record: self.sent_keyframes.append(KeyframeSent(*record)),
+            on_acknowledged=self.sent_keyframes.append,
         )
         self._sender.current_segment = self._segment
         if self._robot.connected:
@@ -565,49 +542,30 @@ class LiveMapper:
     def _encode_keyframe(
         self, frame: Frame, T_odom_camera: Array, features: Features
     ) -> tuple[bytes, EncodedAttachments]:
-        """Encode a keyframe and its attachments.
-
-        Of the features that have depth the keyframe takes the first ones, in the order of the front end.
-        """
+        """Encode a frame with depth as a keyframe, and its attachments."""
         attachments = self._attachments.make(frame, features)
-        depths_m = features.points_camera[:, 2]
-        rows = np.flatnonzero(np.isfinite(depths_m))[: self._max_features(features.kind)]
-        keyframe = SentKeyframe(
-            timestamp_s=frame.timestamp_s,
-            T_odom_camera=T_odom_camera,
-            camera=frame.camera,
-            features=make_features(
-                features.pixels[rows],
-                depths_m[rows],
-                features.descriptors[rows],
-                self._mapper.depth_noise,
-                features.kind,
-                0.0 if frame.stereo is None else frame.camera.fx * frame.stereo.baseline_m,
-            ),
+        data = encode_depth_keyframe(
+            frame,
+            T_odom_camera,
+            features,
+            max_orb_features=self.options.features,
+            depth_noise=self._mapper.depth_noise,
             imu=self._mapper.keyframe_imu(T_odom_camera, self._last_keyframe_s, frame.timestamp_s),
-            points=attachments.points_reference,
-            image=attachments.image_reference,
+            attachments=attachments,
         )
-        return encode_keyframe(keyframe), attachments
+        return data, attachments
 
-    def _encode_monocular_keyframe(self, seen: AdjustedKeyframe, T_odom_camera: Array) -> bytes:
-        """Encode a keyframe up to scale: features with a landmark, thus a depth, come first."""
+    def _encode_monocular_keyframe(self, adjusted: AdjustedKeyframe, T_odom_camera: Array) -> bytes:
         assert self._mapper.camera is not None
-        rows = np.argsort(np.isnan(seen.depths), kind="stable")[: self._max_features(seen.kind)]
-        keyframe = SentKeyframe(
-            timestamp_s=seen.timestamp_s,
-            T_odom_camera=T_odom_camera,
-            camera=self._mapper.camera,
-            features=make_scaleless_features(
-                seen.features.pixels[rows], seen.depths[rows], seen.features.descriptors[rows], seen.kind
+        return encode_monocular_keyframe(
+            adjusted,
+            T_odom_camera,
+            self._mapper.camera,
+            max_orb_features=self.options.features,
+            imu=self._mapper.keyframe_imu(
+                adjusted.T_world_camera, self._last_keyframe_s, adjusted.timestamp_s
             ),
-            imu=self._mapper.keyframe_imu(seen.T_world_camera, self._last_keyframe_s, seen.timestamp_s),
         )
-        return encode_keyframe(keyframe)
-
-    def _max_features(self, kind: DescriptorKind) -> int:
-        """Return the limit of features of a keyframe; larger descriptors than ORB's lower it."""
-        return self.options.features * max_features(kind) // MAX_FEATURES
 
     # --- Priorities: pose queries before keyframes, keyframes before attachments ---
 

@@ -38,7 +38,7 @@ class MonocularOdometry:
         self._newest_segment = -1
         self._processed_loops = 0
         self._next_keyframe = 0
-        self._tracker_unit_at_start = 1.0
+        self._length_factor_at_start = 1.0
         self._last_sent: int | None = None
         self._T_odom_last_sent: Array
 
@@ -61,7 +61,7 @@ class MonocularOdometry:
         self._newest_segment = max(self._newest_segment, tracker.segment)
         # Keyframes of a segment that was continued are those of an earlier odometry frame: skip them.
         self._next_keyframe = 0 if is_new_segment else tracker.segment_keyframes
-        self._tracker_unit_at_start, self._last_sent = tracker.length_factor, None
+        self._length_factor_at_start, self._last_sent = tracker.length_factor, None
         return not is_first
 
     def pose_in_odometry(self, T_world_camera: Array) -> Array:
@@ -69,7 +69,7 @@ class MonocularOdometry:
 
         The pose relative to the keyframe that was sent last is kept, in the unit of the odometry frame.
         """
-        tracker_to_odometry_scale = self._tracker_unit_at_start / self._tracker.length_factor
+        tracker_to_odometry_scale = self._length_factor_at_start / self._tracker.length_factor
         if self._last_sent is None:
             return scaled(T_world_camera, tracker_to_odometry_scale)
         T_sent_camera = inverse(self._tracker.keyframe_pose(self._last_sent)) @ T_world_camera
@@ -84,7 +84,7 @@ class MonocularOdometry:
         while self._next_keyframe + _SETTLED_AFTER < self._tracker.segment_keyframes:
             keyframe = self._tracker.keyframe(self._next_keyframe)
             T_odom_camera = self.pose_in_odometry(keyframe.T_world_camera)
-            tracker_to_odometry_scale = self._tracker_unit_at_start / self._tracker.length_factor
+            tracker_to_odometry_scale = self._length_factor_at_start / self._tracker.length_factor
             self._last_sent, self._T_odom_last_sent = self._next_keyframe, T_odom_camera
             self._next_keyframe += 1
             yield replace(keyframe, depths=tracker_to_odometry_scale * keyframe.depths), T_odom_camera
