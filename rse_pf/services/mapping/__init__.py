@@ -1,4 +1,5 @@
-"""The mapping services: alignment, place recognition, localisation, map merge and pose graphs.
+"""The mapping services: cloud alignment, place recognition, localisation, map merge, pose graphs, and Wi-Fi.
 
-Requests, replies and their limits belong here; algorithms belong to `rse_pf.slam`, storage to `rse_pf.maps`.
+This package holds the requests, replies and limits of the services; their algorithms are in `rse_pf.slam`
+(but for Wi-Fi localisation, which is here), and maps are stored by `rse_pf.maps`.
 """

@@ -1,4 +1,4 @@
-"""The alignment service: from two overlapping clouds and an initial guess to the pose between them."""
+"""The service ``icp``: refine the relative pose of two overlapping point clouds from an initial guess."""
 
 from __future__ import annotations
 
@@ -14,13 +14,21 @@ from rse_pf.wire.arrays import Array, reshaped
 __all__ = ["IcpReply", "IcpRequest", "register"]
 
 MAX_POINTS = 1_000_000
-"""Of one cloud."""
+"""Most points of one cloud of a request, which bounds the time and memory of an alignment."""
 _MAX_VOXELS = 500_000
-"""From the origin along an axis; small_gicp numbers voxels by 21 bits."""
+"""Largest distance of a point from the origin along an axis, in voxels: small_gicp numbers voxels by 21
+bits."""
 
 
 class IcpRequest(msgspec.Struct, frozen=True, kw_only=True):
-    """Two clouds, ``3n`` metres each, and ``T_target_source`` (16 numbers, row-major) to begin with."""
+    """Two point clouds with an initial guess of their relative pose.
+
+    Attributes:
+        target: ``3n`` coordinates of the fixed cloud, metres, row by row.
+        source: ``3m`` coordinates of the cloud that is moved, metres, row by row.
+        T_target_source: 16 numbers, row-major, the initial guess, which maps source to target points.
+        options: Options of the alignment; None for the defaults.
+    """
 
     target: Array
     source: Array
@@ -29,10 +37,18 @@ class IcpRequest(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class IcpReply(msgspec.Struct, frozen=True, kw_only=True):
-    """A pose and what speaks for it.
+    """A relative pose with its evidence.
 
-    ``verdict`` is ``ok``, or ``refused`` with a *reason* (worse, poor-fit, little-overlap, sliding,
-    jumped, not-converged); ``T_target_source`` then is the guess of the request.
+    Attributes:
+        T_target_source: 16 numbers, row-major: the refined pose; the guess of the request where it is
+            refused.
+        verdict: ``ok`` or ``refused``.
+        reason: Why the refined pose is refused: worse, poor-fit, little-overlap, sliding, jumped or
+            not-converged.
+        overlap: Share of the source points with a correspondence at the refined pose, 0..1.
+        misfit_before_m: Mean distance of source points to the target's surface at the guess, metres.
+        misfit_after_m: Mean distance of source points to the target's surface at the refined pose, metres.
+        iterations: Iterations of the registration.
     """
 
     T_target_source: Array
@@ -45,7 +61,7 @@ class IcpReply(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def register(registry: Registry) -> None:
-    """Add ``icp`` to *registry*."""
+    """Add the service ``icp`` to *registry*."""
 
     @registry.service("icp", limited=True, warm_up=load_small_gicp)
     def icp(request: IcpRequest) -> IcpReply:
@@ -59,23 +75,23 @@ def register(registry: Registry) -> None:
         guess = rigid(numbers.reshape(4, 4)) if numbers.size == 16 else None
         if guess is None:
             raise BadRequest("T_target_source is not a rigid motion", hint="send 16 numbers, row-major")
-        found = align_clouds(target, source, guess, request.options)
+        aligned = align_clouds(target, source, guess, request.options)
         return IcpReply(
-            T_target_source=found.T_target_source.ravel(),
-            verdict=found.verdict,
-            reason=found.reason,
-            overlap=found.overlap,
-            misfit_before_m=found.misfit_before_m,
-            misfit_after_m=found.misfit_after_m,
-            iterations=found.iterations,
+            T_target_source=aligned.T_target_source.ravel(),
+            verdict=aligned.verdict,
+            reason=aligned.reason,
+            overlap=aligned.overlap,
+            misfit_before_m=aligned.misfit_before_m,
+            misfit_after_m=aligned.misfit_after_m,
+            iterations=aligned.iterations,
         )
 
 
 def _check_extent(request: IcpRequest) -> None:
-    """Raise BadRequest for numbers so large that their voxels have no number."""
+    """Raise BadRequest for coordinates that lie too many voxels from the origin."""
     voxel_m = (request.options or IcpOptions()).voxel_m
-    numbers = (request.target, request.source, request.T_target_source)
-    extent_m = max((float(np.abs(each).max(initial=0.0)) for each in numbers), default=0.0)
+    arrays = (request.target, request.source, request.T_target_source)
+    extent_m = max(float(np.abs(array).max(initial=0.0)) for array in arrays)
     if extent_m > _MAX_VOXELS * voxel_m:
         raise BadRequest(
             f"a coordinate of {extent_m:g} m is above {_MAX_VOXELS * voxel_m:g} m, {_MAX_VOXELS} voxels",

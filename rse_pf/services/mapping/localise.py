@@ -1,6 +1,7 @@
-"""The localisation service: from one view and a map to the pose of the camera in that map.
+"""The service ``localise``: find the pose of a camera in a map from one view.
 
-A pose with few inliers, or that another place contradicts, is not ok.  Earlier views are not used.
+Each request is independent of earlier views.  A pose with few inliers, or one that another part of the map
+would explain as well, is not ok.
 """
 
 from __future__ import annotations
@@ -24,15 +25,23 @@ from rse_pf.wire.arrays import Array
 
 __all__ = ["LocaliseOptions", "LocaliseReply", "LocaliseRequest", "locate", "register"]
 
-_SEARCHED = 6
-"""So many times the candidates are looked at, so that a second place that looks alike is compared, too."""
+_RETRIEVAL_FACTOR = 6
+"""Keyframes that place recognition retrieves per candidate, so that the candidates, chosen from them, include
+other parts of the map that look alike (perceptual aliases)."""
 
 
 class LocaliseOptions(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """How to localise.
+    """Options of a localisation.
 
-    A pose is ok from *min_inliers*; *candidates* keyframes are looked at; keyframes whose own pose of
-    the view differs by more than *agree_m* or *agree_deg* from the best one do not count for it.
+    Attributes:
+        candidates: Keyframes to which the view is matched, 1..100.
+        min_inliers: Fewest inliers of a pose that is ok, at least 12.
+        min_inlier_ratio: Smallest share of the matches that are inliers of a pose that is ok.
+        agree_m: A keyframe supports the best pose if its own pose of the view differs by at most this
+            distance, metres.
+        agree_deg: A keyframe supports the best pose if its own pose of the view differs by at most this
+            angle, degrees.
+        inlier_px: Largest reprojection error of an inlier, pixels.
 
     Raises:
         BadRequest: A number is out of its range.
@@ -61,7 +70,18 @@ class LocaliseOptions(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=T
 
 
 class LocaliseRequest(msgspec.Struct, frozen=True, kw_only=True):
-    """A view and an encoded map version; *within* is a prior, such as what ``wifi`` answers."""
+    """A view and the map in which it is localised.
+
+    Attributes:
+        map: Encoded map version.
+        camera: Intrinsics of the view.
+        pixels: ``2n`` undistorted pixel coordinates of the features.
+        descriptors: Raw bytes of the ``n`` descriptors; 32 bytes each for ORB.
+        within: Prior of the camera's position, such as that of the service ``wifi``; None to search the whole
+            map.
+        options: Options; None for the defaults.
+        features: Kind of the descriptors; None for ORB.
+    """
 
     map: bytes
     camera: Camera
@@ -70,16 +90,21 @@ class LocaliseRequest(msgspec.Struct, frozen=True, kw_only=True):
     within: Within | None = None
     options: LocaliseOptions | None = None
     features: FeatureKind | None = None
-    """None for ORB."""
 
 
 class LocaliseReply(msgspec.Struct, frozen=True, kw_only=True):
-    """A pose ``T_map_camera`` (16 numbers, row-major) with its evidence.
+    """The pose of the camera in the map with its evidence.
 
-    ``covariance`` (36 numbers, row-major) is of the twist (metres, radians) on the left of the pose.
-    ``inliers`` counts the matches of the best keyframe, and *rmse_px* is over them.
-
-    ``verdict``: ok; weak, with a *reason*; or lost, with a reason and without a pose.
+    Attributes:
+        verdict: ``ok``; ``weak`` for a pose that may be wrong; ``lost`` without a pose.
+        reason: Why the pose is weak or missing; empty for a pose that is ok.
+        T_map_camera: 16 numbers, row-major, maps camera points (metres) to the map frame; None without a
+            pose.
+        inliers: Inliers of the best keyframe.
+        rmse_px: Root mean square reprojection error of these inliers.
+        keyframes: Ids of the keyframes that support the pose, best first.
+        covariance: 36 numbers, row-major, of the twist (metres, radians) that multiplies the pose on the
+            left.
     """
 
     verdict: str
@@ -88,16 +113,19 @@ class LocaliseReply(msgspec.Struct, frozen=True, kw_only=True):
     inliers: int = 0
     rmse_px: float = 0.0
     keyframes: list[int] = []
-    """Ids of the keyframes that support the pose, best first."""
     covariance: Array | None = None
 
 
 def locate(
     index: MapIndex, view: View, options: LocaliseOptions | None = None, *, within: Within | None = None
 ) -> LocaliseReply:
-    """Find the pose of *view* among the keyframes of *index*.
+    """Find the pose of *view* in the map of *index*.
 
-    Place recognition gives candidates of each place that looks alike, and `rse_pf.slam.localise` decides.
+    Args:
+        index: Index of the map.
+        view: Features of the camera's image.
+        options: Options; None for the defaults.
+        within: Prior of the camera's position; None to search the whole map.
 
     Returns:
         The reply of the service, with ``T_map_camera`` as ``(4, 4)`` and ``covariance`` as ``(6, 6)``.
@@ -105,11 +133,14 @@ def locate(
     Raises:
         MissingExtra: The native core is not installed.
     """
+    # 1. Retrieve similar keyframes by place recognition.
     options = options or LocaliseOptions()
-    similar = index.nearest(view.descriptors, _SEARCHED * options.candidates, within)
+    similar = index.nearest(view.descriptors, _RETRIEVAL_FACTOR * options.candidates, within)
+    # 2. Choose candidates from all parts of the map that look alike.
     limits = LocalisationOptions(
         measured=RelativePoseOptions(
-            min_inliers=options.min_inliers, min_inlier_ratio=options.min_inlier_ratio,
+            min_inliers=options.min_inliers,
+            min_inlier_ratio=options.min_inlier_ratio,
             inlier_px=options.inlier_px,
         ),
         min_candidate_inliers=options.min_inliers // 2,
@@ -117,13 +148,14 @@ def locate(
         agree_deg=options.agree_deg,
         max_per_region=max(1, 3 * options.candidates // 4),
         fits_camera=True,
-    )  # fmt: skip
+    )
     rows = spread_candidates(similar, index.T_map_keyframe, options.candidates, limits)
     keyframes = [index.keyframes[row] for row in rows]
     candidates = [
         LocalisationCandidate(id=k.id, landmarks=landmarks_of_keyframe(k), T_map_keyframe=k.T_world_camera)
         for k in keyframes
     ]
+    # 3. Estimate the pose by each candidate, and decide.
     located = localise(candidates, view, limits)
     return LocaliseReply(
         verdict="lost" if located.verdict == "none" else located.verdict,
@@ -137,7 +169,7 @@ def locate(
 
 
 def register(registry: Registry) -> None:
-    """Add ``localise`` to *registry*."""
+    """Add the service ``localise`` to *registry*."""
 
     @registry.service("localise", limited=True)
     def answer(request: LocaliseRequest) -> LocaliseReply:
@@ -145,9 +177,9 @@ def register(registry: Registry) -> None:
         _, index = open_map(request.map)
         view = view_of(request.camera, request.pixels, request.descriptors, request.features, index)
         check_comparisons(index, view, (request.options or LocaliseOptions()).candidates)
-        found = locate(index, view, request.options, within=request.within)
-        if found.T_map_camera is None or found.covariance is None:
-            return found
+        reply = locate(index, view, request.options, within=request.within)
+        if reply.T_map_camera is None or reply.covariance is None:
+            return reply
         return msgspec.structs.replace(
-            found, T_map_camera=found.T_map_camera.ravel(), covariance=found.covariance.ravel()
+            reply, T_map_camera=reply.T_map_camera.ravel(), covariance=reply.covariance.ravel()
         )

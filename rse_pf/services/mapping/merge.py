@@ -1,6 +1,7 @@
-"""The merge service: from the maps of several robots to one map, with what was joined or refused and why.
+"""The service ``merge``: merge the maps of several robots into one map.
 
-A map that shares no view with the others is left out and named.  The same maps give the same result.
+A map that shows no place of the other maps is left out, and the reply names it with the reason.  Equal
+requests have equal results.
 """
 
 from __future__ import annotations
@@ -27,19 +28,26 @@ __all__ = [
 
 
 MAX_MAPS = 64
+"""Most maps of one request."""
 _MAX_PROJECTIONS = 20_000_000_000
-"""Of one point of a cloud into one keyframe: an hour of work, which is all that a job has."""
+"""Most projections of a point of the clouds into a keyframe: they take an hour, the longest time of a job."""
 
 
 class MergeRequest(msgspec.Struct, frozen=True, kw_only=True):
-    """Encoded map versions; the world of the first one becomes the world of the result."""
+    """Encoded map versions; the world frame of the first map becomes that of the result."""
 
     maps: list[bytes]
     options: MergeOptions | None = None
 
 
 class Refusal(msgspec.Struct, frozen=True, kw_only=True):
-    """How many proposed loops between two maps (row numbers) were refused, for one *reason*."""
+    """Rejected loop closures between two maps.
+
+    Attributes:
+        maps: Numbers of the two maps in the request, which may be equal.
+        reason: Why the loop closures were rejected.
+        count: Number of loop closures that were rejected for this reason.
+    """
 
     maps: tuple[int, int]
     reason: str
@@ -47,14 +55,25 @@ class Refusal(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class NotJoined(msgspec.Struct, frozen=True, kw_only=True):
-    """A map that could not be placed, and why."""
+    """A map of the request that is not in the result, by its number, and why."""
 
     map: int
     reason: str
 
 
 class MergeReply(msgspec.Struct, frozen=True, kw_only=True):
-    """One encoded map of all that was joined, and the account of it."""
+    """The merged map.
+
+    Attributes:
+        map: Encoded map version.
+        joined: Numbers of the maps of the request that are in the result.
+        not_joined: The other maps.
+        refused: Rejected loop closures.
+        loops: Accepted loop closures within one map.
+        merges: Accepted loop closures between two maps.
+        cost_before: Cost of the pose graph before the optimisation.
+        cost_after: Cost of the pose graph after the optimisation.
+    """
 
     map: bytes
     joined: list[int]
@@ -67,9 +86,15 @@ class MergeReply(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def merge_maps(request: MergeRequest, *, report: Report = ignore_progress) -> MergeReply:
-    """Make one map of several robots' maps, or close the loops of one.
+    """Merge the maps of several robots into one map, or close the loops of a single map.
 
-    *report* gets the progress, and may raise Cancelled to end the work.
+    Args:
+        request: The maps.
+        report: Function that receives the progress, and may raise Cancelled to stop the work.
+
+    Raises:
+        BadRequest: There are no or too many maps, the bytes are not maps, or a map has no keyframes.
+        LimitExceeded: The maps are too large.
     """
     if not 1 <= len(request.maps) <= MAX_MAPS:
         raise BadRequest(f"{len(request.maps)} maps are not within 1..{MAX_MAPS}", hint="send one or more")
@@ -90,7 +115,7 @@ def merge_maps(request: MergeRequest, *, report: Report = ignore_progress) -> Me
 
 
 def register(registry: Registry) -> None:
-    """Add ``merge`` to *registry*; *data* has the limit of a keyframe's features."""
+    """Add the service ``merge``, a long job, to *registry*."""
 
     @registry.service("merge", kind="long")
     def merge(request: MergeRequest, *, report: Report = ignore_progress) -> MergeReply:
@@ -99,14 +124,14 @@ def register(registry: Registry) -> None:
 
 
 def reply_of(merged: MergedMap) -> MergeReply:
-    """Return the reply of the service: the merged map encoded, and the account of it."""
+    """Return the reply of the service for *merged*, with the encoded map."""
     return MergeReply(
         map=encode_map(merged.version),
         joined=list(merged.joined),
-        not_joined=[NotJoined(map=which, reason=reason) for which, reason in merged.not_joined],
+        not_joined=[NotJoined(map=number, reason=reason) for number, reason in merged.not_joined],
         refused=[
-            Refusal(maps=(one, other), reason=reason, count=count)
-            for (one, other, reason), count in sorted(merged.refused.items())
+            Refusal(maps=(first, second), reason=reason, count=count)
+            for (first, second, reason), count in sorted(merged.refused.items())
         ],
         loops=merged.loops,
         merges=merged.merges,

@@ -1,4 +1,4 @@
-"""The pose-graph service: from a pose graph to the poses that fit its edges best."""
+"""The service ``optimise``: find the poses of a pose graph that fit its edges best."""
 
 from __future__ import annotations
 
@@ -15,18 +15,29 @@ from rse_pf.slam.pose_graph import read_g2o, write_g2o
 __all__ = ["OptimiseReply", "OptimiseRequest", "register"]
 
 MAX_EDGES = 100_000
-"""Limit of one pose graph."""
+"""Most edges of the pose graph of a request."""
 
 
 class OptimiseRequest(msgspec.Struct, frozen=True, kw_only=True):
-    """A pose graph as g2o text; edges between consecutive ids are taken for odometry."""
+    """A pose graph as g2o text; edges between consecutive ids are odometry, all others loop closures."""
 
     g2o: str
     options: OptimiseOptions | None = None
 
 
 class OptimiseReply(msgspec.Struct, frozen=True, kw_only=True):
-    """The graph with its new poses as g2o text, and how well it fits (chi2, no kernel)."""
+    """The optimised pose graph.
+
+    Attributes:
+        g2o: The graph with the optimised poses as g2o text.
+        chi2_before: Sum of the squared residuals of all edges before the optimisation, without a robust loss.
+        chi2_after: The same sum after the optimisation.
+        cost_before: Cost with the robust loss before the optimisation.
+        cost_after: Cost with the robust loss after the optimisation.
+        components: Connected components of the graph.
+        doubted: Loop closures, as pairs of ids, whose residual exceeds three times the scale of the robust
+            loss.
+    """
 
     g2o: str
     chi2_before: float
@@ -35,11 +46,10 @@ class OptimiseReply(msgspec.Struct, frozen=True, kw_only=True):
     cost_after: float
     components: int
     doubted: list[tuple[int, int]]
-    """Loop edges, as pairs of ids, whose residual is more than three times the width of the kernel."""
 
 
 def register(registry: Registry) -> None:
-    """Add ``optimise`` to *registry*."""
+    """Add the service ``optimise``, a long job, to *registry*."""
 
     @registry.service("optimise", kind="long")
     def optimise(request: OptimiseRequest, *, report: Report = ignore_progress) -> OptimiseReply:
@@ -50,15 +60,15 @@ def register(registry: Registry) -> None:
                 f"{len(graph.a)} edges are above {MAX_EDGES}", hint="send a part of the graph"
             )
         options = request.options or OptimiseOptions()
-        found = optimise_graph(graph, options, report=report)
-        squares = graph.squared_residuals(found.T_world_pose)
-        wrong = np.flatnonzero(graph.robust & (squares > 9.0 * max(options.cauchy, 3.0) ** 2))
+        optimised = optimise_graph(graph, options, report=report)
+        squares = graph.squared_residuals(optimised.T_world_pose)
+        outliers = np.flatnonzero(graph.robust & (squares > 9.0 * max(options.cauchy, 3.0) ** 2))
         return OptimiseReply(
-            g2o=write_g2o(replace(graph, T_world_pose=found.T_world_pose)),
+            g2o=write_g2o(replace(graph, T_world_pose=optimised.T_world_pose)),
             chi2_before=graph.chi2(),
             chi2_after=float(squares.sum()),
-            cost_before=found.cost_before,
-            cost_after=found.cost_after,
-            components=found.components,
-            doubted=[(int(graph.ids[graph.a[k]]), int(graph.ids[graph.b[k]])) for k in wrong],
+            cost_before=optimised.cost_before,
+            cost_after=optimised.cost_after,
+            components=optimised.components,
+            doubted=[(int(graph.ids[graph.a[k]]), int(graph.ids[graph.b[k]])) for k in outliers],
         )

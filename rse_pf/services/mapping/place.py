@@ -1,6 +1,7 @@
-"""The place service: find the keyframes of a map that show the same place as a view.
+"""The service ``place``: find the keyframes of a map that show the same place as a view (place recognition).
 
-The same request has the same answer.  A prior only narrows the search; recently used maps are cached.
+Equal requests have equal replies.  A prior of the position only narrows the search.  Maps of recent requests
+are cached.
 """
 
 from __future__ import annotations
@@ -46,18 +47,26 @@ __all__ = [
 ]
 
 _CACHED_MAPS = 2
+"""Decoded maps with their indexes that a process keeps between requests."""
 MAX_KEYFRAMES = 2000
-"""Limit of all maps of one request together."""
+"""Most keyframes of all maps of one request together."""
 MAX_FEATURES = 2_000_000
-"""Likewise."""
+"""Most features of all keyframes of one map."""
 MAX_VIEW_FEATURES = 20_000
-"""Of the view of a request."""
+"""Most features of the view of a request."""
 _MAX_COMPARISONS = 2_000_000_000
-"""Of one descriptor of ORB of the view with one of a candidate; they take about five seconds."""
+"""Most comparisons of an ORB descriptor of the view with one of a candidate keyframe; they take about five
+seconds."""
 
 
 class FeatureKind(msgspec.Struct, frozen=True, kw_only=True):
-    """What the descriptors of a view are, as `DescriptorKind` says."""
+    """The kind of the descriptors of a view.
+
+    Attributes:
+        name: Name of the feature, such as ``orb``.
+        dtype: ``uint8`` for binary descriptors, ``int8`` for vectors.
+        size: Bytes of a binary descriptor, or dimensions of a vector.
+    """
 
     name: str
     dtype: str
@@ -65,7 +74,7 @@ class FeatureKind(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Within(msgspec.Struct, frozen=True, kw_only=True):
-    """A prior: the camera is within *radius_m* of ``(x, y, z)``, metres, map frame."""
+    """A prior of the camera's position: within *radius_m* of ``(x, y, z)``, metres, map frame."""
 
     x: float
     y: float
@@ -74,10 +83,17 @@ class Within(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class PlaceRequest(msgspec.Struct, frozen=True, kw_only=True):
-    """A view and the map to find it in.
+    """A view and the map in which its place is sought.
 
-    ``map`` is an encoded map version; ``pixels`` ``2n`` undistorted; ``descriptors`` raw bytes: ``32n`` of
-    ORB.
+    Attributes:
+        map: Encoded map version.
+        camera: Intrinsics of the view.
+        pixels: ``2n`` undistorted pixel coordinates of the features.
+        descriptors: Raw bytes of the ``n`` descriptors; 32 bytes each for ORB.
+        candidates: Most keyframes of the reply, 1..100.
+        check: Whether candidates are verified by PnP, and sorted by inliers.
+        within: Prior of the camera's position; None to search the whole map.
+        features: Kind of the descriptors; None for ORB.
     """
 
     map: bytes
@@ -86,16 +102,18 @@ class PlaceRequest(msgspec.Struct, frozen=True, kw_only=True):
     descriptors: bytes
     candidates: int = 5
     check: bool = True
-    """Whether each candidate is checked by PnP; the candidates are then sorted by inliers."""
     within: Within | None = None
     features: FeatureKind | None = None
-    """None for ORB."""
 
 
 class Candidate(msgspec.Struct, frozen=True, kw_only=True):
-    """A keyframe that may show the view; *score* is the cosine of the two views' vectors.
+    """A keyframe that may show the same place as the view.
 
-    *inliers* counts the matches that agree with one pose; None if that was not asked.
+    Attributes:
+        keyframe: Id of the keyframe.
+        robot: Robot that took the keyframe.
+        score: Cosine similarity of the place vectors of view and keyframe.
+        inliers: Inliers of the relative pose by PnP, 0 without a pose; None if candidates are not verified.
     """
 
     keyframe: int
@@ -105,18 +123,22 @@ class Candidate(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class PlaceReply(msgspec.Struct, frozen=True, kw_only=True):
-    """Candidates, best first: by inliers where they were checked, else by score."""
+    """Candidates in descending order: by inliers where they were verified, otherwise by score."""
 
     candidates: list[Candidate]
 
 
 class MapIndex:
-    """The keyframes of a map, their ``(n, 4, 4)`` poses, and an index of their places; immutable.
+    """An immutable index of the keyframes of a map for place recognition.
 
-    Rows are those of *keyframes*.
+    Attributes:
+        keyframes: The keyframes; a row is a number of a keyframe in this tuple.
+        kind: Kind of their descriptors.
+        T_map_keyframe: ``(n, 4, 4)``, poses of the keyframes, metres.
     """
 
     def __init__(self, keyframes: Sequence[Keyframe]) -> None:
+        """Index *keyframes*; raises BadRequest if their features are of several kinds."""
         self.keyframes = tuple(keyframes)
         self.kind = common_kind((keyframe.kind for keyframe in self.keyframes), "the map")
         self.T_map_keyframe = np.array([keyframe.T_world_camera for keyframe in self.keyframes])
@@ -127,26 +149,32 @@ class MapIndex:
     def nearest(
         self, descriptors: Descriptors, count: int, within: Within | None = None
     ) -> list[tuple[int, float]]:
-        """Return up to *count* ``(row, score)`` for a view, best first, of keyframes that are *within*."""
+        """Return up to *count* keyframes that are similar to a view, as ``(row, score)``, the best first.
+
+        Args:
+            descriptors: Descriptors of the view.
+            count: Most keyframes.
+            within: Prior; keyframes outside are left out.
+        """
         rows: npt.NDArray[np.int64] | None = None
         if within is not None:
             centre = np.array([within.x, within.y, within.z])
-            apart_m = np.linalg.norm(self.T_map_keyframe[:, :3, 3] - centre, axis=1)
-            rows = np.flatnonzero(apart_m <= within.radius_m).astype(np.int64)
+            distance_m = np.linalg.norm(self.T_map_keyframe[:, :3, 3] - centre, axis=1)
+            rows = np.flatnonzero(distance_m <= within.radius_m).astype(np.int64)
         return self._places.nearest(place_vector(descriptors), count, rows)
 
 
 def map_limits(keyframes: int = MAX_KEYFRAMES) -> MapLimits:
-    """Return what a map may hold that a service computes with."""
+    """Return the limits of a map that a service decodes: *keyframes* and `MAX_FEATURES`."""
     return MapLimits(keyframes=keyframes, features=MAX_FEATURES)
 
 
 def index_map(data: bytes) -> tuple[MapVersion, MapIndex]:
-    """Return the map of *data* and its index.
+    """Decode the map version *data*, and return the version with an index of its keyframes.
 
     Raises:
         BadRequest: The bytes are not a map.
-        LimitExceeded: It holds no keyframe, or more keyframes or features than a service computes with.
+        LimitExceeded: The map has no keyframes, or more keyframes or features than the limits allow.
     """
     version = decode_map(data, limits=map_limits())
     if not version.keyframes:
@@ -157,17 +185,25 @@ def index_map(data: bytes) -> tuple[MapVersion, MapIndex]:
 
 
 open_map = functools.lru_cache(maxsize=_CACHED_MAPS)(index_map)
-"""The same; the last results are cached."""
+"""`index_map` with a cache of the results for the last maps."""
 
 
 def view_of(
     camera: Camera, pixels: Array, descriptors: bytes, features: FeatureKind | None, index: MapIndex
 ) -> View:
-    """Return the view of a request.
+    """Return the view of a request, after a comparison with the map.
+
+    Args:
+        camera: Intrinsics of the view.
+        pixels: ``2n`` undistorted pixel coordinates.
+        descriptors: Raw bytes of the ``n`` descriptors.
+        features: Kind of the descriptors; None for ORB.
+        index: Index of the map.
 
     Raises:
-        BadRequest: Pixels and descriptors do not fit, or are of another kind than those of the map.
-        LimitExceeded: It has too many features.
+        BadRequest: Pixels and descriptors do not fit each other, or the descriptors are of another kind than
+            the map's.
+        LimitExceeded: The view has more than `MAX_VIEW_FEATURES` features.
     """
     kind = ORB if features is None else DescriptorKind(features.name, features.dtype, features.size)
     check_same_kind(index.kind, kind, "the map")
@@ -180,8 +216,8 @@ def view_of(
 
 
 def check_comparisons(index: MapIndex, view: View, candidates: int) -> None:
-    """Raise LimitExceeded if matching *view* to *candidates* keyframes of *index* would take too long."""
-    largest = max(len(each.descriptors) for each in index.keyframes)
+    """Raise LimitExceeded if it would take too long to match *view* to *candidates* keyframes of *index*."""
+    largest = max(len(keyframe.descriptors) for keyframe in index.keyframes)
     comparisons = min(candidates, len(index.keyframes)) * largest * len(view.pixels)
     comparisons = comparisons * index.kind.size // ORB.size
     if comparisons > _MAX_COMPARISONS:
@@ -192,7 +228,7 @@ def check_comparisons(index: MapIndex, view: View, candidates: int) -> None:
 
 
 def register(registry: Registry) -> None:
-    """Add ``place`` to *registry*."""
+    """Add the service ``place`` to *registry*."""
 
     @registry.service("place", limited=True)
     def place(request: PlaceRequest) -> PlaceReply:
@@ -206,13 +242,15 @@ def register(registry: Registry) -> None:
         if request.check:
             check_comparisons(index, view, request.candidates)
         rows = index.nearest(view.descriptors, request.candidates, request.within)
-        found = [_candidate(index.keyframes[row], score, view, request.check) for row, score in rows]
+        candidates = [
+            _make_candidate(index.keyframes[row], score, view, request.check) for row, score in rows
+        ]
         if request.check:
-            found.sort(key=lambda each: (-(each.inliers or 0), -each.score))
-        return PlaceReply(candidates=found)
+            candidates.sort(key=lambda candidate: (-(candidate.inliers or 0), -candidate.score))
+        return PlaceReply(candidates=candidates)
 
 
-def _candidate(keyframe: Keyframe, score: float, view: View, check: bool) -> Candidate:
+def _make_candidate(keyframe: Keyframe, score: float, view: View, check: bool) -> Candidate:
     inliers = None
     if check:
         measured = measure_pose(landmarks_of_keyframe(keyframe), view)

@@ -1,7 +1,8 @@
-"""The wifi service: from a scan of access points and a survey to a position with its uncertainty.
+"""The service ``wifi``: find the position of a robot by the signal strengths of Wi-Fi access points.
 
-No hardware address leaves the robot: identifiers are keyed hashes that `fingerprint_of` computes there, and
-networks whose owner opted out by ``_nomap`` are left out.
+A robot sends a scan and a survey, which is a list of scans with known positions.  No hardware address leaves
+the robot: `fingerprint_of` replaces addresses by keyed hashes, and leaves out networks whose owners opted out
+by ``_nomap``.
 """
 
 from __future__ import annotations
@@ -29,30 +30,39 @@ __all__ = [
     "WifiRequest",
     "fingerprint_of",
     "register",
-]  # fmt: skip
-
-_OPTED_OUT = "_nomap"
-_MAC = re.compile(r"^(?:[0-9a-fA-F]{2}[:\-.]?){5}[0-9a-fA-F]{2}$")
-_MIN_DBM, _MAX_DBM = -120.0, 0.0
-_ONE_SIGMA = 0.68
-_TEMPERS = np.array([0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0])
-_DEFAULT_TEMPER = 0.4
-"""The exponent where a survey is too small to calibrate it."""
-_MIN_HELD_OUT = 30
-_FOLDS = 5
-_CALIBRATION_GRID_M = 0.5
+]
 
 Survey = tuple[tuple[float, float, float], Mapping[str, float]]
-MAX_FINGERPRINTS = 5000
-"""Of one request."""
-_MAX_FLOORS, _MAX_ACCESS_POINTS = 100, 300
-_MAX_POSTERIORS, _MAX_PREDICTIONS = 5_000_000, 100_000_000
-"""Grid points times positions, and times the readings of all access points: five seconds of work each."""
-_DISTANCES_AT_ONCE = 1_000_000
+"""A surveyed position (metres, map frame) with the received strengths (dBm) by hashed access point."""
+
+# --- What a scan may hold ---
+_OPT_OUT_SUFFIX = "_nomap"  # end of a network's name by which its owner opts out of localisation
+_MAC = re.compile(r"^(?:[0-9a-fA-F]{2}[:\-.]?){5}[0-9a-fA-F]{2}$")  # pattern of a hardware address
+_MIN_DBM = -120.0  # weakest plausible signal, dBm: below the thermal noise of a radio
+_MAX_DBM = 0.0  # strongest plausible signal, dBm: 1 mW at the antenna
+
+# --- Calibration of the uncertainty ---
+_ONE_SIGMA = 0.68  # probability that the true position lies within the radius of the reply
+# Candidate exponents of the likelihood.
+_TEMPERS = np.array([0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0])
+_DEFAULT_TEMPER = 0.4  # exponent of the likelihood where a survey is too small to calibrate the exponent
+_MIN_HELD_OUT = 30  # fewest held-out positions from which the exponent is calibrated
+_FOLDS = 5  # folds of the cross-validation that calibrates the exponent
+_CALIBRATION_GRID_M = 0.5  # finest grid of the calibration in metres, to save time
+
+# --- Limits of a request ---
+MAX_FINGERPRINTS = 5000  # most fingerprints of a survey
+_MAX_FLOORS = 100  # most floors, which are surveyed heights rounded to 1 m; each floor has a grid of its own
+_MAX_ACCESS_POINTS = 300  # most access points with a signal field
+# Most products of grid points and surveyed positions: calibration for five seconds.
+_MAX_POSTERIORS = 5_000_000
+_MAX_PREDICTIONS = 100_000_000  # most products of grid points and readings: predictions for five seconds
+# Distances of grid points and positions that are computed at once, which bounds the memory.
+_BATCH = 1_000_000
 
 
 class AccessPointReading(msgspec.Struct, frozen=True, kw_only=True):
-    """One access point as a robot's radio hears it; it stays on the robot."""
+    """An access point that a robot's radio received; its address never leaves the robot."""
 
     mac: str
     ssid: str
@@ -60,14 +70,23 @@ class AccessPointReading(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Fingerprint(msgspec.Struct, frozen=True, kw_only=True):
-    """Strengths in dBm by hashed access point; *position* is ``(x, y, z)`` in metres, map frame."""
+    """A scan: strengths (dBm) by hashed access point; in a survey with its position (metres, map frame)."""
 
     rssi_dbm: dict[str, float]
     position: tuple[float, float, float] | None = None
 
 
 class WifiOptions(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """How to locate: the grid's pitch, how far from the survey to look, how many points to hear."""
+    """Options of a Wi-Fi localisation.
+
+    Attributes:
+        grid_m: Distance of the points of the grid over which the position is estimated, metres, 0.1..5.
+        reach_m: Largest distance of a grid point from a surveyed position, metres, up to 50.
+        min_common: Fewest access points of the scan that the survey knows, 1..100.
+
+    Raises:
+        BadRequest: A number is out of its range.
+    """
 
     grid_m: float = 0.5
     reach_m: float = 3.0
@@ -79,7 +98,7 @@ class WifiOptions(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True)
 
 
 class WifiRequest(msgspec.Struct, frozen=True, kw_only=True):
-    """A scan without a position, and the survey: fingerprints with theirs."""
+    """A scan, whose position is ignored, and a survey of fingerprints with positions."""
 
     scan: Fingerprint
     survey: list[Fingerprint]
@@ -87,10 +106,19 @@ class WifiRequest(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class WifiReply(msgspec.Struct, frozen=True, kw_only=True):
-    """Where the scan was taken: mean, and the radius that holds the truth 68 times in 100.
+    """The position at which a scan was taken.
 
-    ``found`` is False, with a *reason*, where too few access points are known.  Position and radius
-    (twice the sigma is sensible) fit into ``within`` of ``place`` and ``localise``.
+    Position and radius are a prior for the field ``within`` of the services ``place`` and ``localise``; a
+    radius of twice *sigma_m* is sensible.
+
+    Attributes:
+        found: Whether there is a position.
+        reason: Why there is none: too few access points of the scan are known.
+        x: Mean of the posterior, metres, map frame.
+        y: Mean of the posterior, metres, map frame.
+        z: Mean of the posterior, metres, map frame.
+        sigma_m: Horizontal radius that holds the true position with a probability of 68 %.
+        common: Access points of the scan that the survey knows.
     """
 
     found: bool
@@ -105,53 +133,67 @@ class WifiReply(msgspec.Struct, frozen=True, kw_only=True):
 def fingerprint_of(
     readings: Iterable[AccessPointReading], key: bytes, position: tuple[float, float, float] | None = None
 ) -> Fingerprint:
-    """Return the fingerprint of *readings* without hardware addresses; run it on the robot.
+    """Return a fingerprint of *readings* without hardware addresses; the robot calls this function.
 
-    Leaves out networks whose name ends in ``_nomap``, locally administered addresses (phones that
-    share their connection change them) and impossible strengths.  Addresses become keyed hashes: with
-    the team's *key* two robots give an access point the same name; without the key it cannot be traced.
+    Left out are networks whose name ends in ``_nomap``, locally administered addresses (those of phones that
+    share their connection, which change) and implausible strengths.  An address becomes a keyed BLAKE2b hash:
+    robots with the same *key* give an access point the same name, and without the key the address cannot be
+    found out.
+
+    Args:
+        readings: Received access points.
+        key: Secret of the team, at least 16 bytes.
+        position: ``(x, y, z)`` in metres, map frame, for a survey; None for a scan.
 
     Raises:
         BadRequest: *key* is shorter than 16 bytes, or an address is not valid.
     """
     if len(key) < 16:
         raise BadRequest(f"the key has {len(key)} bytes, not 16 or more", hint="make a random key per team")
-    kept: dict[str, float] = {}
+    strengths_dbm: dict[str, float] = {}
     for reading in readings:
         if not _MAC.match(reading.mac):
             raise BadRequest("an address is not six bytes of hexadecimal", hint="send aa:bb:cc:dd:ee:ff")
         address = bytes.fromhex(re.sub(r"[^0-9a-fA-F]", "", reading.mac))
-        local = bool(address[0] & 0x02)
-        audible = _MIN_DBM <= reading.rssi_dbm <= _MAX_DBM
-        if not reading.ssid.endswith(_OPTED_OUT) and not local and audible:
-            kept[hashlib.blake2b(address, key=key[:64], digest_size=8).hexdigest()] = reading.rssi_dbm
-    return Fingerprint(rssi_dbm=kept, position=position)
+        is_local = bool(address[0] & 0x02)
+        is_plausible = _MIN_DBM <= reading.rssi_dbm <= _MAX_DBM
+        if not reading.ssid.endswith(_OPT_OUT_SUFFIX) and not is_local and is_plausible:
+            name = hashlib.blake2b(address, key=key[:64], digest_size=8).hexdigest()
+            strengths_dbm[name] = reading.rssi_dbm
+    return Fingerprint(rssi_dbm=strengths_dbm, position=position)
 
 
 class Locator:
-    """A survey that locates scans; immutable.
+    """Estimates positions from scans by a survey; immutable.
 
-    The posterior over a grid around the surveyed positions: for each received access point a Gaussian
-    with the mean and variance of the model there, and a uniform prior.  The errors of access points are
-    correlated (walls, people), which a product of their likelihoods ignores; therefore the product is
-    tempered by an exponent, chosen so that in a five-fold cross-validation of the survey 68 % of the
+    The posterior over a grid around the surveyed positions has a uniform prior, and for each received access
+    point a Gaussian likelihood with the mean and variance of its signal field.  The errors of access points
+    are correlated (walls, people), which the product of their likelihoods ignores.  The product is therefore
+    raised to a power below 1, chosen so that in a five-fold cross-validation of the survey 68 % of the
     positions lie within their stated radius.
 
     Source:
         Ferris, Haehnel and Fox, Gaussian processes for signal strength-based location estimation,
-        RSS 2006; tempering after Grunwald and van Ommen, Bayesian Analysis 2017.
+        RSS 2006; the power ("tempering") after Grunwald and van Ommen, Bayesian Analysis 2017.
     """
 
     def __init__(self, survey: Sequence[Survey], options: WifiOptions | None = None) -> None:
+        """Fit the signal fields of *survey*.
+
+        Raises:
+            BadRequest: No access point was received at five positions or more, or no grid point is near the
+                survey.
+            LimitExceeded: The survey would take too long.
+        """
         self._options = options or WifiOptions()
         _check_work(survey, self._options)
         model = fit_signals(survey, max_fields=_MAX_ACCESS_POINTS)
-        self._grid = _grid(model.places, self._options.grid_m, self._options.reach_m)
+        self._grid = _make_grid(model.positions, self._options.grid_m, self._options.reach_m)
         self._fields = {name: field.predict(self._grid) for name, field in model.fields.items()}
         self.temper = _calibrate_temper(survey, model, self._options)
 
     def position_of(self, scan: Mapping[str, float]) -> WifiReply:
-        """Return the position of *scan* (dBm by access point) as the reply of the service."""
+        """Return the position at which *scan* (dBm by hashed access point) was taken."""
         known = sorted(name for name in scan if name in self._fields)
         if len(known) < self._options.min_common:
             return WifiReply(
@@ -170,24 +212,24 @@ class Locator:
 
 
 def register(registry: Registry) -> None:
-    """Add ``wifi`` to *registry*."""
+    """Add the service ``wifi`` to *registry*."""
 
     @registry.service("wifi", limited=True)
     def wifi(request: WifiRequest) -> WifiReply:
-        """Locate a robot by the access points it hears."""
+        """Find the position of a robot by the Wi-Fi access points that it receives."""
         if len(request.survey) > MAX_FINGERPRINTS:
             raise LimitExceeded(
                 f"{len(request.survey)} fingerprints are above {MAX_FINGERPRINTS}",
                 hint="send those near the robot's last position",
             )
-        for each in (request.scan, *request.survey):
-            _check_fingerprint(each)
-        survey = [(_position_of(each), each.rssi_dbm) for each in request.survey]
+        for fingerprint in (request.scan, *request.survey):
+            _check_fingerprint(fingerprint)
+        survey = [(_surveyed_position(fingerprint), fingerprint.rssi_dbm) for fingerprint in request.survey]
         return Locator(survey, request.options).position_of(request.scan.rssi_dbm)
 
 
 def _log_likelihood(scan: Mapping[str, float], fields: Mapping[str, tuple[Array, Array]]) -> Array:
-    """Return the log likelihood of *scan* on the grid that *fields* were predicted on."""
+    """Return ``(g,)`` log likelihoods of *scan* at the grid points of *fields* (means, variances)."""
     parts = [
         (scan[name] - fields[name][0]) ** 2 / fields[name][1] + np.log(fields[name][1])
         for name in sorted(scan)
@@ -198,35 +240,36 @@ def _log_likelihood(scan: Mapping[str, float], fields: Mapping[str, tuple[Array,
 
 
 def _posterior(grid: Array, log_likelihood: Array, temper: float) -> tuple[Array, float]:
-    """Return the mean of the posterior and the radius around it that holds 68 %."""
+    """Return the ``(3,)`` mean of the posterior, and the horizontal radius (metres) that holds 68 % of it."""
     weight = np.exp(temper * (log_likelihood - log_likelihood.max()))
     weight /= weight.sum()
     mean = weight @ grid
     distance = np.linalg.norm(grid[:, :2] - mean[:2], axis=1)
-    return mean, _quantile(distance, weight, _ONE_SIGMA)
+    return mean, _weighted_quantile(distance, weight, _ONE_SIGMA)
 
 
 def _calibrate_temper(survey: Sequence[Survey], model: SignalModel, options: WifiOptions) -> float:
-    """Return the exponent at which 68 % of the held-out positions lie within their radius."""
-    grid = _grid(model.places, max(options.grid_m, _CALIBRATION_GRID_M), options.reach_m)
+    """Return the power of the likelihood at which 68 % of the held-out positions lie within their radius."""
+    # 1. Locate the scans of each fold by the others, with each candidate power.
+    grid = _make_grid(model.positions, max(options.grid_m, _CALIBRATION_GRID_M), options.reach_m)
     inside = np.zeros(len(_TEMPERS))
     count = 0
     for fold in range(_FOLDS):
         held_out = np.arange(fold, len(survey), _FOLDS)
-        left = {name: field.without(held_out) for name, field in model.fields.items()}
-        fields = {name: field.predict(grid) for name, field in left.items() if field is not None}
+        remaining = {name: field.without(held_out) for name, field in model.fields.items()}
+        fields = {name: field.predict(grid) for name, field in remaining.items() if field is not None}
         for row in held_out.tolist():
-            place, scan = survey[row]
+            position, scan = survey[row]
             if sum(name in fields for name in scan) < options.min_common:
                 continue
             log_likelihood = _log_likelihood(scan, fields)
             count += 1
             for number, temper in enumerate(_TEMPERS):
                 mean, sigma_m = _posterior(grid, log_likelihood, temper)
-                inside[number] += math.hypot(mean[0] - place[0], mean[1] - place[1]) <= sigma_m
+                inside[number] += math.hypot(mean[0] - position[0], mean[1] - position[1]) <= sigma_m
     if count < _MIN_HELD_OUT:
         return _DEFAULT_TEMPER
-    # A larger exponent makes the radius smaller, so the share inside falls.
+    # 2. Interpolate.  A larger power makes the radius smaller, so the share of positions inside falls.
     share = np.minimum.accumulate(inside / count)
     return float(np.interp(-_ONE_SIGMA, -share, _TEMPERS))
 
@@ -238,7 +281,7 @@ def _check_fingerprint(fingerprint: Fingerprint) -> None:
         raise BadRequest("a strength is not within -120..0 dBm", hint="send dBm")
 
 
-def _position_of(fingerprint: Fingerprint) -> tuple[float, float, float]:
+def _surveyed_position(fingerprint: Fingerprint) -> tuple[float, float, float]:
     position = fingerprint.position
     if position is None or not all(math.isfinite(value) and abs(value) < 1e5 for value in position):
         raise BadRequest("a fingerprint of the survey has no position", hint="send metres, map frame")
@@ -246,61 +289,61 @@ def _position_of(fingerprint: Fingerprint) -> tuple[float, float, float]:
 
 
 def _check_work(survey: Sequence[Survey], options: WifiOptions) -> None:
-    """Raise LimitExceeded if *survey* would take too long."""
+    """Raise LimitExceeded if the calibration or the predictions of *survey* would take too long."""
     if not survey:
         return
-    places = np.array([place for place, _ in survey], dtype=np.float64)
-    low, high = _bounds(places, options.reach_m)
-    floors = len(np.unique(np.round(places[:, 2])))
-    cells = float(np.prod((high - low) / _pitch(low, high, options.grid_m) + 1.0)) * floors
-    heard_at = Counter(name for _, heard in survey for name in heard)
-    readings = sum(min(count, MAX_READINGS) for count in heard_at.values())
+    positions = np.array([position for position, _ in survey], dtype=np.float64)
+    low, high = _bounds(positions, options.reach_m)
+    floors = len(np.unique(np.round(positions[:, 2])))
+    grid_points = float(np.prod((high - low) / _grid_pitch(low, high, options.grid_m) + 1.0)) * floors
+    readings_by_name = Counter(name for _, strengths in survey for name in strengths)
+    readings = sum(min(count, MAX_READINGS) for count in readings_by_name.values())
     if (
         floors > _MAX_FLOORS
-        or cells * len(survey) > _MAX_POSTERIORS
-        or cells * readings > _MAX_PREDICTIONS
-    ):  # fmt: skip
+        or grid_points * len(survey) > _MAX_POSTERIORS
+        or grid_points * readings > _MAX_PREDICTIONS
+    ):
         raise LimitExceeded(
             f"{len(survey)} positions on {floors} floors with {readings} readings, on a grid of up to "
-            f"{cells:.0f} points, are too much for one request",
+            f"{grid_points:.0f} points, are too much for one request",
             hint="send the fingerprints near the robot's last position, or a larger grid_m",
         )
 
 
-def _bounds(places: Array, reach_m: float) -> tuple[Array, Array]:
-    return places[:, :2].min(axis=0) - reach_m, places[:, :2].max(axis=0) + reach_m
+def _bounds(positions: Array, reach_m: float) -> tuple[Array, Array]:
+    return positions[:, :2].min(axis=0) - reach_m, positions[:, :2].max(axis=0) + reach_m
 
 
-def _pitch(low: Array, high: Array, grid_m: float) -> float:
-    """Return the distance of grid points: *grid_m*, or more so that there are about 40,000."""
+def _grid_pitch(low: Array, high: Array, grid_m: float) -> float:
+    """Return the distance of grid points: *grid_m*, or more, so that a floor has at most about 40,000."""
     area, longest = float(np.prod(high - low)), float((high - low).max())
     return max(grid_m, math.sqrt(area / 40_000.0), longest / 40_000.0)
 
 
-def _grid(places: Array, grid_m: float, reach_m: float) -> Array:
-    """Return ``(g, 3)`` grid points within reach of surveyed positions, at the height of the nearest one."""
-    low, high = _bounds(places, reach_m)
-    pitch = _pitch(low, high, grid_m)
+def _make_grid(positions: Array, grid_m: float, reach_m: float) -> Array:
+    """Return ``(g, 3)`` grid points within *reach_m* of a surveyed position, at the height of the nearest."""
+    low, high = _bounds(positions, reach_m)
+    pitch = _grid_pitch(low, high, grid_m)
     x, y = (np.arange(low[axis], high[axis] + pitch, pitch) for axis in (0, 1))
     flat = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
-    floors = np.round(places[:, 2])
+    floors = np.round(positions[:, 2])
     parts = []
     for floor in np.unique(floors):
-        on_floor = places[floors == floor]
-        step = max(1, _DISTANCES_AT_ONCE // len(on_floor))
+        on_floor = positions[floors == floor]
+        step = max(1, _BATCH // len(on_floor))
         for begin in range(0, len(flat), step):
             part = flat[begin : begin + step]
             squared = ((part[:, None, :] - on_floor[None, :, :2]) ** 2).sum(axis=2)
-            near = squared.min(axis=1) <= reach_m**2
+            is_near = squared.min(axis=1) <= reach_m**2
             height = on_floor[np.argmin(squared, axis=1), 2]
-            parts.append(np.column_stack([part[near], height[near]]))
+            parts.append(np.column_stack([part[is_near], height[is_near]]))
     grid = np.concatenate(parts)
     if not len(grid):
         raise BadRequest(f"no point of the grid is within {reach_m:g} m of the survey", hint="raise reach_m")
     return grid
 
 
-def _quantile(values: Array, weights: Array, share: float) -> float:
+def _weighted_quantile(values: Array, weights: Array, probability: float) -> float:
     order = np.argsort(values)
-    below = np.cumsum(weights[order])
-    return float(np.interp(share, below, values[order]))
+    cumulated = np.cumsum(weights[order])
+    return float(np.interp(probability, cumulated, values[order]))

@@ -1,6 +1,7 @@
-"""Signal strength of access points over space: a path-loss trend and a Gaussian process of its residuals.
+"""Model the signal strength of Wi-Fi access points: a path-loss trend, and a Gaussian process of residuals.
 
-The uncertainty grows with the distance from surveyed positions; the noise is estimated from the survey.
+The predicted variance grows with the distance from surveyed positions; the noise is estimated from the
+survey.
 """
 
 from __future__ import annotations
@@ -21,124 +22,159 @@ Rows = npt.NDArray[np.int64]
 __all__ = ["MAX_READINGS", "SignalField", "SignalModel", "fit_signals"]
 
 _MIN_READINGS = 5
+"""Fewest readings of an access point that is used: its position and its trend have four unknowns."""
 _LENGTHS_M = (2.0, 4.0, 8.0, 16.0)
-_SHARES = (0.1, 0.3, 0.5, 0.7, 0.85)
-"""Candidate shares of the residual variance that are smooth in space; the rest is noise."""
-_FLOOR_DBM2 = 1.0
+"""Candidate correlation lengths of the Gaussian process, metres: from a room to a hall."""
+_SMOOTH_SHARES = (0.1, 0.3, 0.5, 0.7, 0.85)
+"""Candidate shares of the residual variance that is smooth in space; the rest is noise."""
+_MIN_VARIANCE_DBM2 = 1.0
+"""Smallest variance of the noise (dBm^2), so that no reading counts as exact."""
 _NEAR_M = 1.0
-_PLACES_AT_ONCE = 8192
-"""Places whose covariances with all readings are computed at once."""
+"""Smallest distance from an access point (metres, added in quadrature), since log10 of 0 is infinite."""
+_BATCH = 8192
+"""Positions whose covariances with all readings are computed at once, which bounds the memory."""
 MAX_READINGS = 400
-"""Readings of one access point in the Gaussian process, evenly chosen: its cost is cubic."""
+"""Most readings of an access point in its Gaussian process, chosen evenly: time grows with their cube."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SignalField:
-    """One access point: trend ``c0 - c1 log10(distance to source)`` and a process of its residuals (dBm)."""
+    """The signal strength of one access point over space.
+
+    Its mean is the trend ``c0 + c1 log10(distance to the access point)`` plus a Gaussian process of the
+    residuals.
+
+    Attributes:
+        source: ``(3,)``, estimated position of the access point, metres.
+        trend: ``(2,)``, c0 in dBm and c1 in dBm per decade.
+        positions: ``(r, 3)``, positions of the readings, metres.
+        residuals: ``(r,)``, readings minus trend, dBm.
+        rows: ``(r,)``, rows of the survey that the readings are from.
+        weights: ``(r,)``, inverse covariance times residuals, 1/dBm.
+        inverse: ``(r, r)``, inverse covariance of the readings, 1/dBm^2.
+        signal_dbm2: Variance of the process.
+        noise_dbm2: Variance of the noise of a reading.
+        length_m: Correlation length of the process.
+    """
 
     source: Array
     trend: Array
-    places: Array
+    positions: Array
     residuals: Array
     rows: Rows
-    """Survey rows of the readings."""
     weights: Array
     inverse: Array
     signal_dbm2: float
     noise_dbm2: float
     length_m: float
 
-    def predict(self, places: Array) -> tuple[Array, Array]:
-        """Return mean (dBm) and variance of a new reading at ``(n, 3)`` places."""
+    def predict(self, positions: Array) -> tuple[Array, Array]:
+        """Return the ``(n,)`` means (dBm) and variances (dBm^2) of readings at ``(n, 3)`` positions (metres)."""
         parts = [
-            self._predict(places[begin : begin + _PLACES_AT_ONCE])
-            for begin in range(0, len(places), _PLACES_AT_ONCE)
+            self._predict(positions[begin : begin + _BATCH]) for begin in range(0, len(positions), _BATCH)
         ]
-        return np.concatenate([mean for mean, _ in parts]), np.concatenate([sigma for _, sigma in parts])
+        means, variances = [mean for mean, _ in parts], [variance for _, variance in parts]
+        return np.concatenate(means), np.concatenate(variances)
 
-    def _predict(self, places: Array) -> tuple[Array, Array]:
-        k = _kernel(places, self.places, self.signal_dbm2, self.length_m)
-        mean = _trend(places, self.source) @ self.trend + k @ self.weights
+    def _predict(self, positions: Array) -> tuple[Array, Array]:
+        k = _kernel(positions, self.positions, self.signal_dbm2, self.length_m)
+        mean = _trend(positions, self.source) @ self.trend + k @ self.weights
         variance = self.signal_dbm2 - ((k @ self.inverse) * k).sum(axis=1)
         return mean, np.maximum(variance, 0.0) + self.noise_dbm2
 
     def without(self, held_out: Rows) -> SignalField | None:
-        """Return the field without the readings at *held_out* survey rows, with the same parameters."""
-        kept = ~np.isin(self.rows, held_out)
-        if kept.sum() < _MIN_READINGS:
+        """Return the field without the readings of the *held_out* survey rows, with the same parameters.
+
+        Return None if fewer than five readings are left.
+        """
+        remains = ~np.isin(self.rows, held_out)
+        if remains.sum() < _MIN_READINGS:
             return None
         kernel = _Kernel(self.signal_dbm2, self.noise_dbm2, self.length_m)
         return _condition(
-            self.places[kept], self.residuals[kept], self.rows[kept], self.source, self.trend, kernel
+            self.positions[remains],
+            self.residuals[remains],
+            self.rows[remains],
+            self.source,
+            self.trend,
+            kernel,
         )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SignalModel:
-    """The fields by access point, and the ``(n, 3)`` surveyed positions in metres."""
+    """The fields of all access points by their names, and the ``(n, 3)`` surveyed positions in metres."""
 
     fields: Mapping[str, SignalField]
-    places: Array
+    positions: Array
 
 
 def fit_signals(
     survey: Sequence[tuple[tuple[float, float, float], Mapping[str, float]]], *, max_fields: int | None = None
 ) -> SignalModel:
-    """Return the model of *survey*: places (metres) with strengths (dBm); deterministic.
+    """Fit a signal model to a survey; equal surveys give equal models.
+
+    Args:
+        survey: For each surveyed position (metres) the received strengths (dBm) by access point.
+        max_fields: Most access points; None for any number.
 
     Raises:
-        BadRequest: No access point was heard at five places or more.
-        LimitExceeded: More than *max_fields* were.
+        BadRequest: No access point was received at five positions or more.
+        LimitExceeded: More than *max_fields* access points were.
 
     Source:
-        Path loss after Rappaport, Wireless Communications, 4.9; processes after Ferris et al. 2006,
-        with parameters of largest marginal likelihood (Rasmussen and Williams 2006, eq. 5.8).
+        Path loss after Rappaport, Wireless Communications, 4.9; Gaussian processes after Ferris et al. 2006,
+        with the parameters of largest marginal likelihood (Rasmussen and Williams 2006, eq. 5.8).
     """
-    places = np.array([place for place, _ in survey], dtype=np.float64).reshape(-1, 3)
+    positions = np.array([place for place, _ in survey], dtype=np.float64).reshape(-1, 3)
     readings: dict[str, list[tuple[int, float]]] = {}
-    for row, (_, heard) in enumerate(survey):
-        for name, dbm in heard.items():
+    for row, (_, received) in enumerate(survey):
+        for name, dbm in received.items():
             readings.setdefault(name, []).append((row, dbm))
-    heard_often = sum(len(heard) >= _MIN_READINGS for heard in readings.values())
-    if max_fields is not None and heard_often > max_fields:
+    access_points = sum(len(received) >= _MIN_READINGS for received in readings.values())
+    if max_fields is not None and access_points > max_fields:
         raise LimitExceeded(
-            f"{heard_often} access points are above {max_fields}", hint="send those near the last position"
+            f"{access_points} access points are above {max_fields}", hint="send those near the last position"
         )
     fields = {
-        name: _fit(places, np.array([row for row, _ in heard]), np.array([dbm for _, dbm in heard]))
-        for name, heard in sorted(readings.items())
-        if len(heard) >= _MIN_READINGS
+        name: _fit(positions, np.array([row for row, _ in received]), np.array([dbm for _, dbm in received]))
+        for name, received in sorted(readings.items())
+        if len(received) >= _MIN_READINGS
     }
     if not fields:
         raise BadRequest(
-            f"no access point was heard at {_MIN_READINGS} places of the survey", hint="survey more places"
+            f"no access point was received at {_MIN_READINGS} positions of the survey",
+            hint="survey more positions",
         )
-    return SignalModel(fields=fields, places=places)
+    return SignalModel(fields=fields, positions=positions)
 
 
-def _fit(all_places: Array, rows: Rows, dbm: Array) -> SignalField:
+def _fit(all_positions: Array, rows: Rows, dbm: Array) -> SignalField:
     if len(rows) > MAX_READINGS:
         chosen = np.linspace(0, len(rows) - 1, MAX_READINGS).astype(np.int64)
         rows, dbm = rows[chosen], dbm[chosen]
-    places = all_places[rows]
-    source = _source(places, dbm)
-    columns = _trend(places, source)
+    # 1. Fit the trend.
+    positions = all_positions[rows]
+    source = _estimate_source(positions, dbm)
+    columns = _trend(positions, source)
     trend = np.linalg.lstsq(columns, dbm, rcond=None)[0].astype(np.float64)
     residuals = dbm - columns @ trend
-    total = max(float(residuals.var()), _FLOOR_DBM2) * len(residuals) / max(1, len(residuals) - 4)
+    total = max(float(residuals.var()), _MIN_VARIANCE_DBM2) * len(residuals) / max(1, len(residuals) - 4)
+    # 2. Choose the correlation length, and the share of smooth variance, with the largest marginal
+    # likelihood.
     best: tuple[float, float, float] = (-math.inf, 0.0, 0.0)
     for length_m in _LENGTHS_M:
-        for share in _SHARES:
-            likelihood = _log_likelihood(places, residuals, share * total, (1.0 - share) * total, length_m)
+        for share in _SMOOTH_SHARES:
+            likelihood = _log_likelihood(positions, residuals, share * total, (1.0 - share) * total, length_m)
             best = max(best, (likelihood, length_m, share))
     _, length_m, share = best
-    noise = max((1.0 - share) * total, _FLOOR_DBM2)
+    noise = max((1.0 - share) * total, _MIN_VARIANCE_DBM2)
     kernel = _Kernel(share * total, noise, length_m)
-    return _condition(places, residuals, rows, source, trend, kernel)
+    return _condition(positions, residuals, rows, source, trend, kernel)
 
 
 class _Kernel(NamedTuple):
-    """The parameters of a Gaussian process: variances of signal and noise, and the length of its kernel."""
+    """The parameters of a Gaussian process: variances of signal and noise, and correlation length."""
 
     signal_dbm2: float
     noise_dbm2: float
@@ -146,58 +182,73 @@ class _Kernel(NamedTuple):
 
 
 def _condition(
-    places: Array, residuals: Array, rows: Rows, source: Array, trend: Array, kernel: _Kernel
+    positions: Array, residuals: Array, rows: Rows, source: Array, trend: Array, kernel: _Kernel
 ) -> SignalField:
-    """Return the field of a process with *kernel* that was read with *residuals* at *places*."""
+    """Return the field of a Gaussian process with *kernel*, given *residuals* at *positions*."""
     signal, noise, length_m = kernel
-    covariance = _kernel(places, places, signal, length_m) + noise * np.eye(len(places))
+    covariance = _kernel(positions, positions, signal, length_m) + noise * np.eye(len(positions))
     inverse = np.linalg.inv(covariance).astype(np.float64)
     return SignalField(
-        source=source, trend=trend, places=places, residuals=residuals, rows=rows,
-        weights=inverse @ residuals, inverse=inverse, signal_dbm2=signal, noise_dbm2=noise, length_m=length_m,
-    )  # fmt: skip
+        source=source,
+        trend=trend,
+        positions=positions,
+        residuals=residuals,
+        rows=rows,
+        weights=inverse @ residuals,
+        inverse=inverse,
+        signal_dbm2=signal,
+        noise_dbm2=noise,
+        length_m=length_m,
+    )
 
 
-def _source(places: Array, dbm: Array) -> Array:
-    """Return the estimated position of the access point: the grid point whose trend fits best."""
-    low, high = places.min(axis=0) - 5.0, places.max(axis=0) + 5.0
+def _estimate_source(positions: Array, dbm: Array) -> Array:
+    """Return the position of an access point: the grid point whose path-loss trend fits best."""
+    low, high = positions.min(axis=0) - 5.0, positions.max(axis=0) + 5.0
     axes = [np.linspace(low[axis], high[axis], 24) for axis in (0, 1)]
-    height = float(places[np.argmax(dbm), 2])
-    best, best_error = places[int(np.argmax(dbm))], math.inf
+    height = float(positions[np.argmax(dbm), 2])
+    best, best_error = positions[int(np.argmax(dbm))], math.inf
     for x in axes[0]:
         for y in axes[1]:
-            trial = np.array([x, y, height])
-            log_m = _trend(places, trial)[:, 1]
-            slope, offset = _line(log_m, dbm)
+            candidate = np.array([x, y, height])
+            log_m = _trend(positions, candidate)[:, 1]
+            slope, offset = _fit_line(log_m, dbm)
             error = float(((dbm - offset - slope * log_m) ** 2).sum())
             if slope < 0 and error < best_error:
-                best, best_error = trial, error
-    found: Array = best
-    return found
+                best, best_error = candidate, error
+    source: Array = best
+    return source
 
 
-def _line(x: Array, y: Array) -> tuple[float, float]:
+def _fit_line(x: Array, y: Array) -> tuple[float, float]:
+    """Return slope and offset of the line through points that has the least squared errors in y."""
     mean_x, mean_y = float(x.mean()), float(y.mean())
     spread = float(((x - mean_x) ** 2).sum())
     slope = float(((x - mean_x) * (y - mean_y)).sum()) / max(spread, 1e-12)
     return slope, mean_y - slope * mean_x
 
 
-def _trend(places: Array, source: Array) -> Array:
-    distance = np.sqrt(((places - source) ** 2).sum(axis=1) + _NEAR_M**2)
-    return np.column_stack([np.ones(len(places)), np.log10(distance)])
+def _trend(positions: Array, source: Array) -> Array:
+    """Return the ``(n, 2)`` design matrix of the trend: ones, and log10 of distances to *source* (metres)."""
+    distance = np.sqrt(((positions - source) ** 2).sum(axis=1) + _NEAR_M**2)
+    return np.column_stack([np.ones(len(positions)), np.log10(distance)])
 
 
 def _kernel(a: Array, b: Array, signal: float, length_m: float) -> Array:
-    """Return Matern's covariance of order 3/2; Rasmussen and Williams 2006, eq. 4.17."""
+    """Return the Matern covariance of order 3/2 of two sets; Rasmussen and Williams 2006, eq. 4.17."""
     squared = np.maximum((a**2).sum(axis=1)[:, None] + (b**2).sum(axis=1) - 2.0 * a @ b.T, 0.0)
     scaled = math.sqrt(3.0) * np.sqrt(squared) / length_m
     kernel: Array = signal * (1.0 + scaled) * np.exp(-scaled)
     return kernel
 
 
-def _log_likelihood(places: Array, residuals: Array, signal: float, noise: float, length_m: float) -> float:
-    noise = max(noise, _FLOOR_DBM2)
-    factor = np.linalg.cholesky(_kernel(places, places, signal, length_m) + noise * np.eye(len(places)))
+def _log_likelihood(
+    positions: Array, residuals: Array, signal: float, noise: float, length_m: float
+) -> float:
+    """Return the log marginal likelihood but for a constant; Rasmussen and Williams 2006, eq. 5.8."""
+    noise = max(noise, _MIN_VARIANCE_DBM2)
+    factor = np.linalg.cholesky(
+        _kernel(positions, positions, signal, length_m) + noise * np.eye(len(positions))
+    )
     half = np.linalg.solve(factor, residuals)
     return -0.5 * float(half @ half) - float(np.log(np.diag(factor)).sum())
