@@ -69,7 +69,7 @@ class SignalField:
     length_m: float
 
     def predict(self, positions: Array) -> tuple[Array, Array]:
-        """Return the ``(n,)`` means (dBm) and variances (dBm^2) of readings at ``(n, 3)`` positions (metres)."""
+        """Return ``(n,)`` means (dBm) and variances (dBm^2) of readings at ``(n, 3)`` positions (metres)."""
         parts = [
             self._predict(positions[begin : begin + _BATCH]) for begin in range(0, len(positions), _BATCH)
         ]
