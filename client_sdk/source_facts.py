@@ -216,10 +216,9 @@ class DoubtLog:
         self._doubts.append(doubt)
 
     def add_reference(self, file: str, stamps_s: Array, span_s: tuple[float, float] | None) -> None:
-        """Add a doubt if *file*, an odometry or ground truth, has no time stamp within the span of the
-        images.
+        """Add a doubt if an odometry or ground truth has no time stamp within the span of the images.
 
-        *stamps_s* ``(n,)`` are the time stamps of the file, *span_s* the first and last one of the images;
+        *stamps_s* ``(n,)`` are the time stamps of *file*, *span_s* the first and last one of the images;
         None for the span adds nothing.
         """
         if span_s is not None:
@@ -307,8 +306,7 @@ def _unit_since_1970(stamps: Array) -> tuple[str, float] | None:
 def stamps_in_seconds(
     stamps: Array, stated_by: str, layout_unit: str | None = None
 ) -> tuple[Array, tuple[str, ...]]:
-    """Return time stamps ``(n,)`` in seconds, and a note if they are not in the unit that the format
-    prescribes.
+    """Return time stamps ``(n,)`` in seconds, and a note if their unit is not the expected one.
 
     Args:
         stamps: Time stamps in an unknown unit.
@@ -326,10 +324,9 @@ def stamps_in_seconds(
 
 
 def median_depth_m(images: Iterable[npt.NDArray[np.float32]]) -> float | None:
-    """Return the median depth of ``(h, w)`` depth images, m, by every eighth row and column; None without
-    readings.
+    """Return the median depth of depth images ``(h, w)``, m; None without readings.
 
-    A pixel without a reading is 0.
+    Every eighth row and column counts.  A pixel without a reading is 0.
     """
     readings = [sample[sample > 0] for sample in (image[::8, ::8] for image in images)]
     depths_m = np.concatenate(readings) if readings else np.empty(0, dtype=np.float32)

@@ -122,8 +122,7 @@ def find_corners(gray: npt.NDArray[np.uint8], board: Board) -> tuple[npt.NDArray
 
 
 def write_board(path: Path, board: Board) -> None:
-    """Write an image of a board that prints at its true size: a ``.pdf``, or a ``.png`` with 300 dots per
-    inch.
+    """Write an image of a board that prints at its true size: ``.pdf``, or ``.png`` with 300 dots per inch.
 
     Raises:
         UsageError: The file name has another ending, or the file cannot be written.

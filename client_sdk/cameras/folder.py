@@ -300,8 +300,7 @@ def _times_in_names(paths: Sequence[Path], name: str) -> tuple[Array | None, tup
 
 
 def _parse_seconds_and_nanoseconds(words: Sequence[str]) -> Array | None:
-    """Return the times ``(n,)``, s, of words ``SECONDS.NANOSECONDS`` without leading zeros of the
-    nanoseconds.
+    """Return the times ``(n,)``, s, of words ``SECONDS.NANOSECONDS`` whose leading zeros are missing.
 
     None means that the words are decimal numbers: no word has nine digits after the point, or all words have.
     """

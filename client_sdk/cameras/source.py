@@ -165,7 +165,7 @@ class FrameStream(AutoClose):
             timestamp_s = item[0]
             if timestamp_s <= self._last_s:
                 self._report_disorder(timestamp_s)
-            elif self._thinning is None or self._thinning.plays(timestamp_s):
+            elif self._thinning is None or self._thinning.selects(timestamp_s):
                 self._last_s = timestamp_s
                 return self._make_frame(item)
 

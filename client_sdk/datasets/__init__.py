@@ -1,6 +1,6 @@
-"""Recordings as frames: layouts of TUM RGB-D, EuRoC and KITTI, NYU Depth V2, ROS bags.
+"""Read recordings as frames: the layouts of TUM RGB-D, EuRoC and KITTI, NYU Depth V2, and ROS bags.
 
-Readers belong here; what a robot does with a frame does not.
+Devices, videos and plain folders of images are read by `client_sdk.cameras`.
 """
 
 from client_sdk.datasets.dataset import Dataset

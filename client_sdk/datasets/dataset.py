@@ -1,4 +1,4 @@
-"""A recording as frames in the order of time, thinned out or shared among robots."""
+"""A recording as frames in the order of time, at a lower rate or divided among robots if wanted."""
 
 from __future__ import annotations
 
@@ -22,14 +22,26 @@ __all__ = ["Dataset"]
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Dataset:
-    """A recording: iterate over it to get its frames in order of time.
+    """A recording: iterate over it for its frames in the order of time.
 
-    ``truth_kind`` is ``reference`` if the poses came with the source as an estimate.  ``read`` reads one of
-    ``rows``; row *i* has the time stamp ``timestamps_s[i]`` of this dataset.  ``notes`` are sentences for the
-    user on what was assumed.  ``T_body_camera`` is the pose of the camera in the body whose path was
-    measured, None where that is the camera itself, or not known.  With *has_stereo* the camera is the
-    rectified left one, and so is that of the truth.  ``imu`` holds all samples of an IMU; each frame that is
-    iterated over gets those since the frame before it in this dataset.  ``log`` collects `doubts`.
+    Images are read during the iteration; one that cannot be read is left out, and counted in `doubts`.
+
+    Attributes:
+        name: Name of the recording, for messages.
+        camera: The pinhole camera of all frames; the rectified left one of a stereo pair.
+        timestamps_s: Time stamps of the frames, s.
+        truth: Measured path of the camera, or None.
+        truth_kind: ``ground truth``, ``reference`` for poses that are an estimate of another program, or
+            ``none``.
+        rows: For each time stamp, the argument with which *read* reads its frame.
+        read: Reads a frame; raises UnreadableImage if an image is damaged.
+        notes: Sentences for the user on what was assumed.
+        has_depth: Whether frames have depth.
+        has_stereo: Whether frames have the right image of a stereo pair.
+        T_body_camera: ``(4, 4)``, m, pose of the camera in the body whose path was measured; None if the path
+            is that of the camera itself, or the pose is not known.
+        imu: All samples of the IMU, or None; each frame carries those since the frame before it.
+        log: Collects the `doubts`.
     """
 
     name: str
@@ -48,24 +60,24 @@ class Dataset:
 
     @property
     def doubts(self) -> tuple[Doubt, ...]:
-        """What is unlikely about the recording, and images that were left out while it was iterated over."""
+        """The doubts about the recording, with images that were left out in iterations so far."""
         return self.log.doubts
 
     @property
     def span_s(self) -> tuple[float, float] | None:
-        """The first and the last time stamp; None without a frame."""
+        """The first and the last time stamp, s; None without frames."""
         return (self.timestamps_s[0], self.timestamps_s[-1]) if self.timestamps_s else None
 
     @property
     def has_imu(self) -> bool:
-        """Whether frames carry samples of an IMU."""
+        """Whether frames carry IMU samples."""
         return self.imu is not None
 
     @property
     def sensors(self) -> str:
-        """What the frames show, for people: such as ``stereo + IMU``."""
-        seen = "stereo" if self.has_stereo else "colour + depth" if self.has_depth else "one lens"
-        return f"{seen} + IMU" if self.has_imu else seen
+        """The sensors of the recording in words, such as ``stereo + IMU``."""
+        cameras = "stereo" if self.has_stereo else "colour + depth" if self.has_depth else "one lens"
+        return f"{cameras} + IMU" if self.has_imu else cameras
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -77,16 +89,16 @@ class Dataset:
         return with_imu(frames, self.imu)
 
     def check(self) -> None:
-        """Look at some stereo pairs, and refuse a rig that is wrong; other recordings are not looked at.
+        """Compare the images of some stereo pairs, and refuse a faulty rig; without stereo, do nothing.
 
         Raises:
             UsageError: The cameras are swapped, not synchronised, or rectified wrongly.
         """
         if self.has_stereo:
-            check_stereo_pairs(self.some_pairs(), self.name)
+            check_stereo_pairs(self.sample_pairs(), self.name)
 
-    def some_pairs(self) -> Iterator[tuple[Frame, Frame]]:
-        """Yield some frames, each with the one after it; damaged images are passed over."""
+    def sample_pairs(self) -> Iterator[tuple[Frame, Frame]]:
+        """Yield up to 14 frames spread over the recording, each with the next one, without damaged images."""
 
         def read(rows: tuple[int, int]) -> tuple[Frame, Frame]:
             return self.read(rows[0]), self.read(rows[1])
@@ -94,25 +106,29 @@ class Dataset:
         return readable(choose_pairs(self.rows), read, DoubtLog())
 
     def thinned(self, rate_hz: float) -> Dataset:
-        """Return frames at *rate_hz* on average; all of them at the recording's own rate, or a higher one.
+        """Return the recording at *rate_hz* on average; unchanged if its own rate is not higher.
 
-        Jitter drops none: `Thinning` says which frame serves which due time.
+        `Thinning` selects the frames, so that jitter of the time stamps drops no frame.
 
         Raises:
             UsageError: The rate is not above 0.
         """
         thinning = Thinning(rate_hz, interval_s=median_interval_s(self.timestamps_s))
-        rows = [index for index, stamp_s in enumerate(self.timestamps_s) if thinning.plays(stamp_s)]
-        return self._only(rows)
+        indices = [index for index, stamp_s in enumerate(self.timestamps_s) if thinning.selects(stamp_s)]
+        return self._select(indices)
 
     def share(self, robot: int, robots: int) -> Dataset:
-        """Return the contiguous share of ``ceil(n / robots)`` frames of *robot* 0, 1, ..."""
+        """Return the ``ceil(n / robots)`` consecutive frames that *robot* 0, 1, ... plays.
+
+        Raises:
+            UsageError: The robot is not within 0..robots - 1.
+        """
         if not 0 <= robot < robots:
             raise UsageError(f"robot {robot} is not one of 0..{robots - 1}", hint="count robots from 0")
         size = math.ceil(len(self) / robots)
-        return self._only(range(len(self))[robot * size : (robot + 1) * size])
+        return self._select(range(len(self))[robot * size : (robot + 1) * size])
 
-    def _only(self, indices: Sequence[int]) -> Dataset:
+    def _select(self, indices: Sequence[int]) -> Dataset:
         return replace(
             self,
             timestamps_s=tuple(self.timestamps_s[index] for index in indices),

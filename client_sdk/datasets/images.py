@@ -1,7 +1,6 @@
-"""Read the images of a source, and say in one line which of them is damaged.
+"""Read image files in one way for all sources: orientation, grey, 16 bits, and damaged files.
 
-Every reader of files uses these functions, so that orientation, grey, 16 bits and damage are treated in one
-way.
+Formats of single benchmarks are read by the other modules of this package.
 """
 
 from __future__ import annotations
@@ -20,21 +19,33 @@ from rse_pf.geometry import Camera
 from rse_pf.images import MAX_IMAGE_PIXELS, load_opencv, read_image
 
 __all__ = [
-    "UnreadableImage", "check_size", "colour_of", "image_files", "is_image", "numbers_in_name", "probe",
-    "read_colour", "read_depth", "readable",
-]  # fmt: skip
+    "UnreadableImage",
+    "check_size",
+    "colour_of",
+    "image_files",
+    "is_image",
+    "numbers_in_name",
+    "probe",
+    "read_colour",
+    "read_depth",
+    "readable",
+]
 
 _Row = TypeVar("_Row")
-_Made = TypeVar("_Made")
-_ENDINGS = {".png", ".jpg", ".jpeg", ".bmp", ".ppm", ".pgm", ".tif", ".tiff", ".webp"}
+_Result = TypeVar("_Result")
+_IMAGE_ENDINGS = {".png", ".jpg", ".jpeg", ".bmp", ".ppm", ".pgm", ".tif", ".tiff", ".webp"}
 _NUMBER = re.compile(r"\d+")
-_NO_READING = 65535  # some recorders write "no reading" so
-_WHITE_PERCENTILE = 99.9  # of an image of 16 bits: brighter pixels are defects of the sensor
-_SAMPLE = 4  # every fourth row and column tells how bright an image is
+_NO_READING = 65535  # value of a 16-bit depth image with which some recorders mark a pixel without a reading
+_WHITE_PERCENTILE = (
+    99.9  # of the values of a 16-bit image, which becomes white: brighter pixels are sensor defects
+)
+_BRIGHTNESS_STRIDE = (
+    4  # rows and columns between the pixels from which the brightness of an image is measured
+)
 
 
 class UnreadableImage(UsageError):
-    """An image is damaged, cut off, empty or too large; a drive leaves it out."""
+    """An image file is damaged, cut off, empty or too large; sources leave such a frame out."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(
@@ -45,7 +56,7 @@ class UnreadableImage(UsageError):
 
 
 def _read_raw(path: Path) -> npt.NDArray[Any]:
-    """Return an image as OpenCV reads it, unchanged, its pixels as they are stored.
+    """Return the pixels of an image file as they are stored: grey ``(h, w)``, BGR or BGRA ``(h, w, c)``.
 
     Raises:
         UnreadableImage: The file is missing, or no whole image.
@@ -58,71 +69,80 @@ def _read_raw(path: Path) -> npt.NDArray[Any]:
 
 
 def is_image(path: Path) -> bool:
-    """Say whether a file is an image by its name; files ``._NAME`` hold what macOS adds to a file."""
-    return path.suffix.lower() in _ENDINGS and not path.name.startswith("._") and path.is_file()
+    """Return whether a file has the name of an image; files ``._NAME``, which macOS adds, are none."""
+    return path.suffix.lower() in _IMAGE_ENDINGS and not path.name.startswith("._") and path.is_file()
 
 
 def image_files(folder: Path) -> list[Path]:
-    """Return the images of a folder in the order of the numbers in their names."""
+    """Return the image files of a folder, in the order of the numbers in their names, then of their names."""
     paths = [path for path in folder.iterdir() if is_image(path)]
     return sorted(paths, key=lambda path: (numbers_in_name(path), path.name))
 
 
 def numbers_in_name(path: Path) -> tuple[int, ...]:
-    """Return the whole numbers in the name of a file, in their order."""
+    """Return the whole numbers in the name of a file without its ending, from left to right."""
     return tuple(int(digits) for digits in _NUMBER.findall(path.stem))
 
 
-def readable(rows: Iterable[_Row], read: Callable[[_Row], _Made], log: DoubtLog) -> Iterator[_Made]:
-    """Yield what *read* makes of rows; those with an image that cannot be read are left out, and counted.
+def readable(rows: Iterable[_Row], read: Callable[[_Row], _Result], log: DoubtLog) -> Iterator[_Result]:
+    """Yield ``read(row)`` for each row, and count in *log* the rows whose image cannot be read.
 
     Raises:
-        UnreadableImage: No row has a readable image.
+        UnreadableImage: The image of every row cannot be read.
     """
     failed: UnreadableImage | None = None
     is_empty = True
     for row in rows:
         try:
-            made = read(row)
+            result = read(row)
         except UnreadableImage as error:
             log.leave_out(error.name)
             failed = error
         else:
             is_empty = False
-            yield made
+            yield result
     if is_empty and failed is not None:
         raise failed
 
 
-def probe(rows: Sequence[_Row], read: Callable[[_Row], _Made]) -> list[_Made]:
-    """Return what *read* makes of the first, the middle and the last row that have readable images.
+def probe(rows: Sequence[_Row], read: Callable[[_Row], _Result]) -> list[_Result]:
+    """Return ``read(row)`` for the first, the middle and the last row, without those that cannot be read.
 
     Raises:
-        UnreadableImage: None of them has.
+        UnreadableImage: None of the three can be read.
     """
-    made: list[_Made] = []
+    results: list[_Result] = []
     failed: UnreadableImage | None = None
     for row in sorted({0, len(rows) // 2, len(rows) - 1}) if rows else ():
         try:
-            made.append(read(rows[row]))
+            results.append(read(rows[row]))
         except UnreadableImage as error:
             failed = error
-    if failed is not None and not made:
+    if failed is not None and not results:
         raise failed
-    return made
+    return results
 
 
 def read_colour(path: Path) -> npt.NDArray[np.uint8]:
-    """Return the ``(h, w, 3)`` colours of a file, red first; raises UnreadableImage, and as `colour_of`."""
+    """Return the RGB image ``(h, w, 3)`` of a file.
+
+    Raises:
+        UnreadableImage: The file is missing, or no whole image.
+        UsageError: The image has other channels or bits than `colour_of` takes.
+        MissingExtra: OpenCV is not installed.
+    """
     return colour_of(_read_raw(path), str(path))
 
 
 def read_depth(path: Path, depth_scale: float) -> npt.NDArray[np.float32]:
-    """Return the ``(h, w)`` depth of a file in metres, 0 without a reading; *depth_scale* units are a metre.
+    """Return the depth image ``(h, w)`` of a file, m, with 0 for pixels without a reading.
+
+    *depth_scale* are the units of the file in a metre; the values 0 and 65535 are no readings.
 
     Raises:
         UnreadableImage: The file is missing, or no whole image.
-        UsageError: The image has not 16 bits of one channel.
+        UsageError: The image has not one channel of 16 bits.
+        MissingExtra: OpenCV is not installed.
     """
     image = _read_raw(path)
     if image.dtype != np.uint16 or image.ndim != 2:
@@ -136,10 +156,10 @@ def read_depth(path: Path, depth_scale: float) -> npt.NDArray[np.float32]:
 
 
 def colour_of(image: npt.NDArray[Any], name: str) -> npt.NDArray[np.uint8]:
-    """Return ``(h, w, 3)``, red first, of an image as OpenCV reads it: grey, BGR or BGRA.
+    """Return the RGB image ``(h, w, 3)`` of an image as OpenCV reads it: grey, BGR or BGRA, 8 or 16 bits.
 
-    Values of 16 bits are scaled so that the brightest pixels of the image are white: cameras use 10, 12, 14
-    or 16 of them.
+    Values of 16 bits are scaled so that the brightest pixels of this image are white, because cameras use 10,
+    12, 14 or all 16 bits.  *name* is the file, for the message.
 
     Raises:
         UsageError: The image has another number of channels, or neither 8 nor 16 bits.
@@ -151,7 +171,9 @@ def colour_of(image: npt.NDArray[Any], name: str) -> npt.NDArray[np.uint8]:
             hint="use grey or colour images of 8 or 16 bits",
         )
     if image.dtype == np.uint16:
-        white = max(1.0, float(np.percentile(image[::_SAMPLE, ::_SAMPLE], _WHITE_PERCENTILE)))
+        white = max(
+            1.0, float(np.percentile(image[::_BRIGHTNESS_STRIDE, ::_BRIGHTNESS_STRIDE], _WHITE_PERCENTILE))
+        )
         image = np.minimum(image.astype(np.float32) * np.float32(255.0 / white), 255.0).astype(np.uint8)
     if channels == 1:
         return np.ascontiguousarray(np.repeat(image.reshape(*image.shape[:2], 1), 3, axis=2))
@@ -159,7 +181,11 @@ def colour_of(image: npt.NDArray[Any], name: str) -> npt.NDArray[np.uint8]:
 
 
 def check_size(image: npt.NDArray[Any], camera: Camera, path: Path) -> None:
-    """Refuse an image of another size than the camera's: the intrinsics would be those of another camera."""
+    """Refuse an image of another size than its camera; *path* is the file, for the message.
+
+    Raises:
+        UsageError: The sizes differ, so that the intrinsics do not fit.
+    """
     height, width = image.shape[:2]
     if (width, height) != (camera.width, camera.height):
         raise UsageError(

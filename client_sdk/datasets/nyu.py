@@ -1,6 +1,6 @@
-"""The formats of NYU Depth V2: raw depth, registration, and the labelled .mat file, which needs h5py.
+"""Read the formats of NYU Depth V2: raw dumps of a Kinect, and the labelled ``.mat`` file (needs h5py).
 
-Images are not undistorted here; `client_sdk.datasets.recordings` does that before registration.
+Images are undistorted in `client_sdk.datasets.recordings`, before depth is registered to the colour image.
 
 Source:
     Silberman et al., ECCV 2012; the calibration is the one shipped with the data set's toolbox.
@@ -65,34 +65,37 @@ _DEPTH_DISTORTION = (
 )
 COLOUR_LENS = Lens(camera=COLOUR_CAMERA, distortion=_COLOUR_DISTORTION)
 DEPTH_LENS = Lens(camera=DEPTH_CAMERA, distortion=_DEPTH_DISTORTION)
-_MAX_DEPTH_M = 10.0
-_MAX_PNM_BYTES = 16 << 20
+_MAX_DEPTH_M = (
+    10.0  # of a reading: the data set's toolbox removes farther ones, since a Kinect does not see so far
+)
+_MAX_PNM_BYTES = 16 << 20  # size of an image file of a raw dump: 640x480 RGB pixels have 0.9 MB
 _PNM_HEAD = re.compile(rb"(P[56])\s+(?:#[^\n]*\n\s*)*(\d{1,5})\s+(\d{1,5})\s+(\d{1,5})\s")
-"""A comment ends with its line, so that there is one way to read a head."""
-_PIXELS = (COLOUR_CAMERA.width, COLOUR_CAMERA.height)
-_MAX_IMAGES, _MAX_LETTERS = 10_000, 256
-_MAX_CHUNK_VALUES = 1 << 26
+"""Header of a binary PNM file: kind, comments, width, height and largest value.  A comment ends with its
+line, so that the pattern matches a header in one way only, and takes linear time."""
+_SIZE_PX = (COLOUR_CAMERA.width, COLOUR_CAMERA.height)  # width and height of all images of the data set
+_MAX_IMAGES = 10_000  # in a labelled file: a multiple of what the published one has
+_MAX_NAME_LENGTH = 256  # characters in the name of a scene
+_MAX_CHUNK_VALUES = 1 << 26  # in a compressed chunk of a labelled file, since HDF5 inflates whole chunks
 _MAT_HINT = "name nyu_depth_v2_labeled.mat as it was published"
-_DAMAGE = (OSError, RuntimeError, KeyError, TypeError, ValueError, OverflowError, MemoryError)
-"""What h5py raises where the bytes of a file make no sense."""
-_SHAPES = {"images": (3, *_PIXELS), "depths": _PIXELS, "rawDepths": _PIXELS}
-"""Of one image in the labelled file."""
-
-_STAMPED = re.compile(r"[dr]-(\d+(?:\.\d+)?)-\d+\.(?:pgm|ppm)$")
+_H5PY_ERRORS = (OSError, RuntimeError, KeyError, TypeError, ValueError, OverflowError, MemoryError)
+"""Errors that h5py raises for a damaged file."""
+_SHAPES = {"images": (3, *_SIZE_PX), "depths": _SIZE_PX, "rawDepths": _SIZE_PX}
+"""Shape of one image in each array of the labelled file, columns before rows."""
+_RAW_FILE_NAME = re.compile(r"[dr]-(\d+(?:\.\d+)?)-\d+\.(?:pgm|ppm)$")
 
 
 class RawFile(NamedTuple):
-    """One image of a raw dump and the time in its name."""
+    """An image of a raw dump, with the time stamp in its name (s)."""
 
     timestamp_s: float
     path: Path
 
 
 def T_colour_depth() -> Array:
-    """Return the pose of the depth camera in the colour camera's frame, metres.
+    """Return the pose ``(4, 4)`` of the depth camera in the frame of the colour camera, m.
 
-    The toolbox stores minus the rotation and the opposite translation, which cancels when it divides
-    by a negative z.  This is the same map with points in front of the camera.
+    The toolbox stores the negative rotation and translation, and then divides by a negative z.  This pose
+    gives the same pixels, with points in front of the camera.
     """
     T = np.eye(4)
     T[:3, :3] = [
@@ -105,40 +108,51 @@ def T_colour_depth() -> Array:
 
 
 def depth_from_raw(raw: npt.NDArray[np.uint16]) -> npt.NDArray[np.float32]:
-    """Return metres, 0 without a reading or beyond 10 m: ``351.3 / (1092.5 - raw)``."""
+    """Return the depth image ``(h, w)``, m, of raw values of a Kinect ``(h, w)``: ``351.3 / (1092.5 - raw)``.
+
+    Pixels without a reading, and readings beyond 10 m, are 0.
+    """
     difference = 1092.5 - raw.astype(np.float32)
     is_reading = (raw > 0) & (difference >= 351.3 / _MAX_DEPTH_M)
     return np.where(is_reading, 351.3 / np.where(is_reading, difference, 1.0), 0.0).astype(np.float32)
 
 
 def register_depth(depth_m: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-    """Return an undistorted depth image as the colour camera sees it, nearest surface first."""
+    """Return an undistorted depth image ``(h, w)``, m, as seen by the colour camera.
+
+    Each reading is projected to the nearest pixel; where several meet, the nearest surface hides the others.
+    Pixels without a reading are 0.
+    """
     rows, columns = np.nonzero(depth_m > 0)
     pixels = np.column_stack((columns, rows)).astype(np.float64)
     points_depth = DEPTH_CAMERA.back_project(pixels, depth_m[rows, columns].astype(np.float64))
     points_colour = transform(T_colour_depth(), points_depth)
     columns, rows = np.rint(COLOUR_CAMERA.project(points_colour)).astype(np.int64).T
-    size = (COLOUR_CAMERA.height, COLOUR_CAMERA.width)
-    seen = (columns >= 0) & (rows >= 0) & (columns < size[1]) & (rows < size[0])
-    far_first = np.flatnonzero(seen)[np.argsort(-points_colour[seen, 2], kind="stable")]
-    registered = np.zeros(size, dtype=np.float32)
+    height, width = COLOUR_CAMERA.height, COLOUR_CAMERA.width
+    is_inside = (columns >= 0) & (rows >= 0) & (columns < width) & (rows < height)
+    far_first = np.flatnonzero(is_inside)[np.argsort(-points_colour[is_inside, 2], kind="stable")]
+    registered = np.zeros((height, width), dtype=np.float32)
     registered[rows[far_first], columns[far_first]] = points_colour[far_first, 2]
     return registered
 
 
 def raw_files(folder: Path, prefix: str) -> list[RawFile]:
-    """Return the images ``prefix-SECONDS-TICKS.p?m`` of a raw dump by time, without `truncated_files`."""
-    return [file for file in _stamped_files(folder, prefix) if not _is_truncated(file)]
+    """Return the images of a raw dump by time, without truncated ones.
+
+    *prefix* is ``d`` for depth, or ``r`` for colour; a file is named ``PREFIX-SECONDS-TICKS.pgm`` or
+    ``.ppm``.
+    """
+    return [file for file in _list_raw_files(folder, prefix) if not _is_truncated(file)]
 
 
 def truncated_files(folder: Path) -> list[str]:
-    """Return the names of images that are too small; the published dump holds some."""
-    files = [*_stamped_files(folder, "d"), *_stamped_files(folder, "r")]
+    """Return the names of images whose files are too small for a whole image; the published dump has some."""
+    files = [*_list_raw_files(folder, "d"), *_list_raw_files(folder, "r")]
     return [file.path.name for file in files if _is_truncated(file)]
 
 
-def _stamped_files(folder: Path, prefix: str) -> list[RawFile]:
-    stamped = [(_STAMPED.match(path.name), path) for path in folder.glob(f"{prefix}-*.p[gp]m")]
+def _list_raw_files(folder: Path, prefix: str) -> list[RawFile]:
+    stamped = [(_RAW_FILE_NAME.match(path.name), path) for path in folder.glob(f"{prefix}-*.p[gp]m")]
     return sorted(RawFile(float(stamp[1]), path) for stamp, path in stamped if stamp)
 
 
@@ -149,10 +163,10 @@ def _is_truncated(file: RawFile) -> bool:
 def read_pnm(path: Path) -> npt.NDArray[Any]:
     """Return the pixels of a binary PPM ``(h, w, 3)`` uint8 or a 16-bit PGM ``(h, w)`` uint16.
 
-    The 16-bit files of the raw dump are *little* endian, contrary to the format.
+    The 16-bit files of the raw dump are little endian, contrary to the format.
 
     Raises:
-        UsageError: The file cannot be read or is of another kind.
+        UsageError: The file cannot be read, is cut off, or is no binary PPM or PGM.
     """
     try:
         content = read_regular_file(path, _MAX_PNM_BYTES)
@@ -161,27 +175,28 @@ def read_pnm(path: Path) -> npt.NDArray[Any]:
     head = _PNM_HEAD.match(content)
     if head:
         width, height = int(head[2]), int(head[3])
-        colours = 3 if head[1] == b"P6" else 1
-        kind = np.dtype("<u2") if int(head[4]) > 255 else np.dtype(np.uint8)
+        channels = 3 if head[1] == b"P6" else 1
+        dtype = np.dtype("<u2") if int(head[4]) > 255 else np.dtype(np.uint8)
         body = content[head.end() :]
-        if len(body) >= width * height * colours * kind.itemsize:
-            pixels = np.frombuffer(body, dtype=kind, count=width * height * colours)
-            return pixels.reshape((height, width, 3) if colours == 3 else (height, width))
+        if len(body) >= width * height * channels * dtype.itemsize:
+            pixels = np.frombuffer(body, dtype=dtype, count=width * height * channels)
+            return pixels.reshape((height, width, 3) if channels == 3 else (height, width))
     raise UsageError(f"{path} is not a complete PPM or PGM image", hint="unpack the dump again")
 
 
 class LabelledFile:
-    """The labelled ``.mat`` file (HDF5), one image at a time.
+    """The labelled ``.mat`` file (HDF5), which is opened for each image that is read.
 
-    MATLAB stores columns first, so HDF5 shows ``images`` as ``(n, 3, w, h)`` and depths as
-    ``(n, w, h)``.  ``rawDepths`` (0 = no reading) are preferred, as ``depths`` have their holes filled.
+    MATLAB stores columns first, so that HDF5 shows ``images`` as ``(n, 3, w, h)``, and depths as ``(n, w,
+    h)``.  ``rawDepths`` (0 without a reading) are read rather than ``depths``, whose holes are filled by
+    interpolation.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
 
     def rows(self, scene: str | None) -> list[int]:
-        """Return the rows of one scene, of all without a *scene*.
+        """Return the rows of the images of one scene, or of all images for None.
 
         Raises:
             UsageError: The file is not the labelled file, or holds no such scene.
@@ -192,23 +207,32 @@ class LabelledFile:
             if scene is None:
                 return list(range(count))
             try:
-                names = _strings(file, "scenes")
-            except _DAMAGE as error:
+                names = _read_strings(file, "scenes")
+            except _H5PY_ERRORS as error:
                 raise self._damage_error() from error
         rows = [row for row, name in enumerate(names) if name == scene]
         if not rows:
-            some = ", ".join(sorted(set(names))[:5]) or "none"
-            raise UsageError(f"no scene {scene} in {self.path}", hint=f"scenes begin with {some}")
+            first_names = ", ".join(sorted(set(names))[:5]) or "none"
+            raise UsageError(
+                f"no scene {scene} in {self.path}", hint=f"name one of its scenes: {first_names}, ..."
+            )
         return rows
 
     def read(self, row: int) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.float32]]:
-        """Return colour ``(h, w, 3)`` and registered depth ``(h, w)`` in metres of one row."""
+        """Return the RGB image ``(h, w, 3)`` and the registered depth image ``(h, w)``, m, of one row.
+
+        Depth is 0 without a reading, and beyond 10 m.
+
+        Raises:
+            UsageError: The file is damaged, or not the labelled file.
+            MissingExtra: h5py is not installed.
+        """
         with self._open() as file:
             depths = file["rawDepths"] if "rawDepths" in file else file["depths"]
             try:
                 rgb = np.ascontiguousarray(np.transpose(file["images"][row], (2, 1, 0)), dtype=np.uint8)
                 depth_m = np.ascontiguousarray(np.transpose(depths[row]), dtype=np.float32)
-            except _DAMAGE as error:
+            except _H5PY_ERRORS as error:
                 raise self._damage_error() from error
         depth_m[~np.isfinite(depth_m) | (depth_m >= _MAX_DEPTH_M)] = 0.0
         return rgb, depth_m
@@ -223,28 +247,26 @@ class LabelledFile:
         except OSError as error:
             raise UsageError(f"{self.path} is not an HDF5 .mat file", hint=_MAT_HINT) from error
         try:
-            is_complete = "images" in file and ("rawDepths" in file or "depths" in file)
-            fits = is_complete and _holds_images(h5py, file)
-        except _DAMAGE as error:
+            has_arrays = "images" in file and ("rawDepths" in file or "depths" in file)
+            is_valid = has_arrays and _has_valid_arrays(h5py, file)
+        except _H5PY_ERRORS as error:
             file.close()
             raise self._damage_error() from error
-        if not fits:
+        if not is_valid:
             file.close()
-            problem = (
-                f"images and depths of {_PIXELS[0]}x{_PIXELS[1]} px" if is_complete else "images and depths"
-            )
-            raise UsageError(f"{self.path} holds no {problem}", hint=_MAT_HINT)
+            size = f" of {_SIZE_PX[0]}x{_SIZE_PX[1]} px" if has_arrays else ""
+            raise UsageError(f"{self.path} holds no images and depths{size}", hint=_MAT_HINT)
         return file
 
     def _damage_error(self) -> UsageError:
         return UsageError(f"{self.path} is damaged", hint=_MAT_HINT)
 
 
-def _holds_images(h5py: Any, file: Any) -> bool:
-    """Say whether all images have the size of the data set, and lie in the file itself.
+def _has_valid_arrays(h5py: Any, file: Any) -> bool:
+    """Return whether all arrays of images have the shape of the data set, and are stored in *file* itself.
 
-    What lies in no file costs nothing there and memory here; what lies in another file may be any file of
-    this machine.
+    A virtual array takes no space in the file, but memory here; a linked one may show any file of this
+    machine.
     """
     counts = set()
     for name in _SHAPES.keys() & file.keys():
@@ -260,15 +282,19 @@ def _holds_images(h5py: Any, file: Any) -> bool:
     return len(counts) == 1 and counts.pop() <= _MAX_IMAGES
 
 
-def _strings(file: Any, name: str) -> list[str]:
-    """Return a MATLAB cell array of strings; an absent one is empty."""
+def _read_strings(file: Any, name: str) -> list[str]:
+    """Return the strings of the MATLAB cell array *name*; empty if the file has none.
+
+    Raises:
+        ValueError: The array has more than 10,000 strings, or one of more than 256 characters.
+    """
     if name not in file:
         return []
     if file[name].size > _MAX_IMAGES:
         raise ValueError(f"{name} names more than {_MAX_IMAGES} images")
     texts = []
     for cell in np.asarray(file[name]).ravel():
-        if file[cell].size > _MAX_LETTERS:
-            raise ValueError(f"{name} holds no short texts")
+        if file[cell].size > _MAX_NAME_LENGTH:
+            raise ValueError(f"{name} holds a text of more than {_MAX_NAME_LENGTH} characters")
         texts.append("".join(chr(code) for code in np.asarray(file[cell]).ravel()))
     return texts

@@ -1,7 +1,8 @@
-"""RGB-D recordings as frames: TUM folders, NYU Depth V2 (labelled file or raw dump), ROS bags.
+"""Open a recording of any known format, and read RGB-D recordings: TUM folders, and NYU Depth V2.
 
-Every `Frame` is undistorted and registered, with depth in metres and colours in the order red, green, blue.
-An image is read only when its frame is needed.  A path that cannot be used is reported in one line.
+Frames are RGB images with depth in metres, undistorted and registered to the colour camera.  An image is read
+only when its frame is needed.  EuRoC and KITTI are read in `client_sdk.datasets.rig_recordings`, bags in
+`client_sdk.bags`.
 """
 
 from __future__ import annotations
@@ -48,20 +49,20 @@ from rse_pf.geometry import Camera, Lens
 
 __all__ = ["associate_stamps", "dataset_of_bag", "is_listed", "open_dataset"]
 
-_MAX_LIST_BYTES = 64 << 20
-"""Of ``rgb.txt`` and ``depth.txt``: a million images."""
-_MAX_STAMP_DIFFERENCE_S = 0.02
-# The raw dump's two streams run freely; the nearest images are at most half a period apart.
+_MAX_LIST_BYTES = 64 << 20  # size of rgb.txt or depth.txt: enough for a million images
+_MAX_STAMP_DIFFERENCE_S = 0.02  # between a colour and a depth image of a TUM folder: as in TUM's associate.py
 _MAX_RAW_STAMP_DIFFERENCE_S = 0.05
-
-# Intrinsics of the TUM benchmark by folder name; the last is its default for unnamed cameras.
+"""Time between a colour and a depth image of a raw dump of NYU Depth V2: its streams are not synchronised, so
+that the nearest images are up to half a period apart."""
 _FREIBURG: dict[str, tuple[float, float, float, float, tuple[float, ...]]] = {
     "freiburg1": (517.3, 516.5, 318.6, 255.3, (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
     "freiburg2": (520.9, 521.0, 325.1, 249.7, (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
     "freiburg3": (535.4, 539.2, 320.1, 247.6, ()),
     "": (525.0, 525.0, 319.5, 239.5, ()),
 }
-_FREIBURG_DEPTH_SCALE = 5000.0
+"""Cameras of the TUM benchmark by a part of the folder's name: fx, fy, cx, cy (px), and distortion k1 k2 p1
+p2 k3.  The last entry, for all other names, is the benchmark's default for a Kinect."""
+_FREIBURG_DEPTH_SCALE = 5000.0  # units of a depth image of the TUM benchmark in a metre
 
 
 def open_dataset(
@@ -72,7 +73,7 @@ def open_dataset(
     imu: bool | None = None,
     intrinsics: Path | str | None = None,
 ) -> Dataset:
-    """Detect the format of *path* and return its frames; images are read later.
+    """Open a recording of any known format; its images are read during the iteration.
 
     Accepts a folder in TUM layout (``rgb.txt``, ``depth.txt``, or a list of associations; with or without
     ``intrinsics.json``), a recording of EuRoC or a sequence of KITTI's odometry benchmark, a raw NYU Depth V2
@@ -81,22 +82,24 @@ def open_dataset(
 
     Args:
         path: The folder or file.
-        scene: Of the labelled file.
+        scene: Name of a scene of the labelled file; None for all images, and for other formats.
         camera: ``stereo`` for both cameras of a rig, ``left`` for one; None for both where there are two.
         imu: Whether frames carry samples of the IMU; None for yes where there is one.
-        intrinsics: File of the camera, in the place of ``intrinsics.json`` of a folder in TUM layout (it
-            names ``depth_scale`` then) or of what a bag says.
+        intrinsics: File of intrinsics or of a rig that is used instead of those of a folder in TUM layout (it
+            must state ``depth_scale`` if there is depth) or of a bag; None for their own.
 
     Raises:
-        UsageError: The path is none of these, has a calibration of its own format beside *intrinsics*, a
-            part is missing or broken, or it has no such camera or IMU.
+        UsageError: The path has no known format, a part of the recording is missing or broken, facts about it
+            contradict each other, it has no such scene, camera or IMU, or *intrinsics* is given for a format
+            that has a calibration of its own.
         MissingExtra: OpenCV, h5py or rosbags is needed and not installed.
     """
     path = Path(path)
     check_exists(path, "name a folder of TUM (rgb.txt, depth.txt, images), EuRoC or KITTI, or a ROS bag")
     if intrinsics is not None and not (_is_bag(path) or is_listed(path)):
         raise UsageError(
-            f"{path} has a calibration of its own format", hint="leave out --intrinsics, or change that file"
+            f"{path} has a calibration in a format of its own",
+            hint="leave out --intrinsics, or change the calibration of the recording",
         )
     if scene is None and is_euroc(path):
         return open_euroc(path, camera=camera, imu=imu)
@@ -120,12 +123,15 @@ def _is_bag(path: Path) -> bool:
 
 
 def is_listed(path: Path) -> bool:
-    """Return whether a folder lists its images: in ``rgb.txt``, or colour and depth in one list."""
-    return (path / "rgb.txt").is_file() or _associations(path) is not None
+    """Return whether a folder has a list of its images: ``rgb.txt``, or a list of associations."""
+    return (path / "rgb.txt").is_file() or _find_associations(path) is not None
 
 
-def _associations(folder: Path) -> Path | None:
-    """Return the list of both, as TUM's ``associate.py`` and ORB-SLAM write it."""
+def _find_associations(folder: Path) -> Path | None:
+    """Return the list of associations, as TUM's ``associate.py`` writes it; None without one.
+
+    Each line has a colour and a depth image, each after its time stamp.
+    """
     return next(iter(sorted(folder.glob("*assoc*.txt"))), None)
 
 
@@ -142,7 +148,7 @@ def _open_single(path: Path, scene: str | None, intrinsics: Path | None) -> Data
 
 
 def dataset_of_bag(bag: Bag) -> Dataset:
-    """Return the frames of an open bag as a recording; they can be read until the bag is closed."""
+    """Return an open bag as a recording, whose frames can be read until the bag is closed."""
     return Dataset(
         name=bag.name,
         camera=bag.camera,
@@ -162,19 +168,27 @@ def dataset_of_bag(bag: Bag) -> Dataset:
 def associate_stamps(
     first: Sequence[float], second: Sequence[float], max_difference_s: float
 ) -> list[tuple[int, int]]:
-    """Return ``(row of first, row of second)`` pairs, nearest in time, each row at most once.
+    """Return the pairs ``(row of first, row of second)`` of time stamps (s) that are nearest to each other.
 
-    Both must ascend.  If several rows are nearest to one partner, the closest of them gets it.
+    Both sequences must ascend.  Each row is in one pair at most; if several rows have the same nearest
+    partner, the closest row gets the partner.  Pairs are at most *max_difference_s* apart.
     """
     return pair_stamps(np.asarray(first, dtype=float), np.asarray(second, dtype=float), max_difference_s)
 
 
-# --- TUM layout --------------------------------------------------------------------------------
+# --- Folders in the layout of TUM: rgb.txt, depth.txt, groundtruth.txt ---
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _List:
-    """Images of one kind, in the order of time, and what their list states."""
+class _ImageList:
+    """The colour or the depth images of a folder in TUM layout, in the order of time.
+
+    Attributes:
+        times: All time stamps of the list, for `check_source`.
+        stamps_s: Time stamps of the images that are used.
+        images: Their paths, relative to the folder.
+        notes: Sentences on the unit of the time stamps.
+    """
 
     times: TimeFacts
     stamps_s: tuple[float, ...]
@@ -182,18 +196,28 @@ class _List:
     notes: tuple[str, ...]
 
 
-def _open_tum(folder: Path, of_camera: Path) -> Dataset:
+def _open_tum(folder: Path, intrinsics_file: Path) -> Dataset:
+    """Return a folder in TUM layout; if *intrinsics_file* does not exist, files of other programs are tried.
+
+    Raises:
+        UsageError: A file is missing or broken, or facts about the recording contradict each other.
+        MissingExtra: OpenCV is not installed.
+    """
+    # 1. The lists of images, and the camera.
     colours, depths = _read_lists(folder)
 
     def size_px() -> tuple[int, int]:
         height, width = probe(colours.images, lambda name: read_colour(folder / name))[0].shape[:2]
         return width, height
 
-    stated = None if of_camera.exists() or of_camera.parent != folder else find_folder_camera(folder, size_px)
-    of_camera = of_camera if stated is None else stated[0]
-    intrinsics, is_unit_stated, notes = _intrinsics(
-        folder, of_camera, None if stated is None else stated[1], has_depth=depths is not None
+    stated = None
+    if not intrinsics_file.exists() and intrinsics_file.parent == folder:
+        stated = find_folder_camera(folder, size_px)
+    intrinsics_file = intrinsics_file if stated is None else stated[0]
+    intrinsics, is_unit_stated, notes = _find_intrinsics(
+        folder, intrinsics_file, None if stated is None else stated[1], has_depth=depths is not None
     )
+    # 2. Pairs of a colour and a depth image.
     pairs = [(row, row) for row in range(len(colours.images))]
     if depths is not None:
         pairs = associate_stamps(colours.stamps_s, depths.stamps_s, _MAX_STAMP_DIFFERENCE_S)
@@ -207,15 +231,18 @@ def _open_tum(folder: Path, of_camera: Path) -> Dataset:
     unpaired = LossFacts(
         sentence=f"{lost} of {total} colour images of {folder} have no depth image of their own within "
         f"{_MAX_STAMP_DIFFERENCE_S:g} s and are left out",
-        lost=lost, total=total, is_usual=True,
-    )  # fmt: skip
-    camera, undistort = intrinsics.camera, map_to_pinhole(intrinsics)
+        lost=lost,
+        total=total,
+        is_usual=True,
+    )
+    # 3. Reading of a frame.
+    camera, undistortion = intrinsics.camera, map_to_pinhole(intrinsics)
     units_per_m = intrinsics.depth_units_per_m
-    no_depth: npt.NDArray[np.float32] = np.zeros((camera.height, camera.width), dtype=np.float32)
+    empty_depth: npt.NDArray[np.float32] = np.zeros((camera.height, camera.width), dtype=np.float32)
 
-    def depth_of(row: int) -> npt.NDArray[np.float32]:
+    def read_depth_of(row: int) -> npt.NDArray[np.float32]:
         if depths is None:
-            return no_depth
+            return empty_depth
         path = folder / depths.images[pairs[row][1]]
         depth_m = read_depth(path, units_per_m)
         check_size(depth_m, camera, path)
@@ -227,27 +254,32 @@ def _open_tum(folder: Path, of_camera: Path) -> Dataset:
         check_size(rgb, camera, path)
         return Frame(
             timestamp_s=colours.stamps_s[pairs[row][0]],
-            rgb=undistort.colour(rgb),
-            depth_m=undistort.depth(depth_of(row)),
+            rgb=undistortion.colour(rgb),
+            depth_m=undistortion.depth(read_depth_of(row)),
             camera=camera,
         )
 
-    truth, truth_kind, of_truth = _read_truth(folder)
-    stated_by = str(of_camera if of_camera.exists() else folder)
-    probed = probe(range(len(pairs)), depth_of)
+    # 4. The facts about the recording.
+    truth, truth_kind, truth_notes = _read_truth(folder)
+    stated_by = str(intrinsics_file if intrinsics_file.exists() else folder)
+    probed = probe(range(len(pairs)), read_depth_of)
     depth = DepthFacts(
-        median_m=median_depth_m(probed), units_per_m=units_per_m, is_unit_stated=is_unit_stated,
+        median_m=median_depth_m(probed),
+        units_per_m=units_per_m,
+        is_unit_stated=is_unit_stated,
         is_registered=intrinsics.is_depth_registered,
-    )  # fmt: skip
+    )
     lists = (colours,) if depths is None else (colours, depths)
     facts = SourceFacts(
         name=str(folder),
         cameras=(CameraFacts(stated_by=stated_by, lens=intrinsics),),
         depth=None if depths is None else depth,
-        times=tuple(each.times for each in lists),
-        references=() if truth is None else (TimeFacts(stated_by=of_truth[0], stamps_s=truth.timestamps_s),),
+        times=tuple(images.times for images in lists),
+        references=()
+        if truth is None
+        else (TimeFacts(stated_by=truth_notes[0], stamps_s=truth.timestamps_s),),
         losses=(unpaired,) if unpaired.lost else (),
-        assumed=(*notes, *(note for each in lists for note in each.notes), *of_truth[1:]),
+        assumed=(*notes, *(note for images in lists for note in images.notes), *truth_notes[1:]),
     )
     return Dataset(
         name=folder.name,
@@ -263,23 +295,32 @@ def _open_tum(folder: Path, of_camera: Path) -> Dataset:
     )
 
 
-def _read_lists(folder: Path) -> tuple[_List, _List | None]:
-    """Return the lists of colours and of depth; None without depth."""
-    associations = _associations(folder)
+def _read_lists(folder: Path) -> tuple[_ImageList, _ImageList | None]:
+    """Return the lists of the colour and of the depth images; None for depth without depth images.
+
+    Raises:
+        UsageError: A list is missing, empty or broken.
+    """
+    associations = _find_associations(folder)
     if not (folder / "rgb.txt").is_file() and associations is not None:
         rows = _read_rows(associations, 4)
-        first, second = ([(row[at], row[at + 1]) for row in rows] for at in (0, 2))
-        if rows and "depth" in first[0][1].lower() and "depth" not in second[0][1].lower():
-            first, second = second, first
-        return _listed(folder, associations.name, first), _listed(folder, associations.name, second)
-    colours = _listed(folder, "rgb.txt", _read_rows(folder / "rgb.txt", 2))
+        colours, depths = ([(row[column], row[column + 1]) for row in rows] for column in (0, 2))
+        if rows and "depth" in colours[0][1].lower() and "depth" not in depths[0][1].lower():
+            colours, depths = depths, colours
+        name = associations.name
+        return _make_list(folder, name, colours), _make_list(folder, name, depths)
+    colour_list = _make_list(folder, "rgb.txt", _read_rows(folder / "rgb.txt", 2))
     if not (folder / "depth.txt").exists() and not (folder / "depth").is_dir():
-        return colours, None
-    return colours, _listed(folder, "depth.txt", _read_rows(folder / "depth.txt", 2))
+        return colour_list, None
+    return colour_list, _make_list(folder, "depth.txt", _read_rows(folder / "depth.txt", 2))
 
 
-def _listed(folder: Path, name: str, rows: Sequence[Sequence[str]]) -> _List:
-    """Return the images of a list whose times increase."""
+def _make_list(folder: Path, name: str, rows: Sequence[Sequence[str]]) -> _ImageList:
+    """Return the images of the *rows* of the file *name*, as far as their time stamps increase.
+
+    Raises:
+        UsageError: There is no row, or the time stamps are in no order.
+    """
     if not rows:
         raise UsageError(
             f"{folder / name} lists no image", hint="write a line for each image: timestamp filename"
@@ -287,14 +328,22 @@ def _listed(folder: Path, name: str, rows: Sequence[Sequence[str]]) -> _List:
     stamps_s, notes = stamps_in_seconds(np.array([float(row[0]) for row in rows]), str(folder / name))
     times = TimeFacts(stated_by=str(folder / name), stamps_s=stamps_s)
     used, _ = rows_in_time(times)
-    return _List(
-        times=times, notes=notes,
-        stamps_s=tuple(stamps_s[used].tolist()), images=tuple(rows[row][1].strip() for row in used),
-    )  # fmt: skip
+    return _ImageList(
+        times=times,
+        notes=notes,
+        stamps_s=tuple(stamps_s[used].tolist()),
+        images=tuple(rows[row][1].strip() for row in used),
+    )
 
 
 def _read_rows(path: Path, columns: int) -> list[list[str]]:
-    """Return the rows of a list: time stamps, each with the path of an image."""
+    """Return the words of each line of a list of images: time stamps, each followed by a path.
+
+    *columns* is 2 for ``rgb.txt``, and 4 for a list of associations.
+
+    Raises:
+        UsageError: The file is missing, or a line has no finite time stamp or no path below the folder.
+    """
     try:
         text = read_regular_file(path, _MAX_LIST_BYTES).decode("utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
@@ -313,26 +362,35 @@ def _read_rows(path: Path, columns: int) -> list[list[str]]:
             stamps, images = [], []
         if len(images) * 2 != columns:
             raise UsageError(
-                f"{path}, line {number} is not an image",
+                f"{path}, line {number} has not {columns} words: a time stamp and a path",
                 hint="write: timestamp filename" + (" timestamp filename" if columns == 4 else ""),
             )
         is_inside = not any(image.is_absolute() or ".." in image.parts for image in images)
         if not all(map(math.isfinite, stamps)) or not is_inside:
             raise UsageError(
-                f"{path}, line {number} names no time, or no image below its folder",
+                f"{path}, line {number} has no finite time stamp, or no path below its folder",
                 hint="write seconds, and a path such as rgb/1.png",
             )
         rows.append(words)
     return rows
 
 
-def _intrinsics(
+def _find_intrinsics(
     folder: Path, file: Path, stated: Intrinsics | None, *, has_depth: bool
 ) -> tuple[Intrinsics, bool, tuple[str, ...]]:
-    """Return the intrinsics of a file, or those *stated* by one of another program, and notes.
+    """Find the intrinsics of a folder in TUM layout.
 
-    Between both stands whether the unit of depth is stated: by the file, or by the benchmark that *folder*
-    is named after.
+    Args:
+        folder: The folder, whose name may be that of a camera of the benchmark.
+        file: ``intrinsics.json``, the file that the user named, or the file of another program.
+        stated: What the file of another program states; None for the other files.
+        has_depth: Whether the folder has depth images.
+
+    Returns:
+        The intrinsics, whether the unit of depth is stated and not assumed, and notes on what was assumed.
+
+    Raises:
+        UsageError: The file cannot be read, or states no unit of depth although there is depth.
     """
     if stated is not None:
         note = (
@@ -342,8 +400,8 @@ def _intrinsics(
         lens = stated if has_unit else replace(stated, depth_scale=_FREIBURG_DEPTH_SCALE)
         return lens, has_unit, () if has_unit else (note,)
     if file.exists() or file.parent != folder:
-        found = read_calibration(file)
-        lens = found.left.lens if isinstance(found, Rig) else found
+        calibration = read_calibration(file)
+        lens = calibration.left.lens if isinstance(calibration, Rig) else calibration
         if has_depth and lens.depth_scale is None:
             raise UsageError(
                 f"{file} has no depth_scale", hint="state it: 5000 for TUM, 1000 for millimetres"
@@ -364,22 +422,29 @@ def _intrinsics(
 def _read_truth(
     folder: Path,
 ) -> tuple[Trajectory | None, Literal["ground truth", "reference", "none"], tuple[str, ...]]:
-    """Return the truth, what it is, and its file with notes on its time stamps."""
+    """Return the true path of the camera, its kind, and its file followed by notes on its time stamps.
+
+    ``groundtruth.txt`` is a ground truth, and ``reference_poses.txt`` an estimate of another program.
+
+    Raises:
+        UsageError: The file is broken.
+    """
     known: tuple[tuple[str, Literal["ground truth", "reference"]], ...] = (
-        ("groundtruth.txt", "ground truth"), ("reference_poses.txt", "reference"),
-    )  # fmt: skip
+        ("groundtruth.txt", "ground truth"),
+        ("reference_poses.txt", "reference"),
+    )
     for name, kind in known:
         if (folder / name).exists():
             path = str(folder / name)
-            read = read_trajectory(folder / name)
-            stamps_s, notes = stamps_in_seconds(read.timestamps_s, path)
+            trajectory = read_trajectory(folder / name)
+            stamps_s, notes = stamps_in_seconds(trajectory.timestamps_s, path)
             if bool((np.diff(stamps_s) < 0.0).any()):
                 notes = (*notes, f"the poses of {path} are not in the order of time, and are sorted")
-            return Trajectory(stamps_s, read.T_world_camera), kind, (path, *notes)
+            return Trajectory(stamps_s, trajectory.T_world_camera), kind, (path, *notes)
     return None, "none", ("",)
 
 
-# --- NYU Depth V2 ------------------------------------------------------------------------------
+# --- NYU Depth V2: raw dumps, and the labelled file ---
 
 
 def _open_raw(folder: Path) -> Dataset:
@@ -394,33 +459,40 @@ def _open_raw(folder: Path) -> Dataset:
             f"no depth image of {folder} has a colour image within {_MAX_RAW_STAMP_DIFFERENCE_S:g} s",
             hint="unpack the whole scene: r-*.ppm and d-*.pgm",
         )
-    colour = map_to_pinhole(nyu.COLOUR_LENS)
-    depth = map_to_pinhole(nyu.DEPTH_LENS)
+    colour_undistortion = map_to_pinhole(nyu.COLOUR_LENS)
+    depth_undistortion = map_to_pinhole(nyu.DEPTH_LENS)
 
     def read(row: int) -> Frame:
         depth_row, colour_row = pairs[row]
         depth_m = nyu.depth_from_raw(nyu.read_pnm(depths[depth_row].path))
         return Frame(
             timestamp_s=depths[depth_row].timestamp_s,
-            rgb=colour.colour(nyu.read_pnm(colours[colour_row].path)),
-            depth_m=nyu.register_depth(depth.depth(depth_m)),
+            rgb=colour_undistortion.colour(nyu.read_pnm(colours[colour_row].path)),
+            depth_m=nyu.register_depth(depth_undistortion.depth(depth_m)),
             camera=nyu.COLOUR_CAMERA,
         )
 
     truncated, unpaired = nyu.truncated_files(folder), len(depths) - len(pairs)
     losses = (
-        LossFacts(sentence=f"{len(truncated)} truncated images of {folder} left out: {some_names(truncated)}",
-                  lost=len(truncated), total=len(depths) + len(colours)),
-        LossFacts(sentence=f"{unpaired} of {len(depths)} depth images of {folder} have no colour image "
-                  f"within {_MAX_RAW_STAMP_DIFFERENCE_S:g} s and are left out",
-                  lost=unpaired, total=len(depths), is_usual=True),
-    )  # fmt: skip
+        LossFacts(
+            sentence=f"{len(truncated)} truncated images of {folder} left out: {some_names(truncated)}",
+            lost=len(truncated),
+            total=len(depths) + len(colours),
+        ),
+        LossFacts(
+            sentence=f"{unpaired} of {len(depths)} depth images of {folder} have no colour image "
+            f"within {_MAX_RAW_STAMP_DIFFERENCE_S:g} s and are left out",
+            lost=unpaired,
+            total=len(depths),
+            is_usual=True,
+        ),
+    )
     stamps_s = [depths[row].timestamp_s for row, _ in pairs]
     return _nyu_dataset(folder.name, stamps_s, read, [loss for loss in losses if loss.lost])
 
 
 def _open_labelled(path: Path, scene: str | None) -> Dataset:
-    """Return the labelled images, one second apart, because the file holds no time stamps."""
+    """Return the images of the labelled file, one second apart, because the file has no time stamps."""
     file = nyu.LabelledFile(path)
     rows = file.rows(scene)
 
@@ -440,11 +512,14 @@ def _nyu_dataset(
     losses: Sequence[LossFacts] = (),
     assumed: tuple[str, ...] = (),
 ) -> Dataset:
-    """Return frames of NYU Depth V2, whose camera and depth its toolbox states."""
+    """Return a recording of NYU Depth V2, whose camera and depth unit the toolbox of the data set states.
+
+    *read* reads the frame of a row; *stamps_s* has a time stamp for each row.
+    """
     camera = nyu.COLOUR_CAMERA
     depths_m = []
     for row in sorted({0, len(stamps_s) // 2, len(stamps_s) - 1}):
-        with contextlib.suppress(UsageError):  # of an image that cannot be read, when it is its turn
+        with contextlib.suppress(UsageError):  # an image that cannot be read is reported in the iteration
             depths_m.append(read(row).depth_m)
     whose = (
         f"the camera of {name} is that of the toolbox of NYU Depth V2: fx {camera.fx:.2f} fy {camera.fy:.2f} "

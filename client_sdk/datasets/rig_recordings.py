@@ -1,6 +1,7 @@
-"""Recordings of EuRoC (ASL) and KITTI odometry as frames of their left camera or of the stereo pair.
+"""Read recordings of EuRoC (ASL) and KITTI odometry: left camera or stereo pair, IMU, and true path.
 
-Frames of one camera are undistorted, those of a pair rectified; the truth is that of the frames' camera.
+Frames of one camera are undistorted, those of a stereo pair are rectified.  The true path is that of the
+camera of the frames.
 """
 
 from __future__ import annotations
@@ -49,16 +50,18 @@ __all__ = ["CameraChoice", "is_euroc", "is_kitti", "open_euroc", "open_kitti"]
 
 CameraChoice = Literal["stereo", "left"]
 
-_EUROC_TRUTH = "state_groundtruth_estimate0/data.csv"
-_MAX_PAIR_S = 0.005
-"""The shutters of a pair open together; stamps that are farther apart are those of other images."""
-_KITTI_PAIRS = ("image_0", "image_1"), ("image_2", "image_3")
-"""The grey and the colour cameras; the digit is that of their projection in ``calib.txt``."""
+_EUROC_TRUTH = "state_groundtruth_estimate0/data.csv"  # the file of the true path, in the folder mav0
+_MAX_PAIR_DIFFERENCE_S = 0.005
+"""Time between two images of a stereo pair: their shutters open together, so that images farther apart belong
+to different moments."""
+_KITTI_PAIRS = (("image_0", "image_1"), ("image_2", "image_3"))
+"""Folders of the grey and of the colour cameras of KITTI, left and right; the digit is that of the camera's
+projection in ``calib.txt``."""
 
 
 def is_euroc(folder: Path) -> bool:
-    """Return whether a folder, or its ``mav0``, has the layout of EuRoC."""
-    return (_asl(folder) / "cam0" / "sensor.yaml").is_file()
+    """Return whether a folder, or the folder ``mav0`` in it, has the layout of EuRoC."""
+    return (_mav0_of(folder) / "cam0" / "sensor.yaml").is_file()
 
 
 def is_kitti(folder: Path) -> bool:
@@ -67,10 +70,18 @@ def is_kitti(folder: Path) -> bool:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Files:
-    """Images of the left camera, and of the right one where it is used, with their ``(n,)`` times.
+class _RigImages:
+    """The images of a recording with one camera or a stereo pair, in the order of time.
 
-    ``stated_by`` are the files of the calibration, and of the times; ``truth`` is the file of the true path.
+    Attributes:
+        lefts: Images of the left camera.
+        rights: For each of them the image of the right camera; None if that is not used.
+        stamps_s: ``(n,)``, time stamps of the images.
+        stated_by: The file of the calibration, and the file of the time stamps, for messages.
+        truth: The file of the true path, for messages.
+        notes: Sentences on what was assumed.
+        losses: Images without a partner.
+        doubts: Doubts about time stamps and lost images.
     """
 
     lefts: Sequence[Path]
@@ -84,90 +95,107 @@ class _Files:
 
 
 def open_euroc(folder: Path, camera: CameraChoice | None = None, imu: bool | None = None) -> Dataset:
-    """Return the frames of ``cam0``, or of both cameras, with the samples of ``imu0``.
-
-    Time stamps are seconds; the truth is ``T_world_body @ T_body_camera``.
+    """Return the recording of a folder in the layout of EuRoC: ``cam0`` or both cameras, with ``imu0``.
 
     Args:
-        folder: With ``mav0``, or that itself.
-        camera: None takes both cameras where there are two.
-        imu: None takes the IMU where there is one.
+        folder: The folder ``mav0``, or the folder that contains it.
+        camera: ``stereo`` or ``left``; None for both cameras where there are two.
+        imu: Whether frames carry samples of the IMU; None for yes where there is one.
 
     Raises:
-        UsageError: A file is missing or broken, or there is no such camera or IMU.
+        UsageError: A file is missing or broken, facts about the recording contradict each other, or there is
+            no such camera or IMU.
+        MissingExtra: OpenCV is not installed.
     """
-    folder = _asl(folder)
-    stereo = _takes(folder / "cam1" / "sensor.yaml", None if camera is None else camera == "stereo", "cam1")
-    has_imu = _takes(folder / "imu0" / "sensor.yaml", imu, "imu0")
+    # 1. The images and the rig.
+    folder = _mav0_of(folder)
+    wants_stereo = None if camera is None else camera == "stereo"
+    has_stereo = _is_used(folder / "cam1" / "sensor.yaml", wants_stereo, "cam1")
+    has_imu = _is_used(folder / "imu0" / "sensor.yaml", imu, "imu0")
     cameras = [read_euroc_camera(folder / "cam0" / "sensor.yaml", "left")]
-    paths, stamps_s, notes, doubts = _euroc_images(folder / "cam0")
+    lefts, stamps_s, notes, doubts = _read_euroc_images(folder / "cam0")
     rights: list[Path] | None = None
     losses: tuple[LossFacts, ...] = ()
-    if stereo:
+    if has_stereo:
         cameras.append(read_euroc_camera(folder / "cam1" / "sensor.yaml", "right"))
-        others, others_s, *_ = _euroc_images(folder / "cam1")
-        pairs, losses = _pairs(stamps_s, others_s, folder.parent.name)
-        paths, stamps_s = [paths[row] for row, _ in pairs], stamps_s[[row for row, _ in pairs]]
-        rights = [others[row] for _, row in pairs]
+        all_rights, right_stamps_s, *_ = _read_euroc_images(folder / "cam1")
+        pairs, losses = _pair_images(stamps_s, right_stamps_s, folder.parent.name)
+        lefts, stamps_s = [lefts[row] for row, _ in pairs], stamps_s[[row for row, _ in pairs]]
+        rights = [all_rights[row] for _, row in pairs]
     rig = Rig(
         cameras=tuple(cameras), imu=read_euroc_imu(folder / "imu0" / "sensor.yaml") if has_imu else None
     )
-    bodies = None
+    # 2. The true path of the body.
+    body_path = None
     if (folder / _EUROC_TRUTH).is_file():
-        lines = [row[:8] for row in _csv(folder / _EUROC_TRUTH, 8)]
-        values = read_numbers(folder / _EUROC_TRUTH, [word for row in lines for word in row]).reshape(-1, 8)
+        rows = [row[:8] for row in _read_table(folder / _EUROC_TRUTH, 8)]
+        values = read_numbers(folder / _EUROC_TRUTH, [word for row in rows for word in row]).reshape(-1, 8)
         poses = np.tile(np.eye(4), (len(values), 1, 1))
         poses[:, :3, 3] = values[:, 1:4]
         poses[:, :3, :3] = [from_quaternion(xyzw) for xyzw in values[:, [5, 6, 7, 4]]]
-        truth_s, of_truth = stamps_in_seconds(values[:, 0], str(folder / _EUROC_TRUTH), "nanoseconds")
-        bodies = Trajectory(truth_s, poses)
-        notes += of_truth
+        truth_s, truth_notes = stamps_in_seconds(values[:, 0], str(folder / _EUROC_TRUTH), "nanoseconds")
+        body_path = Trajectory(truth_s, poses)
+        notes += truth_notes
     name = folder.parent.name if folder.name == "mav0" else folder.name
+    # 3. The samples of the IMU.
     samples = None
     if has_imu:
-        rows = [row[:7] for row in _csv(folder / "imu0" / "data.csv", 7)]
+        rows = [row[:7] for row in _read_table(folder / "imu0" / "data.csv", 7)]
         values = read_numbers(folder / "imu0" / "data.csv", [word for row in rows for word in row])
         samples = values.reshape(-1, 7)
-        samples[:, 0], of_imu = stamps_in_seconds(samples[:, 0], str(folder / "imu0"), "nanoseconds")
-        notes += of_imu
+        samples[:, 0], imu_notes = stamps_in_seconds(samples[:, 0], str(folder / "imu0"), "nanoseconds")
+        notes += imu_notes
     stated_by = str(folder / "cam0" / "sensor.yaml"), str(folder / "cam0" / "data.csv")
-    files = _Files(
-        lefts=paths, rights=rights, stamps_s=stamps_s, notes=notes, doubts=doubts, stated_by=stated_by,
-        truth=_EUROC_TRUTH, losses=losses,
-    )  # fmt: skip
-    return _dataset(name or folder.name, rig, files, bodies, samples)
+    images = _RigImages(
+        lefts=lefts,
+        rights=rights,
+        stamps_s=stamps_s,
+        notes=notes,
+        doubts=doubts,
+        stated_by=stated_by,
+        truth=_EUROC_TRUTH,
+        losses=losses,
+    )
+    return _make_dataset(name or folder.name, rig, images, body_path, samples)
 
 
 def open_kitti(folder: Path, camera: CameraChoice | None = None, imu: bool | None = None) -> Dataset:
-    """Return the frames of ``image_0``, or of both grey cameras; of the colour cameras without grey ones.
+    """Return a sequence of KITTI's odometry benchmark: one camera, or a stereo pair.
 
-    The truth is in ``poses.txt``, or in ``../../poses/NAME.txt``.
+    The grey cameras are used where the sequence has them, else the colour cameras.
+
+    The true path is in ``poses.txt``, or in ``../../poses/NAME.txt``.
 
     Args:
-        folder: Of one sequence.
-        camera: None takes both cameras where there are two.
-        imu: The sequences hold none.
+        folder: The folder of the sequence.
+        camera: ``stereo`` or ``left``; None for both cameras where there are two.
+        imu: Must not be True, since the sequences have no IMU.
 
     Raises:
-        UsageError: A file is missing or broken, or there is no such camera.
+        UsageError: A file is missing or broken, facts about the recording contradict each other, or there is
+            no such camera or IMU.
+        MissingExtra: OpenCV is not installed.
     """
     if imu:
         raise UsageError(f"{folder} has no IMU: KITTI's sequences hold none", hint="leave out --imu")
+    # 1. The lines of times.txt and poses.txt that belong to each image.
     left, right = next(pair for pair in _KITTI_PAIRS if (folder / pair[0]).is_dir())
-    stereo = _takes(folder / right, None if camera is None else camera == "stereo", right)
+    wants_stereo = None if camera is None else camera == "stereo"
+    has_stereo = _is_used(folder / right, wants_stereo, right)
     times_s = read_numbers(folder / "times.txt", read_text(folder / "times.txt").split())
     paths = image_files(folder / left)
     if not paths or not len(times_s):
         raise UsageError(f"{folder} lacks images or times", hint="unpack the sequence again")
-    known = (folder / "poses.txt", folder.parent.parent / "poses" / f"{folder.name}.txt")
-    truth_file = next((each for each in known if each.is_file()), None)
-    poses = None if truth_file is None else _kitti_poses(truth_file)
-    lists = {"times.txt": len(times_s)} | ({} if poses is None else {"poses.txt": len(poses)})
-    rows, notes = _kitti_rows(paths, lists, folder)
+    truth_files = (folder / "poses.txt", folder.parent.parent / "poses" / f"{folder.name}.txt")
+    truth_file = next((file for file in truth_files if file.is_file()), None)
+    poses = None if truth_file is None else _read_kitti_poses(truth_file)
+    line_counts = {"times.txt": len(times_s)} | ({} if poses is None else {"poses.txt": len(poses)})
+    rows, notes = _match_kitti_lines(paths, line_counts, folder)
     stamps_s = times_s[rows["times.txt"]]
     used, doubts = rows_in_time(TimeFacts(stated_by=str(folder / "times.txt"), stamps_s=stamps_s))
+    # 2. The right images.
     rights: list[Path] | None = None
-    if stereo:
+    if has_stereo:
         partners = {path.stem: path for path in image_files(folder / right)}
         alone = [paths[row].name for row in used if paths[row].stem not in partners]
         used = [row for row in used if paths[row].stem in partners]
@@ -183,58 +211,76 @@ def open_kitti(folder: Path, camera: CameraChoice | None = None, imu: bool | Non
             )
             doubts = (*doubts, doubt)
         rights = [partners[paths[row].stem] for row in used]
+    # 3. The true path, and the rig.
     truth = None
     if poses is not None:
         truth = Trajectory(stamps_s[used], poses[rows["poses.txt"]][used])
     lefts = [paths[row] for row in used]
     height, width = probe(lefts, read_colour)[0].shape[:2]
-    keys = (f"P{left[-1]}", f"P{right[-1]}") if stereo else (f"P{left[-1]}",)
-    rig = read_kitti_rig(folder / "calib.txt", (width, height), keys)
-    files = _Files(
-        lefts=lefts, rights=rights, stamps_s=stamps_s[used], notes=notes, doubts=doubts,
-        stated_by=(str(folder / "calib.txt"), str(folder / "times.txt")), truth=str(truth_file),
-    )  # fmt: skip
-    dataset = _dataset(folder.name, rig, files, truth, None)
-    # The path that KITTI measured is that of the left camera itself, as it is rectified.
+    projections = (f"P{left[-1]}", f"P{right[-1]}") if has_stereo else (f"P{left[-1]}",)
+    rig = read_kitti_rig(folder / "calib.txt", (width, height), projections)
+    images = _RigImages(
+        lefts=lefts,
+        rights=rights,
+        stamps_s=stamps_s[used],
+        notes=notes,
+        doubts=doubts,
+        stated_by=(str(folder / "calib.txt"), str(folder / "times.txt")),
+        truth=str(truth_file),
+    )
+    dataset = _make_dataset(folder.name, rig, images, truth, None)
+    # KITTI's true path is that of the rectified left camera itself, and not of a body.
     return replace(dataset, T_body_camera=None)
 
 
-def _kitti_poses(path: Path) -> Array:
-    """Return the ``(n, 4, 4)`` poses of a file of 12 numbers a line."""
+def _read_kitti_poses(path: Path) -> Array:
+    """Return the poses ``(n, 4, 4)`` of a file with the 12 numbers of a 3x4 matrix in each line.
+
+    Raises:
+        UsageError: The file cannot be read, or has another number of numbers.
+    """
     values = read_numbers(path, read_text(path).split())
     if len(values) % 12:
-        raise UsageError(f"{path} has not 12 numbers in each line", hint="unpack the sequence again")
+        raise UsageError(
+            f"{path} has {len(values)} numbers, which are not 12 in each line",
+            hint="unpack the sequence again",
+        )
     poses = np.tile(np.eye(4), (len(values) // 12, 1, 1))
     poses[:, :3] = values.reshape(-1, 3, 4)
     return poses
 
 
-def _kitti_rows(
-    paths: Sequence[Path], lists: Mapping[str, int], folder: Path
+def _match_kitti_lines(
+    paths: Sequence[Path], line_counts: Mapping[str, int], folder: Path
 ) -> tuple[dict[str, list[int]], tuple[str, ...]]:
-    """Return for each list, by its name and length, the row of each image, and what was assumed.
+    """Return for each file of lines the line of each image, and notes on what was assumed.
 
-    An image has the row of its number.  A list that is too short for the numbers, and as long as there are
-    images, was cut out with them.
+    Line *n* (from 0) belongs to the image of number *n*.  If a file is too short for these numbers, but has
+    as many lines as there are images, the file was cut together with the images, and the order counts.
+
+    Args:
+        paths: The images; their names are their numbers.
+        line_counts: The number of lines of each file, by its name.
+        folder: The folder of the sequence, for messages.
 
     Raises:
-        UsageError: A list is too short for the images.
+        UsageError: A file is too short for the images.
     """
     numbers = [int(path.stem) if path.stem.isdecimal() else None for path in paths]
     rows: dict[str, list[int]] = {}
     notes: tuple[str, ...] = ()
-    for name, length in lists.items():
-        by_number = [number for number in numbers if number is not None and number < length]
+    for name, line_count in line_counts.items():
+        by_number = [number for number in numbers if number is not None and number < line_count]
         if len(by_number) == len(paths):
             rows[name] = by_number
-        elif length == len(paths):
-            rows[name] = list(range(length))
+        elif line_count == len(paths):
+            rows[name] = list(range(line_count))
             notes += (
-                f"{name} of {folder} has a line for each of the {length} images, and none for the number "
+                f"{name} of {folder} has a line for each of the {line_count} images, and none for the number "
                 f"{paths[-1].stem}: they are joined in their order",
             )
         else:
-            counts = ", ".join(f"{each} lines in {other}" for other, each in lists.items())
+            counts = ", ".join(f"{count} lines in {file}" for file, count in line_counts.items())
             raise UsageError(
                 f"{folder}: {len(paths)} images with numbers up to {paths[-1].stem}, {counts}",
                 hint="unpack the sequence again: line n belongs to the image of number n",
@@ -242,36 +288,54 @@ def _kitti_rows(
     return rows, notes
 
 
-def _dataset(name: str, rig: Rig, files: _Files, bodies: Trajectory | None, samples: Array | None) -> Dataset:
-    """Return the frames of a rig; *bodies* is the true path of its body, *samples* ``(n, 7)`` of its IMU."""
-    paths, rights, stamps_s = files.lefts, files.rights, files.stamps_s
-    if not len(paths):
+def _make_dataset(
+    name: str, rig: Rig, images: _RigImages, body_path: Trajectory | None, samples: Array | None
+) -> Dataset:
+    """Return the recording of a rig.
+
+    Args:
+        name: Name of the recording.
+        rig: The cameras that are used, and the IMU.
+        images: The images of these cameras.
+        body_path: True path of the body; None without a truth.
+        samples: ``(n, 7)``, samples of the IMU: time stamp (s), angular rate (rad/s), specific force (m/s^2);
+            None without an IMU.
+
+    Raises:
+        UsageError: There is no image, the cameras are no stereo pair, or facts contradict each other.
+        MissingExtra: OpenCV is not installed.
+    """
+    # 1. Reading of a frame.
+    lefts, rights, stamps_s = images.lefts, images.rights, images.stamps_s
+    if not len(lefts):
         raise UsageError(f"{name} has no images", hint="unpack the recording again")
     left, right = rig.left, rig.right
-    rectify = None if rights is None or right is None else Rectification(left, right)
-    undistort = map_to_pinhole(left.lens)
+    rectification = None if rights is None or right is None else Rectification(left, right)
+    undistortion = map_to_pinhole(left.lens)
     right_camera = (left if right is None else right).lens.camera
-    camera = left.lens.camera if rectify is None else rectify.camera
-    T_body_camera = left.T_body_camera if rectify is None else rectify.T_body_camera
-    no_depth: npt.NDArray[np.float32] = np.zeros((camera.height, camera.width), dtype=np.float32)
+    camera = left.lens.camera if rectification is None else rectification.camera
+    T_body_camera = left.T_body_camera if rectification is None else rectification.T_body_camera
+    empty_depth: npt.NDArray[np.float32] = np.zeros((camera.height, camera.width), dtype=np.float32)
 
     def read(row: int) -> Frame:
-        rgb, stamp_s = read_colour(paths[row]), float(stamps_s[row])
-        check_size(rgb, left.lens.camera, paths[row])
-        if rectify is None or rights is None:
-            return Frame(timestamp_s=stamp_s, rgb=undistort.colour(rgb), depth_m=no_depth, camera=camera)
+        rgb, stamp_s = read_colour(lefts[row]), float(stamps_s[row])
+        check_size(rgb, left.lens.camera, lefts[row])
+        if rectification is None or rights is None:
+            return Frame(
+                timestamp_s=stamp_s, rgb=undistortion.colour(rgb), depth_m=empty_depth, camera=camera
+            )
         cv2 = load_opencv()
-        other = read_colour(rights[row])
-        check_size(other, right_camera, rights[row])
-        gray = cv2.cvtColor(other, cv2.COLOR_RGB2GRAY)
+        right_rgb = read_colour(rights[row])
+        check_size(right_rgb, right_camera, rights[row])
         return Frame(
             timestamp_s=stamp_s,
-            rgb=rectify.left(rgb),
-            depth_m=no_depth,
+            rgb=rectification.left(rgb),
+            depth_m=empty_depth,
             camera=camera,
-            stereo=rectify.right(gray),
+            stereo=rectification.right(cv2.cvtColor(right_rgb, cv2.COLOR_RGB2GRAY)),
         )
 
+    # 2. IMU samples on the clock of the left camera, and the true path of the camera of the frames.
     track = None
     if samples is not None and rig.imu is not None:
         track = ImuTrack(
@@ -281,53 +345,70 @@ def _dataset(name: str, rig: Rig, files: _Files, bodies: Trajectory | None, samp
             rig.imu.model(T_body_camera),
         )
     truth = None
-    if bodies is not None:
-        truth = Trajectory(bodies.timestamps_s, bodies.T_world_camera @ T_body_camera)
-    stated = [
+    if body_path is not None:
+        truth = Trajectory(body_path.timestamps_s, body_path.T_world_camera @ T_body_camera)
+    # 3. The facts about the recording.
+    cameras = [
         CameraFacts(
-            stated_by=files.stated_by[0] if each is left else f"the right camera of {name}",
-            lens=each.lens,
+            stated_by=images.stated_by[0] if rig_camera is left else f"the right camera of {name}",
+            lens=rig_camera.lens,
         )
-        for each in rig.cameras
-    ]  # fmt: skip
+        for rig_camera in rig.cameras
+    ]
+    references = () if truth is None else (TimeFacts(stated_by=images.truth, stamps_s=truth.timestamps_s),)
     facts = SourceFacts(
-        name=name, cameras=stated, losses=files.losses, doubts=files.doubts, assumed=files.notes,
-        times=(TimeFacts(stated_by=files.stated_by[1], stamps_s=stamps_s),),
-        references=() if truth is None else (TimeFacts(stated_by=files.truth, stamps_s=truth.timestamps_s),),
-    )  # fmt: skip
+        name=name,
+        cameras=cameras,
+        losses=images.losses,
+        doubts=images.doubts,
+        assumed=images.notes,
+        times=(TimeFacts(stated_by=images.stated_by[1], stamps_s=stamps_s),),
+        references=references,
+    )
     return Dataset(
         name=name,
         camera=camera,
         timestamps_s=tuple(stamps_s.tolist()),
         truth=truth,
         truth_kind="none" if truth is None else "ground truth",
-        rows=tuple(range(len(paths))),
+        rows=tuple(range(len(lefts))),
         read=read,
         notes=facts.notes,
         log=DoubtLog(check_source(facts)),
         has_depth=False,
-        has_stereo=rectify is not None,
+        has_stereo=rectification is not None,
         T_body_camera=T_body_camera,
         imu=track,
     )
 
 
-def _pairs(lefts_s: Array, rights_s: Array, name: str) -> tuple[list[tuple[int, int]], tuple[LossFacts, ...]]:
-    """Return rows of images that were taken together, and what a camera lost."""
-    pairs = pair_stamps(lefts_s, rights_s, _MAX_PAIR_S)
+def _pair_images(
+    left_stamps_s: Array, right_stamps_s: Array, name: str
+) -> tuple[list[tuple[int, int]], tuple[LossFacts, ...]]:
+    """Return the rows of left and right images that were taken together, and the loss of left images.
+
+    Raises:
+        UsageError: No two images are within 5 ms; *name* is the recording, for messages.
+    """
+    pairs = pair_stamps(left_stamps_s, right_stamps_s, _MAX_PAIR_DIFFERENCE_S)
     if not pairs:
         raise UsageError(
-            f"no image of {name}'s cam0 has one of cam1 within {1e3 * _MAX_PAIR_S:g} ms: "
+            f"no image of {name}'s cam0 has one of cam1 within {1e3 * _MAX_PAIR_DIFFERENCE_S:g} ms: "
             "the cameras are not synchronised",
             hint="check data.csv of both, or take one camera: --camera left",
         )
-    alone = len(lefts_s) - len(pairs)
-    note = f"{alone} of {len(lefts_s)} images of {name}'s left camera have no right one, and are left out"
-    loss = LossFacts(sentence=note, lost=alone, total=len(lefts_s), is_usual=True)
-    return pairs, (loss,) if alone else ()
+    lost, total = len(left_stamps_s) - len(pairs), len(left_stamps_s)
+    sentence = f"{lost} of {total} images of {name}'s left camera have no right one, and are left out"
+    loss = LossFacts(sentence=sentence, lost=lost, total=total, is_usual=True)
+    return pairs, (loss,) if lost else ()
 
 
-def _takes(path: Path, wanted: bool | None, name: str) -> bool:
+def _is_used(path: Path, wanted: bool | None, name: str) -> bool:
+    """Return whether the sensor *name* is used: as *wanted*, or for None if its file or folder *path* exists.
+
+    Raises:
+        UsageError: The sensor is wanted, and does not exist.
+    """
     if wanted and not path.exists():
         option = "--imu" if name == "imu0" else "--camera stereo"
         raise UsageError(
@@ -337,14 +418,18 @@ def _takes(path: Path, wanted: bool | None, name: str) -> bool:
     return path.exists() if wanted is None else wanted
 
 
-def _asl(folder: Path) -> Path:
+def _mav0_of(folder: Path) -> Path:
     return folder / "mav0" if (folder / "mav0").is_dir() else folder
 
 
-def _euroc_images(folder: Path) -> tuple[list[Path], Array, tuple[str, ...], tuple[Doubt, ...]]:
-    """Return the images of a camera whose times increase, their times, and notes and doubts on these."""
+def _read_euroc_images(folder: Path) -> tuple[list[Path], Array, tuple[str, ...], tuple[Doubt, ...]]:
+    """Return images of a camera with increasing time stamps, these time stamps ``(n,)`` (s), notes, doubts.
+
+    Raises:
+        UsageError: ``data.csv`` cannot be read, or names a file outside of the folder ``data``.
+    """
     file = folder / "data.csv"
-    lines = _csv(file, 2)
+    lines = _read_table(file, 2)
     stamps_s, notes = stamps_in_seconds(
         read_numbers(file, [line[0] for line in lines]), str(file), "nanoseconds"
     )
@@ -359,10 +444,14 @@ def _euroc_images(folder: Path) -> tuple[list[Path], Array, tuple[str, ...], tup
     return [folder / "data" / name for name in names], stamps_s[rows], notes, doubts
 
 
-def _csv(path: Path, columns: int) -> list[list[str]]:
-    """Return the rows of a table of EuRoC; a line that begins with ``#`` is a heading."""
+def _read_table(path: Path, columns: int) -> list[list[str]]:
+    """Return the words of each line of a CSV file of EuRoC, without headings (lines that begin with ``#``).
+
+    Raises:
+        UsageError: The file cannot be read, or a line has less than *columns* words.
+    """
     lines = [line for line in read_text(path).splitlines() if line.strip() and not line.startswith("#")]
     rows = [line.split(",") for line in lines]
     if any(len(row) < columns for row in rows):
-        raise UsageError(f"{path} has a row of less than {columns} values", hint="unpack it again")
+        raise UsageError(f"{path} has a line of less than {columns} values", hint="unpack it again")
     return rows

@@ -1,4 +1,4 @@
-"""Choose the frames that play a recording or a camera at a lower rate, by their time stamps."""
+"""Lower the frame rate of a recording or a camera: select frames by their time stamps."""
 
 from __future__ import annotations
 
@@ -11,23 +11,29 @@ from rse_pf.errors import UsageError
 
 __all__ = ["Thinning", "median_interval_s"]
 
-_OWN_RATE = 1.05
-"""Rates this close to the recording's own are its own: cameras of 30 Hz have 29.97 or 30.2."""
-_RECENT = 31
-_ROUNDING_S = 1e-6
-"""Stamps are decimal fractions."""
+_SAME_RATE_RATIO = 1.05
+"""Ratio of the frame interval at the wanted rate to that of the recording, up to which both rates count as
+the same: cameras of 30 Hz have 29.97 or 30.2 Hz."""
+_INTERVAL_WINDOW = (
+    31  # latest time stamps of a live camera, whose median interval is taken as its frame interval
+)
+_ROUNDING_S = 1e-6  # error of time stamps and periods that are rounded decimal fractions
 
 
 class Thinning:
-    """Decides for each frame, in order of time, whether it is played at *rate_hz*.
+    """Decides for each frame, in the order of time, whether the frame belongs to a recording at a lower rate.
 
-    Frames are due on a grid that begins at the first one; a frame serves a due time from half a frame
-    interval before it.  Two frames are never closer than half of ``1 / rate_hz``.  A rate that is the frames'
-    own, or higher, plays all of them, however close.
+    Due times are a grid with the period ``1 / rate_hz`` that begins at the first frame.  For each due time,
+    the first frame that is at most half a frame interval early is selected.  Two selected frames are at least
+    half a period apart.  At the rate of the frames themselves, or a higher one, all frames are selected.
     """
 
     def __init__(self, rate_hz: float, *, interval_s: float | None = None) -> None:
-        """Play at *rate_hz*; *interval_s* is the median one of the frames, None to learn it as they come.
+        """Begin without a frame.
+
+        Args:
+            rate_hz: Wanted frames a second.
+            interval_s: Median time between frames, s; None to estimate it from the latest 31 frames.
 
         Raises:
             UsageError: The rate is not above 0.
@@ -36,29 +42,32 @@ class Thinning:
             raise UsageError(f"rate {rate_hz:g} is not above 0", hint="name frames per second, such as 5")
         self._period_s = 1.0 / rate_hz
         self._interval_s = interval_s
-        self._recent: deque[float] = deque(maxlen=_RECENT)
-        self._start_s = self._due_s = self._played_s = -math.inf
+        self._recent: deque[float] = deque(maxlen=_INTERVAL_WINDOW)
+        self._start_s = self._due_s = self._selected_s = -math.inf
 
-    def plays(self, timestamp_s: float) -> bool:
-        """Return whether the frame of *timestamp_s*, the next one, is played."""
+    def selects(self, timestamp_s: float) -> bool:
+        """Return whether the next frame, whose time stamp is *timestamp_s*, is selected."""
         if self._interval_s is None:
             self._recent.append(timestamp_s)
         interval_s = median_interval_s(self._recent) if self._interval_s is None else self._interval_s
-        is_own = self._period_s <= _OWN_RATE * interval_s + _ROUNDING_S
+        is_same_rate = self._period_s <= _SAME_RATE_RATIO * interval_s + _ROUNDING_S
         early_s = min(interval_s, self._period_s) / 2.0 + _ROUNDING_S
         is_due = timestamp_s >= self._due_s - early_s
-        is_apart = timestamp_s - self._played_s >= self._period_s / 2.0 - _ROUNDING_S
-        if not (is_own or (is_due and is_apart)):
+        is_apart = timestamp_s - self._selected_s >= self._period_s / 2.0 - _ROUNDING_S
+        if not (is_same_rate or (is_due and is_apart)):
             return False
         if math.isinf(self._start_s):
             self._start_s = timestamp_s
-        served = math.floor((timestamp_s - self._start_s + early_s) / self._period_s)
-        self._due_s = self._start_s + (served + 1) * self._period_s
-        self._played_s = timestamp_s
+        due_count = math.floor((timestamp_s - self._start_s + early_s) / self._period_s)
+        self._due_s = self._start_s + (due_count + 1) * self._period_s
+        self._selected_s = timestamp_s
         return True
 
 
 def median_interval_s(timestamps_s: Iterable[float]) -> float:
-    """Return the median time between neighbours, the lower one of two; 0 for fewer than two frames."""
+    """Return the median time between successive frames, s; 0 for fewer than two frames.
+
+    Of an even number of intervals, that is the shorter one of the two in the middle.
+    """
     intervals = sorted(later - earlier for earlier, later in pairwise(timestamps_s))
     return intervals[(len(intervals) - 1) // 2] if intervals else 0.0

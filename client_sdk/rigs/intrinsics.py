@@ -1,5 +1,4 @@
-"""``intrinsics.json``: the camera, the lens and the depth unit that calibration writes and every source
-reads.
+"""Read and write ``intrinsics.json``: the camera, the lens, and the unit of depth images.
 
 ::
 

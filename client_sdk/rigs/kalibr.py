@@ -1,5 +1,4 @@
-"""Read rigs of Kalibr: ``camchain.yaml`` or ``camchain-imucam.yaml``, and the ``imu.yaml`` in the same
-folder.
+"""Read rigs of Kalibr: ``camchain.yaml`` or ``camchain-imucam.yaml``, and ``imu.yaml`` in its folder.
 
 The frame of the body is that of the IMU where the camchain states ``T_cam_imu``, else that of the first
 camera.

@@ -120,8 +120,7 @@ def find_fault_of_frames(pairs: Iterable[tuple[Frame, Frame]]) -> PairFault | No
 
 
 def find_fault(measurements: Iterable[PairMeasurement]) -> PairFault | None:
-    """Return the fault of a stereo rig by what `measure_pair` measured; None if there is none, or too few
-    data.
+    """Return the fault of a stereo rig that *measurements* show; None without a fault, or with too few data.
 
     The first fault in this order is returned: swapped cameras, images of two moments, wrong rows.
     """

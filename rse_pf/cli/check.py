@@ -155,7 +155,7 @@ def _checked(
     if dataset.has_stereo:
         from client_sdk.rigs.stereo_pair_checks import find_fault_of_frames
 
-        fault = find_fault_of_frames(dataset.some_pairs())
+        fault = find_fault_of_frames(dataset.sample_pairs())
     truth = MotionReference.of_truth(dataset.truth, dataset.truth_kind, is_camera=not is_bag(path))
     reference = _reference(args, truth)
     log = dataset.log if reference is truth else _compared(dataset.log, reference, dataset.span_s)

@@ -69,8 +69,7 @@ def inverse(T_a_b: Array) -> Array:
 
 
 def body_poses(T_world_camera: Array, T_body_camera: Array) -> Array:
-    """Return the poses ``(..., 4, 4)`` of the body from those of its camera, *T_world_camera* ``(..., 4,
-    4)``.
+    """Return the poses ``(..., 4, 4)`` of the body from the poses *T_world_camera* of its camera.
 
     *T_body_camera* ``(4, 4)`` is where the camera is mounted on the body.
     """

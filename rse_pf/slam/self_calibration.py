@@ -1,5 +1,4 @@
-"""Self-calibration: bundle adjustment of the keyframes of a drive together with the errors of their
-calibration.
+"""Self-calibration: bundle adjustment of a drive together with the errors of its calibration.
 
 Levenberg-Marquardt over poses, landmarks and calibration with Cauchy weights; landmarks are eliminated by the
 Schur complement.  Matches are selected, and results are explained to the user, in `client_sdk.check`.
@@ -308,8 +307,7 @@ def estimate_part_deviations(
 
 
 def disagreement(values: Array, variances: Array) -> Array:
-    """Return the standard deviation ``(n,)`` of the mean of *p* estimates that their variances do not
-    explain.
+    """Return the standard deviation ``(n,)`` of means of estimates that their variances do not explain.
 
     *values* and *variances* are ``(p, n)``: *n* quantities, each estimated *p* times.
 

@@ -201,13 +201,13 @@ def test_names_that_only_look_like_numbers_are_names(tmp_path: Path):
 
 @pytest.mark.parametrize("name", ["../../etc/passwd", "/etc/passwd", "rgb/../../x.png"])
 def test_a_list_of_images_names_none_outside_of_its_folder(tmp_path: Path, name: str):
-    with pytest.raises(UsageError, match=r"rgb\.txt, line 1 names no time, or no image below its folder"):
+    with pytest.raises(UsageError, match=r"rgb\.txt, line 1 has no finite time stamp, or no path"):
         open_dataset(recording(tmp_path / "x", rgb=f"1.0 {name}\n"))
 
 
 @pytest.mark.parametrize("stamp", ["nan", "inf", "-inf", "1e999"])
 def test_a_time_that_is_no_number_is_refused(tmp_path: Path, stamp: str):
-    with pytest.raises(UsageError, match="line 1 names no time"):
+    with pytest.raises(UsageError, match="line 1 has no finite time stamp"):
         open_dataset(recording(tmp_path / "x", depth=f"{stamp} depth/1.png\n"))
 
 

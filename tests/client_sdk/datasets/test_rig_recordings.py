@@ -246,7 +246,7 @@ def test_a_broken_file_of_euroc_is_one_line(tmp_path: Path, file: str, text: str
         ("times.txt", "0.0\nx\n", "no number"),
         ("times.txt", "0.0\nnan\n", "not finite"),
         ("times.txt", "0.2\n0.1\n0.0\n", "2 of 3 time stamps are earlier"),
-        ("poses.txt", "1 2 3\n", "12 numbers in each line"),
+        ("poses.txt", "1 2 3\n", "12 in each line"),
     ],
 )
 def test_a_broken_file_of_kitti_is_one_line(tmp_path: Path, file: str, text: str, says: str) -> None:

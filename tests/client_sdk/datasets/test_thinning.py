@@ -19,7 +19,7 @@ def jittered(seed: int, *, frames: int = 900, jitter: float = 0.2) -> tuple[floa
 
 def played(stamps: tuple[float, ...], rate_hz: float, *, is_known: bool = True) -> list[float]:
     thinning = Thinning(rate_hz, interval_s=median_interval_s(stamps) if is_known else None)
-    return [stamp_s for stamp_s in stamps if thinning.plays(stamp_s)]
+    return [stamp_s for stamp_s in stamps if thinning.selects(stamp_s)]
 
 
 @pytest.mark.parametrize("seed", range(5))
