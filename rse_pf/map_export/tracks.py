@@ -1,7 +1,8 @@
-"""The points that several keyframes of a map see: tracks of matched features, and where each point is.
+"""Find the feature tracks of a map, and triangulate their 3-D points with the poses of the map fixed.
 
-Poses stay as the map has them.  A feature counts for a track while its point is projected near it, so that
-wrong matches leave no track behind; points that one keyframe alone sees are left out.
+A track is the set of features in several keyframes that show the same point.  Features are matched in pairs
+of keyframes, and a feature leaves its track if the point is projected far from it, so that wrong matches
+leave no track.  Points that only one keyframe shows are left out.
 """
 
 from __future__ import annotations
@@ -21,29 +22,31 @@ __all__ = ["Tracks", "find_tracks"]
 
 Rows = npt.NDArray[np.int64]
 
-_NEIGHBOURS = 3
-"""A keyframe is compared with so many that its robot made next, and with those that an edge names."""
+_NEXT_KEYFRAMES = 3
+"""Number of the following keyframes of the same robot with which each keyframe is matched."""
 _OUTLIER_PX = 4.0
-"""An observation farther from the projected point is none; COLMAP filters its own models by as much."""
-_STEPS, _ROUNDS = 3, 2
-_MAX_POINT_M = 1e5
-_NEAREST_M, _FARTHEST_M = 0.05, 200.0
-_NOISE = DepthNoise()
-_GREY = 128
-_COLOUR_M = 0.05
+"""Largest reprojection error in pixels of an observation; COLMAP filters its own models by the same number."""
+_GAUSS_NEWTON_STEPS = 3  # steps in which the points are triangulated, after each removal of outliers
+_OUTLIER_ROUNDS = 2  # number of times that points are triangulated and outliers are removed
+_MAX_POINT_M = 1e5  # largest coordinate in metres of a feature's point in the frame of its camera
+_MIN_DEPTH_M = 0.05  # smallest depth in metres at which a feature's point is used
+_MAX_DEPTH_M = 200.0  # largest depth in metres at which a feature's point is used
+_DEPTH_NOISE = DepthNoise()
+_GREY = 128  # red, green and blue of a point without a coloured point of the cloud nearby
+_COLOUR_VOXEL_M = 0.05  # edge in metres of the voxels in which a point takes the colour of the cloud
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Tracks:
-    """Points and the features that see them; each point is seen by two keyframes or more.
+    """The triangulated points of a map, and their observations in at least two keyframes each.
 
     Attributes:
-        points: ``(n, 3)`` metres, world.
-        colours: ``(n, 3)`` uint8: of the cloud near the point, grey where there is none.
-        point: ``(m,)``, of each observation; in the order of points.
-        keyframe: ``(m,)``, the place of the keyframe in the map.
-        feature: ``(m,)``, the row in the keyframe.
-        error_px: ``(m,)``, between the feature and the projected point.
+        points: ``(n, 3)`` metres, in the world of the map.
+        colours: ``(n, 3)`` uint8, the colour of the map's cloud near the point; grey without cloud.
+        point: ``(m,)``, the row in ``points`` of each observation, ascending.
+        keyframe: ``(m,)``, the index in the map of the keyframe of each observation.
+        feature: ``(m,)``, the row of the feature in its keyframe.
+        error_px: ``(m,)``, the distance between the feature and the projected point.
     """
 
     points: Array
@@ -55,235 +58,292 @@ class Tracks:
 
 
 def find_tracks(version: MapVersion, report: Callable[[float], None] = lambda done: None) -> Tracks:
-    """Return the tracks of a map; deterministic.
+    """Return the tracks of a map; the same map always gives the same tracks.
 
     Args:
-        version: The map.
-        report: Gets how much is done, 0 to 1.
+        version: The map; its poses are not changed.
+        report: Called with the completed share of the matching, 0 to 1.
 
     Raises:
-        MissingExtra: There is no matcher.
+        MissingExtra: The native core, which matches features, is not installed.
     """
-    features = _features_of(version)
-    joined = _Sets(len(features.keyframe))
-    pairs = list(_pairs(version))
+    features = _collect_features(version)
+    # 1. Match pairs of keyframes, and join matched features to sets.
+    sets = _DisjointSets(len(features.keyframe))
+    pairs = list(_keyframe_pairs(version))
     for number, (a, b) in enumerate(pairs):
-        for one, other in ((a, b), (b, a)):
-            rows, columns = _agreeing(version.keyframes[one], version.keyframes[other])
-            joined.join(features.starts[one] + rows, features.starts[other] + columns)
+        for first, second in ((a, b), (b, a)):
+            first_rows, second_rows = _match(version.keyframes[first], version.keyframes[second])
+            sets.join(features.starts[first] + first_rows, features.starts[second] + second_rows)
         report((number + 1) / len(pairs))
-    roots = joined.roots()
+    roots = sets.roots()
+    # 2. Triangulate the point of each set, and remove observations far from its projection.
     row = np.argsort(roots, kind="stable")
-    for _ in range(_ROUNDS):
-        row = _with_others(features, row, roots)
-        point = _numbered(roots[row])
-        points = _solved(version, features, row, point)
-        error_px = _errors(version, features, row, points[point])
-        row = _cleaned(features, row, point, error_px)
-    row = _with_others(features, row, roots)
-    point = _numbered(roots[row])
-    points = _solved(version, features, row, point)
+    for _ in range(_OUTLIER_ROUNDS):
+        row = _keep_observed_twice(features, row, roots)
+        point = _number_runs(roots[row])
+        points = _triangulate(version, features, row, point)
+        error_px = _reprojection_errors(version, features, row, points[point])
+        row = _remove_outliers(features, row, point, error_px)
+    # 3. Triangulate the points that are left.
+    row = _keep_observed_twice(features, row, roots)
+    point = _number_runs(roots[row])
+    points = _triangulate(version, features, row, point)
     return Tracks(
-        points=points, colours=_colours(version, points), point=point, keyframe=features.keyframe[row],
+        points=points,
+        colours=_colours(version, points),
+        point=point,
+        keyframe=features.keyframe[row],
         feature=row - features.starts[features.keyframe[row]],
-        error_px=_errors(version, features, row, points[point]),
-    )  # fmt: skip
+        error_px=_reprojection_errors(version, features, row, points[point]),
+    )
 
 
-def _pairs(version: MapVersion) -> Iterator[tuple[int, int]]:
-    """Yield pairs of places of keyframes: of one robot and near in time, or linked by an edge."""
-    found: dict[tuple[int, int], None] = {}
+def _keyframe_pairs(version: MapVersion) -> Iterator[tuple[int, int]]:
+    """Yield pairs of indices of keyframes: consecutive ones of a robot, and those that an edge connects."""
+    pairs: dict[tuple[int, int], None] = {}
     by_robot: dict[str, list[int]] = {}
-    for place, keyframe in enumerate(version.keyframes):
-        by_robot.setdefault(keyframe.robot, []).append(place)
-    for places in by_robot.values():
-        places.sort(key=lambda place: (version.keyframes[place].timestamp_s, place))
-        for apart in range(1, _NEIGHBOURS + 1):
-            found.update(dict.fromkeys(zip(places, places[apart:], strict=False)))
-    place_of = {keyframe.id: place for place, keyframe in enumerate(version.keyframes)}
+    for index, keyframe in enumerate(version.keyframes):
+        by_robot.setdefault(keyframe.robot, []).append(index)
+    for indices in by_robot.values():
+        indices.sort(key=lambda index: (version.keyframes[index].timestamp_s, index))
+        for distance in range(1, _NEXT_KEYFRAMES + 1):
+            pairs.update(dict.fromkeys(zip(indices, indices[distance:], strict=False)))
+    index_of_id = {keyframe.id: index for index, keyframe in enumerate(version.keyframes)}
     for edge in version.edges:
-        pair = place_of[edge.a], place_of[edge.b]
-        if pair[0] != pair[1] and pair[::-1] not in found:
-            found[pair] = None
-    yield from found
+        pair = index_of_id[edge.a], index_of_id[edge.b]
+        if pair[0] != pair[1] and pair[::-1] not in pairs:
+            pairs[pair] = None
+    yield from pairs
 
 
-def _has_point(keyframe: Keyframe) -> Rows:
-    """Return the rows whose depth a camera may have measured at their pixel."""
+def _rows_with_point(keyframe: Keyframe) -> Rows:
+    """Return the rows of features whose 3-D point is plausible and is projected near their pixel."""
     points = keyframe.points_camera.astype(np.float64)
-    usable = (np.abs(points) <= _MAX_POINT_M).all(axis=1)
-    rows = np.flatnonzero(usable & (points[:, 2] >= _NEAREST_M) & (points[:, 2] <= _FARTHEST_M))
-    apart = keyframe.camera.project(points[rows]) - keyframe.pixels[rows]
-    known: Rows = rows[np.linalg.norm(apart, axis=1) <= _OUTLIER_PX]
-    return known
+    is_usable = (np.abs(points) <= _MAX_POINT_M).all(axis=1)
+    is_usable &= (points[:, 2] >= _MIN_DEPTH_M) & (points[:, 2] <= _MAX_DEPTH_M)
+    rows = np.flatnonzero(is_usable)
+    error = keyframe.camera.project(points[rows]) - keyframe.pixels[rows]
+    near_rows: Rows = rows[np.linalg.norm(error, axis=1) <= _OUTLIER_PX]
+    return near_rows
 
 
-def _agreeing(reference: Keyframe, view: Keyframe) -> tuple[Rows, Rows]:
-    """Return the rows of two keyframes that match, where the point of one is at the pixel of the other."""
-    known = _has_point(reference)
+def _match(reference: Keyframe, view: Keyframe) -> tuple[Rows, Rows]:
+    """Return the rows of *reference* and of *view* that match and agree with the poses of the map.
+
+    The point of the feature in *reference* must be projected near the pixel of the feature in *view*.
+    """
+    known = _rows_with_point(reference)
     options = RelativePoseOptions(max_matches=max(1, len(view.pixels)))
-    rows, columns = match_descriptors(reference.descriptors[known], view.descriptors, options)
-    rows = known[rows]
+    matched, view_rows = match_descriptors(reference.descriptors[known], view.descriptors, options)
+    reference_rows = known[matched]
     T_view_reference = inverse(view.T_world_camera) @ reference.T_world_camera
-    points = transform(T_view_reference, reference.points_camera[rows].astype(np.float64))
-    ahead = points[:, 2] > _NEAREST_M
-    rows, columns, points = rows[ahead], columns[ahead], points[ahead]
-    near = np.linalg.norm(view.camera.project(points) - view.pixels[columns], axis=1) <= _OUTLIER_PX
-    return rows[near], columns[near]
+    points = transform(T_view_reference, reference.points_camera[reference_rows].astype(np.float64))
+    is_ahead = points[:, 2] > _MIN_DEPTH_M
+    reference_rows, view_rows, points = reference_rows[is_ahead], view_rows[is_ahead], points[is_ahead]
+    error = view.camera.project(points) - view.pixels[view_rows]
+    is_near = np.linalg.norm(error, axis=1) <= _OUTLIER_PX
+    return reference_rows[is_near], view_rows[is_near]
 
 
-class _Sets:
-    """Disjoint sets of ``0..n-1``, each known by its least number."""
+class _DisjointSets:
+    """Disjoint sets of the numbers 0..n-1 by union-find; the root of a set is its smallest number."""
 
     def __init__(self, count: int) -> None:
         self._parent = list(range(count))
 
-    def join(self, one: Rows, other: Rows) -> None:
-        for a, b in zip(one.tolist(), other.tolist(), strict=True):
-            first, second = self._root(a), self._root(b)
-            if first != second:
-                self._parent[max(first, second)] = min(first, second)
+    def join(self, first: Rows, second: Rows) -> None:
+        """Join the set of each number of *first* with that of the number at the same position of *second*."""
+        for a, b in zip(first.tolist(), second.tolist(), strict=True):
+            root_a, root_b = self._root(a), self._root(b)
+            if root_a != root_b:
+                self._parent[max(root_a, root_b)] = min(root_a, root_b)
 
     def roots(self) -> Rows:
-        return np.array([self._root(each) for each in range(len(self._parent))], dtype=np.int64)
+        """Return the root of the set of each number, ``(n,)``."""
+        return np.array([self._root(number) for number in range(len(self._parent))], dtype=np.int64)
 
-    def _root(self, each: int) -> int:
+    def _root(self, number: int) -> int:
         parent = self._parent
-        while parent[each] != each:
-            parent[each] = parent[parent[each]]
-            each = parent[each]
-        return each
+        while parent[number] != number:
+            parent[number] = parent[parent[number]]
+            number = parent[number]
+        return number
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Features:
-    """All features of a map; those of keyframe *i* begin at row ``starts[i]``.
+    """All *n* features of a map in one table.
 
-    ``known`` is a feature's own point in the world, ``weight`` its information in 1/m^2, 0 without depth.
+    Attributes:
+        starts: ``(k + 1,)``, the first row of the features of each keyframe, and *n*.
+        keyframe: ``(n,)``, the index of the keyframe of each feature.
+        pixel: ``(n, 2)``, undistorted.
+        measured_point: ``(n, 3)`` metres, the feature's own 3-D point in the world; 0 if unknown.
+        weight: ``(n,)``, the information of this point in 1/m^2; 0 if unknown.
     """
 
     starts: Rows
     keyframe: Rows
     pixel: Array
-    known: Array
+    measured_point: Array
     weight: Array
 
 
-def _features_of(version: MapVersion) -> _Features:
-    counts = [len(each.pixels) for each in version.keyframes]
+def _collect_features(version: MapVersion) -> _Features:
+    counts = [len(keyframe.pixels) for keyframe in version.keyframes]
     starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
-    pixel, known, weight = np.empty((starts[-1], 2)), np.zeros((starts[-1], 3)), np.zeros(starts[-1])
+    n = starts[-1]
+    pixel, measured_point, weight = np.empty((n, 2)), np.zeros((n, 3)), np.zeros(n)
     for start, keyframe in zip(starts, version.keyframes, strict=False):
         pixel[start : start + len(keyframe.pixels)] = keyframe.pixels
-        rows = _has_point(keyframe)
+        rows = _rows_with_point(keyframe)
         points = keyframe.points_camera[rows].astype(np.float64)
-        known[start + rows] = transform(keyframe.T_world_camera, points)
-        weight[start + rows] = 1.0 / _NOISE.variance_m2(points[:, 2])
+        measured_point[start + rows] = transform(keyframe.T_world_camera, points)
+        weight[start + rows] = 1.0 / _DEPTH_NOISE.variance_m2(points[:, 2])
     return _Features(
-        starts=starts, keyframe=np.repeat(np.arange(len(counts)), counts), pixel=pixel, known=known,
+        starts=starts,
+        keyframe=np.repeat(np.arange(len(counts)), counts),
+        pixel=pixel,
+        measured_point=measured_point,
         weight=weight,
-    )  # fmt: skip
+    )
 
 
-def _with_others(features: _Features, row: Rows, roots: Rows) -> Rows:
-    """Return the rows whose point is seen by another one, too, and has a depth in one of them."""
-    of_root = roots[row]
-    seen = np.bincount(of_root, minlength=len(roots))[of_root] > 1
-    return row[seen & (np.bincount(of_root, features.weight[row], len(roots))[of_root] > 0.0)]
+def _keep_observed_twice(features: _Features, row: Rows, roots: Rows) -> Rows:
+    """Return those of the features *row* whose set has at least two features there, one with a depth."""
+    root = roots[row]
+    is_observed_twice = np.bincount(root, minlength=len(roots))[root] > 1
+    has_depth = np.bincount(root, features.weight[row], len(roots))[root] > 0.0
+    return row[is_observed_twice & has_depth]
 
 
-def _numbered(sorted_roots: Rows) -> Rows:
-    """Return 0, 1, ... for each run of equal numbers."""
+def _number_runs(sorted_roots: Rows) -> Rows:
+    """Return 0 for the first run of equal numbers, 1 for the second run, and so on."""
     if not len(sorted_roots):
         return sorted_roots
     return np.concatenate([[0], np.cumsum(sorted_roots[1:] != sorted_roots[:-1])]).astype(np.int64)
 
 
-def _solved(version: MapVersion, features: _Features, row: Rows, point: Rows) -> Array:
-    """Return the ``(n, 3)`` points that fit the pixels, and the depths where there are some.
+def _triangulate(version: MapVersion, features: _Features, row: Rows, point: Rows) -> Array:
+    """Return the points ``(n, 3)`` that fit the pixels, and the depths where they are known.
 
-    Gauss-Newton from the mean of the measured points; a pixel counts with a deviation of one.
+    Gauss-Newton with a Huber loss starts at the weighted mean of the measured points; a pixel has a standard
+    deviation of one pixel.
+
+    Args:
+        version: The map.
+        features: All features of the map.
+        row: ``(m,)``, the observing features.
+        point: ``(m,)``, the number of the point of each observation, ascending.
     """
     count = int(point[-1]) + 1 if len(point) else 0
+    # 1. Average the measured points.
     weight = features.weight[row]
-    total = np.bincount(point, weight, count)
-    known = features.known[row]
-    sums = [np.bincount(point, weight * known[:, axis], count) for axis in range(3)]
-    points: Array = np.stack(sums, axis=1) / total[:, None]
-    for _ in range(_STEPS):
+    total_weight = np.bincount(point, weight, count)
+    measured = features.measured_point[row]
+    sums = [np.bincount(point, weight * measured[:, axis], count) for axis in range(3)]
+    points: Array = np.stack(sums, axis=1) / total_weight[:, None]
+    for _ in range(_GAUSS_NEWTON_STEPS):
+        # 2. Compute residuals and Jacobians of the pixels, with the square roots of the Huber weights.
         residual, jacobian = _residuals(version, features, row, points[point])
-        far = np.linalg.norm(residual, axis=1) / _OUTLIER_PX
-        trust = 1.0 / np.sqrt(np.maximum(far, 1.0))  # Huber
-        residual, jacobian = trust[:, None] * residual, trust[:, None, None] * jacobian
-        normal = np.einsum("mki,mkj->mij", jacobian, jacobian)
-        normal += weight[:, None, None] * np.eye(3)
-        right = weight[:, None] * (known - points[point])
+        relative_error = np.linalg.norm(residual, axis=1) / _OUTLIER_PX
+        root_weight = 1.0 / np.sqrt(np.maximum(relative_error, 1.0))
+        residual, jacobian = root_weight[:, None] * residual, root_weight[:, None, None] * jacobian
+        # 3. Add the normal equations of pixels and measured points.
+        H = np.einsum("mki,mkj->mij", jacobian, jacobian)
+        H += weight[:, None, None] * np.eye(3)
+        right = weight[:, None] * (measured - points[point])
         right += np.einsum("mki,mk->mi", jacobian, residual)
+        # 4. Sum them up for each point, and take a step.
         starts = np.flatnonzero(np.diff(point, prepend=-1))
         if count:
-            left = np.add.reduceat(normal, starts)
+            left = np.add.reduceat(H, starts)
             points = points + np.linalg.solve(left, np.add.reduceat(right, starts)[..., None])[..., 0]
     return points
 
 
 def _residuals(version: MapVersion, features: _Features, row: Rows, points: Array) -> tuple[Array, Array]:
-    """Return the ``(m, 2)`` pixels minus projections, 0 behind the camera, and their ``(m, 2, 3)`` slopes."""
-    T_camera_world = np.array([inverse(each.T_world_camera) for each in version.keyframes]).reshape(-1, 4, 4)
-    lens = np.array([(each.camera.fx, each.camera.fy, each.camera.cx, each.camera.cy)
-                     for each in version.keyframes]).reshape(-1, 4)  # fmt: skip
-    place = features.keyframe[row]
-    rotation = T_camera_world[place, :3, :3]
-    seen = np.einsum("mij,mj->mi", rotation, points) + T_camera_world[place, :3, 3]
-    is_ahead = seen[:, 2] > _NEAREST_M
-    z = np.where(is_ahead, seen[:, 2], 1.0)
-    focal, centre = lens[place, :2], lens[place, 2:]
-    residual = features.pixel[row] - (focal * seen[:, :2] / z[:, None] + centre)
-    slope = np.zeros((len(row), 2, 3))
-    slope[:, 0, 0], slope[:, 1, 1] = focal[:, 0] / z, focal[:, 1] / z
-    slope[:, :, 2] = -focal * seen[:, :2] / (z * z)[:, None]
-    jacobian = np.einsum("mki,mij->mkj", slope, rotation)
+    """Return the pixels minus the projected points ``(m, 2)``, and the Jacobians of the projections.
+
+    The Jacobians ``(m, 2, 3)`` are in pixels per metre.  Residual and Jacobian of a point behind its camera
+    are 0.
+
+    Args:
+        version: The map.
+        features: All features of the map.
+        row: ``(m,)``, the observing features.
+        points: ``(m, 3)``, the point of each observation in the world.
+    """
+    keyframes = version.keyframes
+    T_camera_world = np.array([inverse(k.T_world_camera) for k in keyframes]).reshape(-1, 4, 4)
+    intrinsics = np.array([(k.camera.fx, k.camera.fy, k.camera.cx, k.camera.cy) for k in keyframes])
+    intrinsics = intrinsics.reshape(-1, 4)
+    index = features.keyframe[row]
+    rotation = T_camera_world[index, :3, :3]
+    points_camera = np.einsum("mij,mj->mi", rotation, points) + T_camera_world[index, :3, 3]
+    is_ahead = points_camera[:, 2] > _MIN_DEPTH_M
+    z = np.where(is_ahead, points_camera[:, 2], 1.0)
+    focal, centre = intrinsics[index, :2], intrinsics[index, 2:]
+    residual = features.pixel[row] - (focal * points_camera[:, :2] / z[:, None] + centre)
+    by_point_camera = np.zeros((len(row), 2, 3))
+    by_point_camera[:, 0, 0], by_point_camera[:, 1, 1] = focal[:, 0] / z, focal[:, 1] / z
+    by_point_camera[:, :, 2] = -focal * points_camera[:, :2] / (z * z)[:, None]
+    jacobian = np.einsum("mki,mij->mkj", by_point_camera, rotation)
     residual[~is_ahead], jacobian[~is_ahead] = 0.0, 0.0
     return residual, jacobian
 
 
-def _errors(version: MapVersion, features: _Features, row: Rows, points: Array) -> Array:
+def _reprojection_errors(version: MapVersion, features: _Features, row: Rows, points: Array) -> Array:
+    """Return the reprojection error of each observation in pixels, infinite behind the camera."""
     residual, jacobian = _residuals(version, features, row, points)
     errors: Array = np.linalg.norm(residual, axis=1)
-    errors[~jacobian.any(axis=(1, 2))] = np.inf  # behind the camera
+    errors[~jacobian.any(axis=(1, 2))] = np.inf  # The Jacobian is 0 if the point is behind the camera.
     return errors
 
 
-def _cleaned(features: _Features, row: Rows, point: Rows, error_px: Array) -> Rows:
-    """Return the rows that fit, of each keyframe the best one of a point; in the same order."""
-    place = features.keyframe[row]
-    order = np.lexsort((row, error_px, place, point))
-    same = (np.diff(place[order], prepend=-1) == 0) & (np.diff(point[order], prepend=-1) == 0)
-    kept = order[~same & (error_px[order] <= _OUTLIER_PX)]
-    cleaned: Rows = row[np.sort(kept)]
-    return cleaned
+def _remove_outliers(features: _Features, row: Rows, point: Rows, error_px: Array) -> Rows:
+    """Return the inliers among the observations, only the best one of a point in each keyframe.
+
+    The order of the observations stays.
+    """
+    index = features.keyframe[row]
+    order = np.lexsort((row, error_px, index, point))
+    is_repeated = (np.diff(index[order], prepend=-1) == 0) & (np.diff(point[order], prepend=-1) == 0)
+    inliers = order[~is_repeated & (error_px[order] <= _OUTLIER_PX)]
+    inlier_rows: Rows = row[np.sort(inliers)]
+    return inlier_rows
 
 
 def _colours(version: MapVersion, points: Array) -> npt.NDArray[np.uint8]:
-    """Return the colour of the cloud in the voxel of each point, grey where it has none."""
+    """Return for each of *points* ``(n, 3)`` the colour of a point of the cloud in its voxel, else grey."""
     colours = np.full((len(points), 3), _GREY, dtype=np.uint8)
     if not len(points) or not len(version.points):
         return colours
-    low = points.min(axis=0) - 1.5 * _COLOUR_M
-    sides = np.ceil((points.max(axis=0) - low) / _COLOUR_M) + 2
-    inside = ((version.points >= low) & (version.points < low + sides * _COLOUR_M)).all(axis=1)
-    keys = _voxels(version.points[inside], low, sides)
-    if not len(keys):
+    # 1. Number the voxels around the points, and sort the cloud by them.
+    low = points.min(axis=0) - 1.5 * _COLOUR_VOXEL_M
+    sides = np.ceil((points.max(axis=0) - low) / _COLOUR_VOXEL_M) + 2
+    is_inside = ((version.points >= low) & (version.points < low + sides * _COLOUR_VOXEL_M)).all(axis=1)
+    cloud_voxels = _voxel_numbers(version.points[is_inside], low, sides)
+    if not len(cloud_voxels):
         return colours
-    order = np.argsort(keys, kind="stable")
-    wanted = _voxels(points, low, sides)
-    at = np.minimum(np.searchsorted(keys[order], wanted), len(keys) - 1)
-    found = keys[order[at]] == wanted
-    colours[found] = version.colours[inside][order[at[found]]]
+    order = np.argsort(cloud_voxels, kind="stable")
+    # 2. Look up the voxel of each point by binary search.
+    voxels = _voxel_numbers(points, low, sides)
+    position = np.minimum(np.searchsorted(cloud_voxels[order], voxels), len(cloud_voxels) - 1)
+    has_colour = cloud_voxels[order[position]] == voxels
+    colours[has_colour] = version.colours[is_inside][order[position[has_colour]]]
     return colours
 
 
-def _voxels(points: Array | npt.NDArray[np.float32], low: Array, sides: Array) -> Array:
-    """Return a number for the voxel of each point, exact in float64 while there are fewer than 2**53."""
-    index = np.floor((points - low) / _COLOUR_M)
+def _voxel_numbers(points: Array | npt.NDArray[np.float32], low: Array, sides: Array) -> Array:
+    """Return the number of the voxel of each point; float64 is exact for less than 2**53 voxels.
+
+    Args:
+        points: ``(n, 3)`` metres.
+        low: ``(3,)``, the corner of the first voxel.
+        sides: ``(3,)``, the number of voxels along x, y and z.
+    """
+    index = np.floor((points - low) / _COLOUR_VOXEL_M)
     numbers: Array = (index[:, 0] * sides[1] + index[:, 1]) * sides[2] + index[:, 2]
     return numbers
