@@ -25,7 +25,7 @@ Rows = npt.NDArray[np.int64]
 _NEXT_KEYFRAMES = 3
 """Number of the following keyframes of the same robot with which each keyframe is matched."""
 _OUTLIER_PX = 4.0
-"""Largest reprojection error in pixels of an observation; COLMAP filters its own models by the same number."""
+"""Largest reprojection error in pixels of an observation; COLMAP filters its own models by the same."""
 _GAUSS_NEWTON_STEPS = 3  # steps in which the points are triangulated, after each removal of outliers
 _OUTLIER_ROUNDS = 2  # number of times that points are triangulated and outliers are removed
 _MAX_POINT_M = 1e5  # largest coordinate in metres of a feature's point in the frame of its camera
