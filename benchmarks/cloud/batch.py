@@ -36,7 +36,7 @@ from rse_pf.maps.format import Edge, Keyframe, MapVersion, decode_map, encode_ma
 from rse_pf.object_store import DirectoryStore, digest_of
 from rse_pf.one_thread import ONE_THREAD
 from rse_pf.slam.cloud_deform import deform_cloud
-from rse_pf.slam.links import Atlas, MergeOptions, measure_pairs
+from rse_pf.slam.loop_closures import Atlas, MergeOptions, measure_pairs
 from tests.batch.in_process import InProcessEngine
 
 __all__ = ["kitchen", "noisy_copy"]

@@ -17,7 +17,7 @@ from rse_pf.geometry import Array, inverse, transform
 from rse_pf.slam.cloud_deform import find_observers
 from rse_pf.slam.consistency import LoopClosure
 from rse_pf.slam.icp import IcpOptions, align_clouds
-from rse_pf.slam.links import Atlas
+from rse_pf.slam.loop_closures import Atlas
 from rse_pf.slam.relative_pose import RelativePoseOptions
 
 __all__ = ["TILE_M", "align_tiles"]

@@ -27,7 +27,7 @@ from rse_pf.service import Report
 from rse_pf.services.mapping.place import map_limits
 from rse_pf.slam.cloud_deform import merge_clouds
 from rse_pf.slam.consistency import LoopClosure
-from rse_pf.slam.links import Atlas, LoopProposals, MergeOptions, Refused, maps_of
+from rse_pf.slam.loop_closures import Atlas, LoopProposals, MergeOptions, RejectionCounts, map_pair_of
 from rse_pf.slam.map_merge import MergedMap, MergeSteps, merge_versions
 from rse_pf.slam.optimise import (
     OptimisedGraph,
@@ -255,7 +255,7 @@ class BatchMerge:
     def _proposals(self, atlas: Atlas, results: Sequence[PartResult], owner: Sequence[int]) -> LoopProposals:
         starts = np.searchsorted(atlas.of_map, np.arange(len(self._maps) + 1))
         links: list[LoopClosure] = []
-        failed: Refused = Counter()
+        failed: RejectionCounts = Counter()
         for result, number in zip(results, owner, strict=True):
             pair = self._pairs[number]
             links += [_moved(link, pair, starts) for link in links_of(result)]
@@ -265,10 +265,10 @@ class BatchMerge:
 
     def _select(
         self, atlas: Atlas, proposals: LoopProposals, options: MergeOptions
-    ) -> tuple[list[LoopClosure], Refused]:
+    ) -> tuple[list[LoopClosure], RejectionCounts]:
         groups: dict[tuple[int, int], list[LoopClosure]] = {pair: [] for pair in self._pairs}
         for link in proposals.links:
-            groups[maps_of(atlas, link.a, link.b)].append(link)
+            groups[map_pair_of(atlas, link.a, link.b)].append(link)
         wanted = [number for number, pair in enumerate(self._pairs) if groups[pair]]
         results = self._run([self._agreeing[number] for number in wanted])
         accepted: list[LoopClosure] = []
@@ -284,7 +284,7 @@ class BatchMerge:
     def _align(self, atlas: Atlas, placed: Array, links: Sequence[LoopClosure]) -> list[LoopClosure]:
         if not self._align_clouds:
             return []
-        linked = sorted({maps_of(atlas, link.a, link.b) for link in links})
+        linked = sorted({map_pair_of(atlas, link.a, link.b) for link in links})
         starts = np.searchsorted(atlas.of_map, np.arange(len(self._maps) + 1))
         T_world_map = [placed[row] @ inverse(atlas.T_world_camera[row]) for row in starts[:-1]]
         parts, pairs = [], []
@@ -358,17 +358,19 @@ class BatchMerge:
         return merge_clouds(clouds, [versions[which].colours for which in joined])
 
 
-def strongest(atlas: Atlas, links: Sequence[LoopClosure], most: int) -> tuple[list[LoopClosure], Refused]:
+def strongest(
+    atlas: Atlas, links: Sequence[LoopClosure], most: int
+) -> tuple[list[LoopClosure], RejectionCounts]:
     """Return at most about *most* of *links*: of each pair of maps the best of its keyframes, in their order.
 
     Every pair keeps the same number, or all that it has, so that no map loses its connection.
     """
-    refused: Refused = Counter()
+    refused: RejectionCounts = Counter()
     if len(links) <= most:
         return list(links), refused
     groups: dict[tuple[int, int], list[int]] = {}
     for row, link in enumerate(links):
-        groups.setdefault(maps_of(atlas, link.a, link.b), []).append(row)
+        groups.setdefault(map_pair_of(atlas, link.a, link.b), []).append(row)
     share = max(1, most // len(groups))
     kept: list[int] = []
     for pair, rows in groups.items():

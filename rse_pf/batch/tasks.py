@@ -22,13 +22,13 @@ from rse_pf.object_store import ObjectStore
 from rse_pf.services.mapping.place import map_limits
 from rse_pf.slam.cloud_deform import deform_cloud
 from rse_pf.slam.consistency import LoopClosure
-from rse_pf.slam.links import (
+from rse_pf.slam.loop_closures import (
     Atlas,
     MergeOptions,
-    Refused,
-    agreeing_links,
-    candidate_pairs,
+    RejectionCounts,
+    choose_candidate_pairs,
     measure_pairs,
+    select_consistent,
 )
 from rse_pf.slam.optimise import OptimiseOptions, optimise_graph
 from rse_pf.slam.place_recognition import PLACE_VECTOR_SIZE, PlaceIndex, place_vector
@@ -126,7 +126,7 @@ def _pairs(store: ObjectStore, part: Part) -> PartResult:
     vectors = [read_result(store, name).arrays["vectors"] for name in part.inputs]
     of_map = np.concatenate([np.full(len(each), which) for which, each in enumerate(vectors)])
     stacked = np.concatenate(vectors)
-    pairs = candidate_pairs(
+    pairs = choose_candidate_pairs(
         PlaceIndex.from_vectors(stacked),
         of_map,
         np.arange(len(stacked)),
@@ -151,7 +151,7 @@ def _agree(store: ObjectStore, part: Part) -> PartResult:
     atlas = _atlas(store, part, maps)
     links = [link for name in part.inputs[maps:] for link in links_of(read_result(store, name))]
     tried = strongest_rows(links, part.arguments["most"])
-    rows, refused = agreeing_links(
+    rows, refused = select_consistent(
         (0, maps - 1), [links[row] for row in tried], atlas.T_world_camera, atlas.order, _options(part)
     )
     counts = {**_by_reason(refused), "surplus": len(links) - len(tried)}
@@ -219,7 +219,7 @@ def _options(part: Part) -> MergeOptions:
     return msgspec.convert(part.arguments["options"], MergeOptions)
 
 
-def _by_reason(refused: Refused) -> dict[str, int]:
+def _by_reason(refused: RejectionCounts) -> dict[str, int]:
     counts: Counter[str] = Counter()
     for (_, _, reason), count in refused.items():
         counts[reason] += count

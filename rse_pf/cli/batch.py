@@ -104,7 +104,7 @@ def _merge(args: argparse.Namespace, settings: PlatformSettings) -> int:
     from rse_pf.batch.cluster import Cluster, DaskEngine, LocalCluster, RemoteCluster
     from rse_pf.batch.merge import BatchMerge
     from rse_pf.services.mapping.merge import reply_of
-    from rse_pf.slam.links import MergeOptions
+    from rse_pf.slam.loop_closures import MergeOptions
 
     if args.scheduler is not None and args.workers is not None:
         raise UsageError(

@@ -1,688 +1,689 @@
-"""The state of a live map: keyframes, segments of odometry, links, and how they are connected.
+"""The pose graph of a live map: keyframes, segments of odometry, and loop closures between them.
 
-Explicit numbers only, in the order of the events: the same events, or a snapshot and the events after it,
-give the same bytes.  Nothing here decides; `agreement` and `live_map` do.
+Vertices are the poses of keyframes.  Edges are the odometry between consecutive keyframes of a segment, and
+accepted loop closures.  A *segment* holds the keyframes that one robot made in one odometry frame.  Segments
+that accepted loop closures connect form a *component*, which has one frame and one unit of length.
+
+`MapGraph` owns all tables and keeps them consistent; other modules of this package read them, and change them
+through its methods only.  Nothing here decides which loop closures are right: `outlier_rejection` does.
+All numbers depend on the order of the events only, so that a replay gives equal bytes.
 """
 
 from __future__ import annotations
 
 import heapq
-import math
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
-from typing import Literal
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import pairwise
 
-import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from rse_pf.errors import BadRequest, message_of
-from rse_pf.geometry import Array, scaled
-from rse_pf.slam.consistency import StrongLink
+from rse_pf.geometry import Array, inverse, rotation_angle_deg, scaled
+from rse_pf.live_map.graph_rows import NO_LOOP_CLOSURE_YET, LiveKeyframe, LoopEdge, Segment
 
-__all__ = ["Graph", "LiveKeyframe", "LiveLink", "Segment", "variances_of"]
+__all__ = ["MapGraph", "count_odometry_steps"]
 
-LinkState = Literal["open", "believed", "removed"]
-
-_VERSION = 2
-_MAX_WALK = 200.0
-"""Steps of odometry beyond which two keyframes tell nothing about each other."""
-_MAX_VISITED = 250
-_MAX_REMOVED = 2000
-_SCALES, _OBJECTS = "scales", "objects"
-_MAX_GONE = 10_000
-_CARRIED = 0xFFFF
-"""Contradictions of the newest 16 keyframes count in the robot's next segment, too."""
-
-
-_FLOOR: Array = np.diag([0.02**2] * 3 + [math.radians(0.7) ** 2] * 3)
-"""Covariance of a relative pose at least: errors of depth and calibration are correlated."""
+STEP_LENGTH_M = 0.25  # metres of motion that are one step of odometry, for which its drift is stated
+STEP_ROTATION_DEG = 15.0  # degrees of rotation that are one step of odometry, for which its drift is stated
+MIN_STEP = 0.05  # steps of odometry of any motion, at least, so that a stationary robot has some variance
+MAX_PATH_STEPS = 200.0
+"""Steps of odometry that a path between two keyframes counts at most; the drift of longer paths makes every
+test of consistency pass."""
+MAX_VISITED_KEYFRAMES = 250  # keyframes that a search for shortest paths visits, to bound its CPU time
+MAX_REJECTED_EDGES = 2000  # rejected loop closures that are kept, to decide again after a robot is forgotten
+MAX_ORPHANED_OBJECTS = 10_000  # objects of forgotten robots that are remembered until they are deleted
+CONTRADICTION_HISTORY = 0xFFFFFFFF  # bit mask: the newest 32 keyframes with evidence decide about a robot
+INHERITED_CONTRADICTIONS = 0xFFFF
+"""Bit mask: the contradictions of a robot's newest 16 keyframes count in its next segment, so that a hostile
+robot does not start without a record by opening a segment."""
 
 
-@dataclass(slots=True, eq=False)
-class LiveKeyframe:
-    """The row of a keyframe; ``data`` are its bytes, None when it was culled or forgotten.
-
-    ``objects`` are the digests of what the robot stored beside it, also of a culled one.
-    """
-
-    robot: str
-    segment: int
-    number: int
-    timestamp_s: float
-    data: bytes | None
-    objects: tuple[str, ...] = ()
-
-
-@dataclass(slots=True, eq=False)
-class Segment:
-    """Keyframes of one robot in one odometry frame, by id, oldest first.
-
-    ``told`` is the alignment that was last told, None while it has none; ``reason`` says why.
-    """
-
-    robot: str
-    segment: int
-    keyframes: list[int] = field(default_factory=list)
-    component: int = 0
-    told: Array | None = None
-    covariance: Array = field(default_factory=lambda: _FLOOR.copy())
-    reason: str = "no loop closure between its keyframes and the map is accepted yet"
-    version: bool = False
-    """Whether these are keyframes of the version that the map started from."""
-    contradictions: int = 0
-    """A bit for each of the last 32 keyframes with links within the component: whether all contradict it."""
-    disbelieved: bool = False
-    """Whether its links are no longer taken, since it kept contradicting itself."""
-    is_metric: bool = True
-    """Whether its odometry and its depths are in metres."""
-    scale: float = 1.0
-    """How long its unit is in that of its component: in metres where that is metric."""
-    told_scale: float = 1.0
-    """The scale that was last told with ``told``."""
-
-
-@dataclass(slots=True, eq=False)
-class LiveLink:
-    """A measured relative pose of keyframes ``a`` and ``b``; ``a`` is the one that was measured.
-
-    ``variances`` ``(6,)`` are of the twist (square metres, square radians); ``doubts`` counts the updates in
-    a row in which the link contradicted the graph.  ``scale`` is the logarithm, with its variance, of how
-    long the unit of *b* is in that of *a*, None between two in metres; lengths are metres if one of the two
-    is, else in the unit of *a*.
-    """
-
-    a: int
-    b: int
-    T_a_b: Array
-    information: Array
-    inliers: int
-    matches: int
-    variances: Array
-    fixed: bool = False
-    state: LinkState = "open"
-    doubts: int = 0
-    scale: tuple[float, float] | None = None
-
-    def weight(self, strong: StrongLink) -> float:
-        """Return how much the link counts, within 0..1; those of a version count whole."""
-        return 1.0 if self.fixed else strong.weight_of(self.inliers, self.matches)
-
-
-class Graph:
-    """All that a live map knows; `encode` and `decode` are a snapshot's content.
+class MapGraph:
+    """The pose graph of a live map, and the only writer of its tables.
 
     Attributes:
-        keyframes: By id.
-        T: ``(n, 4, 4)``, pose of each keyframe in the frame of its component; `T_odom` that of its odometry.
-        way: ``(n,)``, steps of odometry from the begin of its segment.
-        of_segment: ``(n,)``, row of its segment, -1 when it was forgotten.
-        held: ``(n,)``, whether its bytes are kept.
-        links: By number, in the order in which they were measured; `open` are those not believed.
-        equal_rooms_m: What joins robots must lie farther apart than this.
-        removed: The newest links that were taken out, by number: who refuted them may be forgotten.
-        smoothing: By robot, how many keyframes were smoothed because of it beyond what its own ones allow.
-        lookalikes: Keyframes at places of which the map knows another one that looks the same.
-        gone_objects: Robot and digest of the newest objects whose robot was forgotten.
+        keyframes: All keyframes by id.  The id of a keyframe is its position in order of arrival.
+        segments: All segments by row; a segment is never removed, but may have no keyframes any more.
+        edges: Pending and accepted loop closures by number, in the order in which they were measured.
+        pending: Numbers of the pending loop closures, oldest first.
+        rejected: The newest rejected loop closures by number; they are decided again when a robot whose
+            evidence rejected them may be forgotten.
+        pair_consistency: Whether two pending loop closures agree, by their numbers, the lower first.
+        next_edge: Number of the next loop closure.
+        root: Row of the segment whose first keyframe defines the frame of the map, -1 while there is none.
+        events: Number of events that were applied.
+        next_numbers: Number that the next keyframe of each robot must have.
+        newest_segments: Row of the newest segment of each robot that has not left.
+        optimised_at: Number of keyframes when an optimisation of the whole graph was last requested.
+        smoothing_debt: By robot, the keyframes that were smoothed because of it beyond its allowance.
+        aliased_keyframes: Keyframes at places that look like another place of the map (perceptual aliases).
+        source: Name of the version that the map started from, empty if it started from none.
+        equal_rooms_m: Metres: size of rooms that look the same, 0 if every place looks unique.
+        orphaned_objects: (robot, digest) of the newest objects whose robot was forgotten.
     """
 
     def __init__(self) -> None:
         self.keyframes: list[LiveKeyframe] = []
         self.segments: list[Segment] = []
-        self.links: dict[int, LiveLink] = {}
-        self.open: list[int] = []
-        self.removed: dict[int, LiveLink] = {}
-        self.agreements: dict[tuple[int, int], bool] = {}
-        self.next_link = 0
+        self.edges: dict[int, LoopEdge] = {}
+        self.pending: list[int] = []
+        self.rejected: dict[int, LoopEdge] = {}
+        self.pair_consistency: dict[tuple[int, int], bool] = {}
+        self.next_edge = 0
         self.root = -1
         self.events = 0
         self.next_numbers: dict[str, int] = {}
-        self.newest: dict[str, int] = {}
-        self.left: list[str] = []
+        self.newest_segments: dict[str, int] = {}
         self.optimised_at = 0
-        self.smoothing: dict[str, int] = {}
-        self.lookalikes: set[int] = set()
+        self.smoothing_debt: dict[str, int] = {}
+        self.aliased_keyframes: set[int] = set()
         self.source = ""
         self.equal_rooms_m = 0.0
-        self.gone_objects: list[tuple[str, str]] = []
-        self._links_of: dict[int, list[int]] = {}
+        self.orphaned_objects: list[tuple[str, str]] = []
+        self._accepted_of: dict[int, list[int]] = {}
         self._size = 0
-        self._T = np.empty((64, 4, 4))
-        self._T_odom = np.empty((64, 4, 4))
-        self._way = np.empty(64)
-        self._of_segment = np.empty(64, dtype=np.int64)
-        self._place = np.empty(64, dtype=np.int64)
-        self._held = np.empty(64, dtype=np.bool_)
+        self._T_component_camera = np.empty((64, 4, 4))
+        self._T_odom_camera = np.empty((64, 4, 4))
+        self._odometry_steps = np.empty(64)
+        self._segment_rows = np.empty(64, dtype=np.int64)
+        self._positions = np.empty(64, dtype=np.int64)
+        self._has_features = np.empty(64, dtype=np.bool_)
 
     def __len__(self) -> int:
         return self._size
 
-    @property
-    def T(self) -> Array:
-        """``(n, 4, 4)``, pose of each keyframe in the frame of its component."""
-        return self._T[: self._size]
+    # --- Tables with a row for each keyframe ---
 
     @property
-    def T_odom(self) -> Array:
-        """``(n, 4, 4)``, pose of each keyframe in the frame of its odometry."""
-        return self._T_odom[: self._size]
+    def T_component_camera(self) -> Array:
+        """``(n, 4, 4)``: pose of each keyframe in the frame and unit of its component."""
+        return self._T_component_camera[: self._size]
 
     @property
-    def way(self) -> Array:
-        """``(n,)``, steps of odometry from the begin of the segment."""
-        return self._way[: self._size]
+    def T_odom_camera(self) -> Array:
+        """``(n, 4, 4)``: pose of each keyframe in its odometry frame, in the unit of its segment."""
+        return self._T_odom_camera[: self._size]
 
     @property
-    def of_segment(self) -> npt.NDArray[np.int64]:
-        """``(n,)``, row of the segment; -1 when the keyframe was forgotten."""
-        return self._of_segment[: self._size]
+    def odometry_steps(self) -> Array:
+        """``(n,)``: steps of odometry from the first keyframe of the segment to each keyframe."""
+        return self._odometry_steps[: self._size]
 
     @property
-    def held(self) -> npt.NDArray[np.bool_]:
-        """``(n,)``, whether the features are kept."""
-        return self._held[: self._size]
+    def segment_rows(self) -> npt.NDArray[np.int64]:
+        """``(n,)``: row of the segment of each keyframe, -1 after its robot was forgotten."""
+        return self._segment_rows[: self._size]
 
-    def is_metric(self, component: int) -> bool:
-        """Return whether the lengths of a component are metres: a segment of it has some."""
-        return any(
-            each.component == component and each.is_metric and each.keyframes for each in self.segments
-        )
+    @property
+    def positions(self) -> npt.NDArray[np.int64]:
+        """``(n,)``: position of each keyframe within its segment, from 0."""
+        return self._positions[: self._size]
+
+    @property
+    def has_features(self) -> npt.NDArray[np.bool_]:
+        """``(n,)``: whether the encoded features of each keyframe are kept, so that others can match them."""
+        return self._has_features[: self._size]
+
+    # --- Queries ---
+
+    def exists(self, i: int) -> bool:
+        """Return whether keyframe *i* was added and its robot was not forgotten."""
+        return 0 <= i < self._size and bool(self._segment_rows[i] >= 0)
 
     def segment_of(self, i: int) -> Segment:
-        """Return the segment of keyframe *i*, which is not forgotten."""
-        return self.segments[int(self._of_segment[i])]
-
-    def unit_of(self, link: LiveLink) -> int:
-        """Return the row of the segment in whose unit a link is, -1 if it is in metres."""
-        a, b = self.segment_of(link.a), self.segment_of(link.b)
-        return -1 if a.is_metric or b.is_metric else int(self._of_segment[link.a])
-
-    def step_of(self, link: LiveLink) -> Array:
-        """Return ``T_a_b`` of a link within one component, in the unit of that."""
-        row = self.unit_of(link)
-        return link.T_a_b if row < 0 else scaled(link.T_a_b, self.segments[row].scale)
-
-    def odometry(self, ids: Sequence[int]) -> Array:
-        """Return ``(n, 4, 4)`` poses in the frames of their odometry, in the unit of the component."""
-        T = self.T_odom[np.asarray(ids, dtype=np.int64)]
-        return scaled(T, np.array([self.segment_of(i).scale for i in ids])) if self.has_scales else T
-
-    @property
-    def has_scales(self) -> bool:
-        """Whether the unit of a segment is unknown."""
-        return not all(each.is_metric for each in self.segments)
-
-    def add(self, keyframe: LiveKeyframe, row: int, T_odom: Array, T: Array, way: float) -> int:
-        """Append a keyframe to segment *row*; return its id."""
-        if self._size == len(self._way):
-            for name in ("_T", "_T_odom", "_way", "_of_segment", "_place", "_held"):
-                old = getattr(self, name)
-                new = np.empty((2 * len(old), *old.shape[1:]), dtype=old.dtype)
-                new[: self._size] = old[: self._size]
-                setattr(self, name, new)
-        i = self._size
-        self._size += 1
-        self.keyframes.append(keyframe)
-        self._T[i], self._T_odom[i], self._way[i] = T, T_odom, way
-        self._of_segment[i], self._place[i], self._held[i] = row, len(self.segments[row].keyframes), True
-        self.segments[row].keyframes.append(i)
-        return i
-
-    def drop_data(self, i: int) -> None:
-        """Forget what keyframe *i* saw; its pose and its links stay."""
-        self.keyframes[i].data = None
-        self._held[i] = False
-
-    def set_data(self, i: int, data: bytes) -> None:
-        """Give keyframe *i* of a snapshot its bytes."""
-        self.keyframes[i].data = data
-        self._held[i] = True
-
-    def add_link(self, link: LiveLink) -> int:
-        """Keep *link*; return its number."""
-        number = self.next_link
-        self.next_link += 1
-        self.links[number] = link
-        if link.state == "believed":
-            self._connect(number, link)
-        else:
-            self.open.append(number)
-        return number
-
-    def believe(self, number: int) -> None:
-        """Let an open link hold poses together."""
-        link = self.links[number]
-        link.state, link.doubts = "believed", 0
-        self.open.remove(number)
-        self._connect(number, link)
-
-    def remove_link(self, number: int) -> None:
-        """Take a link out, believed or not; the newest of those taken out are kept for `reopen`."""
-        link = self.links.pop(number)
-        if link.state == "believed":
-            self._links_of[link.a].remove(number)
-            self._links_of[link.b].remove(number)
-        else:
-            self.open.remove(number)
-        link.state = "removed"
-        self.removed[number] = link
-        if len(self.removed) > _MAX_REMOVED:
-            del self.removed[next(iter(self.removed))]
-
-    def drop_oldest_open(self, most: int) -> None:
-        """Take out the oldest links that are not believed, beyond the newest *most*."""
-        surplus = len(self.open) - most
-        if surplus > 0:
-            for number in self.open[:surplus]:
-                self.remove_link(number)
-            self.forget_agreements()
-
-    def find_segment(self, robot: str, number: int) -> Segment | None:
-        """Return a robot's segment, None if there is none or nothing is left of it."""
-        for each in self.segments:
-            if (each.robot, each.segment) == (robot, number) and not each.version and each.keyframes:
-                return each
-        return None
-
-    def segment_row(self, robot: str, number: int) -> int:
-        """Return the row of a robot's segment; it begins if there is none."""
-        newest = self.newest.get(robot)
-        for row in range(len(self.segments)) if newest is None else (newest,):
-            segment = self.segments[row]
-            if (segment.robot, segment.segment) == (robot, number) and not segment.version:
-                return row
-        row = len(self.segments)
-        segment = Segment(robot=robot, segment=number, component=row)
-        own = [each for each in self.segments if each.robot == robot and not each.version]
-        if own:
-            segment.contradictions = own[-1].contradictions & _CARRIED
-        self.segments.append(segment)
-        return row
-
-    def reopen(self) -> None:
-        """Take all that was believed of links that are not believed back: each has to be judged again."""
-        for number, link in self.removed.items():
-            link.state, link.doubts = "open", 0
-            self.links[number] = link
-        self.open = sorted([*self.open, *self.removed])
-        self.removed = {}
-        self.lookalikes = set()
-        self.agreements = {}
-
-    def forget(self, robot: str) -> list[int]:
-        """Take out the keyframes of *robot* with their links; return their ids."""
-        gone = [
-            i
-            for segment in self.segments
-            if segment.robot == robot and not segment.version
-            for i in segment.keyframes
-        ]
-        members = set(gone)
-        for number in [n for n, link in self.links.items() if link.a in members or link.b in members]:
-            self.remove_link(number)
-        self.removed = {
-            number: link for number, link in self.removed.items()
-            if link.a not in members and link.b not in members
-        }  # fmt: skip
-        for segment in self.segments:
-            if segment.robot == robot and not segment.version:
-                segment.keyframes = []
-                segment.told = None
-                segment.contradictions, segment.disbelieved = 0, False
-        self.smoothing.pop(robot, None)
-        for i in gone:
-            self.drop_data(i)
-            self.gone_objects += [(robot, digest) for digest in self.keyframes[i].objects]
-            self.keyframes[i].objects = ()
-            self._of_segment[i] = -1
-        self.gone_objects = self.gone_objects[-_MAX_GONE:]
-        return gone
-
-    def disbelieve(self, row: int) -> None:
-        """Take out the links of segment *row* for good; its keyframes stay."""
-        self.segments[row].disbelieved = True
-        for number in [number for number, link in self.links.items() if self._is_at(row, link)]:
-            self.remove_link(number)
-        self.removed = {number: link for number, link in self.removed.items() if not self._is_at(row, link)}
-        if self.root == row:
-            component = self.segments[row].component
-            beside = (
-                other for other, each in enumerate(self.segments)
-                if other != row and each.component == component and each.keyframes and each.is_metric
-            )  # fmt: skip
-            self.root = next(beside, row)
-        self.connect()
-
-    def _is_at(self, row: int, link: LiveLink) -> bool:
-        return bool(self._of_segment[link.a] == row or self._of_segment[link.b] == row)
-
-    def anchor(self, row: int) -> int:
-        """Return the keyframe that defines the frame of a segment's component, -1 if it is gone."""
-        root = self.segments[self.root].component if self.root >= 0 else -1
-        component = self.segments[row].component
-        ids = self.segments[self.root if component == root else component].keyframes
-        return ids[0] if ids else -1
-
-    def anchors(self) -> set[int]:
-        """Return the keyframes that define the frames of all components."""
-        return {self.anchor(row) for row in range(len(self.segments))}
-
-    def forget_agreements(self) -> None:
-        """Drop what is known of links that are no longer open."""
-        still = set(self.open)
-        self.agreements = {
-            pair: agrees for pair, agrees in self.agreements.items() if pair[0] in still and pair[1] in still
-        }
-
-    def links_at(self, i: int) -> list[int]:
-        """Return the numbers of the believed links of keyframe *i*."""
-        return self._links_of.get(i, [])
-
-    def neighbours(self, i: int) -> Iterator[tuple[int, float]]:
-        """Yield the keyframes that odometry or a believed link connects with *i*, and how far they are.
-
-        A link counts as one step.
-        """
-        row = self._of_segment[i]
-        segment = self.segments[row]
-        if not segment.version:
-            place = int(self._place[i])
-            for near in (place - 1, place + 1):
-                if 0 <= near < len(segment.keyframes):
-                    other = segment.keyframes[near]
-                    yield other, abs(float(self._way[other] - self._way[i]))
-        for number in self._links_of.get(i, []):
-            link = self.links[number]
-            yield (link.b if link.a == i else link.a), 1.0
-
-    def steps_at(self, i: int) -> list[tuple[int, int]]:
-        """Return the pairs of consecutive keyframes of odometry that *i* belongs to."""
-        segment = self.segments[self._of_segment[i]]
-        if segment.version:
-            return []
-        place, ids = int(self._place[i]), segment.keyframes
-        return [(ids[near], ids[near + 1]) for near in (place - 1, place) if 0 <= near < len(ids) - 1]
-
-    def next_in_segment(self, i: int) -> int:
-        """Return the keyframe after *i* in its segment, -1 if it is the last."""
-        ids, place = self.segments[self._of_segment[i]].keyframes, int(self._place[i])
-        return int(ids[place + 1]) if place + 1 < len(ids) else -1
-
-    def walks(self, start: int, targets: Iterable[int]) -> dict[int, float]:
-        """Return how many steps of odometry each target is away from *start*, along the shortest path.
-
-        The search is bounded; a target beyond it is as far as the farthest that was seen, or farther.
-        """
-        wanted = set(targets)
-        found: dict[int, float] = {}
-        done: set[int] = set()
-        heap = [(0.0, start)]
-        far = 0.0
-        while heap and len(found) < len(wanted) and len(done) < _MAX_VISITED:
-            far, i = heapq.heappop(heap)
-            if i in done:
-                continue
-            done.add(i)
-            if i in wanted:
-                found[i] = far
-            for other, length in self.neighbours(i):
-                if other not in done:
-                    heapq.heappush(heap, (far + length, other))
-        for i in wanted - found.keys():
-            apart = abs(float(self._way[i] - self._way[start]))
-            is_one = self._of_segment[i] == self._of_segment[start]
-            found[i] = min(apart, _MAX_WALK) if is_one else max(far, _MAX_WALK)
-        return found
+        """Return the segment of keyframe *i*, whose robot was not forgotten."""
+        return self.segments[int(self._segment_rows[i])]
 
     def component_of(self, i: int) -> int:
         """Return the component of keyframe *i*: the row of its first segment."""
-        return self.segments[int(self._of_segment[i])].component
+        return self.segments[int(self._segment_rows[i])].component
 
-    def connect(self) -> None:
-        """Compute the components anew: of segments, connected by believed links."""
-        root = list(range(len(self.segments)))
+    def find_segment(self, robot: str, number: int) -> Segment | None:
+        """Return segment *number* of a robot, None if there is none or it has no keyframes left."""
+        for segment in self.segments:
+            is_same = (segment.robot, segment.number) == (robot, number)
+            if is_same and not segment.is_from_version and segment.keyframes:
+                return segment
+        return None
 
-        def find(row: int) -> int:
-            while root[row] != row:
-                root[row] = root[root[row]]
-                row = root[row]
+    def segment_pair_of(self, edge: LoopEdge) -> tuple[int, int]:
+        """Return the rows of the segments of both ends of a loop closure, the lower row first."""
+        row_a, row_b = int(self._segment_rows[edge.a]), int(self._segment_rows[edge.b])
+        return min(row_a, row_b), max(row_a, row_b)
+
+    def root_component(self) -> int:
+        """Return the component that the map consists of, -1 while no segment defines its frame."""
+        return self.segments[self.root].component if self.root >= 0 else -1
+
+    def is_aligned(self, row: int) -> bool:
+        """Return whether segment *row* is connected with the frame of the map."""
+        return self.root >= 0 and self.segments[row].component == self.segments[self.root].component
+
+    def is_metric(self, component: int) -> bool:
+        """Return whether the unit of a component is a metre: one of its segments is metric."""
+        return any(
+            segment.component == component and segment.is_metric and segment.keyframes
+            for segment in self.segments
+        )
+
+    @property
+    def has_scales(self) -> bool:
+        """Whether a segment has no metric scale of its own, so that scales must be estimated."""
+        return not all(segment.is_metric for segment in self.segments)
+
+    def unit_segment_of(self, edge: LoopEdge) -> int:
+        """Return the row of the segment in whose unit a loop closure is, -1 if it is in metres."""
+        is_metric = self.segment_of(edge.a).is_metric or self.segment_of(edge.b).is_metric
+        return -1 if is_metric else int(self._segment_rows[edge.a])
+
+    def relative_pose_of(self, edge: LoopEdge) -> Array:
+        """Return ``T_a_b`` of a loop closure within one component, in the unit of the component."""
+        row = self.unit_segment_of(edge)
+        return edge.T_a_b if row < 0 else scaled(edge.T_a_b, self.segments[row].scale)
+
+    def odometry_poses(self, ids: Sequence[int]) -> Array:
+        """Return ``(n, 4, 4)`` poses of keyframes in their odometry frames, in the unit of the component."""
+        T = self.T_odom_camera[np.asarray(ids, dtype=np.int64)]
+        return scaled(T, np.array([self.segment_of(i).scale for i in ids])) if self.has_scales else T
+
+    def anchor(self, row: int) -> int:
+        """Return the keyframe that defines the frame of the component of segment *row*, -1 if it is gone."""
+        component = self.segments[row].component
+        ids = self.segments[self.root if component == self.root_component() else component].keyframes
+        return ids[0] if ids else -1
+
+    def anchors(self) -> set[int]:
+        """Return the keyframes that define the frames of all components; they are never moved."""
+        return {self.anchor(row) for row in range(len(self.segments))}
+
+    def accepted_edges_of(self, i: int) -> list[int]:
+        """Return the numbers of the accepted loop closures of keyframe *i*."""
+        return self._accepted_of.get(i, [])
+
+    def accepted_edges_by_segments(self) -> dict[tuple[int, int], list[int]]:
+        """Return the numbers of accepted loop closures by the rows of the two segments they connect."""
+        by_segments: dict[tuple[int, int], list[int]] = {}
+        for number, edge in self.edges.items():
+            if edge.state == "accepted":
+                by_segments.setdefault(self.segment_pair_of(edge), []).append(number)
+        return by_segments
+
+    def neighbours(self, i: int) -> Iterator[tuple[int, float]]:
+        """Yield (keyframe, steps) of each keyframe that odometry or an accepted edge connects with *i*.
+
+        A loop closure counts as one step.
+        """
+        segment = self.segments[self._segment_rows[i]]
+        if not segment.is_from_version:
+            position = int(self._positions[i])
+            for near in (position - 1, position + 1):
+                if 0 <= near < len(segment.keyframes):
+                    other = segment.keyframes[near]
+                    yield other, abs(float(self._odometry_steps[other] - self._odometry_steps[i]))
+        for number in self._accepted_of.get(i, []):
+            edge = self.edges[number]
+            yield (edge.b if edge.a == i else edge.a), 1.0
+
+    def odometry_edges_of(self, i: int) -> list[tuple[int, int]]:
+        """Return the pairs of consecutive keyframes of a segment that keyframe *i* belongs to."""
+        segment = self.segments[self._segment_rows[i]]
+        if segment.is_from_version:
+            return []
+        position, ids = int(self._positions[i]), segment.keyframes
+        return [
+            (ids[first], ids[first + 1]) for first in (position - 1, position) if 0 <= first < len(ids) - 1
+        ]
+
+    def next_in_segment(self, i: int) -> int:
+        """Return the keyframe after *i* in its segment, -1 if *i* is the last one."""
+        ids, position = self.segments[self._segment_rows[i]].keyframes, int(self._positions[i])
+        return int(ids[position + 1]) if position + 1 < len(ids) else -1
+
+    def shortest_paths(self, start: int, targets: Iterable[int]) -> dict[int, float]:
+        """Return the steps of odometry from keyframe *start* to each target along the shortest path.
+
+        The search (Dijkstra) visits 250 keyframes at most.  A target that it does not reach counts the steps
+        along the segment, at most 200, if it is in the segment of *start*; else at least 200.
+        """
+        wanted = set(targets)
+        steps: dict[int, float] = {}
+        visited: set[int] = set()
+        heap = [(0.0, start)]
+        farthest = 0.0
+        while heap and len(steps) < len(wanted) and len(visited) < MAX_VISITED_KEYFRAMES:
+            farthest, i = heapq.heappop(heap)
+            if i in visited:
+                continue
+            visited.add(i)
+            if i in wanted:
+                steps[i] = farthest
+            for neighbour, length in self.neighbours(i):
+                if neighbour not in visited:
+                    heapq.heappush(heap, (farthest + length, neighbour))
+        for i in wanted - steps.keys():
+            along_segment = abs(float(self._odometry_steps[i] - self._odometry_steps[start]))
+            is_same_segment = self._segment_rows[i] == self._segment_rows[start]
+            steps[i] = (
+                min(along_segment, MAX_PATH_STEPS) if is_same_segment else max(farthest, MAX_PATH_STEPS)
+            )
+        return steps
+
+    # --- Changes of keyframes and segments ---
+
+    def count_event(self) -> None:
+        """Count an event that was applied."""
+        self.events += 1
+
+    def start_from_version(self, source: str, equal_rooms_m: float, *, has_keyframes: bool) -> None:
+        """Note what the map starts from; keyframes of the version, if there are some, define its frame."""
+        self.source, self.equal_rooms_m = source, equal_rooms_m
+        if has_keyframes:
+            self.segments.append(Segment(robot="", number=-1, is_from_version=True))
+            self.root = 0
+
+    def find_or_add_segment(self, robot: str, number: int) -> int:
+        """Return the row of a robot's segment; add the segment if there is none.
+
+        A new segment inherits the contradictions of the newest 16 keyframes of the robot's last segment.
+        """
+        newest = self.newest_segments.get(robot)
+        for row in range(len(self.segments)) if newest is None else (newest,):
+            segment = self.segments[row]
+            if (segment.robot, segment.number) == (robot, number) and not segment.is_from_version:
+                return row
+        row = len(self.segments)
+        segment = Segment(robot=robot, number=number, component=row)
+        earlier = [each for each in self.segments if each.robot == robot and not each.is_from_version]
+        if earlier:
+            segment.contradictions = earlier[-1].contradictions & INHERITED_CONTRADICTIONS
+        self.segments.append(segment)
+        return row
+
+    def begin_segment(self, row: int, assumed_scale: float | None, reason: str) -> None:
+        """State the unit of a segment without keyframes: metres, or *assumed_scale* metres until it is known.
+
+        *reason* says why a segment without metric scale has no alignment yet.
+        """
+        segment = self.segments[row]
+        segment.is_metric = assumed_scale is None
+        if assumed_scale is not None:
+            segment.scale, segment.reason = assumed_scale, reason
+
+    def add_keyframe(
+        self, keyframe: LiveKeyframe, row: int, T_odom: Array, T_component: Array, odometry_steps: float
+    ) -> int:
+        """Append a keyframe to segment *row*; return its id.
+
+        The first metric segment of a robot defines the frame of a map that has none.
+
+        Args:
+            keyframe: The keyframe.
+            row: Row of its segment.
+            T_odom: ``(4, 4)``, its pose in the odometry frame.
+            T_component: ``(4, 4)``, its pose in the frame of the component.
+            odometry_steps: Steps of odometry from the first keyframe of the segment.
+        """
+        self._grow()
+        i = self._size
+        self._size += 1
+        segment = self.segments[row]
+        self.keyframes.append(keyframe)
+        self._T_component_camera[i], self._T_odom_camera[i] = T_component, T_odom
+        self._odometry_steps[i], self._segment_rows[i] = odometry_steps, row
+        self._positions[i], self._has_features[i] = len(segment.keyframes), True
+        segment.keyframes.append(i)
+        if not segment.is_from_version:
+            self.next_numbers[keyframe.robot] = keyframe.number + 1
+            self.newest_segments[keyframe.robot] = row
+            if self.root < 0 and segment.is_metric:
+                self.root = row
+        return i
+
+    def _grow(self) -> None:
+        """Double the capacity of the tables of keyframes when they are full."""
+        if self._size < len(self._odometry_steps):
+            return
+        names = (
+            "_T_component_camera", "_T_odom_camera", "_odometry_steps", "_segment_rows", "_positions",
+            "_has_features",
+        )  # fmt: skip
+        for name in names:
+            old = getattr(self, name)
+            new = np.empty((2 * len(old), *old.shape[1:]), dtype=old.dtype)
+            new[: self._size] = old[: self._size]
+            setattr(self, name, new)
+
+    def drop_features(self, i: int) -> None:
+        """Drop the encoded features of keyframe *i*; its pose and its loop closures stay."""
+        self.keyframes[i].data = None
+        self._has_features[i] = False
+
+    def restore_features(self, i: int, data: bytes) -> None:
+        """Give keyframe *i*, which came from a snapshot, its encoded features."""
+        self.keyframes[i].data = data
+        self._has_features[i] = True
+
+    def set_poses(self, ids: Sequence[int], T_component_camera: Array) -> None:
+        """Set the ``(n, 4, 4)`` poses of keyframes in the frame of their component."""
+        self._T_component_camera[ids] = T_component_camera
+
+    def scale_segment(self, row: int, factor: float) -> None:
+        """Multiply the estimated scale of segment *row* by *factor*, after its poses were smoothed."""
+        self.segments[row].scale *= factor
+
+    def remove_robot(self, robot: str) -> None:
+        """Note that a robot left; its keyframes and loop closures stay."""
+        self.newest_segments.pop(robot, None)
+
+    def forget_robot(self, robot: str) -> list[int]:
+        """Take out all keyframes of *robot* with their loop closures; return the ids of these keyframes.
+
+        If the frame of the map was defined by the robot, another metric segment defines it afterwards, one of
+        the same component if there is one.
+        """
+        root_component = self.root_component()
+        rows_of_root = [row for row, each in enumerate(self.segments) if each.component == root_component]
+        own = [each for each in self.segments if each.robot == robot and not each.is_from_version]
+        forgotten = [i for segment in own for i in segment.keyframes]
+        members = set(forgotten)
+        # 1. Take out the loop closures, also the rejected ones.
+        for number in [n for n, edge in self.edges.items() if edge.a in members or edge.b in members]:
+            self._reject(number)
+        self.rejected = {
+            number: edge
+            for number, edge in self.rejected.items()
+            if edge.a not in members and edge.b not in members
+        }
+        # 2. Empty the segments.
+        for segment in own:
+            segment.keyframes, segment.reported_T_map_odom = [], None
+            segment.contradictions, segment.is_excluded = 0, False
+        self.smoothing_debt.pop(robot, None)
+        # 3. Drop the data of the keyframes.
+        for i in forgotten:
+            self.drop_features(i)
+            self.orphaned_objects += [(robot, digest) for digest in self.keyframes[i].objects]
+            self.keyframes[i].objects = ()
+            self._segment_rows[i] = -1
+        self.orphaned_objects = self.orphaned_objects[-MAX_ORPHANED_OBJECTS:]
+        # 4. Find the segment that defines the frame of the map, and the components of those that are left.
+        self.newest_segments.pop(robot, None)
+        if self.root < 0 or not self.segments[self.root].keyframes:
+            metric = [row for row, each in enumerate(self.segments) if each.keyframes and each.is_metric]
+            self.root = next((row for row in metric if row in rows_of_root), metric[0] if metric else -1)
+        self._update_components()
+        return forgotten
+
+    def note_contradiction(self, row: int, *, is_contradiction: bool, count: int = 1) -> int:
+        """Record *count* times whether the newest keyframe of segment *row* contradicts the map.
+
+        Return the number of contradictions among the newest 32 records.
+        """
+        bits = (1 << count) - 1 if is_contradiction else 0
+        segment = self.segments[row]
+        segment.contradictions = ((segment.contradictions << count) | bits) & CONTRADICTION_HISTORY
+        return segment.contradictions.bit_count()
+
+    def exclude_segment(self, row: int, reason: str) -> None:
+        """Take out the loop closures of segment *row* for good, and ignore later ones; its keyframes stay."""
+        excluded = self.segments[row]
+        excluded.is_excluded, excluded.reason = True, reason
+        for number in [number for number, edge in self.edges.items() if row in self.segment_pair_of(edge)]:
+            self._reject(number)
+        self.rejected = {
+            number: edge for number, edge in self.rejected.items() if row not in self.segment_pair_of(edge)
+        }
+        if self.root == row:
+            candidates = (
+                other
+                for other, each in enumerate(self.segments)
+                if other != row and each.component == excluded.component and each.keyframes and each.is_metric
+            )
+            self.root = next(candidates, row)
+        self._update_components()
+
+    def mark_aliased(self, ids: Iterable[int]) -> None:
+        """Note keyframes at places that look like another place of the map (perceptual aliases)."""
+        self.aliased_keyframes.update(ids)
+
+    def set_reason(self, row: int, reason: str) -> None:
+        """Note why segment *row* has no alignment with the map."""
+        self.segments[row].reason = reason
+
+    def report_alignment(self, row: int, T_map_odom: Array, covariance: Array | None) -> None:
+        """Note the alignment that the robot of segment *row* is sent; None keeps the last covariance."""
+        segment = self.segments[row]
+        segment.reported_T_map_odom, segment.reason = T_map_odom, ""
+        segment.reported_scale = segment.scale
+        if covariance is not None:
+            segment.covariance = covariance
+
+    def report_unaligned(self, row: int, reason: str) -> None:
+        """Note that the robot of segment *row* is told that it has no alignment any more, and why."""
+        self.segments[row].reported_T_map_odom, self.segments[row].reason = None, reason
+
+    def note_optimisation(self) -> None:
+        """Note that an optimisation of the whole graph is requested now."""
+        self.optimised_at = self._size
+
+    def set_smoothing_debt(self, robot: str, keyframes: int) -> None:
+        """Set how many keyframes were smoothed because of *robot* beyond its allowance."""
+        self.smoothing_debt[robot] = keyframes
+
+    # --- Changes of loop closures ---
+
+    def add_edges(self, edges: Iterable[LoopEdge]) -> list[int]:
+        """Add pending or accepted loop closures; return their numbers."""
+        numbers = []
+        for edge in edges:
+            number = self.next_edge
+            self.next_edge += 1
+            self.edges[number] = edge
+            numbers.append(number)
+            if edge.state == "accepted":
+                self._connect(number, edge)
+            else:
+                self.pending.append(number)
+        if any(self.edges[number].state == "accepted" for number in numbers):
+            self._update_components()
+        return numbers
+
+    def accept_edges(self, numbers: Iterable[int]) -> list[LoopEdge]:
+        """Accept those of *numbers* that are pending, within one component; return these loop closures."""
+        accepted = []
+        for number in numbers:
+            edge = self.edges[number]
+            if edge.state == "pending":
+                edge.state, edge.misfits = "accepted", 0
+                self.pending.remove(number)
+                self._connect(number, edge)
+                accepted.append(edge)
+        return accepted
+
+    def reject_edges(self, numbers: Iterable[int]) -> list[LoopEdge]:
+        """Reject pending or accepted loop closures; components may fall apart; return the loop closures."""
+        edges = [self._reject(number) for number in numbers]
+        if any(self._segment_rows[edge.a] != self._segment_rows[edge.b] for edge in edges):
+            self._update_components()
+            self._drop_pair_consistency()
+        return edges
+
+    def join_components(
+        self, moving: int, T_stay_moving: Array, scale: float, numbers: Iterable[int]
+    ) -> list[LoopEdge]:
+        """Move a component into the frame of another one and accept the loop closures that connect them.
+
+        Args:
+            moving: The component that is moved.
+            T_stay_moving: ``(4, 4)``, frame of the moved component in that of the other one.
+            scale: Length of the unit of the moved component in that of the other one.
+            numbers: The loop closures between both components.
+
+        Returns:
+            The accepted loop closures.
+        """
+        for segment in self.segments:
+            if segment.component == moving and segment.keyframes:
+                self._move_segment(segment, T_stay_moving, scale)
+        accepted = self.accept_edges(numbers)
+        self._update_components()
+        self._drop_pair_consistency()
+        return accepted
+
+    def note_misfit(self, number: int, *, is_misfit: bool) -> int:
+        """Record whether a loop closure misfits the smoothed graph; return its misfits in a row."""
+        edge = self.edges[number]
+        edge.misfits = edge.misfits + 1 if is_misfit else 0
+        return edge.misfits
+
+    def note_pair_consistency(self, earlier: int, later: int, *, is_consistent: bool) -> None:
+        """Remember whether two pending loop closures agree, so that no pair is tested twice."""
+        self.pair_consistency[earlier, later] = is_consistent
+
+    def drop_oldest_pending(self, limit: int) -> None:
+        """Reject the oldest pending loop closures beyond the newest *limit*."""
+        surplus = len(self.pending) - limit
+        if surplus > 0:
+            for number in self.pending[:surplus]:
+                self._reject(number)
+            self._drop_pair_consistency()
+
+    def reopen_rejected(self) -> None:
+        """Make all rejected loop closures pending again, and drop what they proved.
+
+        Segments without an alignment get the reason of a new segment; perceptual aliases are dropped.
+        """
+        for number, edge in self.rejected.items():
+            edge.state, edge.misfits = "pending", 0
+            self.edges[number] = edge
+        self.pending = sorted([*self.pending, *self.rejected])
+        self.rejected, self.aliased_keyframes, self.pair_consistency = {}, set(), {}
+        for segment in self.segments:
+            if segment.reported_T_map_odom is None and not segment.is_excluded:
+                segment.reason = NO_LOOP_CLOSURE_YET
+
+    def _connect(self, number: int, edge: LoopEdge) -> None:
+        self._accepted_of.setdefault(edge.a, []).append(number)
+        self._accepted_of.setdefault(edge.b, []).append(number)
+
+    def _reject(self, number: int) -> LoopEdge:
+        """Take out a loop closure; keep the newest rejected ones for `reopen_rejected`."""
+        edge = self.edges.pop(number)
+        if edge.state == "accepted":
+            self._accepted_of[edge.a].remove(number)
+            self._accepted_of[edge.b].remove(number)
+        else:
+            self.pending.remove(number)
+        edge.state = "rejected"
+        self.rejected[number] = edge
+        if len(self.rejected) > MAX_REJECTED_EDGES:
+            del self.rejected[next(iter(self.rejected))]
+        return edge
+
+    def _move_segment(self, segment: Segment, T_stay_moving: Array, scale: float) -> None:
+        """Express a segment in another frame, its lengths multiplied by *scale*."""
+        ids = segment.keyframes
+        if scale == 1.0:
+            self.set_poses(ids, T_stay_moving @ self.T_component_camera[ids])
+            return
+        self.set_poses(ids, T_stay_moving @ scaled(self.T_component_camera[ids], scale))
+        segment.scale *= scale
+        # Steps of odometry are stated in metres, so they change with the scale.
+        for before, here in pairwise(ids):
+            T_before_here = inverse(self.T_odom_camera[before]) @ self.T_odom_camera[here]
+            step = count_odometry_steps(scaled(T_before_here, segment.scale))
+            self._odometry_steps[here] = self._odometry_steps[before] + step
+
+    def _update_components(self) -> None:
+        """Compute the components of segments anew, by union-find over accepted loop closures."""
+        parent = list(range(len(self.segments)))
+
+        def find_root(row: int) -> int:
+            while parent[row] != row:
+                parent[row] = parent[parent[row]]
+                row = parent[row]
             return row
 
-        for link in self.links.values():
-            if link.state == "believed":
-                one, other = find(int(self._of_segment[link.a])), find(int(self._of_segment[link.b]))
-                root[max(one, other)] = min(one, other)
+        for edge in self.edges.values():
+            if edge.state == "accepted":
+                row_a = find_root(int(self._segment_rows[edge.a]))
+                row_b = find_root(int(self._segment_rows[edge.b]))
+                parent[max(row_a, row_b)] = min(row_a, row_b)
         for row, segment in enumerate(self.segments):
-            segment.component = find(row)
+            segment.component = find_root(row)
 
-    def bridges(self) -> dict[tuple[int, int], list[int]]:
-        """Return the numbers of believed links by the pair of segments that they connect."""
-        found: dict[tuple[int, int], list[int]] = {}
-        for number, link in self.links.items():
-            if link.state == "believed":
-                one, other = int(self._of_segment[link.a]), int(self._of_segment[link.b])
-                found.setdefault((min(one, other), max(one, other)), []).append(number)
-        return found
+    def _drop_pair_consistency(self) -> None:
+        """Drop the known consistency of pairs that are not both pending any more."""
+        pending = set(self.pending)
+        self.pair_consistency = {
+            pair: is_consistent
+            for pair, is_consistent in self.pair_consistency.items()
+            if pair[0] in pending and pair[1] in pending
+        }
 
-    def _connect(self, number: int, link: LiveLink) -> None:
-        self._links_of.setdefault(link.a, []).append(number)
-        self._links_of.setdefault(link.b, []).append(number)
+    # --- Snapshots ---
 
-    def encode(self, extra: dict[str, bytes], with_data: bool = True) -> bytes:
-        """Return everything as bytes, with *extra* byte strings beside it."""
-        believed = {str(i): numbers for i, numbers in sorted(self._links_of.items()) if numbers}
-        if self.has_scales:  # a map in metres has the bytes that it had before there were others
-            extra = {**extra, _SCALES: self._encode_scales()}
-        objects = [(i, each.objects) for i, each in enumerate(self.keyframes) if each.objects]
-        if objects or self.gone_objects:
-            packed_objects = _PackedObjects(keyframes=objects, gone=self.gone_objects)
-            extra = {**extra, _OBJECTS: msgspec.msgpack.encode(packed_objects)}
-        packed = _Packed(
-            version=_VERSION,
-            keyframes=[
-                (k.robot, k.segment, k.number, k.timestamp_s, k.data if with_data else None)
-                for k in self.keyframes
-            ],
-            segments=[
-                (
-                    s.robot, s.segment, s.keyframes, s.component,
-                    None if s.told is None else s.told.tobytes(), s.covariance.tobytes(), s.reason, s.version,
-                )
-                for s in self.segments
-            ],
-            links=[_packed_link(number, link) for number, link in self.links.items()],
-            removed=[_packed_link(number, link) for number, link in self.removed.items()],
-            smoothing=list(self.smoothing.items()),
-            trust=[(each.contradictions, each.disbelieved) for each in self.segments],
-            open=self.open,
-            agreements=[(*pair, agrees) for pair, agrees in self.agreements.items()],
-            numbers=(self.next_link, self.root, self.events, self.optimised_at),
-            next_numbers=list(self.next_numbers.items()),
-            newest=list(self.newest.items()),
-            left=self.left,
-            source=self.source,
-            equal_rooms_m=self.equal_rooms_m,
-            lookalikes=sorted(self.lookalikes),
-            links_of=list(believed.items()),
-            arrays=[
-                np.ascontiguousarray(each).tobytes()
-                for each in (self.T, self.T_odom, self.way, self.of_segment, self._place[: self._size])
-            ],
-            extra=list(extra.items()),
-        )  # fmt: skip
-        return msgspec.msgpack.encode(packed)
+    def accepted_edges_by_keyframe(self) -> dict[int, list[int]]:
+        """Return the numbers of accepted loop closures by keyframe, without empty lists, for a snapshot."""
+        return {i: numbers for i, numbers in sorted(self._accepted_of.items()) if numbers}
+
+    def restore_scale(self, row: int, scale: float, reported_scale: float) -> None:
+        """Set the scales of a segment that is not metric, from a snapshot."""
+        segment = self.segments[row]
+        segment.is_metric, segment.scale, segment.reported_scale = False, scale, reported_scale
+
+    def restore_edge_scale(self, number: int, log_ratio: float, variance: float) -> None:
+        """Set the measured scale of a loop closure, from a snapshot."""
+        edge = self.edges[number] if number in self.edges else self.rejected[number]
+        edge.scale = log_ratio, variance
+
+    def restore_objects(
+        self, digests: Mapping[int, tuple[str, ...]], orphaned: list[tuple[str, str]]
+    ) -> None:
+        """Set the digests of the objects of keyframes, and those of forgotten robots, from a snapshot."""
+        for i, objects in digests.items():
+            self.keyframes[i].objects = objects
+        self.orphaned_objects = orphaned
 
     @classmethod
-    def decode(cls, data: bytes) -> tuple[Graph, dict[str, bytes]]:
-        """Return the graph and the extra bytes of a snapshot.
+    def restore(
+        cls,
+        *,
+        keyframes: list[LiveKeyframe],
+        arrays: Sequence[Array | npt.NDArray[np.int64]],
+        accepted_by_keyframe: dict[int, list[int]],
+        tables: Mapping[str, object],
+    ) -> MapGraph:
+        """Return the graph of a snapshot, without the encoded features of keyframes.
 
-        Raises:
-            BadRequest: The snapshot is damaged, or of another version.
+        Args:
+            keyframes: All keyframes by id, without data.
+            arrays: Poses ``(n, 4, 4)`` in the component and in the odometry frame, steps of odometry
+                ``(n,)``, rows of segments ``(n,)``, and positions within segments ``(n,)``.
+            accepted_by_keyframe: Numbers of accepted loop closures by keyframe.
+            tables: The other attributes of the class by name.
         """
-        try:
-            version = msgspec.msgpack.decode(data, type=_Versioned).version
-            if version != _VERSION:
-                raise BadRequest(
-                    f"the snapshot is of version {version}, not {_VERSION}",
-                    hint="publish the map with the release that wrote it: rse-pf map publish MAP; "
-                    "then start from that version: rse-pf map live start MAP --from MAP",
-                )
-            packed = msgspec.msgpack.decode(data, type=_Packed)
-        except (msgspec.MsgspecError, ValueError) as error:
-            raise BadRequest(
-                f"the snapshot is damaged: {message_of(error)}", hint="take the older one"
-            ) from error
         graph = cls()
-        n = graph._size = len(packed.keyframes)
+        n = graph._size = len(keyframes)
         capacity = max(64, n)
-        kinds = (("<f8", (4, 4)), ("<f8", (4, 4)), ("<f8", ()), ("<i8", ()), ("<i8", ()))
-        names = ("_T", "_T_odom", "_way", "_of_segment", "_place")
-        for name, (kind, shape), raw in zip(names, kinds, packed.arrays, strict=True):
-            array = np.empty((capacity, *shape), dtype=np.dtype(kind))
-            array[:n] = np.frombuffer(raw, dtype=np.dtype(kind)).reshape(n, *shape)
-            setattr(graph, name, array)
-        graph._held = np.zeros(capacity, dtype=np.bool_)
-        graph.keyframes = [LiveKeyframe(*row[:4], data=None) for row in packed.keyframes]
-        for i, row in enumerate(packed.keyframes):
-            if row[-1] is not None:
-                graph.set_data(i, row[-1])
-        graph.segments = [
-            Segment(
-                robot=robot, segment=segment, keyframes=keyframes, component=component,
-                told=None if told is None else _matrix(told, 4), covariance=_matrix(covariance, 6),
-                reason=reason, version=version,
-            )
-            for robot, segment, keyframes, component, told, covariance, reason, version in packed.segments
-        ]  # fmt: skip
-        for segment, (contradictions, disbelieved) in zip(graph.segments, packed.trust, strict=False):
-            segment.contradictions, segment.disbelieved = contradictions, disbelieved
-        graph.links, graph.removed = _links_of(packed.links), _links_of(packed.removed)
-        graph.open = packed.open
-        graph.agreements = {(i, j): agrees for i, j, agrees in packed.agreements}
-        graph.next_link, graph.root, graph.events, graph.optimised_at = packed.numbers
-        graph.next_numbers = dict(packed.next_numbers)
-        graph.newest, graph.smoothing = dict(packed.newest), dict(packed.smoothing)
-        graph.left, graph.source = packed.left, packed.source
-        graph.equal_rooms_m = packed.equal_rooms_m
-        graph.lookalikes = set(packed.lookalikes)
-        graph._links_of = {int(i): numbers for i, numbers in packed.links_of}
-        extra = dict(packed.extra)
-        graph._take_scales(extra.pop(_SCALES, b""))
-        graph._take_objects(extra.pop(_OBJECTS, b""))
-        return graph, extra
-
-    def _encode_scales(self) -> bytes:
-        links = {**self.links, **self.removed}
-        return msgspec.msgpack.encode(
-            _PackedScales(
-                segments=[
-                    (row, each.scale, each.told_scale)
-                    for row, each in enumerate(self.segments) if not each.is_metric
-                ],
-                links=[(n, *each.scale) for n, each in sorted(links.items()) if each.scale is not None],
-            )
-        )  # fmt: skip
-
-    def _take_scales(self, data: bytes) -> None:
-        """Take what `_encode_scales` encoded; raises BadRequest."""
-        if not data:
-            return
-        try:
-            packed = msgspec.msgpack.decode(data, type=_PackedScales)
-            for row, scale, told_scale in packed.segments:
-                segment = self.segments[row]
-                segment.is_metric, segment.scale, segment.told_scale = False, scale, told_scale
-            for number, log_ratio, variance in packed.links:
-                link = self.links[number] if number in self.links else self.removed[number]
-                link.scale = log_ratio, variance
-        except (msgspec.MsgspecError, LookupError) as error:
-            raise BadRequest(
-                f"the snapshot is damaged: {message_of(error)}", hint="take the older one"
-            ) from error
-
-    def _take_objects(self, data: bytes) -> None:
-        """Take the objects of keyframes of a snapshot; raises BadRequest."""
-        if not data:
-            return
-        try:
-            packed = msgspec.msgpack.decode(data, type=_PackedObjects)
-            for i, objects in packed.keyframes:
-                self.keyframes[i].objects = objects
-        except (msgspec.MsgspecError, LookupError) as error:
-            raise BadRequest(
-                f"the snapshot is damaged: {message_of(error)}", hint="take the older one"
-            ) from error
-        self.gone_objects = packed.gone
+        names = ("_T_component_camera", "_T_odom_camera", "_odometry_steps", "_segment_rows", "_positions")
+        for name, values in zip(names, arrays, strict=True):
+            table = np.empty((capacity, *values.shape[1:]), dtype=values.dtype)
+            table[:n] = values
+            setattr(graph, name, table)
+        graph._has_features = np.zeros(capacity, dtype=np.bool_)
+        graph.keyframes, graph._accepted_of = keyframes, accepted_by_keyframe
+        for name, value in tables.items():
+            setattr(graph, name, value)
+        return graph
 
 
-_PackedLink = tuple[int, int, int, bytes, bytes, int, int, bool, LinkState, int]
+def count_odometry_steps(T_from_to: Array) -> float:
+    """Return a motion in steps of odometry: 0.25 m or 15 degrees are one step, the larger count decides.
 
-
-class _Versioned(msgspec.Struct):
-    version: int
-
-
-class _Packed(msgspec.Struct, kw_only=True):
-    version: int
-    keyframes: list[tuple[str, int, int, float, bytes | None]]
-    segments: list[tuple[str, int, list[int], int, bytes | None, bytes, str, bool]]
-    links: list[_PackedLink]
-    open: list[int]
-    agreements: list[tuple[int, int, bool]]
-    numbers: tuple[int, int, int, int]
-    next_numbers: list[tuple[str, int]]
-    newest: list[tuple[str, int]]
-    left: list[str]
-    source: str
-    lookalikes: list[int]
-    links_of: list[tuple[str, list[int]]]
-    arrays: list[bytes]
-    extra: list[tuple[str, bytes]]
-    equal_rooms_m: float = 0.0
-    removed: list[_PackedLink] = []
-    trust: list[tuple[int, bool]] = []
-    smoothing: list[tuple[str, int]] = []
-
-
-class _PackedScales(msgspec.Struct, kw_only=True):
-    """What segments without metres add to a snapshot; the scales of links are logarithms with variances."""
-
-    segments: list[tuple[int, float, float]]
-    links: list[tuple[int, float, float]]
-
-
-class _PackedObjects(msgspec.Struct, kw_only=True):
-    """What objects of robots add to a snapshot: digests by id of the keyframe, and those to be deleted."""
-
-    keyframes: list[tuple[int, tuple[str, ...]]]
-    gone: list[tuple[str, str]]
-
-
-def _packed_link(number: int, link: LiveLink) -> _PackedLink:
-    return (
-        number, link.a, link.b, link.T_a_b.tobytes(), link.information.tobytes(), link.inliers, link.matches,
-        link.fixed, link.state, link.doubts,
-    )  # fmt: skip
-
-
-def _links_of(packed: list[_PackedLink]) -> dict[int, LiveLink]:
-    stack = np.frombuffer(b"".join(each[4] for each in packed), dtype="<f8").reshape(-1, 6, 6)
-    links = {}
-    for each, information, variances in zip(packed, stack, variances_of(stack), strict=True):
-        number, a, b, step, _, inliers, matches, fixed, state, doubts = each
-        links[number] = LiveLink(
-            a=a, b=b, T_a_b=_matrix(step, 4), information=information, inliers=inliers, matches=matches,
-            variances=variances, fixed=fixed, state=state, doubts=doubts,
-        )  # fmt: skip
-    return links
-
-
-def variances_of(information: Array) -> Array:
-    """Return the ``(m, 6)`` variances of twists with the ``(m, 6, 6)`` *information*."""
-    variances: Array = np.diagonal(np.linalg.inv(information), axis1=1, axis2=2)
-    return variances
-
-
-def _matrix(raw: bytes, n: int) -> Array:
-    matrix: Array = np.frombuffer(raw, dtype="<f8").reshape(n, n)
-    return matrix
+    The standard deviation of odometry grows with the square root of these steps.  *T_from_to* is ``(4, 4)``,
+    in metres.
+    """
+    by_length = float(np.sqrt((T_from_to[:3, 3] ** 2).sum())) / STEP_LENGTH_M
+    by_rotation = rotation_angle_deg(T_from_to[:3, :3]) / STEP_ROTATION_DEG
+    return max(by_length, by_rotation, MIN_STEP)

@@ -1,4 +1,4 @@
-"""What an event changed in a live map, as values: the owner logs them and tells the robots."""
+"""What an event changed in a live map, as values: the map server logs them and notifies robots."""
 
 from __future__ import annotations
 
@@ -23,14 +23,17 @@ __all__ = [
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Added:
-    """A keyframe is in the map; ``id`` is its position in order of arrival."""
+    """A keyframe was added to the map; ``id`` is its position in order of arrival, from 0."""
 
     id: int
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Joined:
-    """A segment is aligned with the map from here on, by so many links."""
+    """A segment of a robot is aligned with the map from now on.
+
+    ``links`` counts the accepted loop closures between this segment and others, or within it.
+    """
 
     robot: str
     segment: int
@@ -39,11 +42,13 @@ class Joined:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Corrected:
-    """The alignment of an aligned segment moved, because of keyframe ``cause`` = (robot, number).
+    """The alignment of a robot's segment with the map changed.
 
-    ``covariance`` ``(6, 6)`` is of the twist (metres, radians) on the left of ``T_map_odom``.  ``scale`` is
-    how many metres the unit of the segment is, by which its lengths are multiplied before; None if it has
-    metres.
+    ``T_map_odom`` ``(4, 4)`` maps from the odometry frame of the segment to the frame of the map.
+    ``covariance`` ``(6, 6)`` is that of its left twist (metres, radians).  ``cause`` is the keyframe (robot,
+    number) whose loop closures changed the alignment, None after an optimisation.  ``scale`` is the length
+    in metres of the segment's unit, by which odometry is multiplied before ``T_map_odom`` is applied; None if
+    the odometry is in metres.
     """
 
     robot: str
@@ -56,7 +61,7 @@ class Corrected:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Unaligned:
-    """A segment that was aligned is no longer."""
+    """A segment lost its alignment with the map; ``reason`` is a sentence for the operator."""
 
     robot: str
     segment: int
@@ -65,7 +70,7 @@ class Unaligned:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LoopClosureAccepted:
-    """A link between keyframes ``a`` and ``b`` holds poses together from here on."""
+    """The loop closure between the keyframes ``a`` and ``b`` is an edge of the pose graph from now on."""
 
     a: int
     b: int
@@ -73,7 +78,7 @@ class LoopClosureAccepted:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LoopClosureRejected:
-    """A link that was believed is no longer."""
+    """The loop closure between the keyframes ``a`` and ``b`` was taken out of the graph as an outlier."""
 
     a: int
     b: int
@@ -82,14 +87,21 @@ class LoopClosureRejected:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OptimiseWanted:
-    """The whole graph fits badly: run `LiveMap.optimise` in the background."""
+    """The whole pose graph should be optimised in the background, by `LiveMap.prepare_optimisation`.
+
+    ``misfit`` is the mean squared Mahalanobis norm of the residuals of the smoothed loop closures, 0 after a
+    robot was forgotten or excluded.
+    """
 
     misfit: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Ambiguous:
-    """Links would join a segment, but cannot tell which of several equal places it sees."""
+    """A segment is not aligned, because of perceptual aliases or because it contradicts the map.
+
+    ``reason`` is a sentence for the operator.
+    """
 
     robot: str
     segment: int
@@ -98,16 +110,17 @@ class Ambiguous:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Culled:
-    """Redundant keyframes are gone; what they said is kept in the links of the others."""
+    """The features of the keyframes ``ids`` were dropped; their poses and loop closures stay."""
 
     ids: tuple[int, ...]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Alignment:
-    """Where the newest segment of a robot lies in the map, or the reason why that is unknown.
+    """The alignment of a robot's segment with the map as the robot was last sent it.
 
-    ``scale`` is that of `Corrected`.
+    ``reason`` says why there is none, else it is empty.  The other fields are those of `Corrected`, None
+    without an alignment.
     """
 
     robot: str

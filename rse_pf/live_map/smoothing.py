@@ -1,7 +1,8 @@
-"""Smooth a live map around what changed: windows of keyframes that grow while their border moves.
+"""Smooth the pose graph of a live map around what changed, in windows of keyframes.
 
-The scales of segments without metres are fitted with the poses of a window, by all that is known of them:
-also by the keyframes of such a segment beyond the window, which stay where they are.
+A window holds the keyframes nearest to the change along the graph; all other poses are held.  A window whose
+border would move is replaced by a larger one, so the cost depends on the window and not on the map.  The
+scales of segments that are not metric are estimated together with the poses.
 """
 
 from __future__ import annotations
@@ -13,36 +14,45 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import numpy.typing as npt
 
-from rse_pf.geometry import Array, adjoint, inverse, rotation_angle_deg, scaled
-from rse_pf.live_map.graph import Graph, LiveLink
+from rse_pf.geometry import Array, adjoint, inverse, scaled
+from rse_pf.live_map.graph import MapGraph
+from rse_pf.live_map.graph_rows import LoopEdge
 from rse_pf.live_map.options import LiveMapOptions
+from rse_pf.live_map.outlier_rejection import GraphChanges, reject_misfitting_edges
 from rse_pf.slam.consistency import OdometryNoise
 from rse_pf.slam.smoother import ScaleTerms, SmoothedPoses, smooth
 
 __all__ = [
-    "Edges",
+    "CAUCHY_WIDTH",
+    "GraphEdges",
     "SmoothedWindows",
-    "edges_of",
-    "link_information",
-    "odometry_of",
-    "odometry_step",
-    "smooth_all",
+    "information_of",
+    "odometry_information",
+    "select_edges",
     "smooth_around",
+    "smooth_changes",
+    "smooth_everything",
 ]
 
 Rows = npt.NDArray[np.int64]
 
-_LEAST_STEP = 0.05
-_OF_SCALE = 600
-"""Keyframes of a segment, nearest to a window, by which its scale is fitted."""
+DRIFT = OdometryNoise(step_m=0.007, step_deg=0.35)
+"""Drift of odometry in one step that the smoother assumes; the tests of loop closures assume about three
+times as much, so that no true loop closure fails."""
+CAUCHY_WIDTH = 3.0
+"""Width of the Cauchy kernel on loop closures, standard deviations; larger residuals have less effect."""
+MAX_SCALE_KEYFRAMES = 600
+"""Keyframes of a segment around the window whose edges determine the scale of the segment, to bound CPU
+time."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Edges:
-    """Edges between keyframes ``a`` and ``b`` (ids); ``numbers`` are those of links, -1 for odometry.
+class GraphEdges:
+    """*m* edges between the keyframes ``a`` and ``b`` ``(m,)``, odometry first, then loop closures.
 
-    Lengths are in the unit of the component; ``units`` are the rows of the segments that they come from, -1
-    where they are metres.
+    ``T_a_b`` is ``(m, 4, 4)`` in the unit of the component, ``information`` ``(m, 6, 6)``.  ``numbers``
+    ``(m,)`` are those of loop closures, -1 for odometry.  ``unit_segments`` ``(m,)`` are the rows of the
+    segments in whose unit the edges were measured, -1 for metres.
     """
 
     a: Rows
@@ -50,268 +60,338 @@ class Edges:
     T_a_b: Array
     information: Array
     numbers: Rows
-    units: Rows
+    unit_segments: Rows
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
 class SmoothedWindows:
-    """What `smooth_around` did.
+    """The result of `smooth_around`.
 
-    ``strained`` says that even the largest window was too small; ``misfit`` is the mean squared misfit of the
-    links; ``squares`` that of each believed link that was smoothed; ``keyframes`` counts those of all windows
-    that were tried.
+    ``is_strained`` says that the border of the largest window moved too far, so that the whole graph should
+    be optimised.  ``mean_misfit`` is the mean of ``squared_misfits``, which holds the squared Mahalanobis
+    norm of the residual of each smoothed loop closure by number.  ``keyframe_count`` sums the keyframes of
+    all windows that were tried.
     """
 
-    strained: bool = False
-    misfit: float = 0.0
-    squares: dict[int, float] = field(default_factory=dict)
-    keyframes: int = 0
+    is_strained: bool = False
+    mean_misfit: float = 0.0
+    squared_misfits: dict[int, float] = field(default_factory=dict)
+    keyframe_count: int = 0
     _covariances: dict[int, Array] = field(default_factory=dict)
 
-    def covariance(self, graph: Graph, keyframe: int) -> Array | None:
-        """Return the ``(6, 6)`` covariance of the newest pose of a segment, if it moved, given those held.
+    def covariance(self, graph: MapGraph, keyframe: int) -> Array | None:
+        """Return the ``(6, 6)`` covariance of the newest pose of a segment, None if it was not smoothed.
 
-        It is of the twist (metres, radians) on the left of the pose, in the frame of the map.
+        It is that of a left twist (metres, radians) in the frame of the map, given the poses that were held.
         """
         right = self._covariances.get(keyframe)
         if right is None:
             return None
-        to_left = adjoint(graph.T[keyframe])
-        left: Array = to_left @ (0.5 * (right + right.T)) @ to_left.T
+        Ad = adjoint(graph.T_component_camera[keyframe])
+        left: Array = Ad @ (0.5 * (right + right.T)) @ Ad.T
         return left
 
 
-def smooth_around(
-    graph: Graph, moved: Sequence[int], anchors: Iterable[int], options: LiveMapOptions
-) -> SmoothedWindows:
-    """Smooth *graph* around the keyframes *moved*, one component after the other; the graph changes.
+def smooth_changes(
+    graph: MapGraph, changes: GraphChanges, options: LiveMapOptions, robot: str | None = None
+) -> SmoothedWindows | None:
+    """Smooth around changed loop closures, and reject those that misfit for long; None if nothing changed.
 
-    The window grows while its border moves.  *anchors* are keyframes that define the frame of a component.
+    Args:
+        graph: The graph; its poses change.
+        changes: The keyframes to smooth around; receives the outcomes of rejections.
+        options: Sizes of windows, and the allowance of a robot.
+        robot: Robot whose keyframe is the cause.  If its smoothing debt is too large, the smallest window is
+            taken, and an optimisation of the whole graph does the rest.
     """
-    done = SmoothedWindows()
+    # 1. Limit the window of a robot that caused too much work before.
+    debt = graph.smoothing_debt.get(robot, 0) if robot is not None else 0
+    if debt >= options.max_smoothing_debt:
+        options = replace(options, window_sizes=options.window_sizes[:1])
+    # 2. Smooth; reject what misfits; smooth again without it.
+    windows, keyframe_count = None, 0
+    if changes.moved:
+        windows = smooth_around(graph, changes.moved, graph.anchors(), options)
+        keyframe_count = windows.keyframe_count
+        if reject_misfitting_edges(graph, windows.squared_misfits, changes):
+            windows = smooth_around(graph, changes.moved, graph.anchors(), options)
+            keyframe_count += windows.keyframe_count
+    # 3. Charge the robot.
+    allowance = options.smoothing_allowance
+    if robot is not None and (debt or keyframe_count > allowance):
+        graph.set_smoothing_debt(robot, max(0, debt + keyframe_count - allowance))
+    return windows
+
+
+def smooth_around(
+    graph: MapGraph, moved: Sequence[int], anchors: Iterable[int], options: LiveMapOptions
+) -> SmoothedWindows:
+    """Smooth the poses around the keyframes *moved*, in each component that they belong to.
+
+    Args:
+        graph: The graph; its poses and the scales of its segments change.
+        moved: Keyframes around which edges changed.
+        anchors: Keyframes that define the frame of a component, and are held.
+        options: Sizes of windows, and how far their border may move.
+    """
+    result = SmoothedWindows()
     held = set(anchors)
-    groups: dict[int, list[int]] = {}
+    # 1. Group the keyframes by component.
+    seeds_of: dict[int, list[int]] = {}
     for i in moved:
-        if graph.of_segment[i] >= 0:
-            groups.setdefault(graph.component_of(i), []).append(i)
+        if graph.exists(i):
+            seeds_of.setdefault(graph.component_of(i), []).append(i)
+    newest_segments = [graph.segments[row] for row in graph.newest_segments.values()]
+    newest = [segment.keyframes[-1] for segment in newest_segments if segment.keyframes]
     total = 0.0
-    newest = [
-        graph.segments[row].keyframes[-1] for row in graph.newest.values() if graph.segments[row].keyframes
-    ]
-    for _, seeds in sorted(groups.items()):
-        for size in options.windows:
-            ids, is_whole = _window(graph, seeds, size, held)
+    for _, seeds in sorted(seeds_of.items()):
+        for size in options.window_sizes:
+            # 2. Choose the window and its edges.
+            ids, is_whole = _choose_window(graph, seeds, size, held)
             if not ids:
                 break
-            free = _free_scales(graph, ids)
-            edges = _all_edges(graph, ids, free, options) if free else edges_of(graph, ids, options)
+            free_scales = _find_free_scales(graph, ids)
+            edges = _select_edges_with_scales(graph, ids, free_scales)
             if not len(edges.a):
                 break
+            # 3. Smooth a copy of its poses.
             inside = set(ids)
-            told = [i for i in newest if i in inside]
-            done.keyframes += len(ids)
-            found, border, rows = _fit(graph, ids, told, edges, free, options)
-            is_strained = not is_whole and _is_moved(graph, border, found, rows, options)
-            if not is_strained or size == options.windows[-1]:
-                done.strained |= is_strained
-                graph.T[ids] = found.T[: len(ids)]
-                for row, grown in zip(free, found.log_scales.tolist(), strict=True):
-                    graph.segments[row].scale *= math.exp(grown)
-                squares = {
-                    int(number): float(square)
-                    for number, square in zip(edges.numbers, found.squares, strict=True) if number >= 0
-                }  # fmt: skip
-                done.squares |= squares
-                total += sum(squares.values())
-                done._covariances |= dict(zip(told, found.covariances, strict=True))
-                break
-    done.misfit = total / max(1, len(done.squares))
-    return done
+            wanted = [i for i in newest if i in inside]
+            result.keyframe_count += len(ids)
+            smoothed, border, row_of = _smooth_window(graph, ids, wanted, edges, free_scales)
+            # 4. Take the result if the border hardly moved, or there is no larger window.
+            is_strained = not is_whole and _has_moved(graph, border, smoothed, row_of, options)
+            if is_strained and size != options.window_sizes[-1]:
+                continue
+            result.is_strained |= is_strained
+            graph.set_poses(ids, smoothed.T[: len(ids)])
+            for row, log_factor in zip(free_scales, smoothed.log_scales.tolist(), strict=True):
+                graph.scale_segment(row, math.exp(log_factor))
+            squared_misfits = {
+                int(number): float(square)
+                for number, square in zip(edges.numbers, smoothed.squares, strict=True)
+                if number >= 0
+            }
+            result.squared_misfits |= squared_misfits
+            total += sum(squared_misfits.values())
+            result._covariances |= dict(zip(wanted, smoothed.covariances, strict=True))
+            break
+    result.mean_misfit = total / max(1, len(result.squared_misfits))
+    return result
 
 
-def smooth_all(graph: Graph, options: LiveMapOptions) -> None:
-    """Smooth each segment of *graph* once, by the largest window; the graph changes."""
-    largest, anchors = max(options.windows), graph.anchors()
-    options = replace(options, windows=(largest,))
+def smooth_everything(graph: MapGraph, options: LiveMapOptions) -> None:
+    """Smooth all keyframes of all segments once, in windows of the largest size; the poses change."""
+    largest, anchors = max(options.window_sizes), graph.anchors()
+    options = replace(options, window_sizes=(largest,))
     for segment in graph.segments:
         for begin in range(0, len(segment.keyframes), largest):
             smooth_around(graph, segment.keyframes[begin : begin + largest], anchors, options)
 
 
-def edges_of(graph: Graph, ids: Iterable[int], options: LiveMapOptions) -> Edges:
-    """Return odometry and believed links that touch one of the keyframes *ids*."""
-    links: set[int] = set()
+# --- Edges of the graph as arrays ---
+
+
+def select_edges(graph: MapGraph, ids: Iterable[int]) -> GraphEdges:
+    """Return odometry and accepted loop closures with at least one end among the keyframes *ids*.
+
+    The information of odometry is that of a random walk.  The information of a loop closure is multiplied by
+    the square of its weight: half of the evidence counts as half of the precision.
+    """
+    # 1. Find the edges.
+    loop_numbers: set[int] = set()
     steps: set[tuple[int, int]] = set()
     for i in ids:
-        links.update(graph.links_at(i))
-        steps.update(graph.steps_at(i))
-    numbers = sorted(links)
+        loop_numbers.update(graph.accepted_edges_of(i))
+        steps.update(graph.odometry_edges_of(i))
+    numbers = sorted(loop_numbers)
+    loops = [graph.edges[number] for number in numbers]
     pairs = np.array(sorted(steps), dtype=np.int64).reshape(-1, 2)
     a, b = pairs[:, 0], pairs[:, 1]
-    walked = graph.way[b] - graph.way[a]
-    drift: OdometryNoise = options.drift
-    spread = np.array([drift.step_m] * 3 + [math.radians(drift.step_deg)] * 3) ** -2.0
-    chain = np.zeros((len(a), 6, 6))
-    chain[:, range(6), range(6)] = spread / walked[:, None]
-    measured = [graph.links[number] for number in numbers]
-    if not measured:
-        T_a_b, information = np.empty((0, 4, 4)), np.empty((0, 6, 6))
-    else:
-        T_a_b = np.array([graph.step_of(link) for link in measured])
-        # What has half of the evidence is taken for half as exact.
-        weights = np.array([link.weight(options.strong) for link in measured])
-        information = weights[:, None, None] ** 2 * np.array(
-            [link_information(graph, link) for link in measured]
-        )
-    units = np.full(len(a) + len(measured), -1, dtype=np.int64)
+    # 2. Odometry.
+    T_odometry: Array = inverse(graph.T_odom_camera[a]) @ graph.T_odom_camera[b]
     if graph.has_scales:
-        rows = graph.of_segment[a]
-        of_links = np.array([graph.unit_of(link) for link in measured], dtype=np.int64)
-        units = np.concatenate([np.where(_metric(graph)[rows], -1, rows), of_links])
-    return Edges(
-        a=np.concatenate([a, np.array([link.a for link in measured], dtype=np.int64)]),
-        b=np.concatenate([b, np.array([link.b for link in measured], dtype=np.int64)]),
-        T_a_b=np.concatenate([odometry_of(graph, a, b), T_a_b]),
-        information=np.concatenate([chain, information]),
+        T_odometry = scaled(
+            T_odometry, np.array([each.scale for each in graph.segments])[graph.segment_rows[a]]
+        )
+    odometry = np.zeros((len(a), 6, 6))
+    odometry[:, range(6), range(6)] = (
+        odometry_information() / (graph.odometry_steps[b] - graph.odometry_steps[a])[:, None]
+    )
+    # 3. Loop closures.
+    T_loops, information = np.empty((0, 4, 4)), np.empty((0, 6, 6))
+    if loops:
+        T_loops = np.array([graph.relative_pose_of(edge) for edge in loops])
+        weights = np.array([edge.weight for edge in loops])
+        information = weights[:, None, None] ** 2 * np.array([information_of(graph, edge) for edge in loops])
+    # 4. The units in which they were measured.
+    unit_segments = np.full(len(a) + len(loops), -1, dtype=np.int64)
+    if graph.has_scales:
+        rows = graph.segment_rows[a]
+        is_metric = np.array([segment.is_metric for segment in graph.segments])
+        loop_units = np.array([graph.unit_segment_of(edge) for edge in loops], dtype=np.int64)
+        unit_segments = np.concatenate([np.where(is_metric[rows], -1, rows), loop_units])
+    return GraphEdges(
+        a=np.concatenate([a, np.array([edge.a for edge in loops], dtype=np.int64)]),
+        b=np.concatenate([b, np.array([edge.b for edge in loops], dtype=np.int64)]),
+        T_a_b=np.concatenate([T_odometry, T_loops]),
+        information=np.concatenate([odometry, information]),
         numbers=np.concatenate([np.full(len(a), -1), np.array(numbers, dtype=np.int64)]),
-        units=units,
+        unit_segments=unit_segments,
     )
 
 
-def odometry_of(graph: Graph, a: Rows, b: Rows) -> Array:
-    """Return ``T_a_b`` of keyframes of one segment each by odometry, in the unit of the component."""
-    T_a_b: Array = inverse(graph.T_odom[a]) @ graph.T_odom[b]
-    if graph.has_scales:
-        T_a_b = scaled(T_a_b, np.array([each.scale for each in graph.segments])[graph.of_segment[a]])
-    return T_a_b
-
-
-def _free_scales(graph: Graph, ids: Sequence[int]) -> list[int]:
-    """Return the segments without metres that keyframes of one component belong to, whose scale is free.
-
-    Where no segment has metres, the scale of the one that defines the frame is held.
-    """
-    if not graph.has_scales or not ids:
-        return []
-    rows = sorted({int(row) for row in graph.of_segment[list(ids)] if not graph.segments[row].is_metric})
-    if rows and not graph.is_metric(graph.component_of(ids[0])):
-        held = int(graph.of_segment[graph.anchor(rows[0])])
-        rows = [row for row in rows if row != held]
-    return rows
-
-
-def _metric(graph: Graph) -> npt.NDArray[np.bool_]:
-    return np.array([each.is_metric for each in graph.segments])
-
-
-def link_information(graph: Graph, link: LiveLink) -> Array:
-    """Return the ``(6, 6)`` information of a link in the unit of its component."""
-    row = graph.unit_of(link)
-    if row < 0:
-        return link.information
-    per_length = np.array([1.0 / graph.segments[row].scale] * 3 + [1.0] * 3)
-    information: Array = per_length[:, None] * link.information * per_length
+def odometry_information() -> Array:
+    """Return ``(6,)``: inverse variances of one step of odometry (per square metre, per square radian)."""
+    information: Array = np.array([DRIFT.step_m] * 3 + [math.radians(DRIFT.step_deg)] * 3) ** -2.0
     return information
 
 
-def _all_edges(graph: Graph, ids: list[int], rows: list[int], options: LiveMapOptions) -> Edges:
-    """Return what `edges_of` does, with all edges of the segments *rows*, whose scales are free."""
-    touched = dict.fromkeys(ids)
-    inside = set(ids)
-    for row in rows:
-        own = graph.segments[row].keyframes
-        places = [place for place, i in enumerate(own) if i in inside]
-        begin = max(0, min(places) - _OF_SCALE // 2)
-        touched.update(dict.fromkeys(own[begin : begin + _OF_SCALE]))
-    return edges_of(graph, touched, options)
+def information_of(graph: MapGraph, edge: LoopEdge) -> Array:
+    """Return the ``(6, 6)`` information of a loop closure in the unit of its component, without weight."""
+    row = graph.unit_segment_of(edge)
+    if row < 0:
+        return edge.information
+    per_length = np.array([1.0 / graph.segments[row].scale] * 3 + [1.0] * 3)
+    information: Array = per_length[:, None] * edge.information * per_length
+    return information
 
 
-def _scale_terms(graph: Graph, edges: Edges, rows: list[int], options: LiveMapOptions) -> ScaleTerms | None:
-    """Return the free scales of segments, and what edges measure of them; None if there are none.
+# --- One window ---
 
-    All ratios of depths that a robot causes count as one: what is wrong with its depths is wrong in all of
-    them, on purpose or not.  So lengths of ways, in the metres of others, decide, and no robot moves others
-    by its depths.
+
+def _choose_window(
+    graph: MapGraph, seeds: Sequence[int], size: int, held: set[int]
+) -> tuple[list[int], bool]:
+    """Return up to *size* keyframes around *seeds*, and whether they are the whole component.
+
+    The search is breadth-first and does not pass *held* keyframes.  Of too many seeds the last are taken.
     """
-    if not rows:
-        return None
-    of_row = np.full(len(graph.segments) + 1, -1, dtype=np.int64)
-    of_row[rows] = np.arange(len(rows))
-    m = len(edges.a)
-    difference, information = np.zeros(m), np.zeros(m)
-    for place in np.flatnonzero(edges.numbers >= 0).tolist():
-        link = graph.links[int(edges.numbers[place])]
-        if link.scale is not None:
-            here, there = graph.segment_of(link.a).scale, graph.segment_of(link.b).scale
-            difference[place] = link.scale[0] + math.log(here / there)
-            information[place] = link.weight(options.strong) ** 2 / link.scale[1]
-    measures = information > 0.0
-    ends = [np.where(measures, of_row[graph.of_segment[each]], -1) for each in (edges.b, edges.a)]
-    counts = [np.bincount(each[each >= 0], minlength=len(rows)) for each in ends]
-    shared = np.append(counts[0] + counts[1], 1)
-    information /= np.maximum(shared[ends[0]], shared[ends[1]])
-    return ScaleTerms(
-        count=len(rows), of_edge=of_row[edges.units],
-        plus=ends[0], minus=ends[1],
-        difference=difference, information=information,
-    )  # fmt: skip
-
-
-def odometry_step(T_from_to: Array, options: LiveMapOptions) -> float:
-    """Return how many steps of the odometry's noise a motion is."""
-    moved = float(np.sqrt((T_from_to[:3, 3] ** 2).sum())) / options.spacing_m
-    turned = rotation_angle_deg(T_from_to[:3, :3]) / options.spacing_deg
-    return max(moved, turned, _LEAST_STEP)
-
-
-def _window(graph: Graph, seeds: Sequence[int], size: int, held: set[int]) -> tuple[list[int], bool]:
-    """Return up to *size* keyframes around *seeds*, nearest first, and whether they are the whole component.
-
-    Where there are more seeds, the newest are taken.
-    """
-    front = [i for i in seeds if i not in held][-size:]
-    seen = set(front)
-    ids = list(front)
-    while front:
-        following: list[int] = []
-        for i in front:
-            for other, _ in graph.neighbours(i):
-                if other not in seen and other not in held:
+    frontier = [i for i in seeds if i not in held][-size:]
+    seen = set(frontier)
+    ids = list(frontier)
+    while frontier:
+        next_frontier: list[int] = []
+        for i in frontier:
+            for neighbour, _ in graph.neighbours(i):
+                if neighbour not in seen and neighbour not in held:
                     if len(ids) == size:
                         return ids, False
-                    seen.add(other)
-                    ids.append(other)
-                    following.append(other)
-        front = following
-    return ids, len(front) == 0 and len(seeds) <= size
+                    seen.add(neighbour)
+                    ids.append(neighbour)
+                    next_frontier.append(neighbour)
+        frontier = next_frontier
+    return ids, len(seeds) <= size
 
 
-def _fit(
-    graph: Graph, ids: list[int], told: list[int], edges: Edges, free: list[int], options: LiveMapOptions
+def _smooth_window(
+    graph: MapGraph, ids: list[int], wanted: list[int], edges: GraphEdges, free_scales: list[int]
 ) -> tuple[SmoothedPoses, Rows, dict[int, int]]:
-    """Return the smoothed poses, the keyframes of the window that touch its border, and rows by id."""
+    """Return the smoothed poses, the keyframes at the border of the window, and the row of each keyframe.
+
+    The poses are those of *ids*, followed by their neighbours outside of the window, which are held.
+    Covariances are computed for the keyframes *wanted*.
+    """
     row_of = np.full(len(graph), -1, dtype=np.int64)
     row_of[ids] = np.arange(len(ids))
     a_inside, b_inside = row_of[edges.a] >= 0, row_of[edges.b] >= 0
     border = np.concatenate([edges.a[a_inside & ~b_inside], edges.b[b_inside & ~a_inside]])
-    beyond = np.unique(np.concatenate([edges.b[~b_inside], edges.a[~a_inside]]))
-    row_of[beyond] = len(ids) + np.arange(len(beyond))
-    found = smooth(
-        graph.T[np.concatenate([ids, beyond])], len(ids), row_of[edges.a], row_of[edges.b], edges.T_a_b,
-        edges.information, edges.numbers >= 0, cauchy=options.cauchy, wanted=row_of[told],
-        scales=_scale_terms(graph, edges, free, options),
-    )  # fmt: skip
-    return found, np.unique(border), {i: row for row, i in enumerate(ids)}
+    outside = np.unique(np.concatenate([edges.b[~b_inside], edges.a[~a_inside]]))
+    row_of[outside] = len(ids) + np.arange(len(outside))
+    smoothed = smooth(
+        graph.T_component_camera[np.concatenate([ids, outside])],
+        len(ids),
+        row_of[edges.a],
+        row_of[edges.b],
+        edges.T_a_b,
+        edges.information,
+        edges.numbers >= 0,
+        cauchy=CAUCHY_WIDTH,
+        wanted=row_of[wanted],
+        scales=_scale_terms(graph, edges, free_scales),
+    )
+    return smoothed, np.unique(border), {i: row for row, i in enumerate(ids)}
 
 
-def _is_moved(
-    graph: Graph, border: Rows, found: SmoothedPoses, rows: dict[int, int], options: LiveMapOptions
+def _has_moved(
+    graph: MapGraph, border: Rows, smoothed: SmoothedPoses, row_of: dict[int, int], options: LiveMapOptions
 ) -> bool:
-    """Return whether a keyframe at the border of the window moved by more than it may."""
+    """Return whether a keyframe at the border of a window moved or turned farther than the options allow."""
     if not len(border):
         return False
-    old, new = graph.T[border], found.T[[rows[i] for i in border.tolist()]]
-    moved2_m2 = ((new[:, :3, 3] - old[:, :3, 3]) ** 2).sum(axis=1).max()
-    traces = (old[:, :3, :3] * new[:, :3, :3]).sum(axis=(1, 2))
-    least_trace = 1.0 + 2.0 * math.cos(math.radians(options.border_deg))
-    return bool(moved2_m2 > options.border_m**2 or traces.min() < least_trace)
+    before = graph.T_component_camera[border]
+    after = smoothed.T[[row_of[i] for i in border.tolist()]]
+    moved2_m2 = ((after[:, :3, 3] - before[:, :3, 3]) ** 2).sum(axis=1).max()
+    traces = (before[:, :3, :3] * after[:, :3, :3]).sum(axis=(1, 2))
+    min_trace = 1.0 + 2.0 * math.cos(math.radians(options.max_border_rotation_deg))
+    return bool(moved2_m2 > options.max_border_shift_m**2 or traces.min() < min_trace)
+
+
+# --- Scales of segments that are not metric ---
+
+
+def _find_free_scales(graph: MapGraph, ids: Sequence[int]) -> list[int]:
+    """Return the rows of the segments of keyframes *ids*, of one component, whose scale is estimated.
+
+    These are the segments that are not metric.  In a component without a metric segment, the segment that
+    defines the frame also defines the unit, so its scale is held.
+    """
+    if not graph.has_scales or not ids:
+        return []
+    used_rows = {int(row) for row in graph.segment_rows[list(ids)]}
+    rows = sorted(row for row in used_rows if not graph.segments[row].is_metric)
+    if rows and not graph.is_metric(graph.component_of(ids[0])):
+        held = int(graph.segment_rows[graph.anchor(rows[0])])
+        rows = [row for row in rows if row != held]
+    return rows
+
+
+def _select_edges_with_scales(graph: MapGraph, ids: list[int], free_scales: list[int]) -> GraphEdges:
+    """Return the edges of keyframes *ids*, and those that determine the scales of segments *free_scales*."""
+    touched = dict.fromkeys(ids)
+    inside = set(ids)
+    for row in free_scales:
+        own = graph.segments[row].keyframes
+        first = min(position for position, i in enumerate(own) if i in inside)
+        begin = max(0, first - MAX_SCALE_KEYFRAMES // 2)
+        touched.update(dict.fromkeys(own[begin : begin + MAX_SCALE_KEYFRAMES]))
+    return select_edges(graph, touched)
+
+
+def _scale_terms(graph: MapGraph, edges: GraphEdges, free_scales: list[int]) -> ScaleTerms | None:
+    """Return the scales that are estimated, and what edges measure of them; None if there are none.
+
+    All measured ratios of depths that a segment causes count as one measurement, because an error of its
+    depths is in all of them.  So the lengths of paths, measured in the metres of other robots, decide, and no
+    robot moves others by false depths.
+    """
+    if not free_scales:
+        return None
+    # 1. The index of each estimated scale by row of its segment.
+    index_of_row = np.full(len(graph.segments) + 1, -1, dtype=np.int64)
+    index_of_row[free_scales] = np.arange(len(free_scales))
+    # 2. The logarithm of the ratio of scales that each loop closure measures, and its information.
+    m = len(edges.a)
+    difference, information = np.zeros(m), np.zeros(m)
+    for position in np.flatnonzero(edges.numbers >= 0).tolist():
+        edge = graph.edges[int(edges.numbers[position])]
+        if edge.scale is not None:
+            scale_a, scale_b = graph.segment_of(edge.a).scale, graph.segment_of(edge.b).scale
+            difference[position] = edge.scale[0] + math.log(scale_a / scale_b)
+            information[position] = edge.weight**2 / edge.scale[1]
+    # 3. Share the information of one measurement among all that a segment takes part in.
+    measures = information > 0.0
+    plus, minus = (
+        np.where(measures, index_of_row[graph.segment_rows[ends]], -1) for ends in (edges.b, edges.a)
+    )
+    counts = [np.bincount(scales[scales >= 0], minlength=len(free_scales)) for scales in (plus, minus)]
+    measurements = np.append(counts[0] + counts[1], 1)
+    information /= np.maximum(measurements[plus], measurements[minus])
+    return ScaleTerms(
+        count=len(free_scales),
+        of_edge=index_of_row[edges.unit_segments],
+        plus=plus,
+        minus=minus,
+        difference=difference,
+        information=information,
+    )

@@ -1,9 +1,8 @@
-"""Between a live map and versions of the registry: publish what is connected, and start from one."""
+"""Publish a live map as a version of the registry of maps, and start a live map from such a version."""
 
 from __future__ import annotations
 
 import contextlib
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -14,9 +13,9 @@ import numpy as np
 from rse_pf.errors import BadMessage, BadRequest, InternalError, LimitExceeded
 from rse_pf.geometry import Array, Camera, inverse
 from rse_pf.live_map.events import MapStarted, StartEdge, StartKeyframe, matrix_bytes
-from rse_pf.live_map.graph import Graph, Segment
-from rse_pf.live_map.options import LiveMapOptions
-from rse_pf.live_map.smoothing import edges_of, link_information
+from rse_pf.live_map.graph import MapGraph
+from rse_pf.live_map.graph_rows import LoopEdge, Segment
+from rse_pf.live_map.smoothing import information_of, odometry_information, select_edges
 from rse_pf.maps.format import UP, UP_FIELD, Edge, EdgeKind, Keyframe, MapVersion
 from rse_pf.slam.inertial import agreed_gravity, upright_rotation
 from rse_pf.slam.keyframe import SentKeyframe, decode_keyframe, encode_keyframe
@@ -34,15 +33,18 @@ __all__ = [
     "whole_graph",
 ]
 
-_MAX_IMAGES = 8_000
-"""75 bytes each: a provenance has 1 MiB."""
+MAX_IMAGE_REFERENCES = 8_000
+"""Newest keyframes of a version whose images are listed in its provenance, which may have 1 MiB; a reference
+needs 75 bytes."""
+MAX_ROBOT_NAME = 64  # characters of a robot's name in a version
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PointSource:
-    """The points of one keyframe of a version: an object of ``robot``, a `RobotId.folder`, and its pose.
+    """The stored point cloud of one keyframe of a version.
 
-    ``T_world_camera`` is ``(4, 4)``, in the world of the version.
+    ``reference`` names the object of ``robot``, whose text is that of `RobotId.folder`.  ``camera`` made the
+    depth image, and ``T_world_camera`` ``(4, 4)`` is its pose in the world of the version, metres.
     """
 
     robot: str
@@ -52,33 +54,32 @@ class PointSource:
 
 
 @contextlib.contextmanager
-def as_internal_error(what: str) -> Iterator[None]:
-    """Raise what is wrong with a map that is kept as InternalError: who asks for it has not caused it.
+def as_internal_error(prefix: str) -> Iterator[None]:
+    """Turn errors about a stored map into InternalError, since the client that asks did not cause them.
 
-    Args:
-        what: Begin of the message, such as "the live map cannot be published".
+    *prefix* begins the message, such as "the live map cannot be published".
     """
     try:
         yield
     except (BadRequest, BadMessage, LimitExceeded) as error:
-        raise InternalError(f"{what}: {error.message}", hint=error.hint) from error
+        raise InternalError(f"{prefix}: {error.message}", hint=error.hint) from error
 
 
 def started_from(version: MapVersion, source: str) -> MapStarted:
-    """Return the event by which a live map starts from *version*, which is called *source*.
+    """Return the event by which a live map starts from *version*, whose name is *source*.
 
-    Features without a depth are left out; the cloud of points is not taken over.
+    Features without a depth are left out, and so is the point cloud of the version.
 
     Raises:
-        InternalError: An edge of the version has no usable information.
+        InternalError: The information of an edge is not positive definite.
     """
-    information = np.array([each.information for each in version.edges]).reshape(-1, 6, 6)
+    information = np.array([edge.information for edge in version.edges]).reshape(-1, 6, 6)
     if not is_positive_definite(information):
         raise InternalError(
             f"{source} has an edge whose information is not positive definite",
             hint="start from another version, or from an empty map",
         )
-    row = {keyframe.id: number for number, keyframe in enumerate(version.keyframes)}
+    index_of = {keyframe.id: index for index, keyframe in enumerate(version.keyframes)}
     return MapStarted(
         source=source,
         keyframes=tuple(
@@ -87,165 +88,187 @@ def started_from(version: MapVersion, source: str) -> MapStarted:
         ),
         links=tuple(
             StartEdge(
-                a=row[each.a], b=row[each.b], T_a_b=matrix_bytes(each.T_a_b),
-                information=matrix_bytes(each.information),
+                a=index_of[edge.a],
+                b=index_of[edge.b],
+                T_a_b=matrix_bytes(edge.T_a_b),
+                information=matrix_bytes(edge.information),
             )
-            for each in version.edges
+            for edge in version.edges
         ),
-    )  # fmt: skip
+    )
 
 
-def version_of(graph: Graph, options: LiveMapOptions) -> MapVersion:
-    """Return the keyframes that are connected with the map's frame and keep their features, and their edges.
+def version_of(graph: MapGraph) -> MapVersion:
+    """Return the keyframes with features that are connected with the frame of the map, and their edges.
 
-    Odometry leads from each such keyframe of a segment to the next one.  Where more than half of the robots
-    with an IMU agree on where down is, z of the version points up.
+    Odometry edges lead from each such keyframe of a segment to the next one.  If more than half of the robots
+    with an IMU agree on the direction of gravity, the z axis of the version points up.
 
     Raises:
-        InternalError: Something that the map holds does not fit into a version.
+        InternalError: The map holds something that does not fit into a version.
     """
     with as_internal_error("the live map cannot be published"):
-        return _version_of(graph, options)
+        return _version_of(graph)
 
 
-def _version_of(graph: Graph, options: LiveMapOptions) -> MapVersion:
-    ids = [i for i in _aligned(graph) if graph.held[i]]
+def _version_of(graph: MapGraph) -> MapVersion:
+    # 1. Decode the keyframes, and collect what their IMUs say about gravity.
+    ids = [i for i in _aligned_keyframes(graph) if graph.has_features[i]]
     keyframes: list[Keyframe] = []
-    downs: dict[str, list[Array]] = {}
+    down_directions: dict[str, list[Array]] = {}
     for i in ids:
-        row = graph.keyframes[i]
-        assert row.data is not None
-        seen = decode_keyframe(row.data)
-        if seen.imu is not None:
-            downs.setdefault(row.robot, []).append(graph.T[i, :3, :3] @ seen.imu.down_camera)
+        live = graph.keyframes[i]
+        assert live.data is not None
+        sent, T_map_camera = decode_keyframe(live.data), graph.T_component_camera[i]
+        if sent.imu is not None:
+            down_map = T_map_camera[:3, :3] @ sent.imu.down_camera
+            down_directions.setdefault(live.robot, []).append(down_map)
         keyframes.append(
-            seen.in_map(
+            sent.in_map(
                 id=i,
-                robot=_short_name(row.robot),
-                T_world_camera=graph.T[i].copy(),
+                robot=_short_name(live.robot),
+                T_world_camera=T_map_camera.copy(),
                 metres_per_unit=graph.segment_of(i).scale,
             )
         )
-    # A map that started from a version keeps the axes of that.
-    down = None if graph.source else agreed_gravity([np.array(each) for each in downs.values()])
+    # 2. Turn the map upright; a map that started from a version keeps the axes of the version.
+    is_new = not graph.source
+    down = agreed_gravity([np.array(each) for each in down_directions.values()]) if is_new else None
     if down is not None:
-        turn = upright_rotation(down)
+        upright = upright_rotation(down)
         keyframes = [
-            replace(keyframe, T_world_camera=turn @ keyframe.T_world_camera) for keyframe in keyframes
+            replace(keyframe, T_world_camera=upright @ keyframe.T_world_camera) for keyframe in keyframes
         ]
-    kept = set(ids)
-    edges = []
+    # 3. Collect the edges.
+    published = set(ids)
+    edges: list[Edge] = []
     for segment in _aligned_segments(graph):
-        if not segment.version:
-            edges += _odometry(graph, [i for i in segment.keyframes if i in kept], options)
-    for link in graph.links.values():
-        if link.state == "believed" and link.a in kept and link.b in kept:
-            across = graph.of_segment[link.a] != graph.of_segment[link.b]
-            kind: EdgeKind = "odometry" if link.fixed else "merge" if across else "loop"
+        if not segment.is_from_version:
+            edges += _odometry_edges(graph, [i for i in segment.keyframes if i in published])
+    for edge in graph.edges.values():
+        if edge.state == "accepted" and edge.a in published and edge.b in published:
             edges.append(
                 Edge(
-                    a=link.a, b=link.b, T_a_b=graph.step_of(link), information=link_information(graph, link),
-                    kind=kind,
+                    a=edge.a,
+                    b=edge.b,
+                    T_a_b=graph.relative_pose_of(edge),
+                    information=information_of(graph, edge),
+                    kind=_kind_of(graph, edge),
                 )
-            )  # fmt: skip
+            )
     provenance: dict[str, Any] = {"made_by": "live", "from": graph.source}
     if down is not None:
         provenance[UP_FIELD] = list(UP)
     return MapVersion(keyframes=tuple(keyframes), edges=tuple(edges), provenance=provenance)
 
 
-def point_sources(graph: Graph, version: MapVersion) -> tuple[PointSource, ...]:
-    """Return where the points of the keyframes of *version* are, which was just made of *graph*.
+def point_sources(graph: MapGraph, version: MapVersion) -> tuple[PointSource, ...]:
+    """Return the stored point clouds of the keyframes of *version*, which was just made of *graph*.
 
-    Points of a segment without metres, or that the map does not believe, are left out.
+    Points of segments that are excluded or not metric are left out.
     """
     sources = []
     for keyframe in version.keyframes:
-        row, segment = graph.keyframes[keyframe.id], graph.segment_of(keyframe.id)
-        if not row.objects or row.data is None or not segment.is_metric or segment.disbelieved:
+        live, segment = graph.keyframes[keyframe.id], graph.segment_of(keyframe.id)
+        if not live.objects or live.data is None or not segment.is_metric or segment.is_excluded:
             continue
-        reference = decode_keyframe(row.data).points
+        reference = decode_keyframe(live.data).points
         if reference is not None:
             sources.append(
                 PointSource(
-                    robot=row.robot, reference=reference, camera=keyframe.camera,
+                    robot=live.robot,
+                    reference=reference,
+                    camera=keyframe.camera,
                     T_world_camera=keyframe.T_world_camera,
                 )
-            )  # fmt: skip
+            )
     return tuple(sources)
 
 
-def paths_of(graph: Graph, most: int) -> list[tuple[str, int, Array]]:
-    """Return robot, segment and ``(n, 3)`` positions of the keyframes in the map's frame, metres.
+def paths_of(graph: MapGraph, limit: int) -> list[tuple[str, int, Array]]:
+    """Return (robot, segment, positions ``(n, 3)``) of the robots' segments that are connected with the map.
 
-    They are those of robots' segments that are connected with it, an even choice of *most* keyframes or a
-    few more: the first and the last of each segment are there.
+    Positions are in the frame of the map, metres.  About *limit* keyframes are chosen evenly over all
+    segments; the first and the last keyframe of each segment are among them.
     """
-    segments = [each for each in _aligned_segments(graph) if not each.version]
-    each_one = -(-sum(len(segment.keyframes) for segment in segments) // most) or 1
+    segments = [segment for segment in _aligned_segments(graph) if not segment.is_from_version]
+    stride = -(-sum(len(segment.keyframes) for segment in segments) // limit) or 1
     return [
         (
             segment.robot,
-            segment.segment,
-            graph.T[[*segment.keyframes[:-1:each_one], segment.keyframes[-1]], :3, 3].copy(),
+            segment.number,
+            graph.T_component_camera[[*segment.keyframes[:-1:stride], segment.keyframes[-1]], :3, 3].copy(),
         )
         for segment in segments
     ]
 
 
-def image_references(graph: Graph, version: MapVersion) -> dict[str, dict[str, dict[str, str]]]:
-    """Return ``images`` of the provenance of *version*: digests by robot's folder and id of the keyframe.
+def image_references(graph: MapGraph, version: MapVersion) -> dict[str, dict[str, dict[str, str]]]:
+    """Return the field ``images`` of the provenance of *version*: image digests by robot and id of keyframe.
 
-    They are those of the newest 8,000 keyframes; nothing without an image.
+    The robot is the text of `RobotId.folder`.  The newest 8,000 keyframes are listed; the result is empty if
+    none of them has an image.
     """
     images: dict[str, dict[str, str]] = {}
-    for keyframe in version.keyframes[-_MAX_IMAGES:]:
-        row = graph.keyframes[keyframe.id]
-        image = decode_keyframe(row.data).image if row.objects and row.data is not None else None
+    for keyframe in version.keyframes[-MAX_IMAGE_REFERENCES:]:
+        live = graph.keyframes[keyframe.id]
+        image = decode_keyframe(live.data).image if live.objects and live.data is not None else None
         if image is not None:
-            images.setdefault(row.robot, {})[str(keyframe.id)] = image.digest
+            images.setdefault(live.robot, {})[str(keyframe.id)] = image.digest
     return {"images": images} if images else {}
 
 
-def whole_graph(graph: Graph, options: LiveMapOptions) -> tuple[PoseGraph, list[int]]:
-    """Return all that is connected with the map's frame as a pose graph, and the ids of its rows."""
-    ids = _aligned(graph)
-    rows = np.full(len(graph), -1, dtype=np.int64)
-    rows[ids] = np.arange(len(ids))
-    edges = edges_of(graph, ids, options)
+def whole_graph(graph: MapGraph) -> tuple[PoseGraph, list[int]]:
+    """Return all that is connected with the frame of the map as a pose graph, and the ids of its poses."""
+    ids = _aligned_keyframes(graph)
+    index_of = np.full(len(graph), -1, dtype=np.int64)
+    index_of[ids] = np.arange(len(ids))
+    edges = select_edges(graph, ids)
     pose_graph = PoseGraph(
-        T_world_pose=graph.T[ids].copy(), a=rows[edges.a], b=rows[edges.b], T_a_b=edges.T_a_b,
-        information=edges.information, robust=edges.numbers >= 0, ids=np.array(ids, dtype=np.int64),
-    )  # fmt: skip
+        T_world_pose=graph.T_component_camera[ids].copy(),
+        a=index_of[edges.a],
+        b=index_of[edges.b],
+        T_a_b=edges.T_a_b,
+        information=edges.information,
+        robust=edges.numbers >= 0,
+        ids=np.array(ids, dtype=np.int64),
+    )
     return pose_graph, ids
 
 
-def _aligned_segments(graph: Graph) -> list[Segment]:
+def _aligned_segments(graph: MapGraph) -> list[Segment]:
     if graph.root < 0:
         return []
-    root = graph.segments[graph.root].component
+    root = graph.root_component()
     return [segment for segment in graph.segments if segment.component == root and segment.keyframes]
 
 
-def _aligned(graph: Graph) -> list[int]:
+def _aligned_keyframes(graph: MapGraph) -> list[int]:
     return sorted(i for segment in _aligned_segments(graph) for i in segment.keyframes)
 
 
-def _odometry(graph: Graph, ids: list[int], options: LiveMapOptions) -> list[Edge]:
-    """Return edges between consecutive keyframes of a segment, as the graph has them.
+def _odometry_edges(graph: MapGraph, ids: list[int]) -> list[Edge]:
+    """Return edges between consecutive keyframes *ids* of a segment.
 
-    Where keyframes in between are gone, the pose is that of the graph, which knew more than odometry.
+    Where keyframes in between have lost their features, the edge is the relative pose of the graph, which is
+    more accurate than the odometry over a longer path.
     """
-    spread = np.array([options.drift.step_m] * 3 + [math.radians(options.drift.step_deg)] * 3) ** -2.0
     edges = []
     for a, b in pairwise(ids):
         is_next = graph.next_in_segment(a) == b
-        from_a, to_b = graph.odometry([a, b]) if is_next else graph.T[[a, b]]
-        walked = float(graph.way[b] - graph.way[a])
-        edges.append(Edge(a=a, b=b, T_a_b=inverse(from_a) @ to_b, information=np.diag(spread / walked)))
+        T_a, T_b = graph.odometry_poses([a, b]) if is_next else graph.T_component_camera[[a, b]]
+        steps = float(graph.odometry_steps[b] - graph.odometry_steps[a])
+        information = np.diag(odometry_information() / steps)
+        edges.append(Edge(a=a, b=b, T_a_b=inverse(T_a) @ T_b, information=information))
     return edges
 
 
+def _kind_of(graph: MapGraph, edge: LoopEdge) -> EdgeKind:
+    if edge.is_fixed:
+        return "odometry"
+    return "merge" if graph.segment_rows[edge.a] != graph.segment_rows[edge.b] else "loop"
+
+
 def _short_name(folder: str) -> str:
-    """Return the name of a robot without its tenant and its enrolment."""
-    return folder.rpartition("/")[2].partition("=")[0][:64]
+    """Return the name of a robot without its tenant and its enrolment, from the text of `RobotId.folder`."""
+    return folder.rpartition("/")[2].partition("=")[0][:MAX_ROBOT_NAME]

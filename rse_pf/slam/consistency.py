@@ -1,6 +1,11 @@
-"""Decide which measured relative poses (links) between keyframes agree: loops within and between maps.
+"""Test which loop closures agree with each other and with odometry: pairwise consistency maximisation.
 
-Only links and odometry are compared, so the decision does not depend on the world frames of the maps.
+A merge of stored maps and the live map share these tests.  They compare relative poses only, so the result
+does not depend on the world frame in which a map is expressed.
+
+Source:
+    Mangelson et al., Pairwise consistent measurement set maximization for robust multi-robot map merging,
+    ICRA 2018.  Kimera-RPGO has another implementation (``Pcm.h``).
 """
 
 from __future__ import annotations
@@ -15,31 +20,33 @@ import numpy.typing as npt
 from rse_pf.geometry import Array, inverse, log_se3, scaled
 
 __all__ = [
-    "LinkEnds",
+    "EdgeArrays",
     "LoopClosure",
     "OdometryNoise",
-    "StrongLink",
-    "consistent",
+    "are_pairwise_consistent",
+    "are_scales_consistent",
+    "evidence_weight",
+    "find_consistent_set",
+    "find_maximum_clique",
     "fits_prediction",
-    "largest_clique",
-    "round_trips_close",
-    "scale_fits",
 ]
 
-_CHI2_3_99 = 11.345
-"""99 % of the squared Mahalanobis norms of a 3-vector lie below."""
-_CHI2_1_99 = 6.635
-"""The same of one number."""
-_MANY_ROWS = 128
-_MAX_BRANCHES = 200_000
-"""Limit of the clique search; beyond it the best clique so far is returned."""
+CHI2_99_PERCENT_3 = 11.345  # 99 % quantile of the chi-squared distribution with three degrees of freedom
+CHI2_99_PERCENT_1 = 6.635  # 99 % quantile of the chi-squared distribution with one degree of freedom
+FULL_WEIGHT_INLIERS = 30  # a loop closure with fewer inliers has a weight below 1, since they may be chance
+FULL_WEIGHT_INLIER_RATIO = 0.5  # a loop closure with fewer inliers per match has a weight below 1
+MANY_VERTICES = 128  # vertices from which the clique search colours by bit sets, since that is faster then
+MAX_CLIQUE_BRANCHES = 200_000
+"""Branches that the clique search visits at most, so that hostile input cannot block a server; the largest
+clique found until then is returned."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OdometryNoise:
-    """Drift of odometry: standard deviations for each axis from one keyframe to the next (a random walk).
+    """Drift of odometry as a random walk: standard deviations of each axis for one step of odometry.
 
-    ``step_scale`` is that of the logarithm of the scale of a camera without depth.
+    ``step_m`` is in metres, ``step_deg`` in degrees.  ``step_scale`` is the deviation of the logarithm of the
+    metric scale of a camera without depth.  One step is the motion from a keyframe to the next one.
     """
 
     step_m: float = 0.02
@@ -47,22 +54,14 @@ class OdometryNoise:
     step_scale: float = 0.005
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StrongLink:
-    """The inliers, and their share of the matches, from which on a measured link counts whole."""
-
-    inliers: int = 30
-    ratio: float = 0.5
-
-    def weight_of(self, inliers: int, matches: int) -> float:
-        """Return how much a link counts beside others, within 0..1: its lesser share of both limits."""
-        share = inliers / matches if matches else 1.0
-        return min(1.0, inliers / self.inliers, share / self.ratio)
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class LoopClosure:
-    """A measured relative pose of two keyframes (row numbers of one list)."""
+    """A measured relative pose between the keyframes in rows ``a`` and ``b`` of one list.
+
+    ``T_a_b`` ``(4, 4)`` maps points from the camera frame of *b* to that of *a*.  ``information`` ``(6, 6)``
+    is the inverse covariance of its twist (metres, radians).  ``inliers`` of the ``matches`` between both
+    images fit the pose.
+    """
 
     a: int
     b: int
@@ -73,12 +72,13 @@ class LoopClosure:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class LinkEnds:
-    """*m* links as arrays: from rows *a* to rows *b*, ``T_a_b`` ``(m, 4, 4)``, variances ``(m, 6)``.
+class EdgeArrays:
+    """*m* measured relative poses as arrays: from the keyframes in rows ``a`` to those in rows ``b``.
 
-    The variances are of the twist (square metres, square radians).  Where the poses of all ends *b* have
-    another unit than those of all ends *a*, in which ``T_a_b`` is, ``scales`` ``(m, 2)`` are the logarithm of
-    how long it is in that, and its variance.
+    ``T_a_b`` is ``(m, 4, 4)``; ``variances`` ``(m, 6)`` are those of its twist (square metres, square
+    radians).  ``scales`` ``(m, 2)`` is given where the poses of *b* have another unit of length than those of
+    *a*: the logarithm of the length of the unit of *b* in the unit of *a*, and the variance of this
+    logarithm.  ``T_a_b`` is then in the unit of *a*.
     """
 
     a: npt.NDArray[np.int64]
@@ -88,195 +88,234 @@ class LinkEnds:
     scales: Array | None = None
 
     @classmethod
-    def of(cls, links: Sequence[LoopClosure]) -> LinkEnds:
-        """Return *links*, at least one, as arrays."""
-        information = np.array([link.information for link in links])
+    def of(cls, loop_closures: Sequence[LoopClosure]) -> EdgeArrays:
+        """Return *loop_closures*, at least one, as arrays without scales."""
+        information = np.array([closure.information for closure in loop_closures])
         return cls(
-            a=np.array([link.a for link in links], dtype=np.int64),
-            b=np.array([link.b for link in links], dtype=np.int64),
-            T_a_b=np.array([link.T_a_b for link in links]),
+            a=np.array([closure.a for closure in loop_closures], dtype=np.int64),
+            b=np.array([closure.b for closure in loop_closures], dtype=np.int64),
+            T_a_b=np.array([closure.T_a_b for closure in loop_closures]),
             variances=np.diagonal(np.linalg.inv(information), axis1=1, axis2=2),
         )
 
-    def rows(self, which: slice | npt.NDArray[np.int64]) -> LinkEnds:
-        """Return some of the links."""
+    def select(self, chosen: slice | npt.NDArray[np.int64]) -> EdgeArrays:
+        """Return the relative poses at the positions *chosen*, a slice or an array of indices."""
         return replace(
-            self, a=self.a[which], b=self.b[which], T_a_b=self.T_a_b[which], variances=self.variances[which],
-            scales=None if self.scales is None else self.scales[which],
-        )  # fmt: skip
+            self,
+            a=self.a[chosen],
+            b=self.b[chosen],
+            T_a_b=self.T_a_b[chosen],
+            variances=self.variances[chosen],
+            scales=None if self.scales is None else self.scales[chosen],
+        )
 
     @property
     def mean_variances(self) -> tuple[Array, Array]:
-        """The ``(m,)`` means of the variances of an axis: square metres, square radians."""
+        """Variances of one axis of each relative pose: ``(m,)`` square metres, ``(m,)`` square radians."""
         return self.variances[:, :3].mean(axis=1), self.variances[:, 3:].mean(axis=1)
 
 
-def consistent(
-    links: Sequence[LoopClosure],
+def evidence_weight(inliers: int, matches: int) -> float:
+    """Return the weight of a loop closure within 0 to 1, by its inliers and by its inliers per match.
+
+    The smaller ratio to 30 inliers and to half of the matches decides.  Weights add up: two loop closures of
+    weight 0.5 count as one of full weight.
+    """
+    ratio = inliers / matches if matches else 1.0
+    return min(1.0, inliers / FULL_WEIGHT_INLIERS, ratio / FULL_WEIGHT_INLIER_RATIO)
+
+
+def find_consistent_set(
+    loop_closures: Sequence[LoopClosure],
     T_world_camera: Array,
     order: npt.NDArray[np.int64],
     noise: OdometryNoise,
 ) -> npt.NDArray[np.int64]:
-    """Return the rows of the largest set of *links* that agree pairwise; deterministic.
-
-    Two links agree as `round_trips_close` says.
+    """Return the sorted indices of the largest set of loop closures that agree pairwise; deterministic.
 
     Args:
-        links: All between the same two trajectories (or within one).
-        T_world_camera: ``(n, 4, 4)``, odometry of each trajectory in its own frame.
-        order: ``(n,)``, index of each keyframe along its trajectory.
-        noise: Of the odometry.
-    """
-    if not links:
-        return np.empty(0, dtype=np.int64)
-    ends = LinkEnds.of(links)
-    agree = np.zeros((len(links), len(links)), dtype=np.bool_)
-    for k in range(len(links)):
-        walked = np.abs(order[ends.a] - order[ends.a[k]]) + np.abs(order[ends.b] - order[ends.b[k]])
-        agree[k] = round_trips_close(T_world_camera, ends, ends.rows(slice(k, k + 1)), walked, noise)
-    agree &= agree.T
-    np.fill_diagonal(agree, False)
-    return largest_clique(agree)
-
-
-def round_trips_close(
-    T: Array, links: LinkEnds, last: LinkEnds, walked: Array, noise: OdometryNoise
-) -> npt.NDArray[np.bool_]:
-    """Return for each of *m* links whether it agrees with one other link: the only test of a pair.
-
-    The round trip a1 -> b1 -> b2 -> a2 -> a1 must be the identity; translation and rotation are tested
-    separately, at 99 %, against the noise of both links and of the odometry between them; rotation noise acts
-    on translation with the length of the path as its lever.
-
-    Where their frames have different units, the scales of two links that agree do, too; the trip is judged by
-    their mean.
-
-    Args:
-        T: ``(n, 4, 4)``, poses of keyframes; all ends *a* in one frame, and all ends *b* in one.
-        links: The *m* links.
-        last: The one link they are compared with.
-        walked: ``(m,)``, steps of odometry between the ends *a* and between the ends *b* together.
-        noise: Of one step of odometry.
+        loop_closures: All between the same two trajectories, or all within one trajectory.
+        T_world_camera: ``(n, 4, 4)``, poses of the keyframes by odometry, each trajectory in its own frame.
+        order: ``(n,)``, position of each keyframe along its trajectory.
+        noise: Drift of the odometry from one keyframe to the next.
 
     Source:
         Mangelson et al., Pairwise consistent measurement set maximization, ICRA 2018.
     """
-    along_b = inverse(T[last.b]) @ T[links.b]
-    along_a = inverse(T[links.a]) @ T[last.a]
-    off2, scale2, apart2 = np.zeros(1), np.zeros(1), np.ones(1)
-    if links.scales is not None and last.scales is not None:
-        off, apart2 = (links.scales - last.scales)[:, 0], links.scales[:, 1] + last.scales[:, 1]
-        # The mean by the information of both.
-        log_scale = last.scales[:, 0] + off * last.scales[:, 1] / apart2
+    if not loop_closures:
+        return np.empty(0, dtype=np.int64)
+    edges = EdgeArrays.of(loop_closures)
+    # 1. Test each pair of loop closures.
+    agree = np.zeros((len(loop_closures), len(loop_closures)), dtype=np.bool_)
+    for k in range(len(loop_closures)):
+        steps = np.abs(order[edges.a] - order[edges.a[k]]) + np.abs(order[edges.b] - order[edges.b[k]])
+        agree[k] = are_pairwise_consistent(T_world_camera, edges, edges.select(slice(k, k + 1)), steps, noise)
+    # 2. A pair agrees if both directions of the test say so, since rounding may differ.
+    agree &= agree.T
+    np.fill_diagonal(agree, False)
+    # 3. The largest set that agrees pairwise is a maximum clique of the graph of agreeing pairs.
+    return find_maximum_clique(agree)
+
+
+def are_pairwise_consistent(
+    T: Array, edges: EdgeArrays, reference: EdgeArrays, steps: Array, noise: OdometryNoise
+) -> npt.NDArray[np.bool_]:
+    """Return ``(m,)``: whether each of *m* loop closures agrees with one reference loop closure.
+
+    The round trip over both loop closures and the odometry between their ends must be the identity.
+    Translation and rotation are tested separately, at 99 %, against the noise of both loop closures and of
+    the odometry.  Rotation noise moves the end of the trip with the length of the path as its lever.
+
+    Where the two trajectories have different units of length, the two measured scales must agree as well,
+    and the round trip uses their mean, weighted by information.
+
+    Args:
+        T: ``(n, 4, 4)``, poses of keyframes; all ends *a* are in one frame, and all ends *b* in one.
+        edges: The *m* loop closures.
+        reference: One loop closure between the same two trajectories.
+        steps: ``(m,)``, steps of odometry between both ends *a* plus those between both ends *b*.
+        noise: Drift of the odometry in one step.
+
+    Source:
+        Mangelson et al., Pairwise consistent measurement set maximization, ICRA 2018.
+    """
+    # 1. Odometry between the ends of both loop closures.
+    along_b = inverse(T[reference.b]) @ T[edges.b]
+    along_a = inverse(T[edges.a]) @ T[reference.a]
+    # 2. Where units differ: the mean of both scales, and its variance.
+    scale_difference2, mean_scale_variance, scale_variance = np.zeros(1), np.zeros(1), np.ones(1)
+    if edges.scales is not None and reference.scales is not None:
+        difference = (edges.scales - reference.scales)[:, 0]
+        scale_variance = edges.scales[:, 1] + reference.scales[:, 1]
+        log_scale = reference.scales[:, 0] + difference * reference.scales[:, 1] / scale_variance
         along_b = scaled(along_b, np.exp(log_scale))
-        off2, scale2 = off**2, links.scales[:, 1] * last.scales[:, 1] / apart2
-    trip = log_se3(last.T_a_b @ along_b @ inverse(links.T_a_b) @ along_a)
+        scale_difference2 = difference**2
+        mean_scale_variance = edges.scales[:, 1] * reference.scales[:, 1] / scale_variance
+    # 3. The round trip a_reference -> b_reference -> b -> a -> a_reference as a twist.
+    trip = log_se3(reference.T_a_b @ along_b @ inverse(edges.T_a_b) @ along_a)
+    # 4. The variance that noise explains.
     lever_m2 = (along_a[:, :3, 3] ** 2).sum(axis=1) + (along_b[:, :3, 3] ** 2).sum(axis=1)
-    m2, rad2 = links.mean_variances
-    last_m2, last_rad2 = last.mean_variances
-    rad2 = rad2 + last_rad2 + walked * math.radians(noise.step_deg) ** 2
-    m2 = m2 + last_m2 + walked * noise.step_m**2 + rad2 * lever_m2
-    if links.scales is None:
-        return within_noise(trip, m2, rad2)
-    m2 = m2 + scale2 * (along_b[:, :3, 3] ** 2).sum(axis=1)
-    return within_noise(trip, m2, rad2) & scale_fits(off2, apart2 + walked * noise.step_scale**2)
+    variance_m2, variance_rad2 = edges.mean_variances
+    reference_m2, reference_rad2 = reference.mean_variances
+    variance_rad2 = variance_rad2 + reference_rad2 + steps * math.radians(noise.step_deg) ** 2
+    variance_m2 = variance_m2 + reference_m2 + steps * noise.step_m**2 + variance_rad2 * lever_m2
+    # 5. The chi-squared tests.
+    if edges.scales is None:
+        return _are_twists_noise(trip, variance_m2, variance_rad2)
+    variance_m2 = variance_m2 + mean_scale_variance * (along_b[:, :3, 3] ** 2).sum(axis=1)
+    scale_variance = scale_variance + steps * noise.step_scale**2
+    return _are_twists_noise(trip, variance_m2, variance_rad2) & are_scales_consistent(
+        scale_difference2, scale_variance
+    )
 
 
 def fits_prediction(
-    T_a_b: Array, links: LinkEnds, walked: Array, lever_m: Array, noise: OdometryNoise
+    T_a_b: Array, edges: EdgeArrays, steps: Array, lever_m: Array, noise: OdometryNoise
 ) -> npt.NDArray[np.bool_]:
-    """Return for each of *m* links whether it agrees with the pose that odometry or a graph predicts.
+    """Return ``(m,)``: whether each of *m* loop closures agrees with a predicted relative pose, at 99 %.
 
     Args:
-        T_a_b: ``(m, 4, 4)``, predicted.
-        links: The *m* measured links.
-        walked: ``(m,)``, steps of odometry from *a* to *b*.
-        lever_m: ``(m,)``, metres: how far a rotation along the way moves its end.
-        noise: Of one step of odometry.
+        T_a_b: ``(m, 4, 4)``, the relative poses that odometry or a pose graph predicts.
+        edges: The *m* measured loop closures.
+        steps: ``(m,)``, steps of odometry from *a* to *b*; the variance of the prediction grows with them.
+        lever_m: ``(m,)``, metres: distance over which rotation noise along the path moves its end.
+        noise: Drift of the odometry in one step.
     """
-    off = log_se3(inverse(links.T_a_b) @ T_a_b)
-    m2, rad2 = links.mean_variances
-    turned2 = walked * math.radians(noise.step_deg) ** 2
-    return within_noise(off, m2 + walked * noise.step_m**2 + turned2 * lever_m**2, rad2 + turned2)
+    error = log_se3(inverse(edges.T_a_b) @ T_a_b)
+    variance_m2, variance_rad2 = edges.mean_variances
+    drift_rad2 = steps * math.radians(noise.step_deg) ** 2
+    return _are_twists_noise(
+        error, variance_m2 + steps * noise.step_m**2 + drift_rad2 * lever_m**2, variance_rad2 + drift_rad2
+    )
 
 
-def scale_fits(off2: Array, variance: Array) -> npt.NDArray[np.bool_]:
-    """Return whether squares ``(m,)`` of logarithms of scales are noise of these variances, at 99 %."""
-    fits: npt.NDArray[np.bool_] = off2 <= _CHI2_1_99 * variance
+def are_scales_consistent(difference2: Array, variance: Array) -> npt.NDArray[np.bool_]:
+    """Return whether squared differences of logarithms of scales are noise of the given variance, at 99 %."""
+    fits: npt.NDArray[np.bool_] = difference2 <= CHI2_99_PERCENT_1 * variance
     return fits
 
 
-def within_noise(xi: Array, m2: Array, rad2: Array) -> npt.NDArray[np.bool_]:
-    """Return whether ``(m, 6)`` twists are noise of these variances of each axis, at 99 % for each half."""
-    close: npt.NDArray[np.bool_] = ((xi[:, :3] ** 2).sum(axis=1) <= _CHI2_3_99 * m2) & (
-        (xi[:, 3:] ** 2).sum(axis=1) <= _CHI2_3_99 * rad2
+def _are_twists_noise(xi: Array, variance_m2: Array, variance_rad2: Array) -> npt.NDArray[np.bool_]:
+    """Return whether both halves of ``(m, 6)`` twists are noise of these variances of one axis, at 99 %."""
+    fits: npt.NDArray[np.bool_] = ((xi[:, :3] ** 2).sum(axis=1) <= CHI2_99_PERCENT_3 * variance_m2) & (
+        (xi[:, 3:] ** 2).sum(axis=1) <= CHI2_99_PERCENT_3 * variance_rad2
     )
-    return close
+    return fits
 
 
-def largest_clique(agree: npt.NDArray[np.bool_]) -> npt.NDArray[np.int64]:
-    """Return the sorted rows of a largest set that agree pairwise; exact unless it is very large.
+def find_maximum_clique(adjacency: npt.NDArray[np.bool_]) -> npt.NDArray[np.int64]:
+    """Return the sorted vertices of a maximum clique of a graph, by branch and bound.
 
-    *agree* is ``(m, m)``, symmetric, with a diagonal of False.
+    A greedy colouring bounds the size of a clique: each colour contributes one vertex at most.  Among cliques
+    of equal size the first one found is returned.  The result is exact unless the search needs more than
+    200,000 branches; then it is the largest clique found so far.
 
-    Branch and bound with a greedy colouring as the bound; among equals the first found wins.
+    Args:
+        adjacency: ``(m, m)``, symmetric, with a diagonal of False.
 
     Source:
         Tomita and Kameda, An efficient branch-and-bound algorithm for finding a maximum clique, 2007.
     """
-    neighbours = [frozenset(np.flatnonzero(row).tolist()) for row in agree]
-    by_degree = sorted(range(len(neighbours)), key=lambda row: (-len(neighbours[row]), row))
-    best: list[int] = []
-    left = _MAX_BRANCHES
-    # A clique may be larger than the interpreter's recursion limit.
-    branches: list[tuple[list[int], list[tuple[int, int]]]] = [([], _colour(by_degree, neighbours, agree))]
-    while branches:
-        clique, coloured = branches[-1]
-        row, colours = coloured.pop() if coloured else (-1, 0)
-        if len(clique) + colours <= len(best) or left <= 0:
-            branches.pop()
+    neighbours = [frozenset(np.flatnonzero(row).tolist()) for row in adjacency]
+    by_degree = sorted(range(len(neighbours)), key=lambda vertex: (-len(neighbours[vertex]), vertex))
+    largest: list[int] = []
+    branches_left = MAX_CLIQUE_BRANCHES
+    # The stack of branches is explicit: a clique may be larger than the interpreter's recursion limit.
+    stack: list[tuple[list[int], list[tuple[int, int]]]] = [
+        ([], _colour_vertices(by_degree, neighbours, adjacency))
+    ]
+    while stack:
+        clique, candidates = stack[-1]
+        vertex, colours = candidates.pop() if candidates else (-1, 0)
+        # 1. Give this branch up if no clique in it can be larger.
+        if len(clique) + colours <= len(largest) or branches_left <= 0:
+            stack.pop()
             continue
-        left -= 1
-        grown = [*clique, row]
-        best = max(best, grown, key=len)
-        rest = [other for other, _ in coloured if other in neighbours[row]]
-        branches.append((grown, _colour(rest, neighbours, agree)))
-    return np.array(sorted(best), dtype=np.int64)
+        # 2. Add the vertex to the clique.
+        branches_left -= 1
+        grown = [*clique, vertex]
+        largest = max(largest, grown, key=len)
+        # 3. Go on with the candidates that are neighbours of the vertex.
+        remaining = [candidate for candidate, _ in candidates if candidate in neighbours[vertex]]
+        stack.append((grown, _colour_vertices(remaining, neighbours, adjacency)))
+    return np.array(sorted(largest), dtype=np.int64)
 
 
-def _colour(
-    rows: list[int], neighbours: list[frozenset[int]], agree: npt.NDArray[np.bool_]
+def _colour_vertices(
+    vertices: list[int], neighbours: list[frozenset[int]], adjacency: npt.NDArray[np.bool_]
 ) -> list[tuple[int, int]]:
-    """Return rows with how many colours those up to each need: no clique in them is larger."""
-    if len(rows) >= _MANY_ROWS:
-        return _colour_many(rows, agree)
+    """Return (vertex, number of colours used so far): no clique of the vertices up to this one is larger."""
+    if len(vertices) >= MANY_VERTICES:
+        return _colour_with_bit_sets(vertices, adjacency)
     classes: list[list[int]] = []
-    for row in rows:
-        for each in classes:
-            if neighbours[row].isdisjoint(each):
-                each.append(row)
+    for vertex in vertices:
+        for colour_class in classes:
+            if neighbours[vertex].isdisjoint(colour_class):
+                colour_class.append(vertex)
                 break
         else:
-            classes.append([row])
-    return [(row, colour) for colour, each in enumerate(classes, start=1) for row in each]
+            classes.append([vertex])
+    return [
+        (vertex, colour) for colour, colour_class in enumerate(classes, start=1) for vertex in colour_class
+    ]
 
 
-def _colour_many(rows: list[int], agree: npt.NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """Return what `_colour` does, class by class, by sets of rows that are bits of one integer each.
+def _colour_with_bit_sets(vertices: list[int], adjacency: npt.NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """Return the same colouring as `_colour_vertices`; a set of vertices is the bits of one integer.
 
     Source:
         San Segundo et al., An exact bit-parallel algorithm for the maximum clique problem, 2011.
     """
-    bits = np.packbits(agree[np.ix_(rows, rows)], axis=1, bitorder="little")
+    bits = np.packbits(adjacency[np.ix_(vertices, vertices)], axis=1, bitorder="little")
     neighbours = [int.from_bytes(row.tobytes(), "little") for row in bits]
-    coloured, left, colour = [], (1 << len(rows)) - 1, 0
-    while left:
+    coloured, uncoloured, colour = [], (1 << len(vertices)) - 1, 0
+    while uncoloured:
         colour += 1
-        allowed = left
+        allowed = uncoloured
         while allowed:
-            first = allowed & -allowed
-            place = first.bit_length() - 1
-            coloured.append((rows[place], colour))
-            left ^= first
-            allowed = (allowed ^ first) & ~neighbours[place]
+            lowest_bit = allowed & -allowed
+            position = lowest_bit.bit_length() - 1
+            coloured.append((vertices[position], colour))
+            uncoloured ^= lowest_bit
+            allowed = (allowed ^ lowest_bit) & ~neighbours[position]
     return coloured

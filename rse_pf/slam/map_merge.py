@@ -24,14 +24,14 @@ from rse_pf.maps.format import UP_FIELD, Edge, EdgeKind, MapVersion
 from rse_pf.service import Report
 from rse_pf.slam.cloud_deform import deform_clouds
 from rse_pf.slam.consistency import LoopClosure, OdometryNoise
-from rse_pf.slam.links import (
+from rse_pf.slam.loop_closures import (
     Atlas,
     LoopProposals,
     MergeOptions,
-    Refused,
-    agreeing_links,
-    maps_of,
-    propose_links,
+    RejectionCounts,
+    map_pair_of,
+    propose_loop_closures,
+    select_consistent,
 )
 from rse_pf.slam.optimise import (
     OptimisedGraph,
@@ -49,7 +49,7 @@ __all__ = [
     "MergeSteps",
     "MergedMap",
     "merge_versions",
-    "propose_links",
+    "propose_loop_closures",
 ]
 
 _STEP_NOISE = OdometryNoise(step_m=0.007, step_deg=0.5)
@@ -88,18 +88,18 @@ def _group_by_maps(
     """Return the loop closures by the indices of the two maps that they connect."""
     groups: dict[tuple[int, int], list[LoopClosure]] = {}
     for closure in loop_closures:
-        groups.setdefault(maps_of(atlas, closure.a, closure.b), []).append(closure)
+        groups.setdefault(map_pair_of(atlas, closure.a, closure.b), []).append(closure)
     return groups
 
 
 def _select(
     atlas: Atlas, proposals: LoopProposals, options: MergeOptions
-) -> tuple[list[LoopClosure], Refused]:
+) -> tuple[list[LoopClosure], RejectionCounts]:
     """Return the consistent loop closures of each pair of maps, and the counts of rejected ones by reason."""
     rejected = Counter(proposals.failed)
     accepted: list[LoopClosure] = []
     for pair, closures in sorted(_group_by_maps(atlas, proposals.links).items()):
-        rows, reasons = agreeing_links(pair, closures, atlas.T_world_camera, atlas.order, options)
+        rows, reasons = select_consistent(pair, closures, atlas.T_world_camera, atlas.order, options)
         accepted += [closures[row] for row in rows]
         rejected.update(reasons)
     return accepted, Counter({key: count for key, count in rejected.items() if count})
@@ -133,8 +133,8 @@ class MergeSteps:
             of the keyframes that are part of the merged map.
     """
 
-    propose: Callable[[Atlas, MergeOptions, Report], LoopProposals] = propose_links
-    select: Callable[[Atlas, LoopProposals, MergeOptions], tuple[list[LoopClosure], Refused]] = field(
+    propose: Callable[[Atlas, MergeOptions, Report], LoopProposals] = propose_loop_closures
+    select: Callable[[Atlas, LoopProposals, MergeOptions], tuple[list[LoopClosure], RejectionCounts]] = field(
         default=_select
     )
     align: Callable[[Atlas, Array, Sequence[LoopClosure]], list[LoopClosure]] = _align_nothing

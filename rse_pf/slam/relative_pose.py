@@ -2,7 +2,7 @@
 
 The landmarks of one image are found in the other one.  `measure_pose` returns any pose that was found;
 `measure_relative_pose` accepts it as a constraint between two keyframes only if enough matches are inliers.
-Which images are compared, and which constraints are outliers, is decided by `rse_pf.slam.links`,
+Which images are compared, and which constraints are outliers, is decided by `rse_pf.slam.loop_closures`,
 `rse_pf.slam.localise` and `rse_pf.live_map`.
 """
 

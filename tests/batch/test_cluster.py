@@ -19,7 +19,7 @@ from rse_pf.config import PlatformSettings
 from rse_pf.errors import BadRequest, Crashed
 from rse_pf.maps.format import MapVersion, encode_map
 from rse_pf.object_store import DirectoryStore
-from rse_pf.slam.map_merge import Atlas, MergeOptions, merge_versions, propose_links
+from rse_pf.slam.map_merge import Atlas, MergeOptions, merge_versions, propose_loop_closures
 from tests.synthetic_maps import make_world
 
 pytestmark = pytest.mark.slow
@@ -64,7 +64,7 @@ def test_a_merge_survives_its_workers_and_its_scheduler(tmp_path: Path, versions
 
     assert len(killed) == 2
     assert "the connection to the scheduler was lost and is there again" in events
-    expected = propose_links(Atlas.of(versions), MergeOptions()).links
+    expected = propose_loop_closures(Atlas.of(versions), MergeOptions()).links
     assert len(found.links) == len(expected)
     for one, other in zip(found.links, expected, strict=True):
         assert np.array_equal(one.T_a_b, other.T_a_b)

@@ -10,7 +10,7 @@ import pytest
 from rse_pf.batch.icp_tiles import align_tiles
 from rse_pf.geometry import Camera, exp_se3, inverse, pose_difference, transform
 from rse_pf.maps.format import Keyframe, MapVersion
-from rse_pf.slam.links import Atlas
+from rse_pf.slam.loop_closures import Atlas
 from tests.synthetic_maps import make_room
 
 pytest.importorskip("small_gicp", reason="the extra maps is not installed")

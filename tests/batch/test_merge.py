@@ -17,7 +17,7 @@ from rse_pf.errors import BadRequest, Disconnected, LimitExceeded
 from rse_pf.geometry import Array
 from rse_pf.maps.format import MapVersion, encode_map
 from rse_pf.object_store import MemoryStore
-from rse_pf.slam.map_merge import Atlas, MergedMap, MergeOptions, merge_versions, propose_links
+from rse_pf.slam.map_merge import Atlas, MergedMap, MergeOptions, merge_versions, propose_loop_closures
 from tests.batch.in_process import InProcessEngine
 from tests.synthetic_maps import make_world
 
@@ -74,7 +74,7 @@ def poses(merged: MergedMap) -> Array:
 
 
 def test_the_links_are_those_of_one_process_to_the_bit() -> None:
-    expected = propose_links(Atlas.of(two_robots()), MergeOptions()).links
+    expected = propose_loop_closures(Atlas.of(two_robots()), MergeOptions()).links
 
     found = in_parts().links
 

@@ -56,7 +56,7 @@ def _lying(world: GeneratedWorld, attack: str, positions: Array) -> GeneratedDri
         for number in range(1, len(odometry)):
             step = np.r_[world.rng.uniform(-2.0, 2.0, 3), world.rng.uniform(-1.0, 1.0, 3)]
             odometry[number] = odometry[number - 1] @ exp_se3(step)
-    elif attack == "lookalikes":  # its first views again, as if they lay 15 m away
+    elif attack == "aliases":  # its first views again, as if they lay 15 m away
         seen = drive.T_world_camera.copy()
         again = len(seen) - half
         seen[half:] = seen[:again]

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from rse_pf.geometry import Array, exp_se3, inverse
-from rse_pf.live_map import beliefs
-from rse_pf.live_map.beliefs import has_jumped
 from rse_pf.live_map.events import KeyframeAdded, LoopClosuresMeasured, MeasuredLoopClosure, matrix_bytes
-from rse_pf.live_map.graph import Graph, LiveKeyframe, LiveLink
+from rse_pf.live_map.graph import MapGraph
+from rse_pf.live_map.graph_rows import LiveKeyframe, LoopEdge
 from rse_pf.live_map.live_map import LiveMap
-from rse_pf.live_map.options import LiveMapOptions
 from rse_pf.live_map.outcomes import Culled
+from rse_pf.live_map.outlier_rejection import find_weakest_connection
+from rse_pf.live_map.robot_checks import has_odometry_jump
 from rse_pf.slam.keyframe import decode_keyframe
 from tests.live_map.hostile_rig import (
     ACCEPTED,
@@ -84,14 +84,14 @@ def step_of(metres: float) -> Array:
     return exp_se3(np.array([metres, 0.0, 0.0, 0.0, 0.0, 0.0]))
 
 
-def path(metres: list[float], is_metric: bool = True) -> Graph:
+def path(metres: list[float], is_metric: bool = True) -> MapGraph:
     """Return a graph with one robot that says it is so far along its path at each keyframe."""
-    graph = Graph()
-    row = graph.segment_row("x", 0)
-    graph.segments[row].is_metric = is_metric
+    graph = MapGraph()
+    row = graph.find_or_add_segment("x", 0)
+    graph.begin_segment(row, None if is_metric else 1.0, "")
     for number, at in enumerate(metres):
         keyframe = LiveKeyframe(robot="x", segment=0, number=number, timestamp_s=0.0, data=None)
-        graph.add(keyframe, row, step_of(at), step_of(at), 0.0)
+        graph.add_keyframe(keyframe, row, step_of(at), step_of(at), 0.0)
     return graph
 
 
@@ -114,8 +114,8 @@ JUMPED = [0.0, 0.2, 0.4, 0.6, 0.8, 4.0]
 def test_a_keyframe_is_off_its_path_where_those_just_before_see_it_elsewhere(
     metres: list[float], links: list[MeasuredLoopClosure], is_off: bool
 ) -> None:
-    assert has_jumped(path(metres), 5, links, LiveMapOptions()) is is_off
-    assert not has_jumped(path(metres, is_metric=False), 5, links, LiveMapOptions())
+    assert has_odometry_jump(path(metres), 5, links) is is_off
+    assert not has_odometry_jump(path(metres, is_metric=False), 5, links)
 
 
 def test_a_keyframe_off_its_path_is_compared_with_nothing_and_counts_as_a_contradiction(
@@ -131,9 +131,9 @@ def test_a_keyframe_off_its_path_is_compared_with_nothing_and_counts_as_a_contra
     outcomes = live_map.apply(measured)
 
     assert Culled(ids=(4,)) in outcomes
-    assert not live_map._graph.links
+    assert not live_map._graph.edges
     assert live_map._graph.segments[0].contradictions == 1
-    assert not live_map._graph.held[4]
+    assert not live_map._graph.has_features[4]
     assert LiveMap.restore(live_map.snapshot()).digest() == live_map.digest()
 
 
@@ -141,22 +141,21 @@ def test_a_keyframe_off_its_path_is_compared_with_nothing_and_counts_as_a_contra
 def test_a_robot_without_metres_separates_no_two_robots_with_metres(
     is_metric: bool, weakest: tuple[str, str]
 ) -> None:
-    graph = Graph()
+    graph = MapGraph()
     for robot in ("a", "b", "x"):
-        row = graph.segment_row(robot, 0)
+        row = graph.find_or_add_segment(robot, 0)
         keyframe = LiveKeyframe(robot=robot, segment=0, number=0, timestamp_s=0.0, data=None)
-        graph.add(keyframe, row, np.eye(4), np.eye(4), 0.0)
+        graph.add_keyframe(keyframe, row, np.eye(4), np.eye(4), 0.0)
     graph.segments[2].is_metric = is_metric
     for one, other, count in ((0, 1, 1), (1, 2, 5)):
         for _ in range(count):
-            graph.add_link(
-                LiveLink(
-                    a=one, b=other, T_a_b=np.eye(4), information=np.eye(6), inliers=100, matches=100,
-                    variances=np.ones(6), state="believed",
-                )
+            edge = LoopEdge(
+                a=one, b=other, T_a_b=np.eye(4), information=np.eye(6), inliers=100, matches=100,
+                variances=np.ones(6), state="accepted",
             )  # fmt: skip
+            graph.add_edges([edge])
 
-    numbers = beliefs._weakest_bridge(graph, 0, 2, LiveMapOptions())
+    numbers = find_weakest_connection(graph, 0, 2)
 
-    ends = {(graph.links[number].a, graph.links[number].b) for number in numbers}
+    ends = {(graph.edges[number].a, graph.edges[number].b) for number in numbers}
     assert ends == {tuple("abx".index(robot) for robot in weakest)}

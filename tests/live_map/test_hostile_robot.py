@@ -1,4 +1,4 @@
-"""A robot that lies in its own live map: it separates nobody for good, and is not believed for long."""
+"""A hostile robot in a live map: it separates nobody for good, and is excluded soon."""
 
 from __future__ import annotations
 
@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 
 from rse_pf.geometry import inverse
-from rse_pf.live_map.beliefs import Changes, smooth_changes
 from rse_pf.live_map.events import RobotForgotten
-from rse_pf.live_map.graph import Graph
+from rse_pf.live_map.graph import MapGraph
 from rse_pf.live_map.live_map import LiveMap
 from rse_pf.live_map.options import LiveMapOptions
 from rse_pf.live_map.outcomes import Ambiguous, LoopClosureRejected, Unaligned
+from rse_pf.live_map.outlier_rejection import GraphChanges
+from rse_pf.live_map.smoothing import smooth_changes
 from tests.live_map.generated_drives import GeneratedWorld, circle
 from tests.live_map.hostile_robot import HOSTILE, error_cm, joins, play, scenario, without
 
@@ -23,8 +24,8 @@ JOINED = {"a": True, "b": True, "c": True}
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1])
-def test_forgetting_a_robot_that_proved_false_lookalikes_joins_the_others_again(seed: int) -> None:
-    events, true = scenario("lookalikes", seed)
+def test_forgetting_a_robot_that_proved_false_aliases_joins_the_others_again(seed: int) -> None:
+    events, true = scenario("aliases", seed)
     attacked, clean = play(events), play(without(events, HOSTILE))
     assert joins(attacked.live_map) != JOINED
     restored = LiveMap.restore(attacked.live_map.snapshot())
@@ -34,11 +35,11 @@ def test_forgetting_a_robot_that_proved_false_lookalikes_joins_the_others_again(
 
     assert joins(attacked.live_map) == joins(clean.live_map) == JOINED
     assert restored.digest() == attacked.live_map.digest()
-    assert not attacked.live_map._graph.lookalikes
+    assert not attacked.live_map._graph.aliased_keyframes
     assert abs(error_cm(attacked, true[attacked.ids]) - error_cm(clean, true[attacked.ids])) <= 0.1
 
 
-def test_a_robot_whose_odometry_is_random_is_disbelieved_and_told() -> None:
+def test_a_robot_whose_odometry_is_random_is_excluded_and_notified() -> None:
     events, _ = scenario("random-odometry", seed=0, rounds=0.7)
     live_map = LiveMap()
     outcomes = [each for event in events for each in live_map.apply(event)]
@@ -54,7 +55,7 @@ def test_a_robot_whose_odometry_is_random_is_disbelieved_and_told() -> None:
 
 
 @pytest.mark.parametrize("slip", [0.9, 1.1])
-def test_robots_whose_wheels_slip_are_believed(slip: float) -> None:
+def test_robots_whose_wheels_slip_are_not_excluded(slip: float) -> None:
     world = GeneratedWorld(seed=4, links=3)
     drives = [world.drive(name, circle(1.2, 1.1, phase=phase)) for name, phase in (("a", 0.0), ("b", 2.0))]
     for drive in drives:
@@ -75,37 +76,42 @@ def test_smoothing_that_a_robot_causes_has_a_budget_of_its_own() -> None:
     ]
     live_map = play([*world.play(drives)]).live_map
     graph = live_map._graph
-    assert not graph.smoothing
+    assert not graph.smoothing_debt
     # No window is large enough, as if the robot's links moved the graph each time.
     options = LiveMapOptions(
-        windows=(5, 10, 20), border_m=0.0, border_deg=0.0, smoothing_each=10, smoothing_most=60
+        window_sizes=(5, 10, 20),
+        max_border_shift_m=0.0,
+        max_border_rotation_deg=0.0,
+        smoothing_allowance=10,
+        max_smoothing_debt=60,
     )
 
     def smoothed(robot: str) -> int:
-        graph.T[:, :3, 3] *= 1.01
-        window = smooth_changes(graph, Changes(moved=[len(graph) // 2]), options, robot)
+        graph.T_component_camera[:, :3, 3] *= 1.01
+        window = smooth_changes(graph, GraphChanges(moved=[len(graph) // 2]), options, robot)
         assert window is not None
-        return window.keyframes
+        return window.keyframe_count
 
     assert [smoothed(HOSTILE) for _ in range(6)] == [35, 35, 35, 5, 5, 5]
     restored = LiveMap.restore(live_map.snapshot())
-    assert restored._graph.smoothing == graph.smoothing == {HOSTILE: 60}
+    assert restored._graph.smoothing_debt == graph.smoothing_debt == {HOSTILE: 60}
     assert restored.digest() == live_map.digest()
     assert smoothed("a") == 35
     live_map.apply(RobotForgotten(robot=HOSTILE))
-    assert HOSTILE not in graph.smoothing
+    assert HOSTILE not in graph.smoothing_debt
 
 
-def test_a_robot_that_opens_segments_is_not_believed_anew_each_time() -> None:
-    graph = Graph()
-    first = graph.segments[graph.segment_row(HOSTILE, 0)]
-    first.contradictions, first.disbelieved = 0xFFFFFFFF, True
+def test_a_robot_that_opens_segments_does_not_lose_its_record() -> None:
+    graph = MapGraph()
+    row = graph.find_or_add_segment(HOSTILE, 0)
+    graph.note_contradiction(row, is_contradiction=True, count=32)
+    graph.exclude_segment(row, "contradicting")
 
-    second = graph.segments[graph.segment_row(HOSTILE, 1)]
-    honest = graph.segments[graph.segment_row("a", 0)]
+    second = graph.segments[graph.find_or_add_segment(HOSTILE, 1)]
+    honest = graph.segments[graph.find_or_add_segment("a", 0)]
 
-    assert (second.contradictions, second.disbelieved) == (0xFFFF, False)
-    assert (honest.contradictions, honest.disbelieved) == (0, False)
+    assert (second.contradictions, second.is_excluded) == (0xFFFF, False)
+    assert (honest.contradictions, honest.is_excluded) == (0, False)
 
 
 def test_a_snapshot_of_an_earlier_release_is_read() -> None:
@@ -117,7 +123,7 @@ def test_a_snapshot_of_an_earlier_release_is_read() -> None:
 
     restored = LiveMap.restore(msgspec.msgpack.encode(packed))
 
-    assert np.array_equal(restored._graph.T, live_map._graph.T)
+    assert np.array_equal(restored._graph.T_component_camera, live_map._graph.T_component_camera)
     assert restored.loop_closure_count == live_map.loop_closure_count
     assert not any(
         isinstance(each, LoopClosureRejected) for each in restored.apply(RobotForgotten(robot=HOSTILE))

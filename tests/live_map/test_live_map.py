@@ -12,6 +12,7 @@ import pytest
 
 from rse_pf.errors import BadRequest
 from rse_pf.geometry import Array, exp_se3, inverse, pose_difference
+from rse_pf.live_map.candidates import choose_candidates
 from rse_pf.live_map.events import (
     Event,
     LoopClosuresMeasured,
@@ -96,10 +97,10 @@ def test_two_robots_in_one_place_share_one_frame(joined: Run) -> None:
     assert degrees < 2.0
 
 
-def test_random_wrong_links_are_not_believed(joined: Run) -> None:
+def test_random_wrong_loop_closures_are_not_accepted(joined: Run) -> None:
     true = joined.world
-    for link in joined.map._graph.links.values():
-        if link.state == "believed":
+    for link in joined.map._graph.edges.values():
+        if link.state == "accepted":
             metres, degrees = pose_difference(link.T_a_b, inverse(true.seen[link.a]) @ true.seen[link.b])
             assert metres < 0.2
             assert degrees < 10.0
@@ -149,10 +150,10 @@ def test_a_part_is_made_anew_when_half_of_it_is_gone() -> None:
     run = _unmeasured(GeneratedWorld(seed=6), 128)
     first = run.map.snapshot_parts()
     for i in range(64):
-        run.map._graph.drop_data(i)
+        run.map._graph.drop_features(i)
         run.map._places.remove(i)
     second = run.map.snapshot_parts(first.parts)
-    run.map._graph.drop_data(64)
+    run.map._graph.drop_features(64)
     run.map._places.remove(64)
     third = run.map.snapshot_parts(first.parts)
     again = LiveMap.restore_parts(second.head, lambda name: first.parts[name] or b"")
@@ -266,7 +267,7 @@ def test_planted_links_are_removed_soon_after_contrary_evidence() -> None:
     assert run.worst_error(range(len(world.seen)))[0] < 0.1
 
 
-def test_a_segment_that_loses_its_links_is_told(joined: Run) -> None:
+def test_a_robot_keeps_its_alignment_when_the_first_robot_is_forgotten(joined: Run) -> None:
     run = copy_of(joined)
     told = run.apply(RobotForgotten(robot="a"))
     aligned = {each.robot: each.aligned for each in run.map.alignments()}
@@ -330,13 +331,15 @@ def test_robots_in_rooms_that_may_be_equal_are_joined_by_more_than_a_room() -> N
     assert LiveMap.restore(run.map.snapshot()).snapshot() == run.map.snapshot()
 
 
-def test_an_owner_that_is_behind_compares_a_keyframe_with_few_and_none_of_just_before() -> None:
+def test_an_overloaded_map_server_compares_a_keyframe_with_few_and_none_of_just_before() -> None:
     world = GeneratedWorld(seed=1)
     live_map, drive = LiveMap(LiveMapOptions(candidates=1000)), world.drive("a", straight(0.0, 9.0))
     for number in range(60):
         live_map.apply(world.keyframe(drive, number))
     assert len(live_map.prepare_measurement(59, 100, 4)) == 4
-    assert max(live_map._candidates(59)) > 50 > max(live_map._candidates(59, 1000))
+    graph, places = live_map._graph, live_map._places
+    assert max(choose_candidates(graph, places, 59, 1000)) > 50
+    assert max(choose_candidates(graph, places, 59, 1000, is_overloaded=True)) < 50
 
 
 def test_a_keyframe_is_new_known_or_ahead() -> None:
@@ -363,7 +366,7 @@ def test_a_keyframe_is_new_known_or_ahead() -> None:
         {"segment": -1},
     ],
 )
-def test_garbage_is_refused_before_it_is_logged(change: dict[str, Any]) -> None:
+def test_malformed_keyframes_are_refused_before_they_are_logged(change: dict[str, Any]) -> None:
     world = GeneratedWorld(seed=1)
     good = world.keyframe(world.drive("a", ROUND), 0)
     live = LiveMap()
@@ -387,9 +390,9 @@ def test_links_to_keyframes_that_were_forgotten_change_nothing(joined: Run) -> N
     run.apply(RobotForgotten(robot="b"))
     believed = run.map.loop_closure_count
 
-    measured = len(run.map._graph.links)
+    measured = len(run.map._graph.edges)
     assert run.apply(late) == []
-    assert len(run.map._graph.links) == measured
+    assert len(run.map._graph.edges) == measured
     assert run.apply(LoopClosuresMeasured(keyframe=10_000)) == []
     assert run.map.loop_closure_count == believed
 

@@ -1,4 +1,4 @@
-"""A robot whose metres are not those of two others: its links tell it, and it is disbelieved."""
+"""A robot whose metres are not those of two others: its loop closures show it, and it is excluded."""
 
 from __future__ import annotations
 
@@ -8,27 +8,26 @@ import msgspec
 import numpy as np
 import pytest
 
-from rse_pf.live_map.beliefs import Changes, disbelieve_contradicting, has_other_metres
 from rse_pf.live_map.events import KeyframeAdded, LoopClosuresMeasured, MeasuredLoopClosure, matrix_bytes
-from rse_pf.live_map.graph import Graph, LiveKeyframe
+from rse_pf.live_map.graph import MapGraph
+from rse_pf.live_map.graph_rows import LiveKeyframe
 from rse_pf.live_map.live_map import LiveMap
 from rse_pf.live_map.measure import measure_loop_closures
-from rse_pf.live_map.options import LiveMapOptions
 from rse_pf.live_map.outcomes import Outcome, Unaligned
+from rse_pf.live_map.outlier_rejection import GraphChanges
+from rse_pf.live_map.robot_checks import exclude_if_contradicting, has_wrong_scale
 from rse_pf.slam.keyframe import decode_keyframe, make_features
 from tests.live_map.generated_drives import GeneratedWorld, circle
 from tests.live_map.hostile_rig import generated_drives
 
-OPTIONS = LiveMapOptions()
 
-
-def graph_of(*robots: str) -> Graph:
+def graph_of(*robots: str) -> MapGraph:
     """Return a graph with one keyframe of each robot, without links."""
-    graph = Graph()
+    graph = MapGraph()
     for robot in robots:
-        row = graph.segment_row(robot, 0)
+        row = graph.find_or_add_segment(robot, 0)
         keyframe = LiveKeyframe(robot=robot, segment=0, number=0, timestamp_s=0.0, data=None)
-        graph.add(keyframe, row, np.eye(4), np.eye(4), 0.0)
+        graph.add_keyframe(keyframe, row, np.eye(4), np.eye(4), 0.0)
     return graph
 
 
@@ -56,25 +55,25 @@ def link(other: int, off_scale: float, inliers: int = 100) -> MeasuredLoopClosur
 def test_metres_are_others_where_two_robots_say_so(links: list[MeasuredLoopClosure], is_other: bool) -> None:
     graph = graph_of("x", "a", "b", "c")
 
-    assert has_other_metres(graph, 0, links, OPTIONS) is is_other
+    assert has_wrong_scale(graph, 0, links) is is_other
 
 
 def test_robots_without_metres_say_nothing_of_them() -> None:
     graph = graph_of("x", "a", "b")
     graph.segments[1].is_metric = False
 
-    assert not has_other_metres(graph, 0, [link(1, 0.1), link(2, 0.1)], OPTIONS)
+    assert not has_wrong_scale(graph, 0, [link(1, 0.1), link(2, 0.1)])
 
 
-def test_after_eight_keyframes_with_other_metres_a_robot_is_disbelieved() -> None:
+def test_after_eight_keyframes_with_other_metres_a_robot_is_excluded() -> None:
     graph = graph_of("x", "a", "b")
 
-    gone = [disbelieve_contradicting(graph, 0, Changes(), has_other_metres=True) for _ in range(8)]
+    gone = [exclude_if_contradicting(graph, 0, GraphChanges(), is_scale_wrong=True) for _ in range(8)]
 
     assert gone == [False] * 7 + [True]
-    assert graph.segments[0].disbelieved
+    assert graph.segments[0].is_excluded
     assert graph.segments[0].reason == "contradicting: its metres are not those of two other robots"
-    assert not graph.segments[1].disbelieved
+    assert not graph.segments[1].is_excluded
 
 
 @pytest.mark.parametrize(("factor", "least"), [(1.0, 0.0), (1.1, 0.06), (1 / 1.1, 0.06), (1.5, 0.3)])

@@ -128,13 +128,13 @@ def test_a_log_of_an_earlier_release_with_scaled_rotations_is_replayed_and_publi
     assert len(decode_map(encode_map(one.to_version())).keyframes) == 12
 
 
-def test_a_map_that_cannot_be_published_is_no_bad_decode_request_who_asks() -> None:
+def test_a_map_that_cannot_be_published_is_no_bad_request_of_its_client() -> None:
     world = GeneratedWorld(seed=1)
     drive = world.drive("a", straight(0.0, 1.2))
     live_map = LiveMap()
     for number in range(3):
         live_map.apply(world.keyframe(drive, number))
-    live_map._graph.T[1, 0, 3] = np.nan
+    live_map._graph.T_component_camera[1, 0, 3] = np.nan
 
     with pytest.raises(InternalError, match="the live map cannot be published: keyframe 1"):
         live_map.to_version()

@@ -12,7 +12,8 @@ import pytest
 
 from rse_pf.errors import BadRequest
 from rse_pf.geometry import Array, exp_se3, inverse, pose_difference, scaled
-from rse_pf.live_map.agreement import scale_into, step_into
+from rse_pf.live_map.alignment_reports import UP_TO_SCALE
+from rse_pf.live_map.edge_consistency import relative_pose_between_components, relative_scale
 from rse_pf.live_map.events import (
     Event,
     LoopClosuresMeasured,
@@ -23,10 +24,10 @@ from rse_pf.live_map.events import (
     matrix_bytes,
     matrix_of,
 )
-from rse_pf.live_map.live_map import UP_TO_SCALE, LiveMap
+from rse_pf.live_map.live_map import LiveMap
 from rse_pf.live_map.measure import measure_loop_closures
 from rse_pf.live_map.outcomes import Corrected, Joined
-from rse_pf.slam.consistency import LinkEnds, OdometryNoise, round_trips_close
+from rse_pf.slam.consistency import EdgeArrays, OdometryNoise, are_pairwise_consistent
 from rse_pf.slam.keyframe import KeyframeFeatures, make_features, make_scaleless_features
 from rse_pf.slam.smoother import ScaleTerms, smooth
 from tests.live_map.generated_drives import GeneratedDrive, GeneratedWorld, circle, make_link, straight
@@ -98,7 +99,7 @@ def test_the_first_robot_of_a_map_may_have_no_metres() -> None:
     run = Run(3, {"a": 0.5, "b": 3.0})
     run.play()
     before = run.map.alignments()
-    bridges = [pair for pair in run.map._graph.bridges() if pair[0] != pair[1]]
+    bridges = [pair for pair in run.map._graph.accepted_edges_by_segments() if pair[0] != pair[1]]
 
     assert bridges, "the two are one component before"
     assert [(each.aligned, each.reason) for each in before] == [(False, UP_TO_SCALE)] * 2
@@ -253,12 +254,12 @@ def test_a_link_says_one_place_whichever_of_its_ends_was_measured(
 
     for stay in (0, 1) if None not in units_m else (units_m.index(None),):
         moving, unit_m = 1 - stay, units_m[stay] or 1.0
-        for number, link in graph.links.items():
+        for number, link in graph.edges.items():
             assert link.scale is not None
             true = math.log((units_m[1 - link.a] or 1.0) / (units_m[link.a] or 1.0))
             link.scale = true, link.scale[1]
-            log_scale, variance = scale_into(graph, number, stay)
-            ends = step_into(graph, number, stay, log_scale)
+            log_scale, variance = relative_scale(graph, number, stay)
+            ends = relative_pose_between_components(graph, number, stay, log_scale)
             length = graph.segments[stay].scale / unit_m
             assert variance > 0.0
             assert (ends.a, ends.b) == (stay, moving)
@@ -268,14 +269,14 @@ def test_a_link_says_one_place_whichever_of_its_ends_was_measured(
 def test_links_of_one_place_whose_scales_differ_do_not_agree() -> None:
     T = np.array([np.eye(4)] * 2)
 
-    def ends(log_scale: float) -> LinkEnds:
-        return LinkEnds(
+    def ends(log_scale: float) -> EdgeArrays:
+        return EdgeArrays(
             a=np.array([0]), b=np.array([1]), T_a_b=np.eye(4)[None], variances=np.full((1, 6), 1e-4),
             scales=np.array([[log_scale, 0.03**2]]),
         )  # fmt: skip
 
     def agree(other: float) -> bool:
-        return bool(round_trips_close(T, ends(0.7), ends(other), np.zeros(1), OdometryNoise())[0])
+        return bool(are_pairwise_consistent(T, ends(0.7), ends(other), np.zeros(1), OdometryNoise())[0])
 
     assert agree(0.75)
     assert not agree(0.9)

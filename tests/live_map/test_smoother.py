@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rse_pf.geometry import Array, exp_se3, inverse, log_se3
-from rse_pf.live_map.graph import LiveLink, variances_of
+from rse_pf.live_map.graph_rows import LoopEdge, variances_of
 from rse_pf.live_map.live_map import LiveMap
 from rse_pf.live_map.options import LiveMapOptions
 from rse_pf.live_map.smoothing import smooth_around
@@ -56,25 +56,24 @@ def test_a_wrong_link_does_not_move_the_poses(seed: int) -> None:
     assert np.abs(off).max() < 0.03
 
 
-def test_a_believed_link_that_is_wrong_does_not_move_the_map() -> None:
+def test_an_accepted_loop_closure_that_is_wrong_does_not_move_the_map() -> None:
     """The map itself says which of its edges may be wrong."""
     world = GeneratedWorld(seed=3)
     drive, live = world.drive("a", circle(0.3, 1.4)), LiveMap()
     for event in world.play([drive]):
         live.apply(event)
     graph, last = live._graph, len(world.seen) - 1
-    before = graph.T.copy()
+    before = graph.T_component_camera.copy()
     wrong = world.step(last, last - 10) @ exp_se3([0.5, -0.4, 0.0, 0.0, 0.3, 0.0])
-    graph.add_link(
-        LiveLink(
-            a=last, b=last - 10, T_a_b=wrong, information=INFORMATION, inliers=50, matches=90,
-            variances=variances_of(INFORMATION[None])[0], state="believed",
-        )
+    edge = LoopEdge(
+        a=last, b=last - 10, T_a_b=wrong, information=INFORMATION, inliers=50, matches=90,
+        variances=variances_of(INFORMATION[None])[0], state="accepted",
     )  # fmt: skip
+    graph.add_edges([edge])
     done = smooth_around(graph, [last, last - 10], [0], LiveMapOptions())
 
-    assert max(done.squares.values()) > 100.0
-    assert np.abs(log_se3(inverse(before) @ graph.T)).max() < 0.02
+    assert max(done.squared_misfits.values()) > 100.0
+    assert np.abs(log_se3(inverse(before) @ graph.T_component_camera)).max() < 0.02
 
 
 def test_poses_that_are_held_stay_to_the_byte() -> None:

@@ -9,12 +9,10 @@ import pytest
 from rse_pf.geometry import exp_se3, inverse
 from rse_pf.live_map.events import LoopClosuresMeasured, MeasuredLoopClosure
 from rse_pf.live_map.live_map import LiveMap
-from rse_pf.live_map.options import LiveMapOptions
-from rse_pf.live_map.smoothing import edges_of
-from rse_pf.slam.consistency import StrongLink
+from rse_pf.live_map.smoothing import select_edges
+from rse_pf.slam.consistency import evidence_weight
 from tests.live_map.generated_drives import GeneratedWorld, circle, make_link
 
-STRONG = StrongLink(inliers=30, ratio=0.5)
 WEAK_INLIERS = 20
 """Two thirds of a strong link."""
 
@@ -25,7 +23,7 @@ WEAK_INLIERS = 20
 def test_a_link_counts_by_the_lesser_of_its_inliers_and_their_share(
     inliers: int, matches: int, weight: float
 ) -> None:
-    assert STRONG.weight_of(inliers, matches) == weight
+    assert evidence_weight(inliers, matches) == weight
 
 
 def test_three_weak_links_that_agree_join_nothing_and_five_do() -> None:
@@ -71,7 +69,7 @@ def test_a_weak_link_is_believed_where_no_strong_one_ties_its_keyframe() -> None
     assert (tied, live_map.loop_closure_count) == (before, before + 1)
 
 
-def test_weak_links_that_contradict_the_map_do_not_disbelieve_their_robot() -> None:
+def test_weak_links_that_contradict_the_map_do_not_exclude_their_robot() -> None:
     live_map, world = joined_robots()
     rng = np.random.default_rng(2)
 
@@ -80,7 +78,7 @@ def test_weak_links_that_contradict_the_map_do_not_disbelieve_their_robot() -> N
         add(live_map, k, make_link(k - 12, world.step(k, k - 12) @ off, WEAK_INLIERS))
 
     assert [each.aligned for each in live_map.alignments()] == [True, True]
-    assert not any(segment.disbelieved for segment in live_map._graph.segments)
+    assert not any(segment.is_excluded for segment in live_map._graph.segments)
     assert live_map.loop_closure_count == 4
 
 
@@ -90,7 +88,7 @@ def test_a_weak_link_is_taken_for_less_exact() -> None:
     for k, link in ((17, strong), (18, few)):
         add(live_map, k, link)
 
-    edges = edges_of(live_map._graph, [17, 18], LiveMapOptions())
+    edges = select_edges(live_map._graph, [17, 18])
     of_links = edges.information[edges.numbers >= 0]
 
     np.testing.assert_allclose(of_links[1], of_links[0] * (2.0 / 3.0) ** 2)

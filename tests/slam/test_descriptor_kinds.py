@@ -33,7 +33,7 @@ from rse_pf.slam.keyframe import (
     make_features,
     max_features,
 )
-from rse_pf.slam.links import Atlas
+from rse_pf.slam.loop_closures import Atlas
 from rse_pf.slam.place_recognition import place_vector
 from rse_pf.slam.tracking import (
     GuidedMatchLimits,

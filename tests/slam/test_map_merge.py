@@ -13,7 +13,7 @@ from rse_pf.geometry import Array, exp_se3, inverse, pose_difference
 from rse_pf.maps.format import MapVersion, decode_map, encode_map
 from rse_pf.service import Report
 from rse_pf.services.mapping.merge import MergeRequest, merge_maps
-from rse_pf.slam.consistency import LoopClosure, OdometryNoise, consistent, largest_clique
+from rse_pf.slam.consistency import LoopClosure, OdometryNoise, find_consistent_set, find_maximum_clique
 from rse_pf.slam.map_merge import (
     Atlas,
     LoopProposals,
@@ -21,7 +21,7 @@ from rse_pf.slam.map_merge import (
     MergeOptions,
     MergeSteps,
     merge_versions,
-    propose_links,
+    propose_loop_closures,
 )
 from rse_pf.slam.optimise import ignore_progress
 from tests.synthetic_maps import make_world
@@ -93,7 +93,7 @@ def planted(share: float, seed: int):  # type: ignore[no-untyped-def]
     """Return a proposer that turns a share of the links into wrong ones, and counts them."""
 
     def propose(atlas: Atlas, options: MergeOptions, report: Report) -> LoopProposals:
-        found = propose_links(atlas, options, report)
+        found = propose_loop_closures(atlas, options, report)
         rng = np.random.default_rng(seed)
         links = list(found.links)
         for k in rng.choice(len(links), max(1, round(share * len(links))), replace=False).tolist():
@@ -117,7 +117,7 @@ def test_wrong_loops_are_refused_and_do_not_deform_the_map(seed: int) -> None:
     assert wrong.joined == (0, 1)
     assert rmse_m(wrong, truth) <= max(1.1 * rmse_m(clean, truth), rmse_m(clean, truth) + 0.005)
     wrongs = planted(0.1, seed)(Atlas.of(maps), MergeOptions(), ignore_progress).links
-    rights = propose_links(Atlas.of(maps), MergeOptions()).links
+    rights = propose_loop_closures(Atlas.of(maps), MergeOptions()).links
     fakes = {
         w.T_a_b.tobytes() for w, r in zip(wrongs, rights, strict=True) if not np.array_equal(w.T_a_b, r.T_a_b)
     }
@@ -134,7 +134,7 @@ def test_a_single_wrong_link_joins_nothing() -> None:
     maps, _ = two_robots()
 
     def propose(atlas: Atlas, options: MergeOptions, report: Report) -> LoopProposals:
-        links = propose_links(atlas, options, report)
+        links = propose_loop_closures(atlas, options, report)
         across = [link for link in links.links if (link.a < 13) != (link.b < 13)]
         return LoopProposals(links=tuple(across[:1]), failed=links.failed)
 
@@ -210,8 +210,8 @@ def test_the_largest_set_that_agrees_is_found() -> None:
             for other in group:
                 agree[one, other] = one != other
 
-    assert largest_clique(agree).tolist() == [2, 3, 4, 5]
-    assert largest_clique(np.zeros((0, 0), dtype=bool)).tolist() == []
+    assert find_maximum_clique(agree).tolist() == [2, 3, 4, 5]
+    assert find_maximum_clique(np.zeros((0, 0), dtype=bool)).tolist() == []
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -225,7 +225,7 @@ def test_the_clique_is_as_large_as_the_one_of_brute_force(seed: int) -> None:
         if len(rows) > best and all(agree[a, b] for a in rows for b in rows if a != b):
             best = len(rows)
 
-    found = largest_clique(agree)
+    found = find_maximum_clique(agree)
 
     assert len(found) == best
     assert all(agree[a, b] for a in found for b in found if a != b)
@@ -234,13 +234,13 @@ def test_the_clique_is_as_large_as_the_one_of_brute_force(seed: int) -> None:
 def test_consistency_does_not_depend_on_the_world_frames() -> None:
     maps, _ = two_robots()
     atlas = Atlas.of(maps)
-    links = propose_links(atlas, MergeOptions(close_loops=False)).links
+    links = propose_loop_closures(atlas, MergeOptions(close_loops=False)).links
     moved = atlas.T_world_camera.copy()
     moved[atlas.of_map == 1] = exp_se3([5.0, -3.0, 1.0, 1.0, 2.0, 0.5]) @ moved[atlas.of_map == 1]
 
-    here = consistent(links, atlas.T_world_camera, atlas.order, OdometryNoise())
+    here = find_consistent_set(links, atlas.T_world_camera, atlas.order, OdometryNoise())
 
-    np.testing.assert_array_equal(here, consistent(links, moved, atlas.order, OdometryNoise()))
+    np.testing.assert_array_equal(here, find_consistent_set(links, moved, atlas.order, OdometryNoise()))
 
 
 def test_without_the_extra_the_answer_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:

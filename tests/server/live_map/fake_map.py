@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 import msgspec
 import numpy as np
+from rse_pf.live_map.feature_parts import SnapshotParts
 
 from rse_pf.errors import BadRequest
 from rse_pf.geometry import Camera
@@ -20,7 +21,6 @@ from rse_pf.live_map.events import (
     RobotForgotten,
     encode_events,
 )
-from rse_pf.live_map.feature_parts import SnapshotParts
 from rse_pf.live_map.outcomes import Added, Alignment, Corrected, Outcome
 from rse_pf.live_map.versions import PointSource
 from rse_pf.maps.format import Keyframe, MapVersion

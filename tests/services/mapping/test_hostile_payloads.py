@@ -19,7 +19,7 @@ from rse_pf.service import dispatch
 from rse_pf.services.builtin import builtin_services
 from rse_pf.services.mapping import place as place_service
 from rse_pf.slam import consistency
-from rse_pf.slam.consistency import largest_clique
+from rse_pf.slam.consistency import find_maximum_clique
 from rse_pf.slam.map_merge import merge_versions
 from rse_pf.wire import Command, Failure, Result, make_codec
 from tests.synthetic_maps import make_room, make_world
@@ -187,17 +187,17 @@ def test_too_many_comparisons_are_refused(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 @pytest.mark.parametrize("seed", range(12))
-def test_the_largest_clique_does_not_depend_on_how_rows_are_coloured(
+def test_the_find_maximum_clique_does_not_depend_on_how_rows_are_coloured(
     seed: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rng = np.random.default_rng(seed)
     upper = np.triu(rng.random((40, 40)) < rng.uniform(0.1, 0.9), 1)
     agree = upper | upper.T
 
-    one_by_one = largest_clique(agree)
+    one_by_one = find_maximum_clique(agree)
     monkeypatch.setattr(consistency, "_MANY_ROWS", 1)
 
-    np.testing.assert_array_equal(largest_clique(agree), one_by_one)
+    np.testing.assert_array_equal(find_maximum_clique(agree), one_by_one)
 
 
 def test_a_clique_may_be_larger_than_the_recursion_limit() -> None:
@@ -205,7 +205,7 @@ def test_a_clique_may_be_larger_than_the_recursion_limit() -> None:
     limit = sys.getrecursionlimit()
     sys.setrecursionlimit(len(inspect.stack(0)) + 100)
     try:
-        found = largest_clique(agree)
+        found = find_maximum_clique(agree)
     finally:
         sys.setrecursionlimit(limit)
 

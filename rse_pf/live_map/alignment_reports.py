@@ -1,0 +1,111 @@
+"""Report how the alignments of robots' segments with a live map changed.
+
+An alignment ``T_map_odom`` maps from the odometry frame of a segment to the frame of the map.  Poses in the
+odometry frame never jump, so a robot can use them in control loops; the alignment takes all corrections.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from rse_pf.geometry import Array, inverse
+from rse_pf.live_map.graph import MapGraph
+from rse_pf.live_map.graph_rows import Segment
+from rse_pf.live_map.outcomes import Alignment, Corrected, Joined, Outcome, Unaligned
+from rse_pf.live_map.smoothing import SmoothedWindows
+
+__all__ = ["UP_TO_SCALE", "alignment_of", "report_alignments"]
+
+UP_TO_SCALE = "up to scale: no robot with metres has seen what it sees"
+
+MIN_REPORTED_SHIFT_M = 0.001  # metres that an alignment must move before the robot is sent a correction
+MIN_REPORTED_ROTATION_DEG = 0.05  # degrees that an alignment must turn before the robot is sent a correction
+MIN_REPORTED_LOG_SCALE = 0.002
+"""Change of the logarithm of a segment's scale above which its robot is sent a correction."""
+
+
+def report_alignments(
+    graph: MapGraph, cause: tuple[str, int] | None, windows: SmoothedWindows | None = None
+) -> list[Outcome]:
+    """Return how the alignments of the robots' newest segments changed since they were last reported.
+
+    The graph notes the reported alignments.
+
+    Args:
+        graph: The graph.
+        cause: The keyframe (robot, number) that caused the changes, None after an optimisation.
+        windows: The smoothed windows, which know the covariances of the newest poses.
+    """
+    outcomes: list[Outcome] = []
+    for row, T_map_odom, has_changed in _find_alignments(graph):
+        segment = graph.segments[row]
+        is_reported = segment.reported_T_map_odom is not None
+        # 1. A segment that lost its connection with the map.
+        if not graph.is_aligned(row):
+            if is_reported:
+                is_metric = graph.is_metric(segment.component)
+                default = "the links that aligned it were removed" if is_metric else UP_TO_SCALE
+                graph.report_unaligned(row, segment.reason or default)
+                outcomes.append(Unaligned(robot=segment.robot, segment=segment.number, reason=segment.reason))
+            continue
+        # 2. A segment that was connected with the map just now.
+        if not is_reported:
+            connections = graph.accepted_edges_by_segments().items()
+            count = sum(len(numbers) for pair, numbers in connections if row in pair)
+            outcomes.append(Joined(robot=segment.robot, segment=segment.number, links=count))
+        elif not has_changed:
+            continue
+        # 3. The alignment of a connected segment.
+        newest = segment.keyframes[-1]
+        covariance = windows.covariance(graph, newest) if windows is not None else None
+        graph.report_alignment(row, T_map_odom, covariance)
+        outcomes.append(
+            Corrected(
+                robot=segment.robot,
+                segment=segment.number,
+                T_map_odom=T_map_odom,
+                covariance=segment.covariance,
+                cause=cause,
+                scale=None if segment.is_metric else segment.scale,
+            )
+        )
+    return outcomes
+
+
+def alignment_of(segment: Segment) -> Alignment:
+    """Return the alignment of a segment as its robot was last sent it, or why it has none."""
+    is_aligned = segment.reported_T_map_odom is not None
+    return Alignment(
+        robot=segment.robot,
+        segment=segment.number,
+        aligned=is_aligned,
+        reason=segment.reason,
+        T_map_odom=segment.reported_T_map_odom,
+        covariance=segment.covariance if is_aligned else None,
+        scale=segment.reported_scale if is_aligned and not segment.is_metric else None,
+    )
+
+
+def _find_alignments(graph: MapGraph) -> list[tuple[int, Array, bool]]:
+    """Return (row, ``T_map_odom``, whether it changed since the last report) of each newest segment."""
+    rows = [row for row in graph.newest_segments.values() if graph.segments[row].keyframes]
+    # 1. The alignments of the newest keyframes.
+    newest = [graph.segments[row].keyframes[-1] for row in rows]
+    T = graph.T_component_camera[newest] @ inverse(graph.odometry_poses(newest))
+    reported = T.copy()
+    for index, row in enumerate(rows):
+        T_reported = graph.segments[row].reported_T_map_odom
+        if T_reported is not None:
+            reported[index] = T_reported
+    # 2. Compare them with the reported ones.
+    moved2_m2 = ((T[:, :3, 3] - reported[:, :3, 3]) ** 2).sum(axis=1)
+    traces = (T[:, :3, :3] * reported[:, :3, :3]).sum(axis=(1, 2))
+    min_trace = 1.0 + 2.0 * math.cos(math.radians(MIN_REPORTED_ROTATION_DEG))
+    has_changed = (moved2_m2 > MIN_REPORTED_SHIFT_M**2) | (traces < min_trace)
+    if graph.has_scales:
+        scales = [(graph.segments[row].scale, graph.segments[row].reported_scale) for row in rows]
+        changes = [abs(math.log(scale / before)) > MIN_REPORTED_LOG_SCALE for scale, before in scales]
+        has_changed |= np.array(changes, dtype=np.bool_)
+    return list(zip(rows, T, has_changed.tolist(), strict=True))

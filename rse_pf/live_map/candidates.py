@@ -1,0 +1,77 @@
+"""Choose the keyframes of a live map that a new one is compared with, and those that are redundant."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from rse_pf.live_map.graph import MapGraph
+from rse_pf.slam.place_recognition import PlaceIndex
+
+__all__ = ["choose_candidates", "find_redundant_keyframes"]
+
+MIN_LOOP_STEPS = 0.8
+"""Steps of odometry that two keyframes of one segment are apart, at least, before they are compared; a loop
+closure between closer ones would only repeat the odometry."""
+MIN_LOOP_STEPS_UNDER_LOAD = 12.0
+"""Steps of odometry that two keyframes of one segment are apart, at least, before an overloaded map server
+compares them, because loop closures over short paths join no robots."""
+SAME_PLACE_M = 0.12  # metres along each axis, at most, between two keyframes at the same place
+SAME_PLACE_DEG = 8.0  # degrees of rotation, at most, between two keyframes with the same view of a place
+MAX_KEYFRAMES_OF_VIEW = 2  # keyframes of the map with the same view of a place that keep their features
+
+
+def choose_candidates(
+    graph: MapGraph, places: PlaceIndex, keyframe: int, limit: int, *, is_overloaded: bool = False
+) -> list[int]:
+    """Return up to *limit* keyframes that may show the same place as *keyframe*, by id.
+
+    Up to half of them are from other components, which they may join; the others are from the component of
+    the keyframe.
+
+    Args:
+        graph: The graph.
+        places: Place recognition vectors of all keyframes with features.
+        keyframe: The new keyframe.
+        limit: Number of candidates.
+        is_overloaded: Whether to leave out what the robot saw within the last 12 steps of odometry.
+    """
+    rows = graph.segment_rows
+    vector = places.vector_of(keyframe)
+    # 1. Leave out keyframes without features, excluded segments, and those shortly before.
+    is_excluded = np.array([segment.is_excluded for segment in graph.segments])[rows]
+    is_allowed = graph.has_features & ~is_excluded
+    is_allowed[keyframe] = False
+    min_steps = MIN_LOOP_STEPS_UNDER_LOAD if is_overloaded else MIN_LOOP_STEPS
+    is_close = rows == rows[keyframe]
+    is_close &= np.abs(graph.odometry_steps - graph.odometry_steps[keyframe]) < min_steps
+    # 2. Ask place recognition, separately for other components and for the keyframe's own one.
+    component = np.array([segment.component for segment in graph.segments])[rows]
+    is_own = component == graph.component_of(keyframe)
+    from_others = places.nearest(vector, limit // 2, np.flatnonzero(is_allowed & ~is_own))
+    own_limit = limit - len(from_others)
+    from_own = places.nearest(vector, own_limit, np.flatnonzero(is_allowed & is_own & ~is_close))
+    return sorted(i for i, _ in from_own + from_others)
+
+
+def find_redundant_keyframes(graph: MapGraph, keyframe: int) -> tuple[int, ...]:
+    """Return the keyframes of the map with the same view as *keyframe*, except the newest two, by id.
+
+    Two keyframes have the same view if they are within 0.12 m along each axis and within 8 degrees.
+    """
+    if not graph.is_aligned(int(graph.segment_rows[keyframe])):
+        return ()
+    T = graph.T_component_camera
+    # 1. Compare positions; the first coordinate alone excludes most keyframes.
+    is_near = np.abs(T[:, 0, 3] - T[keyframe, 0, 3]) <= SAME_PLACE_M
+    near = np.flatnonzero(graph.has_features & is_near)
+    distance_m = np.abs(T[near, :3, 3] - T[keyframe, :3, 3]).max(axis=1)
+    near = near[distance_m <= SAME_PLACE_M]
+    # 2. Compare rotations.
+    traces = np.einsum("nij,ij->n", T[near, :3, :3], T[keyframe, :3, :3])
+    near = near[traces >= 1.0 + 2.0 * math.cos(math.radians(SAME_PLACE_DEG))]
+    # 3. Keep the newest ones of those in the map.
+    in_map = [i for i in near.tolist() if graph.is_aligned(int(graph.segment_rows[i]))]
+    surplus = max(0, len(in_map) - MAX_KEYFRAMES_OF_VIEW)
+    return tuple(i for i in in_map[:surplus] if i != keyframe)

@@ -1,0 +1,110 @@
+"""Rows of the tables of a live map's pose graph: keyframes, segments, and loop closures.
+
+These are values without rules.  `MapGraph` in `graph` holds the tables and alone changes their rows.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from rse_pf.geometry import Array
+from rse_pf.slam.consistency import evidence_weight
+
+__all__ = ["NO_LOOP_CLOSURE_YET", "EdgeState", "LiveKeyframe", "LoopEdge", "Segment", "variances_of"]
+
+EdgeState = Literal["pending", "accepted", "rejected"]
+"""State of a loop closure: *pending* ones wait for evidence, *accepted* ones are edges of the pose graph,
+*rejected* ones were taken out as outliers."""
+
+NO_LOOP_CLOSURE_YET = "no loop closure between its keyframes and the map is accepted yet"
+
+MIN_RELATIVE_COVARIANCE: Array = np.diag([0.02**2] * 3 + [math.radians(0.7) ** 2] * 3)
+"""``(6, 6)``, square metres and square radians: covariance that an alignment has at least, because errors of
+depth and calibration are correlated and do not average out."""
+
+
+@dataclass(slots=True, eq=False)
+class LiveKeyframe:
+    """A keyframe of one robot in the graph.
+
+    ``segment`` and ``number`` are those of its `KeyframeAdded`.  ``data`` holds the encoded keyframe; it is
+    None after the keyframe was culled or its robot was forgotten.  ``objects`` are the digests of the objects
+    (points, image) that the robot stored with it, also after culling.
+    """
+
+    robot: str
+    segment: int
+    number: int
+    timestamp_s: float
+    data: bytes | None
+    objects: tuple[str, ...] = ()
+
+
+@dataclass(slots=True, eq=False)
+class Segment:
+    """The keyframes that one robot made in one odometry frame, by id, oldest first."""
+
+    robot: str
+    number: int
+    keyframes: list[int] = field(default_factory=list)
+    component: int = 0
+    """Row of the first segment of the component that this segment belongs to."""
+    reported_T_map_odom: Array | None = None
+    """``(4, 4)``: the alignment with the map that the robot was last sent, None while it has none."""
+    covariance: Array = field(default_factory=lambda: MIN_RELATIVE_COVARIANCE.copy())
+    """``(6, 6)``: covariance of the reported alignment as a left twist (metres, radians)."""
+    reason: str = NO_LOOP_CLOSURE_YET
+    """Why the segment has no alignment with the map; shown to operators and robots."""
+    is_from_version: bool = False
+    """Whether the keyframes come from the stored version that the map started from."""
+    contradictions: int = 0
+    """Bits, newest lowest: whether each of the last 32 keyframes with evidence contradicted the map."""
+    is_excluded: bool = False
+    """Whether loop closures of the segment are ignored, because it kept contradicting the map."""
+    is_metric: bool = True
+    """Whether odometry and depths of the segment are in metres; a single camera has no metric scale."""
+    scale: float = 1.0
+    """Length of the segment's unit in the unit of its component, which is a metre if that is metric."""
+    reported_scale: float = 1.0
+    """The scale that the robot was sent with the reported alignment."""
+
+
+@dataclass(slots=True, eq=False)
+class LoopEdge:
+    """A loop closure: the measured relative pose of keyframes ``a`` and ``b``, of one robot or of two.
+
+    ``a`` is the keyframe that was compared with older ones when it arrived.  ``T_a_b`` is ``(4, 4)``,
+    ``information`` ``(6, 6)`` the inverse covariance of its twist, ``variances`` ``(6,)`` the diagonal of the
+    covariance (square metres, square radians).  Lengths are metres if *a* or *b* is in a metric segment, else
+    in the unit of the segment of *a*.  ``scale`` is None between two metric segments; otherwise it holds the
+    logarithm of the length of the unit of *b* in the unit of *a*, and the variance of this logarithm.
+    ``is_fixed`` marks an edge of the version that the map started from, which is never rejected.
+    ``misfits`` counts the updates in a row in which the loop closure did not fit the graph.
+    """
+
+    a: int
+    b: int
+    T_a_b: Array
+    information: Array
+    inliers: int
+    matches: int
+    variances: Array
+    is_fixed: bool = False
+    state: EdgeState = "pending"
+    misfits: int = 0
+    scale: tuple[float, float] | None = None
+
+    @property
+    def weight(self) -> float:
+        """Weight of the evidence within 0 to 1; an edge of a stored version has full weight."""
+        return 1.0 if self.is_fixed else evidence_weight(self.inliers, self.matches)
+
+
+def variances_of(information: Array) -> Array:
+    """Return the ``(m, 6)`` variances of twists with the ``(m, 6, 6)`` inverse covariances *information*."""
+    variances: Array = np.diagonal(np.linalg.inv(information), axis1=1, axis2=2)
+    return variances

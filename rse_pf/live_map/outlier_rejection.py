@@ -1,0 +1,427 @@
+"""Accept and reject the loop closures of a live map: classification, joins, and contradicting evidence.
+
+A new loop closure is *pending*.  Within one component it is compared with the poses of the graph, between two
+components with other loop closures (`component_joins`).  Loop closures that contradict the graph, but agree
+with each other, are evidence against loop closures that were accepted earlier.
+
+To add a rule that rejects loop closures, see CONTRIBUTING.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from itertools import groupby
+from typing import Literal
+
+import numpy as np
+
+from rse_pf.geometry import inverse
+from rse_pf.live_map.component_joins import ALIAS_DISTANCE_M, AmbiguousJoin, decide_join, is_at_alias
+from rse_pf.live_map.edge_consistency import (
+    MIN_SUPPORT,
+    Fit,
+    classify_by_graph,
+    find_consistent_by_odometry,
+    has_enough_support,
+    total_weight,
+)
+from rse_pf.live_map.graph import STEP_LENGTH_M, MapGraph
+from rse_pf.live_map.outcomes import Ambiguous, LoopClosureAccepted, LoopClosureRejected, Outcome
+
+__all__ = [
+    "GraphChanges",
+    "decide_again",
+    "find_weakest_connection",
+    "process_new_edges",
+    "reject_misfitting_edges",
+]
+
+MAX_SQUARED_MISFIT = 30.0
+"""Squared Mahalanobis norm of a loop closure's residual (six degrees of freedom) above which it counts as a
+misfit; one true loop closure in 25,000 is above."""
+MAX_MISFITS = 8  # updates in a row in which a loop closure may misfit the smoothed graph; then it is rejected
+MAX_EDGES_AFTER_JOIN = 48  # newest pending loop closures that are classified after a join, to bound CPU time
+MAX_ALIAS_RADIUS_M = 5.0
+"""Metres around a place that looks like another one within which all keyframes are taken for aliases, at
+most."""
+MIN_ALIAS_SUPPORT = 12
+"""Summed weight of contrary loop closures between two robots, at least, that proves perceptual aliases
+against heavier accepted loop closures."""
+MAX_DRIFT_RATIO = 0.15
+"""Error of odometry per length of path, at most; a larger error means that two places look the same."""
+FIXED_WEIGHT = 1e9  # weight of connections that are never rejected, above any sum of weights of loop closures
+
+_AT_SEVERAL_PLACES = "ambiguous: what it saw is in the map at several places"
+
+
+@dataclass(slots=True)
+class GraphChanges:
+    """What an update of loop closures changed.
+
+    ``outcomes`` are reported.  ``moved`` are the keyframes around which the graph must be smoothed.  ``fits``
+    says how the loop closures of full weight within one component fitted the graph; those at perceptual
+    aliases, which say nothing about the robot, are "alias".
+    """
+
+    outcomes: list[Outcome] = field(default_factory=list)
+    moved: list[int] = field(default_factory=list)
+    fits: set[Fit | Literal["alias"]] = field(default_factory=set)
+
+    def mark_moved(self, *keyframes: int) -> None:
+        """Add keyframes around which the graph must be smoothed, each at most once."""
+        self.moved += [i for i in keyframes if i not in self.moved]
+
+
+def process_new_edges(graph: MapGraph, keyframe: int, numbers: list[int]) -> GraphChanges:
+    """Decide about the pending loop closures *numbers* of *keyframe*, and change the graph accordingly.
+
+    Return the outcomes, and the keyframes around which the graph must be smoothed.
+    """
+    changes = GraphChanges()
+    # 1. Classify the loop closures within the component of the keyframe by the poses of the graph.
+    component = graph.component_of(keyframe)
+    others = {
+        number: graph.edges[number].b if graph.edges[number].a == keyframe else graph.edges[number].a
+        for number in numbers
+    }
+    within = [number for number in numbers if graph.component_of(others[number]) == component]
+    _decide_within(graph, _drop_redundant_weak(graph, within), changes)
+    # 2. Try to join the other components.
+    for other in sorted({graph.component_of(i) for i in others.values()} - {component}):
+        _join_if_consistent(graph, graph.component_of(keyframe), other, changes)
+    return changes
+
+
+def decide_again(graph: MapGraph) -> Iterator[GraphChanges]:
+    """Decide again about all loop closures that are not accepted, as if they arrived now, oldest first.
+
+    Rejected loop closures become pending, and proofs of perceptual aliases are dropped before, since they may
+    rest on loop closures that were taken out.  The caller smooths the graph around each yielded change before
+    the next one is computed.
+    """
+    graph.reopen_rejected()
+    for keyframe, group in groupby(list(graph.pending), lambda number: graph.edges[number].a):
+        pending = [number for number in group if _is_pending(graph, number)]
+        if pending:
+            changes = process_new_edges(graph, keyframe, pending)
+            if changes.outcomes or changes.moved:
+                yield changes
+
+
+def reject_misfitting_edges(
+    graph: MapGraph, squared_misfits: Mapping[int, float], changes: GraphChanges
+) -> bool:
+    """Reject accepted loop closures that misfitted the graph in eight updates in a row.
+
+    Args:
+        graph: The graph after smoothing.
+        squared_misfits: Squared Mahalanobis norm of the residual of each smoothed loop closure, by number.
+        changes: Receives the outcomes.
+
+    Returns:
+        Whether there was such a loop closure.
+    """
+    outliers = []
+    for number, square in squared_misfits.items():
+        is_misfit = square > MAX_SQUARED_MISFIT and not graph.edges[number].is_fixed
+        if graph.note_misfit(number, is_misfit=is_misfit) >= MAX_MISFITS:
+            outliers.append(number)
+    _reject(graph, outliers, "contrary to the graph", changes)
+    return bool(outliers)
+
+
+# --- Loop closures within one component ---
+
+
+def _decide_within(graph: MapGraph, numbers: list[int], changes: GraphChanges) -> None:
+    """Accept loop closures within one component that agree with the graph; weigh the others as evidence."""
+    if not numbers:
+        return
+    # 1. Classify them by the poses of the graph and the steps of odometry between both ends.
+    paths: dict[int, dict[int, float]] = {}
+    for number in numbers:
+        a = graph.edges[number].a
+        if a not in paths:
+            ends = [graph.edges[each].b for each in numbers if graph.edges[each].a == a]
+            paths[a] = graph.shortest_paths(a, ends)
+    steps = [paths[graph.edges[number].a][graph.edges[number].b] for number in numbers]
+    fits = dict(zip(numbers, classify_by_graph(graph, numbers, steps), strict=True))
+    changes.fits |= {
+        "alias" if is_at_alias(graph, number) else fit
+        for number, fit in fits.items()
+        if graph.edges[number].weight == 1.0
+    }
+    # 2. Accept those that agree: full weight first, weak ones only where no other one connects the same.
+    agreeing = [number for number, fit in fits.items() if fit == "agrees"]
+    _accept(graph, [number for number in agreeing if graph.edges[number].weight == 1.0], changes)
+    for number in agreeing:
+        if _is_pending(graph, number) and not _has_full_weight_parallel(graph, number):
+            _accept(graph, [number], changes)
+    # 3. Compare the others with pending ones: vague ones may be accepted, contrary ones may reject others.
+    for number, fit in fits.items():
+        if fit == "agrees" or not _is_pending(graph, number):
+            continue
+        edge = graph.edges[number]
+        if graph.component_of(edge.a) != graph.component_of(edge.b):
+            continue
+        consistent = find_consistent_by_odometry(graph, number, _pending_parallels(graph, number))
+        if not has_enough_support(graph, consistent):
+            continue
+        if fit == "vague":
+            _accept(graph, consistent, changes)
+        else:
+            _reject_contradicted(graph, number, consistent, changes)
+
+
+def _drop_redundant_weak(graph: MapGraph, numbers: list[int]) -> list[int]:
+    """Return the loop closures of one keyframe without weak ones to a segment that a full one leads to.
+
+    A weak loop closure adds nothing there, at the cost of another decision.
+    """
+    full = [number for number in numbers if graph.edges[number].weight == 1.0]
+    connected = {int(graph.segment_rows[graph.edges[number].b]) for number in full}
+    return [
+        number
+        for number in numbers
+        if number in full or int(graph.segment_rows[graph.edges[number].b]) not in connected
+    ]
+
+
+def _has_full_weight_parallel(graph: MapGraph, number: int) -> bool:
+    """Return whether an accepted full-weight loop closure leads from one end to the segment of the other."""
+    edge = graph.edges[number]
+    for near, far in ((edge.a, edge.b), (edge.b, edge.a)):
+        for parallel in (graph.edges[each] for each in graph.accepted_edges_of(near)):
+            end = parallel.b if parallel.a == near else parallel.a
+            if graph.segment_rows[end] == graph.segment_rows[far] and parallel.weight == 1.0:
+                return True
+    return False
+
+
+def _pending_parallels(graph: MapGraph, number: int) -> list[int]:
+    """Return the other pending loop closures between the same two segments."""
+    pair = graph.segment_pair_of(graph.edges[number])
+    return [
+        each for each in graph.pending if each != number and graph.segment_pair_of(graph.edges[each]) == pair
+    ]
+
+
+# --- Evidence against accepted loop closures ---
+
+
+def _reject_contradicted(graph: MapGraph, number: int, consistent: list[int], changes: GraphChanges) -> None:
+    """Reject accepted loop closures that *consistent* ones, among them the contrary *number*, outweigh.
+
+    Where accepted and contrary loop closures both have much weight, both are right: the robots saw two places
+    that look the same (perceptual aliases).
+    """
+    reason = f"{len(consistent)} later links agree with each other and contradict it"
+    edge = graph.edges[number]
+    row_a, row_b = int(graph.segment_rows[edge.a]), int(graph.segment_rows[edge.b])
+    if row_a == row_b:
+        _reject_contradicted_loops(graph, number, consistent, reason, changes)
+        return
+    if is_at_alias(graph, number):
+        return
+    # 1. Reject the weakest connection between both segments until they are in two components.
+    weight = total_weight(graph, consistent)
+    has_rejected = False
+    while graph.segments[row_a].component == graph.segments[row_b].component:
+        weakest = find_weakest_connection(graph, row_a, row_b)
+        if not weakest or total_weight(graph, weakest) >= weight:
+            break
+        _reject(graph, weakest, reason, changes)
+        has_rejected = True
+    component_a, component_b = graph.segments[row_a].component, graph.segments[row_b].component
+    # 2. Join them again, as the contrary loop closures say.
+    if has_rejected and component_a != component_b:
+        _join_if_consistent(graph, component_a, component_b, changes)
+    # 3. Where nothing could be rejected, a large error proves perceptual aliases.
+    elif not has_rejected and weight >= MIN_ALIAS_SUPPORT:
+        error_m = _error_of_graph_m(graph, number)
+        steps = graph.shortest_paths(edge.a, [edge.b])[edge.b]
+        if error_m > max(ALIAS_DISTANCE_M, steps * STEP_LENGTH_M * MAX_DRIFT_RATIO):
+            _mark_aliases(graph, consistent, error_m, changes)
+
+
+def _reject_contradicted_loops(
+    graph: MapGraph, number: int, consistent: list[int], reason: str, changes: GraphChanges
+) -> None:
+    """Reject accepted loops within one segment that *consistent* contrary ones outweigh, and accept these.
+
+    Where odometry cannot be so wrong, the contrary loop closures prove perceptual aliases instead.
+    """
+    edge = graph.edges[number]
+    row = int(graph.segment_rows[edge.a])
+    error_m = _error_of_odometry_m(graph, number)
+    steps = abs(float(graph.odometry_steps[edge.a] - graph.odometry_steps[edge.b]))
+    if error_m > max(ALIAS_DISTANCE_M, steps * STEP_LENGTH_M * MAX_DRIFT_RATIO):
+        _mark_aliases(graph, consistent, error_m, changes)
+        return
+    contradicted = [
+        each
+        for each, accepted in graph.edges.items()
+        if accepted.state == "accepted"
+        and not accepted.is_fixed
+        and graph.segment_rows[accepted.a] == graph.segment_rows[accepted.b] == row
+        and each not in find_consistent_by_odometry(graph, number, [each])
+    ]
+    if contradicted and total_weight(graph, contradicted) < total_weight(graph, consistent):
+        _reject(graph, contradicted, reason, changes)
+        _accept(graph, consistent, changes)
+
+
+def _error_of_odometry_m(graph: MapGraph, number: int) -> float:
+    """Return the distance between what odometry says and a loop closure within one segment, metres."""
+    edge = graph.edges[number]
+    T_odom_a, T_odom_b = graph.odometry_poses([edge.a, edge.b])
+    error = inverse(graph.relative_pose_of(edge)) @ inverse(T_odom_a) @ T_odom_b
+    return float(np.sqrt((error[:3, 3] ** 2).sum()))
+
+
+def _error_of_graph_m(graph: MapGraph, number: int) -> float:
+    """Return the distance between what the poses of the graph say and a loop closure, metres."""
+    edge = graph.edges[number]
+    T_a, T_b = graph.T_component_camera[edge.a], graph.T_component_camera[edge.b]
+    error = inverse(graph.relative_pose_of(edge)) @ inverse(T_a) @ T_b
+    return float(np.sqrt((error[:3, 3] ** 2).sum()))
+
+
+def find_weakest_connection(graph: MapGraph, row_a: int, row_b: int) -> list[int]:
+    """Return the loop closures of the weakest connection on the strongest path between two segments.
+
+    A *connection* is all accepted loop closures between two segments.  Connections with an edge of a stored
+    version are never returned; nor are those between two metric segments if segment *row_a* or *row_b* is
+    not metric, because a segment of unknown scale proves nothing against known scales.  Return an empty list
+    if there is no other connection on the path.
+    """
+    # 1. The weight of each connection.
+    connections = {
+        pair: numbers for pair, numbers in graph.accepted_edges_by_segments().items() if pair[0] != pair[1]
+    }
+    is_metric = _are_metric(graph, (row_a, row_b))
+    weights = {
+        pair: FIXED_WEIGHT
+        if any(graph.edges[number].is_fixed for number in numbers)
+        or (_are_metric(graph, pair) and not is_metric)
+        else total_weight(graph, numbers)
+        for pair, numbers in connections.items()
+    }
+    # 2. The strongest path: the first path when connections are added from the heaviest to the lightest.
+    for min_weight in sorted(set(weights.values()), reverse=True):
+        path = _find_path(row_a, row_b, [pair for pair in weights if weights[pair] >= min_weight])
+        if path:
+            # 3. Its weakest connection.
+            weakest = min(path, key=lambda pair: (weights[pair], pair))
+            return [] if weights[weakest] == FIXED_WEIGHT else connections[weakest]
+    return []
+
+
+def _are_metric(graph: MapGraph, rows: Iterable[int]) -> bool:
+    return all(graph.segments[row].is_metric for row in rows)
+
+
+def _find_path(start: int, goal: int, pairs: list[tuple[int, int]]) -> list[tuple[int, int]]:
+    """Return the pairs of segments on a shortest path, by breadth-first search; empty if there is none."""
+    came_from: dict[int, tuple[int, tuple[int, int]]] = {start: (start, (start, start))}
+    frontier = [start]
+    while frontier and goal not in came_from:
+        next_frontier = []
+        for row in frontier:
+            for pair in sorted(pairs):
+                if row in pair:
+                    neighbour = pair[1] if pair[0] == row else pair[0]
+                    if neighbour not in came_from:
+                        came_from[neighbour] = (row, pair)
+                        next_frontier.append(neighbour)
+        frontier = next_frontier
+    path = []
+    row = goal
+    while row in came_from and row != start:
+        row, pair = came_from[row]
+        path.append(pair)
+    return path
+
+
+# --- Joins and perceptual aliases ---
+
+
+def _join_if_consistent(graph: MapGraph, first: int, second: int, changes: GraphChanges) -> None:
+    """Join two components if enough pending loop closures between them agree; note if they are ambiguous."""
+    decision = decide_join(graph, first, second)
+    if decision is None:
+        return
+    if isinstance(decision, AmbiguousJoin):
+        _note_ambiguity(graph, decision, changes)
+        return
+    # 1. Move one component into the frame of the other one.
+    accepted = graph.join_components(decision.moving, decision.T_stay_moving, decision.scale, decision.edges)
+    for edge in accepted:
+        changes.outcomes.append(LoopClosureAccepted(a=edge.a, b=edge.b))
+        changes.mark_moved(edge.a, edge.b)
+    # 2. Classify the pending loop closures that are now within one component.
+    joined = graph.component_of(accepted[0].a)
+    within = [
+        number
+        for number in graph.pending
+        if graph.component_of(graph.edges[number].a) == graph.component_of(graph.edges[number].b) == joined
+    ]
+    _decide_within(graph, within[-MAX_EDGES_AFTER_JOIN:], changes)
+
+
+def _note_ambiguity(graph: MapGraph, decision: AmbiguousJoin, changes: GraphChanges) -> None:
+    """Set the reason of all segments outside the map that the ambiguous loop closures touch, newest first."""
+    root = graph.root_component()
+    edges = [graph.edges[number] for number in decision.edges]
+    for i in sorted({end for edge in edges for end in (edge.a, edge.b)}, reverse=True):
+        segment = graph.segment_of(i)
+        if segment.component != root and segment.reason != decision.reason:
+            graph.set_reason(int(graph.segment_rows[i]), decision.reason)
+            changes.outcomes.append(
+                Ambiguous(robot=segment.robot, segment=segment.number, reason=decision.reason)
+            )
+
+
+def _mark_aliases(graph: MapGraph, numbers: list[int], distance_m: float, changes: GraphChanges) -> None:
+    """Mark the ends of loop closures as two places that look the same, and undo the joins that rest on them.
+
+    The places are *distance_m* metres apart.  All keyframes within half of this distance, at most 5 m, are
+    marked, since they may look like the other place as well.
+    """
+    # 1. Mark the keyframes around both ends.
+    radius_m = min(0.5 * distance_m, MAX_ALIAS_RADIUS_M)
+    ends = {end for number in numbers for end in (graph.edges[number].a, graph.edges[number].b)}
+    components = np.array([graph.component_of(i) if graph.exists(i) else -1 for i in range(len(graph))])
+    positions = graph.T_component_camera[:, :3, 3]
+    for i in sorted(ends):
+        distances_m = np.sqrt(((positions - positions[i]) ** 2).sum(axis=1))
+        near = np.flatnonzero((distances_m < radius_m) & (components == components[i]))
+        graph.mark_aliased(near.tolist())
+    # 2. Reject the connections between segments that have too little weight without the marked places.
+    for pair, connection in sorted(graph.accepted_edges_by_segments().items()):
+        is_fixed = any(graph.edges[number].is_fixed for number in connection)
+        distinct = [number for number in connection if not is_at_alias(graph, number)]
+        if pair[0] != pair[1] and not is_fixed and total_weight(graph, distinct) < MIN_SUPPORT:
+            _reject(graph, connection, "ambiguous: both ends look like another place", changes)
+            for row in pair:
+                graph.set_reason(row, _AT_SEVERAL_PLACES)
+
+
+# --- Applying decisions ---
+
+
+def _is_pending(graph: MapGraph, number: int) -> bool:
+    return number in graph.edges and graph.edges[number].state == "pending"
+
+
+def _accept(graph: MapGraph, numbers: list[int], changes: GraphChanges) -> None:
+    for edge in graph.accept_edges(numbers):
+        changes.outcomes.append(LoopClosureAccepted(a=edge.a, b=edge.b))
+        changes.mark_moved(edge.a, edge.b)
+
+
+def _reject(graph: MapGraph, numbers: list[int], reason: str, changes: GraphChanges) -> None:
+    for edge in graph.reject_edges(numbers):
+        changes.outcomes.append(LoopClosureRejected(a=edge.a, b=edge.b, reason=reason))
+        changes.mark_moved(edge.a, edge.b)

@@ -1,0 +1,311 @@
+"""Find loop closures between keyframes of stored maps: propose pairs, measure them, keep those that agree.
+
+Each function works on the keyframes that it is given, so that one pair of maps can be computed alone, in any
+process, with the same result.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from rse_pf.errors import BadRequest, LimitExceeded
+from rse_pf.geometry import Array, inverse
+from rse_pf.maps.descriptors import common_kind
+from rse_pf.maps.format import Keyframe, MapVersion
+from rse_pf.service import Report
+from rse_pf.slam.consistency import (
+    EdgeArrays,
+    LoopClosure,
+    OdometryNoise,
+    find_consistent_set,
+    fits_prediction,
+)
+from rse_pf.slam.optimise import ignore_progress
+from rse_pf.slam.place_recognition import PlaceIndex, place_vector
+from rse_pf.slam.relative_pose import (
+    RelativePoseOptions,
+    landmarks_of_keyframe,
+    measure_relative_pose,
+    view_of_keyframe,
+)
+
+__all__ = [
+    "Atlas",
+    "LoopProposals",
+    "MergeOptions",
+    "RejectionCounts",
+    "choose_candidate_pairs",
+    "map_pair_of",
+    "measure_pairs",
+    "propose_loop_closures",
+    "select_consistent",
+]
+
+RejectionCounts = Counter[tuple[int, int, str]]
+"""Number of rejected keyframe pairs by (lower map, higher map, reason)."""
+
+MAX_PAIRS = 700_000  # keyframe pairs that one merge may compare, because each needs some milliseconds
+WEAK_POSE_VARIANCE = 4.0
+"""Factor by which the covariance of a weakly determined relative pose is multiplied.  In rendered worlds the
+errors of such poses are 1.2 to 1.7 times, at most 2.7 times, their standard deviations; a third of the loop
+closures between two maps are weak, so a merge cannot do without them."""
+MIN_LOOP_KEYFRAMES = 3  # keyframes along a trajectory, at least, between both ends of a loop within one map
+PAIRS_PER_REPORT = 16  # keyframe pairs between two reports of progress
+
+
+class MergeOptions(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """Options of a merge of stored maps.
+
+    Attributes:
+        candidates: Keyframes of each map that place recognition proposes for each keyframe, within 1 to 100.
+        min_inliers: Inliers that a loop closure needs, at least 12.
+        min_inlier_ratio: Inliers per match that a loop closure needs, above 0 and at most 1.
+        min_links: Loop closures that must agree pairwise to join two maps; with fewer, none is accepted.
+        close_loops: Whether to look for loop closures within each map as well.
+        cauchy: Width of the robust Cauchy kernel on loop closures, in standard deviations; 0 for none.
+
+    Raises:
+        BadRequest: A number is out of its range.
+    """
+
+    candidates: int = 8
+    min_inliers: int = 40
+    min_inlier_ratio: float = 0.5
+    min_links: int = 3
+    close_loops: bool = True
+    cauchy: float = 3.0
+
+    def __post_init__(self) -> None:
+        is_valid = (
+            1 <= self.candidates <= 100
+            and self.min_inliers >= 12
+            and 0 < self.min_inlier_ratio <= 1
+            and self.min_links >= 1
+            and self.cauchy >= 0
+        )
+        if not is_valid:
+            raise BadRequest("an option of merge is out of its range", hint="leave it out for the default")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Atlas:
+    """The keyframes of several maps in one list, by map, robot and time.
+
+    Attributes:
+        keyframes: All *n* keyframes.
+        of_map: ``(n,)``, the map of each keyframe.
+        order: ``(n,)``, position of each keyframe along the trajectory of its robot.
+        T_world_camera: ``(n, 4, 4)``, each pose in the world frame of its own map, metres.
+        row_of: Row of each keyframe by (map, id).
+    """
+
+    keyframes: tuple[Keyframe, ...]
+    of_map: npt.NDArray[np.int64]
+    order: npt.NDArray[np.int64]
+    T_world_camera: Array
+    row_of: Mapping[tuple[int, int], int]
+
+    @classmethod
+    def of(cls, versions: Sequence[MapVersion]) -> Atlas:
+        """Return the atlas of *versions*.
+
+        Raises:
+            BadRequest: The maps have descriptors of two kinds.
+        """
+        common_kind((version.kind for version in versions if version.keyframes), "the first map")
+        rows = [
+            (map_index, keyframe)
+            for map_index, version in enumerate(versions)
+            for keyframe in sorted(version.keyframes, key=lambda k: (k.robot, k.timestamp_s, k.id))
+        ]
+        return cls(
+            keyframes=tuple(keyframe for _, keyframe in rows),
+            of_map=np.array([map_index for map_index, _ in rows], dtype=np.int64),
+            order=np.arange(len(rows), dtype=np.int64),
+            T_world_camera=np.array([keyframe.T_world_camera for _, keyframe in rows], dtype=np.float64),
+            row_of={(map_index, keyframe.id): row for row, (map_index, keyframe) in enumerate(rows)},
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LoopProposals:
+    """Measured loop closures ``links``, and counts of keyframe pairs that ``failed``, by maps and reason."""
+
+    links: tuple[LoopClosure, ...]
+    failed: RejectionCounts
+
+
+def propose_loop_closures(
+    atlas: Atlas, options: MergeOptions, report: Report = ignore_progress
+) -> LoopProposals:
+    """Measure the relative poses of keyframes that place recognition proposes as the same place.
+
+    Args:
+        atlas: The keyframes of all maps.
+        options: How many candidates are compared, and what a loop closure needs.
+        report: Receives the progress within 0.1 to 0.8, and a text.
+
+    Raises:
+        LimitExceeded: There may be more keyframe pairs than can be compared.
+    """
+    pair_limit = len(atlas.keyframes) * (int(atlas.of_map.max()) + 1) * options.candidates
+    if pair_limit > MAX_PAIRS:
+        raise LimitExceeded(
+            f"up to {pair_limit} pairs of keyframes are above {MAX_PAIRS}",
+            hint="merge fewer maps at once, or ask for fewer candidates",
+        )
+    index = PlaceIndex.from_vectors(place_vector(keyframe.descriptors) for keyframe in atlas.keyframes)
+    pairs = choose_candidate_pairs(index, atlas.of_map, atlas.order, options)
+    loop_closures, failed = measure_pairs(
+        atlas, pairs, options, lambda progress, text: report(0.1 + 0.7 * progress, text)
+    )
+    return LoopProposals(links=tuple(loop_closures), failed=failed)
+
+
+def choose_candidate_pairs(
+    index: PlaceIndex,
+    of_map: npt.NDArray[np.int64],
+    order: npt.NDArray[np.int64],
+    options: MergeOptions,
+    *,
+    between: tuple[int, int] | None = None,
+) -> list[tuple[int, int]]:
+    """Return the pairs of rows that may show the same place, the lower row first, sorted.
+
+    Args:
+        index: Place recognition vectors of all keyframes, by row.
+        of_map: ``(n,)``, the map of each keyframe.
+        order: ``(n,)``, position of each keyframe along the trajectory of its robot.
+        options: How many candidates are chosen, and whether pairs within one map are.
+        between: Two maps, or one map twice, if only pairs between them are wanted.
+    """
+    pairs: set[tuple[int, int]] = set()
+    rows = np.arange(len(of_map))
+    maps = np.unique(of_map).tolist()
+    for a in range(len(of_map)):
+        for map_index in maps:
+            is_same_map = map_index == of_map[a]
+            if is_same_map and not options.close_loops:
+                continue
+            if between is not None and {int(of_map[a]), map_index} != set(between):
+                continue
+            allowed = rows[of_map == map_index]
+            if is_same_map:
+                allowed = allowed[np.abs(order[allowed] - order[a]) >= MIN_LOOP_KEYFRAMES]
+            for b, _ in index.nearest(index.vector_of(a), options.candidates, allowed):
+                pairs.add((min(a, b), max(a, b)))
+    return sorted(pairs)
+
+
+def measure_pairs(
+    atlas: Atlas,
+    pairs: Sequence[tuple[int, int]],
+    options: MergeOptions,
+    report: Report = ignore_progress,
+) -> tuple[list[LoopClosure], RejectionCounts]:
+    """Return the loop closures of those *pairs* of rows that PnP can measure, and why the others failed.
+
+    *report* receives the progress within 0 to 1, and a text.
+    """
+    pose_options = RelativePoseOptions(
+        min_inliers=options.min_inliers,
+        min_inlier_ratio=options.min_inlier_ratio,
+        weak_variance=WEAK_POSE_VARIANCE,
+    )
+    loop_closures: list[LoopClosure] = []
+    failed: RejectionCounts = Counter()
+    for done, (a, b) in enumerate(pairs):
+        if done % PAIRS_PER_REPORT == 0:
+            report(done / len(pairs), f"{done} of {len(pairs)} keyframe pairs")
+        measured = measure_relative_pose(
+            landmarks_of_keyframe(atlas.keyframes[a]), view_of_keyframe(atlas.keyframes[b]), pose_options
+        )
+        if isinstance(measured, str):
+            failed[(*map_pair_of(atlas, a, b), measured)] += 1
+        else:
+            loop_closures.append(
+                LoopClosure(
+                    a=a,
+                    b=b,
+                    T_a_b=measured.T_a_b,
+                    information=measured.information,
+                    inliers=measured.inliers,
+                    matches=measured.matches,
+                )
+            )
+    return loop_closures, failed
+
+
+def select_consistent(
+    maps: tuple[int, int],
+    loop_closures: Sequence[LoopClosure],
+    T_world_camera: Array,
+    order: npt.NDArray[np.int64],
+    options: MergeOptions,
+) -> tuple[list[int], RejectionCounts]:
+    """Return the indices of the loop closures that agree pairwise, and how many were rejected, by reason.
+
+    Args:
+        maps: The two maps that all loop closures connect, or one map twice.
+        loop_closures: Their ends are rows of the two arrays.
+        T_world_camera: ``(n, 4, 4)``, poses of the keyframes, each in the world frame of its own map.
+        order: ``(n,)``, position of each keyframe along the trajectory of its robot.
+        options: How many loop closures must agree to join two maps.
+    """
+    first, second = maps
+    rejected: RejectionCounts = Counter()
+    noise = OdometryNoise()
+    candidates = list(range(len(loop_closures)))
+    # 1. A loop within one map must agree with the odometry as well.
+    if first == second:
+        candidates = _find_fitting_odometry(T_world_camera, order, loop_closures, noise)
+        rejected[first, second, "against-odometry"] += len(loop_closures) - len(candidates)
+    # 2. Keep the largest set that agrees pairwise.
+    consistent = find_consistent_set(
+        [loop_closures[index] for index in candidates], T_world_camera, order, noise
+    )
+    # 3. Two maps are joined by several loop closures or not at all.
+    if first != second and len(consistent) < options.min_links:
+        rejected[first, second, "too-few-agree"] += len(loop_closures)
+        return [], rejected
+    rejected[first, second, "inconsistent"] += len(candidates) - len(consistent)
+    return [candidates[position] for position in consistent.tolist()], rejected
+
+
+def map_pair_of(atlas: Atlas, a: int, b: int) -> tuple[int, int]:
+    """Return the maps of the keyframes in rows *a* and *b*, the lower map first."""
+    map_a, map_b = int(atlas.of_map[a]), int(atlas.of_map[b])
+    return min(map_a, map_b), max(map_a, map_b)
+
+
+def _find_fitting_odometry(
+    T_world_camera: Array,
+    order: npt.NDArray[np.int64],
+    loop_closures: Sequence[LoopClosure],
+    noise: OdometryNoise,
+) -> list[int]:
+    """Return the indices of the loop closures that differ from odometry by no more than its drift."""
+    if not loop_closures:
+        return []
+    edges = EdgeArrays.of(loop_closures)
+    predicted = inverse(T_world_camera[edges.a]) @ T_world_camera[edges.b]
+    steps = np.abs(order[edges.a] - order[edges.b]).astype(np.float64)
+    lever_m = np.array([_lever_m(T_world_camera, closure) for closure in loop_closures])
+    fits = fits_prediction(predicted, edges, steps, lever_m, noise)
+    return [int(index) for index in np.flatnonzero(fits)]
+
+
+def _lever_m(T_world_camera: Array, closure: LoopClosure) -> float:
+    """Return the largest distance, in metres, of the path between both ends of a loop closure from its end.
+
+    This is the lever by which a rotation error along the path moves its end.
+    """
+    first, last = sorted((closure.a, closure.b))
+    path = T_world_camera[first : last + 1, :3, 3]
+    return float(np.linalg.norm(path - path[-1], axis=1).max())
