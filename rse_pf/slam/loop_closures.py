@@ -227,7 +227,8 @@ def measure_pairs(
             landmarks_of_keyframe(atlas.keyframes[a]), view_of_keyframe(atlas.keyframes[b]), pose_options
         )
         if isinstance(measured, str):
-            failed[(*map_pair_of(atlas, a, b), measured)] += 1
+            first, second = map_pair_of(atlas, a, b)
+            failed[first, second, measured] += 1
         else:
             loop_closures.append(
                 LoopClosure(

@@ -8,7 +8,6 @@ from typing import Any, Literal
 
 import msgspec
 import numpy as np
-from rse_pf.live_map.feature_parts import SnapshotParts
 
 from rse_pf.errors import BadRequest
 from rse_pf.geometry import Camera
@@ -22,6 +21,7 @@ from rse_pf.live_map.events import (
     encode_events,
 )
 from rse_pf.live_map.outcomes import Added, Alignment, Corrected, Outcome
+from rse_pf.live_map.snapshots import SnapshotParts
 from rse_pf.live_map.versions import PointSource
 from rse_pf.maps.format import Keyframe, MapVersion
 from rse_pf.server.live_map.map_server.environment import GraphOptimiser, MapImplementation
