@@ -429,8 +429,7 @@ class MapRegistry:
         return msgspec.json.decode(raw, type=MapRecord)
 
     def versions(self, name: str) -> list[MapRecord]:
-        """Return the records of all versions, oldest first, including those that are no ancestors of the
-        head.
+        """Return the records of all versions, oldest first, whether or not they are ancestors of the head.
 
         Raises:
             NotFound: There is no map *name*.

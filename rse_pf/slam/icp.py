@@ -195,7 +195,7 @@ class _Surfaces:
         return _Fit(float(has_match.mean()), float(distance.mean()))
 
     def measure_constraint(self, T_target_source: Array) -> float:
-        """Return how well the surfaces constrain the least constrained motion: 0 if they can slide or turn.
+        """Return how well the surfaces constrain a pose in its weakest direction; 0 if they can slide.
 
         The measure is the smallest eigenvalue of the mean outer product of ``(normal, lever x normal)``,
         where levers are divided by their mean length.
@@ -212,10 +212,9 @@ class _Surfaces:
         return float(np.linalg.eigvalsh(rows.T @ rows / len(rows))[0])
 
     def _correspondences(self, T_target_source: Array) -> tuple[npt.NDArray[np.bool_], Array, Array, Array]:
-        """Return for each source point: whether it has a correspondence, and the distance to its tangent
-        plane.
+        """Return for each source point whether it has a correspondence, and its point-to-plane distance.
 
-        The last two arrays are the source points in the target's frame and the normals of the planes.
+        The last two arrays are the source points in the target's frame and the normals of the target there.
         """
         points = transform(T_target_source, self._source)
         indices, squared_distances = self._tree.batch_nearest_neighbor_search(points, num_threads=1)

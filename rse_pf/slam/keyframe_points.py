@@ -148,7 +148,7 @@ def decode_points(data: bytes, camera: Camera) -> tuple[Array, Colours]:
     # 2. Sum the differences up to pixels, depths and colours, and check pixels and depths.
     indices = np.cumsum(_decode_planes(raw, 0, n, "<u4"))
     if n and (indices[-1] >= camera.width * camera.height or (np.diff(indices) <= 0).any()):
-        raise _bad_points("a pixel lies outside the image, or stands twice")
+        raise _bad_points("a pixel lies outside the image, or occurs twice")
     depths_mm = np.cumsum(_decode_planes(raw, 4 * n, n, "<u2")) & 0xFFFF
     if n and depths_mm.min() < _MIN_DEPTH_MM:
         raise _bad_points(f"a depth is below {_MIN_DEPTH_MM} mm")

@@ -1,5 +1,4 @@
-"""Merge maps of several robots: find loop closures, reject outliers, align the maps, optimise, deform the
-clouds.
+"""Merge maps: find loop closures, reject outliers, align the maps, optimise the poses, deform the clouds.
 
 `merge_versions` is a function of the maps and the options alone; `rse_pf.services.mapping.merge` is the
 service that robots call, and `rse_pf.batch` runs the same steps in several processes.

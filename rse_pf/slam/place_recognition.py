@@ -1,5 +1,4 @@
-"""Recognise places: compute one VLAD vector for each image, and find the keyframes with the most similar
-ones.
+"""Recognise places: compute a VLAD vector for each image, and find keyframes with similar vectors.
 
 The vector of an image aggregates its local descriptors by a vocabulary of 32 visual words.  ORB has a
 vocabulary that was trained on rendered worlds; other kinds of descriptors have one of random directions.

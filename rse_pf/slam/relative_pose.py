@@ -1,6 +1,6 @@
 """Measure the relative pose of two images: match features, solve PnP, and refine the pose with depths.
 
-The landmarks of one image are found in the other one.  `measure_pose` returns any pose that was found;
+The landmarks of one image are matched with the features of the other image.  `measure_pose` returns any pose;
 `measure_relative_pose` accepts it as a constraint between two keyframes only if enough matches are inliers.
 Which images are compared, and which constraints are outliers, is decided by `rse_pf.slam.loop_closures`,
 `rse_pf.slam.localise` and `rse_pf.live_map`.

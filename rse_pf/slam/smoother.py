@@ -39,8 +39,7 @@ pose without an edge stays where it is."""
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ScaleTerms:
-    """Unknown scales that are fitted together with the poses; a scale multiplies the translations of some
-    edges.
+    """Unknown scales, each multiplying the translations of some edges, that are fitted with the poses.
 
     Attributes:
         count: The number *k* of scales; the logarithm of each scale starts at 0.

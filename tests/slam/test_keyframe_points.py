@@ -101,7 +101,7 @@ def test_a_keyframe_holds_references_and_an_older_reader_keeps_them() -> None:
         (one_point()[:8] + b"\xff" * 20, "they are damaged"),
         (one_point(step_px=640 * 480), "outside the image"),
         (one_point(step_px=2**32 - 1), "outside the image"),
-        (stated(2, struct.pack("<2Q", 0, 0)[:8] + bytes(10)), "stands twice"),
+        (stated(2, struct.pack("<2Q", 0, 0)[:8] + bytes(10)), "occurs twice"),
         (one_point(depth_mm=0), "depth is below"),
     ],
 )
