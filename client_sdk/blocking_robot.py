@@ -141,12 +141,12 @@ class BlockingRobot(AutoClose):
 
     @property
     def failure(self) -> RsePfError | None:
-        """Why all servers refuse this robot now; None while they do not.  It goes on reconnecting."""
+        """Why all servers refuse this robot now, None while they do not; the robot goes on reconnecting."""
         return self._robot.failure
 
     @property
     def stats(self) -> Stats:
-        """A snapshot of the robot's traffic."""
+        """A snapshot of the counters and times of this robot's commands and connections."""
 
         async def snapshot() -> Stats:
             return self._robot.stats

@@ -42,7 +42,7 @@ async def merge_maps(
     if options is not None:
         request["options"] = options
     answer = await robot.call("merge", request, MergeReply, on_progress=on_progress or _ignore_progress)
-    if answer.reply is None:  # too large for a message: it is stored as an object
+    if answer.reply is None:  # the reply is too large for a message
         stored = await asyncio.to_thread(data.download, answer.object)
         return decode_reply(stored, MergeReply)
     reply: MergeReply = answer.reply

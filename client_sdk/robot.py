@@ -82,7 +82,7 @@ class Robot:
         thumbnails: bool = False,
         burst_url: str | None = None,
     ) -> None:
-        """Connect to nothing yet: use ``async with connect(...) as robot``, or await the robot.
+        """Describe a robot; ``async with connect(...) as robot``, or awaiting the robot, connects it.
 
         A first connect that is refused raises.  A robot that was connected once reconnects for ever, whatever
         the servers answer; `failure` holds their last refusal.
@@ -512,7 +512,7 @@ class Robot:
 
     @property
     def stats(self) -> Stats:
-        """A snapshot of the robot's traffic."""
+        """A snapshot of the counters and times of this robot's commands and connections."""
         counter, session, connection = self._counter, self._session, self._connection
         current = session.current
         clock = current.clock_offset if current else None
@@ -588,7 +588,7 @@ class Robot:
             raise failed.error from None
 
     def _read_access(self) -> tuple[str, ssl.SSLContext | None]:
-        """Return the address of the servers, and what the robot trusts there."""
+        """Return the WebSocket address of the servers, and the TLS context for it (None: the default)."""
         return self._connection.url, self._connection.dialler.ssl_context
 
     def _handle_event(self, event: RobotEvent) -> None:

@@ -20,7 +20,8 @@ from rse_pf.wire.client_subscriptions import SubscriptionEnded, Updated
 __all__ = ["BlockingUpdates", "RobotSubscriptions", "Updates"]
 
 MAX_UNREAD_KEYS = 4096
-"""Most keys of one subscription whose values wait to be read; beyond it the oldest one is dropped."""
+"""Most keys of one subscription whose values the program has not read yet; the oldest is dropped beyond
+it."""
 
 
 class Updates:
@@ -31,7 +32,7 @@ class Updates:
     """
 
     def __init__(self, topic: str, on_close: Callable[[], None]) -> None:
-        """Hold no value yet.
+        """Begin without values to read.
 
         Args:
             topic: Name of the subscribed topic, such as ``live/MAP``.
@@ -113,7 +114,7 @@ class RobotSubscriptions:
     """Hold the open subscriptions of one robot by their ids."""
 
     def __init__(self, session: ClientSession, flush: Callable[[], None], clock: Callable[[], float]) -> None:
-        """Begin without subscriptions.
+        """Begin without open subscriptions.
 
         Args:
             session: Writes the messages that begin and end a subscription.

@@ -11,9 +11,9 @@ from random import Random
 __all__ = ["Percentiles", "Stats", "TrafficCounter"]
 
 SAMPLE_SIZE = 2048
-"""How many commands of a run, drawn uniformly, percentiles are computed from."""
+"""Size of the uniform sample of a run's commands from which percentiles are computed."""
 RECENT_ROUND_TRIPS = 32
-"""How many of the last round trips the next one is predicted from."""
+"""From how many of the last round trips to a server the next one is predicted."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -27,7 +27,7 @@ class Percentiles:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Stats:
-    """A snapshot of a robot's traffic since it was made.
+    """A snapshot of the counters of one robot, which start at zero when the robot is made.
 
     Attributes:
         sent: Commands that the program asked for.
@@ -106,7 +106,7 @@ class TrafficCounter:
     """Count and sample the commands of one robot; `Robot.stats` makes a `Stats` of it."""
 
     def __init__(self, random: Random) -> None:
-        """Begin with nothing; *random* draws the samples."""
+        """Begin with counters of zero; *random* draws the samples of commands."""
         self.sent = 0
         self.answered = 0
         self.answered_by_burst = 0
@@ -124,7 +124,7 @@ class TrafficCounter:
             self._samples.setdefault(quantity, _ReservoirSample()).add(value, self._random)
 
     def add_payload(self, size_bytes: int) -> None:
-        """Record the size of one command."""
+        """Record the size of the message of one command, for its median and its maximum."""
         self.payload_bytes_max = max(self.payload_bytes_max, size_bytes)
         self.add("payload_bytes", size_bytes)
 

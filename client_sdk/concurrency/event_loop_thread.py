@@ -20,7 +20,8 @@ __all__ = ["EventLoopThread", "wrong_process_error"]
 T = TypeVar("T")
 
 CLOSE_TIMEOUT_S = 5.0
-"""How long the last coroutine of the loop may take: it closes connections and finishes a recording."""
+"""How long the last coroutine of the event loop may take, in seconds: it closes connections and a
+recording."""
 THREAD_JOIN_S = 1.0
 """How long the thread of the loop may take to end after its last coroutine: a function of the program may
 block it."""
@@ -38,10 +39,12 @@ class EventLoopThread:
     """Run coroutines for other threads between `start` and `close`."""
 
     def __init__(self, at_end: Callable[[], Coroutine[Any, Any, None]]) -> None:
-        """Start nothing yet; *at_end* makes the last coroutine that the loop runs, within 5 s."""
+        """Prepare a thread for `start`; *at_end* makes the last coroutine of its loop, which has 5 s."""
         self._at_end = at_end
         self._calls: set[_Call] = set()
-        self._lock = threading.RLock()  # a signal handler may close while the same thread calls
+        self._lock = (
+            threading.RLock()
+        )  # reentrant: a signal handler may call `close` in a thread that holds it
         self._process = os.getpid()
         self._loop: asyncio.AbstractEventLoop | None = None
         self._stop: asyncio.Event

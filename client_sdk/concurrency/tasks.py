@@ -18,7 +18,7 @@ async def cancel_tasks(tasks: Iterable[asyncio.Task[Any]]) -> None:
 
 
 async def wait_for_event(event: asyncio.Event, timeout_s: float) -> None:
-    """Return when *event* is set or after *timeout_s* seconds; the caller asks the event which one it was.
+    """Wait until *event* is set, for at most *timeout_s* seconds; a timeout raises nothing.
 
     `asyncio.wait_for` is not used because it can swallow a cancellation of the waiting task.
     """

@@ -44,7 +44,7 @@ class UserCallbacks:
     """Call the functions of one program; `errors` counts the calls that failed or were too slow."""
 
     def __init__(self, slow_s: float = SLOW_CALL_S) -> None:
-        """Call in the running event loop; report a call that blocks it for more than *slow_s* seconds."""
+        """Prepare calls in the running event loop; report one that blocks it for more than *slow_s* s."""
         self.errors = 0
         self._slow_s = slow_s
         self._reported: set[tuple[str, str, str]] = set()
@@ -54,7 +54,7 @@ class UserCallbacks:
         self._token_loop: asyncio.AbstractEventLoop | None = None
 
     def start_thread(self) -> None:
-        """Call in a new thread from now on, and token functions in the event loop of another thread."""
+        """Call user functions in a new thread from now on, and token functions in the loop of another."""
         self._calls = queue.SimpleQueue()
         self._thread = threading.Thread(
             target=self._run_calls, args=(self._calls,), name="rse-pf-callbacks", daemon=True
@@ -97,7 +97,7 @@ class UserCallbacks:
         return value
 
     async def fetch_token(self, function: Callable[[], Awaitable[str]]) -> Any:
-        """Return what the async token function of the program returns, which may be no text.
+        """Call the async token function of the program and return its value, which may be no text.
 
         Raises:
             ConnectError: *function* raised, was cancelled, or took longer than 30 s.
@@ -114,7 +114,7 @@ class UserCallbacks:
             result.cancel()  # no effect on a token that has arrived
         error: BaseException
         if is_late:
-            self._end_token_loop()  # the function may block this loop for ever
+            self._end_token_loop()  # the token function may block this event loop for ever
             error = TimeoutError(f"no token within {TOKEN_TIMEOUT_S:g} s")
         elif result.cancelled():
             error = asyncio.CancelledError()
@@ -126,7 +126,7 @@ class UserCallbacks:
 
     def token_error(self, error: BaseException) -> ConnectError:
         """Report *error*, which a token function raised, and return it as an error of the connection."""
-        if isinstance(error, RsePfError):  # message and hint are written for users: no traceback
+        if isinstance(error, RsePfError):  # its message and hint tell users enough without a traceback
             self.report(CREDENTIAL_FUNCTION, error, has_traceback=False)
             return ConnectError(f"no token: {error.message}", hint=error.hint)
         self.report(CREDENTIAL_FUNCTION, error)
@@ -136,7 +136,7 @@ class UserCallbacks:
         )
 
     def report(self, name: str, error: BaseException, *, has_traceback: bool = True) -> None:
-        """Count *error*, and log it unless the same line raised an error of the same type before."""
+        """Count *error* of the user function *name*; log it unless the same line raised its type before."""
         frames = traceback.extract_tb(error.__traceback__)
         source_line = f"{frames[-1].filename}:{frames[-1].lineno}" if frames else ""
         if self._is_new((name, type(error).__name__, source_line)):
@@ -229,7 +229,7 @@ async def _await_token(function: Callable[[], Awaitable[str]]) -> Any:
                 hint="pass an async function, such as read_enrolment(FILE).token",
             )
         return await token
-    except (SystemExit, KeyboardInterrupt) as error:  # asyncio would end its event loop
+    except (SystemExit, KeyboardInterrupt) as error:  # these exceptions would end the event loop
         if _is_interrupt(error):
             raise
         raise RuntimeError(f"{CREDENTIAL_FUNCTION} raised {type(error).__name__}") from error
@@ -238,7 +238,7 @@ async def _await_token(function: Callable[[], Awaitable[str]]) -> Any:
 
 
 def _exit_forked_child(parent: int, name: str) -> None:
-    """Exit if this is a child process that *name* forked: it would write on the sockets of *parent*."""
+    """Exit a child process that the user function *name* forked: it shares sockets with *parent*."""
     if os.getpid() != parent:
         _log_error("%s forked, and its child returned; hint: end the child by os._exit", name)
         os._exit(1)

@@ -101,23 +101,23 @@ that is used now, ``stands-by`` with the name of a server of a further region th
 """
 
 FIRST_CONNECT_ATTEMPTS = 4
-"""Attempts of a robot's first connect before its error is raised; later reconnects have no limit."""
+"""How many attempts a robot's first connect makes before it raises; later reconnects have no limit."""
 MIN_TIMER_PAUSE_S = 0.001
 """Shortest pause of the timer task, so that deadlines that are due at once do not make it spin."""
 OTHER_REGIONS_WAIT_RATIO = 1.0
-"""After the first region was measured, a first connect waits for the others by this multiple of the time that
-the first one took: a region that needs longer is not the nearest."""
+"""A first connect waits for further regions by this multiple of the time after which the first region could
+be used: a region that needs longer is not the nearest."""
 OTHER_REGIONS_MAX_WAIT_S = 0.7
 """Longest wait for the other regions of a first connect once one of them can be used."""
 DUPLICATE_REGION_S = 5.0
-"""A server that closes a connection as replaced, this soon after the robot opened one in another region,
-shows that both addresses lead to one platform."""
+"""If a server closes a connection as replaced within this many seconds after the robot opened one in another
+region, both addresses lead to the same platform, and the robot itself is the cause."""
 LATE_WELCOME_S = 60.0
 """A stalled server may accept a connection attempt this long after the robot gave it up, which replaces the
 robot's newer connection; a replacement within this time is therefore not blamed on another program."""
 TOKEN_CLOCK_STEP_S = 1.0
-"""Times in tokens are whole seconds, so a token that is signed this much after a revocation is newer than
-it."""
+"""After a revocation the robot waits this many seconds before it signs a new token, so that the new one,
+whose time is in whole seconds, is certainly later than the revocation."""
 
 
 class Connection:
@@ -142,7 +142,7 @@ class Connection:
         callbacks: UserCallbacks,
         tap: MessageTap | None = None,
     ) -> None:
-        """Connect to nothing yet.
+        """Prepare the connections of one robot; `open` makes them.
 
         Args:
             urls: WebSocket address of each region, 1 to `MAX_REGIONS` different ones.
@@ -299,7 +299,7 @@ class Connection:
         try:
             while running and not self._usable_sockets():
                 _, running = await asyncio.wait(running, return_when=asyncio.FIRST_COMPLETED)
-            # 2. Wait for the others, about as long again: one of them may be nearer.
+            # 2. Wait about as long again for the other regions: one of them may be nearer.
             if running:
                 elapsed_s = self._clock() - began_s
                 others_s = min(OTHER_REGIONS_MAX_WAIT_S, OTHER_REGIONS_WAIT_RATIO * elapsed_s)
@@ -307,7 +307,7 @@ class Connection:
         except asyncio.CancelledError:
             await cancel_tasks(joins)
             raise
-        # 3. Keep what failed, and let what still runs go on in the background.
+        # 3. Keep the failures; attempts that still run go on in the background.
         for region, task in zip(self._regions, joins, strict=True):
             region.first_join = task if task in running else None
             region.last_failure = None if task in running else task.result()
@@ -402,12 +402,12 @@ class Connection:
         began_s = self._clock()
         clock_offset_s = self._reconnect_wait.clock_offset_s()
         while True:
-            # 1. Pause, as the last failure demands.
+            # 1. Pause for as long as the last failure demands.
             failure = region.last_failure
             spent_s = self._clock() - began_s
             pause_s = self._reconnect_wait.pause_s(region.backoff, failure, spent_s=spent_s)
             await self._reconnect_wait.wait(pause_s, failure, clock_offset_s)
-            # 2. Dial.
+            # 2. Dial the region, and wait for the Welcome.
             began_s = self._clock()
             clock_offset_s = self._reconnect_wait.clock_offset_s()
             region.last_failure = await self._join_region(region)
@@ -453,7 +453,9 @@ class Connection:
             except DialError as error:
                 failure = error
             else:
-                if self._session.current is not old.state:  # the old socket was lost meanwhile
+                if (
+                    self._session.current is not old.state
+                ):  # the old socket was lost while this one was dialled
                     self._hold_socket(fresh)
                     self._adopt_if_disconnected(region)
                     return
@@ -481,7 +483,7 @@ class Connection:
             if failure.may_be_accepted_late:
                 self._late_welcome_until_s = self._clock() + LATE_WELCOME_S
             raise
-        # 2. Start to read and write it; the first message is Hello.
+        # 2. Start the tasks that read and write the socket; the first message is Hello.
         socket = RegionSocket(region, websocket, self._session.open_connection(self._clock()))
         self._sockets.append(socket)
         socket.tap_number = self._tap.open_connection(self._session.codec, token)
@@ -490,7 +492,7 @@ class Connection:
             self._start_task(self._write_messages(socket)),
         ]
         socket.has_outgoing.set()
-        # 3. Wait for the Welcome.
+        # 3. Wait for the Welcome of the server.
         try:
             done, _ = await asyncio.wait({socket.welcomed}, timeout=self._timings.connect_timeout_s)
             if not done:
@@ -648,7 +650,7 @@ class Connection:
         if self._session.current is socket.state and not self._is_closed:
             self._notify_change("link-lost", "closed")
         self._session.close_connection(socket.state)
-        # 2. End its tasks and whoever waits for its Welcome or its first pong.
+        # 2. End the tasks of the socket, and every wait for its Welcome or its first pong.
         for task in socket.tasks:
             if task is not asyncio.current_task():
                 task.cancel()
@@ -656,9 +658,9 @@ class Connection:
             shown_url = socket.region.shown_url
             error = ConnectError(f"{shown_url} closed without a Welcome message", hint=CHECK_RUNNING)
             socket.welcomed.set_exception(DialError(error))
-            socket.welcomed.exception()  # marks it as retrieved: perhaps nobody waits for it
+            socket.welcomed.exception()  # asyncio would log an exception that nobody retrieves
         socket.has_round_trip.set()
-        # 3. Take it from its region.
+        # 3. Remove the socket from its region.
         region = socket.region
         if region.socket is socket:
             region.socket = None

@@ -90,7 +90,7 @@ class DialError(Exception):
         cause: str = "",
         valid_from_s: float | None = None,
     ) -> None:
-        """Describe the failure; *cause* is the cause that a refusal names, empty if it names none."""
+        """Set the attributes; *cause* is the cause that the body of a refusal names, empty without one."""
         super().__init__(error.message)
         self.error = error
         self.retry_after_s = retry_after_s
@@ -116,7 +116,7 @@ def explain_tcp_failure(address: str, error: OSError) -> ConnectError:
         cause = f"the name {parts.hostname} does not resolve: {cause}"
         hint = "check the host in the URL, and the name server (DNS) of this network"
     elif error.errno in ANSWERED_ERRNOS:
-        cause = os.strerror(error.errno)  # asyncio puts the address into the text of the error
+        cause = os.strerror(error.errno)  # the text of the error itself repeats the address
     else:
         hint = f"check the network of this robot, and that firewalls let it reach {parts.netloc}"
     return ConnectError(f"cannot connect to {address}: {cause}", hint=hint)
@@ -226,7 +226,7 @@ def split_address(url: str, schemes: tuple[str, ...], error: UsageError) -> Spli
     try:
         parts = urlsplit(url)
         parts.port  # noqa: B018 - urllib checks the port only when it is read
-        (parts.hostname or "").encode("idna")  # refuses empty labels and labels of more than 63 letters
+        (parts.hostname or "").encode("idna")  # raises for host names with empty or too long labels
     except ValueError:  # UnicodeError is a ValueError, too
         raise error from None
     if parts.scheme not in schemes or not parts.hostname:

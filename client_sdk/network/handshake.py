@@ -52,15 +52,15 @@ Token = str | Callable[[], Awaitable[str]] | None
 """A robot's token, or an async function that returns a fresh one for each connection and each renewal."""
 
 TCP_TIMEOUT_S = 1.0
-"""Longest attempt to open a TCP connection; a shorter ``connect_timeout_s`` is used instead of this
-number."""
+"""Longest attempt to open a TCP connection, in seconds, even if ``connect_timeout_s`` is longer: Linux
+repeats an unanswered attempt after 1, 3 and 7 s, for which a robot whose network is back must not wait."""
 MAX_FIRST_BYTES = 4096
 """How many first bytes of the peer are kept, to explain an answer that is not HTTP/1.1: head and page
 title."""
 
 
 def websocket_options(settings: SessionSettings, timings: ConnectTimings) -> dict[str, Any]:
-    """Return the options of the library for every WebSocket.
+    """Return the options with which the library websockets opens every WebSocket of the SDK.
 
     Compression and pings of the library are off: the codec compresses, and pings of the protocol measure
     delays.
@@ -111,7 +111,7 @@ class Dialler:
         timings: ConnectTimings,
         callbacks: UserCallbacks,
     ) -> None:
-        """Open nothing yet.
+        """Keep what is needed to open WebSockets as one robot; nothing is opened yet.
 
         Args:
             token: The robot's token, an async function that returns one, or None.
@@ -231,7 +231,7 @@ class Dialler:
         options["sock"] = await self._connect_tcp(url, on_answered)
         if self.ssl_context is not None and url.startswith("wss:"):
             options["ssl"] = self.ssl_context
-        # 2. TLS and the HTTP upgrade; each failure is explained by what the peer showed.
+        # 2. Do the TLS handshake and the HTTP upgrade; explain a failure by what the peer showed.
         first_bytes = bytearray()
         try:
             websocket = await _NoRedirectConnect(
@@ -252,8 +252,7 @@ class Dialler:
                 address, error, issuer=issuer, is_enrolled=is_enrolled
             ) from error
         except (OSError, asyncio.TimeoutError, WebSocketException, EOFError) as error:
-            # An address where a WebSocket was open before has the right scheme and program: no probe is
-            # needed.
+            # Where a WebSocket was open before, scheme and program are right, and a probe is not needed.
             needs_probe = not first_bytes and url not in self._opened_urls
             raise no_answer_error(
                 address,

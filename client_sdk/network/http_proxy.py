@@ -115,7 +115,8 @@ def receive_until(connection: socket.socket, max_bytes: int, deadline_s: float) 
     """
     if time.monotonic() >= deadline_s:
         raise TimeoutError("the peer sends too slowly")
-    connection.settimeout(max(0.001, deadline_s - time.monotonic()))  # 0 would mean not to block
+    # A timeout of 0 would make the socket non-blocking.
+    connection.settimeout(max(0.001, deadline_s - time.monotonic()))
     return connection.recv(max_bytes)
 
 

@@ -36,14 +36,14 @@ class MessageTap(Protocol):
 
 
 class NullMessageTap:
-    """Ignore all messages."""
+    """Ignore all messages: the tap of a robot that nobody observes."""
 
     def open_connection(self, codec: Codec, token: str | None) -> int:
         """Return 0 for every connection."""
         return 0
 
     def observe_message(self, connection: int, direction: Literal["up", "down"], data: bytes) -> None:
-        """Ignore the message."""
+        """Ignore the bytes of a message."""
 
     def close_connection(self, connection: int) -> None:
         """Ignore the end of the connection."""

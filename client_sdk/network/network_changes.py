@@ -24,7 +24,7 @@ class NetworkChanges:
     """Call a function in the event loop after each network change, between `open` and `close`."""
 
     def __init__(self, on_change: Callable[[], None]) -> None:
-        """Watch nothing yet; *on_change* is called without arguments."""
+        """Prepare to call *on_change*, a function without arguments, after each network change."""
         self._on_change = on_change
         self._socket: socket.socket | None = None
 

@@ -79,7 +79,8 @@ def probe_peer(parts: SplitResult, timeout_s: float) -> PeerProbe:
 def _connect_until(parts: SplitResult, deadline_s: float) -> socket.socket:
     """Return a TCP connection whose next operation ends at *deadline_s* of the monotonic clock."""
     connection = connect_tcp(parts, deadline_s - time.monotonic())
-    connection.settimeout(max(0.001, deadline_s - time.monotonic()))  # 0 would mean not to block
+    # A timeout of 0 would make the socket non-blocking.
+    connection.settimeout(max(0.001, deadline_s - time.monotonic()))
     return connection
 
 

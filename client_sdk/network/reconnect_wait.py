@@ -29,7 +29,7 @@ class ReconnectWait:
     """Pause one robot between its attempts to connect."""
 
     def __init__(self, clock: Callable[[], float], wall_clock: Callable[[], float]) -> None:
-        """Watch nothing yet; *clock* is monotonic, and *wall_clock* (Unix seconds) signs tokens."""
+        """Keep two clocks: *clock* is monotonic, *wall_clock* (Unix seconds) gives tokens their time."""
         self._clock = clock
         self.wall_clock = wall_clock
         self._network = NetworkChanges(self._note_network_change)
@@ -76,11 +76,12 @@ class ReconnectWait:
         return self.wall_clock() - asyncio.get_running_loop().time()
 
     async def wait(self, pause_s: float, failure: DialError | None, clock_offset_s: float) -> None:
-        """Wait for *pause_s* seconds, or until a new attempt is worthwhile for another reason.
+        """Wait for *pause_s* seconds, or until a change of network or wall clock makes an attempt worthwhile.
 
         Args:
             pause_s: Longest wait from now.
-            failure: Of the last attempt, which decides what ends the wait early.
+            failure: Of the last attempt: a new network ends the wait after an unanswered one, a clock that
+                was set after a refusal.
             clock_offset_s: `clock_offset_s` at the start of the last attempt: the wall clock may have been
                 set since then.
         """

@@ -46,7 +46,7 @@ class RegionChoice:
     """Measure the regions of one robot, numbered from 0, and say when to change to another one."""
 
     def __init__(self, count: int, *, hold_s: float) -> None:
-        """Know no round trip yet.
+        """Begin without measured round trips.
 
         Args:
             count: Number of regions.

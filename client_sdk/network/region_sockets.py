@@ -22,7 +22,7 @@ class Region:
     """Hold one address of a robot and the socket that is kept open to it."""
 
     def __init__(self, number: int, url: str, backoff: Backoff) -> None:
-        """Begin without a socket.
+        """Describe an address to which no socket is open yet.
 
         Args:
             number: Position of the region in the robot's list of addresses, from 0.
@@ -50,7 +50,7 @@ class Region:
 
     @property
     def usable_socket(self) -> RegionSocket | None:
-        """The socket if commands may be sent on it from now on, else None."""
+        """The socket of this region if it may carry new commands: it is not leaving, closing or ended."""
         socket = self.socket
         is_unusable = socket is None or socket.state.leaving or socket.is_closing or socket.has_ended.is_set()
         return None if is_unusable else socket

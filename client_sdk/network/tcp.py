@@ -32,7 +32,7 @@ class TcpDialler:
     """Open TCP connections, and remember the last known addresses of each host."""
 
     def __init__(self) -> None:
-        """Know no addresses yet."""
+        """Begin without known addresses of hosts."""
         self._known: dict[tuple[str, int], list[_AddressInfo]] = {}
         self._lookups: dict[tuple[str, int], asyncio.Future[list[_AddressInfo]]] = {}
 
@@ -68,7 +68,7 @@ class TcpDialler:
         if known is not None:
             return known
         if done:
-            return lookup.result()  # raises what the name server answered
+            return lookup.result()  # raises the error of the name server
         raise OSError(errno.ETIMEDOUT, f"no name server answers for {host}")
 
     def _keep_addresses(self, key: tuple[str, int], lookup: asyncio.Future[list[_AddressInfo]]) -> None:

@@ -27,23 +27,25 @@ __all__ = ["BURST_SERVICES", "BurstClient"]
 BURST_SERVICES = frozenset({"pnp"})
 """Services that the burst function offers."""
 SERVER_NAME = "lambda"
-"""Name of the server in failures that this module makes itself."""
+"""Name of the burst function as a server, in failures that its client makes itself."""
 COLD_START_HEADER = "x-rse-pf-cold"
-"""Header of an answer that says ``true`` if an execution environment had to be started for it."""
+"""Header of the burst function's answer that is ``true`` after a cold start (AWS Lambda had to start an
+environment)."""
 TOKEN_REUSE_S = 60.0
-"""How long a token from a function is reused, in seconds; tokens are valid for longer."""
+"""How long the client of the burst function reuses a signed token, in seconds; tokens are valid for
+minutes."""
 IDLE_TIMEOUT_S = 20.0
-"""How long an unused connection is kept for the next command, in seconds."""
+"""How long an unused HTTP connection to the burst function is kept for the next command, in seconds."""
 MAX_IDLE_CONNECTIONS = 4
-"""Most unused connections to one host that are kept."""
+"""Most unused HTTP connections to the host of the burst function that are kept."""
 MAX_HEAD_BYTES = 16384
-"""Longest status line and headers of an answer."""
+"""Longest status line and headers of an answer of the burst function, in bytes."""
 MAX_RETRY_AFTER_S = 86400.0
-"""Longest wait in seconds that is accepted from an answer of the function."""
+"""Longest time in seconds for which an answer of the burst function can ask the robot to send nothing."""
 EXCHANGE_TIMEOUT_S = 5.0
-"""A command without an answer for this long, in seconds, counts as a failure of the function."""
+"""A command that the burst function has not answered for this long, in seconds, counts as a failure of it."""
 FUNCTION_FAILURES = frozenset({"busy", "quota", "unauthorized", "forbidden", "connect", "bad-message"})
-"""Error codes that are failures of the function, and not of the command; they count for the circuit
+"""Error codes that are failures of the burst function and not of the command; they count for its circuit
 breaker."""
 
 
@@ -83,7 +85,7 @@ class BurstClient:
         max_answer_bytes: int,
         url: str | None = None,
     ) -> None:
-        """Send nothing yet.
+        """Prepare a client of the burst function; nothing is sent yet.
 
         Args:
             codec: Codec of the robot's connection.
@@ -122,16 +124,16 @@ class BurstClient:
         return burst_address(url, self._read_access()[0]) if url else None
 
     def expected_s(self, service: str) -> float | None:
-        """Return how many seconds an answer will take, None if *service* cannot be asked now."""
+        """Return the expected seconds of an answer to *service*, None if the function cannot be asked now."""
         if service not in BURST_SERVICES or self.address is None:
             return None
         now_s = self._clock()
         return self.policy.expected_s(now_s) if self.policy.may_send(now_s) else None
 
     async def ask(self, command: Command, *, deadline_s: float, why: str) -> Answer | Failure:
-        """Send *command*; return its answer, or a failure after at most *deadline_s* seconds.
+        """Send *command* to the burst function; return an answer or failure within *deadline_s* seconds.
 
-        *why* is the reason for asking the function, which is put into the answer.
+        *why* says why no server was asked or answered; the answer carries this text.
         """
         address, began_s = self.address, self._clock()
         if address is None or not self.policy.may_send(began_s):
@@ -189,7 +191,7 @@ class BurstClient:
         self._idle.clear()
 
     async def _post(self, address: str, body: bytes) -> tuple[Result | Failure, bool]:
-        """Return the answer to a posted command, and whether it was a cold start of the function."""
+        """Post an encoded command; return the answer, and whether it was a cold start of the function."""
         try:
             token = await self._reuse_token()
             if token is None:
@@ -228,7 +230,7 @@ class BurstClient:
         return _failure("bad-message", "the burst function sent a message that is no answer to a command")
 
     async def _send(self, address: str, token: str, body: bytes) -> _Response:
-        # 1. Write the request.
+        # 1. Write the HTTP request.
         parts = urlsplit(address)
         host = parts.netloc.rpartition("@")[2]
         target = parts.path + (f"?{parts.query}" if parts.query else "")
@@ -253,7 +255,7 @@ class BurstClient:
                 except _StaleConnection:
                     continue
             connection.writer.transport.abort()
-        # 3. Or open a new connection.
+        # 3. Otherwise open a new connection.
         context = self._tls_context(host) if parts.scheme == "https" else None
         try:
             reader, writer = await _open_connection(parts, context)
@@ -297,7 +299,7 @@ class BurstClient:
                 writer.transport.abort()
 
     def _tls_context(self, host: str) -> ssl.SSLContext:
-        """Return what the robot trusts at *host*: at the host of its servers the same as there."""
+        """Return the TLS context of the robot's servers if *host* is theirs, else the default context."""
         own_url, own_context = self._read_access()
         if own_context is not None and host == urlsplit(own_url).netloc.rpartition("@")[2]:
             return own_context
@@ -335,7 +337,7 @@ def _parse_head(head: bytes) -> tuple[int, dict[str, str]]:
 
 
 def _status_failure(response: _Response) -> Failure:
-    """Return the failure for an HTTP status other than 200."""
+    """Return the failure for an answer of the burst function with an HTTP status other than 200."""
     retry_after = response.headers.get("retry-after", "")
     is_number = retry_after.isdecimal() and len(retry_after) < 9
     retry_after_ms = float(retry_after) * 1e3 if is_number else None

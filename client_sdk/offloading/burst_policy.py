@@ -17,27 +17,32 @@ __all__ = ["BurstPolicy", "burst_address", "check_burst_url"]
 
 DAY_S = 86400.0
 BREAKER_FAILURES = 3
-"""The circuit breaker opens after this many consecutive failures: no command is sent for a while."""
+"""After this many consecutive failures of the burst function the circuit breaker opens: the robot sends it no
+command for a while."""
 FIRST_OPEN_S = 1.0
-"""Longest time for which the breaker stays open at first, in seconds; it doubles with each further
-failure."""
+"""Longest time for which the circuit breaker of the burst function first stays open, in seconds; it doubles
+with each further failure."""
 MAX_OPEN_S = 60.0
-"""Longest time for which the breaker stays open, in seconds."""
+"""Longest time for which the circuit breaker of the burst function ever stays open, in seconds."""
 MAX_DOUBLINGS = 16
-"""The open time stops doubling after this many failures, so that the number stays finite."""
+"""The open time of the circuit breaker stops doubling after this many failures, so that the number stays
+finite."""
 MAX_IN_FLIGHT = 8
-"""Most unanswered commands of one robot at the function; after an open breaker one is sent, as a trial."""
+"""Most commands of one robot that the burst function has not answered yet; after the circuit breaker was
+open, one is sent as a trial."""
 RECENT_ANSWERS = 16
-"""How many of the last answers the expected time of the next one is taken from."""
+"""From how many of its last answers the expected time of the burst function is computed."""
 ANSWER_MEMORY_S = 10.0
-"""An answer's time counts for this long, so that one slow answer does not prevent all later attempts."""
+"""How long a measured answer of the burst function counts for the expected time of the next one, in seconds:
+one slow answer must not prevent all later attempts."""
 EXPECTED_PERCENTILE = 0.75
-"""The expected time of an answer is this percentile of the recent ones: most count, and not the slowest."""
+"""The expected time of the burst function is this share of its recent answers, sorted by time: three of four
+are quicker, so that a single slow one does not count."""
 
 
 @dataclass(slots=True, kw_only=True)
 class BurstPolicy:
-    """Hold the daily budget and the circuit breaker of one robot; all times are seconds of one clock.
+    """Hold one robot's daily budget and circuit breaker for the burst function; times are in seconds.
 
     Attributes:
         commands_per_day: How many commands may be sent within 24 hours, counted from the first.
@@ -81,7 +86,7 @@ class BurstPolicy:
             self._recent.append((now_s, took_s))
 
     def count_failure(self, now_s: float, *, retry_after_s: float = 0.0, jitter: float = 0.5) -> None:
-        """Count a failure of the function at *now_s*, and open the breaker after the third one in a row.
+        """Count a failure of the burst function; the third one in a row opens the circuit breaker.
 
         Args:
             now_s: When the failure was noticed.

@@ -74,7 +74,7 @@ class CommandRouter:
         burst: BurstClient,
         callbacks: UserCallbacks,
     ) -> None:
-        """Hold no command yet.
+        """Keep the three places to ask; no command is sent yet.
 
         Args:
             session: Sends commands to the servers.

@@ -24,7 +24,7 @@ class LocalServices:
     """Hold the services that a robot offers itself, and answer one command at a time."""
 
     def __init__(self, registry: Registry | None, clock: Callable[[], float]) -> None:
-        """Load nothing yet.
+        """Keep the registry of services; `prepare` loads them.
 
         Args:
             registry: The services; None means the built-in ones.

@@ -27,11 +27,12 @@ delayed."""
 MAX_SPOOL_BYTES = 1 << 30
 """Default size of the spool folder, in bytes: room for the keyframes of some hours without a network."""
 THREAD_JOIN_S = 5.0
-"""How long `BackgroundUploader.close` waits for the upload that its thread works on."""
+"""How long `BackgroundUploader.close` waits for the upload that its thread works on, in seconds."""
 RETRY_PAUSE_S = 5.0
-"""Pause after an upload that failed; the data client has repeated its requests before."""
+"""Pause in seconds before a failed upload is tried again; the data client has repeated each request
+before."""
 BUSY_POLL_S = 0.05
-"""How often *is_busy* is called while live poses are waiting."""
+"""Pause between two calls of *is_busy* while live poses are waiting, in seconds."""
 
 
 class BackgroundUploader:
@@ -47,7 +48,7 @@ class BackgroundUploader:
         clock: Callable[[], float] = time.monotonic,
         is_busy: Callable[[], bool] = lambda: False,
     ) -> None:
-        """Upload nothing yet.
+        """Describe the uploads; `start` begins them.
 
         Args:
             uploads: Client of the data service.
@@ -149,7 +150,11 @@ class BackgroundUploader:
         path = self._folder / name
         try:
             self._uploads.upload(path, self._pause_between_parts)
-        except (BadRequest, LimitExceeded, UsageError) as error:  # refused for good, or the file is missing
+        except (
+            BadRequest,
+            LimitExceeded,
+            UsageError,
+        ) as error:  # a second attempt would fail in the same way
             self.dropped += 1
             self.last_error = error.message
         except RsePfError as error:

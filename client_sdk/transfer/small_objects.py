@@ -24,7 +24,7 @@ class SmallObjectStore:
         read_token: Callable[[], Awaitable[str | None]],
         read_access: Callable[[], tuple[str, ssl.SSLContext | None]],
     ) -> None:
-        """Connect to nothing yet.
+        """Keep how to find and enter the data service; nothing is sent yet.
 
         Args:
             read_token: Returns a valid token, None where the platform needs none.

@@ -46,7 +46,7 @@ MAX_QUEUED_ENTRIES = 2000
 FLUSH_INTERVAL_S = 0.2
 """Longest time between two flushes of the file, so that a crash loses little of the recording."""
 STOP_TIMEOUT_S = 5.0
-"""How long `RobotRecorder.stop` waits for the thread to write the entries that are still queued."""
+"""How long `RobotRecorder.stop` waits until the thread has written the queued entries, in seconds."""
 MAX_MESSAGES_BEFORE_WELCOME = 16
 """Messages of a connection that are kept until its Welcome names the robot; further ones are not recorded."""
 THUMBNAIL_WIDTH_PX = 160
@@ -107,7 +107,7 @@ class RobotRecorder:
     def __init__(
         self, folder: str | Path, *, thumbnails: bool, session: SessionSettings, version: str = ""
     ) -> None:
-        """Record nothing yet.
+        """Describe the recording; `start` begins it.
 
         Args:
             folder: For the files; made if it is missing.
@@ -290,7 +290,7 @@ class _EntryWriter:
 
 
 def _subsample(rgb: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
-    """Return a copy of every n-th pixel, not less wide than a thumbnail, so that the queue stays small."""
+    """Return a copy of every n-th pixel, at least twice as wide as a thumbnail unless *rgb* is narrower."""
     step = max(1, rgb.shape[1] // (2 * THUMBNAIL_WIDTH_PX))
     return np.ascontiguousarray(rgb[::step, ::step])
 
