@@ -12,9 +12,9 @@
 //   };
 //   RSE_PF_SERVICE(Centroid)
 //
-// Throw rse_pf::BadRequest, rse_pf::Degenerate or any std::exception: the robot gets a typed failure.
-// A class with `std::string snapshot() const` and `void restore(const std::string &)` survives its server: say
-// RSE_PF_SERVICE_WITH_SNAPSHOTS(Class).
+// Throw rse_pf::BadRequest, rse_pf::Degenerate or any std::exception to fail a request: the robot receives an error.
+// The state of a class with `std::string snapshot() const` and `void restore(const std::string &)` survives its server:
+// write RSE_PF_SERVICE_WITH_SNAPSHOTS(Class) instead.
 #ifndef RSE_PF_SERVICE_HPP
 #define RSE_PF_SERVICE_HPP
 
@@ -31,15 +31,17 @@
 
 namespace rse_pf {
 
+// The request is invalid; the robot receives the error "bad-request".
 struct BadRequest : std::runtime_error {
   using std::runtime_error::runtime_error;
 };
 
+// The geometry of the request does not determine a result; the robot receives the error "degenerate".
 struct Degenerate : std::runtime_error {
   using std::runtime_error::runtime_error;
 };
 
-// A number, a text, or an array of doubles with its shape.
+// A value of a request or a reply: a number, a text, or an array of doubles with its shape.
 struct Field {
   uint32_t type = RSE_PF_FLOAT64;
   std::vector<uint64_t> shape;
@@ -57,15 +59,16 @@ struct Field {
   }
 };
 
+// The fields of a request or a reply by their names.
 class Fields : public std::map<std::string, Field> {
  public:
-  // The field called `name`; a request without it is the robot's mistake.
+  // Return the field `name`; throw BadRequest if the request has no such field.
   const Field &at(const std::string &name) const {
     auto found = find(name);
     if (found == end()) throw BadRequest("the request has no field '" + name + "'");
     return found->second;
   }
-  // The numbers of an array of rows of `columns` numbers each.
+  // Return the numbers of an array of rows, each of `columns` numbers; throw BadRequest for any other field.
   const std::vector<double> &rows(const std::string &name, std::size_t columns) const {
     const Field &field = at(name);
     if (field.type != RSE_PF_FLOAT64 || field.values.size() % columns != 0)
@@ -82,8 +85,9 @@ struct State {
   std::string error;
 };
 
-inline Fields taken(const rse_pf_field *fields, uint32_t count) {
-  Fields made;
+// Copy the C fields of a request.
+inline Fields copy_fields(const rse_pf_field *fields, uint32_t count) {
+  Fields copies;
   for (uint32_t i = 0; i < count; ++i) {
     Field field;
     field.type = fields[i].type;
@@ -94,13 +98,13 @@ inline Fields taken(const rse_pf_field *fields, uint32_t count) {
       const double *data = static_cast<const double *>(fields[i].data);
       field.values.assign(data, data + fields[i].count);
     }
-    made[fields[i].name] = std::move(field);
+    copies[fields[i].name] = std::move(field);
   }
-  return made;
+  return copies;
 }
 
-// The reply in one block of memory: fields first, then numbers, then texts; one free() gives it back.
-inline rse_pf_field *given(const Fields &fields) {
+// Copy a reply to C fields in one block of memory: fields, then numbers, then texts.  free() releases the block.
+inline rse_pf_field *allocate_fields(const Fields &fields) {
   std::size_t numbers = 0, bytes = 0;
   for (const auto &entry : fields) {
     numbers += entry.second.values.size();
@@ -115,32 +119,32 @@ inline rse_pf_field *given(const Fields &fields) {
   std::size_t i = 0;
   for (const auto &entry : fields) {
     const Field &field = entry.second;
-    rse_pf_field made = {};
-    made.type = field.type;
-    made.rank = static_cast<uint32_t>(field.shape.size() > 4 ? 4 : field.shape.size());
-    for (uint32_t axis = 0; axis < made.rank; ++axis) made.shape[axis] = field.shape[axis];
-    made.name = text;
+    rse_pf_field c_field = {};
+    c_field.type = field.type;
+    c_field.rank = static_cast<uint32_t>(field.shape.size() > 4 ? 4 : field.shape.size());
+    for (uint32_t axis = 0; axis < c_field.rank; ++axis) c_field.shape[axis] = field.shape[axis];
+    c_field.name = text;
     std::memcpy(text, entry.first.c_str(), entry.first.size() + 1);
     text += entry.first.size() + 1;
     if (field.type == RSE_PF_TEXT) {
-      made.count = field.text.size();
-      made.data = text;
+      c_field.count = field.text.size();
+      c_field.data = text;
       std::memcpy(text, field.text.data(), field.text.size());
       text += field.text.size();
     } else {
-      made.count = field.values.size();
-      made.data = values;
+      c_field.count = field.values.size();
+      c_field.data = values;
       if (!field.values.empty()) std::memcpy(values, field.values.data(), field.values.size() * sizeof(double));
       values += field.values.size();
     }
-    out[i++] = made;
+    out[i++] = c_field;
   }
   return out;
 }
 
-// Run `work`, and turn what it throws into a code and a text.
+// Run `work`, and convert an exception to a code of rse_pf_status and its message.
 template <class Work>
-int guarded(std::string &error, Work work) {
+int run_guarded(std::string &error, Work work) {
   try {
     error.clear();
     work();
@@ -162,44 +166,44 @@ int guarded(std::string &error, Work work) {
 }  // namespace detail
 }  // namespace rse_pf
 
-#define RSE_PF_SERVICE(Class)                                                                                      \
-  using RsePfState = rse_pf::detail::State<Class>;                                                                 \
+#define RSE_PF_SERVICE(Class)                                                                                       \
+  using RsePfState = rse_pf::detail::State<Class>;                                                                  \
   extern "C" RSE_PF_EXPORT uint32_t rse_pf_service_abi(void) { return RSE_PF_SERVICE_ABI; }                         \
   extern "C" RSE_PF_EXPORT int rse_pf_service_open(const char *, void **state) {                                    \
-    std::string error;                                                                                             \
-    return rse_pf::detail::guarded(error, [&] { *state = new RsePfState(); });                                      \
-  }                                                                                                                \
+    std::string error;                                                                                              \
+    return rse_pf::detail::run_guarded(error, [&] { *state = new RsePfState(); });                                  \
+  }                                                                                                                 \
   extern "C" RSE_PF_EXPORT void rse_pf_service_close(void *state) { delete static_cast<RsePfState *>(state); }      \
   extern "C" RSE_PF_EXPORT const char *rse_pf_service_error(void *state) {                                          \
-    return static_cast<RsePfState *>(state)->error.c_str();                                                        \
-  }                                                                                                                \
+    return static_cast<RsePfState *>(state)->error.c_str();                                                         \
+  }                                                                                                                 \
   extern "C" RSE_PF_EXPORT void rse_pf_service_free(void *, void *memory) { std::free(memory); }                    \
   extern "C" RSE_PF_EXPORT int rse_pf_service_call_arrays(void *state, const rse_pf_field *request, uint32_t count, \
-                                                          rse_pf_field **reply, uint32_t *reply_count) {           \
-    RsePfState *own = static_cast<RsePfState *>(state);                                                            \
-    return rse_pf::detail::guarded(own->error, [&] {                                                               \
-      rse_pf::Fields made = own->service.call(rse_pf::detail::taken(request, count));                              \
-      *reply_count = static_cast<uint32_t>(made.size());                                                           \
-      *reply = rse_pf::detail::given(made);                                                                        \
-    });                                                                                                            \
+                                                          rse_pf_field **reply, uint32_t *reply_count) {            \
+    RsePfState *own = static_cast<RsePfState *>(state);                                                             \
+    return rse_pf::detail::run_guarded(own->error, [&] {                                                            \
+      rse_pf::Fields fields = own->service.call(rse_pf::detail::copy_fields(request, count));                       \
+      *reply_count = static_cast<uint32_t>(fields.size());                                                          \
+      *reply = rse_pf::detail::allocate_fields(fields);                                                             \
+    });                                                                                                             \
   }
 
-#define RSE_PF_SERVICE_WITH_SNAPSHOTS(Class)                                                                       \
-  RSE_PF_SERVICE(Class)                                                                                            \
+#define RSE_PF_SERVICE_WITH_SNAPSHOTS(Class)                                                                        \
+  RSE_PF_SERVICE(Class)                                                                                             \
   extern "C" RSE_PF_EXPORT int rse_pf_service_snapshot(void *state, uint8_t **data, uint64_t *size) {               \
-    RsePfState *own = static_cast<RsePfState *>(state);                                                            \
-    return rse_pf::detail::guarded(own->error, [&] {                                                               \
-      std::string made = own->service.snapshot();                                                                  \
-      *data = static_cast<uint8_t *>(std::malloc(made.size() + 1));                                                \
-      if (*data == nullptr) throw std::bad_alloc();                                                                \
-      std::memcpy(*data, made.data(), made.size());                                                                \
-      *size = made.size();                                                                                         \
-    });                                                                                                            \
-  }                                                                                                                \
+    RsePfState *own = static_cast<RsePfState *>(state);                                                             \
+    return rse_pf::detail::run_guarded(own->error, [&] {                                                            \
+      std::string bytes = own->service.snapshot();                                                                  \
+      *data = static_cast<uint8_t *>(std::malloc(bytes.size() + 1));                                                \
+      if (*data == nullptr) throw std::bad_alloc();                                                                 \
+      std::memcpy(*data, bytes.data(), bytes.size());                                                               \
+      *size = bytes.size();                                                                                         \
+    });                                                                                                             \
+  }                                                                                                                 \
   extern "C" RSE_PF_EXPORT int rse_pf_service_restore(void *state, const uint8_t *data, uint64_t size) {            \
-    RsePfState *own = static_cast<RsePfState *>(state);                                                            \
-    return rse_pf::detail::guarded(                                                                                \
-        own->error, [&] { own->service.restore(std::string(reinterpret_cast<const char *>(data), size)); });       \
+    RsePfState *own = static_cast<RsePfState *>(state);                                                             \
+    return rse_pf::detail::run_guarded(                                                                             \
+        own->error, [&] { own->service.restore(std::string(reinterpret_cast<const char *>(data), size)); });        \
   }
 
 #endif

@@ -1,11 +1,12 @@
-// @NAME@: where a cloud of points lies, and how far it reaches.
+// @NAME@: compute the centroid and the radius of a point cloud.
 #include <algorithm>
 #include <cmath>
 
 #include "rse_pf_service.hpp"
 
 struct Service {
-  // Request: points, 3n metres, row after row.  Reply: centroid, 3 metres; radius, the largest distance from it.
+  // Request: points, the 3n coordinates of n points, metres, row by row.
+  // Reply: centroid, 3 coordinates in metres; radius, the largest distance of a point from it, metres.
   rse_pf::Fields call(const rse_pf::Fields &request) {
     const std::vector<double> &points = request.rows("points", 3);
     std::size_t n = points.size() / 3;

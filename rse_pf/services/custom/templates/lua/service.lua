@@ -1,5 +1,6 @@
--- @NAME@: where a cloud of points lies, and how far it reaches.
--- Request: points, 3n metres, row after row.  Reply: centroid, 3 metres; radius, the largest distance from it.
+-- @NAME@: compute the centroid and the radius of a point cloud.
+-- Request: points, the 3n coordinates of n points, metres, row by row.
+-- Reply: centroid, 3 coordinates in metres; radius, the largest distance of a point from it, metres.
 
 return function(request)
   local points = request.points

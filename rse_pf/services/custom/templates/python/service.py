@@ -1,4 +1,4 @@
-"""@NAME@: where a cloud of points lies, and how far it reaches."""
+"""@NAME@: compute the centroid and the radius of a point cloud."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ __all__ = ["Reply", "Request", "serve"]
 
 
 class Request(msgspec.Struct):
-    """``points`` holds 3n metres, row after row."""
+    """``points`` holds the 3n coordinates of n points, metres, row by row."""
 
     points: Array
 
 
 class Reply(msgspec.Struct):
-    """``centroid`` holds 3 metres; ``radius`` is the largest distance from it."""
+    """``centroid`` holds 3 metres; ``radius`` is the largest distance of a point from it, metres."""
 
     centroid: Array
     radius: float
 
 
 def serve(request: Request) -> Reply:
-    """Return centroid and radius of the points; raises BadRequest without any."""
+    """Return the centroid and the radius of the points; raises BadRequest if there are none."""
     points = reshaped("points", request.points, 3)
     if not len(points):
         raise BadRequest("there are no points", hint="send at least one")
