@@ -179,7 +179,7 @@ def _align_linearly(
         if -scale > _CERTAIN_DEVIATIONS * deviations[0]:
             raise UsageError(
                 "the accelerometer measures the opposite of how the camera moves: an axis has the wrong sign",
-                hint="an accelerometer at rest reads 9.81 upwards; correct its axes, or T_imu_camera",
+                hint="a stationary accelerometer reads 9.81 upwards; correct its axes, or T_imu_camera",
             )
     if not scale > 0.0 or not magnitude > 0.0:
         return None
@@ -188,8 +188,8 @@ def _align_linearly(
         excess = abs(magnitude - GRAVITY_M_S2) - MAX_GRAVITY_ERROR_M_S2
         if excess > _CERTAIN_DEVIATIONS * deviations[:3].max():
             raise UsageError(
-                describe_gravity_error(magnitude, "of gravity beside the camera"),
-                hint="calibrate the accelerometer; at rest it must read 9.81 m/s^2",
+                describe_gravity_error(magnitude, "for gravity, compared with the motion of the camera"),
+                hint="calibrate the accelerometer: it must read 9.81 m/s^2 while it is stationary",
             )
     # 5. Set the magnitude of gravity.
     gravity = gravity * (GRAVITY_M_S2 / magnitude)

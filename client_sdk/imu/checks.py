@@ -48,7 +48,7 @@ _MIN_INTERVALS = 30  # intervals between poses that are needed to compare the ra
 _MAX_INTERVAL_S = 0.5  # longest interval between two poses whose mean rate is compared with the gyroscope
 _MIN_RATE_SPREAD_RAD_S = 0.04
 """Smallest standard deviation of the camera's rates about its second most turned axis, in rad/s: slower
-rotations, or rotations about one axis, do not tell the axes of the gyroscope apart."""
+rotations, or rotations about one axis, do not distinguish the axes of the gyroscope."""
 _MAX_OFFSET_S = 0.1
 """Largest time offset between the clocks of IMU and camera that is sought, in either direction."""
 _OFFSET_STEP_S = 0.002
@@ -87,8 +87,8 @@ class RateCheck:
 def find_sample_trouble(history: ImuHistory) -> str:
     """Return in one line why the samples of an IMU cannot be used; empty if they can.
 
-    Missing and saturated samples are found, values in g, and an accelerometer that does not measure 9.81
-    m/s^2 while the IMU is stationary.  Before 100 samples the result is empty.
+    Faults are missing samples, saturated samples, values in g, and an accelerometer that does not measure
+    9.81 m/s^2 while the IMU is stationary.  Before 100 samples the result is empty.
     """
     samples, model = history.to_array(), history.model
     if len(samples) < _MIN_SAMPLES:
@@ -114,14 +114,15 @@ def find_sample_trouble(history: ImuHistory) -> str:
         return f"the accelerometer reads {mean_accel:.1f} m/s^2 on average, where gravity is 9.8"
     # 4. Magnitude of gravity while the IMU is stationary.
     stationary_accel = _stationary_accel(samples, model)
-    return "" if stationary_accel is None else describe_gravity_error(stationary_accel, "at rest")
+    return "" if stationary_accel is None else describe_gravity_error(stationary_accel, "while stationary")
 
 
 def describe_gravity_error(measured_m_s2: float, circumstance: str) -> str:
     """Return in one line how wrong an accelerometer is that measures gravity as *measured_m_s2*.
 
-    Empty up to an error of 0.6 m/s^2, which the usual bias explains.  One direction of gravity does not tell
-    a wrong scale from a bias, so the line names both.  *circumstance* follows the measured value in the line.
+    Empty up to an error of 0.6 m/s^2, which the usual bias explains.  One direction of gravity does not
+    distinguish a wrong scale from a bias, so the line names both.  *circumstance* follows the measured value
+    in the line.
     """
     error = measured_m_s2 - GRAVITY_M_S2
     if abs(error) <= MAX_GRAVITY_ERROR_M_S2:
@@ -252,21 +253,24 @@ def _find_rate_trouble(
         is_mirrored: Whether *Q* is a reflection.
     """
     if unexplained > _MAX_UNEXPLAINED:
-        return "", "the gyroscope does not turn as the camera does, at any offset in time within 100 ms"
+        return "", "the rates of the gyroscope do not follow the camera's, at any time offset within 100 ms"
     if ratio > _MIN_DEGREES_RATIO:
         return "", (
-            f"the gyroscope reads {ratio:.0f} times what the camera turns: in degrees, where rad/s are needed"
+            f"the gyroscope reads {ratio:.0f} times the camera's rates: in degrees/s, where rad/s are needed"
         )
     if not 1.0 / _MAX_RATE_RATIO < ratio < _MAX_RATE_RATIO:
-        return "", f"the gyroscope reads {ratio:.2f} times what the camera turns: is its unit rad/s?"
+        return "", f"the gyroscope reads {ratio:.2f} times the camera's rates: is its unit rad/s?"
     if is_mirrored:
-        return "axes", "an axis of the gyroscope has the wrong sign, or two are swapped: they are left-handed"
+        return "axes", "the gyroscope's axes are left-handed: one has the wrong sign, or two are swapped"
     angle = rotation_angle_deg(Q)
     if angle > _MAX_AXES_ERROR_DEG:
         return "axes", (
-            f"the axes of the IMU are turned by {angle:.0f} degrees from what T_imu_camera says: "
+            f"the axes of the IMU are turned by {angle:.0f} degrees against what T_imu_camera says: "
             "are two of them swapped?"
         )
     if abs(offset_s) > _MAX_USABLE_OFFSET_S:
-        return "offset", f"the clock of the IMU is {1e3 * offset_s:.0f} ms off that of the camera"
+        return (
+            "offset",
+            f"the clock of the IMU is {1e3 * offset_s:.0f} ms ahead of the camera's: more than 60 ms off",
+        )
     return "", ""

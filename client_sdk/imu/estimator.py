@@ -73,7 +73,7 @@ class ImuEstimator:
 
         Returns:
             ``R_begin_end`` ``(3, 3)`` of the camera; None if samples are missing, before the gyroscope has
-            agreed with the camera, and after a fault was found.
+            agreed with the camera, and while ``trouble`` is not empty.
         """
         if not self._has_agreed or self.trouble:
             return None
@@ -108,7 +108,7 @@ class ImuEstimator:
             is_metric: Whether the unit of the poses is the metre.
 
         Returns:
-            The alignment; None if the poses do not determine it, or if a fault is found, which is then in
+            The alignment; None if the poses do not determine it, or if there is a fault, which is then in
             ``trouble``.
         """
         self.alignment = None
