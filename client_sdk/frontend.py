@@ -101,8 +101,7 @@ class Frame:
 
     @property
     def depth_noise(self) -> DepthNoise:
-        """Noise model of the depths of this frame's features in a sharp image: a Kinect's, or a stereo
-        pair's."""
+        """Noise model of this frame's depths in a sharp image: a Kinect's, or a stereo pair's."""
         return DepthNoise() if self.stereo is None else noise_of(self.stereo, self.camera)
 
 

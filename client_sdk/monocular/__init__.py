@@ -1,5 +1,5 @@
-"""Geometry of one camera without depth: two-view start, bundle adjustment, scale.
+"""Geometry of one camera without depth: the start from two views, bundle adjustment, and the metric scale.
 
-Functions over arrays of pixels, points and poses belong here, and how OpenCV is loaded; frames, features and
-queries do not.
+The functions take arrays of pixels, points and poses.  Frames, features and queries are in
+`client_sdk.tracking`.
 """

@@ -1,7 +1,7 @@
-"""Bundle adjustment over few keyframes: poses and points that agree best with all pixels.
+"""Bundle adjustment: the camera poses and points that agree best with all pixels; deterministic.
 
-Levenberg-Marquardt with Huber weights; the points are eliminated by the Schur complement, so that the linear
-system has six rows for each free camera.  Deterministic.  It does not decide what is adjusted.
+Levenberg-Marquardt with Huber weights.  The points are eliminated by the Schur complement, so that the linear
+system has six rows for each free camera.
 """
 
 from __future__ import annotations
@@ -19,27 +19,43 @@ __all__ = ["Adjuster", "Bundle", "adjust"]
 
 Rows = npt.NDArray[np.int64]
 
-# Huber's threshold in standard deviations: 95 % of the residuals of a 2-D Gaussian are below.
-_HUBER = 2.45
+_HUBER_SIGMAS = 2.45
+"""Threshold of the Huber loss, in standard deviations: 95 % of the residuals of a 2-D Gaussian are below
+it."""
 _MIN_DEPTH = 1e-3
-_FIRST_DAMPING = 1e-4  # Levenberg-Marquardt's share of the diagonal: nearly Gauss-Newton at first
-_MAX_DAMPING = 1e6  # with more, a step is shorter than the rounding of a pose
-_CONVERGED = 1e-4
+"""Smallest depth of a point before a camera, in the unit of the map; an observation behind it has no
+weight."""
+_BEHIND_COST = 1e4
+"""Cost of an observation whose point lies behind its camera, in squared standard deviations: above that of
+usual outliers, so that a step that moves points behind cameras raises the cost."""
+_INITIAL_DAMPING = 1e-4
+"""Initial damping of Levenberg-Marquardt as a share of the diagonal: nearly Gauss-Newton."""
+_MIN_DAMPING = 1e-9
+"""Smallest damping of Levenberg-Marquardt as a share of the diagonal, however many steps succeed."""
+_MAX_DAMPING = 1e6
+"""Largest damping of Levenberg-Marquardt as a share of the diagonal: with more, a step is shorter than the
+rounding of a pose."""
+_DAMPING_FACTOR = 10.0
+"""The damping of Levenberg-Marquardt is multiplied by this after a step that fails, and divided after one
+that succeeds."""
+_CONVERGED_SHARE = 1e-4
 """The adjustment ends when a step lowers the cost by less than this share."""
-_LITTLE_INFORMATION = 1e-9  # far below that of any pixel: a point behind all cameras has an inverse
+_ADDED_INFORMATION = 1e-9
+"""Information added to the diagonals of cameras and points, far below that of any pixel: without it, a point
+behind all of its cameras has no inverse."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Bundle:
-    """Cameras, points, and which camera sees which point where.
+    """Cameras, points, and the pixels at which cameras see points.
 
     Attributes:
-        T_camera_world: ``(c, 4, 4)``.
-        is_fixed: ``(c,)``, cameras that keep their poses; two or more of them fix position and scale.
+        T_camera_world: ``(c, 4, 4)``, poses of the cameras.
+        is_fixed: ``(c,)``, whether each camera keeps its pose; two or more fixed cameras fix frame and scale.
         points_world: ``(p, 3)``.
-        cameras: ``(n,)``, row of the camera of each observation.
-        points: ``(n,)``, row of the point of each observation; a camera sees a point at most once.
-        pixels: ``(n, 2)``, undistorted.
+        cameras: ``(n,)``, camera of each observation.
+        points: ``(n,)``, point of each observation; a camera sees a point at most once.
+        pixels: ``(n, 2)``, undistorted, of each observation.
         sigma_px: ``(n,)``, standard deviation of each pixel.
     """
 
@@ -53,107 +69,124 @@ class Bundle:
 
 
 class Adjuster(Protocol):
-    """What adjusts a bundle as `adjust` does."""
+    """A function that adjusts a bundle, such as `adjust` or a user's optimiser."""
 
     def __call__(self, bundle: Bundle, camera: Camera, *, iterations: int = 8) -> tuple[Array, Array]:
-        """Return adjusted poses and points."""
+        """Return adjusted poses ``T_camera_world`` ``(c, 4, 4)`` and points ``(p, 3)``."""
 
 
 def adjust(bundle: Bundle, camera: Camera, *, iterations: int = 8) -> tuple[Array, Array]:
-    """Return adjusted poses ``(c, 4, 4)`` and points ``(p, 3)`` of *bundle*; its cost never grows.
+    """Adjust the free cameras and all points of a bundle; the cost never grows.
+
+    Args:
+        bundle: Cameras, points and observations.
+        camera: Intrinsics of all cameras.
+        iterations: Largest number of steps that lower the cost.
+
+    Returns:
+        Poses ``T_camera_world`` ``(c, 4, 4)`` and points ``(p, 3)``.
 
     Source:
         Triggs et al., "Bundle Adjustment - A Modern Synthesis", 2000, Sect. 6.1 (Schur complement).
     """
-    order = np.argsort(bundle.points, kind="stable")
-    system = _System(bundle, order, camera)
+    system = _System(bundle, camera)
     poses, points = bundle.T_camera_world.copy(), bundle.points_world.copy()
-    cost, damping = system.cost(poses, points), _FIRST_DAMPING
+    cost, damping = system.cost(poses, points), _INITIAL_DAMPING
     for _ in range(iterations):
+        # 1. Linearise, and raise the damping until a step lowers the cost.
         system.linearise(poses, points)
         while True:
             try:
-                moved_poses, moved_points = system.step(poses, points, damping)
-                moved_cost = system.cost(moved_poses, moved_points)
+                new_poses, new_points = system.step(poses, points, damping)
+                new_cost = system.cost(new_poses, new_points)
             except np.linalg.LinAlgError:
-                moved_cost = np.inf
-            if moved_cost < cost or damping > _MAX_DAMPING:
+                new_cost = np.inf
+            if new_cost < cost or damping > _MAX_DAMPING:
                 break
-            damping *= 10.0
-        if not moved_cost < cost:
+            damping *= _DAMPING_FACTOR
+        if not new_cost < cost:
             break
-        is_done = cost - moved_cost < _CONVERGED * cost
-        poses, points, cost = moved_poses, moved_points, moved_cost
-        damping = max(damping * 0.1, 1e-9)
-        if is_done:
+        # 2. Take the step; end when it gained little.
+        has_converged = cost - new_cost < _CONVERGED_SHARE * cost
+        poses, points, cost = new_poses, new_points, new_cost
+        damping = max(damping * 0.1, _MIN_DAMPING)
+        if has_converged:
             break
     return poses, points
 
 
 class _System:
-    """The normal equations of a bundle, with observations in the order of their points."""
+    """The normal equations of a bundle; its observations are sorted by their points."""
 
-    def __init__(self, bundle: Bundle, order: Rows, camera: Camera) -> None:
+    def __init__(self, bundle: Bundle, camera: Camera) -> None:
+        order = np.argsort(bundle.points, kind="stable")
         self._camera = camera
         self._cameras, self._points = bundle.cameras[order], bundle.points[order]
         self._pixels, self._sigma_px = bundle.pixels[order], bundle.sigma_px[order]
-        self._seen, self._starts = np.unique(self._points, return_index=True)
-        self._slot = np.searchsorted(self._seen, self._points)
-        self._free = np.flatnonzero(~bundle.is_fixed)
-        self._of_camera = [np.flatnonzero(self._cameras == row) for row in self._free]
-        size = 6 * len(self._free)
-        # What no camera sees of a point stays 0 in E from one step to the next.
+        self._seen_points, self._starts = np.unique(self._points, return_index=True)
+        self._rows_of_points = np.searchsorted(self._seen_points, self._points)
+        self._free_cameras = np.flatnonzero(~bundle.is_fixed)
+        self._observations_of = [np.flatnonzero(self._cameras == c) for c in self._free_cameras]
+        size, count = 6 * len(self._free_cameras), len(self._seen_points)
+        # E keeps its zeros, for points that a camera does not see, from one step to the next.
         self._equations = NormalEquations(
-            np.zeros((size, size)), np.zeros(size), np.zeros((len(self._seen), 3, size)),
-            np.zeros((len(self._seen), 3, 3)), np.zeros((len(self._seen), 3)),
-        )  # fmt: skip
+            np.zeros((size, size)),
+            np.zeros(size),
+            np.zeros((count, 3, size)),
+            np.zeros((count, 3, 3)),
+            np.zeros((count, 3)),
+        )
 
     def cost(self, poses: Array, points: Array) -> float:
-        """Return the sum of Huber's function over the observations."""
-        camera_points = _moved(poses[self._cameras], points[self._points])
+        """Return the sum of the Huber loss over all observations."""
+        camera_points = _transform_each(poses[self._cameras], points[self._points])
         squared = np.square(_residuals(camera_points, self._pixels, self._camera)).sum(axis=1)
         squared /= np.square(self._sigma_px)
         norm = np.sqrt(squared)
-        each = np.where(norm <= _HUBER, squared, 2 * _HUBER * norm - _HUBER**2)
-        each = np.where(camera_points[:, 2] > _MIN_DEPTH, each, 1e4)
-        return float(each.sum())
+        losses = np.where(norm <= _HUBER_SIGMAS, squared, 2 * _HUBER_SIGMAS * norm - _HUBER_SIGMAS**2)
+        losses = np.where(camera_points[:, 2] > _MIN_DEPTH, losses, _BEHIND_COST)
+        return float(losses.sum())
 
     def linearise(self, poses: Array, points: Array) -> None:
-        """Take the Jacobians at these poses and points."""
-        camera_points = _moved(poses[self._cameras], points[self._points])
+        """Set the normal equations at these poses and points."""
+        # 1. Weighted residuals and Jacobians.
+        camera_points = _transform_each(poses[self._cameras], points[self._points])
         Jc, Jp = _jacobians(camera_points, poses[self._cameras, :3, :3], self._camera)
         residuals = _residuals(camera_points, self._pixels, self._camera) / self._sigma_px[:, None]
         weights = np.sqrt(_huber_weights(residuals) * (camera_points[:, 2] > _MIN_DEPTH))
         scale = (weights / self._sigma_px)[:, None, None]
         Jc, Jp, residuals = Jc * scale, Jp * scale, residuals * weights[:, None]
-        equations, J_pt = self._equations, Jp.transpose(0, 2, 1)
-        equations.H_landmarks = np.add.reduceat(J_pt @ Jp, self._starts, axis=0)
+        # 2. The blocks of the points, of the cameras, and of both.
+        equations, Jp_transposed = self._equations, Jp.transpose(0, 2, 1)
+        equations.H_landmarks = np.add.reduceat(Jp_transposed @ Jp, self._starts, axis=0)
         equations.g_landmarks = np.add.reduceat(np.einsum("nij,ni->nj", Jp, residuals), self._starts, axis=0)
-        for row, own in enumerate(self._of_camera):
-            at = slice(6 * row, 6 * row + 6)
+        for camera, own in enumerate(self._observations_of):
+            block = slice(6 * camera, 6 * camera + 6)
             J = Jc[own].reshape(-1, 6)
-            equations.H[at, at] = J.T @ J
-            equations.g[at] = J.T @ residuals[own].ravel()
-            equations.E[self._slot[own], :, at] = J_pt[own] @ Jc[own]
+            equations.H[block, block] = J.T @ J
+            equations.g[block] = J.T @ residuals[own].ravel()
+            equations.E[self._rows_of_points[own], :, block] = Jp_transposed[own] @ Jc[own]
 
     def step(self, poses: Array, points: Array, damping: float) -> tuple[Array, Array]:
         """Return the poses and points after one damped step."""
-        reduced = self._equations.reduce(damping, _LITTLE_INFORMATION, _LITTLE_INFORMATION)
-        dc: Array = np.linalg.solve(reduced.S, reduced.right).astype(np.float64, copy=False)
-        moved_poses, moved_points = poses.copy(), points.copy()
-        for column, row in enumerate(self._free):
-            moved_poses[row] = exp_se3(dc[6 * column : 6 * column + 6]) @ poses[row]
-        moved_points[self._seen] += self._equations.landmark_steps(reduced, dc)
-        return moved_poses, moved_points
+        reduced = self._equations.reduce(damping, _ADDED_INFORMATION, _ADDED_INFORMATION)
+        twists: Array = np.linalg.solve(reduced.S, reduced.right).astype(np.float64, copy=False)
+        new_poses, new_points = poses.copy(), points.copy()
+        for row, camera in enumerate(self._free_cameras):
+            new_poses[camera] = exp_se3(twists[6 * row : 6 * row + 6]) @ poses[camera]
+        new_points[self._seen_points] += self._equations.landmark_steps(reduced, twists)
+        return new_poses, new_points
 
 
-def _moved(T_camera_world: Array, points_world: Array) -> Array:
+def _transform_each(T_camera_world: Array, points_world: Array) -> Array:
+    """Return ``(n, 3)`` points, each transformed by its own pose of ``(n, 4, 4)``."""
     rotation, translation = T_camera_world[..., :3, :3], T_camera_world[..., :3, 3]
     moved: Array = np.einsum("...ij,...j->...i", rotation, points_world) + translation
     return moved
 
 
 def _residuals(points_camera: Array, pixels: Array, camera: Camera) -> Array:
+    """Return the ``(n, 2)`` projections minus the pixels."""
     z = np.maximum(points_camera[:, 2], _MIN_DEPTH)
     residuals = np.empty((len(pixels), 2))
     residuals[:, 0] = camera.fx * points_camera[:, 0] / z + camera.cx - pixels[:, 0]
@@ -162,7 +195,11 @@ def _residuals(points_camera: Array, pixels: Array, camera: Camera) -> Array:
 
 
 def _jacobians(points_camera: Array, rotation: Array, camera: Camera) -> tuple[Array, Array]:
-    """Return the derivatives of the pixels by the twist ``(n, 2, 6)`` and by the point ``(n, 2, 3)``."""
+    """Return the derivatives of the projections by the twists and by the points.
+
+    The twist (translation, rotation) of a camera is applied on the left of ``T_camera_world``, whose
+    rotations are *rotation* ``(n, 3, 3)``.  The shapes are ``(n, 2, 6)`` and ``(n, 2, 3)``.
+    """
     x, y = points_camera[:, 0], points_camera[:, 1]
     z = np.maximum(points_camera[:, 2], _MIN_DEPTH)
     Jc = np.zeros((len(points_camera), 2, 6))
@@ -177,6 +214,7 @@ def _jacobians(points_camera: Array, rotation: Array, camera: Camera) -> tuple[A
 
 
 def _huber_weights(residuals: Array) -> Array:
+    """Return the ``(n,)`` Huber weights of ``(n, 2)`` residuals in standard deviations."""
     norm = np.hypot(residuals[:, 0], residuals[:, 1])
-    weights: Array = np.minimum(1.0, _HUBER / np.maximum(norm, 1e-12))
+    weights: Array = np.minimum(1.0, _HUBER_SIGMAS / np.maximum(norm, 1e-12))
     return weights

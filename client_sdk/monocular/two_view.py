@@ -1,6 +1,6 @@
-"""Two views of one camera without depth: their relative pose, and whether they suffice for a start.
+"""Two views of one camera without depth: their relative pose, and whether they suffice to begin a map.
 
-The length of the translation is unknown to two views; it is 1 here.
+Two views do not determine the length of the translation; here it is 1.
 """
 
 from __future__ import annotations
@@ -16,17 +16,25 @@ from rse_pf.slam.triangulation import parallax_deg, triangulate
 
 __all__ = ["TwoViewStart", "start_from_two_views"]
 
-_CONFIDENCE = 0.9999
-_MIN_SHARE = 0.5
-"""Of the matches that must agree with the relative pose, lie before both cameras and have parallax."""
+_RANSAC_CONFIDENCE = 0.9999
+"""Probability with which RANSAC finds an essential matrix without outliers."""
+_MIN_GOOD_SHARE = 0.5
+"""Smallest share of the inlier matches whose points lie before both cameras and have parallax: in a
+degenerate view, such as of one plane, most points do not."""
+_MIN_POINT_PARALLAX_SHARE = 0.3
+"""Smallest parallax of a point that is kept, as a share of the smallest median parallax of a start."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class TwoViewStart:
-    """The pose of the second view and the points that both see, in the frame of the first camera.
+    """Relative pose of two views, and the points that both see.
 
-    ``rows`` are the rows of the matches whose points are good; ``points`` ``(len(rows), 3)``.  *reason* is
-    empty if the views suffice for a start.
+    Attributes:
+        T_second_first: ``(4, 4)``, pose of the second view, with a translation of length 1.
+        rows: ``(k,)``, rows of the matches whose points are good.
+        points: ``(k, 3)``, in the frame of the first camera.
+        parallax_deg: Median parallax of the points, in degrees.
+        reason: Why the two views do not suffice for a start; empty if they do.
     """
 
     T_second_first: Array
@@ -45,54 +53,69 @@ def start_from_two_views(
     min_points: int = 80,
     min_parallax_deg: float = 1.5,
 ) -> TwoViewStart:
-    """Estimate the relative pose of two views and the points that both see.
+    """Estimate the relative pose of two views and triangulate the points that both see.
 
     Args:
-        first: ``(n, 2)`` undistorted pixels of the first view.
-        second: ``(n, 2)``, row *i* shows the same point.
-        camera: Intrinsics of both.
-        inlier_px: Largest distance from the epipolar line, and largest reprojection error over 2.
-        min_points: Fewer good points are no start.
-        min_parallax_deg: Median angle between the rays; below it depth is noise.
+        first: ``(n, 2)`` undistorted pixels in the first view.
+        second: ``(n, 2)`` pixels of the same points in the second view.
+        camera: Intrinsics of both views.
+        inlier_px: Largest distance of a pixel from its epipolar line, and half of the largest reprojection
+            error.
+        min_points: Fewest good points of a start.
+        min_parallax_deg: Smallest median angle, in degrees, between the two rays of a point; below it depths
+            are noise.
 
     Returns:
-        The views; ``reason`` says why they are no start.
+        The start; its ``reason`` says whether the two views suffice.
 
     Raises:
         MissingExtra: OpenCV is not installed.
 
     Source:
-        Nister, PAMI 2004 (five points); MAGSAC++, Barath et al., CVPR 2020, as OpenCV implements them.
+        Nister, PAMI 2004 (five-point algorithm); MAGSAC++, Barath et al., CVPR 2020, as OpenCV implements
+        them.
     """
+    # 1. The essential matrix of the matches, by robust estimation.
     cv2 = load_opencv()
-    nothing = np.empty(0, dtype=np.int64)
-    none = TwoViewStart(
-        T_second_first=np.eye(4), rows=nothing, points=np.empty((0, 3)), parallax_deg=0.0,
+    no_start = TwoViewStart(
+        T_second_first=np.eye(4),
+        rows=np.empty(0, dtype=np.int64),
+        points=np.empty((0, 3)),
+        parallax_deg=0.0,
         reason=f"only {len(first)} matches with the first view",
-    )  # fmt: skip
+    )
     if len(first) < min_points:
-        return none
+        return no_start
     cv2.setRNGSeed(1)
     essential, mask = cv2.findEssentialMat(
-        first, second, camera.matrix, cv2.USAC_MAGSAC, _CONFIDENCE, inlier_px
+        first, second, camera.matrix, cv2.USAC_MAGSAC, _RANSAC_CONFIDENCE, inlier_px
     )
     if essential is None or essential.shape != (3, 3):
-        return none
+        return no_start
     rows = np.flatnonzero(mask.ravel())
     if len(rows) < min_points:
-        return none
+        return no_start
+    # 2. The one of its four poses with the points before both cameras.
     _, rotation, translation, _ = cv2.recoverPose(essential, first[rows], second[rows], camera.matrix)
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = rotation, translation.ravel()
-    points, good = triangulate(np.eye(4), pose, first[rows], second[rows], camera, max_error_px=2 * inlier_px)
-    angles = parallax_deg(points, np.zeros(3), inverse(pose)[:3, 3])
-    median = float(np.median(angles[good])) if good.any() else 0.0
-    kept = good & (angles > 0.3 * min_parallax_deg)
-    reason = ""
-    if median < min_parallax_deg:
-        reason = f"the camera has moved too little sideways: {median:.1f} of {min_parallax_deg:g} deg"
-    elif kept.sum() < max(min_points, _MIN_SHARE * len(rows)):
-        reason = f"only {int(kept.sum())} of {len(rows)} points lie before both views"
+    # 3. The points, and their parallax.
+    points, is_good = triangulate(
+        np.eye(4), pose, first[rows], second[rows], camera, max_error_px=2 * inlier_px
+    )
+    angles_deg = parallax_deg(points, np.zeros(3), inverse(pose)[:3, 3])
+    median_deg = float(np.median(angles_deg[is_good])) if is_good.any() else 0.0
+    is_kept = is_good & (angles_deg > _MIN_POINT_PARALLAX_SHARE * min_parallax_deg)
+    # 4. Decide whether they suffice.
+    kept_count, reason = int(is_kept.sum()), ""
+    if median_deg < min_parallax_deg:
+        reason = f"the camera has moved too little sideways: {median_deg:.1f} of {min_parallax_deg:g} deg"
+    elif kept_count < max(min_points, _MIN_GOOD_SHARE * len(rows)):
+        reason = f"only {kept_count} of {len(rows)} points lie before both views"
     return TwoViewStart(
-        T_second_first=pose, rows=rows[kept], points=points[kept], parallax_deg=median, reason=reason
+        T_second_first=pose,
+        rows=rows[is_kept],
+        points=points[is_kept],
+        parallax_deg=median_deg,
+        reason=reason,
     )

@@ -1,5 +1,5 @@
-"""A rectified stereo pair, and the depths that it measures.
+"""Rectified stereo pairs and their depths.
 
-Rigs, lenses and how images are rectified are in `client_sdk.rigs`; frames are tracked in
+Rigs, lenses and the rectification of images are in `client_sdk.rigs`; frames are tracked in
 `client_sdk.tracking`.
 """

@@ -1,4 +1,4 @@
-"""The right image of a rectified stereo pair."""
+"""The right image of a rectified stereo pair, with the baseline."""
 
 from __future__ import annotations
 
@@ -11,15 +11,22 @@ from rse_pf.errors import UsageError
 
 __all__ = ["StereoView"]
 
-_LEAST_BASELINE_M, _MOST_BASELINE_M = 0.001, 10.0
+_MIN_BASELINE_M = 0.001
+"""Smallest baseline of a stereo pair, in metres: a smaller one is most likely of another unit."""
+_MAX_BASELINE_M = 10.0
+"""Largest baseline of a stereo pair, in metres: a larger one is most likely of another unit."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StereoView:
-    """The rectified right image beside a frame's left one: ``(h, w)`` uint8, and the baseline in metres.
+    """The rectified right image of a stereo pair, whose left image is that of the frame.
 
-    Both images have the frame's camera: the point at depth *z* of left pixel ``(u, v)`` is seen at
-    ``(u - fx * baseline_m / z, v)`` here.
+    Both images have the frame's camera.  A point at depth *z* that the left image shows at pixel ``(u, v)``
+    is shown at ``(u - fx * baseline_m / z, v)`` by the right image.
+
+    Attributes:
+        gray: ``(h, w)`` uint8.
+        baseline_m: Distance of the two cameras, in metres.
 
     Raises:
         UsageError: The image is not grey, or the baseline is not within 1 mm to 10 m.
@@ -34,9 +41,9 @@ class StereoView:
                 f"a right image of shape {self.gray.shape} and type {self.gray.dtype} cannot be used",
                 hint="give a rectified grey image of one byte a pixel",
             )
-        if not _LEAST_BASELINE_M <= self.baseline_m <= _MOST_BASELINE_M:
+        if not _MIN_BASELINE_M <= self.baseline_m <= _MAX_BASELINE_M:
             raise UsageError(
-                f"a baseline of {self.baseline_m:g} m is not within {_LEAST_BASELINE_M:g} to "
-                f"{_MOST_BASELINE_M:g} m",
+                f"a baseline of {self.baseline_m:g} m is not within {_MIN_BASELINE_M:g} to "
+                f"{_MAX_BASELINE_M:g} m",
                 hint="give it in metres, from the left camera to the right one",
             )

@@ -183,8 +183,7 @@ class KeyframeMap:
         return landmarks
 
     def distances(self, T_world_camera: Array) -> tuple[Array, Array]:
-        """Return the ``(k,)`` distances of all keyframes from a pose in metres, and their angles in
-        degrees."""
+        """Return the distances ``(k,)`` of all keyframes from a pose, in metres and in degrees."""
         metres = np.linalg.norm(self._poses[:, :3, 3] - T_world_camera[:3, 3], axis=1)
         cosines = (np.einsum("nij,ij->n", self._poses[:, :3, :3], T_world_camera[:3, :3]) - 1.0) / 2.0
         return metres, np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0)))
@@ -197,8 +196,7 @@ class KeyframeMap:
         return nearest if newest in nearest else [*nearest, newest]
 
     def rank_by_similarity(self, place: LazyPlaceVector, count: int) -> list[int]:
-        """Return the *count* keyframes whose place vectors are most similar to that of an image, best
-        first."""
+        """Return the *count* keyframes whose place vectors are most similar to an image's, best first."""
         ranked: list[int] = np.argsort(-(self._place_vectors @ place.get()), kind="stable").tolist()
         return ranked[:count]
 
@@ -243,8 +241,7 @@ class KeyframeMap:
     def landmarks_of_view(
         self, view: View, T_world_camera: Array, landmarks: Rows, noise: DepthNoise
     ) -> Landmarks:
-        """Return the landmarks of an image, and as further ones its features with depth that show no
-        landmark.
+        """Return the landmarks of an image, and its other features with depth as landmarks of no map.
 
         All of them look as in this image.
 

@@ -208,8 +208,7 @@ class LandmarkMap:
         return len(self.points) - count
 
     def append(self, other: LandmarkMap) -> tuple[int, int]:
-        """Add all of another map in the same world frame; return its first keyframe's and landmark's
-        numbers."""
+        """Add all of another map in the same frame; return the numbers of its first keyframe and landmark."""
         keyframe, landmark = len(self.keyframes), len(self.points)
         if not landmark:
             self.descriptors = other.descriptors[:0]
@@ -273,7 +272,7 @@ class LandmarkMap:
         )
 
     def rank_by_similarity(self, place: LazyPlaceVector, count: int, among: Rows | None = None) -> list[int]:
-        """Return the *count* keyframes whose place vectors are most similar to that of an image, best first.
+        """Return the *count* keyframes whose place vectors are most similar to an image's, best first.
 
         Only keyframes of *among* are considered, all for None.
         """
@@ -443,10 +442,10 @@ class LandmarkMap:
         self.add_landmarks(points[is_good], (neighbour, rows[is_good]), (number, columns[is_good]))
 
     def _interpolate_depths(self, number: int) -> Array | None:
-        """Guess the depth of each feature of a keyframe: the mean inverse depth of the three nearest
-        landmarks.
+        """Guess the depths of a keyframe's features by the three nearest landmarks in the image.
 
-        Nearest means in the image.  Returned is ``(n,)``, None if the keyframe sees no landmark.
+        The guess is the mean of the inverse depths.  Returned is ``(n,)``, None if the keyframe sees no
+        landmark.
         """
         keyframe = self.keyframes[number]
         seen = np.flatnonzero(keyframe.landmarks != NO_LANDMARK)
@@ -572,8 +571,10 @@ class LandmarkMap:
         self._remove(used[self._count_observations()[used] < 2])
 
     def _observations(self, numbers: list[int], is_wanted: npt.NDArray[np.bool_]) -> tuple[Rows, Rows, Rows]:
-        """Return all observations of wanted landmarks: row of *numbers*, feature and landmark, ``(n,)``
-        each."""
+        """Return all observations of wanted landmarks by keyframes.
+
+        Returned are, ``(n,)`` each, the row of *numbers*, the feature and the landmark of each observation.
+        """
         cameras, features, landmarks = [], [], []
         for camera, number in enumerate(numbers):
             of_features = self.keyframes[number].landmarks

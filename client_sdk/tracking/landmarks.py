@@ -89,8 +89,12 @@ class Landmarks:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Matches:
-    """Landmarks that an image shows: row *i* of ``features`` ``(n,)`` is the feature that shows landmark
-    *i*."""
+    """Landmarks and the features of an image that show them.
+
+    Attributes:
+        landmarks: ``n`` landmarks.
+        features: ``(n,)``, row of the feature that shows each landmark.
+    """
 
     landmarks: Landmarks
     features: Rows

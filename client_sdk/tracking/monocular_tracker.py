@@ -154,8 +154,7 @@ class AdjustedKeyframe:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _RelativePose:
-    """Pose of a frame relative to a keyframe, so that later adjustments of the keyframe move the frame,
-    too."""
+    """Pose of a frame relative to a keyframe, which it follows when the keyframe is adjusted."""
 
     timestamp_s: float
     keyframe: int
@@ -381,8 +380,7 @@ class MonocularTracker:
 
     @property
     def length_factor(self) -> float:
-        """By what the lengths around the newest frames of the present segment were multiplied since it
-        began."""
+        """Product of all factors of the lengths around the newest frames since the segment began."""
         return self._present.length_factor
 
     @property
@@ -408,8 +406,10 @@ class MonocularTracker:
         return pose
 
     def keyframes_of(self, segment: int) -> Iterator[AdjustedKeyframe]:
-        """Yield the keyframes of a segment as they are adjusted now, oldest first; none of an unknown
-        segment."""
+        """Yield the keyframes of a segment as they are adjusted now, oldest first.
+
+        A segment that does not exist has none.
+        """
         for number in range(self._segments[segment].map.keyframe_count if segment in self._segments else 0):
             yield self.keyframe(number, segment)
 
@@ -459,8 +459,10 @@ class MonocularTracker:
         return transform(self._T_world_start, own.points[own.is_alive]), own.colours[own.is_alive]
 
     def median_depth(self, segment: int = 0) -> float:
-        """Return the median depth of the landmarks of a segment's reference keyframe, in the segment's
-        unit."""
+        """Return the median depth of a segment's reference keyframe, in the segment's unit.
+
+        The depth is 1 for a segment that does not exist, and without landmarks.
+        """
         own = self._segments.get(segment)
         return 1.0 if own is None else own.map.median_depth(own.reference)
 
@@ -643,8 +645,7 @@ class MonocularTracker:
             self._join(similarity.segment, back, similarity.keyframe)
 
     def _find_loop(self) -> Generator[PoseQuery, QueryAnswer, None]:
-        """Ask for the place of a new keyframe among much older ones; close the loop if two keyframes
-        agree."""
+        """Ask for the place of a new keyframe among much older ones; close a loop if two frames agree."""
         # 1. Choose older keyframes that share few landmarks with the new one.
         state, own = self._state, self._present.map
         assert state.last is not None
@@ -749,8 +750,13 @@ class MonocularTracker:
         self._merge_places(similarity.keyframe, first_keyframe + keyframe)
 
     def _move_state(self, T_new_old: Array, scale: float, first_landmark: int = 0) -> None:
-        """Express the last pose in another frame and unit, and its landmarks in a map where they begin
-        later."""
+        """Express the last pose in another frame and unit after its segment was moved or appended.
+
+        Args:
+            T_new_old: ``(4, 4)``, applied after the lengths are multiplied.
+            scale: Factor of all lengths.
+            first_landmark: Number of the segment's first landmark in the map that it was appended to.
+        """
         state = self._state
         last = state.last
         if last is not None:
@@ -835,8 +841,10 @@ class MonocularTracker:
         radius_px: float,
         around: int | None = None,
     ) -> _PosedView | None:
-        """Match landmarks near the pixels of a pose and fit the pose to them, twice; None if too few
-        agree."""
+        """Match landmarks near the pixels of a pose, and fit the pose to them; None if too few agree.
+
+        Both are done twice, first within *radius_px*, then within 5 px.
+        """
         limits, min_inliers = self.options.limits, self.options.min_inliers
         for radius in (radius_px, _REFINE_RADIUS_PX):
             near = GuidedMatchLimits(radius_px=radius, lowe_ratio=_VERIFY_LOWE_RATIO)

@@ -58,8 +58,7 @@ class RecognisableMap(Protocol):
         """The number of keyframes."""
 
     def rank_by_similarity(self, place: LazyPlaceVector, count: int) -> list[int]:
-        """Return the *count* keyframes whose place vectors are most similar to that of an image, best
-        first."""
+        """Return the *count* keyframes whose place vectors are most similar to an image's, best first."""
 
     def landmarks_in(self, keyframe: int) -> tuple[Landmarks, Descriptors]:
         """Return the landmarks that a keyframe sees, and their descriptors in that keyframe."""
@@ -77,8 +76,7 @@ class Candidate:
 def make_place_vector(
     descriptors: Descriptors, rgb: npt.NDArray[np.uint8], plugin: LoopsPlugin | None
 ) -> LazyPlaceVector:
-    """Return the place vector of an image: by a user's place recogniser, or by the visual words of its
-    features.
+    """Make the place vector of an image by its visual words, or by a user's place recogniser.
 
     Args:
         descriptors: ``(n, d)``, of the image's features.
@@ -93,8 +91,7 @@ def make_place_vector(
 def list_relocalisation_candidates(
     maps: Mapping[int, RecognisableMap], place: LazyPlaceVector, current_segment: int
 ) -> Iterator[tuple[int, int]]:
-    """Yield (segment, keyframe) of all keyframes that may show the place of a frame that could not be
-    tracked.
+    """Yield (segment, keyframe) of all keyframes that may show the place of an untracked frame.
 
     These are the most similar keyframes of every segment, and the newest ones of the current segment.
     """

@@ -44,8 +44,7 @@ class QueryAnswer:
     is_weak: bool
 
     def accepted_pose(self, min_inliers: float) -> Array | None:
-        """Return the pose with a true rotation; None if fewer than *min_inliers* agree, or it is not
-        rigid."""
+        """Return the pose as a rigid motion; None if it is none, or fewer than *min_inliers* agree."""
         if self.T_camera_world is None or self.inliers < min_inliers:
             return None
         return rigid(self.T_camera_world)

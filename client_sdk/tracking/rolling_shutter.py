@@ -103,8 +103,9 @@ def correct_view(view: View, features: Features, readout_s: float, rate: Array) 
 def rotation_rate(
     T_world_first: Array, T_world_second: Array, interval_s: float, previous_rate: Array
 ) -> Array:
-    """Return the rotation rate of a camera at the second of two poses, in rad/s and in its own frame,
-    ``(3,)``.
+    """Return the ``(3,)`` rotation rate of a camera at the second of two poses, in rad/s.
+
+    The rate is in the camera's own frame.
 
     Args:
         T_world_first: ``(4, 4)``.

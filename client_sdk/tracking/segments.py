@@ -177,8 +177,7 @@ class DriveRecords:
         return record
 
     def add_to_cloud(self, tracked: TrackedFrame, pose: Array, features: Features | None) -> None:
-        """Add the points that a frame measured to the cloud of its segment, see the function
-        `add_to_cloud`."""
+        """Add the points that a frame measured to the cloud of its segment."""
         record = self._segments[tracked.segment]
         add_to_cloud(record.cloud, tracked.frame, pose, features, tracked.keyframe)
         if tracked.frame.stereo is not None and features is not None and tracked.keyframe:

@@ -83,8 +83,7 @@ class StereoAdjustment:
         return abs(self.offset_px) >= max(_MIN_CLEAR_OFFSET_PX, _MIN_CLEAR_SIGMAS * self.deviation_px)
 
     def moved(self, stamps_s: Array, T_world_camera: Array) -> Array:
-        """Return ``(n, 4, 4)`` poses at any times ``(n,)`` in seconds, moved like the keyframes around
-        them."""
+        """Return ``(n, 4, 4)`` poses of any times ``(n,)`` in seconds, moved as the keyframes around them."""
         return Trajectory(self.stamps_s, self.T_new_old).at(stamps_s) @ T_world_camera
 
 

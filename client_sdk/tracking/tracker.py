@@ -572,7 +572,12 @@ class Tracker:
             self._state = replace(self._state, join_candidate=None)
 
     def _move_state(self, T_new_old: Array, first_landmark: int = 0) -> None:
-        """Express the last pose in another frame, and its landmarks in a map where they begin at a number."""
+        """Express the last pose in another frame after its segment was moved or appended.
+
+        Args:
+            T_new_old: ``(4, 4)``.
+            first_landmark: Number of the segment's first landmark in the map that it was appended to.
+        """
         T_world_camera = _orthonormalise(T_new_old @ self._state.T_world_camera)
         last = self._state.last
         if last is not None:
@@ -895,8 +900,7 @@ class Tracker:
 
 
 def _orthonormalise(T: Array) -> Array:
-    """Return a pose with the nearest true rotation: products of poses drift, and `inverse` doubles the
-    error."""
+    """Return a pose with the nearest true rotation; a product of poses drifts away from one."""
     U, _, Vt = np.linalg.svd(T[:3, :3])
     orthonormal: Array = T.copy()
     orthonormal[:3, :3] = U @ Vt

@@ -1,7 +1,7 @@
-"""Disparities of features between the two images of a rectified stereo pair.
+"""Disparities of features between the two images of a rectified stereo pair, and the noise of their depths.
 
-A feature of the left image is sought along its row of the right one; no pixel in between is matched.  Depths
-and their noise follow from the disparities; which of them are used is decided by who tracks.
+A feature of the left image is searched along its row of the right image; pixels between features are not
+matched. The caller computes depths from disparities, and decides which of them are used.
 """
 
 from __future__ import annotations
@@ -23,23 +23,24 @@ __all__ = ["StereoOptions", "StereoRequest", "disparities", "stereo_noise"]
 
 Gray = npt.NDArray[np.uint8]
 
-_PORTABLE = 1
-_BASE_M = 1e-5
-"""The least deviation that `DepthNoise` takes."""
+_PORTABLE_FLAG = 1
+"""Flag of the native core's ``rse_pf_disparities`` that forbids AVX2."""
+_BASE_NOISE_M = 1e-5
+"""Constant part of the noise of a stereo depth, in metres: the smallest that `DepthNoise` accepts, standing
+for 0."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StereoOptions:
-    """Which disparities are sought, and which are believed.
+    """Which disparities of a stereo pair are searched, and which are accepted.
 
     Attributes:
-        min_disparity_px: Smaller ones are dropped: their depth is nearly unknown.
-        max_disparity_px: Larger ones are not sought; at most 1,024.
-        min_likeness: Least squared correlation of the two patches.
-        uniqueness: What the best lacks of a likeness of 1 is less than this share of what the second best
-            lacks.
-        left_right_px: From the right image back to the left one, the best differs by this at most; below 0
-            it is not sought.
+        min_disparity_px: Smallest accepted disparity, above 0: the depths of smaller ones are nearly unknown.
+        max_disparity_px: Largest searched disparity, at most 1,024.
+        min_likeness: Smallest accepted likeness: the squared normalised correlation of the two patches.
+        uniqueness: Ratio test: 1 minus the best likeness must be below this share of 1 minus the second best.
+        left_right_px: Largest difference between the disparities of the search from left to right and of the
+            search back from right to left; the search back is left out below 0.
     """
 
     min_disparity_px: float = 1.0
@@ -61,13 +62,15 @@ class StereoOptions:
 
 
 def stereo_noise(f_baseline: float, disparity_px: float) -> DepthNoise:
-    """Return the noise of depths *f_baseline* / d whose disparities d have a deviation of *disparity_px*.
+    """Return the noise model of depths ``f_baseline / d`` by the noise of their disparities ``d``.
 
     Args:
         f_baseline: Focal length in pixels times the baseline in metres.
-        disparity_px: Pixels.
+        disparity_px: Standard deviation of a disparity, in pixels.
     """
-    return DepthNoise(base_m=_BASE_M, growth_per_m=float(min(1.0, disparity_px / f_baseline)), from_m=0.0)
+    return DepthNoise(
+        base_m=_BASE_NOISE_M, growth_per_m=float(min(1.0, disparity_px / f_baseline)), from_m=0.0
+    )
 
 
 class StereoRequest(ctypes.Structure):
@@ -85,22 +88,25 @@ class StereoRequest(ctypes.Structure):
 def disparities(
     left: Gray, right: Gray, pixels: Array, options: StereoOptions | None = None, *, portable: bool = False
 ) -> Array:
-    """Return the ``(n,)`` disparities of pixels of the left image, NaN where none is believed.
+    """Measure the disparities of pixels of the left image.
 
-    The patch of 11x11 pixels around the nearest whole pixel is sought along its row of the right image by its
-    squared normalised correlation.  The best must be like enough, unique, and lead back from the right image
-    to the left one.  It is refined by least squares in the horizontal direction, with a gain and an offset of
-    brightness.
+    The patch of 11x11 pixels around the nearest whole pixel is compared with those along its row of the right
+    image by the squared normalised correlation.  The best must be similar enough, unique, and found again
+    from the right image to the left one.  It is refined to a fraction of a pixel by least squares in the
+    horizontal direction, with a gain and an offset of brightness.
 
     Args:
         left: ``(h, w)``, the rectified left image.
-        right: ``(h, w)``, the right one, whose rows are those of the left.
-        pixels: ``(n, 2)``, in the left image.
-        options: Limits; None means the defaults.
+        right: ``(h, w)``, the rectified right image, whose rows are those of the left.
+        pixels: ``(n, 2)``, column and row in the left image.
+        options: Limits; None for the defaults.
         portable: Forbid AVX2, which changes no byte of the result.
 
+    Returns:
+        ``(n,)`` pixels; NaN where no disparity is accepted.
+
     Raises:
-        BadRequest: Shapes do not fit, or an image is larger than 65,536 px.
+        BadRequest: Shapes do not fit, or a side of the images is above 65,536 px.
         MissingExtra: The native core is not installed.
 
     Source:
@@ -111,25 +117,27 @@ def disparities(
     is_image = left.ndim == 2 and left.shape == right.shape and left.dtype == right.dtype == np.uint8
     if not is_image or pixels.ndim != 2 or pixels.shape[1] != 2:
         raise BadRequest(
-            f"images {left.shape} and {right.shape} and pixels {pixels.shape} do not fit",
-            hint="give two grey images of one size, and two numbers for each pixel",
+            f"a left image {left.shape} of {left.dtype}, a right image {right.shape} of {right.dtype} and "
+            f"pixels {pixels.shape} do not fit together",
+            hint="give two grey images of uint8 and of one size, and two numbers for each pixel",
         )
     left, right, pixels = aligned(left), aligned(right), aligned(pixels, np.float64)
-    found = np.empty(len(pixels))
+    disparities_px = np.empty(len(pixels))
     height, width = left.shape
     request = StereoRequest(
-        PART_ABIS["stereo"], _PORTABLE if portable else 0, width, height, address_of(left), address_of(right),
-        len(pixels), address_of(pixels), options.min_disparity_px, options.min_likeness, options.uniqueness,
-        options.max_disparity_px, options.left_right_px,
+        PART_ABIS["stereo"], _PORTABLE_FLAG if portable else 0, width, height, address_of(left),
+        address_of(right), len(pixels), address_of(pixels), options.min_disparity_px, options.min_likeness,
+        options.uniqueness, options.max_disparity_px, options.left_right_px,
     )  # fmt: skip
-    if _function()(ctypes.byref(request), address_of(found)):
+    if _core_disparities()(ctypes.byref(request), address_of(disparities_px)):
         raise BadRequest(
-            f"a stereo pair of {width}x{height} px cannot be matched", hint="send smaller images"
+            f"a stereo pair of {width}x{height} px cannot be matched: a side is above 65536 px",
+            hint="give smaller images",
         )
-    return found
+    return disparities_px
 
 
 @cache
-def _function() -> Any:
+def _core_disparities() -> Any:
     pointer = ctypes.c_void_p
     return core_function("stereo", "rse_pf_disparities", (pointer, pointer), ctypes.c_int32)
