@@ -62,7 +62,7 @@ class MapOptions:
 
     def __post_init__(self) -> None:
         if not _MIN_VOXEL_M <= self.voxel_m <= _MAX_VOXEL_M:
-            raise UsageError(f"voxel_m = {self.voxel_m:g} is not within 0.001..1", hint="use 0.01 to 0.02")
+            raise UsageError(f"voxel_m = {self.voxel_m:g} is not within 0.001..1 m", hint="use 0.01 to 0.02")
         if self.every_px < 1 or self.max_points < 1:
             raise UsageError(
                 f"every_px = {self.every_px} and max_points = {self.max_points} must be 1 or more",

@@ -566,7 +566,7 @@ def _huber_weights(residuals: Array) -> Array:
 
 
 def _huber_cost(residuals: Array) -> Array:
-    """Return the Huber loss ``(n, k / 3)`` of whitened residuals ``(n, k)``, one for each three axes."""
+    """Return the Huber loss ``(n, k / 3)`` of whitened residuals ``(n, k)``, one per group of 3 axes."""
     squared = np.square(residuals.reshape(len(residuals), -1, 3)).sum(axis=2)
     norms = np.sqrt(squared / 3.0)
     linear = 3.0 * (2.0 * _HUBER_WIDTH * norms - _HUBER_WIDTH**2)

@@ -34,7 +34,7 @@ the fault of a wrong pose."""
 _MAX_BIAS_CHANGE_RAD_S = 0.005  # change of the gyroscope's bias from which on a motion is preintegrated again
 _MAX_CACHED_MOTIONS = 4 * _MAX_POSES  # preintegrated motions that are kept for later IMU alignments
 _RATE_CHECK_S = 20.0  # seconds of newest poses whose rotations are compared with the gyroscope
-_MAX_MOTION_S = 10.0  # longest motion between keyframes that is sent: longer ones are too uncertain to help
+_MAX_MOTION_S = 10.0  # longest preintegrated motion that a keyframe contains: longer ones are too uncertain
 _MIN_GRAVITY_DEVIATION_RAD = 1e-3  # smallest standard deviation of gravity that a keyframe states
 _MAX_STATIONARY_ERROR = 0.25
 """Largest relative difference between the mean of the first specific forces and 9.81 m/s^2, for which they
@@ -143,7 +143,7 @@ class ImuEstimator:
             )
         if self._misfits_in_a_row:
             return None
-        # 5. Store the result; align less often once it is good.
+        # 5. Store the result; wait longer for the next alignment once gravity and scale are known.
         self._gyro_bias = alignment.gyro_bias_rad_s[-1]
         self.alignment = alignment
         is_gravity_known = alignment.gravity_deviation_rad <= _MAX_GRAVITY_DEVIATION_RAD

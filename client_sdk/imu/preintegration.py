@@ -76,7 +76,10 @@ def preintegrate(samples: ImuSamples, gyro_bias_rad_s: Array, accel_bias_m_s2: A
         that one product of ``(15, 15)`` matrices propagates both the covariance and the derivatives.
     """
     if len(samples) < 2:
-        raise UsageError(f"{len(samples)} IMU samples are no interval", hint="give two samples or more")
+        raise UsageError(
+            f"{len(samples)} IMU samples cannot be integrated: 2 or more are needed",
+            hint="give the samples from the first frame to the second one",
+        )
     # 1. Take mean rates and forces of each step, and the rotations of whole and half steps.
     dt = np.diff(samples.timestamps_s)
     rates = 0.5 * (samples.gyro[1:] + samples.gyro[:-1]) - gyro_bias_rad_s

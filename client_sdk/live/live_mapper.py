@@ -244,14 +244,16 @@ class LiveMapper:
                 that *depth* promised, or a keyframe cannot be written to the spool folder.
         """
         if not self._is_joined:
-            raise UsageError("this live map is not joined", hint="use async with robot.live_map(...)")
+            raise UsageError(
+                f"the live map {self.name} is not joined", hint="use async with robot.live_map(...)"
+            )
         async with self._frame_lock:
             # 1. Refuse a first frame without the promised depth.
             has_depth = frame.stereo is not None or frame.depth_m.any()
             if self.frames == 0 and self._has_depth and not has_depth:
                 raise UsageError(
-                    "the first frame has no depth",
-                    hint="wait for depth, or leave depth=True out for one lens",
+                    "the first frame has no depth, which depth=True requires",
+                    hint="wait until the camera delivers depth; leave depth=True out if it never does",
                 )
             # 2. Begin another segment at the last known pose, if tracking was lost for too long.
             if self._mapper.unrecognised >= self.options.segment_after and self._poses:

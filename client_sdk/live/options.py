@@ -62,7 +62,7 @@ class LiveOptions:
                 limit = "at least 0" if name in _MAY_BE_ZERO else "above 0"
                 raise UsageError(f"{name} = {value:g} is not {limit}", hint="leave it out for the default")
         if self.points > MAX_POINTS:
-            raise UsageError(f"points = {self.points} is above {MAX_POINTS}", hint="12500 are enough")
+            raise UsageError(f"points = {self.points} is above {MAX_POINTS}", hint="use 12500")
 
     def sent_with(self, codec: str) -> LiveOptions:
         """Return these options with as many features as fit into 34 kB in the codec of the connection."""
