@@ -22,11 +22,28 @@ from rse_pf.errors import RsePfError, UsageError
 from rse_pf.geometry import Array, Lens
 
 __all__ = [
-    "CameraFacts", "DepthFacts", "Doubt", "DoubtLog", "DoubtName", "LossFacts", "SourceFacts", "TimeFacts",
-    "VideoFacts", "check_accepted", "check_reference", "check_source", "doubt_line", "ended_early",
-    "is_since_1970", "median_depth_m", "rows_in_time", "some_names", "stamps_in_seconds", "time_unit_s",
+    "CameraFacts",
+    "DepthFacts",
+    "Doubt",
+    "DoubtLog",
+    "DoubtName",
+    "LossFacts",
+    "SourceFacts",
+    "TimeFacts",
+    "VideoFacts",
+    "check_accepted",
+    "check_reference",
+    "check_source",
+    "doubt_line",
+    "ended_early",
+    "is_since_1970",
+    "median_depth_m",
+    "rows_in_time",
+    "some_names",
+    "stamps_in_seconds",
+    "time_unit_s",
     "unresolved",
-]  # fmt: skip
+]
 
 MIN_MEDIAN_DEPTH_M = 0.05  # median of some depth images: no depth camera measures nearer
 MAX_MEDIAN_DEPTH_M = 30.0  # median of some depth images: no depth camera measures farther

@@ -100,12 +100,18 @@ class FolderImages:
             if not depth.is_unit_stated:
                 assumed += (f"{stated_by} states no depth_scale: {units_per_m:g} units a metre are assumed",)
         camera = CameraFacts(
-            stated_by=stated_by, lens=lens, image_size_px=self.size_px,
-        )  # fmt: skip
+            stated_by=stated_by,
+            lens=lens,
+            image_size_px=self.size_px,
+        )
         return SourceFacts(
-            name=self.name, cameras=(camera,), depth=depth, doubts=self.doubts, assumed=assumed,
+            name=self.name,
+            cameras=(camera,),
+            depth=depth,
+            doubts=self.doubts,
+            assumed=assumed,
             times=(TimeFacts(stated_by=self.name, stamps_s=self.stamps_s),),
-        )  # fmt: skip
+        )
 
     @property
     def size_px(self) -> tuple[int, int]:
@@ -221,7 +227,7 @@ def _order_by_time(
         images = [images[row] for row, _ in pairs]
         paired = [partners[row] for _, row in pairs]
         stamps_s = stamps_s[[row for row, _ in pairs]]
-    # 3. The order of time, without repeated time stamps.
+    # 3. Sort the images by time, and leave out repeated time stamps.
     order = np.argsort(stamps_s, kind="stable")
     times = TimeFacts(stated_by=name, stamps_s=stamps_s[order])
     rows, time_doubts = rows_in_time(times)

@@ -35,7 +35,7 @@ from rse_pf.geometry import Camera
 __all__ = ["is_recording", "open_camera", "source_of_frames"]
 
 _ROS_BAG_ENDINGS = {".mcap", ".db3"}  # of ROS 2 bags, which `client_sdk.bags` reads
-_REALSENSE_NAMES = ("realsense", "realsense-stereo")  # sources that are no files, although they look so
+_REALSENSE_NAMES = ("realsense", "realsense-stereo")  # names of sources that are devices, and not files
 _SOURCE_HINT = "name a device by its number, a video, a folder or a recording that exists"
 
 

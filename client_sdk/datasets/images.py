@@ -36,12 +36,10 @@ _Result = TypeVar("_Result")
 _IMAGE_ENDINGS = {".png", ".jpg", ".jpeg", ".bmp", ".ppm", ".pgm", ".tif", ".tiff", ".webp"}
 _NUMBER = re.compile(r"\d+")
 _NO_READING = 65535  # value of a 16-bit depth image with which some recorders mark a pixel without a reading
-_WHITE_PERCENTILE = (
-    99.9  # of the values of a 16-bit image, which becomes white: brighter pixels are sensor defects
-)
-_BRIGHTNESS_STRIDE = (
-    4  # rows and columns between the pixels from which the brightness of an image is measured
-)
+_WHITE_PERCENTILE = 99.9
+"""Percentile of a 16-bit image's values that becomes white: brighter pixels are defects of the sensor."""
+_BRIGHTNESS_STRIDE = 4
+"""Rows and columns between the pixels from which the brightness of an image is measured."""
 
 
 class UnreadableImage(UsageError):

@@ -65,16 +65,14 @@ _DEPTH_DISTORTION = (
 )
 COLOUR_LENS = Lens(camera=COLOUR_CAMERA, distortion=_COLOUR_DISTORTION)
 DEPTH_LENS = Lens(camera=DEPTH_CAMERA, distortion=_DEPTH_DISTORTION)
-_MAX_DEPTH_M = (
-    10.0  # of a reading: the data set's toolbox removes farther ones, since a Kinect does not see so far
-)
+_MAX_DEPTH_M = 10.0  # depth of a reading, beyond which its pixel counts as without a reading
 _MAX_PNM_BYTES = 16 << 20  # size of an image file of a raw dump: 640x480 RGB pixels have 0.9 MB
 _PNM_HEAD = re.compile(rb"(P[56])\s+(?:#[^\n]*\n\s*)*(\d{1,5})\s+(\d{1,5})\s+(\d{1,5})\s")
 """Header of a binary PNM file: kind, comments, width, height and largest value.  A comment ends with its
 line, so that the pattern matches a header in one way only, and takes linear time."""
 _SIZE_PX = (COLOUR_CAMERA.width, COLOUR_CAMERA.height)  # width and height of all images of the data set
 _MAX_IMAGES = 10_000  # in a labelled file: a multiple of what the published one has
-_MAX_NAME_LENGTH = 256  # characters in the name of a scene
+_MAX_NAME_LENGTH = 256  # characters in the name of a scene; a longer text is the sign of a damaged file
 _MAX_CHUNK_VALUES = 1 << 26  # in a compressed chunk of a labelled file, since HDF5 inflates whole chunks
 _MAT_HINT = "name nyu_depth_v2_labeled.mat as it was published"
 _H5PY_ERRORS = (OSError, RuntimeError, KeyError, TypeError, ValueError, OverflowError, MemoryError)

@@ -14,9 +14,8 @@ __all__ = ["Thinning", "median_interval_s"]
 _SAME_RATE_RATIO = 1.05
 """Ratio of the frame interval at the wanted rate to that of the recording, up to which both rates count as
 the same: cameras of 30 Hz have 29.97 or 30.2 Hz."""
-_INTERVAL_WINDOW = (
-    31  # latest time stamps of a live camera, whose median interval is taken as its frame interval
-)
+_INTERVAL_WINDOW = 31
+"""Latest time stamps of a live camera, whose median interval is taken as its frame interval."""
 _ROUNDING_S = 1e-6  # error of time stamps and periods that are rounded decimal fractions
 
 

@@ -132,7 +132,7 @@ class Intrinsics(Lens):
     def __post_init__(self) -> None:
         try:
             Lens.__post_init__(self)
-            LENS_MODELS[self.model].check_stated(self.distortion)
+            LENS_MODELS[self.model].check_stated_coefficients(self.distortion)
         except InvalidCamera as error:
             raise UsageError(error.message, hint=error.hint) from error
         if not _MIN_DEPTH_SCALE <= self.depth_units_per_m <= _MAX_DEPTH_SCALE:

@@ -19,7 +19,9 @@ __all__ = ["Rectification"]
 
 _MIN_BASELINE_M = 0.001  # between the cameras of a pair: a shorter one is no stereo rig, but a missing pose
 _MIN_SIDEWAYS_SHARE = 0.7  # of the baseline along x of the left camera: less means one camera above the other
-_RECTIFIED_TOLERANCE = 1e-9  # of each number of T_right_left: cameras within it are rectified already
+_RECTIFIED_TOLERANCE = 1e-9
+"""Deviation of a number of the pose between two cameras from a pure translation along x, up to which the pair
+counts as rectified already."""
 
 
 class Rectification:

@@ -29,7 +29,7 @@ __all__ = [
     "measure_pair",
 ]
 
-_MAX_FEATURES = 600  # ORB features of each image that are matched: more do not change the medians taken here
+_MAX_FEATURES = 600  # ORB features of each image that are matched: enough for the medians of `find_fault`
 _MAX_DISTANCE_RATIO = 0.8
 """Hamming distance of the nearest descriptor over that of the second nearest, above which a match is
 ambiguous (Lowe's ratio test)."""

@@ -14,8 +14,8 @@ from rse_pf.geometry.transforms import Array
 __all__ = ["Camera"]
 
 MAX_IMAGE_SIDE_PX = 16384  # width or height: no sensor of a robot is larger, and a larger one is a wrong unit
-MIN_FOCAL_LENGTH = 0.05  # of the longer side of the image: a shorter one was given in metres, not in pixels
-MAX_FOCAL_LENGTH = 100.0  # times the longer side of the image: no robot carries such a telescope
+MIN_FOCAL_LENGTH = 0.05  # focal length over the longer side of the image: a shorter one is in another unit
+MAX_FOCAL_LENGTH = 100.0  # focal length over the longer side of the image: no robot carries such a telescope
 
 
 class Camera(msgspec.Struct, frozen=True, kw_only=True):

@@ -63,7 +63,7 @@ class LensModel:
     undistortion_maps: Callable[..., tuple[Any, Any]]
     rectify: Callable[..., tuple[Array, Array, Array, Array]]
 
-    def check(self, coefficients: tuple[float, ...]) -> None:
+    def check_coefficients(self, coefficients: tuple[float, ...]) -> None:
         """Refuse coefficients that OpenCV's functions do not take.
 
         Raises:
@@ -77,14 +77,14 @@ class LensModel:
                 hint=f"give {' '.join(self.coefficient_names)}",
             )
 
-    def check_stated(self, coefficients: tuple[float, ...]) -> None:
+    def check_stated_coefficients(self, coefficients: tuple[float, ...]) -> None:
         """Refuse coefficients that a file or a request may not state, although OpenCV would take them.
 
         Raises:
             InvalidCamera: There are more than ``coefficient_names``, one is above `MAX_STATED_COEFFICIENT`,
-                or `check` refuses them.
+                or `check_coefficients` refuses them.
         """
-        self.check(coefficients)
+        self.check_coefficients(coefficients)
         largest = max(map(abs, coefficients), default=0.0)
         if len(coefficients) > len(self.coefficient_names) or largest > MAX_STATED_COEFFICIENT:
             raise InvalidCamera(
@@ -116,7 +116,7 @@ class Lens:
             raise InvalidCamera(
                 f"no lens model {self.model!r}", hint=f"write one of {', '.join(LENS_MODELS)}"
             )
-        LENS_MODELS[self.model].check(self.distortion)
+        LENS_MODELS[self.model].check_coefficients(self.distortion)
 
     @property
     def is_pinhole(self) -> bool:
@@ -187,9 +187,13 @@ class Lens:
             MissingExtra: OpenCV is not installed.
         """
         return LENS_MODELS[self.model].undistortion_maps(
-            load_opencv(), self.camera.matrix, self.coefficients, np.eye(3) if rotation is None else rotation,
-            camera.matrix, (camera.width, camera.height),
-        )  # fmt: skip
+            load_opencv(),
+            self.camera.matrix,
+            self.coefficients,
+            np.eye(3) if rotation is None else rotation,
+            camera.matrix,
+            (camera.width, camera.height),
+        )
 
     def _undistort(self, pixels: Array, K_new: Array | None) -> Array:
         contiguous = np.ascontiguousarray(pixels).reshape(-1, 1, 2)
@@ -202,7 +206,7 @@ class Lens:
 
 
 def find_lens_model(name: str) -> LensModel | None:
-    """Return the model with this name or alias, whatever its case; None if no model has it."""
+    """Return the model with this name or alias, in any case, with spaces or ``_``; None if there is none."""
     name = name.lower().replace(" ", "_")
     return next((model for model in LENS_MODELS.values() if name in {model.name, *model.aliases}), None)
 
@@ -228,9 +232,15 @@ def rectify_stereo_pair(
         Bouguet's method, as ``cv2.stereoRectify`` and ``cv2.fisheye.stereoRectify`` implement it.
     """
     R1, R2, P1, P2 = LENS_MODELS[left.model].rectify(
-        load_opencv(), left.camera.matrix, left.coefficients, right.camera.matrix, right.coefficients,
-        (left.camera.width, left.camera.height), T_right_left[:3, :3], T_right_left[:3, 3],
-    )  # fmt: skip
+        load_opencv(),
+        left.camera.matrix,
+        left.coefficients,
+        right.camera.matrix,
+        right.coefficients,
+        (left.camera.width, left.camera.height),
+        T_right_left[:3, :3],
+        T_right_left[:3, 3],
+    )
     return (R1, R2), (P1, P2)
 
 

@@ -42,13 +42,13 @@ class PhotoLens(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
                 f"no lens model {self.model!r}", hint=f"send model={' or model='.join(LENS_MODELS)}"
             )
         try:
-            model.check_stated(self.distortion)
+            model.check_stated_coefficients(self.distortion)
         except InvalidCamera as error:
             raise BadRequest(error.message, hint=error.hint) from error
         if (self.width > 0) != (self.height > 0) or min(self.width, self.height) < 0:
             raise BadRequest(
-                f"intrinsics of an image of {self.width}x{self.height} px",
-                hint="send width and height, or neither of them",
+                f"the intrinsics are for an image of {self.width}x{self.height} px",
+                hint="send width and height above 0, or neither of them",
             )
 
 

@@ -30,9 +30,8 @@ _MAX_FEATURES = 1000  # ORB features of a photo: as many as a robot finds in one
 _MAX_FOCAL_RATIO = 1.2
 """Focal length of a photo over that of the map's images, in pixels: a photo with a longer one is made
 smaller, because beyond one level of ORB's image pyramid (1.2) the same corners get other descriptors."""
-_MAX_PIXEL_RATIO = (
-    4  # pixels of a photo over those of the map's largest image: a larger photo is made smaller
-)
+_MAX_PIXEL_RATIO = 4
+"""Pixels of a photo over those of the map's largest image: a larger photo is made smaller."""
 _MAX_ASPECT_DIFFERENCE = 0.01
 """Relative difference of aspect ratio between a photo and its intrinsics: rounding of a resized photo stays
 below 1 %, and a cropped or rotated photo differs by more."""
