@@ -3,21 +3,21 @@
 
 namespace {
 
-// Largest height or width of an image, pixels.
+// Largest height or width of an image, pixels: a limit of plausible requests.
 constexpr int64_t kMaxSide = int64_t{1} << 16;
-// Most pixels at which depths are read in one call.
+// Most pixels at which depths are read in one call: a limit of plausible requests.
 constexpr int64_t kMaxRows = int64_t{1} << 24;
 // Distance (px) over which the contrast of an edge is measured: wider than a blurred edge.
 constexpr int64_t kContrastPx = 16;
 // Distance (px) over which the steepest part of an edge is measured.
 constexpr int64_t kSlopePx = 2;
-// Shortest line (px) whose edges are measured.
+// Shortest line (px) whose edges are measured: three times the distance over which contrast is measured.
 constexpr int64_t kMinLength = 48;
-// Grey levels of a pixel.
+// Number of grey levels of a pixel, and so of contrasts.
 constexpr int64_t kLevels = 256;
-// Distance (px) of the four neighbours of a pixel whose depths join the median.
+// Distance (px) of the four neighbours of a pixel whose depths join the median: near enough to show the same surface.
 constexpr int64_t kNeighbourPx = 2;
-// Number of pixels that memory is fetched ahead, so that it has arrived when a pixel's turn comes.
+// Number of pixels by which memory is fetched ahead, so that the depths are in the cache when they are needed.
 constexpr int64_t kAhead = 16;
 
 int absolute_difference(uint8_t a, uint8_t b) { return a < b ? b - a : a - b; }

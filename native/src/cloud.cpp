@@ -3,9 +3,9 @@
 
 namespace {
 
-// Most points that one call adds.
+// Most points that one call adds: a limit of plausible requests.
 constexpr int64_t kMaxRows = int64_t{1} << 28;
-// Largest height or width of a depth image, pixels.
+// Largest height or width of a depth image, pixels: a limit of plausible requests.
 constexpr int64_t kMaxSide = int64_t{1} << 16;
 // Key of an empty slot of the hash table; keys of voxels are not negative.
 constexpr int64_t kEmpty = -1;

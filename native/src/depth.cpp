@@ -23,23 +23,26 @@ namespace {
 
 using namespace rse_pf_depth_detail;
 
-// Most correspondences of a request.
+// Most correspondences of a request: a limit of plausible requests.
 constexpr int64_t kMaxRows = int64_t{1} << 24;
-// Most Gauss-Newton iterations: the input pose is near the minimum.
+// Most Gauss-Newton iterations of the refinement: the input pose is near the minimum.
 constexpr int kMaxIterations = 6;
-// Step (largest component, metres and radians) below which the iteration has converged.
+// Largest component (m, rad) of a Gauss-Newton step below which the refinement has converged.
 constexpr double kConvergedStep = 1e-5;
-// Largest coordinate of a point (m) or pixel (px).
+// Largest coordinate of a point (m) or pixel (px): a limit of plausible requests.
 constexpr double kMaxAbs = 1e6;
-// Largest depth in the second image, metres.
+// Largest depth in the second image (m): a limit of plausible requests.
 constexpr double kMaxDepthM = 1e3;
-// Smallest standard deviation of a pixel (px): the reprojection errors of few matches may be small by chance.
+// Smallest standard deviation of a pixel (px) that is derived from the reprojection error, which may be small by chance
+// where matches are few.
 constexpr double kMinPixelPx = 0.05;
-// Smallest factor of the covariance that the residuals may give: they may be small by chance.
+// Smallest factor by which the residuals may scale the covariance of the pose: few residuals may be small by chance.
 constexpr double kMinScale = 0.01;
-// Largest ratio of the reprojection errors after and before: a larger one shows that depths and pixels disagree.
+// Largest ratio of the reprojection errors after and before the refinement: a larger ratio shows that depths and pixels
+// disagree.
 constexpr double kMaxRmseGrowth = 1.5;
-// Smallest reprojection error before the refinement (px) for that ratio: smaller errors may grow more by chance.
+// Smallest reprojection error (px) with which the error after the refinement is compared: smaller errors may grow more
+// by chance.
 constexpr double kMinRmsePx = 0.2;
 
 bool is_within(double value, double low, double high) { return value >= low && value <= high; }

@@ -10,13 +10,13 @@ namespace rse_pf_depth_detail {
 
 typedef double Four __attribute__((vector_size(32)));
 
-// Correspondences in a vector.
+// Correspondences that the loop takes at a time: four doubles fill a register of AVX.
 constexpr int64_t kFour = 4;
-// Arrays of a Rows, each with a number for every correspondence.
+// Arrays of a Rows, which the workspace of the caller must hold, each with a number per correspondence.
 constexpr int kColumns = 11;
-// Smallest depth (metres) of a point in front of a camera; a smaller depth is replaced by it.
+// Smallest depth of a point in front of a camera (m); smaller depths are replaced by it, so that no division overflows.
 constexpr double kMinDepthM = 1e-3;
-// Squared Mahalanobis distance of a residual at which its Cauchy weight is one half: 2.5 standard deviations.
+// Squared Mahalanobis distance at which the Cauchy weight of a residual is one half: 2.5 standard deviations, squared.
 constexpr double kCauchy2 = 6.25;
 
 // Inliers as a structure of arrays; `count` is a multiple of four, and the last vector is padded.

@@ -20,17 +20,18 @@ namespace {
 
 using rse_pf::Image, rse_pf::kMaxLevels, rse_pf::kMaxRows, rse_pf::kMaxSide, rse_pf::Pyramid, rse_pf::round_to_integer;
 
-// Pairs of pixels that are compared: bits of a descriptor.
+// Pairs of pixels that a descriptor compares: one pair for each bit.
 constexpr int64_t kPairs = 256;
 // Bytes of a descriptor.
 constexpr int64_t kBytes = 32;
-// Largest distance (px, per axis) of a compared pixel from the keypoint at any orientation.
+// Largest distance (px, along an axis) of a compared pixel from the keypoint at any orientation of the keypoint.
 constexpr int64_t kPatternReach = 19;
-// Pixels on each side that the smoothing reads.
+// Pixels that the Gaussian smoothing reads on each side of a pixel.
 constexpr int64_t kBlurRadius = 3;
-// Smallest distance (px) of a keypoint from the border of its level.
+// Smallest distance (px) of a keypoint from the border of its level: the rotated pattern and the smoothing must stay
+// inside.
 constexpr int64_t kReach = kPatternReach + kBlurRadius;
-// Weights of the smoothing along an axis.
+// Weights of the Gaussian smoothing along an axis: 3 pixels on each side, and the middle one.
 constexpr int64_t kTaps = 7;
 // A Gaussian with a standard deviation of 2 px, in the rounding of OpenCV.
 constexpr float kGauss[kTaps] = {0x1.1f5f62p-4f, 0x1.0c70fcp-3f, 0x1.869472p-3f, 0x1.ba95cp-3f,

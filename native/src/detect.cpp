@@ -29,19 +29,19 @@ namespace {
 using rse_pf::Image, rse_pf::kMaxLevels, rse_pf::kMaxRows, rse_pf::kMaxSide, rse_pf::Pyramid;
 using Corner = rse_pf::Ranked;
 
-// Pixels from the border of a level within which OpenCV detects no keypoints.
+// Distance (px) from the border of a level within which no keypoints are detected, as in OpenCV.
 constexpr int64_t kBorder = 31;
-// Pixels of the circle of FAST.
+// Pixels of the circle around a pixel that the FAST detector compares.
 constexpr int64_t kCircle = 16;
-// Pixels that are processed at a time: bytes of an AVX2 register.
+// Pixels that are processed at a time: 32 bytes fill a register of AVX2.
 constexpr int64_t kChunk = 32;
-// Side of the square over which the Harris response sums, pixels.
+// Side (px) of the square over which the Harris response sums gradients, as in OpenCV.
 constexpr int64_t kHarrisSide = 7;
-// Radius of the disc of the intensity centroid, pixels.
+// Radius (px) of the disc whose intensity centroid gives the orientation of a keypoint, as in OpenCV.
 constexpr int64_t kDiscRadius = 15;
-// Rows of that disc.
+// Rows of the disc whose intensity centroid gives the orientation of a keypoint.
 constexpr int64_t kDiscRows = 2 * kDiscRadius + 1;
-// Half width of a row of the disc (pixels) by its distance from the middle row.
+// Half widths (px) of the rows of the disc of the intensity centroid, from the middle row to the last one.
 constexpr int32_t kHalfWidths[kDiscRadius + 1] = {15, 15, 15, 15, 14, 14, 14, 13, 13, 12, 11, 10, 9, 8, 6, 3};
 // Column and row of the pixels of FAST's circle, relative to its centre.
 constexpr int64_t kCircleColumns[kCircle] = {0, 1, 2, 3, 3, 3, 2, 1, 0, -1, -2, -3, -3, -3, -2, -1};

@@ -8,7 +8,7 @@
 
 namespace RSE_PF_ISA {
 
-constexpr double kInfinity = __builtin_inf();
+constexpr double kInfinity = __builtin_inf();  // cost of an impossible pose
 constexpr double kPi = 3.14159265358979323846;
 
 // The compiler translates this into the square root instruction, which IEEE 754 rounds correctly.

@@ -7,17 +7,19 @@ namespace RSE_PF_ISA {
 
 // Smallest squared error (px^2) of the false alarm test: messages are rounded, and four points may fit by luck.
 constexpr double kMinError2 = 0.01;
-// Quantile of the distances from and along the main axis that gives width and length of a point set: the farthest fifth
-// may be outliers.
+// Quantile of the distances of points from and along their main axis that is their width and length: up to a fifth of
+// the points may be outliers.
 constexpr double kShapeQuantile = 0.8;
-// Number of inliers at the farthest possible distance that are subtracted before inliers count as wide without a
-// quantile.
+// Number of inliers that may lie at the farthest corner of the image while the others are still called wide without an
+// exact quantile.
 constexpr double kOutlierFactor = 4.0;
-// Width over length above which that bound replaces the exact quantile, which needs a selection over all inliers.
+// Width over length of inliers (0: a line) from which on a lower bound is enough, and the exact quantile, a selection
+// over all inliers, is left out.
 constexpr double kClearlyWide = 0.15;
-// Cells across the width of the image: inliers in one cell or in adjacent cells count as one independent inlier.
+// Cells of a grid across the width of the image: inliers in one cell or in adjacent cells count as one independent
+// inlier.
 constexpr double kCellsAcross = 40.0;
-// Occupied cells from which on all inliers count as independent: copies of a few features do not occupy as many.
+// Occupied cells of the image from which on all inliers count as independent: copies of a few features occupy fewer.
 constexpr int kManyCells = 24;
 // Largest log10 of the expected number of random poses that fit as well as an accepted pose: one in 100,000 requests.
 constexpr double kMaxLog10FalseAlarms = -5.0;

@@ -12,15 +12,15 @@ namespace {
 
 using namespace rse_pf_match_detail;
 
-// Most keypoints or descriptors of one call.
+// Most keypoints or descriptors of one call: a limit of plausible requests.
 constexpr int64_t kMaxRows = int64_t{1} << 24;
-// Largest height or width of a depth image, pixels.
+// Largest height or width of a depth image, pixels: a limit of plausible requests.
 constexpr int64_t kMaxSide = int64_t{1} << 16;
-// Pixels of a patch of 3 x 3.
+// Pixels of the 3 x 3 patch whose median is the depth of a keypoint.
 constexpr int kPatch = 9;
-// Fewest valid depths of a patch whose median is used: more than half.
+// Fewest valid depths in the 3 x 3 patch of a keypoint whose median is used: more than half.
 constexpr int kMinDepths = 5;
-// Number of keypoints that memory is fetched ahead, so that it has arrived when their median is computed.
+// Number of keypoints by which memory is fetched ahead, so that the depths are in the cache when they are needed.
 constexpr int64_t kAhead = 16;
 
 double not_a_number() { return __builtin_nan(""); }

@@ -21,17 +21,17 @@
 
 namespace rse_pf_match_detail {
 
-// Bits of a descriptor.
+// Bits of a descriptor, the largest Hamming distance.
 constexpr int64_t kBits = 256;
 // Bytes of a descriptor.
 constexpr int64_t kBytes = 32;
-// 64-bit words of a descriptor.
+// Words of 64 bits of a descriptor.
 constexpr int64_t kWords = 4;
-// Rows that AVX-512 compares at a time.
+// Rows that AVX-512 compares at a time: eight words of 64 bits fill a register.
 constexpr int64_t kEight = 8;
-// Rows that AVX2 compares at a time.
+// Rows that AVX2 compares at a time: 32 bytes fill a register.
 constexpr int64_t kBlock = 32;
-// The candidate, or the row number, that means none; it is larger than all candidates.
+// Value of a candidate or a row number that means "none"; it is larger than all candidates.
 constexpr uint64_t kNone = ~uint64_t{0};
 
 struct TwoNearest {
@@ -89,12 +89,13 @@ typedef uint8_t Block __attribute__((vector_size(32)));
 typedef uint16_t Halves __attribute__((vector_size(32)));
 typedef int16_t Distances __attribute__((vector_size(32)));
 
-// A distance larger than all others.
+// Start value of a search for the smallest distance, larger than all Hamming distances.
 constexpr int16_t kFar = 0x7fff;
-// Bytes after which a block of rows is dropped if all of its rows are too far already: three quarters of a descriptor,
-// as widest rows are known to be too far then.
+// Bytes of a descriptor, three quarters of it, after which a block of rows is dropped if all rows are too far already:
+// most are.
 constexpr int64_t kEarlyBytes = 24;
-// Most blocks of a search by AVX2: twice the number of a block, plus one, has to fit into 16 bits with a sign.
+// Most blocks of 32 rows of a search by AVX2: twice the number of a block, plus one, has to fit into a signed number of
+// 16 bits.
 constexpr int64_t kMaxBlocks = 0x3fff;
 
 // For each of 16 lanes the two smallest distances, and the half block (2 * block, plus 1 for odd rows) that holds the

@@ -9,6 +9,7 @@ namespace {
 // Most digits of a number: 10^15 is below 2^53, so digits and power of ten are exact doubles, and their quotient, which
 // is rounded once, is the double nearest to the text.
 constexpr int64_t kMaxDigits = 15;
+// 10^0 to 10^15, by which a number without its decimal point is divided.
 constexpr double kPowersOfTen[kMaxDigits + 1] = {1e0, 1e1, 1e2,  1e3,  1e4,  1e5,  1e6,  1e7,
                                                  1e8, 1e9, 1e10, 1e11, 1e12, 1e13, 1e14, 1e15};
 // Bytes of the string "\u000K" that replaces a list.

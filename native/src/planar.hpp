@@ -8,14 +8,15 @@
 
 namespace RSE_PF_ISA {
 
-// Standard deviation over mean of the inliers' inverse depths below which a second pose is sought: above it,
-// perspective distinguishes the two poses.
+// Standard deviation over mean of the inverse depths of the inliers below which a planar scene may have a second pose:
+// above it, perspective tells the poses apart.
 constexpr double kWeakPerspective = 0.08;
-// Iterations of the refinement of the second pose: it starts near its minimum.
+// Most iterations of the refinement of the second pose of a planar scene, which starts near its minimum.
 constexpr int kSecondPoseIterations = 15;
-// Largest component of a step of that refinement (metres, radians): a larger one shows that it diverges.
+// Largest component (m, rad) of a step of the refinement of the second pose of a planar scene: a larger step shows that
+// the refinement diverges.
 constexpr double kMaxSecondPoseStep = 10.0;
-// Relative decrease of the cost below which that refinement has converged.
+// Relative decrease of the cost below which the refinement of the second pose of a planar scene has converged.
 constexpr double kConvergedDecrease = 1e-7;
 // Poses whose translations differ by less than this (metres) and whose rotations differ by less than 1 degree count as
 // the same pose.

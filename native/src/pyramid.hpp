@@ -11,11 +11,11 @@ namespace rse_pf {
 
 // Largest height or width of an image, pixels: the index of a pixel then fits into 32 bits.
 constexpr int64_t kMaxSide = int64_t{1} << 14;
-// Most keypoints of one call.
+// Most keypoints of one call: a limit of plausible requests.
 constexpr int64_t kMaxRows = int64_t{1} << 24;
-// Most levels of a pyramid.
+// Most levels of a pyramid: a limit of plausible requests; ORB has eight.
 constexpr int32_t kMaxLevels = 32;
-// Bytes of an EightPixels, which the workspace of the caller holds.
+// Size of an EightPixels in bytes: the caller, who provides the memory, counts with it.
 constexpr int64_t kEightPixelsBytes = 80;
 
 struct Image {

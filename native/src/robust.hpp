@@ -12,10 +12,10 @@ namespace RSE_PF_ISA {
 // Most Gauss-Newton steps of a local optimisation within RANSAC: it only has to come near the minimum, since the last
 // refinement converges.
 constexpr int kLocalSteps = 4;
-// Up to this number of correspondences, at least kMinTrialsOfFewRows samples are drawn: a sample is cheap then, and one
-// inlier more or less decides whether the pose is weak.
+// Most correspondences of a request that counts as small: a sample is cheap there, and one inlier more or less decides
+// whether the pose is weak.
 constexpr int64_t kFewRows = 32;
-// Fewest samples of RANSAC for requests with at most kFewRows correspondences.
+// Fewest RANSAC samples of a request with at most 32 correspondences, where samples are cheap and one inlier decides.
 constexpr int64_t kMinTrialsOfFewRows = 30;
 // Most Levenberg-Marquardt steps of the last refinement: a bound for input on which it does not converge.
 constexpr int kMaxRefinementSteps = 100;

@@ -14,11 +14,13 @@ constexpr double kNearlyCollinear = 0.1;
 // Increase of the sum of squared errors from the first to the second pose of a planar scene, in units of the pixel
 // variance, below which both fit equally well (3 sigma, squared), and the pose is refused.
 constexpr double kEqualFit = 9.0;
-// The same increase below which a pose is weak.
+// Increase of the sum of squared errors from the first to the second pose of a planar scene, in units of the pixel
+// variance, below which both fit similarly well, and the pose is weak.
 constexpr double kSimilarFit = 40.0;
 // Smallest variance of a pixel (px^2): messages are rounded to 0.01 px, and four points may fit by luck.
 constexpr double kMinPixelVariance = 0.01;
-// Most RANSAC samples of the test for mirrored points, which only has to find a much better pose.
+// Most RANSAC samples of the test whether the points are mirrored: a correct reflection has many inliers and is found
+// soon.
 constexpr int64_t kMirrorIterations = 50;
 
 // Write the pose as a 4x4 matrix of the caller's world, from whose origin `centre` (metres) was subtracted.

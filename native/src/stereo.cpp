@@ -18,29 +18,32 @@
 
 namespace {
 
-// Most features of a request.
+// Most features of a request: a limit of plausible requests.
 constexpr int64_t kMaxRows = int64_t{1} << 24;
-// Largest height or width of an image, pixels.
+// Largest height or width of an image, pixels: a limit of plausible requests.
 constexpr int64_t kMaxSide = int64_t{1} << 16;
-// Pixels on each side of a feature that its patch reaches: patches are 11 x 11.
+// Pixels that the patch of a feature reaches on each side: patches of 11 x 11 px are correlated.
 constexpr int64_t kRadius = 5;
-// Pixels of a row of a patch.
+// Side of the patch of a feature, pixels.
 constexpr int64_t kSide = 2 * kRadius + 1;
-// Pixels of a patch.
+// Number of pixels in the patch of a feature.
 constexpr int64_t kCount = kSide * kSide;
-// Numbers that store a row of a patch: a vector of 16, padded with zeros so that neighbours in the image do not count.
+// Numbers that store a row of a patch: 16 fill a vector, and those behind the patch are zero, so that they do not
+// count.
 constexpr int64_t kPaddedSide = 16;
-// Pixels of a row of the search strip of the other image.
+// Numbers that store a row of the search strip: all pixels of the other image that a search can read.
 constexpr int64_t kStrip = RSE_PF_STEREO_MAX_DISPARITY_PX + kSide + kPaddedSide;
-// Disparities next to the best one (px) that are not its rivals: the correlation has a broad peak.
+// Distance (px) from the best disparity within which other disparities are not its rivals: the correlation has a broad
+// peak.
 constexpr int64_t kPeakRadius = 2;
-// Most steps of the sub-pixel refinement.
+// Most Gauss-Newton steps of the sub-pixel refinement of a disparity.
 constexpr int kMaxSteps = 8;
-// Step (px) of the sub-pixel refinement at which it has converged.
+// Step (px) of the sub-pixel refinement of a disparity below which the refinement has converged.
 constexpr double kConvergedPx = 0.002;
-// Largest distance (px) that the refinement may move from the integer disparity: beyond it lies another peak.
+// Largest distance (px) between the refined disparity and the integer disparity: farther away lies another peak of the
+// correlation.
 constexpr double kMaxShiftPx = 1.25;
-// Largest last step (px) of a refinement that is accepted.
+// Largest last step (px) of a sub-pixel refinement that is accepted, although it has not converged.
 constexpr double kMaxLastStepPx = 0.05;
 
 double not_a_number() { return __builtin_nan(""); }

@@ -14,43 +14,46 @@ namespace {
 
 using namespace rse_pf_track_detail;
 
-// Most features, landmarks or measurements of a request.
+// Most features, landmarks or measurements of a request: a limit of plausible requests.
 constexpr int64_t kMaxRows = int64_t{1} << 24;
 // Bytes of a descriptor.
 constexpr int64_t kBytes = 32;
-// Bits of a descriptor; the distance of a feature that has no other one to compare with.
+// Bits of a descriptor, and the distance of a feature that is compared with no other feature.
 constexpr int64_t kBits = 256;
-// Cells of the search grid along a side; what lies beyond falls into the last one.
+// Cells of the search grid along a side: 128 cells of 16 px cover 2048 px, and what lies beyond falls into the last
+// cell.
 constexpr int64_t kCells = 128;
-// Side of a cell of the search grid, pixels: the radius of a search is a few cells.
+// Side of a cell of the search grid (px): a search looks at a few cells.
 constexpr double kCellPx = 16.0;
-// The candidate, or the row number, that means none; it is larger than all candidates.
+// Value of a candidate or a row number that means "none"; it is larger than all candidates.
 constexpr uint64_t kNone = ~uint64_t{0};
-// Most Gauss-Newton iterations of a pose fit.
+// Most Gauss-Newton iterations of a pose fit: a bound for measurements on which the fit does not converge.
 constexpr int kMaxIterations = 10;
-// First iteration that leaves outliers out: before, the pose may be so far off that inliers look like outliers.
+// First iteration of a pose fit that leaves outliers out: before, the pose may be so far off that inliers look like
+// outliers.
 constexpr int kFirstGatedIteration = 3;
-// Step (largest component, metres and radians) below which a pose fit has converged.
+// Largest component (m, rad) of a Gauss-Newton step below which a pose fit has converged.
 constexpr double kConvergedStep = 1e-6;
-// Smallest depth of an inlier, metres; smaller depths are replaced by it.
+// Smallest depth of an inlier (m); smaller depths are replaced by it, so that no division overflows.
 constexpr double kMinDepthM = 0.05;
-// Largest coordinate or pixel of a valid request.
+// Largest number of a valid request (m or px): a limit of plausible requests.
 constexpr double kMaxAbs = 1e9;
-// Largest component of a step (metres, radians); a larger one shows that the fit diverges.
+// Largest component (m, rad) of a Gauss-Newton step: a larger step shows that the pose fit diverges.
 constexpr double kMaxTwist = 1e6;
 // Largest squared Mahalanobis distance that counts as a number: larger ones come from a singular covariance.
 constexpr double kMaxDistance2 = 1e300;
 // Smallest eigenvalue of the information matrix, scaled to a diagonal of 1, at which all motions are constrained:
 // points on a line have 1e-14 and less, a marker of 20 px without depths has 1e-9.
 constexpr double kMinEigenvalue = 1e-12;
-// Inverse iterations that estimate the smallest eigenvalue.
+// Inverse iterations by which the smallest eigenvalue of the information matrix is estimated.
 constexpr int kInverseIterations = 6;
-// Pixels added to a search radius when cells are chosen: the sum of a pixel and a radius is rounded.
+// Pixels that are added to a search radius when the cells of the grid are chosen: the sum of a pixel and a radius is
+// rounded.
 constexpr double kSlackPx = 1.0;
-// Smallest divisor of a quotient of lengths, so that none is a division by 0.
+// Smallest divisor of a quotient of lengths, which avoids a division by 0.
 constexpr double kMinLength = 1e-9;
-// Share of the displacements' information that must remain beside the camera motion: with less, the camera motion
-// explains the same residuals.
+// Smallest share of the information about the scalar of rse_pf_fit_sway that may remain after the camera motion is
+// eliminated: with less, the camera motion explains the same residuals.
 constexpr double kMinRemainingShare = 1e-9;
 
 bool is_within(double value, double low, double high) { return value >= low && value <= high; }
