@@ -1,4 +1,4 @@
-"""Maps whose truth is exact: of points that all keyframes see, and of a rendered world with its plan."""
+"""Maps with an exact ground truth: points that all keyframes see, and a rendered world with its plan."""
 
 from __future__ import annotations
 
@@ -19,16 +19,22 @@ WORLD = {"seed": 3, "robot": 0, "robots": 1, "frames": 150}
 
 
 def points_map(
-    *, keyframes: int = 5, points: int = 60, robot: str = "robot-1", cameras: tuple[Camera, ...] = (CAMERA,),
-    wrong: int = 0, up: list[float] | None = None,
-) -> tuple[MapVersion, Array]:  # fmt: skip
-    """Return a map whose keyframes all see the same points, and these; *wrong* features of each match badly.
+    *,
+    keyframes: int = 5,
+    points: int = 60,
+    robot: str = "robot-1",
+    cameras: tuple[Camera, ...] = (CAMERA,),
+    wrong: int = 0,
+    up: list[float] | None = None,
+) -> tuple[MapVersion, Array]:
+    """Return a map whose keyframes all see the same points, and the true points ``(n, 3)`` in the world.
 
-    Feature *i* of each keyframe sees point *i* of the rows that it sees, in another order for each.
+    The features of each keyframe are in another order.  The pixels of the first *wrong* features of each
+    keyframe are 50 px off.
     """
     rng = np.random.default_rng([7, keyframes, points])
     world = rng.uniform([-1.0, -0.7, 2.0], [1.0, 0.7, 4.0], (points, 3))
-    looks = rng.integers(0, 256, (points, 32), dtype=np.uint8)
+    descriptors = rng.integers(0, 256, (points, 32), dtype=np.uint8)
     made = []
     for number in range(keyframes):
         camera = cameras[number % len(cameras)]
@@ -40,11 +46,16 @@ def points_map(
         pixels[:wrong] += 50.0
         made.append(
             Keyframe(
-                id=10 * number, robot=robot, timestamp_s=float(number), T_world_camera=T, camera=camera,
-                pixels=pixels.astype(np.float32), descriptors=looks[order],
+                id=10 * number,
+                robot=robot,
+                timestamp_s=float(number),
+                T_world_camera=T,
+                camera=camera,
+                pixels=pixels.astype(np.float32),
+                descriptors=descriptors[order],
                 points_camera=seen.astype(np.float32),
             )
-        )  # fmt: skip
+        )
     colours = np.tile(np.array([200, 100, 50], dtype=np.uint8), (points, 1))
     provenance = {} if up is None else {"up": up}
     cloud = world.astype(np.float32)
@@ -53,7 +64,7 @@ def points_map(
 
 @functools.cache
 def world_map() -> MapVersion:
-    """Return the map of a drive through the rendered world at its true poses, z up, which it does not say."""
+    """Return a map of the rendered world with true poses; its z axis points up, without the field ``up``."""
     from client_sdk.frontend import FrontEndOptions, extract
     from client_sdk.point_map import PointMap
     from client_sdk.simulator.drive import render_along, true_trajectory
@@ -70,17 +81,22 @@ def world_map() -> MapVersion:
         cloud.add(frame, T)
         made.append(
             Keyframe(
-                id=number, robot="robot-1", timestamp_s=frame.timestamp_s, T_world_camera=T,
-                camera=frame.camera, pixels=features.pixels.astype(np.float32),
-                descriptors=features.descriptors, points_camera=features.points_camera.astype(np.float32),
+                id=number,
+                robot="robot-1",
+                timestamp_s=frame.timestamp_s,
+                T_world_camera=T,
+                camera=frame.camera,
+                pixels=features.pixels.astype(np.float32),
+                descriptors=features.descriptors,
+                points_camera=features.points_camera.astype(np.float32),
             )
-        )  # fmt: skip
+        )
     points, colours = cloud.points(min_readings=2)
     return MapVersion(keyframes=tuple(made), points=points, colours=colours)
 
 
 def plan_of_world(x: Array, y: Array, low_m: float, high_m: float) -> npt.NDArray[np.bool_]:
-    """Return where something of the rendered world stands between two heights: walls, furniture, outside."""
+    """Return at which positions the rendered world is occupied between two heights."""
     from client_sdk.simulator.world import DEPTH_M, DOOR_Y_M, ROOM_M, ROOMS, make_world
 
     faces = make_world(WORLD["seed"]).faces
@@ -102,9 +118,9 @@ def plan_of_world(x: Array, y: Array, low_m: float, high_m: float) -> npt.NDArra
 
 
 def shares_right(grid: OccupancyGrid, low_m: float, high_m: float) -> tuple[float, float, float]:
-    """Return the right shares of all seen cells, of the free and of the occupied ones.
+    """Return the shares of correct cells among all known cells, the free cells, and the occupied cells.
 
-    A free cell is right if nothing stands at its centre, an occupied one if something stands within it.
+    A free cell is correct if its centre is free in the world, an occupied cell if any part of it is occupied.
     """
     from rse_pf.map_export.occupancy import FREE, OCCUPIED
 
@@ -118,6 +134,7 @@ def shares_right(grid: OccupancyGrid, low_m: float, high_m: float) -> tuple[floa
     right_occupied = occupied & solid.any(axis=(1, 3))
     right = right_free.sum() + right_occupied.sum()
     return (
-        float(right / (free.sum() + occupied.sum())), float(right_free.sum() / free.sum()),
+        float(right / (free.sum() + occupied.sum())),
+        float(right_free.sum() / free.sum()),
         float(right_occupied.sum() / occupied.sum()),
-    )  # fmt: skip
+    )

@@ -89,9 +89,12 @@ def test_keyframes_far_apart_in_time_are_matched_where_an_edge_links_them() -> N
     version = replace(version, keyframes=(first, *version.keyframes[5:8], last))
     alone = [replace(keyframe, robot=f"robot-{n}") for n, keyframe in enumerate(version.keyframes)]
     edge = Edge(
-        a=first.id, b=last.id, T_a_b=inverse(first.T_world_camera) @ last.T_world_camera,
-        information=np.eye(6), kind="loop",
-    )  # fmt: skip
+        a=first.id,
+        b=last.id,
+        T_a_b=inverse(first.T_world_camera) @ last.T_world_camera,
+        information=np.eye(6),
+        kind="loop",
+    )
     assert not len(find_tracks(MapVersion(keyframes=tuple(alone))).points)
 
     tracks = find_tracks(MapVersion(keyframes=tuple(alone), edges=(edge,)))
@@ -125,10 +128,11 @@ def test_absurd_points_and_poses_cost_only_their_own_features() -> None:
     version = replace(
         version,
         keyframes=(
-            replace(first, points_camera=points, pixels=pixels), *version.keyframes[1:4],
+            replace(first, points_camera=points, pixels=pixels),
+            *version.keyframes[1:4],
             replace(version.keyframes[4], T_world_camera=far),
         ),
-    )  # fmt: skip
+    )
 
     tracks = find_tracks(version)
 

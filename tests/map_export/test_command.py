@@ -1,4 +1,4 @@
-"""The verb map export: files that other programs read, one line for each wrong call and each hostile map."""
+"""The command map export: the files of each format, and one line for each wrong call and hostile map."""
 
 from __future__ import annotations
 
@@ -44,8 +44,10 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     maps = MapRegistry(DirectoryStore(tmp_path / "store"))
     whole = hall()
     for name, version in (
-        ("hall", whole), ("bare", MapVersion(keyframes=whole.keyframes)), ("void", MapVersion(keyframes=())),
-    ):  # fmt: skip
+        ("hall", whole),
+        ("bare", MapVersion(keyframes=whole.keyframes)),
+        ("void", MapVersion(keyframes=())),
+    ):
         maps.commit(name, encode_map(version), parent=None, author="me", created_s=0.0)
     return tmp_path
 
@@ -184,17 +186,22 @@ def test_every_hostile_map_is_one_clear_line(
     held, summary = DirectoryStore(folder / "store"), MapSummary(keyframes=1, edges=0, points=0, robots=())
     whole = hall()
     worse = {
-        "many keyframes": many_keyframes(), "points at 1e30": absurd_points(whole),
+        "many keyframes": many_keyframes(),
+        "points at 1e30": absurd_points(whole),
         "cut": encode_map(whole)[:-100],
-    }  # fmt: skip
+    }
     for number, (what, data) in enumerate([*worse.items(), *hostile_maps().items()]):
         if number % 7 and what not in DECODABLE and what not in worse:
             continue  # they are refused while they are read, as in each other verb
         held.put("object", data)
         MapRegistry(held).commit_object(
-            f"map-{number}", "object", summary, MapContent(digest_of(data), len(data)),
-            MapOrigin(parent=None, author="me", created_s=1.0), charged=lambda record, size: nullcontext(),
-        )  # fmt: skip
+            f"map-{number}",
+            "object",
+            summary,
+            MapContent(digest_of(data), len(data)),
+            MapOrigin(parent=None, author="me", created_s=1.0),
+            charged=lambda record, size: nullcontext(),
+        )
         code = export(f"map-{number}", kind, "out")
         said = capsys.readouterr()
         assert "Traceback" not in said.err, what

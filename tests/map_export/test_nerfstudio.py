@@ -1,4 +1,4 @@
-"""transforms.json fits the documented schema, in the axes of OpenGL, and turned where gravity is known."""
+"""transforms.json fits the documented schema, has the axes of OpenGL, and is upright if gravity is known."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Text = Annotated[str, msgspec.Meta(min_length=1)]
 
 
 class IntrinsicsSchema(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
-    """What the file says for all frames, or a frame for itself."""
+    """The intrinsics, which stand at the top of the file or in each frame."""
 
     fl_x: Positive | msgspec.UnsetType = msgspec.UNSET
     fl_y: Positive | msgspec.UnsetType = msgspec.UNSET
@@ -46,7 +46,7 @@ class FrameSchema(IntrinsicsSchema, forbid_unknown_fields=True, kw_only=True):
 
 
 class TransformsSchema(IntrinsicsSchema, forbid_unknown_fields=True, kw_only=True):
-    """The file: intrinsics here, if all frames share them, or in each frame."""
+    """The whole file; its intrinsics are here if all frames have the same camera, else in each frame."""
 
     camera_model: Literal["OPENCV", "OPENCV_FISHEYE"]
     frames: Annotated[list[FrameSchema], msgspec.Meta(min_length=1)]

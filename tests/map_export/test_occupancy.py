@@ -1,4 +1,4 @@
-"""A floor plan against the true one of a rendered world, its files, and maps that would make it huge."""
+"""Floor plans compared with the true plan of a rendered world, their files, and too large grids."""
 
 from __future__ import annotations
 
@@ -50,11 +50,15 @@ def room(*, looks: Array | None = None, T: Array | None = None) -> MapVersion:
     turn = np.eye(4) if T is None else T
     n = len(seen)
     keyframe = Keyframe(
-        id=0, robot="r", timestamp_s=0.0, T_world_camera=turn @ pose, camera=CAMERA,
+        id=0,
+        robot="r",
+        timestamp_s=0.0,
+        T_world_camera=turn @ pose,
+        camera=CAMERA,
         pixels=np.ones((n, 2), np.float32),
         descriptors=np.zeros((n, 32), np.uint8),
         points_camera=seen.astype(np.float32),
-    )  # fmt: skip
+    )
     moved = transform(turn, points.astype(np.float64)).astype(np.float32)
     colours = np.zeros((len(points), 3), dtype=np.uint8)
     return MapVersion(keyframes=(keyframe,), points=moved, colours=colours)
@@ -109,7 +113,7 @@ def test_ramps_and_walls_do_not_tilt_what_is_level() -> None:
 
 
 def long_floor(tilt_deg: float, *, width_m: float = 4.0, step_m: float = 0.0) -> tuple[Array, Array]:
-    """Return a floor of 14 m with furniture of 0.4 to 0.8 m on a third of it, tilted; and camera places."""
+    """Return a tilted floor of 14 m with furniture on a third of it (0.4 to 0.8 m), and camera positions."""
     rng = np.random.default_rng(6)
     points = np.column_stack([rng.uniform(0, 14, 60_000), rng.uniform(0, width_m, 60_000), np.zeros(60_000)])
     points[:, 2] = np.where(points[:, 0] > 7.0, step_m, 0.0) + 0.008 * rng.standard_normal(60_000)
@@ -132,9 +136,10 @@ def test_a_long_floor_tells_up_better_than_its_parts(tilt_deg: float) -> None:
 
 
 @pytest.mark.parametrize(
-    "floor", [long_floor(8.0), long_floor(0.0, width_m=0.7), long_floor(0.0, step_m=0.9)],
+    "floor",
+    [long_floor(8.0), long_floor(0.0, width_m=0.7), long_floor(0.0, step_m=0.9)],
     ids=["a ramp", "a corridor of 0.7 m", "two storeys"],
-)  # fmt: skip
+)
 def test_a_floor_that_tells_no_up_is_not_asked(floor: tuple[Array, Array]) -> None:
     points, places = floor
 
@@ -205,9 +210,14 @@ def test_the_files_are_those_of_map_server() -> None:
     image = np.frombuffer(data, dtype=np.uint8).reshape(height, width)
     assert (head, most) == (b"P5", b"255")
     assert about == {
-        "image": "map.pgm", "mode": "trinary", "resolution": 0.05, "negate": 0, "occupied_thresh": 0.65,
-        "free_thresh": 0.196, "origin": [*(round(each, 6) for each in grid.origin_m), 0.0],
-    }  # fmt: skip
+        "image": "map.pgm",
+        "mode": "trinary",
+        "resolution": 0.05,
+        "negate": 0,
+        "occupied_thresh": 0.65,
+        "free_thresh": 0.196,
+        "origin": [*(round(each, 6) for each in grid.origin_m), 0.0],
+    }
     # As map_server reads it: the lowest row of the image is that of the origin.
     row = height - 1 - int((3.2 - about["origin"][1]) / 0.05)
     column = int((1.2 - about["origin"][0]) / 0.05)
@@ -220,9 +230,10 @@ def test_points_far_from_all_poses_are_left_out_and_counted() -> None:
     version = room()
     wild = np.array([[1e8, 0, 0], [0, -9e8, 0], [5e4, 1, 1]], dtype=np.float32)
     more = replace(
-        version, points=np.concatenate([version.points, wild]),
+        version,
+        points=np.concatenate([version.points, wild]),
         colours=np.concatenate([version.colours, np.zeros((3, 3), np.uint8)]),
-    )  # fmt: skip
+    )
 
     grid = make_occupancy_grid(more, UP)
 

@@ -1,4 +1,4 @@
-"""Exported files hold what the map holds, in the conventions of other programs."""
+"""Single-file exports hold the content of the map in the conventions of other programs."""
 
 from __future__ import annotations
 

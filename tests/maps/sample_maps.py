@@ -18,15 +18,22 @@ def make_map(seed: int = 1, keyframes: int = 4, points: int = 20) -> MapVersion:
     return MapVersion(
         keyframes=tuple(
             Keyframe(
-                id=n * 10, robot=f"robot-{n % 2 + 1}", timestamp_s=100.0 + n, T_world_camera=pose,
-                camera=CAMERA, pixels=rng.uniform(0, 600, (7, 2)).astype(np.float32),
-                descriptors=rng.integers(0, 256, (7, 32), dtype=np.uint8), points_camera=depth,
+                id=n * 10,
+                robot=f"robot-{n % 2 + 1}",
+                timestamp_s=100.0 + n,
+                T_world_camera=pose,
+                camera=CAMERA,
+                pixels=rng.uniform(0, 600, (7, 2)).astype(np.float32),
+                descriptors=rng.integers(0, 256, (7, 32), dtype=np.uint8),
+                points_camera=depth,
             )
             for n, pose in enumerate(poses)
         ),
         edges=tuple(
             Edge(
-                a=n * 10, b=n * 10 + 10, T_a_b=inverse(poses[n]) @ poses[n + 1],
+                a=n * 10,
+                b=n * 10 + 10,
+                T_a_b=inverse(poses[n]) @ poses[n + 1],
                 information=np.diag([100.0, 100.0, 100.0, 400.0, 400.0, 400.0]),
                 kind="odometry" if n else "loop",
             )
@@ -35,4 +42,4 @@ def make_map(seed: int = 1, keyframes: int = 4, points: int = 20) -> MapVersion:
         points=rng.normal(0, 1, (points, 3)).astype(np.float32),
         colours=rng.integers(0, 256, (points, 3), dtype=np.uint8),
         provenance={"made": "by a test", "seed": seed},
-    )  # fmt: skip
+    )

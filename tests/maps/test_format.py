@@ -1,4 +1,4 @@
-"""The encoding of a map: exact, bounded, and refused when damaged."""
+"""The encoding of maps: it is exact and limited, and damaged bytes are rejected."""
 
 from __future__ import annotations
 

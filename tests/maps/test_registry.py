@@ -1,4 +1,4 @@
-"""The map registry: immutable versions, one winner, and a whole head after any crash."""
+"""The map registry: versions never change, one of two commits succeeds, a crash leaves a complete head."""
 
 from __future__ import annotations
 
@@ -104,13 +104,18 @@ def test_a_difference_names_what_was_added_removed_and_moved() -> None:
         keyframes=(
             before.keyframes[0],
             Keyframe(
-                id=moved.id, robot=moved.robot, timestamp_s=moved.timestamp_s, camera=moved.camera,
-                T_world_camera=moved.T_world_camera @ step, pixels=moved.pixels,
-                descriptors=moved.descriptors, points_camera=moved.points_camera,
+                id=moved.id,
+                robot=moved.robot,
+                timestamp_s=moved.timestamp_s,
+                camera=moved.camera,
+                T_world_camera=moved.T_world_camera @ step,
+                pixels=moved.pixels,
+                descriptors=moved.descriptors,
+                points_camera=moved.points_camera,
             ),
         ),
         edges=before.edges[:1],
-    )  # fmt: skip
+    )
 
     found = compare_versions(before, after)
 
@@ -191,9 +196,13 @@ def test_images_of_keyframes_are_those_of_robots_of_the_tenant_and_nothing_else(
     named = {
         "default/robot-1": {"0": good, "10": of_text, "20": forged, "30": "f" * 64, "99": good, "x": 5},
         "default/robot-1=abc": {"10": good},
-        "rival/robot-1": {"20": good}, "default/../rival/robot-1": {"20": good}, "default": {"20": good},
-        "default/": {"20": good}, "default/robot-2": good, "/robot-1": {"20": good},
-    }  # fmt: skip
+        "rival/robot-1": {"20": good},
+        "default/../rival/robot-1": {"20": good},
+        "default": {"20": good},
+        "default/": {"20": good},
+        "default/robot-2": good,
+        "/robot-1": {"20": good},
+    }
 
     def images(of: object) -> list[int]:
         version = dataclasses.replace(make_map(), provenance={"images": of})

@@ -1,4 +1,4 @@
-"""Versions of maps are removed: which ones, beside others who commit and roll back, and over a crash."""
+"""Removal of map versions: which are chosen, and that concurrent commits and crashes harm nothing."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ ROBOT = RobotId("default", "robot-1")
 
 
 class SteppedStore(MemoryStore):
-    """Calls *act* before the operation number *at*, counted from 1 since `count_from_here`."""
+    """A store that calls *act* before its operation number *at*, counted from 1 since `count_from_here`."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -131,9 +131,18 @@ def test_the_head_stays_after_a_rollback_and_so_do_bytes_that_another_version_sh
 
 def record(number: int, *, size: int = 10, note: str = "", digest: str = "") -> MapRecord:
     return MapRecord(
-        digest=digest or f"d{number}", size=size, parent=None, number=number, author="r",
-        created_s=float(number), note=note, keyframes=0, edges=0, points=0, robots=(),
-    )  # fmt: skip
+        digest=digest or f"d{number}",
+        size=size,
+        parent=None,
+        number=number,
+        author="r",
+        created_s=float(number),
+        note=note,
+        keyframes=0,
+        edges=0,
+        points=0,
+        robots=(),
+    )
 
 
 @pytest.mark.parametrize(
@@ -164,8 +173,8 @@ def inner_rollback(maps: MapRegistry) -> None:
     maps.move_head(NAME, oldest.id, expected=maps.head(NAME).id)
 
 
-class Turns:
-    """One of two that use a store; it does as many operations as it is allowed to, and then waits."""
+class SteppedThread:
+    """A thread that uses a store: it does the permitted number of operations, and then waits."""
 
     def __init__(self, act: Callable[[], object]) -> None:
         self._act, self._left, self._is_waiting, self._is_done = act, 0, False, False
@@ -175,7 +184,7 @@ class Turns:
         self._thread.start()
 
     def allow(self, steps: int) -> bool:
-        """Let it do so many operations; return whether it has ended."""
+        """Permit *steps* operations, wait until they are done, and return whether the thread has ended."""
         with self._changed:
             self._left, self._is_waiting = steps, False
             self._changed.notify_all()
@@ -191,7 +200,7 @@ class Turns:
             self._left -= 1
 
     def _run(self) -> None:
-        TURNS.of_thread = self
+        CURRENT.thread = self
         try:
             self._act()
         except (Busy, Conflict, NotFound) as error:
@@ -202,16 +211,16 @@ class Turns:
                 self._changed.notify_all()
 
 
-TURNS = threading.local()
+CURRENT = threading.local()
 
 
 class SharedStore(SteppedStore):
-    """Each operation waits for the turn of its thread."""
+    """A store in which each operation waits until its thread is permitted to do it."""
 
     def _step(self) -> None:
-        turns = getattr(TURNS, "of_thread", None)
-        if turns is not None:
-            turns.step()
+        thread = getattr(CURRENT, "thread", None)
+        if thread is not None:
+            thread.step()
 
 
 ACTS = {"prune": prune, "commit": inner_commit, "rollback": inner_rollback}
@@ -227,8 +236,8 @@ def test_in_every_order_of_two_interruptions_the_head_and_every_version_stay_who
             maps = MapRegistry(store)
             for seed in range(1, 4):
                 commit(maps, seed)
-            one = Turns(lambda: ACTS[first](maps))  # noqa: B023  it ends within this round
-            two = Turns(lambda: ACTS[second](maps))  # noqa: B023
+            one = SteppedThread(lambda: ACTS[first](maps))  # noqa: B023  it ends within this round
+            two = SteppedThread(lambda: ACTS[second](maps))  # noqa: B023
             one_ended = one.allow(before)
             two_ended = two.allow(between)
             assert one.allow(1000)

@@ -1,4 +1,4 @@
-"""Descriptors of any kind: how they compare, where two kinds meet, and what is refused at each door."""
+"""Descriptors of any kind: how they are matched, and that two kinds are never compared."""
 
 from __future__ import annotations
 
@@ -64,23 +64,32 @@ def random_descriptors(kind: DescriptorKind, n: int, seed: int = 1) -> npt.NDArr
 def keyframe(kind: DescriptorKind, n: int = 20, seed: int = 1) -> SentKeyframe:
     rng = np.random.default_rng(seed)
     features = make_features(
-        rng.uniform(0, [640, 480], (n, 2)), rng.uniform(0.3, 6.0, n), random_descriptors(kind, n, seed),
+        rng.uniform(0, [640, 480], (n, 2)),
+        rng.uniform(0.3, 6.0, n),
+        random_descriptors(kind, n, seed),
         kind=kind,
-    )  # fmt: skip
+    )
     return SentKeyframe(
-        timestamp_s=1.8e9, T_odom_camera=exp_se3([1.0, -2.0, 3.0, 0.1, 0.2, 0.3]), camera=CAMERA,
+        timestamp_s=1.8e9,
+        T_odom_camera=exp_se3([1.0, -2.0, 3.0, 0.1, 0.2, 0.3]),
+        camera=CAMERA,
         features=features,
-    )  # fmt: skip
+    )
 
 
 def map_keyframe(kind: DescriptorKind, number: int = 0, n: int = 20) -> Keyframe:
     rng = np.random.default_rng(number)
     return Keyframe(
-        id=number, robot="r", timestamp_s=float(number), T_world_camera=np.eye(4), camera=CAMERA,
+        id=number,
+        robot="r",
+        timestamp_s=float(number),
+        T_world_camera=np.eye(4),
+        camera=CAMERA,
         pixels=rng.uniform(0, 480, (n, 2)).astype(np.float32),
         descriptors=random_descriptors(kind, n, number),
-        points_camera=rng.uniform(1, 3, (n, 3)).astype(np.float32), kind=kind,
-    )  # fmt: skip
+        points_camera=rng.uniform(1, 3, (n, 3)).astype(np.float32),
+        kind=kind,
+    )
 
 
 # --- distances ---------------------------------------------------------------------------------
@@ -139,9 +148,14 @@ def test_features_near_a_pixel_are_matched_by_their_own_metric(kind: DescriptorK
     descriptors = random_descriptors(kind, n, 5)
     pixels = np.stack([40.0 * np.arange(n), np.full(n, 50.0)], axis=1)
     image = ImageFeatures(
-        pixels=pixels, descriptors=descriptors, orientations=np.zeros((n, 2)), sizes=np.full(n, 9.0),
-        distinctiveness=measure_distinctiveness(descriptors, pixels), is_oriented=False, is_scaled=False,
-    )  # fmt: skip
+        pixels=pixels,
+        descriptors=descriptors,
+        orientations=np.zeros((n, 2)),
+        sizes=np.full(n, 9.0),
+        distinctiveness=measure_distinctiveness(descriptors, pixels),
+        is_oriented=False,
+        is_scaled=False,
+    )
     seen_again = descriptors.copy()
     seen_again[:, :8] ^= 7  # as far as another look of the same point: above 60 for a vector
     sought = PredictedFeatures(
@@ -235,7 +249,7 @@ HOSTILE_KEYFRAMES = {
     "bytes that are no letters": changed(SIFT, 7, "<B", 4, name=b"\xff\xfe\x00\x01"),
     "named ORB": changed(DescriptorKind("abc", "uint8", 32), 7, "<B", 3, name=b"orb"),
     "a pixel outside": changed(SIFT, 8, "<H", 65_535),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("data", HOSTILE_KEYFRAMES.values(), ids=HOSTILE_KEYFRAMES)
@@ -266,9 +280,11 @@ class KeyframeOfMany:
     def __init__(self, n: int) -> None:
         few = keyframe(DescriptorKind("tiny", "uint8", 4), 10).features
         many = replace(
-            few, pixels=np.tile(few.pixels, (n // 10, 1)), depths_m=np.tile(few.depths_m, n // 10),
+            few,
+            pixels=np.tile(few.pixels, (n // 10, 1)),
+            depths_m=np.tile(few.depths_m, n // 10),
             descriptors=np.tile(few.descriptors, (n // 10, 1)),
-        )  # fmt: skip
+        )
         self.data = encode_keyframe(replace(keyframe(ORB), features=many))
 
 
@@ -322,7 +338,7 @@ HOSTILE_MAPS = {
     "nested lists": with_features([[[[["sift"]]]]]),
     "bytes": with_features(b"sift"),
     "64 for 128": with_features(["sift", "int8", 64]),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("data", HOSTILE_MAPS.values(), ids=HOSTILE_MAPS)
@@ -343,10 +359,13 @@ SIFT_MAP = encode_map(MapVersion(keyframes=(map_keyframe(SIFT, 0, 60), map_keyfr
 def asked(service: str, kind: DescriptorKind, **other: Any) -> Result | Failure:
     own = map_keyframe(kind, 0, 60)
     payload = {
-        "map": SIFT_MAP, "camera": msgspec.to_builtins(CAMERA),
-        "pixels": own.pixels.ravel(), "descriptors": own.descriptors.tobytes(),
-        "features": {"name": kind.name, "dtype": kind.dtype, "size": kind.size}, **other,
-    }  # fmt: skip
+        "map": SIFT_MAP,
+        "camera": msgspec.to_builtins(CAMERA),
+        "pixels": own.pixels.ravel(),
+        "descriptors": own.descriptors.tobytes(),
+        "features": {"name": kind.name, "dtype": kind.dtype, "size": kind.size},
+        **other,
+    }
     return dispatch(REGISTRY, Command(id=1, service=service, payload=payload), time.monotonic)
 
 

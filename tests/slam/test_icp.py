@@ -1,4 +1,4 @@
-"""icp recovers small offsets, and otherwise returns the initial guess with a reason."""
+"""ICP recovers small offsets, and otherwise returns the initial pose with a reason."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ pytest.importorskip("small_gicp", reason="the extra maps is not installed")
 
 
 def make_room(seed: int, *, walls: int = 3) -> Array:
-    """Return a room of few points, to be quick."""
+    """Return a room with few points, for fast tests."""
     return full_room(seed, points=6000, walls=walls)
 
 
 def offset(seed: int, metres: float, degrees: float) -> Array:
-    """Return a motion of exactly these lengths in a random direction."""
+    """Return a motion with this translation and rotation in a random direction."""
     rng = np.random.default_rng(seed)
     t, r = rng.normal(size=3), rng.normal(size=3)
     return exp_se3(

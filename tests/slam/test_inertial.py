@@ -1,4 +1,4 @@
-"""The block of the IMU: read as it was written; hostile values are refused, false gravity is outvoted."""
+"""The IMU block of a keyframe: round trips, rejected values, and that a false gravity is outvoted."""
 
 from __future__ import annotations
 
@@ -23,16 +23,22 @@ from rse_pf.slam.keyframe import SentKeyframe, decode_keyframe, encode_keyframe,
 RNG = np.random.default_rng(4)
 ROOT = RNG.normal(size=(9, 9))
 MOTION = InertialMotion(
-    duration_s=0.35, rotation=np.array([0.1, -0.2, 0.05]), velocity=np.array([1.0, 2.0, -3.0]),
-    position=np.array([0.2, 0.3, -0.5]), bias_gyro=np.array([0.01, 0.02, 0.08]),
-    bias_accel=np.array([0.1, -0.1, 0.05]), covariance=1e-6 * ROOT @ ROOT.T,
-)  # fmt: skip
+    duration_s=0.35,
+    rotation=np.array([0.1, -0.2, 0.05]),
+    velocity=np.array([1.0, 2.0, -3.0]),
+    position=np.array([0.2, 0.3, -0.5]),
+    bias_gyro=np.array([0.01, 0.02, 0.08]),
+    bias_accel=np.array([0.1, -0.1, 0.05]),
+    covariance=1e-6 * ROOT @ ROOT.T,
+)
 IMU = KeyframeImu(
-    down_camera=np.array([0.0, 0.8, 0.6]), deviation_rad=0.004,
-    T_imu_camera=exp_se3(np.array([0.1, 0.2, 0.3, 1.0, -2.0, 0.5])), motion=MOTION,
-)  # fmt: skip
+    down_camera=np.array([0.0, 0.8, 0.6]),
+    deviation_rad=0.004,
+    T_imu_camera=exp_se3(np.array([0.1, 0.2, 0.3, 1.0, -2.0, 0.5])),
+    motion=MOTION,
+)
 FIRST_OF_MOTION = 10
-"""Row of the float32 numbers at which the motion begins."""
+"""Index in the float32 numbers of an IMU block at which the motion begins."""
 
 
 def changed(row: int, value: float, imu: KeyframeImu = IMU) -> bytes:
@@ -87,11 +93,12 @@ def test_hostile_blocks_are_refused(data, line):
 
 def keyframe(imu: KeyframeImu | None) -> SentKeyframe:
     return SentKeyframe(
-        timestamp_s=1.0, T_odom_camera=np.eye(4),
+        timestamp_s=1.0,
+        T_odom_camera=np.eye(4),
         camera=Camera(fx=500.0, fy=500.0, cx=319.5, cy=239.5, width=640, height=480),
         features=make_features(np.full((3, 2), 5.0), np.ones(3), np.zeros((3, ORB.size), dtype=np.uint8)),
         imu=imu,
-    )  # fmt: skip
+    )
 
 
 def test_the_block_takes_less_than_400_bytes_of_a_keyframe():

@@ -1,4 +1,4 @@
-"""The bytes of a keyframe: what comes back, what is kept, and what is refused."""
+"""The encoding of sent keyframes: round trips, unknown blocks, and rejected bytes."""
 
 from __future__ import annotations
 
@@ -147,7 +147,7 @@ def test_optional_blocks_that_are_not_known_are_kept_byte_for_byte() -> None:
 
 
 def noisy(*numbers: float) -> bytes:
-    """Return a keyframe with a block of the noise that holds these numbers."""
+    """Return an encoded keyframe whose noise block holds these numbers."""
     whole = bytearray(encode_keyframe(keyframe()))
     whole[3] += 1
     content = struct.pack(f"<{len(numbers)}d", *numbers)
@@ -220,7 +220,7 @@ def changed(at: int, form: str, value: float, data: bytes = GOOD) -> bytes:
 
 
 def with_blocks(count: int, size: int = 0) -> bytes:
-    """Return a keyframe with *count* optional blocks more, each of *size* bytes."""
+    """Return an encoded keyframe with *count* additional optional blocks of *size* bytes."""
     return changed(3, "<B", 3 + count) + count * (struct.pack("<HHI", 7, 0, size) + bytes(size))
 
 
@@ -228,7 +228,7 @@ GEOMETRY_AT = FEATURES_AT + 8 + 20 * 36 + BLOCK
 
 
 F_BASELINE = 380.0
-"""Of KITTI: 707 px times 0.54 m."""
+"""Focal length times baseline of KITTI's stereo pair: 707 px times 0.54 m."""
 
 
 def stereo_keyframe(n: int = 20) -> SentKeyframe:
@@ -389,7 +389,7 @@ def test_damaged_bytes_give_a_keyframe_within_bounds_or_an_error_of_ours() -> No
 
 
 def peak_of(act: Callable[[], object]) -> int:
-    """Return the most bytes that *act* holds at one time."""
+    """Return the peak memory in bytes of a call of *act*."""
     tracemalloc.start()
     try:
         act()

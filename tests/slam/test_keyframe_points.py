@@ -1,4 +1,4 @@
-"""The points that belong to a keyframe: what comes back, and what is refused."""
+"""The encoding of a keyframe's coloured points: round trips and rejected bytes."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def some_points(n: int = 500, seed: int = 1):
 
 
 def stated(n: int, content: bytes) -> bytes:
-    """Return an object that says that its inflated *content* is *n* points."""
+    """Return an object that states *n* points and holds the compressed *content*."""
     return struct.pack("<2sBBI", b"KP", 1, 0, n) + zlib.compress(content)
 
 

@@ -1,4 +1,4 @@
-"""The place of one view among placed keyframes."""
+"""Localisation of one view among keyframes with known poses."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def coded(keyframe) -> KeyframeFeatures:
 
 
 def candidates_of(seed: int, turns, T_map_world=None):
-    """Return keyframes of a hall, placed without error, and the pose of the one at 0.03 turns."""
+    """Return id, features, camera and true pose of each keyframe of a drive around a hall."""
     T_map_world = np.eye(4) if T_map_world is None else T_map_world
     version, truth = make_world(seed, points=4000).walk("r", np.asarray(turns), seed=5)
     return [
@@ -40,11 +40,11 @@ MAP = candidates_of(3, TURNS)
 _, VIEW, CAMERA, T_VIEW = candidates_of(3, (0.0, 0.035))[1]
 ELSEWHERE = exp_se3([12.0, 1.0, 0.0, 0.0, 0.0, 1.0])
 TURNED = T_VIEW @ exp_se3([0.0, 0.0, 0.0, 0.0, 1.0, 0.0]) @ inverse(T_VIEW)
-"""About the view, which stays where it is."""
+"""A rotation of the map by 1 rad about the camera of `VIEW`."""
 
 
 def place_of(candidates, view: KeyframeFeatures, camera, *options: LocalisationOptions) -> Localised:
-    """Return the place of *view* among candidates of ids, features, cameras and poses."""
+    """Localise *view* among candidates, given as id, features, camera and pose."""
     placed = [
         LocalisationCandidate(id=number, landmarks=landmarks_of_features(features, of), T_map_keyframe=T)
         for number, features, of, T in candidates
@@ -168,7 +168,7 @@ def test_candidates_that_look_another_way_are_of_another_place():
 
 
 def strip(number: int, left: float, right: float) -> LocalisationCandidate:
-    """Return a keyframe of `MAP` that has only the features between two columns."""
+    """Return a candidate of `MAP` with only the features between two columns of its image."""
     _, features, camera, T_map_keyframe = MAP[number]
     rows = np.flatnonzero((features.pixels[:, 0] >= left) & (features.pixels[:, 0] < right))
     part = KeyframeFeatures(

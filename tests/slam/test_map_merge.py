@@ -1,4 +1,4 @@
-"""Maps are joined by consistent links; others are refused with a reason."""
+"""Maps are merged by consistent loop closures; other maps are left out with a reason."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def merged_without_wrong_links() -> MergedMap:
 
 
 def rmse_m(merged: MergedMap, truth: Array) -> float:
-    """Return the rmse of keyframe positions, both in the frame of the first true pose."""
+    """Return the root mean square error of keyframe positions in metres, in the frame of the first pose."""
     estimate = np.array([each.T_world_camera for each in merged.version.keyframes])
     start = inverse(estimate[0])
     true_start = inverse(truth[0])
@@ -90,7 +90,7 @@ def test_maps_that_share_no_view_are_not_joined_and_the_reason_is_reported() -> 
 
 
 def planted(share: float, seed: int):  # type: ignore[no-untyped-def]
-    """Return a proposer that turns a share of the links into wrong ones, and counts them."""
+    """Return a function that proposes loop closures, of which *share* are replaced by wrong ones."""
 
     def propose(atlas: Atlas, options: MergeOptions, report: Report) -> LoopProposals:
         found = propose_loop_closures(atlas, options, report)
@@ -173,7 +173,7 @@ def test_points_move_with_the_keyframes_that_observed_them() -> None:
 
 
 def median_distance(points: Array, others: Array) -> float:
-    """Return the median distance of points to their nearest other."""
+    """Return the median distance in metres from a point to its nearest neighbour."""
     squared = ((points[:, None, :] - others[None]) ** 2).sum(axis=2).min(axis=1)
     return float(np.sqrt(np.median(squared)))
 

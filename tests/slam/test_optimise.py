@@ -1,4 +1,4 @@
-"""Pose graphs: they fit as well as the truth, never worse than before, and agree with g2o."""
+"""Pose graph optimisation: it fits as well as the true poses, never worsens the cost, and reads g2o."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ pytest.importorskip("gtsam", reason="the extra maps is not installed")
 
 
 def rmse_m(T_estimate: Array, T_truth: Array) -> float:
-    """Return the rmse of positions; both start at the same pose."""
+    """Return the root mean square error of positions in metres; both trajectories start at the same pose."""
     return float(np.sqrt(((T_estimate - T_truth)[:, :3, 3] ** 2).sum(axis=1).mean()))
 
 
@@ -45,9 +45,14 @@ def test_wrong_loops_hardly_move_the_poses() -> None:
     for k in rng.choice(loops, len(loops) // 10, replace=False):
         steps[k] = exp_se3(rng.uniform(-3, 3, 6))
     wrong = PoseGraph(
-        T_world_pose=graph.T_world_pose, a=graph.a, b=graph.b, T_a_b=steps,
-        information=graph.information, robust=graph.robust, ids=graph.ids,
-    )  # fmt: skip
+        T_world_pose=graph.T_world_pose,
+        a=graph.a,
+        b=graph.b,
+        T_a_b=steps,
+        information=graph.information,
+        robust=graph.robust,
+        ids=graph.ids,
+    )
 
     assert rmse_m(optimise_graph(wrong).T_world_pose, truth) <= 1.1 * clean
 
@@ -66,9 +71,14 @@ def test_each_connected_component_keeps_its_first_pose() -> None:
     poses[:, 0, 3] = [0.0, 1.1, 9.0, 10.2, 11.0]
     step = exp_se3([1.0, 0, 0, 0, 0, 0])
     graph = PoseGraph(
-        T_world_pose=poses, a=np.array([0, 2, 3]), b=np.array([1, 3, 4]), T_a_b=np.array([step] * 3),
-        information=np.tile(np.eye(6), (3, 1, 1)), robust=np.zeros(3, dtype=bool), ids=np.arange(5),
-    )  # fmt: skip
+        T_world_pose=poses,
+        a=np.array([0, 2, 3]),
+        b=np.array([1, 3, 4]),
+        T_a_b=np.array([step] * 3),
+        information=np.tile(np.eye(6), (3, 1, 1)),
+        robust=np.zeros(3, dtype=bool),
+        ids=np.arange(5),
+    )
 
     found = optimise_graph(graph)
 
@@ -126,9 +136,14 @@ def test_an_information_matrix_that_is_not_positive_definite_is_refused() -> Non
 
     with pytest.raises(BadRequest, match="positive definite"):
         PoseGraph(
-            T_world_pose=graph.T_world_pose, a=graph.a, b=graph.b, T_a_b=graph.T_a_b,
-            information=-graph.information, robust=graph.robust, ids=graph.ids,
-        )  # fmt: skip
+            T_world_pose=graph.T_world_pose,
+            a=graph.a,
+            b=graph.b,
+            T_a_b=graph.T_a_b,
+            information=-graph.information,
+            robust=graph.robust,
+            ids=graph.ids,
+        )
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""A view is recognised and located in a map, or lost; a prior only narrows the search."""
+"""Place recognition and localisation in a map; a prior position only narrows the search."""
 
 from __future__ import annotations
 
@@ -26,9 +26,7 @@ def true_map() -> MapVersion:
     """Return a map of the whole hall with true poses."""
     rng = np.random.default_rng(5)
     poses = [WORLD.pose(turn) for turn in TURNS]
-    return MapVersion(
-        keyframes=tuple(WORLD.keyframe(n, "map", T, T, rng) for n, T in enumerate(poses))
-    )  # fmt: skip
+    return MapVersion(keyframes=tuple(WORLD.keyframe(n, "map", T, T, rng) for n, T in enumerate(poses)))
 
 
 MAP = true_map()
@@ -36,16 +34,16 @@ INDEX = MapIndex(MAP.keyframes)
 
 
 def seen(turn: float, seed: int = 9) -> tuple[Keyframe, Array]:
-    """Return what a camera sees between the map's keyframes, and where it is."""
+    """Return a keyframe between those of the map, and its true pose."""
     truth = WORLD.pose(turn)
     return WORLD.keyframe(0, "r", truth, np.eye(4), np.random.default_rng(seed)), truth
 
 
 def view(keyframe: Keyframe) -> View:
-    """Return a keyframe as a bare view."""
+    """Return the pixels and descriptors of a keyframe as a view without depths."""
     return View(
         camera=keyframe.camera, pixels=keyframe.pixels.astype(np.float64), descriptors=keyframe.descriptors
-    )  # fmt: skip
+    )
 
 
 @pytest.mark.parametrize("turn", [0.02, 0.31, 0.55, 0.98])
@@ -106,9 +104,12 @@ def test_a_prior_narrows_the_search_and_a_wrong_one_finds_nothing() -> None:
 
 
 def wall_view(factor: float, slope: float, seed: int) -> tuple[MapIndex, View, Array]:
-    """Return a map of a wall at 4 m that leaves its plane by 5 cm, a view of it, and where that is.
+    """Return a map of a wall at 4 m with 5 cm relief, a view of the wall, and the true pose of the view.
 
-    *slope* is the tangent of the wall's turn, *factor* that of the focal length that the view states.
+    Args:
+        factor: Stated over true focal length of the view.
+        slope: Tangent of the angle by which the wall is rotated.
+        seed: Of the random points.
     """
     rng = np.random.default_rng(seed)
     points = rng.uniform([-2.4, -1.8, 3.95], [2.4, 1.8, 4.05], (300, 3))
@@ -130,11 +131,16 @@ def wall_view(factor: float, slope: float, seed: int) -> tuple[MapIndex, View, A
         pixels, points_camera, described = seen_from(T)
         keyframes.append(
             Keyframe(
-                id=number, robot="map", timestamp_s=float(number), camera=camera, T_world_camera=T,
-                pixels=pixels.astype(np.float32), descriptors=described,
+                id=number,
+                robot="map",
+                timestamp_s=float(number),
+                camera=camera,
+                T_world_camera=T,
+                pixels=pixels.astype(np.float32),
+                descriptors=described,
                 points_camera=points_camera.astype(np.float32),
             )
-        )  # fmt: skip
+        )
     truth = exp_se3(np.array([0.1, 0.05, 0.3, 0.02, 0.03, 0.01]))
     pixels, _, described = seen_from(truth)
     stated = Camera(fx=525.0 * factor, fy=525.0 * factor, cx=319.5, cy=239.5, width=640, height=480)
@@ -174,11 +180,14 @@ def test_matches_are_closest_and_unambiguous_and_used_once() -> None:
 
 
 def request_of(keyframe: Keyframe, kind: type[PlaceRequest] | type[LocaliseRequest], **more: object):  # type: ignore[no-untyped-def]
-    """Return the request that a robot sends of *keyframe*."""
+    """Return the request by which a robot asks where *keyframe* is."""
     return kind(
-        map=encode_map(MAP), camera=keyframe.camera, pixels=keyframe.pixels.ravel().astype(np.float64),
-        descriptors=keyframe.descriptors.tobytes(), **more,  # type: ignore[arg-type]
-    )  # fmt: skip
+        map=encode_map(MAP),
+        camera=keyframe.camera,
+        pixels=keyframe.pixels.ravel().astype(np.float64),
+        descriptors=keyframe.descriptors.tobytes(),
+        **more,  # type: ignore[arg-type]
+    )
 
 
 def ask(service: str, request: object) -> Result | Failure:

@@ -1,4 +1,4 @@
-"""The fixed vocabulary, the vectors of views, and the search over them."""
+"""Place recognition: the fixed vocabulary, the vectors of images, and the search among them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""PLY: all that the writer writes the reader reads; what is no cloud is refused before it costs anything."""
+"""PLY files: the decoder reads all that the encoder writes, and rejects other bytes at low cost."""
 
 from __future__ import annotations
 

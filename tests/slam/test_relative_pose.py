@@ -1,4 +1,4 @@
-"""The relative pose of two keyframes uses the depth of both."""
+"""Measurement of the relative pose of two keyframes, with the depths of both."""
 
 from __future__ import annotations
 
@@ -23,21 +23,25 @@ _NOISE = DepthNoise()
 
 
 def keyframe(number: int, pixels: Array, depth_m: Array, rng: np.random.Generator) -> Keyframe:
-    """Return what a depth camera with the noise of a Kinect would see."""
+    """Return a keyframe of these pixels and depths, with the noise of a Kinect."""
     pixels = pixels + rng.normal(size=pixels.shape) * 0.5
     depth_m = depth_m + rng.normal(size=len(depth_m)) * np.sqrt(_NOISE.variance_m2(depth_m))
     return Keyframe(
-        id=number, robot="r", timestamp_s=float(number), T_world_camera=np.eye(4), camera=KINECT,
+        id=number,
+        robot="r",
+        timestamp_s=float(number),
+        T_world_camera=np.eye(4),
+        camera=KINECT,
         pixels=pixels.astype(np.float32),
         descriptors=np.random.default_rng(0).integers(0, 256, (len(pixels), 32)).astype(np.uint8),
         points_camera=KINECT.back_project(pixels, depth_m).astype(np.float32),
-    )  # fmt: skip
+    )
 
 
 def pair(seed: int, n: int = 150, top: float = 80.0) -> tuple[Keyframe, Keyframe, Array]:
-    """Return two keyframes of the same points, and the pose of the second one in the first one.
+    """Return two keyframes a and b of the same points, and the true ``T_a_b``.
 
-    No pixel is above *top*; those of 385 and more are a narrow strip.
+    All pixels are in rows from *top* to 400; with *top* at 385 they form a narrow strip.
     """
     rng = np.random.default_rng(seed)
     T_a_b = exp_se3(np.concatenate([rng.uniform(-0.2, 0.2, 3), rng.normal(size=3) * 0.08]))
@@ -47,13 +51,19 @@ def pair(seed: int, n: int = 150, top: float = 80.0) -> tuple[Keyframe, Keyframe
 
 
 def with_depths(b: Keyframe, depth_m: Array | float) -> Keyframe:
-    """Return *b* with other depths."""
+    """Return keyframe *b* with all depths replaced."""
     points = b.points_camera.copy()
     points[:, 2] = depth_m
     return Keyframe(
-        id=b.id, robot=b.robot, timestamp_s=b.timestamp_s, T_world_camera=b.T_world_camera,
-        camera=b.camera, pixels=b.pixels, descriptors=b.descriptors, points_camera=points,
-    )  # fmt: skip
+        id=b.id,
+        robot=b.robot,
+        timestamp_s=b.timestamp_s,
+        T_world_camera=b.T_world_camera,
+        camera=b.camera,
+        pixels=b.pixels,
+        descriptors=b.descriptors,
+        points_camera=points,
+    )
 
 
 def measured(a: Keyframe, b: Keyframe) -> RelativePose:

@@ -1,4 +1,4 @@
-"""Keyframes of a camera without depth: their depths are in a unit whose length nobody knows."""
+"""Keyframes of a camera without depth: their depths have no metric scale."""
 
 from __future__ import annotations
 
@@ -26,9 +26,11 @@ def keyframe(depths: Array, seed: int = 0) -> SentKeyframe:
     pixels = rng.uniform(0, [640, 480], (n, 2))
     descriptors = rng.integers(0, 256, (n, 32), dtype=np.uint8)
     return SentKeyframe(
-        timestamp_s=1.8e9, T_odom_camera=exp_se3([0.1, 0.2, -0.3, 0.1, 0.0, 0.2]), camera=CAMERA,
+        timestamp_s=1.8e9,
+        T_odom_camera=exp_se3([0.1, 0.2, -0.3, 0.1, 0.0, 0.2]),
+        camera=CAMERA,
         features=make_scaleless_features(pixels, depths, descriptors),
-    )  # fmt: skip
+    )
 
 
 @pytest.mark.parametrize("unit", [1e-4, 0.5, 1.0, 40.0, 1e5])

@@ -1,4 +1,4 @@
-"""The reduced equations give the same step as the whole system, solved at once."""
+"""The Schur complement gives the same step as the whole system of equations."""
 
 from __future__ import annotations
 
@@ -20,10 +20,12 @@ def test_the_step_is_that_of_the_whole_system(damping: float, prior: float) -> N
     whole, gradient = J.T @ J, J.T @ rng.normal(size=400)
     blocks = whole[cameras:, cameras:].reshape(landmarks, 3, landmarks, 3)
     equations = NormalEquations(
-        whole[:cameras, :cameras].copy(), gradient[:cameras],
+        whole[:cameras, :cameras].copy(),
+        gradient[:cameras],
         whole[cameras:, :cameras].reshape(landmarks, 3, cameras),
-        blocks[np.arange(landmarks), :, np.arange(landmarks)], gradient[cameras:].reshape(landmarks, 3),
-    )  # fmt: skip
+        blocks[np.arange(landmarks), :, np.arange(landmarks)],
+        gradient[cameras:].reshape(landmarks, 3),
+    )
 
     reduced = equations.reduce(damping, prior, prior)
     step = np.linalg.solve(reduced.S, reduced.right)
