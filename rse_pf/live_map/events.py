@@ -1,7 +1,9 @@
-"""The events of a live map: what its log holds, and all that its state depends on.
+"""The events of a live map: the content of its log, and all that its state depends on.
 
-The log of a map is a list of entries, an entry a list of events.  They hold plain numbers: the events from
-the first on, or a snapshot and those after it, give the same map everywhere.
+The log of a map is a list of entries, and an entry is a list of events.  Events hold plain numbers.  All
+events from the first one on, or a snapshot and the events after it, give the same map on every computer.
+
+The tags and the names of fields are encoded in stored logs and never change.
 """
 
 from __future__ import annotations
@@ -38,9 +40,9 @@ __all__ = [
 class KeyframeAdded(msgspec.Struct, frozen=True, kw_only=True, dict=True, tag="keyframe-2"):
     """A robot made a keyframe.
 
-    ``robot`` is the text of `RobotId.folder`.  ``segment`` counts the odometry frames of a robot: a new one
-    begins when tracking was lost, or the robot started again.  ``number`` counts its keyframes over all
-    segments, from 0 and without gaps.  ``data`` is the keyframe as the robot encoded it.
+    ``robot`` is the text of `RobotId.folder`.  ``segment`` counts the odometry frames of the robot: a new
+    segment begins when tracking was lost, or when the robot started again.  ``number`` counts the robot's
+    keyframes over all segments, from 0 and without gaps.  ``data`` is the keyframe as the robot encoded it.
     """
 
     robot: str
@@ -50,17 +52,26 @@ class KeyframeAdded(msgspec.Struct, frozen=True, kw_only=True, dict=True, tag="k
 
     @cached_property
     def keyframe(self) -> SentKeyframe:
-        """The keyframe, decoded once; raises BadRequest or InvalidCamera."""
+        """The keyframe, decoded once.
+
+        Raises:
+            BadRequest: The data are damaged.
+            InvalidCamera: The camera model cannot be right.
+        """
         return decode_keyframe(self.data)
 
 
 class MeasuredLoopClosure(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """A measured relative pose to keyframe ``other``, with its ``(6, 6)`` information.
+    """The measured pose of keyframe ``other`` relative to the keyframe of a `LoopClosuresMeasured`.
 
-    ``scale`` is the logarithm, with its variance, of how long the unit of the other keyframe is in that of
-    this one; none between two in metres.  Lengths are metres if one of the two is, else in the unit of this
-    one.  ``off_scale`` is the logarithm of how long a metre of the other keyframe is in those of this one,
-    where both claim metres and these clearly differ; else none.
+    ``T_keyframe_other`` ``(4, 4)`` and its ``information`` ``(6, 6)``, the inverse covariance of its twist,
+    are bytes as `matrix_bytes` makes them.  Lengths are metres if one of both keyframes is metric, else in
+    the unit of the measured keyframe.  ``inliers`` of ``matches`` fit the pose.
+
+    ``scale`` is None between two metric keyframes; else it holds the logarithm of the length of the other
+    keyframe's unit in the unit of the measured one, and the variance of this logarithm.  ``off_scale`` is the
+    logarithm of the length of the other keyframe's metre in metres of the measured one, if both are metric
+    and the difference is significant, else None.
     """
 
     other: int
@@ -73,7 +84,7 @@ class MeasuredLoopClosure(msgspec.Struct, frozen=True, kw_only=True, omit_defaul
 
 
 class LoopClosuresMeasured(msgspec.Struct, frozen=True, kw_only=True, tag="links"):
-    """The links that `measure` found for a keyframe, and the number of candidates that failed, by reason."""
+    """The loop closures that were measured for a keyframe, and how many candidates failed, by reason."""
 
     keyframe: int
     links: tuple[MeasuredLoopClosure, ...] = ()
@@ -81,7 +92,10 @@ class LoopClosuresMeasured(msgspec.Struct, frozen=True, kw_only=True, tag="links
 
 
 class Optimised(msgspec.Struct, frozen=True, kw_only=True, tag="optimised"):
-    """Poses ``(n, 4, 4)`` that a background optimisation found, from the state after ``up_to`` events."""
+    """The whole pose graph, as it was after ``up_to`` events, was optimised in the background.
+
+    ``T_map_camera`` has the poses ``(n, 4, 4)`` of the keyframes ``ids``, as `matrix_bytes` makes them.
+    """
 
     up_to: int
     ids: tuple[int, ...]
@@ -89,26 +103,32 @@ class Optimised(msgspec.Struct, frozen=True, kw_only=True, tag="optimised"):
 
 
 class RobotForgotten(msgspec.Struct, frozen=True, kw_only=True, tag="forgotten"):
-    """All that a robot contributed is taken out."""
+    """An operator removes all that a robot contributed to the map."""
 
     robot: str
 
 
 class RobotLeft(msgspec.Struct, frozen=True, kw_only=True, tag="left"):
-    """A robot left; what it contributed stays."""
+    """A robot left the map; its keyframes and loop closures stay."""
 
     robot: str
 
 
 class StartKeyframe(msgspec.Struct, frozen=True, kw_only=True):
-    """A keyframe of the version that a live map starts from; the pose in ``data`` is that in the version."""
+    """A keyframe of the version that a live map starts from.
+
+    ``data`` is encoded like a keyframe of a robot; its odometry pose is the pose in the version.
+    """
 
     robot: str
     data: bytes
 
 
 class StartEdge(msgspec.Struct, frozen=True, kw_only=True):
-    """An edge of the version that a live map starts from; ``a`` and ``b`` are row numbers."""
+    """An edge of the version that a live map starts from, between the keyframes ``a`` and ``b`` of the event.
+
+    ``T_a_b`` ``(4, 4)`` and ``information`` ``(6, 6)`` are bytes as `matrix_bytes` makes them.
+    """
 
     a: int
     b: int
@@ -117,10 +137,10 @@ class StartEdge(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class MapStarted(msgspec.Struct, frozen=True, kw_only=True, tag="started-2"):
-    """The map begins with the keyframes of a version, or with none; it has no keyframes before.
+    """The map begins with the keyframes and edges of the version ``source``, or empty.
 
-    ``equal_rooms_m`` is the size of rooms that look the same, 0 if every place is unique: what joins robots
-    must lie farther apart.
+    ``equal_rooms_m`` is the size, in metres, of rooms that look the same; 0 if every place looks unique.
+    Loop closures that join robots must then extend over more than this size.
     """
 
     source: str
@@ -130,7 +150,7 @@ class MapStarted(msgspec.Struct, frozen=True, kw_only=True, tag="started-2"):
 
 
 class MapServerChanged(msgspec.Struct, frozen=True, kw_only=True, tag="owner"):
-    """Another process owns the map from here on."""
+    """Another process, the map server ``owner``, writes the log from now on, with lease number ``epoch``."""
 
     owner: str
     epoch: int
@@ -152,12 +172,12 @@ _DECODER = msgspec.msgpack.Decoder(list[Event])
 
 
 def encode_events(events: Sequence[Event]) -> bytes:
-    """Return *events* as one entry of a log, as MessagePack."""
+    """Return *events* as one entry of a log, in MessagePack; equal events give equal bytes."""
     return _ENCODER.encode(list(events))
 
 
 def decode_events(data: bytes) -> list[Event]:
-    """Return the events of an entry that `encode_events` returned.
+    """Return the events of one entry of a log, as `encode_events` encoded them.
 
     Raises:
         BadRequest: The bytes are damaged.
@@ -171,15 +191,15 @@ def decode_events(data: bytes) -> list[Event]:
 
 
 def matrix_bytes(matrix: Array) -> bytes:
-    """Return numbers as float64, little-endian, row-major."""
+    """Return a matrix as float64, little-endian, row-major."""
     return np.ascontiguousarray(matrix, dtype="<f8").tobytes()
 
 
 def matrix_of(data: bytes, rows: int, columns: int) -> Array:
-    """Return the ``(rows, columns)`` matrix of `matrix_bytes`.
+    """Return the ``(rows, columns)`` matrix that `matrix_bytes` encoded.
 
     Raises:
-        BadRequest: The size does not fit.
+        BadRequest: The number of bytes is not that of such a matrix.
     """
     if len(data) != 8 * rows * columns:
         raise BadRequest(

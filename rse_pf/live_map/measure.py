@@ -1,4 +1,8 @@
-"""Measure the links of a keyframe of a live map with others that may show the same place."""
+"""Measure loop closures: the relative poses of a keyframe of a live map and older ones, by their features.
+
+Cameras without depth have no metric scale.  Their lengths are multiplied by `assumed_scale` before matching,
+so that thresholds and noise in metres fit, and divided by the same number afterwards.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +30,7 @@ from rse_pf.slam.relative_pose import (
 __all__ = [
     "StoredView",
     "assumed_scale",
-    "decoded_view",
+    "decode_view",
     "landmarks_of_features",
     "measure_loop_closures",
     "measure_stored_keyframes",
@@ -35,145 +39,185 @@ __all__ = [
     "view_of_features",
 ]
 
-_DEFAULT = RelativePoseOptions()
-_MEDIAN_DEPTH = 2.0
-"""Metres that the median depth of points without scale counts as, where they are sought."""
-_OFF, _OFF_DEVIATIONS = 0.04, 2.0
-"""Depths of good cameras differ by less: those of the kitchen's three robots by 1 to 2 %."""
+ASSUMED_MEDIAN_DEPTH_M = 2.0
+"""Metres: median depth that a keyframe without metric scale is assumed to have, as in a room."""
+MIN_WRONG_LOG_SCALE = 0.04
+"""Logarithm of the ratio of two robots' depths from which on their metric scales differ; good cameras stay
+below: the three robots of the kitchen recordings differ by 1 to 2 %."""
+MIN_WRONG_SCALE_DEVIATIONS = 2.0
+"""Standard deviations of the measured ratio of depths from which on two metric scales differ."""
+
 StoredView = tuple[int, bytes]
-"""Id and bytes of a keyframe."""
+"""Id of a keyframe, and the keyframe as encoded by the robot."""
+
+_DEFAULT_OPTIONS = RelativePoseOptions()
 
 
 def measure_loop_closures(
     keyframe: tuple[int, KeyframeFeatures, Camera],
     others: Sequence[tuple[int, KeyframeFeatures, Camera]],
-    options: RelativePoseOptions = _DEFAULT,
+    options: RelativePoseOptions = _DEFAULT_OPTIONS,
 ) -> LoopClosuresMeasured:
-    """Measure the pose of each of *others* relative to *keyframe*; deterministic.
+    """Measure the pose of each of *others* relative to *keyframe* by PnP; deterministic.
 
     Args:
-        keyframe: Its id, features and camera.
-        others: The ids, features and cameras of the keyframes to compare it with.
-        options: What a link needs.
+        keyframe: Id, features and camera of the new keyframe.
+        others: Ids, features and cameras of the keyframes it is compared with.
+        options: Inliers and matches that a loop closure needs.
 
     Returns:
-        The links in the order of *others*, and the number of failures by the reasons of
+        The loop closures in the order of *others*, and the number of failures by the reasons of
         `measure_relative_pose`.
     """
-    number, features, camera = keyframe
-    reference = landmarks_of_features(features, camera)
-    links: list[MeasuredLoopClosure] = []
+    i, features, camera = keyframe
+    landmarks = landmarks_of_features(features, camera)
+    loop_closures: list[MeasuredLoopClosure] = []
     failed: Counter[str] = Counter()
     for other, other_features, other_camera in others:
+        # 1. Solve PnP; the landmarks are those of the metric keyframe, so that the pose is in metres.
         if other_features.is_metric and not features.is_metric:
-            # So that the pose is in metres.
-            sought = landmarks_of_features(other_features, other_camera)
-            measured = measure_inverse_relative_pose(sought, view_of_features(features, camera), options)
+            other_landmarks = landmarks_of_features(other_features, other_camera)
+            view = view_of_features(features, camera)
+            measured = measure_inverse_relative_pose(other_landmarks, view, options)
         else:
-            measured = measure_relative_pose(
-                reference, view_of_features(other_features, other_camera), options
-            )
+            view = view_of_features(other_features, other_camera)
+            measured = measure_relative_pose(landmarks, view, options)
         if isinstance(measured, str):
             failed[measured] += 1
             continue
-        measured = _in_units(measured, features, other_features)
-        links.append(
+        # 2. Undo the assumed scales.
+        measured = _in_robots_units(measured, features, other_features)
+        scale = measured.scale
+        loop_closures.append(
             MeasuredLoopClosure(
-                other=other, T_keyframe_other=matrix_bytes(measured.T_a_b),
+                other=other,
+                T_keyframe_other=matrix_bytes(measured.T_a_b),
                 information=matrix_bytes(measured.information),
-                inliers=measured.inliers, matches=measured.matches,
-                scale=None if measured.scale is None else (measured.scale.log_ratio, measured.scale.variance),
-                off_scale=_off_scale(measured),
+                inliers=measured.inliers,
+                matches=measured.matches,
+                scale=None if scale is None else (scale.log_ratio, scale.variance),
+                off_scale=_wrong_log_scale(measured),
             )
-        )  # fmt: skip
-    return LoopClosuresMeasured(keyframe=number, links=tuple(links), failed=dict(sorted(failed.items())))
+        )
+    return LoopClosuresMeasured(keyframe=i, links=tuple(loop_closures), failed=dict(sorted(failed.items())))
 
 
 def measure_stored_keyframes(
-    keyframe: StoredView, others: Sequence[StoredView], options: RelativePoseOptions = _DEFAULT
+    keyframe: StoredView, others: Sequence[StoredView], options: RelativePoseOptions = _DEFAULT_OPTIONS
 ) -> LoopClosuresMeasured:
-    """Decode stored keyframes and measure their links as `measure_loop_closures` does; raises BadRequest."""
-    return measure_loop_closures(decoded_view(keyframe), [decoded_view(other) for other in others], options)
+    """Decode keyframes and measure their loop closures as `measure_loop_closures` does.
+
+    Raises:
+        BadRequest: A keyframe is damaged.
+    """
+    return measure_loop_closures(decode_view(keyframe), [decode_view(other) for other in others], options)
 
 
-def decoded_view(stored: StoredView) -> tuple[int, KeyframeFeatures, Camera]:
-    """Return id, features and camera of a keyframe as it is kept; raises BadRequest."""
-    number, data = stored
+def merge_measurements(keyframe: int, parts: Iterable[LoopClosuresMeasured]) -> LoopClosuresMeasured:
+    """Return the loop closures and failures of several measurements of *keyframe* as one event, in order."""
+    loop_closures: list[MeasuredLoopClosure] = []
+    failed: Counter[str] = Counter()
+    for part in parts:
+        loop_closures += part.links
+        failed.update(part.failed)
+    return LoopClosuresMeasured(
+        keyframe=keyframe, links=tuple(loop_closures), failed=dict(sorted(failed.items()))
+    )
+
+
+def decode_view(stored: StoredView) -> tuple[int, KeyframeFeatures, Camera]:
+    """Return the id, the features and the camera of an encoded keyframe.
+
+    Raises:
+        BadRequest: The keyframe is damaged.
+    """
+    i, data = stored
     keyframe = decode_keyframe(data)
-    return number, keyframe.features, keyframe.camera
+    return i, keyframe.features, keyframe.camera
 
 
 def landmarks_of_features(features: KeyframeFeatures, camera: Camera) -> Landmarks:
-    """Return the points of a keyframe that are sought in other images, by `assumed_scale` without scale."""
+    """Return the 3-D points of a keyframe in its camera frame, to be matched with the features of others.
+
+    Points are in metres, by `assumed_scale` if the keyframe is not metric; features without depth are left
+    out then.
+    """
     if features.is_metric:
         return Landmarks(points_camera=features.points_camera(camera), descriptors=features.descriptors)
-    rows = np.flatnonzero(features.depths_m > 0.0)
+    with_depth = np.flatnonzero(features.depths_m > 0.0)
     return Landmarks(
-        points_camera=assumed_scale(features) * features.points_camera(camera)[rows],
-        descriptors=features.descriptors[rows],
+        points_camera=assumed_scale(features) * features.points_camera(camera)[with_depth],
+        descriptors=features.descriptors[with_depth],
     )
 
 
 def view_of_features(features: KeyframeFeatures, camera: Camera) -> View:
-    """Return the image of a keyframe in which the points of others are sought, as `landmarks_of_features`."""
+    """Return the features of a keyframe as the view in which landmarks of other keyframes are found.
+
+    Depths are in metres, by `assumed_scale` if the keyframe is not metric.
+    """
     depths = features.depths_m.astype(np.float64)
     return View(
-        camera=camera, pixels=features.pixels.astype(np.float64), descriptors=features.descriptors,
-        depths_m=depths if features.is_metric else assumed_scale(features) * depths, noise=features.noise,
+        camera=camera,
+        pixels=features.pixels.astype(np.float64),
+        descriptors=features.descriptors,
+        depths_m=depths if features.is_metric else assumed_scale(features) * depths,
+        noise=features.noise,
         is_metric=features.is_metric,
-    )  # fmt: skip
+    )
 
 
 def assumed_scale(features: KeyframeFeatures) -> float:
-    """Return by what lengths without scale are multiplied, so that points are as far as those in a room.
+    """Return the metres that a unit of a keyframe is assumed to have, so that its median depth is 2 m.
 
-    Noise and rounding are those of metres.
+    The result is 1 if the keyframe is metric, or has no depths.
     """
     depths = features.depths_m[features.depths_m > 0.0]
-    return 1.0 if features.is_metric or not len(depths) else _MEDIAN_DEPTH / float(np.median(depths))
-
-
-def _off_scale(measured: RelativePose) -> float | None:
-    """Return the logarithm of the ratio of two metres that clearly differ, else None."""
-    ratio = measured.depth_ratio
-    if ratio is None or abs(ratio.log_ratio) < max(_OFF, _OFF_DEVIATIONS * math.sqrt(ratio.variance)):
-        return None
-    return round(ratio.log_ratio, 4)
-
-
-def _in_units(measured: RelativePose, features: KeyframeFeatures, other: KeyframeFeatures) -> RelativePose:
-    """Return a link whose lengths were multiplied by `assumed_scale` as a `MeasuredLoopClosure` has it."""
-    if measured.scale is None:
-        return measured
-    here, there = assumed_scale(features), assumed_scale(other)
-    T_a_b, information = measured.T_a_b, measured.information
-    if not other.is_metric and not features.is_metric:
-        T_a_b = T_a_b.copy()
-        T_a_b[:3, 3] /= here
-        stretch = np.array([here] * 3 + [1.0] * 3)
-        information = stretch[:, None] * information * stretch
-    scale = ScaleRatio(measured.scale.log_ratio + math.log(there / here), measured.scale.variance)
-    return replace(measured, T_a_b=T_a_b, information=information, scale=scale)
+    if features.is_metric or not len(depths):
+        return 1.0
+    return ASSUMED_MEDIAN_DEPTH_M / float(np.median(depths))
 
 
 def placed_keyframe(stored: StoredView, T_map_keyframe: Array, scale: float = 1.0) -> LocalisationCandidate:
-    """Return a stored keyframe with its ``(4, 4)`` pose, to find a view near it; raises BadRequest.
+    """Return an encoded keyframe with its pose, as a candidate for the localisation of a view.
 
-    *scale* is how many metres its unit is, if it is not in metres.
+    Args:
+        stored: Id and encoded keyframe.
+        T_map_keyframe: ``(4, 4)``, its pose in the map, metres.
+        scale: Metres of its unit, if the keyframe is not metric.
+
+    Raises:
+        BadRequest: The keyframe is damaged.
     """
-    number, features, camera = decoded_view(stored)
-    reference = landmarks_of_features(features, camera)
+    i, features, camera = decode_view(stored)
+    landmarks = landmarks_of_features(features, camera)
     if not features.is_metric:
-        points = scale / assumed_scale(features) * reference.points_camera
-        reference = replace(reference, points_camera=points)
-    return LocalisationCandidate(id=number, landmarks=reference, T_map_keyframe=T_map_keyframe)
+        points = scale / assumed_scale(features) * landmarks.points_camera
+        landmarks = replace(landmarks, points_camera=points)
+    return LocalisationCandidate(id=i, landmarks=landmarks, T_map_keyframe=T_map_keyframe)
 
 
-def merge_measurements(keyframe: int, measured: Iterable[LoopClosuresMeasured]) -> LoopClosuresMeasured:
-    """Return the loop closures and failures of several measurements of *keyframe* as one event."""
-    links: list[MeasuredLoopClosure] = []
-    failed: Counter[str] = Counter()
-    for part in measured:
-        links += part.links
-        failed.update(part.failed)
-    return LoopClosuresMeasured(keyframe=keyframe, links=tuple(links), failed=dict(sorted(failed.items())))
+def _wrong_log_scale(measured: RelativePose) -> float | None:
+    """Return the logarithm of the ratio of both keyframes' metres if it clearly differs from 0, else None."""
+    ratio = measured.depth_ratio
+    if ratio is None:
+        return None
+    limit = max(MIN_WRONG_LOG_SCALE, MIN_WRONG_SCALE_DEVIATIONS * math.sqrt(ratio.variance))
+    return None if abs(ratio.log_ratio) < limit else round(ratio.log_ratio, 4)
+
+
+def _in_robots_units(
+    measured: RelativePose, features: KeyframeFeatures, other: KeyframeFeatures
+) -> RelativePose:
+    """Return a relative pose that was measured with assumed scales in the units of both robots."""
+    if measured.scale is None:
+        return measured
+    scale_a, scale_b = assumed_scale(features), assumed_scale(other)
+    T_a_b, information = measured.T_a_b, measured.information
+    if not other.is_metric and not features.is_metric:
+        T_a_b = T_a_b.copy()
+        T_a_b[:3, 3] /= scale_a
+        per_unit = np.array([scale_a] * 3 + [1.0] * 3)
+        information = per_unit[:, None] * information * per_unit
+    scale = ScaleRatio(measured.scale.log_ratio + math.log(scale_b / scale_a), measured.scale.variance)
+    return replace(measured, T_a_b=T_a_b, information=information, scale=scale)

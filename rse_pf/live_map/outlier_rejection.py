@@ -1,8 +1,8 @@
 """Accept and reject the loop closures of a live map: classification, joins, and contradicting evidence.
 
 A new loop closure is *pending*.  Within one component it is compared with the poses of the graph, between two
-components with other loop closures (`component_joins`).  Loop closures that contradict the graph, but agree
-with each other, are evidence against loop closures that were accepted earlier.
+components with other loop closures (see `pairwise_consistency`).  Loop closures that contradict the graph,
+but agree with each other, are evidence against loop closures that were accepted earlier.
 
 To add a rule that rejects loop closures, see CONTRIBUTING.md.
 """
@@ -17,17 +17,20 @@ from typing import Literal
 import numpy as np
 
 from rse_pf.geometry import inverse
-from rse_pf.live_map.component_joins import ALIAS_DISTANCE_M, AmbiguousJoin, decide_join, is_at_alias
-from rse_pf.live_map.edge_consistency import (
-    MIN_SUPPORT,
-    Fit,
-    classify_by_graph,
-    find_consistent_by_odometry,
-    has_enough_support,
-    total_weight,
-)
 from rse_pf.live_map.graph import STEP_LENGTH_M, MapGraph
 from rse_pf.live_map.outcomes import Ambiguous, LoopClosureAccepted, LoopClosureRejected, Outcome
+from rse_pf.live_map.pairwise_consistency import (
+    ALIAS_DISTANCE_M,
+    MIN_SUPPORT,
+    AmbiguousJoin,
+    Fit,
+    classify_by_graph,
+    decide_join,
+    find_consistent_by_odometry,
+    has_enough_support,
+    is_at_alias,
+    total_weight,
+)
 
 __all__ = [
     "GraphChanges",

@@ -11,11 +11,11 @@ from collections.abc import Iterable
 import numpy as np
 
 from rse_pf.geometry import inverse
-from rse_pf.live_map.component_joins import ALIAS_DISTANCE_M
 from rse_pf.live_map.events import MeasuredLoopClosure, matrix_of
 from rse_pf.live_map.graph import MapGraph
 from rse_pf.live_map.outcomes import Ambiguous, LoopClosureAccepted
 from rse_pf.live_map.outlier_rejection import GraphChanges
+from rse_pf.live_map.pairwise_consistency import ALIAS_DISTANCE_M
 from rse_pf.slam.consistency import evidence_weight
 
 __all__ = ["exclude_if_contradicting", "has_odometry_jump", "has_wrong_scale"]

@@ -13,7 +13,6 @@ import pytest
 from rse_pf.errors import BadRequest
 from rse_pf.geometry import Array, exp_se3, inverse, pose_difference, scaled
 from rse_pf.live_map.alignment_reports import UP_TO_SCALE
-from rse_pf.live_map.edge_consistency import relative_pose_between_components, relative_scale
 from rse_pf.live_map.events import (
     Event,
     LoopClosuresMeasured,
@@ -27,6 +26,7 @@ from rse_pf.live_map.events import (
 from rse_pf.live_map.live_map import LiveMap
 from rse_pf.live_map.measure import measure_loop_closures
 from rse_pf.live_map.outcomes import Corrected, Joined
+from rse_pf.live_map.pairwise_consistency import relative_pose_between_components, relative_scale
 from rse_pf.slam.consistency import EdgeArrays, OdometryNoise, are_pairwise_consistent
 from rse_pf.slam.keyframe import KeyframeFeatures, make_features, make_scaleless_features
 from rse_pf.slam.smoother import ScaleTerms, smooth
