@@ -219,7 +219,7 @@ def test_a_pose_that_is_far_in_a_small_unit_is_refused() -> None:
     event = run.world.keyframe(replace(run.drives[0], T_odom_camera=far), 0)
 
     assert run.map.check_keyframe(near) == "new"
-    with pytest.raises(BadRequest, match="from the start"):
+    with pytest.raises(BadRequest, match="from the odometry's start"):
         run.map.check_keyframe(event)
 
 
