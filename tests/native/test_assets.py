@@ -1,4 +1,4 @@
-"""The packages of the cloud hold the native core; `make slow` builds them first."""
+"""The packages for AWS contain the native core; `make slow` builds the packages first."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ pytestmark = pytest.mark.slow
 
 LIBRARY = "librse_pf_native.so"
 _MACHINE_AT, _AARCH64 = 18, 183
-"""Where an ELF file names its machine, and the number of ARM with 64 bits."""
+"""Byte offset of the machine in an ELF header, and the number of 64-bit ARM."""
 
 
 @pytest.fixture

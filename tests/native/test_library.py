@@ -1,4 +1,4 @@
-"""The native core of this checkout: its version, and which instructions of the processor it uses."""
+"""The native core: its version, its instructions, and where an editable installation finds it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The setup compiles the native core, once, with a compiler of the machine or of the ziglang wheel."""
+"""scripts/native.sh compiles the native core once, with a compiler of the system or the ziglang wheel."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ TOOLS = ("sh", "make", "dirname", "mkdir", "rm", "mv", "uname", "sed", "cat")
 
 
 class Checkout:
-    """A copy of what the script needs, and a machine with few programs."""
+    """A copy of the files that the script needs, and a PATH with few programs."""
 
     def __init__(self, folder: Path, repository: Path) -> None:
         self.folder, self.programs, self.log = folder / "checkout", folder / "bin", folder / "calls"
@@ -38,7 +38,7 @@ class Checkout:
 
     @property
     def built(self) -> Path:
-        """Where the library is put."""
+        """Path of the compiled library."""
         return self.folder / "native/build/librse_pf_native.so"
 
     def add_compiler(self, name: str, status: int = 0) -> Path:
@@ -49,7 +49,7 @@ class Checkout:
         return program
 
     def add_ziglang(self, status: int = 0) -> None:
-        """Let the installation of ziglang end with *status*, and its compiler succeed."""
+        """Let the installation of ziglang exit with *status*; its compiler succeeds."""
         (self.folder / "scripts/tool.sh").write_text(f"exit {status}\n", encoding="utf-8")
         zig = self.folder / "build/ziglang/ziglang/zig"
         zig.parent.mkdir(parents=True)

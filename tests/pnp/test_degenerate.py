@@ -1,4 +1,4 @@
-"""Input that fixes no pose: a typed error, never an answer."""
+"""Correspondences that determine no pose are refused with a typed error."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def test_small_pure_noise_is_never_a_pose_in_thousands_of_tries(n):
 
 
 def noisy_line(seed, *, sideways_m, outliers):
-    """A line as a Kinect sees it, 1 to 6 m away; *outliers* of its 100 pixels are anywhere."""
+    """Make 100 noisy points on a line 1 to 6 m away, with *outliers* random pixels."""
     rng = np.random.default_rng(seed)
     while True:
         direction = rng.normal(size=3)

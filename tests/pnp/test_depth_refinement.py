@@ -1,4 +1,4 @@
-"""Poses refined with the depth of both images: smaller errors, honest covariance, no harm from bad depth."""
+"""Refinement of poses with depths: smaller errors, a correct covariance, and no harm from wrong depths."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _options = PnpOptions(inlier_px=5.0)
 
 @pytest.fixture(autouse=True, params=["native", "opencv"])
 def options(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Refine the solutions of both engines."""
+    """Run each test with the poses of both engines."""
     monkeypatch.setitem(globals(), "_options", PnpOptions(inlier_px=5.0, engine=request.param))
 
 

@@ -1,4 +1,4 @@
-"""The refinement with depth agrees with its definition, on any input and with the same bytes without AVX2."""
+"""The refinement with depths equals its definition in NumPy, and has the same bytes without AVX2."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ NOISE = DepthNoise()
 
 
 class Problem(msgspec.Struct, frozen=True, kw_only=True, eq=False):
-    """Matches of two depth images, and the pose that their pixels gave."""
+    """Correspondences of two depth images, and the pose that PnP estimated from their pixels."""
 
     solution: PnpSolution
     points: Array
@@ -32,7 +32,7 @@ class Problem(msgspec.Struct, frozen=True, kw_only=True, eq=False):
 
 
 def problem(seed: int, n: int | None = None) -> Problem:
-    """Return a problem of 4 to 300 rows, of which some have no depth and some are no inliers."""
+    """Return a problem of 4 to 300 rows; some rows have no depth, and some are outliers."""
     rng = np.random.default_rng(seed)
     n = int(rng.integers(4, 300)) if n is None else n
     T = exp_se3(rng.normal(size=6) * ([0.15] * 3 + [0.08] * 3))

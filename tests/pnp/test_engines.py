@@ -1,4 +1,4 @@
-"""Two engines, one contract: the same question gives the same pose, and no foreign exception leaves."""
+"""Both PnP engines: correct poses, equal poses for equal requests, and errors of this package only."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def test_the_same_request_gives_the_same_pose_whatever_was_solved_before_and_in_
 
 @EVERY
 def test_a_plane_is_solved_right_or_not_at_all(engine):
-    """Kept from a fault: EPnP fell into a plane's second minimum, and its pose was called ok."""
+    """Guard against an old fault: EPnP found a plane's second minimum, and its pose was ok."""
     rng = np.random.default_rng(3)
     for seed in range(30):
         problem = make_problem(seed=seed, n=80, outlier_ratio=0.0)

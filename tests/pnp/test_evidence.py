@@ -1,4 +1,4 @@
-"""Places and width of the evidence; what else it says is compared with the oracle."""
+"""Independent inliers and width over length; test_native compares all evidence with the oracle."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ OPTIONS = native_options(PnpOptions(), WeakLimits())
 
 
 def evidence_at(pixels: Array) -> Evidence:
-    """Return the evidence of a right pose for points that project to *pixels*."""
+    """Return the evidence of the true pose for points that project exactly to *pixels*."""
     pixels = np.asarray(pixels, dtype=np.float64)
     points = KINECT.back_project(pixels, np.linspace(2.0, 4.0, len(pixels)))
     return native_solver().evaluate(points, pixels, KINECT, OPTIONS, np.eye(4))

@@ -1,4 +1,4 @@
-"""The native solver: poses of PoseLib, evidence of the oracle, and the same bytes anywhere."""
+"""The native solver: no worse than PoseLib, evidence of the oracle, and equal bytes for equal requests."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ OPTIONS = engines.native_options(PnpOptions(), WeakLimits())
 
 @pytest.fixture
 def solver() -> NativeSolver:
-    """The solver, which the engine ``native`` uses as well."""
+    """The solver of the native core."""
     return native_solver()
 
 
@@ -53,7 +53,7 @@ def solve(solver, problem, **changes):
 
 
 def assert_no_worse_than_poselib(report):
-    """At least PoseLib's success and accuracy, no wrong pose that is ok, and no bit that depends on AVX2."""
+    """Require PoseLib's success and accuracy, no wrong pose that is ok, and equal bytes without AVX2."""
     total = report["all"]
     assert total["native right"] >= total["poselib right"] - 0.0005 * total["n"]
     assert total["native right and ok"] >= total["poselib right and ok"]
@@ -95,7 +95,7 @@ def test_the_evidence_is_that_of_the_oracle(solver, make):
         assert ours.rmse_px == pytest.approx(expected.rmse_px, rel=1e-6, abs=1e-6)
         assert ours.log10_false_alarms == pytest.approx(expected.log10_false_alarms, rel=1e-9)
         assert ours.radius_px == pytest.approx(expected.radius_px, rel=1e-9, abs=1e-4)
-        # Of inliers that are clearly wide, the core knows a lower bound.
+        # For inliers with a ratio above 0.15 the core computes a lower bound only.
         assert min(0.15, ours.inlier_width_to_length) == pytest.approx(
             min(0.15, expected.inlier_width_to_length), abs=1e-4
         )

@@ -1,4 +1,4 @@
-"""The rules of the evidence: the solver decides by them."""
+"""The listed rules decide as the native solver does."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_the_rules_that_a_pose_breaks_are_the_reason_of_its_verdict(engine: str)
         broken = [rule for rule in rules(problem, found) if not rule.is_satisfied]
         if found.refusal is not None:
             refused += 1
-            # Whether the world is mirrored is no figure of the pose.
+            # The test for mirrored points is not among the rules.
             assert any(rule.refuses for rule in broken) or "mirrored" in found.refusal.message
             continue
         names = [rule.name for rule in broken]

@@ -1,4 +1,4 @@
-"""A right pose with its evidence, for right input."""
+"""`solve_pnp` finds the true pose of valid input, with a correct covariance and verdict."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_the_order_of_the_rows_changes_the_inliers_numbers_only():
 
 @pytest.mark.parametrize("n", [60, 80])
 def test_thirteen_right_matches_among_many_wrong_ones_are_a_weak_pose(n):
-    """The wide-baseline pairs of the real recordings: 13 inliers at 3 px."""
+    """As in the wide-baseline pairs of real recordings, which have 13 inliers at 3 px."""
     found = 0
     for seed in range(20):
         problem = make_problem(seed=seed, n=n, noise_px=0.7, outlier_ratio=1 - 13 / n)
@@ -65,7 +65,7 @@ def test_thirteen_right_matches_among_many_wrong_ones_are_a_weak_pose(n):
 
 
 def twist_of(T):
-    """The first-order logarithm; the errors here are below a degree."""
+    """Return the twist of a small motion by the first-order logarithm, exact enough below one degree."""
     return np.array([*T[:3, 3], *(0.5 * np.array([T[2, 1] - T[1, 2], T[0, 2] - T[2, 0], T[1, 0] - T[0, 1]]))])
 
 

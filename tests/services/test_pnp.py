@@ -1,4 +1,4 @@
-"""A `pnp` request with the depths of its pixels, in every encoding."""
+"""`pnp` requests with and without depths, in all encodings."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _REGISTRY = builtin_services(PlatformSettings())
 
 
 def _views(n: int = 60) -> tuple[Array, Array, Array]:
-    """Return points, pixels and depths of two images some 0.1 m apart."""
+    """Return points, pixels and depths of two images taken about 0.1 m apart."""
     rng = np.random.default_rng(1)
     points = KINECT.back_project(rng.uniform(60.0, [580.0, 420.0], (n, 2)), rng.uniform(1.0, 4.0, n))
     seen = transform(_T, points)

@@ -71,9 +71,12 @@ class LuaRuntime:
         self._name = service.name
         self._lupa = lupa
         self._lua = lupa.LuaRuntime(
-            unpack_returned_tuples=True, register_eval=False, register_builtins=False,
-            attribute_filter=_no_attributes, encoding=None,
-        )  # fmt: skip
+            unpack_returned_tuples=True,
+            register_eval=False,
+            register_builtins=False,
+            attribute_filter=_no_attributes,
+            encoding=None,
+        )
         try:
             setup = self._lua.execute(f"return function(...) {_SETUP} end".encode())
             folder = str(service.folder).encode()

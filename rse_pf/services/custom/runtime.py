@@ -30,10 +30,18 @@ __all__ = ["Runtime", "open_runtime"]
 _BYTES = (bytes, bytearray, memoryview)
 _ROWS = (list, tuple, np.ndarray)
 _KINDS: dict[Any, tuple[type, ...]] = {
-    float: (float, int, np.floating), int: (int, np.integer), str: (str,), bool: (bool,), bytes: _BYTES,
-    list: _ROWS, tuple: _ROWS, np.ndarray: _ROWS, dict: (dict,), types.NoneType: (types.NoneType,),
+    float: (float, int, np.floating),
+    int: (int, np.integer),
+    str: (str,),
+    bool: (bool,),
+    bytes: _BYTES,
+    list: _ROWS,
+    tuple: _ROWS,
+    np.ndarray: _ROWS,
+    dict: (dict,),
+    types.NoneType: (types.NoneType,),
     None: (types.NoneType,),
-}  # fmt: skip
+}
 """For each annotation of a field of a reply the classes of values that its message carries correctly."""
 
 

@@ -1,4 +1,4 @@
-"""Packages of a service's own: what a lock may hold, how it is installed, and who may change it."""
+"""Python packages of a service: valid locks, installation by pip, and refusal of changed packages."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Service folders: what can be installed, and that a change afterwards is refused."""
+"""Service folders: valid and invalid folders, and refusal of files that were changed after installation."""
 
 from __future__ import annotations
 

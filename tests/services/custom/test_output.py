@@ -1,4 +1,4 @@
-"""What a service prints, as bounded lines."""
+"""The output of a service becomes lines of limited length and rate."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The example pnp-lua, the flow of the paper, finds the same pose as the platform's solver."""
+"""The example pnp-lua, the paper's design, finds the same pose as the service ``pnp``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Publishing a service: what is refused before it reaches the servers, and what a server refuses."""
+"""Publishing of services: checks before the upload, and checks of the servers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Services in three languages behind one interface."""
+"""The runtimes of Python, C++ and Lua behave alike."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ int rse_pf_service_call(void *state, const uint8_t *request, uint64_t size, uint
 
 
 BUILT = {}
-"""Libraries that were compiled already, by what they were compiled of."""
+"""Paths of compiled libraries by their source texts, so that each source is compiled once."""
 
 
 def compiled(folder, source, name, *flags):

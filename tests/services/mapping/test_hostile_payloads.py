@@ -1,4 +1,4 @@
-"""Hostile payloads of the map services: a typed failure or an answer, in bounded time (T26)."""
+"""Hostile payloads of the mapping services get a reply or a typed failure in bounded time (threat T26)."""
 
 from __future__ import annotations
 
@@ -135,7 +135,7 @@ ANSWERED = {
     "icp, equal points", "icp, a plane", "wifi, a corridor around the earth", "wifi, all at one place",
     "optimise, information of a gap", "place, a prior that is not a number",
 }  # fmt: skip
-"""Requests that are odd but may be answered."""
+"""Unusual requests that may have a reply."""
 
 
 @pytest.mark.parametrize("name", HOSTILE)

@@ -1,4 +1,4 @@
-"""wifi answers with a position and a calibrated radius, and receives no hardware address."""
+"""The service ``wifi``: position with a calibrated radius, and no hardware address in a request."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ KEY = b"a key of the team"
 
 
 def surveyed(building: Building, seed: int, pitch_m: float = 2.0) -> list[Fingerprint]:
-    """Return one fingerprint for each place of a grid over the building."""
+    """Return a fingerprint for each point of a grid over the building."""
     rng = np.random.default_rng(seed)
     places = [(x, y, 0.3) for x in np.arange(1, 40, pitch_m) for y in np.arange(1, 20, pitch_m)]
     return [fingerprint_of(building.scan(np.array(place), rng), KEY, place) for place in places]
@@ -38,7 +38,7 @@ def asked(request: WifiRequest) -> Result | Failure:
 
 
 def located(building: Building, locator: Locator, scans: int, seed: int) -> tuple[list[float], list[float]]:
-    """Return errors and stated radii of scans at random places."""
+    """Return the errors and the stated radii of scans at random positions."""
     rng = np.random.default_rng(seed)
     errors, radii = [], []
     for _ in range(scans):
