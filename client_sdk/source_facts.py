@@ -51,8 +51,8 @@ MIN_ASSUMED_MEDIAN_DEPTH_M = 0.2  # median depth where the unit is assumed: near
 MAX_ASSUMED_MEDIAN_DEPTH_M = 6.0  # median depth where the unit is assumed: rooms are smaller
 MIN_INTERVAL_S = 1e-4  # median time between images: no camera is faster than 10,000 Hz
 MAX_INTERVAL_S = 1e3  # median time between images: a longer one is a wrong unit of the time stamps
-_MIN_EPOCH_S = 1e9  # time stamps from here on are seconds since 1970: the year 2001
-_MAX_EPOCH_S = 1e10  # time stamps below are seconds since 1970: the year 2286
+_MIN_EPOCH_S = 1e9  # smallest time stamp that counts as seconds since 1970: the year 2001
+_MAX_EPOCH_S = 1e10  # largest time stamp that counts as seconds since 1970: the year 2286
 _TIME_UNITS_S = {"seconds": 1.0, "milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9}
 """Units that time stamps of recordings have, each with its length in seconds."""
 _USUAL_LOSS_SHARE = 0.1
@@ -362,7 +362,7 @@ def rows_in_time(times: TimeFacts) -> tuple[list[int], tuple[Doubt, ...]]:
     """
     steps_s = np.diff(times.stamps_s)
     total = len(times.stamps_s)
-    # 1. Where the clock goes back.
+    # 1. Find where the clock goes back.
     backs = np.flatnonzero(steps_s < 0.0)
     if len(backs) > 1 or (len(backs) == 1 and backs[0] == 0):
         raise UsageError(
@@ -370,7 +370,7 @@ def rows_in_time(times: TimeFacts) -> tuple[list[int], tuple[Doubt, ...]]:
             f"{times.stamps_s[backs[0] + 1]:.6f} s after {times.stamps_s[backs[0]]:.6f} s",
             hint="sort the images in the order in which they were taken, if their clock can be trusted",
         )
-    # 2. The recording ends before the jump.
+    # 2. End the recording before the clock goes back.
     doubts = []
     end = total
     if len(backs):
@@ -383,7 +383,7 @@ def rows_in_time(times: TimeFacts) -> tuple[list[int], tuple[Doubt, ...]]:
                 hint="make two recordings of it, one before and one after the jump",
             )
         )
-    # 3. Of rows with equal time stamps, the first is used.
+    # 3. Use the first of several rows with equal time stamps.
     rows = [0][:total] + [row + 1 for row in range(end - 1) if steps_s[row] > 0.0]
     equal_count = end - len(rows)
     if equal_count:

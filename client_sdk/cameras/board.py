@@ -169,9 +169,9 @@ def _charuco_board(cv2: Any, board: Board) -> Any:
 def _pdf_of(image: npt.NDArray[np.uint8], pixel_mm: float) -> bytes:
     """Return a PDF page with an image ``(h, w)`` whose pixels have a side of *pixel_mm*.
 
-    Each run of black pixels in a row is drawn as a rectangle, because a printer may resample images.
+    Each run of black pixels in a row is drawn as a rectangle, so that the printed size is exact.
     """
-    # 1. Rectangles, in points from the lower left corner of the page.
+    # 1. Draw rectangles, in points from the lower left corner of the page.
     margin, pixel = _MARGIN_MM / _MM_PER_POINT, pixel_mm / _MM_PER_POINT
     height, width = image.shape
     page = (width * pixel + 2 * margin, height * pixel + 2 * margin)
@@ -185,7 +185,7 @@ def _pdf_of(image: npt.NDArray[np.uint8], pixel_mm: float) -> bytes:
             for start, end in zip(starts, ends, strict=True)
         ]
     content = ("0 g\n" + "\n".join(rectangles) + "\nf\n").encode("ascii")
-    # 2. The objects of the file: catalogue, list of pages, page, and its content.
+    # 2. Make the objects of the file: catalogue, list of pages, page, and its content.
     objects = [
         b"<< /Type /Catalog /Pages 2 0 R >>",
         b"<< /Type /Pages /Kids [3 0 R] /Count 1 >>",
@@ -193,7 +193,7 @@ def _pdf_of(image: npt.NDArray[np.uint8], pixel_mm: float) -> bytes:
         "/Resources << >> >>".encode("ascii"),
         f"<< /Length {len(content)} >>\nstream\n".encode("ascii") + content + b"endstream",
     ]
-    # 3. The file, with the table of the offsets of its objects.
+    # 3. Join the objects, and append the table of their offsets.
     data, offsets = b"%PDF-1.4\n", []
     for number, pdf_object in enumerate(objects, start=1):
         offsets.append(len(data))

@@ -198,7 +198,7 @@ def _order_by_time(
     Raises:
         UsageError: No image has a partner, or the time stamps are in no order.
     """
-    # 1. Time stamps from names, or from the rate.
+    # 1. Take time stamps from names, or from the rate.
     doubts: tuple[Doubt, ...] = ()
     named_s, assumed = _times_in_names(images, name)
     period_s = _ASSUMED_PERIOD_S if rate_hz is None else 1.0 / rate_hz
@@ -207,7 +207,7 @@ def _order_by_time(
         assumed = (
             f"names of images in {name} are no times: {_ASSUMED_PERIOD_S:g} s between images are assumed",
         )
-    # 2. Only images with a partner are used.
+    # 2. Leave out images without a partner.
     paired: list[Path] | None = None
     if partners is not None:
         pairs = _match_names(images, partners)

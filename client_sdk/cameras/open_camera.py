@@ -68,7 +68,7 @@ def open_camera(
             other.
         MissingExtra: A package for this kind of source is not installed.
     """
-    # 1. The source exists, and the user's intrinsics can be read.
+    # 1. Check that the source exists, and read the intrinsics that the user names.
     word = str(source)
     path = Path(word)
     for name in (word,) if path.exists() or word.count(",") != 1 else word.split(","):
@@ -76,7 +76,7 @@ def open_camera(
             check_exists(name, _SOURCE_HINT)
     own = read_calibration(intrinsics) if isinstance(intrinsics, Path | str) else intrinsics
     stated_by = str(intrinsics) if isinstance(intrinsics, Path | str) else f"the intrinsics of {word}"
-    # 2. Stereo sources with a rig of their own, and RealSense cameras.
+    # 2. Open a stereo source with a rig of its own, or a RealSense camera.
     if word == "realsense-stereo":
         pairs, rig, close = open_realsense_stereo()
         facts = SourceFacts(name=word)
@@ -92,7 +92,7 @@ def open_camera(
         lens = own if isinstance(own, Intrinsics) else factory
         facts = _facts_of_lens(word, lens, stated_by)
         return _open_single(facts, lambda log: _without_depth(raw, depth), lens, rate_hz, depth, close)
-    # 3. Recordings.
+    # 3. Open a recording of a benchmark, and refuse bags, which have a command of their own.
     if path.suffix in _ROS_BAG_ENDINGS or (path / "metadata.yaml").is_file():
         raise UsageError(
             f"{word} is a ROS bag",
@@ -114,7 +114,7 @@ def open_camera(
             log=dataset.log,
             span_s=dataset.span_s,
         )
-    # 4. Devices and videos of a stereo rig.
+    # 4. Open the devices or videos of a stereo rig.
     if isinstance(own, Rig) and own.right is None:
         own = own.left.lens
     if isinstance(own, Rig) and path.is_dir():
@@ -124,7 +124,7 @@ def open_camera(
         )
     if isinstance(own, Rig):
         return _open_stereo_video(word, own, rate_hz, camera, stated_by)
-    # 5. One camera: a folder, a video or a device.
+    # 5. Open one camera: a folder, a video or a device.
     if camera == "stereo":
         raise UsageError(f"{word} is one camera", hint="name a rig: --intrinsics rig.json")
     if imu:

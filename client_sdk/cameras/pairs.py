@@ -40,7 +40,7 @@ class PairVideos:
         return SourceFacts(name=self.name, videos=stated, assumed=(*self.left.notes, *self.right.notes))
 
     def pairs(self, log: DoubtLog) -> Iterator[RawPair]:
-        """Yield pairs: of devices, images as they come; of videos, images with the same presentation time.
+        """Yield pairs: of devices, images as they come; of videos, images within 0.4 intervals of time.
 
         *log* counts images of videos without a partner.
         """

@@ -88,14 +88,14 @@ def calibrate_pair(views: PairViews, *, max_rms_px: float = 1.0) -> StereoCalibr
     Source:
         Zhang, PAMI 2000, and Bouguet, as OpenCV's ``stereoCalibrate`` implements it.
     """
-    # 1. The intrinsics of each camera.
+    # 1. Calibrate the intrinsics of each camera.
     lenses = []
     for side, views_of_side in (("left", views.left), ("right", views.right)):
         try:
             lenses.append(calibrate(views_of_side, max_rms_px=max_rms_px))
         except CommandFailed as error:
             raise CommandFailed(f"the {side} camera: {error.message}", hint=error.hint) from error
-    # 2. Corners that both cameras see.
+    # 2. Select the corners that both cameras see.
     points, left_pixels, right_pixels = [], [], []
     for left_view, right_view in views.pairs:
         left_indices, left_corners = views.left.views[left_view]
@@ -110,7 +110,7 @@ def calibrate_pair(views: PairViews, *, max_rms_px: float = 1.0) -> StereoCalibr
             f"both cameras see the board in {len(points)} views at once; a pair needs {MIN_VIEWS}",
             hint="hold the board where both cameras see it whole, still, from many sides",
         )
-    # 3. The pose between both cameras.
+    # 3. Estimate the pose between both cameras.
     cv2 = load_opencv()
     camera = lenses[0].camera
     rms_px, _, _, _, _, R, t, _, _ = cv2.stereoCalibrate(

@@ -34,7 +34,7 @@ __all__ = [
 _Row = TypeVar("_Row")
 _Result = TypeVar("_Result")
 _IMAGE_ENDINGS = {".png", ".jpg", ".jpeg", ".bmp", ".ppm", ".pgm", ".tif", ".tiff", ".webp"}
-_NUMBER = re.compile(r"\d+")
+_WHOLE_NUMBER = re.compile(r"\d+")  # in the name of a file
 _NO_READING = 65535  # value of a 16-bit depth image with which some recorders mark a pixel without a reading
 _WHITE_PERCENTILE = 99.9
 """Percentile of a 16-bit image's values that becomes white: brighter pixels are defects of the sensor."""
@@ -79,7 +79,7 @@ def image_files(folder: Path) -> list[Path]:
 
 def numbers_in_name(path: Path) -> tuple[int, ...]:
     """Return the whole numbers in the name of a file without its ending, from left to right."""
-    return tuple(int(digits) for digits in _NUMBER.findall(path.stem))
+    return tuple(int(digits) for digits in _WHOLE_NUMBER.findall(path.stem))
 
 
 def readable(rows: Iterable[_Row], read: Callable[[_Row], _Result], log: DoubtLog) -> Iterator[_Result]:

@@ -203,7 +203,7 @@ def _open_tum(folder: Path, intrinsics_file: Path) -> Dataset:
         UsageError: A file is missing or broken, or facts about the recording contradict each other.
         MissingExtra: OpenCV is not installed.
     """
-    # 1. The lists of images, and the camera.
+    # 1. Read the lists of images, and the intrinsics.
     colours, depths = _read_lists(folder)
 
     def size_px() -> tuple[int, int]:
@@ -217,7 +217,7 @@ def _open_tum(folder: Path, intrinsics_file: Path) -> Dataset:
     intrinsics, is_unit_stated, notes = _find_intrinsics(
         folder, intrinsics_file, None if stated is None else stated[1], has_depth=depths is not None
     )
-    # 2. Pairs of a colour and a depth image.
+    # 2. Pair each colour image with the depth image that is nearest in time.
     pairs = [(row, row) for row in range(len(colours.images))]
     if depths is not None:
         pairs = associate_stamps(colours.stamps_s, depths.stamps_s, _MAX_STAMP_DIFFERENCE_S)
@@ -235,7 +235,7 @@ def _open_tum(folder: Path, intrinsics_file: Path) -> Dataset:
         total=total,
         is_usual=True,
     )
-    # 3. Reading of a frame.
+    # 3. Prepare the undistortion with which a frame is read later.
     camera, undistortion = intrinsics.camera, map_to_pinhole(intrinsics)
     units_per_m = intrinsics.depth_units_per_m
     empty_depth: npt.NDArray[np.float32] = np.zeros((camera.height, camera.width), dtype=np.float32)
@@ -259,7 +259,7 @@ def _open_tum(folder: Path, intrinsics_file: Path) -> Dataset:
             camera=camera,
         )
 
-    # 4. The facts about the recording.
+    # 4. Collect the facts about the recording, and compare them.
     truth, truth_kind, truth_notes = _read_truth(folder)
     stated_by = str(intrinsics_file if intrinsics_file.exists() else folder)
     probed = probe(range(len(pairs)), read_depth_of)

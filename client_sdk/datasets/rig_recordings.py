@@ -107,7 +107,7 @@ def open_euroc(folder: Path, camera: CameraChoice | None = None, imu: bool | Non
             no such camera or IMU.
         MissingExtra: OpenCV is not installed.
     """
-    # 1. The images and the rig.
+    # 1. Read the lists of images, and the rig.
     folder = _mav0_of(folder)
     wants_stereo = None if camera is None else camera == "stereo"
     has_stereo = _is_used(folder / "cam1" / "sensor.yaml", wants_stereo, "cam1")
@@ -125,7 +125,7 @@ def open_euroc(folder: Path, camera: CameraChoice | None = None, imu: bool | Non
     rig = Rig(
         cameras=tuple(cameras), imu=read_euroc_imu(folder / "imu0" / "sensor.yaml") if has_imu else None
     )
-    # 2. The true path of the body.
+    # 2. Read the true path of the body.
     body_path = None
     if (folder / _EUROC_TRUTH).is_file():
         rows = [row[:8] for row in _read_table(folder / _EUROC_TRUTH, 8)]
@@ -137,7 +137,7 @@ def open_euroc(folder: Path, camera: CameraChoice | None = None, imu: bool | Non
         body_path = Trajectory(truth_s, poses)
         notes += truth_notes
     name = folder.parent.name if folder.name == "mav0" else folder.name
-    # 3. The samples of the IMU.
+    # 3. Read the samples of the IMU.
     samples = None
     if has_imu:
         rows = [row[:7] for row in _read_table(folder / "imu0" / "data.csv", 7)]
@@ -178,7 +178,7 @@ def open_kitti(folder: Path, camera: CameraChoice | None = None, imu: bool | Non
     """
     if imu:
         raise UsageError(f"{folder} has no IMU: KITTI's sequences hold none", hint="leave out --imu")
-    # 1. The lines of times.txt and poses.txt that belong to each image.
+    # 1. Find the lines of times.txt and poses.txt that belong to each image.
     left, right = next(pair for pair in _KITTI_PAIRS if (folder / pair[0]).is_dir())
     wants_stereo = None if camera is None else camera == "stereo"
     has_stereo = _is_used(folder / right, wants_stereo, right)
@@ -193,7 +193,7 @@ def open_kitti(folder: Path, camera: CameraChoice | None = None, imu: bool | Non
     rows, notes = _match_kitti_lines(paths, line_counts, folder)
     stamps_s = times_s[rows["times.txt"]]
     used, doubts = rows_in_time(TimeFacts(stated_by=str(folder / "times.txt"), stamps_s=stamps_s))
-    # 2. The right images.
+    # 2. Find the right image of each left one.
     rights: list[Path] | None = None
     if has_stereo:
         partners = {path.stem: path for path in image_files(folder / right)}
@@ -211,7 +211,7 @@ def open_kitti(folder: Path, camera: CameraChoice | None = None, imu: bool | Non
             )
             doubts = (*doubts, doubt)
         rights = [partners[paths[row].stem] for row in used]
-    # 3. The true path, and the rig.
+    # 3. Take the true path, and read the rig.
     truth = None
     if poses is not None:
         truth = Trajectory(stamps_s[used], poses[rows["poses.txt"]][used])
@@ -305,7 +305,7 @@ def _make_dataset(
         UsageError: There is no image, the cameras are no stereo pair, or facts contradict each other.
         MissingExtra: OpenCV is not installed.
     """
-    # 1. Reading of a frame.
+    # 1. Prepare the undistortion or rectification, with which a frame is read later.
     lefts, rights, stamps_s = images.lefts, images.rights, images.stamps_s
     if not len(lefts):
         raise UsageError(f"{name} has no images", hint="unpack the recording again")
@@ -335,7 +335,7 @@ def _make_dataset(
             stereo=rectification.right(cv2.cvtColor(right_rgb, cv2.COLOR_RGB2GRAY)),
         )
 
-    # 2. IMU samples on the clock of the left camera, and the true path of the camera of the frames.
+    # 2. Put IMU samples on the clock of the left camera, and the true path into the frame of that camera.
     track = None
     if samples is not None and rig.imu is not None:
         track = ImuTrack(
@@ -347,7 +347,7 @@ def _make_dataset(
     truth = None
     if body_path is not None:
         truth = Trajectory(body_path.timestamps_s, body_path.T_world_camera @ T_body_camera)
-    # 3. The facts about the recording.
+    # 3. Collect the facts about the recording, and compare them.
     cameras = [
         CameraFacts(
             stated_by=images.stated_by[0] if rig_camera is left else f"the right camera of {name}",

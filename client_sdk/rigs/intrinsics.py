@@ -208,10 +208,10 @@ def parse_intrinsics(values: Any) -> Intrinsics:
         InvalidCamera: The numbers of the pinhole camera are impossible.
         KeyError, ValueError, TypeError, AttributeError: A field is missing, or has another type.
     """
-    # 1. Fields by the names of intrinsics.json.
+    # 1. Give all fields the names of intrinsics.json.
     values = _replace_field_aliases(values)
     model = parse_lens_model(values.get("model"))
-    # 2. The camera matrix, where it is stated instead of fx fy cx cy.
+    # 2. Read the camera matrix, if it is stated instead of fx fy cx cy.
     if "matrix" in values:
         K = np.array(values["matrix"], dtype=np.float64).reshape(3, 3)
         K = K.T if K[2, 0] or K[2, 1] else K  # Open3D writes column after column
@@ -221,7 +221,7 @@ def parse_intrinsics(values: Any) -> Intrinsics:
         width=int(values["width"]),
         height=int(values["height"]),
     )
-    # 3. Everything that may be left out.
+    # 3. Read the fields that may be left out.
     return Intrinsics(
         camera=camera,
         distortion=_parse_distortion(values, model),

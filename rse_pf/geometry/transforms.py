@@ -119,7 +119,7 @@ def rigid(T: Array, max_m: float = MAX_TRANSLATION_M) -> Array | None:
 
 def rigid_many(T: Array, max_m: float = MAX_TRANSLATION_M) -> Array | None:
     """Return ``(n, 4, 4)`` matrices as rigid motions by the rule of `rigid`; None if one matrix is none."""
-    # 1. Are all matrices rigid motions?  A NaN makes each comparison false.
+    # 1. Check that all matrices are rigid motions; a NaN makes each comparison false.
     rotations = T[:, :3, :3]
     with np.errstate(over="ignore", invalid="ignore"):
         gram = np.swapaxes(rotations, 1, 2) @ rotations

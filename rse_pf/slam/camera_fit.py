@@ -92,20 +92,20 @@ def fit_camera(
         for scale_px in _FIRST_SCALES_PX
     ]
     fit = min(fits, key=lambda fit: fit.cost)
-    # 2. Information of the matches, and the part of it that errors of the points' depths feign: before a flat
-    #    wall, only these errors make points leave their plane, and seem to determine the camera.
+    # 2. Compute the information of the matches, and the part of it that errors of the points' depths feign:
+    # before a flat wall, only these errors make points leave their plane, and seem to determine the camera.
     shifted_map = points_map + _DEPTH_DEVIATION * (points_map - origins_map)
     jacobian_change = fit.jacobian_and_errors(shifted_map, pixels, camera)[0] - fit.jacobian
     weights = fit.weights[:, None, None]
     information = (fit.jacobian * weights).reshape(-1, 11).T @ fit.jacobian.reshape(-1, 11)
     feigned = (jacobian_change * weights).reshape(-1, 11).T @ jacobian_change.reshape(-1, 11)
-    # 3. Covariance, with the variance of a pixel from the errors that remain.
+    # 3. Compute the covariance, with the variance of a pixel from the errors that remain.
     squares_px2 = float(fit.weights @ np.square(fit.errors_px).sum(axis=1))
     variance_px2 = max(_MIN_VARIANCE_PX2, squares_px2 / (2.0 * float(fit.weights.sum())))
     covariance = _covariance_of(information, feigned, _CORRELATION_FACTOR * variance_px2, prior_information)
     variances = np.diag(covariance)
-    # 4. From the twist left of T_camera_map to that left of T_map_camera: the inverse of exp(xi) T has the
-    # twist -Ad(inverse(T)) xi on its left.
+    # 4. Convert the twist left of T_camera_map into that left of T_map_camera: the inverse of exp(xi) T has
+    # the twist -Ad(inverse(T)) xi on its left.
     T_fitted = inverse(fit.T_camera_map)
     adjoint_to_map = adjoint(T_fitted)
     return CameraFit(

@@ -52,7 +52,7 @@ _FIRST_DAMPING = 1e-4  # Levenberg-Marquardt's share of the diagonal: nearly Gau
 _MIN_DAMPING = 1e-9  # Levenberg-Marquardt's share of the diagonal is not lowered below this
 _MAX_DAMPING = 1e4  # an adjustment ends when a step with more damping than this does not lower the cost
 _MIN_DEPTH_M = 0.02  # depth of a landmark in a camera: projections of nearer landmarks use this depth
-_BEHIND_COST = 1e3  # cost of a landmark nearer than this, or behind the camera: far above that of an outlier
+_BEHIND_COST = 1e3  # cost of an observation whose landmark is behind the camera: far above that of an outlier
 _TIME_BLOCKS = 6  # consecutive parts of a drive within which errors count as correlated
 _IMAGE_CELLS = 6  # columns, and rows, of image regions within which errors count as correlated
 _MAD_TO_SIGMA = 1.4826  # standard deviation of normal noise over its median absolute deviation
@@ -60,7 +60,7 @@ _MIN_PIXEL_FACTOR = 0.05  # smallest ratio of the noise of pixels to their state
 _MIN_DEPTH_FACTOR = 0.1  # smallest ratio of the noise of depths to their stated deviations
 _MIN_DEPTHS = 20  # depths of a drive above which their noise is estimated from residuals
 _MAX_PARTS = 4  # parts of a drive that are adjusted alone to see whether they agree
-_MIN_PART_KEYFRAMES = 6  # keyframes of such a part
+_MIN_PART_KEYFRAMES = 6  # keyframes of a part of a drive that is adjusted alone: fewer do not determine it
 _MAX_STEP_RAD = 0.5  # rotation of a keyframe in one step: the linearisation does not hold beyond it
 _ZOOM_MEAN_INFORMATION = 1e8
 """Information on the mean of the focal lengths of keyframes, which is held at 0, since ``fx`` and ``fy``
@@ -381,7 +381,7 @@ class _DriveSystem:
         self._keyframe_count, self._landmark_count = keyframe_count, landmark_count
         self._keyframe_size = 7 if zooms else 6
         self._poses_size = self._keyframe_size * keyframe_count
-        # 1. Observations, sorted by landmark.
+        # 1. Sort the observations by landmark.
         order = np.argsort(observed.landmarks, kind="stable")
         self.camera = observed.camera
         self.keyframes, self.landmarks = observed.keyframes[order], observed.landmarks[order]
@@ -390,11 +390,11 @@ class _DriveSystem:
         self.depths_m = np.where(self.has_depth, observed.depths_m[order], 0.0)
         self.depths_dev_m = np.where(self.has_depth, observed.depths_dev_m[order], 1.0)
         self.rates_m_s = np.where(self.has_depth, observed.rates_m_s[order], 0.0)
-        # 2. Motion of the camera during the exposure of the rows of an image.
+        # 2. Take the motion of the camera during the exposure of the rows of an image.
         twists = observed.twists_s[self.keyframes]
         self._velocities, self._angular_rates = twists[:, :3], twists[:, 3:]
         self._row_fractions = self.pixels[:, 1:] / self.camera.height - 0.5
-        # 3. Noise over stated deviations, and the arrays of the normal equations.
+        # 3. Begin with the stated deviations, and allocate the normal equations.
         self.pixel_factor = self.depth_factor = 1.0
         self._observations_of_keyframe = [np.flatnonzero(self.keyframes == k) for k in range(keyframe_count)]
         size = self._poses_size + len(self._free)
@@ -473,7 +473,7 @@ class _DriveSystem:
 
     def linearise(self, state: _State) -> None:
         """Compute the weighted Jacobians and residuals at *state*, and the normal equations from them."""
-        # 1. Derivatives of pixel and depth by the point in the camera frame.
+        # 1. Differentiate pixel and depth by the point in the camera frame.
         residual, points_camera = self.residuals(state)
         z = np.maximum(points_camera[:, 2], _MIN_DEPTH_M)
         n = len(z)
@@ -490,7 +490,7 @@ class _DriveSystem:
         J_camera[:, :2, :2] = J_xy / z[:, None, None]
         J_camera[:, :2, 2] = -(J_xy @ np.stack([x, y], axis=1)[:, :, None])[:, :, 0] / z[:, None]
         J_camera[:, 2, 2] = 1.0 + 2.0 * state.values[8] * points_camera[:, 2]
-        # 2. Derivatives by pose and zoom of the keyframe, and by the unknowns of the calibration.
+        # 2. Differentiate by pose and zoom of the keyframe, and by the unknowns of the calibration.
         J_keyframe = np.zeros((n, 3, 7))
         J_keyframe[:, :, :3] = J_camera
         J_keyframe[:, :, 3:6] = -J_camera @ skew(points_camera)
@@ -503,7 +503,7 @@ class _DriveSystem:
         J_values[:, :2, 7] = (J_camera[:, :2] @ motion[:, :, None])[:, :, 0]
         J_values[:, 2, 5], J_values[:, 2, 6] = 1.0, -self.rates_m_s
         J_values[:, 2, 8] = points_camera[:, 2] ** 2
-        # 3. Weights of the Cauchy loss; points behind the camera have none.
+        # 3. Weight residuals by the Cauchy loss; points behind the camera get the weight 0.
         inverse_deviations = self._inverse_deviations()
         whitened = residual * inverse_deviations
         pixel_weights = 1.0 / (1.0 + (whitened[:, :2] ** 2).sum(axis=1) / _CAUCHY_SCALE**2)
@@ -519,7 +519,7 @@ class _DriveSystem:
             J_points,
         )
         self._r = whitened * roots
-        # 4. The normal equations.
+        # 4. Sum the normal equations.
         self._set_equations()
 
     def _set_equations(self) -> None:
@@ -584,7 +584,7 @@ class _DriveSystem:
 
     def result(self, state: _State) -> Calibrated:
         """Return the solution *state* with its covariances; `linearise` must have been called with it."""
-        # 1. Covariance of the calibration and the zooms, inflated for correlated residuals.
+        # 1. Compute the covariance of calibration and zooms, inflated for correlated residuals.
         reduced = self._reduce(0.0)
         S, landmark_covariance = reduced.S, reduced.landmark_covariance
         count, size, poses_size = self._keyframe_count, self._keyframe_size, self._poses_size
@@ -602,7 +602,7 @@ class _DriveSystem:
         zooms_covariance: Array = (
             estimated[free_count:, free_count:] if size == 7 else np.zeros((count, count))
         )
-        # 2. Motion of the poses if an unknown is held one unit too large.
+        # 2. Compute how the poses move if an unknown is held one unit too large.
         pose_slopes = -np.linalg.solve(S[:poses_size, :poses_size], S[:poses_size, poses_size:])
         pose_slopes = pose_slopes.reshape(count, size, free_count)
         # The camera centre -R^T t moves by -R^T rho with a twist (rho, phi) on the left of the pose.
@@ -636,7 +636,7 @@ class _DriveSystem:
             landmark_covariance: ``(l, 3, 3)``, covariances of the landmarks for fixed keyframes.
             variances: ``(p,)``, variances of the parameters with independent residuals.
         """
-        # 1. Influence (n, p) of each observation on each parameter.
+        # 1. Compute the influence (n, p) of each observation on each parameter.
         by_points = np.einsum("lar,lab->rlb", self._equations.E @ rows.T, landmark_covariance)
         by_keyframes = rows[:, : self._poses_size].reshape(
             len(rows), self._keyframe_count, self._keyframe_size
@@ -648,7 +648,7 @@ class _DriveSystem:
         for parameter in range(len(rows)):
             influence[:, parameter] += (by_keyframes[parameter, self.keyframes] * g_keyframe).sum(axis=1)
             influence[:, parameter] -= (by_points[parameter, self.landmarks] * g_points).sum(axis=1)
-        # 2. Clusters: landmarks, consecutive parts of the drive, and regions of the image.
+        # 2. Cluster residuals by landmark, by part of the drive, and by region of the image.
         cell_size = self.camera.width / _IMAGE_CELLS, self.camera.height / _IMAGE_CELLS
         cells = np.clip(self.pixels // cell_size, 0, _IMAGE_CELLS - 1) @ (1, _IMAGE_CELLS)
         block_count = min(_TIME_BLOCKS, self._keyframe_count)
@@ -657,7 +657,7 @@ class _DriveSystem:
             (self.keyframes * block_count // self._keyframe_count, block_count),
             (cells.astype(np.int64), _IMAGE_CELLS**2),
         )
-        # 3. The excess of the variance over each kind of clusters is added.
+        # 3. Add up by how much the variance over clusters exceeds that of independent residuals.
         inflation = np.ones(len(rows))
         for clusters, count in clusterings:
             sums = _sum_by_index(influence, clusters, count)

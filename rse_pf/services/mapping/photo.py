@@ -55,20 +55,20 @@ def localise_photo(data: bytes, photo_lens: PhotoLens, index: MapIndex) -> Local
         InvalidCamera: The intrinsics describe no camera.
         MissingExtra: OpenCV or the native core is not installed.
     """
-    # 1. The camera of the photo, and of the smaller image in which features are sought.
+    # 1. Find the camera of the photo, and of the smaller image in which features are detected.
     check_same_kind(index.kind, ORB, "the map")
     camera_of_photo = _camera_of_photo(photo_lens, *photo_size(data))
     camera = _camera_for_features(camera_of_photo, [keyframe.camera for keyframe in index.keyframes])
-    # 2. ORB features of this image.
+    # 2. Detect ORB features in this image.
     rgb = decode_photo(data)
     if camera != camera_of_photo:
         cv2 = load_opencv()
         rgb = cv2.resize(rgb, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
     features = describe_orb(rgb, _MAX_FEATURES)
-    # 3. Their pixels without the distortion of the lens.
+    # 3. Undistort their pixels.
     lens = Lens(camera=camera, distortion=photo_lens.distortion, model=photo_lens.model)
     pixels, is_valid = _undistort_features(features.pixels, lens)
-    # 4. Place recognition and relative pose.
+    # 4. Localise the features in the map.
     view = View(camera=camera, pixels=pixels[is_valid], descriptors=features.descriptors[is_valid])
     check_comparisons(index, view, LocaliseOptions().candidates)
     return locate(index, view)
