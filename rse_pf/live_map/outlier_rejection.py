@@ -27,7 +27,7 @@ from rse_pf.live_map.pairwise_consistency import (
     classify_by_graph,
     decide_join,
     find_consistent_by_odometry,
-    has_enough_support,
+    find_supporting_edges,
     is_at_alias,
     total_weight,
 )
@@ -139,17 +139,8 @@ def reject_misfitting_edges(
 
 def _decide_within(graph: MapGraph, numbers: list[int], changes: GraphChanges) -> None:
     """Accept loop closures within one component that agree with the graph; weigh the others as evidence."""
-    if not numbers:
-        return
-    # 1. Classify them by the poses of the graph and the steps of odometry between both ends.
-    paths: dict[int, dict[int, float]] = {}
-    for number in numbers:
-        a = graph.edges[number].a
-        if a not in paths:
-            ends = [graph.edges[each].b for each in numbers if graph.edges[each].a == a]
-            paths[a] = graph.shortest_paths(a, ends)
-    steps = [paths[graph.edges[number].a][graph.edges[number].b] for number in numbers]
-    fits = dict(zip(numbers, classify_by_graph(graph, numbers, steps), strict=True))
+    # 1. Classify them by the poses of the graph.
+    fits = classify_by_graph(graph, numbers)
     changes.fits |= {
         "alias" if is_at_alias(graph, number) else fit
         for number, fit in fits.items()
@@ -168,13 +159,11 @@ def _decide_within(graph: MapGraph, numbers: list[int], changes: GraphChanges) -
         edge = graph.edges[number]
         if graph.component_of(edge.a) != graph.component_of(edge.b):
             continue
-        consistent = find_consistent_by_odometry(graph, number, _pending_parallels(graph, number))
-        if not has_enough_support(graph, consistent):
-            continue
-        if fit == "vague":
-            _accept(graph, consistent, changes)
-        else:
-            _reject_contradicted(graph, number, consistent, changes)
+        supporting = find_supporting_edges(graph, number)
+        if supporting and fit == "vague":
+            _accept(graph, supporting, changes)
+        elif supporting:
+            _reject_contradicted(graph, number, supporting, changes)
 
 
 def _drop_redundant_weak(graph: MapGraph, numbers: list[int]) -> list[int]:
@@ -200,14 +189,6 @@ def _has_full_weight_parallel(graph: MapGraph, number: int) -> bool:
             if graph.segment_rows[end] == graph.segment_rows[far] and parallel.weight == 1.0:
                 return True
     return False
-
-
-def _pending_parallels(graph: MapGraph, number: int) -> list[int]:
-    """Return the other pending loop closures between the same two segments."""
-    pair = graph.segment_pair_of(graph.edges[number])
-    return [
-        each for each in graph.pending if each != number and graph.segment_pair_of(graph.edges[each]) == pair
-    ]
 
 
 # --- Evidence against accepted loop closures ---

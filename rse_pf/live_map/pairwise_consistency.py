@@ -45,7 +45,7 @@ __all__ = [
     "classify_by_graph",
     "decide_join",
     "find_consistent_by_odometry",
-    "has_enough_support",
+    "find_supporting_edges",
     "is_at_alias",
     "relative_pose_between_components",
     "relative_scale",
@@ -164,31 +164,51 @@ def choose_testable_edges(graph: MapGraph, numbers: Sequence[int]) -> list[int]:
 # --- Loop closures within one component ---
 
 
-def classify_by_graph(graph: MapGraph, numbers: Sequence[int], steps: Sequence[float]) -> list[Fit]:
-    """Return how each loop closure within one component fits the poses of the graph.
-
-    Args:
-        graph: The pose graph.
-        numbers: The loop closures.
-        steps: Steps of odometry between both ends of each loop closure along the graph.
-    """
+def classify_by_graph(graph: MapGraph, numbers: Sequence[int]) -> dict[int, Fit]:
+    """Return by number how each of some loop closures within one component fits the poses of the graph."""
+    if not numbers:
+        return {}
     # 1. The relative poses that the graph predicts.
     edges = [graph.edges[number] for number in numbers]
     T = graph.T_component_camera
     predicted = inverse(T[[edge.a for edge in edges]]) @ T[[edge.b for edge in edges]]
-    # 2. The lever of rotation noise: on a round trip no pose is farther away than the diameter of the circle.
+    # 2. The steps of odometry between both ends along the graph.
+    targets: dict[int, list[int]] = {}
+    for edge in edges:
+        targets.setdefault(edge.a, []).append(edge.b)
+    paths = {a: graph.shortest_paths(a, ends) for a, ends in targets.items()}
+    steps = [paths[edge.a][edge.b] for edge in edges]
+    # 3. The lever of rotation noise: on a round trip no pose is farther away than the diameter of the circle.
     steps_between = np.maximum(np.array(steps), 1.0)
     distance_m = np.sqrt((predicted[:, :3, 3] ** 2).sum(axis=1))
     lever_m = np.maximum(distance_m, STEP_LENGTH_M * steps_between / math.pi)
-    # 3. The tests of pose and scale.
+    # 4. The tests of pose and scale.
     measured = _stack_edges([_edge_within_component(graph, edge) for edge in edges])
     agrees = fits_prediction(predicted, measured, steps_between, lever_m, TEST_NOISE)
     has_scale = [has_consistent_scale(graph, edge, along) for edge, along in zip(edges, steps, strict=True)]
     agrees &= np.array(has_scale, dtype=np.bool_)
-    return [
-        "contrary" if not is_consistent else "vague" if is_far else "agrees"
-        for is_consistent, is_far in zip(agrees, steps_between > MAX_CONFIRMED_STEPS, strict=True)
+    return {
+        number: "contrary" if not is_consistent else "vague" if is_far else "agrees"
+        for number, is_consistent, is_far in zip(
+            numbers, agrees, steps_between > MAX_CONFIRMED_STEPS, strict=True
+        )
+    }
+
+
+def find_supporting_edges(graph: MapGraph, number: int) -> list[int]:
+    """Return the pending loop closures that agree with *number* by odometry, if they have enough support.
+
+    They are between the same two segments as *number*, which is among them.  The list is empty if their
+    weight or the number of their keyframes is too small, see `has_enough_support`.
+    """
+    pair = graph.segment_pair_of(graph.edges[number])
+    parallels = [
+        other
+        for other in graph.pending
+        if other != number and graph.segment_pair_of(graph.edges[other]) == pair
     ]
+    consistent = find_consistent_by_odometry(graph, number, parallels)
+    return consistent if has_enough_support(graph, consistent) else []
 
 
 def has_consistent_scale(graph: MapGraph, edge: LoopEdge, steps: float = 0.0) -> bool:
