@@ -187,7 +187,7 @@ def test_too_many_comparisons_are_refused(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 @pytest.mark.parametrize("seed", range(12))
-def test_the_find_maximum_clique_does_not_depend_on_how_rows_are_coloured(
+def test_the_maximum_clique_does_not_depend_on_how_vertices_are_coloured(
     seed: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rng = np.random.default_rng(seed)
@@ -195,7 +195,7 @@ def test_the_find_maximum_clique_does_not_depend_on_how_rows_are_coloured(
     agree = upper | upper.T
 
     one_by_one = find_maximum_clique(agree)
-    monkeypatch.setattr(consistency, "_MANY_ROWS", 1)
+    monkeypatch.setattr(consistency, "MANY_VERTICES", 1)
 
     np.testing.assert_array_equal(find_maximum_clique(agree), one_by_one)
 
