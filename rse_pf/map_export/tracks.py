@@ -16,6 +16,7 @@ import numpy.typing as npt
 from rse_pf.geometry import Array, inverse, transform
 from rse_pf.maps.format import Keyframe, MapVersion
 from rse_pf.pnp import DepthNoise
+from rse_pf.slam.pose_graph import connected_components
 from rse_pf.slam.relative_pose import RelativePoseOptions, match_descriptors
 
 __all__ = ["Tracks", "find_tracks"]
@@ -68,15 +69,18 @@ def find_tracks(version: MapVersion, report: Callable[[float], None] = lambda do
         MissingExtra: The native core, which matches features, is not installed.
     """
     features = _collect_features(version)
-    # 1. Match pairs of keyframes, and join matched features to sets.
-    sets = _DisjointSets(len(features.keyframe))
+    # 1. Match pairs of keyframes in both directions, and join matched features to sets.
+    first_features, second_features = [np.empty(0, dtype=np.int64)], [np.empty(0, dtype=np.int64)]
     pairs = list(_keyframe_pairs(version))
     for number, (a, b) in enumerate(pairs):
         for first, second in ((a, b), (b, a)):
             first_rows, second_rows = _match(version.keyframes[first], version.keyframes[second])
-            sets.join(features.starts[first] + first_rows, features.starts[second] + second_rows)
+            first_features.append(features.starts[first] + first_rows)
+            second_features.append(features.starts[second] + second_rows)
         report((number + 1) / len(pairs))
-    roots = sets.roots()
+    roots = connected_components(
+        len(features.keyframe), np.concatenate(first_features), np.concatenate(second_features)
+    )
     # 2. Triangulate the point of each set, and remove observations far from its projection.
     row = np.argsort(roots, kind="stable")
     for _ in range(_OUTLIER_ROUNDS):
@@ -144,31 +148,6 @@ def _match(reference: Keyframe, view: Keyframe) -> tuple[Rows, Rows]:
     error = view.camera.project(points) - view.pixels[view_rows]
     is_near = np.linalg.norm(error, axis=1) <= _OUTLIER_PX
     return reference_rows[is_near], view_rows[is_near]
-
-
-class _DisjointSets:
-    """Disjoint sets of the numbers 0..n-1 by union-find; the root of a set is its smallest number."""
-
-    def __init__(self, count: int) -> None:
-        self._parent = list(range(count))
-
-    def join(self, first: Rows, second: Rows) -> None:
-        """Join the set of each number of *first* with that of the number at the same position of *second*."""
-        for a, b in zip(first.tolist(), second.tolist(), strict=True):
-            root_a, root_b = self._root(a), self._root(b)
-            if root_a != root_b:
-                self._parent[max(root_a, root_b)] = min(root_a, root_b)
-
-    def roots(self) -> Rows:
-        """Return the root of the set of each number, ``(n,)``."""
-        return np.array([self._root(number) for number in range(len(self._parent))], dtype=np.int64)
-
-    def _root(self, number: int) -> int:
-        parent = self._parent
-        while parent[number] != number:
-            parent[number] = parent[parent[number]]
-            number = parent[number]
-        return number
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

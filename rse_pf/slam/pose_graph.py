@@ -123,12 +123,12 @@ def is_positive_definite(information: Array) -> bool:
 
 
 def connected_components(n: int, a: npt.NDArray[np.int64], b: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    """Return for each pose the smallest row of its connected component, ``(n,)``, by union-find.
+    """Return for each node of a graph the smallest node of its connected component, ``(n,)``, by union-find.
 
     Args:
-        n: The number of poses.
-        a: ``(m,)``, the row of the first pose of each edge.
-        b: ``(m,)``, the row of the second pose of each edge.
+        n: The number of nodes, such as poses, which are numbered from 0.
+        a: ``(m,)``, the first node of each edge.
+        b: ``(m,)``, the second node of each edge.
     """
     parent = list(range(n))
 
