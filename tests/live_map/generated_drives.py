@@ -1,7 +1,7 @@
-"""Events of robots that drive through a generated building, with links measured from their true poses.
+"""Events of robots that drive through a generated building, with loop closures made from their true poses.
 
-No image is made: features are random, and what PnP would have measured is the truth with noise.  So a map of
-10,000 keyframes is made in seconds, and every wrong link is known.
+No image is rendered: features are random, and a measured relative pose is the true one with noise.  So a map
+of 10,000 keyframes is made in seconds, and every wrong loop closure is known.
 """
 
 from __future__ import annotations
@@ -27,9 +27,10 @@ from rse_pf.slam.keyframe import SentKeyframe, encode_keyframe, make_features, m
 __all__ = ["GeneratedDrive", "GeneratedWorld", "circle", "make_link", "straight"]
 
 CAMERA = Camera(fx=525.0, fy=525.0, cx=319.5, cy=239.5, width=640, height=480)
-STEP_M = 0.1
-LINK_SIGMA_M, LINK_SIGMA_DEG = 0.01, 0.4
-SCALE_SIGMA = 0.03
+STEP_M = 0.1  # metres between two keyframes along a path
+LINK_SIGMA_M = 0.01  # standard deviation of a loop closure along each axis, metres
+LINK_SIGMA_DEG = 0.4  # standard deviation of a loop closure around each axis, degrees
+SCALE_SIGMA = 0.03  # standard deviation of the logarithm of a measured scale
 INFORMATION = np.diag([0.02**-2] * 3 + [math.radians(0.7) ** -2] * 3)
 
 
@@ -37,7 +38,7 @@ INFORMATION = np.diag([0.02**-2] * 3 + [math.radians(0.7) ** -2] * 3)
 class GeneratedDrive:
     """A robot that follows a path: its true poses, and its odometry, which drifts.
 
-    With ``unit_m`` the odometry and the depths are in a unit of so many metres, which nobody is told.
+    With ``unit_m``, odometry and depths are in a unit of this many metres, which no event states.
     """
 
     robot: str
@@ -49,10 +50,12 @@ class GeneratedDrive:
 
 @dataclass(eq=False)
 class GeneratedWorld:
-    """Robots in one building; ``seen`` has the true pose of each keyframe in the map, by id.
+    """Robots in one building.
 
-    With ``twin_m``, what is at x looks like what is at x + ``twin_m``.  Random wrong links have
-    ``wrong_inliers``.
+    ``seen``, ``units_m`` and ``owners`` have the true pose, the unit, and (robot, number) of each keyframe by
+    id.  Keyframes within ``reach_m`` metres overlap; at most ``links`` loop closures are made for each.  With
+    ``twin_m``, the place at x looks like the place at x + ``twin_m`` metres.  Random wrong loop closures have
+    ``wrong_inliers`` inliers.
     """
 
     seed: int
@@ -108,9 +111,9 @@ class GeneratedWorld:
         )
 
     def links_of(self, keyframe: int, wrong: float = 0.0) -> LoopClosuresMeasured:
-        """Return the links of the newest keyframe to those that it truly overlaps; some may be wrong.
+        """Return the loop closures of the newest keyframe with those that it truly overlaps.
 
-        *wrong* is the share of links, measured in addition, that are random.
+        *wrong* is the probability of one more loop closure, which is random.
         """
         poses = self._poses(keyframe)
         links = []
@@ -132,7 +135,7 @@ class GeneratedWorld:
         return LoopClosuresMeasured(keyframe=keyframe, links=tuple(links))
 
     def _poses(self, count: int) -> Array:
-        """Return the first poses of ``seen`` as an array, which grows with it."""
+        """Return the first *count* poses of ``seen`` as an array ``(count, 4, 4)``."""
         of, known = self._stacked
         if of is not self.seen:  # a copy of a world drives on by itself
             self._stack, known = np.empty((0, 4, 4)), 0
@@ -147,7 +150,7 @@ class GeneratedWorld:
         return self._stack[:count]
 
     def _links_to_twin(self, keyframe: int, poses: Array, shift: float) -> list[MeasuredLoopClosure]:
-        """Return links to keyframes of the place that looks like that of *keyframe*."""
+        """Return loop closures with keyframes at the place that looks like that of *keyframe*."""
         shifted = self.seen[keyframe].copy()
         shifted[0, 3] += shift
         apart = np.sqrt(((poses[:, :3, 3] - shifted[:3, 3]) ** 2).sum(axis=1))
@@ -165,13 +168,13 @@ class GeneratedWorld:
         return step
 
     def true_link(self, keyframe: int, other: int) -> MeasuredLoopClosure:
-        """Return a link as PnP measures it."""
+        """Return a loop closure as PnP measures it: the true relative pose with noise."""
         sigma = np.array([LINK_SIGMA_M] * 3 + [math.radians(LINK_SIGMA_DEG)] * 3)
         link = make_link(other, self.step(keyframe, other) @ exp_se3(sigma * self.rng.normal(size=6)))
         return self.in_units(keyframe, link)
 
     def in_units(self, keyframe: int, link: MeasuredLoopClosure, ratio: float = 1.0) -> MeasuredLoopClosure:
-        """Return a link in metres as it is between keyframes whose units differ, its scale *ratio* wrong."""
+        """Return a loop closure in metres in the units of both keyframes, its scale wrong by *ratio*."""
         here, there = self.units_m[keyframe], self.units_m[link.other]
         if here is None and there is None:
             return link
@@ -197,7 +200,7 @@ class GeneratedWorld:
 
 
 def make_link(other: int, T_keyframe_other: Array, inliers: int = 100) -> MeasuredLoopClosure:
-    """Return a link with the noise that the map expects, and two thirds of its matches as inliers."""
+    """Return a loop closure with INFORMATION as its information; two thirds of its matches are inliers."""
     return MeasuredLoopClosure(
         other=other, T_keyframe_other=matrix_bytes(T_keyframe_other), information=matrix_bytes(INFORMATION),
         inliers=inliers, matches=3 * inliers // 2,

@@ -24,7 +24,7 @@ _BLOCKS_AT = 3
 _F_BASELINE = 50.0
 
 Drives = Mapping[str, tuple[bytes, ...]]
-"""The keyframes of each robot."""
+"""The encoded keyframes of each robot, in order."""
 Attack = Callable[[int, SentKeyframe], bytes]
 """Returns the bytes that the robot sends for keyframe *number*."""
 
@@ -91,7 +91,7 @@ def tell_truth(number: int, keyframe: SentKeyframe) -> bytes:
 
 
 def _with_block(keyframe: SentKeyframe, kind: int, content: bytes, flags: int = 0) -> bytes:
-    """Return a keyframe with one more block behind its own, whatever the block holds."""
+    """Return an encoded keyframe with one more block after its own ones."""
     data = bytearray(encode_keyframe(keyframe))
     data[_BLOCKS_AT] += 1
     return bytes(data) + _BLOCK.pack(kind, flags, len(content)) + content
@@ -129,7 +129,7 @@ def _with_baseline(keyframe: SentKeyframe, f_baseline: float) -> bytes:
 
 
 def jump(number: int, keyframe: SentKeyframe) -> bytes:
-    """Send each fifth keyframe 3 m aside."""
+    """Return a keyframe whose odometry is 3 m aside, if it is every fifth one."""
     T = keyframe.T_odom_camera.copy()
     T[:3, 3] += (3.0 if number % 5 == 4 else 0.0) * T[:3, 0]
     return _moved(keyframe, T)
@@ -149,7 +149,7 @@ REFUSED: dict[str, Attack] = {
     ),
     "unknown-required": lambda number, keyframe: _with_block(keyframe, _UNKNOWN_KIND, b"rig", flags=1),
 }
-"""Every keyframe of these is refused."""
+"""Attacks whose keyframes are all refused."""
 ACCEPTED: dict[str, Attack] = {
     "unknown-optional": lambda number, keyframe: encode_keyframe(
         replace(keyframe, unknown_blocks=(UnknownBlock(_UNKNOWN_KIND, bytes(1000)),))
@@ -157,4 +157,4 @@ ACCEPTED: dict[str, Attack] = {
     "false-gravity": _imu([1.0, 0.0, 0.0]),
     "false-motion": _imu([0.0, 1.0, 0.0], arm_m=9.9, motion=_FALSE_MOTION),
 }
-"""Keyframes of these are accepted, and move no other robot."""
+"""Attacks whose keyframes are accepted, and move no other robot."""

@@ -68,7 +68,7 @@ def _lying(world: GeneratedWorld, attack: str, positions: Array) -> GeneratedDri
 
 
 def without(events: Sequence[Event], robot: str) -> list[Event]:
-    """Return *events* as they are without *robot*: keyframes are numbered anew, links to it are left out."""
+    """Return *events* without those of *robot*, and without loop closures with it; ids are counted anew."""
     number_of: dict[int, int] = {}
     others: list[Event] = []
     count = 0

@@ -16,12 +16,12 @@ from rse_pf.slam.keyframe import decode_keyframe, encode_keyframe
 from tests.live_map.generated_drives import GeneratedWorld, circle
 
 DOWN = np.array([0.3, 0.9, -0.2]) / np.linalg.norm([0.3, 0.9, -0.2])
-"""In the world of the truth."""
+"""Direction of gravity in the true world, a unit vector."""
 FALSE = np.array([1.0, 0.0, 0.0])
 
 
 def published(downs: dict[str, Array]) -> tuple[MapVersion, GeneratedWorld]:
-    """Return the map of three robots, each of which says where down is in the world of the truth."""
+    """Return the published map of three robots, which state the directions of gravity *downs*."""
     world = GeneratedWorld(seed=3)
     drives = [
         world.drive(robot, circle(0.5, 0.7, phase=phase))

@@ -85,7 +85,7 @@ def step_of(metres: float) -> Array:
 
 
 def path(metres: list[float], is_metric: bool = True) -> MapGraph:
-    """Return a graph with one robot that says it is so far along its path at each keyframe."""
+    """Return a graph with one robot, whose odometry is at these metres along x, keyframe by keyframe."""
     graph = MapGraph()
     row = graph.find_or_add_segment("x", 0)
     graph.begin_segment(row, None if is_metric else 1.0, "")
@@ -105,20 +105,20 @@ JUMPED = [0.0, 0.2, 0.4, 0.6, 0.8, 4.0]
         (JUMPED, [link(4, step_of(-0.2)), link(3, step_of(-0.4))], True),
         (JUMPED, [link(4, step_of(-0.2)), link(3, step_of(-3.4))], False),  # one of two agrees
         (JUMPED, [link(4, step_of(-0.2), inliers=16)], False),
-        (JUMPED, [link(0, step_of(-1.0))], False),  # long before: it may look like another place
+        (JUMPED, [link(0, step_of(-1.0))], False),  # long before: the place may look like another one
         (JUMPED, [], False),
         ([0.0, 0.2, 0.4, 0.6, 0.8, 1.7], [link(4, step_of(-0.2))], False),
         ([0.0, 5.0, 10.0, 15.0, 20.0, 25.0], [link(4, step_of(-3.8))], False),  # a car
     ],
 )
-def test_a_keyframe_is_off_its_path_where_those_just_before_see_it_elsewhere(
+def test_odometry_has_jumped_where_all_keyframes_just_before_contradict_it(
     metres: list[float], links: list[MeasuredLoopClosure], is_off: bool
 ) -> None:
     assert has_odometry_jump(path(metres), 5, links) is is_off
     assert not has_odometry_jump(path(metres, is_metric=False), 5, links)
 
 
-def test_a_keyframe_off_its_path_is_compared_with_nothing_and_counts_as_a_contradiction(
+def test_a_keyframe_after_a_jump_is_compared_with_nothing_and_counts_as_a_contradiction(
     drives: Drives,
 ) -> None:
     live_map = LiveMap()

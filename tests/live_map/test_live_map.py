@@ -1,4 +1,4 @@
-"""The live map as a state machine: generated drives, whose true poses and wrong links are known."""
+"""The live map as a state machine: generated drives with known true poses and wrong loop closures."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ ROUND = circle(0.5, 1.2)
 
 
 class Run:
-    """A map, the events that made it, and what came of each."""
+    """A map, its events, and the outcomes of each event."""
 
     def __init__(self, world: GeneratedWorld) -> None:
         self.world, self.map = world, LiveMap()
@@ -146,7 +146,7 @@ def test_a_snapshot_in_parts_is_the_same_map_and_writes_what_is_new() -> None:
     assert len(first.parts) == 2
 
 
-def test_a_part_is_made_anew_when_half_of_it_is_gone() -> None:
+def test_a_part_is_encoded_again_when_half_of_its_features_were_dropped() -> None:
     run = _unmeasured(GeneratedWorld(seed=6), 128)
     first = run.map.snapshot_parts()
     for i in range(64):
@@ -211,7 +211,7 @@ def test_a_damaged_snapshot_is_refused(joined: Run) -> None:
         LiveMap.restore(joined.map.snapshot()[:-100])
 
 
-def test_links_that_do_not_agree_join_nothing() -> None:
+def test_inconsistent_loop_closures_join_nothing() -> None:
     run, world = _two_apart()
     rng = np.random.default_rng(3)
     for k in range(12, 18):
@@ -221,7 +221,7 @@ def test_links_that_do_not_agree_join_nothing() -> None:
     assert [each.robot for each in run.of(Joined)] == ["a"]
 
 
-def test_links_from_one_keyframe_join_nothing() -> None:
+def test_loop_closures_of_one_keyframe_join_nothing() -> None:
     run, world = _two_apart()
     links = tuple(world.true_link(12, other) for other in (0, 1, 2, 3))
     run.apply(LoopClosuresMeasured(keyframe=12, links=links))
@@ -230,8 +230,8 @@ def test_links_from_one_keyframe_join_nothing() -> None:
     assert [each.robot for each in run.of(Joined)] == ["a"]
 
 
-def test_robots_that_are_joined_already_need_one_link_only() -> None:
-    """Links are judged by component: c is known through b, so one link to a is enough."""
+def test_robots_of_one_component_need_one_loop_closure_only() -> None:
+    """Robot c is in the component of robot a through robot b, so one loop closure with a is accepted."""
     world = GeneratedWorld(seed=5, links=0)
     drives = [world.drive(name, ROUND[:12]) for name in ("a", "b", "c")]
     run = Run(world)
@@ -248,7 +248,7 @@ def test_robots_that_are_joined_already_need_one_link_only() -> None:
     assert run.map.loop_closure_count == believed + 1
 
 
-def test_planted_links_are_removed_soon_after_contrary_evidence() -> None:
+def test_planted_loop_closures_are_rejected_soon_after_contrary_evidence() -> None:
     run, world = _two_apart()
     wrong = exp_se3([1.5, 0.3, 0.0, 0.0, 0.4, 0.0])
     for k in range(12, 16):
@@ -272,7 +272,7 @@ def test_a_robot_keeps_its_alignment_when_the_first_robot_is_forgotten(joined: R
     told = run.apply(RobotForgotten(robot="a"))
     aligned = {each.robot: each.aligned for each in run.map.alignments()}
 
-    assert aligned == {"b": True}  # the map's frame stays with what is left of it
+    assert aligned == {"b": True}  # robot b defines the frame of the map now
     assert not [each for each in told if isinstance(each, Unaligned)]
     assert run.map.contributors == ("b",)
 
@@ -299,7 +299,7 @@ def test_a_robot_that_meets_in_the_second_of_equal_rooms_whom_it_met_in_the_firs
             live_map.apply(world.keyframe(drive, number))
     first_b, in_second = len(c.T_world_camera), len(c.T_world_camera) - steps
     shift = world.seen[0] @ inverse(world.seen[in_second])
-    for near in range(3 * steps):  # more than are ever compared at once
+    for near in range(3 * steps):  # more than the map ever tests at once
         k = first_b + near % steps
         other = (near % steps + near // steps) % steps
         link = make_link(other, inverse(world.seen[k]) @ inverse(shift) @ world.seen[other])
@@ -317,7 +317,7 @@ def test_a_robot_that_meets_in_the_second_of_equal_rooms_whom_it_met_in_the_firs
 
 
 def test_robots_in_rooms_that_may_be_equal_are_joined_by_more_than_a_room() -> None:
-    """The links of two equal rooms and those of one are the same numbers, so the map must be told."""
+    """Two equal rooms and one room give the same loop closures, so an operator states the size of rooms."""
     world = GeneratedWorld(seed=2, links=2)
     way = np.column_stack([np.arange(0.0, 3.0, 0.1), np.zeros(30)])
     run = Run(world)
@@ -381,7 +381,7 @@ def test_malformed_keyframes_are_refused_before_they_are_logged(change: dict[str
     assert live.digest() == before
 
 
-def test_links_to_keyframes_that_were_forgotten_change_nothing(joined: Run) -> None:
+def test_loop_closures_of_forgotten_keyframes_change_nothing(joined: Run) -> None:
     run = copy_of(joined)
     newest = len(run.world.seen) - 1
     late = LoopClosuresMeasured(
@@ -473,7 +473,7 @@ def _unmeasured(world: GeneratedWorld, count: int) -> Run:
 
 
 def _two_apart() -> tuple[Run, GeneratedWorld]:
-    """Return a map of two robots, 12 and 36 keyframes, without any link."""
+    """Return a map of two robots, 12 and 36 keyframes, without any loop closure."""
     world = GeneratedWorld(seed=5, links=0, drift_m=0.001, drift_deg=0.05)
     run = Run(world)
     a, b = world.drive("a", ROUND[:12]), world.drive("b", ROUND[:36])

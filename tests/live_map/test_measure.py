@@ -29,7 +29,7 @@ def numbered(number: int):
     return number, FEATURES[number], CAMERA
 
 
-def test_a_link_is_the_pose_of_the_other_in_the_frame_of_the_keyframe():
+def test_a_loop_closure_is_the_pose_of_the_other_keyframe_in_the_frame_of_the_new_one():
     found = measure_loop_closures(numbered(0), [numbered(1), numbered(2)])
 
     assert [link.other for link in found.links] == [1, 2]
@@ -41,7 +41,7 @@ def test_a_link_is_the_pose_of_the_other_in_the_frame_of_the_keyframe():
         assert 40 <= link.inliers <= link.matches
 
 
-def test_the_information_is_that_of_an_edge_with_the_floor():
+def test_the_covariance_has_a_minimum():
     options = RelativePoseOptions()
     (link,) = measure_loop_closures(numbered(0), [numbered(1)], options).links
 
@@ -60,7 +60,7 @@ def test_places_that_have_nothing_in_common_fail_with_their_reason():
     assert found.failed == {"no-matches": 1}
 
 
-def test_candidates_that_are_measured_in_two_pieces_give_the_same_links_and_failures():
+def test_candidates_that_are_measured_in_two_pieces_give_the_same_event():
     others = [numbered(3), numbered(1), numbered(2)]
     whole = measure_loop_closures(numbered(0), others)
 
@@ -71,14 +71,14 @@ def test_candidates_that_are_measured_in_two_pieces_give_the_same_links_and_fail
     assert merge_measurements(0, [LoopClosuresMeasured(keyframe=0, failed={"a": 1})] * 2).failed == {"a": 2}
 
 
-def test_too_few_inliers_are_no_link():
+def test_too_few_inliers_are_no_loop_closure():
     found = measure_loop_closures(numbered(0), [numbered(1)], RelativePoseOptions(min_inliers=700))
 
     assert found.links == ()
     assert sum(found.failed.values()) == 1
 
 
-def test_a_pose_that_the_evidence_calls_weak_is_no_link():
+def test_a_weakly_determined_pose_is_no_loop_closure():
     near = FEATURES[0].pixels[:, 0] < 25  # a narrow column of the image
     narrow = KeyframeFeatures(
         pixels=FEATURES[0].pixels[near], depths_m=FEATURES[0].depths_m[near],
@@ -91,7 +91,7 @@ def test_a_pose_that_the_evidence_calls_weak_is_no_link():
     assert found.failed == {"nearly-collinear": 1}
 
 
-def test_a_view_of_fewer_than_two_features_gives_no_link():
+def test_a_view_of_fewer_than_two_features_gives_no_loop_closure():
     one = KeyframeFeatures(
         pixels=FEATURES[0].pixels[:1], depths_m=FEATURES[0].depths_m[:1],
         descriptors=FEATURES[0].descriptors[:1],
@@ -126,7 +126,7 @@ def noisy_pair(seed: int, noise: DepthNoise) -> tuple[bytes, bytes, Array]:
     return encoded(pixels, depths_m), encoded(KINECT.project(seen), seen[:, 2]), T_a_b
 
 
-def test_links_of_stored_keyframes_weigh_their_depths_by_the_noise_that_they_carry():
+def test_stored_keyframes_weigh_their_depths_by_the_noise_that_they_state():
     def median_error_m(noise: DepthNoise) -> float:
         errors = []
         for seed in range(40):

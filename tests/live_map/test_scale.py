@@ -1,4 +1,4 @@
-"""Robots with one lens in a live map: the scale of their segments is found where others have metres."""
+"""Robots with one lens in a live map: overlap with metric segments gives the scale of their segments."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ Tamper = Callable[[GeneratedWorld, int, MeasuredLoopClosure], MeasuredLoopClosur
 
 
 class Run:
-    """Robots in one live map, what it told, and how far it is from the truth."""
+    """Robots in one live map, the alignments that it reported, and its errors."""
 
     def __init__(self, seed: int, units_m: dict[str, float | None], wrong: float = 0.0) -> None:
         self.world, self.map = GeneratedWorld(seed=seed), LiveMap()
@@ -79,7 +79,7 @@ class Run:
 
 
 @pytest.mark.parametrize(("seed", "unit_m"), [(0, 0.37), pytest.param(1, 2.9, marks=pytest.mark.slow)])
-def test_a_robot_without_metres_gets_them_from_one_with(seed: int, unit_m: float) -> None:
+def test_a_robot_without_metric_scale_gets_it_from_a_metric_one(seed: int, unit_m: float) -> None:
     run = Run(seed, {"a": None, "b": unit_m, "c": None}, wrong=0.3).play()
     [lens] = [each for each in run.map.alignments() if each.robot == "b"]
 
@@ -95,7 +95,7 @@ def test_a_robot_without_metres_gets_them_from_one_with(seed: int, unit_m: float
     assert all(each.scale is None for each in run.told if isinstance(each, Corrected) and each.robot != "b")
 
 
-def test_the_first_robot_of_a_map_may_have_no_metres() -> None:
+def test_the_first_robot_of_a_map_may_have_no_metric_scale() -> None:
     run = Run(3, {"a": 0.5, "b": 3.0})
     run.play()
     before = run.map.alignments()
@@ -129,7 +129,7 @@ def test_a_replay_and_a_snapshot_with_scales_are_equal_to_the_byte() -> None:
     assert restored.digest() == run.map.digest()
 
 
-def test_a_version_has_the_segments_without_metres_in_metres() -> None:
+def test_a_version_is_in_metres() -> None:
     run = Run(5, {"a": None, "b": 0.4}).play()
 
     version = run.map.to_version()
@@ -144,7 +144,7 @@ def test_a_version_has_the_segments_without_metres_in_metres() -> None:
         assert pose_difference(edge.T_a_b, step)[0] < 0.1
 
 
-def test_links_whose_scales_contradict_each_other_join_nothing() -> None:
+def test_loop_closures_whose_scales_contradict_each_other_join_nothing() -> None:
     rng = np.random.default_rng(0)
 
     def tamper(world: GeneratedWorld, keyframe: int, link: MeasuredLoopClosure) -> MeasuredLoopClosure:
@@ -157,7 +157,7 @@ def test_links_whose_scales_contradict_each_other_join_nothing() -> None:
     assert [each.aligned for each in run.map.alignments()] == [True, False]
 
 
-def test_links_within_the_map_whose_scale_is_wrong_are_not_believed() -> None:
+def test_loop_closures_within_the_map_whose_scale_is_wrong_are_not_accepted() -> None:
     run = Run(7, {"a": None, "b": 0.4}).play()
     newest = run.ids("b")[-1]
     near = min(run.ids("a"), key=lambda i: pose_difference(run.world.seen[i], run.world.seen[newest])[0])
@@ -191,7 +191,7 @@ def test_a_false_scale_moves_no_other_robot(lie: float) -> None:
     honest = Run(8, {"a": None, "b": None, HOSTILE: 0.7}).play()
     alone = play(without(attacked.log, HOSTILE))
 
-    if lie == 0.5:  # it is not believed, so the map is the one without it
+    if lie == 0.5:  # the robot is not joined, so the map is the one without it
         kept = [i for i, (name, _) in enumerate(attacked.world.owners) if name != HOSTILE]
         for number, i in enumerate(kept):
             assert pose_difference(attacked.map.pose(i), alone.live_map.pose(number))[0] < 1e-3
@@ -238,7 +238,7 @@ def test_rooms_of_a_stated_size_are_measured_in_metres() -> None:
 
 
 @pytest.mark.parametrize("units_m", [(0.5, 3.0), (None, 3.0), (0.5, None)])
-def test_a_link_says_one_place_whichever_of_its_ends_was_measured(
+def test_a_loop_closure_gives_one_pose_whichever_of_its_ends_was_measured(
     units_m: tuple[float | None, float | None],
 ) -> None:
     world, live_map = GeneratedWorld(seed=12), LiveMap()
@@ -266,7 +266,7 @@ def test_a_link_says_one_place_whichever_of_its_ends_was_measured(
             np.testing.assert_allclose(ends.T_a_b, scaled(world.step(stay, moving), length), atol=1e-9)
 
 
-def test_links_of_one_place_whose_scales_differ_do_not_agree() -> None:
+def test_loop_closures_of_one_place_whose_scales_differ_are_not_consistent() -> None:
     T = np.array([np.eye(4)] * 2)
 
     def ends(log_scale: float) -> EdgeArrays:
@@ -282,7 +282,7 @@ def test_links_of_one_place_whose_scales_differ_do_not_agree() -> None:
     assert not agree(0.9)
 
 
-# --- measured from features ---
+# --- Scales measured from features ---
 
 WORLD, TRUTH = make_world(3, points=4000).walk("r", np.array([0.0, 0.02, 0.04, 0.5]), seed=1)
 CAMERA = WORLD.keyframes[0].camera
@@ -297,7 +297,7 @@ def features(number: int, unit_m: float | None) -> KeyframeFeatures:
 
 
 @pytest.mark.parametrize("units_m", [(None, 0.01), (0.3, None), (5.0, 0.2), (1e-3, 1e3)])
-def test_a_link_measures_pose_and_scale(units_m: tuple[float | None, float | None]) -> None:
+def test_a_loop_closure_measures_pose_and_scale(units_m: tuple[float | None, float | None]) -> None:
     [link] = measure_loop_closures(
         (0, features(0, units_m[0]), CAMERA), [(1, features(1, units_m[1]), CAMERA)]
     ).links
@@ -316,14 +316,14 @@ def test_a_link_measures_pose_and_scale(units_m: tuple[float | None, float | Non
     assert 0.015 < deviation < 0.06
 
 
-def test_links_in_metres_have_no_scale_and_the_bytes_that_they_had() -> None:
+def test_loop_closures_in_metres_have_no_scale_and_their_earlier_bytes() -> None:
     found = measure_loop_closures((0, features(0, None), CAMERA), [(1, features(1, None), CAMERA)])
 
     assert found.links[0].scale is None
     assert b"scale" not in encode_events([found])
 
 
-# --- fitted with poses ---
+# --- Scales estimated together with poses ---
 
 
 def test_a_scale_is_fitted_with_the_poses_of_a_chain() -> None:
@@ -357,7 +357,7 @@ def test_a_scale_is_fitted_with_the_poses_of_a_chain() -> None:
 
 
 def _in_metres(world: GeneratedWorld, keyframe: int, link: MeasuredLoopClosure) -> MeasuredLoopClosure:
-    """Return a link as `GeneratedWorld.in_units` got it."""
+    """Return the loop closure in metres that `GeneratedWorld.in_units` would convert to *link*."""
     here, there = world.units_m[keyframe], world.units_m[link.other]
     length: float = here if here is not None and there is not None else 1.0
     T: Array = scaled(matrix_of(link.T_keyframe_other, 4, 4), length)

@@ -1,4 +1,4 @@
-"""The smoother finds true poses from noisy edges, some of which are wrong, and holds what it must hold."""
+"""The smoother finds true poses from noisy edges, some of which are wrong, and moves no held pose."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def fit(graph: PoseGraph, start: Array) -> SmoothedPoses:
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
-def test_a_wrong_link_does_not_move_the_poses(seed: int) -> None:
+def test_a_wrong_loop_closure_does_not_move_the_poses(seed: int) -> None:
     true, start, graph = problem(seed)
 
     off = log_se3(inverse(true) @ fit(graph, start).T)

@@ -1,4 +1,4 @@
-"""A link with few inliers counts in part: it joins with others that agree, and never against many."""
+"""A loop closure with few inliers has partial weight: it joins robots together with others only."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from rse_pf.slam.consistency import evidence_weight
 from tests.live_map.generated_drives import GeneratedWorld, circle, make_link
 
 WEAK_INLIERS = 20
-"""Two thirds of a strong link."""
+"""Inliers of a loop closure with a weight of two thirds."""
 
 
 @pytest.mark.parametrize(
     ("inliers", "matches", "weight"), [(30, 60, 1.0), (90, 100, 1.0), (15, 20, 0.5), (60, 240, 0.5)]
 )
-def test_a_link_counts_by_the_lesser_of_its_inliers_and_their_share(
+def test_the_weight_is_the_smaller_one_by_inliers_and_by_inlier_ratio(
     inliers: int, matches: int, weight: float
 ) -> None:
     assert evidence_weight(inliers, matches) == weight
 
 
-def test_three_weak_links_that_agree_join_nothing_and_five_do() -> None:
+def test_three_weak_loop_closures_that_agree_join_nothing_and_five_do() -> None:
     live_map, world = two_apart()
 
     joined = [add(live_map, 12 + k, weak(world.true_link(12 + k, k))) for k in range(5)]
@@ -35,7 +35,7 @@ def test_three_weak_links_that_agree_join_nothing_and_five_do() -> None:
     assert live_map.loop_closure_count == 5
 
 
-def test_weak_links_add_to_strong_ones() -> None:
+def test_weak_loop_closures_add_to_those_of_full_weight() -> None:
     live_map, world = two_apart()
 
     joined = [add(live_map, 12 + k, world.true_link(12 + k, k)) for k in range(2)]
@@ -44,7 +44,7 @@ def test_weak_links_add_to_strong_ones() -> None:
     assert joined == [False, False, False, True]
 
 
-def test_strong_links_join_although_more_weak_ones_agree_on_another_place() -> None:
+def test_full_weight_joins_although_more_weak_loop_closures_agree_on_another_place() -> None:
     live_map, world = two_apart()
     off = exp_se3([1.5, 0.3, 0.0, 0.0, 0.4, 0.0])
     moved = world.seen[0] @ off @ inverse(world.seen[0])
@@ -58,18 +58,20 @@ def test_strong_links_join_although_more_weak_ones_agree_on_another_place() -> N
     assert {(a, b) for a, b, _ in live_map.accepted_loop_closures()} == {(16, 4), (17, 5), (18, 6)}
 
 
-def test_a_weak_link_is_believed_where_no_strong_one_ties_its_keyframe() -> None:
+def test_a_weak_loop_closure_is_accepted_where_no_full_weight_one_connects_its_keyframe() -> None:
     live_map, world = joined_robots()
     before = live_map.loop_closure_count
 
-    add(live_map, 15, weak(world.true_link(15, 4)))  # a strong link ties 15 to the other robot
+    add(
+        live_map, 15, weak(world.true_link(15, 4))
+    )  # keyframe 15 has a full-weight loop closure with the other robot
     tied = live_map.loop_closure_count
     add(live_map, 17, weak(world.true_link(17, 5)))
 
     assert (tied, live_map.loop_closure_count) == (before, before + 1)
 
 
-def test_weak_links_that_contradict_the_map_do_not_exclude_their_robot() -> None:
+def test_weak_loop_closures_that_contradict_the_map_do_not_exclude_their_robot() -> None:
     live_map, world = joined_robots()
     rng = np.random.default_rng(2)
 
@@ -82,7 +84,7 @@ def test_weak_links_that_contradict_the_map_do_not_exclude_their_robot() -> None
     assert live_map.loop_closure_count == 4
 
 
-def test_a_weak_link_is_taken_for_less_exact() -> None:
+def test_the_information_of_a_weak_loop_closure_is_reduced() -> None:
     live_map, world = joined_robots()
     strong, few = world.true_link(17, 5), weak(world.true_link(18, 6))
     for k, link in ((17, strong), (18, few)):
@@ -94,7 +96,7 @@ def test_a_weak_link_is_taken_for_less_exact() -> None:
     np.testing.assert_allclose(of_links[1], of_links[0] * (2.0 / 3.0) ** 2)
 
 
-def test_random_wrong_links_with_few_inliers_are_not_believed() -> None:
+def test_random_wrong_loop_closures_with_few_inliers_are_not_accepted() -> None:
     world = GeneratedWorld(seed=4, wrong_inliers=WEAK_INLIERS)
     live_map = LiveMap()
     drives = [world.drive(name, circle(0.5, 1.2, phase)) for name, phase in (("a", 0.0), ("b", 3.0))]
@@ -113,13 +115,13 @@ def weak(link: MeasuredLoopClosure, inliers: int = WEAK_INLIERS) -> MeasuredLoop
 
 
 def add(live_map: LiveMap, keyframe: int, link: MeasuredLoopClosure) -> bool:
-    """Give a link to the map; return whether both robots are in it now."""
+    """Add a measured loop closure of *keyframe* to the map; return whether all robots are aligned now."""
     live_map.apply(LoopClosuresMeasured(keyframe=keyframe, links=(link,)))
     return all(each.aligned for each in live_map.alignments())
 
 
 def two_apart() -> tuple[LiveMap, GeneratedWorld]:
-    """Return a map of two robots, 12 and 36 keyframes of one way, without any link."""
+    """Return a map of two robots, 12 and 36 keyframes along the same path, without any loop closure."""
     world = GeneratedWorld(seed=5, links=0, drift_m=0.001, drift_deg=0.05)
     live_map = LiveMap()
     way = circle(0.5, 1.2)
@@ -131,7 +133,7 @@ def two_apart() -> tuple[LiveMap, GeneratedWorld]:
 
 
 def joined_robots() -> tuple[LiveMap, GeneratedWorld]:
-    """Return the map of `two_apart` after four strong links, of the keyframes 12 to 15."""
+    """Return the map of `two_apart` after full-weight loop closures of the keyframes 12 to 15 joined it."""
     live_map, world = two_apart()
     for k in range(12, 16):
         add(live_map, k, world.true_link(k, k - 12))

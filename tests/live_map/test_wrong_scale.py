@@ -1,4 +1,4 @@
-"""A robot whose metres are not those of two others: its loop closures show it, and it is excluded."""
+"""A robot whose metric scale differs from that of two others: its loop closures show it; it is excluded."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from tests.live_map.hostile_rig import generated_drives
 
 
 def graph_of(*robots: str) -> MapGraph:
-    """Return a graph with one keyframe of each robot, without links."""
+    """Return a graph with one keyframe of each robot, without loop closures."""
     graph = MapGraph()
     for robot in robots:
         row = graph.find_or_add_segment(robot, 0)
@@ -52,20 +52,22 @@ def link(other: int, off_scale: float, inliers: int = 100) -> MeasuredLoopClosur
         ([], False),
     ],
 )
-def test_metres_are_others_where_two_robots_say_so(links: list[MeasuredLoopClosure], is_other: bool) -> None:
+def test_a_scale_is_wrong_where_two_robots_differ_alike(
+    links: list[MeasuredLoopClosure], is_other: bool
+) -> None:
     graph = graph_of("x", "a", "b", "c")
 
     assert has_wrong_scale(graph, 0, links) is is_other
 
 
-def test_robots_without_metres_say_nothing_of_them() -> None:
+def test_robots_without_metric_scale_are_no_evidence() -> None:
     graph = graph_of("x", "a", "b")
     graph.segments[1].is_metric = False
 
     assert not has_wrong_scale(graph, 0, [link(1, 0.1), link(2, 0.1)])
 
 
-def test_after_eight_keyframes_with_other_metres_a_robot_is_excluded() -> None:
+def test_after_eight_keyframes_with_a_wrong_scale_a_robot_is_excluded() -> None:
     graph = graph_of("x", "a", "b")
 
     gone = [exclude_if_contradicting(graph, 0, GraphChanges(), is_scale_wrong=True) for _ in range(8)]
@@ -77,7 +79,7 @@ def test_after_eight_keyframes_with_other_metres_a_robot_is_excluded() -> None:
 
 
 @pytest.mark.parametrize(("factor", "least"), [(1.0, 0.0), (1.1, 0.06), (1 / 1.1, 0.06), (1.5, 0.3)])
-def test_depths_of_both_keyframes_tell_the_ratio_of_their_metres(factor: float, least: float) -> None:
+def test_depths_of_both_keyframes_give_the_ratio_of_their_scales(factor: float, least: float) -> None:
     sent = generated_drives(seed=1, keyframes=6)["a"]
     one, other = (decode_keyframe(data) for data in sent[2:4])
     seen = other.features
@@ -85,14 +87,14 @@ def test_depths_of_both_keyframes_tell_the_ratio_of_their_metres(factor: float, 
 
     (measured,) = measure_loop_closures((0, one.features, one.camera), [(1, false, other.camera)]).links
 
-    # A metre of the second one is shorter if it reads too many.
+    # The second robot's metre is shorter if its depths are too large.
     off_scale = measured.off_scale or 0.0
     assert -off_scale * math.copysign(1.0, math.log(factor)) >= least
     assert abs(off_scale) <= 1.3 * abs(math.log(factor))
 
 
 @pytest.mark.parametrize(("off_scale", "gone"), [(0.1, {"x"}), (None, set())])
-def test_a_map_lets_go_a_robot_whose_links_say_that_its_metres_are_others(
+def test_a_map_unaligns_a_robot_whose_loop_closures_show_a_wrong_scale(
     off_scale: float | None, gone: set[str]
 ) -> None:
     world, live = GeneratedWorld(seed=1), LiveMap()
