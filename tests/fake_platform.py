@@ -147,7 +147,7 @@ class FakePlatform:
         self.tokens_seen: list[str] = []
         self.refusals: list[tuple[int, int | None]] = []
         self.refuses_as_firewall = False
-        self.told: dict[str, Any] = {}
+        self.refusal_members: dict[str, Any] = {}
         self.hold = False
         self.welcomes = True
         self.on_command: Callable[[FakeSocket, Command], Awaitable[Answer | None]] | None = None
@@ -249,7 +249,7 @@ class FakePlatform:
         self.tokens_seen.append(given)
         if self.refusals:
             status, retry_after = self.refusals.pop(0)
-            return _refusal(status, retry_after, is_firewall=self.refuses_as_firewall, **self.told)
+            return _refusal(status, retry_after, is_firewall=self.refuses_as_firewall, **self.refusal_members)
         if self.token is not None and given != self.token:
             return _refusal(401, None)
         if request.path != "/ws":

@@ -70,6 +70,39 @@ TIME_ERRORS = (9, 10)
 NAME_ERRORS = (62, 64)
 """Codes of X509_verify_cert_error_string(3) for certificates of another host name or IP address."""
 
+NO_SERVER_OF_OURS = (
+    ", and it is not an RSE-PF server that says so",
+    "a firewall or a login page between robot and platform answered: ask who runs the network",
+)
+NO_SERVER_BEHIND_PROXY = (
+    ": a proxy in front of the platform reaches no server",
+    "check that the servers of the platform run; {retry}",
+)
+CAUSE_AND_HINT = {
+    401: NO_SERVER_OF_OURS,
+    403: NO_SERVER_OF_OURS,
+    407: (
+        ": a proxy asks for a user name and a password",
+        "set {variable}=http://USER:PASSWORD@PROXY:PORT",
+    ),
+    413: (
+        ": a proxy on the way limits the size of uploads",
+        "let the proxy in front of the platform pass bodies of 1 MiB (nginx: client_max_body_size)",
+    ),
+    426: (
+        ": a proxy on the way removed the header Upgrade",
+        "let the proxy in front of the platform pass on the headers Upgrade and Connection",
+    ),
+    429: (": too many attempts to connect", "{retry}"),
+    451: NO_SERVER_OF_OURS,
+    502: NO_SERVER_BEHIND_PROXY,
+    503: (": the platform is full, or is starting", "{retry}"),
+    504: NO_SERVER_BEHIND_PROXY,
+    511: (": this network lets nothing pass before a login", "{login}"),
+}
+"""Cause and hint of the HTTP statuses that have one usual cause; the fields of a hint are filled in later:
+when to try again, where to log in, and the environment variable that names the proxy."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class HttpAnswer:
@@ -124,42 +157,26 @@ def explain_answer(address: str, answer: HttpAnswer) -> ConnectError:
     The cause is told by the status first, then by headers and body.
     """
     status, statement = answer.status, f"{address} answers {answer.shown_status}"
+    # 1. A wrong scheme in the URL, or headers of the upgrade that a proxy removed on the way to RSE-PF.
+    if status == 400 and TLS_WANTED.search(answer.body) and not _is_tls_address(address):
+        return _explain_tls(address)
+    if status == 400 and refusal_in(answer.body, "bad-message") is not None:
+        status = 426
+    # 2. A status with one usual cause.
     retry = _retry_hint(answer)
-    # 1. Machines of the network between robot and platform.
-    if status == 407:
+    if status in CAUSE_AND_HINT:
+        cause, hint = CAUSE_AND_HINT[status]
         variable = f"{WEB_SCHEME[urlsplit(address).scheme].upper()}_PROXY"
-        hint = f"set {variable}=http://USER:PASSWORD@PROXY:PORT"
-        return ConnectError(f"{statement}: a proxy asks for a user name and a password", hint=hint)
-    if status == 511:
-        hint = _login_hint(address)
-        return ConnectError(f"{statement}: this network lets nothing pass before a login", hint=hint)
+        hint = hint.format(retry=retry, login=_login_hint(address), variable=variable)
+        return ConnectError(f"{statement}{cause}", hint=hint)
+    # 3. Redirects and pages, whose target or content tells the cause.
     if 300 <= status < 400:
         return _explain_redirect(address, answer)
     if 200 <= status < 300 or status == 101:
         return _explain_success(address, answer)
-    if status in (401, 403, 451):
-        hint = "a firewall or a login page between robot and platform answered: ask who runs the network"
-        return ConnectError(f"{statement}, and it is not an RSE-PF server that says so", hint=hint)
-    # 2. A wrong scheme, and proxies in front of the platform that change or limit requests.
-    if status == 400 and TLS_WANTED.search(answer.body) and not _is_tls_address(address):
-        return _explain_tls(address)
-    if status == 426 or (status == 400 and refusal_in(answer.body, "bad-message") is not None):
-        hint = "let the proxy in front of the platform pass on the headers Upgrade and Connection"
-        return ConnectError(f"{statement}: a proxy on the way removed the header Upgrade", hint=hint)
-    if status == 413:
-        hint = "let the proxy in front of the platform pass bodies of 1 MiB (nginx: client_max_body_size)"
-        return ConnectError(f"{statement}: a proxy on the way limits the size of uploads", hint=hint)
-    # 3. A platform that is overloaded or broken.
-    if status == 429:
-        return ConnectError(f"{statement}: too many attempts to connect", hint=retry)
-    if status == 503:
-        return ConnectError(f"{statement}: the platform is full, or is starting", hint=retry)
-    if status in (502, 504):
-        hint = f"check that the servers of the platform run; {retry}"
-        return ConnectError(f"{statement}: a proxy in front of the platform reaches no server", hint=hint)
+    # 4. A server that failed, or another program.
     if status >= 500 and status not in (501, 505):
         return ConnectError(f"{statement}: the server failed", hint=f"see the log of the server; {retry}")
-    # 4. Another program.
     server = _shorten(answer.headers.get("server", ""))
     sender = f" (a server that calls itself {server!r})" if server else ""
     has_server_path = urlsplit(address).path.rstrip("/").endswith("/ws") or not address.startswith("ws")

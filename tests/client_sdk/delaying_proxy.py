@@ -24,7 +24,7 @@ class DelayingProxy:
 
     @property
     def url(self) -> str:
-        """What a robot connects to."""
+        """Address of the relay, to which a robot connects."""
         return f"ws://127.0.0.1:{self.port}/ws"
 
     async def __aenter__(self) -> DelayingProxy:
@@ -33,7 +33,7 @@ class DelayingProxy:
         return self
 
     async def __aexit__(self, *_: object) -> None:
-        """Cut everything."""
+        """Reset all connections and stop listening."""
         await self.die()
 
     async def listen(self) -> None:

@@ -11,7 +11,7 @@ from fakes import FakeServer
 
 
 class ServerThread:
-    """The server and its loop; `cut` ends its connections from any thread."""
+    """A fake server in the event loop of a thread; any thread may `cut` its connections."""
 
     def __init__(self, server: FakeServer, loop: asyncio.AbstractEventLoop) -> None:
         self.server = server
@@ -19,13 +19,13 @@ class ServerThread:
         self._loop = loop
 
     def cut(self) -> None:
-        """End every connection without a goodbye."""
+        """Abort every connection without a close handshake."""
         self._loop.call_soon_threadsafe(self.server.cut)
 
 
 @contextlib.contextmanager
 def server_thread() -> Iterator[ServerThread]:
-    """Run a server until the end of the block."""
+    """Run a fake server in a thread until the end of the ``with`` block."""
     started = threading.Event()
     stop: list[asyncio.Event] = []
     made: list[ServerThread] = []

@@ -1,4 +1,4 @@
-"""When robots dial again, on a fake clock: soon, then rarely, never more often than the firewall allows."""
+"""Pauses between attempts to connect, on a fake clock: never more attempts than the firewall allows."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ BEGAN_S = 1000.0
 
 @dataclass
 class Outage:
-    """What a fleet behind one address did: when each robot was connected again, and what was blocked."""
+    """Result of an outage for robots behind one IP address: times of reconnects, and blocked attempts."""
 
     connected_s: list[float]
     blocked: int
@@ -28,7 +28,7 @@ class Outage:
 
 
 def play(settings: PlatformSettings, *, robots: int, outage_s: float, seed: int = 0) -> Outage:
-    """Cut all robots off at the same moment; the load balancer answers 503, and the firewall its rules."""
+    """Disconnect all robots at once; the load balancer answers 503, and the firewall applies its rules."""
     firewall = PlayedFirewall(rules_of_settings(settings))
     backoffs = [Backoff(ConnectTimings(), Random(f"{seed}/{robot}")) for robot in range(robots)]
     due = [(BEGAN_S + each.pause_s(BEGAN_S), robot) for robot, each in enumerate(backoffs)]

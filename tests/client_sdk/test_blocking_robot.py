@@ -1,4 +1,4 @@
-"""The blocking twin has the same methods and no rules of its own."""
+"""The blocking robot has the methods of the asyncio robot, and ends every call in time."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from rse_pf.errors import Disconnected, Expired, RsePfError, UnknownService
 from tests.client_sdk.server_thread import server_thread
 
 LATE_S = 5.0
-"""A call that has not ended so long after its deadline hangs, also on a slow machine."""
+"""A call that has not ended this many seconds after its deadline hangs, also on a slow machine."""
 
 
 @pytest.fixture

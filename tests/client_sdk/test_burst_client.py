@@ -51,14 +51,14 @@ def closed_port() -> tuple[socket.socket, str]:
     return held, f"ws://127.0.0.1:{held.getsockname()[1]}/ws"
 
 
-def told_of(burst: FakeBurst, budget: int = BUDGET) -> FakePlatform:
+def platform_with(burst: FakeBurst, budget: int = BUDGET) -> FakePlatform:
     platform = FakePlatform(registry=builtin_services(PLATFORM))
     platform.burst = BurstSettings(url=burst.url, robot_commands_per_day=budget)
     return platform
 
 
 async def test_for_a_busy_server_the_function_of_the_welcome_answers_with_the_same_token_and_bytes():
-    async with FakeBurst() as burst, told_of(burst) as platform, robot(platform.url) as client:
+    async with FakeBurst() as burst, platform_with(burst) as platform, robot(platform.url) as client:
         platform.on_command = busy
         answer = await client.solve_pnp(*FRAME, deadline_s=5.0)
 
@@ -76,7 +76,7 @@ async def test_for_a_busy_server_the_function_of_the_welcome_answers_with_the_sa
 
 async def test_a_function_behind_the_proxy_of_the_environment_answers(monkeypatch):
     asked: list[str] = []
-    async with FakeBurst() as burst, told_of(burst) as platform:
+    async with FakeBurst() as burst, platform_with(burst) as platform:
         platform.on_command = busy
         with peer(proxy_to(urlsplit(burst.url).port, asked)) as port:
             monkeypatch.setenv("http_proxy", f"http://127.0.0.1:{port}")
@@ -88,7 +88,7 @@ async def test_a_function_behind_the_proxy_of_the_environment_answers(monkeypatc
 
 
 async def test_a_server_that_answers_is_never_replaced():
-    async with FakeBurst() as burst, told_of(burst) as platform, robot(platform.url) as client:
+    async with FakeBurst() as burst, platform_with(burst) as platform, robot(platform.url) as client:
         answer = await client.solve_pnp(*FRAME, deadline_s=5.0)
 
         assert (answer.source, burst.commands) == ("cloud", [])
@@ -97,7 +97,7 @@ async def test_a_server_that_answers_is_never_replaced():
 async def test_a_late_server_is_replaced_while_the_function_can_still_be_in_time():
     solve_pnp(*FRAME)  # the first solution loads the solver
 
-    async with FakeBurst() as burst, told_of(burst) as platform, robot(platform.url) as client:
+    async with FakeBurst() as burst, platform_with(burst) as platform, robot(platform.url) as client:
         platform.hold = True
         answer = await client.solve_pnp(*FRAME, deadline_s=1.0)
 
@@ -118,7 +118,7 @@ async def test_a_robot_that_finds_no_server_at_all_asks_the_function_that_connec
 
 
 async def test_after_the_loss_of_all_servers_the_last_welcome_still_counts():
-    async with FakeBurst() as burst, told_of(burst) as platform, robot(platform.url) as client:
+    async with FakeBurst() as burst, platform_with(burst) as platform, robot(platform.url) as client:
         platform.refusals = [(503, None)] * 1000
         platform.sockets[0].cut()
         await platform.until(lambda: len(platform.handshakes) > 1)
@@ -127,7 +127,7 @@ async def test_after_the_loss_of_all_servers_the_last_welcome_still_counts():
 
 
 async def test_the_function_comes_before_the_robots_own_solver_and_the_solver_when_it_fails():
-    async with FakeBurst() as burst, told_of(burst) as platform, own_solver(platform) as client:
+    async with FakeBurst() as burst, platform_with(burst) as platform, own_solver(platform) as client:
         platform.on_command = busy
         first = await client.solve_pnp(*FRAME, deadline_s=5.0)
         burst.status = 502
@@ -138,7 +138,11 @@ async def test_the_function_comes_before_the_robots_own_solver_and_the_solver_wh
 
 
 async def test_the_budget_of_the_welcome_is_never_exceeded():
-    async with FakeBurst() as burst, told_of(burst, budget=3) as platform, own_solver(platform) as client:
+    async with (
+        FakeBurst() as burst,
+        platform_with(burst, budget=3) as platform,
+        own_solver(platform) as client,
+    ):
         platform.on_command = busy
         sources = [(await client.solve_pnp(*FRAME, deadline_s=5.0)).source for _ in range(6)]
 
@@ -147,7 +151,7 @@ async def test_the_budget_of_the_welcome_is_never_exceeded():
 
 
 async def test_a_function_that_fails_is_left_alone_by_the_breaker():
-    async with FakeBurst() as burst, told_of(burst) as platform, robot(platform.url) as client:
+    async with FakeBurst() as burst, platform_with(burst) as platform, robot(platform.url) as client:
         platform.on_command = busy
         burst.status = 503
         for _ in range(6):
@@ -158,7 +162,7 @@ async def test_a_function_that_fails_is_left_alone_by_the_breaker():
 
 
 async def test_a_function_that_stays_silent_costs_no_more_than_the_deadline():
-    async with FakeBurst() as burst, told_of(burst) as platform, robot(platform.url) as client:
+    async with FakeBurst() as burst, platform_with(burst) as platform, robot(platform.url) as client:
         platform.on_command = busy
         burst.hold = True
         began = asyncio.get_running_loop().time()
@@ -170,7 +174,7 @@ async def test_a_function_that_stays_silent_costs_no_more_than_the_deadline():
 
 
 async def test_a_frame_without_a_pose_is_not_solved_a_second_time():
-    async with FakeBurst() as burst, told_of(burst) as platform, own_solver(platform) as client:
+    async with FakeBurst() as burst, platform_with(burst) as platform, own_solver(platform) as client:
         platform.on_command = busy
         noise = make_degenerate("noise", seed=1)
         with pytest.raises(NoConsensus):
@@ -180,7 +184,7 @@ async def test_a_frame_without_a_pose_is_not_solved_a_second_time():
 
 
 async def test_other_services_and_robots_without_a_token_do_not_ask():
-    async with FakeBurst() as burst, told_of(burst) as platform:
+    async with FakeBurst() as burst, platform_with(burst) as platform:
         platform.on_command = busy
         async with robot(platform.url) as client:
             with pytest.raises(Busy):
@@ -193,7 +197,7 @@ async def test_other_services_and_robots_without_a_token_do_not_ask():
 
 
 async def test_the_user_may_turn_it_off():
-    async with FakeBurst() as burst, told_of(burst) as platform:
+    async with FakeBurst() as burst, platform_with(burst) as platform:
         platform.on_command = busy
         async with robot(platform.url, burst_url="") as client:
             with pytest.raises(Busy):
@@ -203,7 +207,7 @@ async def test_the_user_may_turn_it_off():
 
 
 async def test_a_connection_is_kept_and_one_that_was_closed_meanwhile_costs_nothing():
-    async with FakeBurst() as burst, told_of(burst) as platform, robot(platform.url) as client:
+    async with FakeBurst() as burst, platform_with(burst) as platform, robot(platform.url) as client:
         platform.on_command = busy
         for _ in range(2):
             await client.solve_pnp(*FRAME, deadline_s=5.0)
@@ -216,7 +220,7 @@ async def test_a_connection_is_kept_and_one_that_was_closed_meanwhile_costs_noth
 
 @pytest.mark.parametrize("wrong", ["text/html", "application/rse-pf.v1.bin"])
 async def test_what_is_not_our_function_does_not_answer_commands(wrong: str):
-    async with FakeBurst() as burst, told_of(burst) as platform, robot(platform.url) as client:
+    async with FakeBurst() as burst, platform_with(burst) as platform, robot(platform.url) as client:
         platform.on_command = busy
         burst.content_type = wrong
         with pytest.raises(Busy):

@@ -1,4 +1,4 @@
-"""The budget and the breaker of a robot, and which address a token may be sent to."""
+"""Daily budget and circuit breaker of the burst function, and the addresses that may receive a token."""
 
 from __future__ import annotations
 
@@ -136,9 +136,9 @@ def test_a_token_goes_only_where_it_is_as_safe_as_at_the_servers(url: str, own: 
 
 
 def test_an_address_that_the_user_cannot_mean_is_refused_at_once():
-    with pytest.raises(UsageError) as told:
+    with pytest.raises(UsageError) as raised:
         check_burst_url("robots.example/burst", "ws://robots.example/ws")
 
-    assert "https://HOST/burst" in told.value.hint
+    assert "https://HOST/burst" in raised.value.hint
     assert check_burst_url("", "ws://robots.example/ws") == ""
     assert check_burst_url(None, "ws://robots.example/ws") is None

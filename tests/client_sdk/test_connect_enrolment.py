@@ -1,4 +1,4 @@
-"""connect(enrolment=FILE): the file says all, is read when the robot connects, and excludes an address."""
+"""connect(enrolment=FILE): address and key come from the file, which is read when the robot connects."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The robot's sockets against real ones on 127.0.0.1: reconnect, move, refusals, garbage."""
+"""The robot's sockets against real ones on 127.0.0.1: reconnect, move, refusals, malformed input."""
 
 from __future__ import annotations
 
@@ -161,11 +161,11 @@ async def test_a_server_that_dies_during_a_move_loses_nothing():
 async def test_a_wrong_token_is_reported_at_once():
     async with FakePlatform() as platform:
         platform.token = "right"
-        with pytest.raises(Unauthorized) as told:
+        with pytest.raises(Unauthorized) as raised:
             await robot(platform.url, token="wrong").__aenter__()
 
-        assert "rse-pf token issue" in told.value.hint
-        assert "wrong" not in str(told.value).replace("missing, wrong or expired", "")
+        assert "rse-pf token issue" in raised.value.hint
+        assert "wrong" not in str(raised.value).replace("missing, wrong or expired", "")
         assert platform.tokens_seen == ["wrong"]
 
 
@@ -188,9 +188,9 @@ async def test_a_token_callable_is_called_once_more_when_its_token_has_expired()
 async def test_a_token_that_is_refused_later_ends_the_calls_and_the_robot_comes_back_when_it_is_accepted():
     async with FakePlatform() as platform:
         platform.token = "right"
-        told = []
+        changes = []
         async with robot(
-            platform.url, token="right", on_change=lambda *change: told.append(change)
+            platform.url, token="right", on_change=lambda *change: changes.append(change)
         ) as a_robot:
             platform.hold = True
             waiting = ask(a_robot, 1, deadline_s=10)
@@ -204,8 +204,8 @@ async def test_a_token_that_is_refused_later_ends_the_calls_and_the_robot_comes_
             with pytest.raises(Unauthorized):
                 await ask(a_robot, 2)
             assert isinstance(a_robot.failure, Unauthorized)
-            assert [what for what, _ in told] == ["link-lost", "refused"]
-            assert told[-1][1] == a_robot.failure.message
+            assert [change for change, _ in changes] == ["link-lost", "refused"]
+            assert changes[-1][1] == a_robot.failure.message
 
             refused = len(platform.tokens_seen)
             await platform.until(lambda: len(platform.tokens_seen) > refused + 1)
@@ -215,7 +215,7 @@ async def test_a_token_that_is_refused_later_ends_the_calls_and_the_robot_comes_
 
             assert answer.reply == {"value": 3}
             assert a_robot.failure is None
-            assert [what for what, _ in told] == ["link-lost", "refused", "link-back"]
+            assert [change for change, _ in changes] == ["link-lost", "refused", "link-back"]
 
 
 async def test_a_robot_that_is_revoked_does_not_come_back_to_a_server_that_has_not_heard_of_it():
@@ -231,13 +231,13 @@ async def test_a_robot_that_is_revoked_does_not_come_back_to_a_server_that_has_n
 
 
 async def test_a_token_callable_that_fails_is_called_again():
-    told = iter([OSError("issuer is away"), OSError("still"), "fresh"])
+    tokens = iter([OSError("issuer is away"), OSError("still"), "fresh"])
 
     async def token():
-        next_one = next(told)
-        if isinstance(next_one, OSError):
-            raise next_one
-        return next_one
+        result = next(tokens)
+        if isinstance(result, OSError):
+            raise result
+        return result
 
     async with FakePlatform() as platform, robot(platform.url, token=token) as a_robot:
         assert (await ask(a_robot, 1)).reply == {"value": 1}
@@ -297,11 +297,11 @@ async def test_an_address_without_a_server_is_one_line_with_a_hint():
         free.bind(("127.0.0.1", 0))
         url = f"ws://127.0.0.1:{free.getsockname()[1]}/ws"
 
-    with pytest.raises(ConnectError) as told:
+    with pytest.raises(ConnectError) as raised:
         await robot(url).__aenter__()
-    assert "\n" not in told.value.message
-    assert url in told.value.message
-    assert "rse-pf local" in told.value.hint
+    assert "\n" not in raised.value.message
+    assert url in raised.value.message
+    assert "rse-pf local" in raised.value.hint
 
 
 @pytest.mark.parametrize("url", ["http://localhost/ws", "localhost:8700", "ws://", "ws://h:99999/ws"])
@@ -316,21 +316,21 @@ def test_neither_an_address_nor_an_enrolment_is_refused_with_both_ways():
 
 
 def test_an_unknown_codec_is_refused_with_the_choices():
-    with pytest.raises(UsageError) as told:
+    with pytest.raises(UsageError) as raised:
         robot("ws://localhost/ws", codec="xml")
 
-    assert "zlib, json, bin" in told.value.hint
+    assert "zlib, json, bin" in raised.value.hint
 
 
 async def test_invalid_messages_of_a_server_affect_no_command_up_to_a_limit():
     async with FakePlatform() as platform, robot(platform.url) as a_robot:
         first = platform.sockets[0]
         for _ in range(MAX_BAD_MESSAGES):
-            await first.send(b"\x00garbage")
+            await first.send(b"\x00malformed")
         assert (await ask(a_robot, 1)).reply == {"value": 1}
         assert a_robot.stats.reconnects == 0
 
-        await first.send(b"\x00garbage")
+        await first.send(b"\x00malformed")
         await platform.until(lambda: len(platform.sockets) == 2)
         assert (await ask(a_robot, 2)).reply == {"value": 2}
 
@@ -359,7 +359,7 @@ async def test_another_robot_with_the_same_token_is_told_as_a_conflict_and_tried
 
 
 async def test_a_robot_replaced_by_its_own_abandoned_attempt_reconnects():
-    """A server that was stopped for a moment welcomes the dial late, and closes the robot's older socket."""
+    """A server that was stopped accepts an abandoned attempt late, and closes the robot's present socket."""
 
     async with FakePlatform() as platform, robot(platform.url) as a_robot:
         platform.welcomes = False

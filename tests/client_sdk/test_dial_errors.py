@@ -1,4 +1,4 @@
-"""What a failed connection attempt means for the next one, and how an address is shown."""
+"""Errors of failed attempts to connect: kind, pause before the next attempt, and the address as shown."""
 
 from __future__ import annotations
 

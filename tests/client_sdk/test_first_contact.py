@@ -1,4 +1,4 @@
-"""What a new user meets first: a token with white space, and a cloud that is not there yet."""
+"""First mistakes of new users: a token with white space, and a platform that is not started."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ def test_white_space_around_a_token_does_not_count(around: str) -> None:
 
 @pytest.mark.parametrize("wrong", [f"{SECRET}\n{SECRET}", f"{SECRET} x", f"{SECRET}\u00e9", "", " ", 7, None])
 def test_what_no_header_can_hold_is_refused_without_showing_it(wrong: object) -> None:
-    with pytest.raises(Unauthorized) as told:
+    with pytest.raises(Unauthorized) as raised:
         strip_token(wrong)
 
-    assert "eyJ" not in str(told.value)
-    assert "rse-pf token issue" in told.value.hint
+    assert "eyJ" not in str(raised.value)
+    assert "rse-pf token issue" in raised.value.hint
 
 
 @pytest.mark.system
@@ -51,17 +51,17 @@ async def test_a_token_that_was_read_with_its_newline_connects() -> None:
 @pytest.mark.system
 async def test_a_broken_token_ends_at_once_and_is_in_no_message() -> None:
     async with FakePlatform() as platform:
-        with pytest.raises(Unauthorized) as told:
+        with pytest.raises(Unauthorized) as raised:
             await robot(platform.url, token=f"{SECRET}\nX-Other: 1").__aenter__()
-        assert "eyJ" not in str(told.value)
+        assert "eyJ" not in str(raised.value)
         assert platform.handshakes == []
 
 
 def test_the_client_of_the_data_service_does_not_show_a_broken_token_either() -> None:
-    with pytest.raises(Unauthorized) as told:
+    with pytest.raises(Unauthorized) as raised:
         DataClient("http://127.0.0.1:9", f"{SECRET}\nX-Other: 1").delete("0" * 64)
 
-    assert "eyJ" not in str(told.value)
+    assert "eyJ" not in str(raised.value)
 
 
 @pytest.mark.system

@@ -1,4 +1,4 @@
-"""The paper's recommendation as decisions: who solves a command, and when."""
+"""Plans of `CloudFirst`: who computes a command, and when each of them is asked."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A robot or data client that cannot connect names what answered, in one line, and what helps."""
+"""A robot or data client that cannot connect names the machine that answered, and an action that helps."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ PORTAL = "<html><title>Guest Wi-Fi</title><form>Password: <input></form></html>"
 
 @dataclass(frozen=True)
 class Case:
-    """An answer, and the words of the error's message and hint that a robot shows for it."""
+    """Bytes that a peer answers with, and parts of the message and the hint that the error must have."""
 
     name: str
     answer: bytes

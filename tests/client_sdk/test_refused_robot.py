@@ -1,4 +1,4 @@
-"""What a robot does when its servers refuse it, or nobody answers: it goes on, and comes back."""
+"""A robot that its servers refuse, or that nobody answers, goes on dialling and reconnects."""
 
 from __future__ import annotations
 
@@ -47,8 +47,7 @@ async def test_a_refusal_that_names_the_time_of_the_cut_off_is_followed_by_a_lat
     async with FakePlatform() as platform:
         clock = {"wall_clock": lambda: now_s[0]}
         async with robot(platform.url, token=token, **clock) as a_robot:
-            told = {"cause": "cut-off", "valid_from_s": 1120.0}
-            platform.told = told
+            platform.refusal_members = {"cause": "cut-off", "valid_from_s": 1120.0}
             platform.refusals = [(401, None)] * 2
             platform.sockets[0].cut()
             await platform.until(lambda: not platform.refusals)
@@ -61,7 +60,7 @@ async def test_a_refusal_that_names_the_time_of_the_cut_off_is_followed_by_a_lat
             assert len(platform.tokens_seen) == 4  # a cut-off is no reason to ask for another token at once
 
 
-@pytest.mark.parametrize("when", ["after the refusal", "while the refusal is told"])
+@pytest.mark.parametrize("when", ["after the refusal", "while the refusal is reported"])
 async def test_a_robot_whose_clock_is_set_right_is_tried_again_at_once(when):
     now_s = [1000.0]
     timings = replace(TIMINGS, reconnect_long_max_s=1000.0)
@@ -70,7 +69,7 @@ async def test_a_robot_whose_clock_is_set_right_is_tried_again_at_once(when):
         return "t"
 
     def set_clock(event, detail):
-        if event == "refused" and when == "while the refusal is told":
+        if event == "refused" and when == "while the refusal is reported":
             now_s[0] -= 120.0
 
     async with FakePlatform() as platform:
@@ -79,7 +78,7 @@ async def test_a_robot_whose_clock_is_set_right_is_tried_again_at_once(when):
             on_change=set_clock, wall_clock=lambda: now_s[0] + time.monotonic(),
         )  # fmt: skip
         async with connecting as a_robot:
-            platform.told = {"cause": "not-yet-valid"}
+            platform.refusal_members = {"cause": "not-yet-valid"}
             platform.refusals = [(401, None)]
             platform.sockets[0].cut()
             await platform.until(lambda: not platform.refusals)

@@ -1,4 +1,4 @@
-"""Which of several regions a robot uses, on a fake clock."""
+"""Choice among several regions by round trips, on a fake clock."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ HOLD_S = 60.0
 
 
 class Drive:
-    """A robot in one region that measures both once in two seconds."""
+    """A robot that uses one of two regions and pings both every two seconds."""
 
     def __init__(self, *, current: int = NEAR, now: float = 0.0) -> None:
         self.choice = RegionChoice(2, hold_s=HOLD_S)

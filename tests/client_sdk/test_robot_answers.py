@@ -1,4 +1,4 @@
-"""Who answers a command, what its caller is told, and what the robot remembers of it."""
+"""Who answers a command, what its caller receives, and what the robot counts."""
 
 from __future__ import annotations
 
@@ -55,10 +55,10 @@ async def test_the_hint_and_the_pause_of_a_failure_reach_the_caller():
 
     async with FakePlatform() as platform, connect(platform) as robot:
         platform.on_command = busy
-        with pytest.raises(Busy, match="full") as told:
+        with pytest.raises(Busy, match="full") as raised:
             await robot.call("echo", {}, deadline_s=1)
 
-        assert (told.value.hint, told.value.retry_after_ms) == ("later", 9e4)
+        assert (raised.value.hint, raised.value.retry_after_ms) == ("later", 9e4)
 
 
 async def test_a_cancelled_call_is_forgotten_and_not_sent_again():
@@ -155,9 +155,9 @@ async def test_a_robot_without_the_native_core_is_told_what_to_install(monkeypat
     async with FakePlatform() as platform:
         monkeypatch.setattr(native, "find_library", lambda: None)
         native_solver.cache_clear()
-        with pytest.raises(MissingExtra, match="the native core") as told:
+        with pytest.raises(MissingExtra, match="the native core") as raised:
             await connect(platform, offload=client_sdk.CloudFirst()).__aenter__()
-        assert "rse-pf[vision]" in told.value.hint
+        assert "rse-pf[vision]" in raised.value.hint
         assert not platform.sockets
 
 

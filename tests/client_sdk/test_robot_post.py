@@ -31,7 +31,7 @@ def connect(server: FakeServer, **options: Any) -> client_sdk.Robot:
 
 
 class Ends:
-    """Collects what `post` hears."""
+    """Collect the answers that `Robot.post` delivers."""
 
     def __init__(self) -> None:
         self.heard: list[Answered] = []
@@ -106,26 +106,26 @@ async def test_nothing_is_posted_by_a_robot_that_is_closed() -> None:
 
 
 async def test_a_lost_connection_and_its_return_are_reported_once_each() -> None:
-    told: list[tuple[str, str]] = []
+    changes: list[tuple[str, str]] = []
     back = asyncio.Event()
 
-    def changed(what: str, why: str) -> None:
-        told.append((what, why))
-        if what == "link-back":
+    def changed(change: str, detail: str) -> None:
+        changes.append((change, detail))
+        if change == "link-back":
             back.set()
 
     async with FakeServer().running() as server, connect(server, on_change=changed):
         server.cut()
         await back.wait()
-    assert told == [("link-lost", "closed"), ("link-back", "fake")]
+    assert changes == [("link-lost", "closed"), ("link-back", "fake")]
 
 
 async def test_a_stalled_connection_is_reported_with_its_reason() -> None:
-    told: list[tuple[str, str]] = []
+    changes: list[tuple[str, str]] = []
     lost = asyncio.Event()
 
-    def changed(what: str, why: str) -> None:
-        told.append((what, why))
+    def changed(change: str, detail: str) -> None:
+        changes.append((change, detail))
         lost.set()
 
     async with FakeServer().running() as server, connect(server, on_change=changed) as robot:
@@ -133,4 +133,4 @@ async def test_a_stalled_connection_is_reported_with_its_reason() -> None:
         robot.post("echo", {"value": 1}, Ends())
         await lost.wait()
         server.deaf = False
-    assert told[0] == ("link-lost", "silence")
+    assert changes[0] == ("link-lost", "silence")

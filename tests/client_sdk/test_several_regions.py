@@ -1,4 +1,4 @@
-"""A robot with several addresses, against fake platforms behind links of different lengths on 127.0.0.1."""
+"""A robot with several addresses, against fake platforms behind links with different delays on 127.0.0.1."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ NEAR_S, FAR_S = 0.01, 0.06
 
 
 class TwoRegions:
-    """Two platforms, the first behind a short link and the second behind a long one."""
+    """Two platforms, the first behind a link with a short delay, the second behind one with a long delay."""
 
     async def __aenter__(self) -> TwoRegions:
         self._stack = AsyncExitStack()
@@ -51,7 +51,7 @@ class TwoRegions:
         await self._stack.aclose()
 
     async def both_joined(self) -> None:
-        """Wait until the robot has a standby."""
+        """Wait until the robot has a standby connection to the other region."""
         await asyncio.wait_for(self._stands_by.wait(), 5.0)
 
     def _changed(self, what, why):
@@ -72,7 +72,7 @@ def ask(a_robot, value, **options):
 
 
 async def asked_until(a_robot, server):
-    """Ask until *server* answers."""
+    """Send commands until the server named *server* answers one."""
     while (await ask(a_robot, 0, deadline_s=10)).server != server:
         await asyncio.sleep(0)
 

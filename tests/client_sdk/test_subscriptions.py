@@ -1,4 +1,4 @@
-"""Updates that a robot subscribed to: newest of each key, across reconnects and moves."""
+"""Updates of subscribed topics: the newest value of each key, across reconnects and moves."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def robot(platform: FakePlatform, **options: Any) -> client_sdk.Robot:
 
 
 async def subscribed(platform: FakePlatform, number: int = 0) -> Any:
-    """Return the socket *number* once it has a subscription."""
+    """Wait until the connection *number* of the fake server has a subscription, and return it."""
     await platform.until(lambda: len(platform.sockets) > number and bool(platform.sockets[number].topics))
     return platform.sockets[number]
 

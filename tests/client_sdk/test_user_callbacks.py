@@ -1,4 +1,4 @@
-"""Callables of a program that fail: they are reported, and the robot goes on."""
+"""User functions that raise, block or fork: the failure is reported, and the robot goes on."""
 
 from __future__ import annotations
 

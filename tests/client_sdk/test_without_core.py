@@ -1,4 +1,4 @@
-"""A robot without the native core is imported, and says in one line what features and poses need."""
+"""The SDK without the native core can be imported; features and poses name the package that they need."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ def test_the_rate_limit_of_uploads_allows_no_burst_after_an_idle_time() -> None:
 
 
 class FakeUploads:
-    """Takes files, or fails as told; knows when each came."""
+    """Accept uploads, or fail as the test demands; note the time of each."""
 
     def __init__(self) -> None:
         self.taken: list[bytes] = []
@@ -42,7 +42,7 @@ class FakeUploads:
         return ""
 
     def close(self) -> None:
-        """Nothing is open."""
+        """Do nothing: the fake client has no connection."""
 
 
 @contextmanager

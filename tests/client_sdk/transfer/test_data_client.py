@@ -23,7 +23,7 @@ Script = Callable[[str, str, dict[str, str], bytes], "Answer | None"]
 
 
 class FakeService:
-    """Stores parts in memory; *script* may answer first, and ``(0, {}, b"")`` cuts the connection."""
+    """A data service in memory; *script* may answer a request instead, and ``(0, {}, b"")`` disconnects."""
 
     def __init__(self) -> None:
         self.objects: dict[str, bytes] = {}
@@ -54,7 +54,7 @@ class FakeService:
             do_GET = do_PUT = do_PATCH = do_DELETE = do_POST = answer
 
             def log_message(self, *_: object) -> None:
-                """Stay silent."""
+                """Write no log."""
 
         self.server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
         self.thread = threading.Thread(target=self.server.serve_forever, args=(0.01,), daemon=True)
@@ -85,8 +85,8 @@ class FakeService:
         if int(first) >= len(whole):
             return 416, {"Content-Range": f"bytes */{len(whole)}"}, b"{}"
         piece = whole[int(first) : int(last) + 1]
-        told = f"bytes {first}-{int(first) + len(piece) - 1}/{len(whole)}"
-        return 206, {"Content-Range": told}, piece
+        content_range = f"bytes {first}-{int(first) + len(piece) - 1}/{len(whole)}"
+        return 206, {"Content-Range": content_range}, piece
 
     def close(self) -> None:
         self.server.shutdown()
@@ -106,7 +106,7 @@ def service() -> Iterator[FakeService]:
 
 
 class Robot:
-    """A client whose clock and pauses are the test's."""
+    """A data client with a fake clock that its pauses advance."""
 
     def __init__(self, service: FakeService) -> None:
         self.now = 0.0
@@ -145,13 +145,13 @@ def test_a_small_object_is_sent_in_one_request(service: FakeService, robot: Robo
 
 
 def test_a_large_object_is_sent_in_parts_of_the_servers_size(service: FakeService, robot: Robot) -> None:
-    told: list[tuple[int, int]] = []
+    progress: list[tuple[int, int]] = []
 
-    assert robot.client.upload(DATA, lambda done, size: told.append((done, size))) == DIGEST
+    assert robot.client.upload(DATA, lambda done, size: progress.append((done, size))) == DIGEST
 
     assert service.objects[DIGEST] == DATA
-    assert [done for done, _ in told] == [0, 200_000, 400_000, 600_000, 700_000]
-    assert {size for _, size in told} == {700_000}
+    assert [done for done, _ in progress] == [0, 200_000, 400_000, 600_000, 700_000]
+    assert {size for _, size in progress} == {700_000}
 
 
 @pytest.mark.parametrize(
@@ -272,11 +272,11 @@ def test_a_platform_without_a_data_service_is_told_soon_and_with_a_hint(
 ) -> None:
     service.script = lambda *_: (503, {}, b"no healthy upstream")  # of Envoy without targets
 
-    with pytest.raises(ConnectError, match="has no data service") as told:
+    with pytest.raises(ConnectError, match="has no data service") as raised:
         robot.client.upload(DATA)
 
     assert 2.0 < robot.now <= 5.0
-    assert "--no-data" in told.value.hint
+    assert "--no-data" in raised.value.hint
 
 
 def test_a_data_service_that_comes_within_seconds_is_waited_for(service: FakeService, robot: Robot) -> None:

@@ -1,4 +1,4 @@
-"""The robot's way straight to the bucket: without its token, and back to the service when it is closed."""
+"""Transfers by presigned addresses: without the token, and through the data service if the bucket fails."""
 
 from __future__ import annotations
 
@@ -49,8 +49,8 @@ class Bucket(MemoryStore):
                 bucket.asked.append((self.command, status))
                 self.send_response(status)
                 if status == 206:
-                    told = f"bytes {first}-{int(first) + len(body) - 1}/{len(whole)}"
-                    self.send_header("Content-Range", told)
+                    content_range = f"bytes {first}-{int(first) + len(body) - 1}/{len(whole)}"
+                    self.send_header("Content-Range", content_range)
                 self.send_header("Content-Length", str(len(body)))
                 self.end_headers()
                 self.wfile.write(body)
@@ -58,7 +58,7 @@ class Bucket(MemoryStore):
             do_GET = do_PUT = answer
 
             def log_message(self, *_: object) -> None:
-                """Stay silent."""
+                """Write no log."""
 
         self._server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
         self._server.daemon_threads = True
@@ -80,7 +80,7 @@ class Bucket(MemoryStore):
 
 @pytest.fixture
 def bucket() -> Iterator[Bucket]:
-    """An open bucket."""
+    """Run a bucket that answers."""
     made = Bucket()
     yield made
     made.close()
@@ -88,7 +88,7 @@ def bucket() -> Iterator[Bucket]:
 
 @pytest.fixture
 def service(bucket: Bucket) -> Service:
-    """A data service on it."""
+    """Run a data service that offers addresses of the bucket."""
     return Service(small_settings(part_bytes=200_000, max_object_bytes=1 << 20, quota_bytes=1 << 22), bucket)
 
 
@@ -96,7 +96,7 @@ def service(bucket: Bucket) -> Service:
 def connected(
     service: Service, sleep: Callable[[float], None] = lambda seconds: None
 ) -> Iterator[DataClient]:
-    """A robot that calls *sleep* instead of sleeping."""
+    """Make a data client that calls *sleep* instead of pausing."""
     with HttpServer(service) as server:
         client = DataClient(server.url, service.token, DataOptions(sleep=sleep))
         try:
@@ -107,13 +107,13 @@ def connected(
 
 @pytest.fixture
 def robot(service: Service) -> Iterator[DataClient]:
-    """A robot that never sleeps."""
+    """Make a data client that never pauses."""
     with connected(service) as client:
         yield client
 
 
 def carried(service: Service) -> int:
-    """How many bytes of objects went through the service."""
+    """Return how many bytes of objects went through the data service instead of the bucket."""
     lines = [line for line in service.lines if line["operation"] in ("append_part", "get_object")]
     return sum(line["received_bytes"] + line["sent_bytes"] for line in lines)
 
