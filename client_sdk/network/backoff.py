@@ -22,8 +22,8 @@ from rse_pf.token_bucket import TokenBucket
 __all__ = ["AttemptResult", "Backoff"]
 
 RECONNECT_BASE_S = 0.1
-"""Upper bound of the first pause in seconds; it doubles with each attempt ("full jitter", AWS Architecture
-Blog, 2015)."""
+"""Upper bound of the first pause before a reconnect, in seconds; it doubles with each attempt ("full jitter",
+AWS Architecture Blog, 2015)."""
 MAX_PAUSE_RATIO = 1.0 / 3.0
 """A pause is at most this share of the time for which attempts have failed: after an outage of a minute a
 robot is back within 20 seconds."""

@@ -76,8 +76,7 @@ def websocket_options(settings: SessionSettings, timings: ConnectTimings) -> dic
 
 
 class _NoRedirectConnect(websocket_connect):
-    """The library's connect without redirects, which would send the token to any address that an answer
-    names."""
+    """Connect like the library, but follow no redirect: it could lead the token to any address."""
 
     def process_redirect(self, exc: Exception) -> Exception:
         """Treat a redirect as a failure, like every other status that is not 101."""
@@ -85,8 +84,7 @@ class _NoRedirectConnect(websocket_connect):
 
 
 class _FirstBytesConnection(ClientConnection):
-    """A connection that copies the first bytes of the peer, which identify a peer that is no WebSocket
-    server."""
+    """Keep the first bytes that the peer sends: they tell what a peer is that is no WebSocket server."""
 
     def __init__(self, first_bytes: bytearray, *args: Any, **options: Any) -> None:
         super().__init__(*args, **options)

@@ -43,7 +43,7 @@ FOREIGN_STATUSES = (101, 301, 302, 303, 308, 407, 511)
 """HTTP statuses that login pages and proxies send and the data service never does; it redirects by 307
 only."""
 TLS_WANTED = re.compile(rb"https|\bssl\b|\btls\b", re.IGNORECASE)
-"""Words in the 400 that nginx, Apache and Go send to plain HTTP at a TLS port."""
+"""Words by which a 400 of nginx, Apache or Go is recognised as their answer to plain HTTP at a TLS port."""
 LOGIN_WORDS = re.compile(
     r"\blog[ -]?[io]n\b|\bsign[ -]?in\b|\bo?auth2?\b|\bsso\b|captive|portal|password|<form"
     r"|http-equiv=.?refresh",

@@ -311,7 +311,7 @@ class BurstClient:
 async def _open_connection(
     parts: SplitResult, context: ssl.SSLContext | None
 ) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
-    """Connect to the host of *parts*, through the proxy of the environment if it has one."""
+    """Open a TCP or TLS connection to the host of *parts*, perhaps through a proxy of the environment."""
     host, port = parts.hostname or "", port_of(parts)
     if find_proxy(parts.scheme, host, port) is None:
         return await asyncio.open_connection(host, port, limit=MAX_HEAD_BYTES, ssl=context)

@@ -59,8 +59,7 @@ class _PlannedRequest:
 
 
 class CommandRouter:
-    """Ask the three places that may answer the commands of one robot, and hold the commands at the
-    servers."""
+    """Send commands of one robot to servers, burst function or robot, and wait for their answers."""
 
     def __init__(
         self,

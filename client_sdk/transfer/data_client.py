@@ -346,7 +346,7 @@ class DataClient:
                 response = _request_bucket("GET", route.url, headers, None, options.timeout_s)
                 if response is not None:
                     return response
-            # The address has expired, or the bucket cannot be reached.
+            # The presigned address has expired, or the bucket cannot be reached.
             route.url, route.attempts_left = "", route.attempts_left - 1
             options.sleep(options.first_pause_s)
         return self._request("GET", path, bytes, None, headers, expected=(416,))
