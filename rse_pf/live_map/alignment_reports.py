@@ -42,7 +42,7 @@ def report_alignments(
     for row, T_map_odom, has_changed in _find_alignments(graph):
         segment = graph.segments[row]
         is_reported = segment.reported_T_map_odom is not None
-        # 1. A segment that lost its connection with the map.
+        # 1. Report a segment whose connection with the map was lost.
         if not graph.is_aligned(row):
             if is_reported:
                 is_metric = graph.is_metric(segment.component)
@@ -50,14 +50,14 @@ def report_alignments(
                 graph.report_unaligned(row, segment.reason or default)
                 outcomes.append(Unaligned(robot=segment.robot, segment=segment.number, reason=segment.reason))
             continue
-        # 2. A segment that was connected with the map just now.
+        # 2. Report a segment that has an alignment for the first time.
         if not is_reported:
             connections = graph.accepted_edges_by_segments().items()
             count = sum(len(numbers) for pair, numbers in connections if row in pair)
             outcomes.append(Joined(robot=segment.robot, segment=segment.number, links=count))
         elif not has_changed:
             continue
-        # 3. The alignment of a connected segment.
+        # 3. Report the new alignment.
         newest = segment.keyframes[-1]
         covariance = windows.covariance(graph, newest) if windows is not None else None
         graph.report_alignment(row, T_map_odom, covariance)
@@ -91,7 +91,7 @@ def alignment_of(segment: Segment) -> Alignment:
 def _find_alignments(graph: MapGraph) -> list[tuple[int, Array, bool]]:
     """Return (row, ``T_map_odom``, whether it changed since the last report) of each newest segment."""
     rows = [row for row in graph.newest_segments.values() if graph.segments[row].keyframes]
-    # 1. The alignments of the newest keyframes.
+    # 1. The pose of the newest keyframe in the map and in its odometry frame give the alignment.
     newest = [graph.segments[row].keyframes[-1] for row in rows]
     T = graph.T_component_camera[newest] @ inverse(graph.odometry_poses(newest))
     reported = T.copy()
@@ -99,7 +99,7 @@ def _find_alignments(graph: MapGraph) -> list[tuple[int, Array, bool]]:
         T_reported = graph.segments[row].reported_T_map_odom
         if T_reported is not None:
             reported[index] = T_reported
-    # 2. Compare them with the reported ones.
+    # 2. Compare the alignments with those that the robots were last sent.
     moved2_m2 = ((T[:, :3, 3] - reported[:, :3, 3]) ** 2).sum(axis=1)
     traces = (T[:, :3, :3] * reported[:, :3, :3]).sum(axis=(1, 2))
     min_trace = 1.0 + 2.0 * math.cos(math.radians(MIN_REPORTED_ROTATION_DEG))

@@ -39,7 +39,7 @@ def choose_candidates(
     """
     rows = graph.segment_rows
     vector = places.vector_of(keyframe)
-    # 1. Leave out keyframes without features, excluded segments, and those shortly before.
+    # 1. Leave out keyframes without features, of excluded segments, and shortly before on the same path.
     is_excluded = np.array([segment.is_excluded for segment in graph.segments])[rows]
     is_allowed = graph.has_features & ~is_excluded
     is_allowed[keyframe] = False
@@ -63,15 +63,15 @@ def find_redundant_keyframes(graph: MapGraph, keyframe: int) -> tuple[int, ...]:
     if not graph.is_aligned(int(graph.segment_rows[keyframe])):
         return ()
     T = graph.T_component_camera
-    # 1. Compare positions; the first coordinate alone excludes most keyframes.
+    # 1. Find keyframes at the same position; the first coordinate alone excludes most of them.
     is_near = np.abs(T[:, 0, 3] - T[keyframe, 0, 3]) <= SAME_PLACE_M
     near = np.flatnonzero(graph.has_features & is_near)
     distance_m = np.abs(T[near, :3, 3] - T[keyframe, :3, 3]).max(axis=1)
     near = near[distance_m <= SAME_PLACE_M]
-    # 2. Compare rotations.
+    # 2. Of those, find keyframes with the same rotation.
     traces = np.einsum("nij,ij->n", T[near, :3, :3], T[keyframe, :3, :3])
     near = near[traces >= 1.0 + 2.0 * math.cos(math.radians(SAME_PLACE_DEG))]
-    # 3. Keep the newest ones of those in the map.
+    # 3. All but the newest two of those that are connected with the map are redundant.
     in_map = [i for i in near.tolist() if graph.is_aligned(int(graph.segment_rows[i]))]
     surplus = max(0, len(in_map) - MAX_KEYFRAMES_OF_VIEW)
     return tuple(i for i in in_map[:surplus] if i != keyframe)

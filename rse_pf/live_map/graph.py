@@ -27,11 +27,11 @@ STEP_LENGTH_M = 0.25  # metres of motion that are one step of odometry, for whic
 STEP_ROTATION_DEG = 15.0  # degrees of rotation that are one step of odometry, for which its drift is stated
 MIN_STEP = 0.05  # steps of odometry of any motion, at least, so that a stationary robot has some variance
 MAX_PATH_STEPS = 200.0
-"""Steps of odometry that a path between two keyframes counts at most; the drift of longer paths makes every
-test of consistency pass."""
-MAX_VISITED_KEYFRAMES = 250  # keyframes that a search for shortest paths visits, to bound its CPU time
+"""Steps of odometry of a path between two keyframes beyond which odometry says nothing about their relative
+pose."""
+MAX_VISITED_KEYFRAMES = 250  # keyframes that one search for shortest paths visits, to bound its CPU time
 MAX_REJECTED_EDGES = 2000  # rejected loop closures that are kept, to decide again after a robot is forgotten
-MAX_ORPHANED_OBJECTS = 10_000  # objects of forgotten robots that are remembered until they are deleted
+MAX_ORPHANED_OBJECTS = 10_000  # newest objects of forgotten robots that are listed for deletion
 CONTRADICTION_HISTORY = 0xFFFFFFFF  # bit mask: the newest 32 keyframes with evidence decide about a robot
 INHERITED_CONTRADICTIONS = 0xFFFF
 """Bit mask: the contradictions of a robot's newest 16 keyframes count in its next segment, so that a hostile
@@ -271,7 +271,7 @@ class MapGraph:
     # --- Changes of keyframes and segments ---
 
     def count_event(self) -> None:
-        """Count an event that was applied."""
+        """Increment the number of applied events."""
         self.events += 1
 
     def start_from_version(self, source: str, equal_rooms_m: float, *, has_keyframes: bool) -> None:
@@ -386,7 +386,7 @@ class MapGraph:
         own = [each for each in self.segments if each.robot == robot and not each.is_from_version]
         forgotten = [i for segment in own for i in segment.keyframes]
         members = set(forgotten)
-        # 1. Take out the loop closures, also the rejected ones.
+        # 1. Take out the accepted, pending and rejected loop closures of the robot.
         for number in [n for n, edge in self.edges.items() if edge.a in members or edge.b in members]:
             self._reject(number)
         self.rejected = {
@@ -394,19 +394,19 @@ class MapGraph:
             for number, edge in self.rejected.items()
             if edge.a not in members and edge.b not in members
         }
-        # 2. Empty the segments.
+        # 2. Empty the segments of the robot; their rows stay, so that other rows keep their numbers.
         for segment in own:
             segment.keyframes, segment.reported_T_map_odom = [], None
             segment.contradictions, segment.is_excluded = 0, False
         self.smoothing_debt.pop(robot, None)
-        # 3. Drop the data of the keyframes.
+        # 3. Drop the features of the keyframes, and remember their stored objects until these are deleted.
         for i in forgotten:
             self.drop_features(i)
             self.orphaned_objects += [(robot, digest) for digest in self.keyframes[i].objects]
             self.keyframes[i].objects = ()
             self._segment_rows[i] = -1
         self.orphaned_objects = self.orphaned_objects[-MAX_ORPHANED_OBJECTS:]
-        # 4. Find the segment that defines the frame of the map, and the components of those that are left.
+        # 4. Choose another segment to define the frame of the map if necessary, and update the components.
         self.newest_segments.pop(robot, None)
         if self.root < 0 or not self.segments[self.root].keyframes:
             metric = [row for row, each in enumerate(self.segments) if each.keyframes and each.is_metric]
@@ -489,7 +489,10 @@ class MapGraph:
         return numbers
 
     def accept_edges(self, numbers: Iterable[int]) -> list[LoopEdge]:
-        """Accept those of *numbers* that are pending, within one component; return these loop closures."""
+        """Accept those of *numbers* that are pending, and return these loop closures.
+
+        Both ends of each must be in one component, because components are not updated.
+        """
         accepted = []
         for number in numbers:
             edge = self.edges[number]

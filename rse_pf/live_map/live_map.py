@@ -375,12 +375,12 @@ class LiveMap:
         graph = self._graph
         if self.kind is not None:
             check_same_kind(self.kind, view.features.kind, "the live map")
-        # 1. Choose candidates by place recognition, spread over the map.
+        # 1. Choose keyframes by place recognition that are spread over the map.
         allowed = np.flatnonzero(graph.has_features & self._aligned_mask())
         limit = self.options.candidates
         vector = place_vector(view.features.descriptors)
         nearest = self._places.nearest(vector, RELOCALISATION_POOL * limit, allowed)
-        # 2. Copy what the function needs.
+        # 2. Copy their poses, since the map may change before the returned function runs.
         T = graph.T_component_camera
         chosen = [
             (self._stored(i), T[i].copy(), graph.segment_of(i).scale)
@@ -426,13 +426,13 @@ class LiveMap:
     def _add_keyframe(self, event: KeyframeAdded) -> list[Outcome]:
         """Add a keyframe where odometry says that it is."""
         graph, keyframe = self._graph, event.keyframe
-        # 1. Find the segment, or begin a new one.
+        # 1. Find the segment of the keyframe, or begin a new one.
         row = graph.find_or_add_segment(event.robot, event.segment)
         segment, T_odom = graph.segments[row], keyframe.T_odom_camera
         if not segment.keyframes:
             is_metric = keyframe.features.is_metric
             graph.begin_segment(row, None if is_metric else assumed_scale(keyframe.features), UP_TO_SCALE)
-        # 2. Continue from the newest keyframe by odometry.
+        # 2. Compute the pose by odometry from the newest keyframe of the segment.
         if segment.keyframes:
             newest = segment.keyframes[-1]
             motion = inverse(graph.T_odom_camera[newest]) @ T_odom
@@ -441,7 +441,7 @@ class LiveMap:
             steps = float(graph.odometry_steps[newest]) + count_odometry_steps(motion)
         else:
             T_component, steps = T_odom if segment.is_metric else scaled(T_odom, segment.scale), 0.0
-        # 3. Add it to the graph and to the index of place recognition.
+        # 3. Add the keyframe to the graph and to the index of place recognition.
         objects = tuple(each.digest for each in (keyframe.points, keyframe.image) if each is not None)
         i = graph.add_keyframe(
             LiveKeyframe(
@@ -458,7 +458,7 @@ class LiveMap:
             steps,
         )
         self._places.add(i, place_vector(keyframe.features.descriptors))
-        # 4. Report.  Odometry changes no alignment, so only a segment that has none yet can get one.
+        # 4. Report alignments. Odometry changes none, so only a segment without an alignment can get one.
         if segment.reported_T_map_odom is not None or not graph.is_aligned(row):
             return [Added(id=i)]
         return [Added(id=i), *report_alignments(graph, (event.robot, event.number))]
@@ -480,21 +480,22 @@ class LiveMap:
         if has_jumped:
             measured = []
         numbers = graph.add_edges(_pending_edges(keyframe, measured))
-        # 2. Classify them within the component, and join other components.
+        # 2. Accept or reject loop closures, and join components that they connect.
         changes = process_new_edges(graph, keyframe, numbers)
-        # 3. Exclude the robot if it keeps contradicting the map; decide again about what rested on it.
+        # 3. Exclude the robot if it keeps contradicting the map, and decide again about all loop closures.
         if has_jumped:
             changes.fits.add("contrary")
         is_scale_wrong = has_wrong_scale(graph, keyframe, measured)
         is_excluded = exclude_if_contradicting(graph, keyframe, changes, is_scale_wrong=is_scale_wrong)
         decided_again = self._decide_again() if is_excluded else []
-        # 4. Smooth the poses around what changed.
+        # 4. Smooth the poses around the changed loop closures.
         robot, number = graph.keyframes[keyframe].robot, graph.keyframes[keyframe].number
         windows = self._smooth(changes, robot)
         graph.drop_oldest_pending(MAX_PENDING_EDGES)
-        # 5. Report changed alignments.
+        # 5. Report the alignments of robots that changed.
         reports = report_alignments(graph, (robot, number), windows)
-        # 6. Drop redundant features; those of a keyframe after a jump would place others wrongly.
+        # 6. Drop redundant features, and those of a keyframe whose odometry jumped, since they would
+        #    contradict every later keyframe.
         culled = (
             self._drop_features((keyframe,))
             if has_jumped
@@ -507,7 +508,7 @@ class LiveMap:
         graph = self._graph
         T_optimised = np.frombuffer(event.T_map_camera, dtype="<f8").reshape(-1, 4, 4)
         index_of = {i: index for index, i in enumerate(event.ids) if graph.exists(i) and self.is_in_map(i)}
-        # 1. Move each segment; a later keyframe moves as the last optimised one before it.
+        # 1. Take the optimised poses; a keyframe that arrived later moves as the optimised one before it.
         motions: dict[int, Array] = {}
         for row, segment in enumerate(graph.segments):
             if not segment.keyframes or not graph.is_aligned(row):
@@ -523,17 +524,21 @@ class LiveMap:
             if motion is not None:
                 graph.set_poses(segment.keyframes, T)
                 motions[row] = motion
-        # 2. Move the segments that joined after the optimisation began, and smooth where they are connected.
+        # 2. Move segments that joined the map later, and smooth the poses where they are connected.
         changes = GraphChanges(moved=self._move_joined_segments(motions))
         windows = self._smooth(changes)
-        # 3. Report.
+        # 3. Report the alignments of robots that changed.
         return [*changes.outcomes, *report_alignments(graph, None, windows)]
 
     def _move_joined_segments(self, motions: dict[int, Array]) -> list[int]:
-        """Move segments without an optimised keyframe as a segment that they are connected with.
+        """Move segments that joined the map during an optimisation with the segments they are connected to.
 
-        *motions* has the motion ``(4, 4)`` of each optimised segment by row, and receives the others.  Return
-        the keyframes at which such segments are connected.
+        Args:
+            motions: By row of an optimised segment, the motion ``(4, 4)`` of its newest keyframe in the frame
+                of the map; receives the motions of the moved segments.
+
+        Returns:
+            The ends of loop closures between moved and optimised segments, to smooth around them.
         """
         graph = self._graph
         ends: list[int] = []

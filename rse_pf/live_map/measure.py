@@ -74,7 +74,8 @@ def measure_loop_closures(
     loop_closures: list[MeasuredLoopClosure] = []
     failed: Counter[str] = Counter()
     for other, other_features, other_camera in others:
-        # 1. Solve PnP; the landmarks are those of the metric keyframe, so that the pose is in metres.
+        # 1. Solve PnP with the landmarks of the metric keyframe, if there is one, so that the pose is in
+        #    metres.
         if other_features.is_metric and not features.is_metric:
             other_landmarks = landmarks_of_features(other_features, other_camera)
             view = view_of_features(features, camera)
@@ -85,7 +86,7 @@ def measure_loop_closures(
         if isinstance(measured, str):
             failed[measured] += 1
             continue
-        # 2. Undo the assumed scales.
+        # 2. Convert lengths and scale from assumed metres to the units of both robots.
         measured = _in_robots_units(measured, features, other_features)
         scale = measured.scale
         loop_closures.append(
@@ -209,7 +210,7 @@ def _wrong_log_scale(measured: RelativePose) -> float | None:
 def _in_robots_units(
     measured: RelativePose, features: KeyframeFeatures, other: KeyframeFeatures
 ) -> RelativePose:
-    """Return a relative pose that was measured with assumed scales in the units of both robots."""
+    """Convert a relative pose from assumed metres to the units that both robots use."""
     if measured.scale is None:
         return measured
     scale_a, scale_b = assumed_scale(features), assumed_scale(other)

@@ -52,8 +52,9 @@ MIN_ALIAS_SUPPORT = 12
 """Summed weight of contrary loop closures between two robots, at least, that proves perceptual aliases
 against heavier accepted loop closures."""
 MAX_DRIFT_RATIO = 0.15
-"""Error of odometry per length of path, at most; a larger error means that two places look the same."""
-FIXED_WEIGHT = 1e9  # weight of connections that are never rejected, above any sum of weights of loop closures
+"""Error of odometry, in metres per metre of path, that is possible; a larger disagreement with loop closures
+means that two places look the same."""
+FIXED_WEIGHT = 1e9  # weight of a connection that is never rejected, above any sum of loop closures' weights
 
 _AT_SEVERAL_PLACES = "ambiguous: what it saw is in the map at several places"
 
@@ -77,7 +78,7 @@ class GraphChanges:
 
 
 def process_new_edges(graph: MapGraph, keyframe: int, numbers: list[int]) -> GraphChanges:
-    """Decide about the pending loop closures *numbers* of *keyframe*, and change the graph accordingly.
+    """Accept or reject the pending loop closures *numbers* of *keyframe*, and join components by them.
 
     Return the outcomes, and the keyframes around which the graph must be smoothed.
     """
@@ -90,7 +91,7 @@ def process_new_edges(graph: MapGraph, keyframe: int, numbers: list[int]) -> Gra
     }
     within = [number for number in numbers if graph.component_of(others[number]) == component]
     _decide_within(graph, _drop_redundant_weak(graph, within), changes)
-    # 2. Try to join the other components.
+    # 2. Try to join the component with those that its loop closures lead to.
     for other in sorted({graph.component_of(i) for i in others.values()} - {component}):
         _join_if_consistent(graph, graph.component_of(keyframe), other, changes)
     return changes
@@ -138,21 +139,23 @@ def reject_misfitting_edges(
 
 
 def _decide_within(graph: MapGraph, numbers: list[int], changes: GraphChanges) -> None:
-    """Accept loop closures within one component that agree with the graph; weigh the others as evidence."""
-    # 1. Classify them by the poses of the graph.
+    """Accept loop closures within one component that agree with the graph; use the others as evidence."""
+    # 1. Compare the loop closures with the poses of the graph.
     fits = classify_by_graph(graph, numbers)
     changes.fits |= {
         "alias" if is_at_alias(graph, number) else fit
         for number, fit in fits.items()
         if graph.edges[number].weight == 1.0
     }
-    # 2. Accept those that agree: full weight first, weak ones only where no other one connects the same.
+    # 2. Accept loop closures that agree with the graph: those of full weight first, weak ones only where no
+    #    accepted one of full weight connects the same keyframe and segment.
     agreeing = [number for number, fit in fits.items() if fit == "agrees"]
     _accept(graph, [number for number in agreeing if graph.edges[number].weight == 1.0], changes)
     for number in agreeing:
         if _is_pending(graph, number) and not _has_full_weight_parallel(graph, number):
             _accept(graph, [number], changes)
-    # 3. Compare the others with pending ones: vague ones may be accepted, contrary ones may reject others.
+    # 3. Compare the other loop closures with pending ones: with enough support vague ones are accepted, and
+    #    contrary ones reject accepted ones.
     for number, fit in fits.items():
         if fit == "agrees" or not _is_pending(graph, number):
             continue
@@ -169,7 +172,7 @@ def _decide_within(graph: MapGraph, numbers: list[int], changes: GraphChanges) -
 def _drop_redundant_weak(graph: MapGraph, numbers: list[int]) -> list[int]:
     """Return the loop closures of one keyframe without weak ones to a segment that a full one leads to.
 
-    A weak loop closure adds nothing there, at the cost of another decision.
+    A weak loop closure adds nothing there, and costs the CPU time of a decision.
     """
     full = [number for number in numbers if graph.edges[number].weight == 1.0]
     connected = {int(graph.segment_rows[graph.edges[number].b]) for number in full}
@@ -181,7 +184,10 @@ def _drop_redundant_weak(graph: MapGraph, numbers: list[int]) -> list[int]:
 
 
 def _has_full_weight_parallel(graph: MapGraph, number: int) -> bool:
-    """Return whether an accepted full-weight loop closure leads from one end to the segment of the other."""
+    """Return whether an accepted loop closure of full weight connects the same keyframe and segment.
+
+    It leads from one end of loop closure *number* to any keyframe in the segment of the other end.
+    """
     edge = graph.edges[number]
     for near, far in ((edge.a, edge.b), (edge.b, edge.a)):
         for parallel in (graph.edges[each] for each in graph.accepted_edges_of(near)):
@@ -218,10 +224,10 @@ def _reject_contradicted(graph: MapGraph, number: int, consistent: list[int], ch
         _reject(graph, weakest, reason, changes)
         has_rejected = True
     component_a, component_b = graph.segments[row_a].component, graph.segments[row_b].component
-    # 2. Join them again, as the contrary loop closures say.
+    # 2. Join the two components again where the contrary loop closures say.
     if has_rejected and component_a != component_b:
         _join_if_consistent(graph, component_a, component_b, changes)
-    # 3. Where nothing could be rejected, a large error proves perceptual aliases.
+    # 3. If no connection could be rejected, a large error of the graph proves perceptual aliases.
     elif not has_rejected and weight >= MIN_ALIAS_SUPPORT:
         error_m = _error_of_graph_m(graph, number)
         steps = graph.shortest_paths(edge.a, [edge.b])[edge.b]
@@ -257,7 +263,7 @@ def _reject_contradicted_loops(
 
 
 def _error_of_odometry_m(graph: MapGraph, number: int) -> float:
-    """Return the distance between what odometry says and a loop closure within one segment, metres."""
+    """Return the translation error, in metres, of odometry against a loop closure within one segment."""
     edge = graph.edges[number]
     T_odom_a, T_odom_b = graph.odometry_poses([edge.a, edge.b])
     error = inverse(graph.relative_pose_of(edge)) @ inverse(T_odom_a) @ T_odom_b
@@ -265,7 +271,7 @@ def _error_of_odometry_m(graph: MapGraph, number: int) -> float:
 
 
 def _error_of_graph_m(graph: MapGraph, number: int) -> float:
-    """Return the distance between what the poses of the graph say and a loop closure, metres."""
+    """Return the translation error, in metres, of the poses of the graph against a loop closure."""
     edge = graph.edges[number]
     T_a, T_b = graph.T_component_camera[edge.a], graph.T_component_camera[edge.b]
     error = inverse(graph.relative_pose_of(edge)) @ inverse(T_a) @ T_b
@@ -280,7 +286,7 @@ def find_weakest_connection(graph: MapGraph, row_a: int, row_b: int) -> list[int
     not metric, because a segment of unknown scale proves nothing against known scales.  Return an empty list
     if there is no other connection on the path.
     """
-    # 1. The weight of each connection.
+    # 1. Sum the weights of the loop closures of each connection between two segments.
     connections = {
         pair: numbers for pair, numbers in graph.accepted_edges_by_segments().items() if pair[0] != pair[1]
     }
@@ -292,11 +298,12 @@ def find_weakest_connection(graph: MapGraph, row_a: int, row_b: int) -> list[int
         else total_weight(graph, numbers)
         for pair, numbers in connections.items()
     }
-    # 2. The strongest path: the first path when connections are added from the heaviest to the lightest.
+    # 2. Find the strongest path: the first one that exists when connections are added from the heaviest to
+    #    the lightest.
     for min_weight in sorted(set(weights.values()), reverse=True):
         path = _find_path(row_a, row_b, [pair for pair in weights if weights[pair] >= min_weight])
         if path:
-            # 3. Its weakest connection.
+            # 3. Return the weakest connection on the path, unless nothing may reject it.
             weakest = min(path, key=lambda pair: (weights[pair], pair))
             return [] if weights[weakest] == FIXED_WEIGHT else connections[weakest]
     return []
@@ -373,7 +380,7 @@ def _mark_aliases(graph: MapGraph, numbers: list[int], distance_m: float, change
     The places are *distance_m* metres apart.  All keyframes within half of this distance, at most 5 m, are
     marked, since they may look like the other place as well.
     """
-    # 1. Mark the keyframes around both ends.
+    # 1. Mark the keyframes around both ends of the loop closures.
     radius_m = min(0.5 * distance_m, MAX_ALIAS_RADIUS_M)
     ends = {end for number in numbers for end in (graph.edges[number].a, graph.edges[number].b)}
     components = np.array([graph.component_of(i) if graph.exists(i) else -1 for i in range(len(graph))])
@@ -382,7 +389,7 @@ def _mark_aliases(graph: MapGraph, numbers: list[int], distance_m: float, change
         distances_m = np.sqrt(((positions - positions[i]) ** 2).sum(axis=1))
         near = np.flatnonzero((distances_m < radius_m) & (components == components[i]))
         graph.mark_aliased(near.tolist())
-    # 2. Reject the connections between segments that have too little weight without the marked places.
+    # 2. Reject connections between segments that have too little weight without the marked keyframes.
     for pair, connection in sorted(graph.accepted_edges_by_segments().items()):
         is_fixed = any(graph.edges[number].is_fixed for number in connection)
         distinct = [number for number in connection if not is_at_alias(graph, number)]

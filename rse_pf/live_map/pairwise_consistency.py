@@ -63,7 +63,7 @@ MIN_SUPPORTING_KEYFRAMES = 2
 """Different keyframes on each side that loop closures must connect before they join components, because loop
 closures of one keyframe share its errors."""
 MAX_TESTED_EDGES = 48  # newest loop closures between two components that are tested, to bound CPU time
-MAX_EDGES_OF_KEYFRAME = 4  # tested loop closures that share a keyframe, since more repeat the same evidence
+MAX_EDGES_OF_KEYFRAME = 4  # tested loop closures that share a keyframe, at most; more repeat its evidence
 MAX_CONTRARY_EDGES = 24  # newest loop closures that are tested against a contrary one, to bound CPU time
 MAX_CONFIRMED_STEPS = 12.0
 """Steps of odometry between both ends of a loop closure beyond which drift makes the graph too vague to
@@ -73,10 +73,11 @@ KNOWN_SCALE_DEVIATION = 0.03
 an error of 1 to 3 %."""
 
 TEST_NOISE = OdometryNoise()
-"""Drift of odometry that the tests of loop closures assume: about three times that of the smoother, so that
+"""Drift of odometry that the tests of loop closures assume: two to three times that of the smoother, so that
 no true loop closure fails."""
 ALIAS_DISTANCE_M = 1.0
-"""Metres from which on two poses count as two places: errors of true loop closures stay far below."""
+"""Metres between two poses from which on they are two places that look the same, and not one place with an
+error."""
 RIVAL_WEIGHT = 0.5
 """Share of the weight of the best consistent set from which on a second set, which says another place, makes
 the join ambiguous."""
@@ -168,21 +169,22 @@ def classify_by_graph(graph: MapGraph, numbers: Sequence[int]) -> dict[int, Fit]
     """Return by number how each of some loop closures within one component fits the poses of the graph."""
     if not numbers:
         return {}
-    # 1. The relative poses that the graph predicts.
+    # 1. Predict the relative poses of the loop closures by the poses of the graph.
     edges = [graph.edges[number] for number in numbers]
     T = graph.T_component_camera
     predicted = inverse(T[[edge.a for edge in edges]]) @ T[[edge.b for edge in edges]]
-    # 2. The steps of odometry between both ends along the graph.
+    # 2. Count the steps of odometry between both ends along the graph; drift grows with them.
     targets: dict[int, list[int]] = {}
     for edge in edges:
         targets.setdefault(edge.a, []).append(edge.b)
     paths = {a: graph.shortest_paths(a, ends) for a, ends in targets.items()}
     steps = [paths[edge.a][edge.b] for edge in edges]
-    # 3. The lever of rotation noise: on a round trip no pose is farther away than the diameter of the circle.
+    # 3. Compute the lever of rotation noise; on a round trip no pose is farther away than the diameter of
+    #    the circle.
     steps_between = np.maximum(np.array(steps), 1.0)
     distance_m = np.sqrt((predicted[:, :3, 3] ** 2).sum(axis=1))
     lever_m = np.maximum(distance_m, STEP_LENGTH_M * steps_between / math.pi)
-    # 4. The tests of pose and scale.
+    # 4. Test whether noise explains the errors of pose and scale.
     measured = _stack_edges([_edge_within_component(graph, edge) for edge in edges])
     agrees = fits_prediction(predicted, measured, steps_between, lever_m, TEST_NOISE)
     has_scale = [has_consistent_scale(graph, edge, along) for edge, along in zip(edges, steps, strict=True)]
@@ -235,16 +237,16 @@ def find_consistent_by_odometry(graph: MapGraph, number: int, others: Iterable[i
     candidates = choose_testable_edges(graph, sorted({*others} - {number}))[-MAX_CONTRARY_EDGES:]
     if not candidates:
         return [number]
-    # 1. Take the edges in the direction and unit of one segment, the metric one if there is one.
+    # 1. Express the loop closures in the direction and unit of one segment, the metric one if there is one.
     edge = graph.edges[number]
     base, opposite = int(graph.segment_rows[edge.a]), int(graph.segment_rows[edge.b])
     if graph.segments[opposite].is_metric and not graph.segments[base].is_metric:
         base = opposite
     directed = [_edge_between_segments(graph, graph.edges[each], base) for each in candidates]
     reference = _edge_between_segments(graph, edge, base)
-    # 2. Keep those that agree with the loop closure itself.
+    # 2. Keep the other loop closures that agree with loop closure *number*.
     near = np.flatnonzero(_agree_by_odometry(graph, directed, reference))
-    # 3. Test them pairwise; the largest set is a maximum clique.
+    # 3. Test these pairwise; the largest set that agrees is a maximum clique.
     agree = np.zeros((len(near), len(near)), dtype=np.bool_)
     for j in range(1, len(near)):
         before = [directed[position] for position in near[:j]]
@@ -347,7 +349,7 @@ def decide_join(graph: MapGraph, first: int, second: int) -> Join | AmbiguousJoi
     stay, moving = (second, first) if is_second else (first, second)
     if choose_metric_component(graph, stay, moving) != stay:
         stay, moving = moving, stay
-    # 4. The median over the loop closures gives scale and pose.
+    # 4. Compute scale and pose as medians over the loop closures.
     log_scale = _median_log_scale(graph, consistent, stay)
     T_stay_moving = _median_frame(graph, consistent, stay, log_scale)
     return Join(moving=moving, T_stay_moving=T_stay_moving, scale=math.exp(log_scale), edges=consistent)
@@ -366,7 +368,7 @@ def _find_consistent_edges(
 
     The set is empty if all of them together have too little weight.  *excluded* ones are left out.
     """
-    # 1. Choose the loop closures between both components, with a scale that the graph does not contradict.
+    # 1. Choose the pending loop closures between both components whose scale the graph does not contradict.
     pair = {first, second}
     numbers = [
         number
@@ -376,13 +378,14 @@ def _find_consistent_edges(
     ]
     base = choose_metric_component(graph, first, second)
     numbers = [number for number in numbers if has_consistent_scale(graph, graph.edges[number])]
-    # 2. Bound their number; where rooms look the same, those that are left must reach beyond one room.
+    # 2. Limit their number. Where rooms look the same, take them at a distance from each other, so that the
+    #    limited number extends over more than one room.
     if graph.equal_rooms_m:
         numbers = _thin_out(graph, numbers, base, 3.0 * graph.equal_rooms_m / MAX_TESTED_EDGES)
     numbers = choose_testable_edges(graph, numbers)
     if total_weight(graph, numbers) < MIN_SUPPORT:
         return []
-    # 3. Test the pairs that were not tested before.
+    # 3. Test the pairs of loop closures that were not tested before.
     for position, later in enumerate(numbers):
         untested = [each for each in numbers[:position] if (each, later) not in graph.pair_consistency]
         if untested:
@@ -393,7 +396,7 @@ def _find_consistent_edges(
     for j, later in enumerate(numbers):
         for i, earlier in enumerate(numbers[:j]):
             adjacency[i, j] = adjacency[j, i] = graph.pair_consistency[earlier, later]
-    # 4. The largest consistent set is a maximum clique.
+    # 4. The largest consistent set is a maximum clique of the graph of consistent pairs.
     return _find_heaviest_clique(graph, numbers, adjacency)
 
 
@@ -428,12 +431,12 @@ def _find_ambiguity(graph: MapGraph, first: int, second: int, consistent: list[i
     distinct = [number for number in consistent if not is_at_alias(graph, number)]
     if not has_enough_support(graph, distinct):
         return "ambiguous: what it sees is in the map at several places"
-    # 2. Where rooms look the same, the loop closures must reach beyond one room on both sides.
+    # 2. Where rooms look the same, the loop closures must extend over more than one room on both sides.
     size_m = graph.equal_rooms_m
     metric = [side for side in (first, second) if not graph.has_scales or graph.is_metric(side)]
     if size_m and min((_extent_m(graph, distinct, side) for side in metric), default=0.0) <= size_m:
         return f"ambiguous: what it shares with others lies within {size_m:g} m, the size of equal rooms"
-    # 3. A second consistent set of similar weight must say the same place.
+    # 3. A second consistent set of at least half of the weight must give the same pose.
     rivals = _find_consistent_edges(graph, first, second, frozenset(consistent))
     is_heavy = total_weight(graph, rivals) / RIVAL_WEIGHT >= total_weight(graph, consistent)
     if is_heavy and has_enough_support(graph, rivals):
@@ -456,7 +459,7 @@ def _extent_m(graph: MapGraph, numbers: list[int], component: int) -> float:
 
 
 def _median_log_scale(graph: MapGraph, numbers: list[int], stay: int) -> float:
-    """Return the logarithm of the length of the other component's unit in the unit of *stay*."""
+    """Return the median logarithm of the length of the other component's unit in the unit of *stay*."""
     return float(np.median([relative_scale(graph, number, stay)[0] for number in numbers]))
 
 

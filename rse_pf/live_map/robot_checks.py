@@ -23,7 +23,7 @@ __all__ = ["exclude_if_contradicting", "has_odometry_jump", "has_wrong_scale"]
 JUMP_NEIGHBOURS = 4
 """Keyframes before a new one that may prove a jump of its odometry: they saw the same place a moment before,
 so they cannot be at another place that looks the same."""
-MAX_JUMP_RATIO = 0.5  # error of odometry per length of its motion from which on the odometry has jumped
+MAX_JUMP_RATIO = 0.5  # error of odometry per length of motion above which the odometry has jumped
 MAX_CONTRADICTIONS = 16
 """Contradictions among the last 32 keyframes from which on a robot is excluded; honest robots stay far below,
 also with 10 % of wheel slip."""

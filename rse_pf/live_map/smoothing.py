@@ -37,7 +37,7 @@ __all__ = [
 Rows = npt.NDArray[np.int64]
 
 DRIFT = OdometryNoise(step_m=0.007, step_deg=0.35)
-"""Drift of odometry in one step that the smoother assumes; the tests of loop closures assume about three
+"""Drift of odometry in one step that the smoother assumes; the tests of loop closures assume two to three
 times as much, so that no true loop closure fails."""
 CAUCHY_WIDTH = 3.0
 """Width of the Cauchy kernel on loop closures, standard deviations; larger residuals have less effect."""
@@ -108,7 +108,7 @@ def smooth_changes(
     debt = graph.smoothing_debt.get(robot, 0) if robot is not None else 0
     if debt >= options.max_smoothing_debt:
         options = replace(options, window_sizes=options.window_sizes[:1])
-    # 2. Smooth; reject what misfits; smooth again without it.
+    # 2. Smooth; reject loop closures that misfit the result for long; smooth again without them.
     windows, keyframe_count = None, 0
     if changes.moved:
         windows = smooth_around(graph, changes.moved, graph.anchors(), options)
@@ -116,7 +116,7 @@ def smooth_changes(
         if reject_misfitting_edges(graph, windows.squared_misfits, changes):
             windows = smooth_around(graph, changes.moved, graph.anchors(), options)
             keyframe_count += windows.keyframe_count
-    # 3. Charge the robot.
+    # 3. Add what exceeds the allowance of one keyframe to the debt of the robot, or pay back debt.
     allowance = options.smoothing_allowance
     if robot is not None and (debt or keyframe_count > allowance):
         graph.set_smoothing_debt(robot, max(0, debt + keyframe_count - allowance))
@@ -136,7 +136,7 @@ def smooth_around(
     """
     result = SmoothedWindows()
     held = set(anchors)
-    # 1. Group the keyframes by component.
+    # 1. Group the moved keyframes by component.
     seeds_of: dict[int, list[int]] = {}
     for i in moved:
         if graph.exists(i):
@@ -146,7 +146,7 @@ def smooth_around(
     total = 0.0
     for _, seeds in sorted(seeds_of.items()):
         for size in options.window_sizes:
-            # 2. Choose the window and its edges.
+            # 2. Choose the keyframes of the window, and the edges that touch them.
             ids, is_whole = _choose_window(graph, seeds, size, held)
             if not ids:
                 break
@@ -154,7 +154,7 @@ def smooth_around(
             edges = _select_edges_with_scales(graph, ids, free_scales)
             if not len(edges.a):
                 break
-            # 3. Smooth a copy of its poses.
+            # 3. Smooth a copy of the poses of the window.
             inside = set(ids)
             wanted = [i for i in newest if i in inside]
             result.keyframe_count += len(ids)
@@ -198,7 +198,7 @@ def select_edges(graph: MapGraph, ids: Iterable[int]) -> GraphEdges:
     The information of odometry is that of a random walk.  The information of a loop closure is multiplied by
     the square of its weight: half of the evidence counts as half of the precision.
     """
-    # 1. Find the edges.
+    # 1. Find the edges that touch the keyframes.
     loop_numbers: set[int] = set()
     steps: set[tuple[int, int]] = set()
     for i in ids:
@@ -208,7 +208,7 @@ def select_edges(graph: MapGraph, ids: Iterable[int]) -> GraphEdges:
     loops = [graph.edges[number] for number in numbers]
     pairs = np.array(sorted(steps), dtype=np.int64).reshape(-1, 2)
     a, b = pairs[:, 0], pairs[:, 1]
-    # 2. Odometry.
+    # 2. Compute the relative poses of odometry, and their information by the steps between them.
     T_odometry: Array = inverse(graph.T_odom_camera[a]) @ graph.T_odom_camera[b]
     if graph.has_scales:
         T_odometry = scaled(
@@ -218,13 +218,13 @@ def select_edges(graph: MapGraph, ids: Iterable[int]) -> GraphEdges:
     odometry[:, range(6), range(6)] = (
         odometry_information() / (graph.odometry_steps[b] - graph.odometry_steps[a])[:, None]
     )
-    # 3. Loop closures.
+    # 3. Take the relative poses of loop closures, and their information reduced by their weight.
     T_loops, information = np.empty((0, 4, 4)), np.empty((0, 6, 6))
     if loops:
         T_loops = np.array([graph.relative_pose_of(edge) for edge in loops])
         weights = np.array([edge.weight for edge in loops])
         information = weights[:, None, None] ** 2 * np.array([information_of(graph, edge) for edge in loops])
-    # 4. The units in which they were measured.
+    # 4. Note the segment in whose unit each edge was measured, since its scale may be estimated.
     unit_segments = np.full(len(a) + len(loops), -1, dtype=np.int64)
     if graph.has_scales:
         rows = graph.segment_rows[a]
@@ -367,10 +367,10 @@ def _scale_terms(graph: MapGraph, edges: GraphEdges, free_scales: list[int]) -> 
     """
     if not free_scales:
         return None
-    # 1. The index of each estimated scale by row of its segment.
+    # 1. Number the estimated scales, and look them up by the row of their segment.
     index_of_row = np.full(len(graph.segments) + 1, -1, dtype=np.int64)
     index_of_row[free_scales] = np.arange(len(free_scales))
-    # 2. The logarithm of the ratio of scales that each loop closure measures, and its information.
+    # 2. Compute the logarithm of the ratio of scales that each loop closure measures, and its information.
     m = len(edges.a)
     difference, information = np.zeros(m), np.zeros(m)
     for position in np.flatnonzero(edges.numbers >= 0).tolist():
@@ -379,7 +379,7 @@ def _scale_terms(graph: MapGraph, edges: GraphEdges, free_scales: list[int]) -> 
             scale_a, scale_b = graph.segment_of(edge.a).scale, graph.segment_of(edge.b).scale
             difference[position] = edge.scale[0] + math.log(scale_a / scale_b)
             information[position] = edge.weight**2 / edge.scale[1]
-    # 3. Share the information of one measurement among all that a segment takes part in.
+    # 3. Divide the information by the number of measurements of the segment, so that all count as one.
     measures = information > 0.0
     plus, minus = (
         np.where(measures, index_of_row[graph.segment_rows[ends]], -1) for ends in (edges.b, edges.a)

@@ -223,7 +223,7 @@ def _unpack_segments(packed: _Packed) -> list[Segment]:
         for robot, number, keyframes, component, reported, covariance, reason, is_from_version
         in packed.segments
     ]  # fmt: skip
-    # Snapshots of earlier releases do not say how far segments are trusted.
+    # Snapshots of earlier releases do not have the contradictions of segments.
     for segment, (contradictions, is_excluded) in zip(segments, packed.trust, strict=False):
         segment.contradictions, segment.is_excluded = contradictions, is_excluded
     return segments

@@ -112,7 +112,7 @@ def version_of(graph: MapGraph) -> MapVersion:
 
 
 def _version_of(graph: MapGraph) -> MapVersion:
-    # 1. Decode the keyframes, and collect what their IMUs say about gravity.
+    # 1. Decode the keyframes, and collect the directions of gravity that their IMUs measured.
     ids = [i for i in _aligned_keyframes(graph) if graph.has_features[i]]
     keyframes: list[Keyframe] = []
     down_directions: dict[str, list[Array]] = {}
@@ -139,7 +139,7 @@ def _version_of(graph: MapGraph) -> MapVersion:
         keyframes = [
             replace(keyframe, T_world_camera=upright @ keyframe.T_world_camera) for keyframe in keyframes
         ]
-    # 3. Collect the edges.
+    # 3. Collect odometry and accepted loop closures between published keyframes.
     published = set(ids)
     edges: list[Edge] = []
     for segment in _aligned_segments(graph):

@@ -150,7 +150,7 @@ def find_consistent_set(
     for k in range(len(loop_closures)):
         steps = np.abs(order[edges.a] - order[edges.a[k]]) + np.abs(order[edges.b] - order[edges.b[k]])
         agree[k] = are_pairwise_consistent(T_world_camera, edges, edges.select(slice(k, k + 1)), steps, noise)
-    # 2. A pair agrees if both directions of the test say so, since rounding may differ.
+    # 2. The test depends on which loop closure of a pair is the reference, so both directions must agree.
     agree &= agree.T
     np.fill_diagonal(agree, False)
     # 3. The largest set that agrees pairwise is a maximum clique of the graph of agreeing pairs.
@@ -179,10 +179,10 @@ def are_pairwise_consistent(
     Source:
         Mangelson et al., Pairwise consistent measurement set maximization, ICRA 2018.
     """
-    # 1. Odometry between the ends of both loop closures.
+    # 1. Compute the odometry between the ends of both loop closures.
     along_b = inverse(T[reference.b]) @ T[edges.b]
     along_a = inverse(T[edges.a]) @ T[reference.a]
-    # 2. Where units differ: the mean of both scales, and its variance.
+    # 2. Where units of length differ, compute the mean of both measured scales and its variance.
     scale_difference2, mean_scale_variance, scale_variance = np.zeros(1), np.zeros(1), np.ones(1)
     if edges.scales is not None and reference.scales is not None:
         difference = (edges.scales - reference.scales)[:, 0]
@@ -191,15 +191,15 @@ def are_pairwise_consistent(
         along_b = scaled(along_b, np.exp(log_scale))
         scale_difference2 = difference**2
         mean_scale_variance = edges.scales[:, 1] * reference.scales[:, 1] / scale_variance
-    # 3. The round trip a_reference -> b_reference -> b -> a -> a_reference as a twist.
+    # 3. Compute the round trip a_reference -> b_reference -> b -> a -> a_reference as a twist.
     trip = log_se3(reference.T_a_b @ along_b @ inverse(edges.T_a_b) @ along_a)
-    # 4. The variance that noise explains.
+    # 4. Sum the variances of both loop closures and of the odometry between them.
     lever_m2 = (along_a[:, :3, 3] ** 2).sum(axis=1) + (along_b[:, :3, 3] ** 2).sum(axis=1)
     variance_m2, variance_rad2 = edges.mean_variances
     reference_m2, reference_rad2 = reference.mean_variances
     variance_rad2 = variance_rad2 + reference_rad2 + steps * math.radians(noise.step_deg) ** 2
     variance_m2 = variance_m2 + reference_m2 + steps * noise.step_m**2 + variance_rad2 * lever_m2
-    # 5. The chi-squared tests.
+    # 5. Test translation, rotation and scale against the chi-squared distribution.
     if edges.scales is None:
         return _are_twists_noise(trip, variance_m2, variance_rad2)
     variance_m2 = variance_m2 + mean_scale_variance * (along_b[:, :3, 3] ** 2).sum(axis=1)
