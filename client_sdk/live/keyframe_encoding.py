@@ -6,7 +6,7 @@ import numpy as np
 
 from client_sdk.frontend import Features, Frame
 from client_sdk.live.attachments import EncodedAttachments
-from client_sdk.tracking.monocular_tracker import AdjustedKeyframe
+from client_sdk.tracking.monocular_segment import AdjustedKeyframe
 from rse_pf.geometry import Array, Camera
 from rse_pf.maps.descriptors import DescriptorKind
 from rse_pf.pnp import DepthNoise

@@ -45,7 +45,8 @@ from client_sdk.live.relocaliser import Relocaliser
 from client_sdk.mapper import AskPose, Mapper
 from client_sdk.plugins import FeaturesFunction, LoopsFunction, MotionFunction
 from client_sdk.point_map import MapOptions, PointMap
-from client_sdk.tracking.monocular_tracker import AdjustedKeyframe, MonocularTracker
+from client_sdk.tracking.monocular_segment import AdjustedKeyframe
+from client_sdk.tracking.monocular_tracker import MonocularTracker
 from client_sdk.tracking.segments import add_to_cloud
 from client_sdk.trajectory import Trajectory
 from rse_pf.errors import BadMessage, BadRequest, RsePfError, UnsupportedProtocol, UsageError

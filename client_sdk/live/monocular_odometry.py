@@ -12,7 +12,8 @@ import math
 from collections.abc import Iterator
 from dataclasses import replace
 
-from client_sdk.tracking.monocular_tracker import AdjustedKeyframe, MonocularTracker
+from client_sdk.tracking.monocular_segment import AdjustedKeyframe
+from client_sdk.tracking.monocular_tracker import MonocularTracker
 from rse_pf.geometry import Array, inverse, scaled
 
 __all__ = ["MonocularOdometry"]

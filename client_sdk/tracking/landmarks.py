@@ -142,9 +142,8 @@ def shift_landmarks(numbers: Rows, first: int) -> Rows:
 
 def _change_columns(change: Callable[..., npt.NDArray[np.generic]], *tables: Landmarks) -> Landmarks:
     """Return landmarks whose arrays are made by *change* from the same array of each of *tables*."""
-    return Landmarks(
-        **{
-            column.name: change(*(getattr(table, column.name) for table in tables))  # type: ignore[arg-type]
-            for column in fields(Landmarks)
-        }
-    )
+    columns = {name: change(*(getattr(table, name) for table in tables)) for name in _COLUMNS}
+    return Landmarks(**columns)  # type: ignore[arg-type]
+
+
+_COLUMNS = tuple(column.name for column in fields(Landmarks))

@@ -26,6 +26,12 @@ from client_sdk.tracking.landmark_map import (
     MonocularView,
 )
 from client_sdk.tracking.landmarks import NO_LANDMARK, Matches, match_by_appearance, shift_landmarks
+from client_sdk.tracking.monocular_segment import (
+    AdjustedKeyframe,
+    MonocularSegment,
+    PosedView,
+    Similarity,
+)
 from client_sdk.tracking.place_recognition import (
     LATEST_KEYFRAMES,
     list_other_segments,
@@ -37,12 +43,12 @@ from client_sdk.tracking.pose_queries import CLEAR_INLIERS, FrameSteps, OpenQuer
 from client_sdk.tracking.segment_join import NOT_JOINED, Join
 from client_sdk.trajectory import Trajectory
 from rse_pf.errors import UsageError
-from rse_pf.geometry import Array, inverse, pose_difference, rigid, scaled, transform
-from rse_pf.maps.descriptors import ORB, DescriptorKind
+from rse_pf.geometry import Array, inverse, pose_difference, scaled, transform
+from rse_pf.maps.descriptors import ORB
 from rse_pf.slam.descriptors import match_all
-from rse_pf.slam.tracking import GuidedMatchLimits, ImageFeatures, Observations, fit_pose
+from rse_pf.slam.tracking import GuidedMatchLimits
 
-__all__ = ["AdjustedKeyframe", "MonocularOptions", "MonocularTracker"]
+__all__ = ["MonocularOptions", "MonocularTracker"]
 
 Rows = npt.NDArray[np.int64]
 
@@ -68,11 +74,6 @@ _WIDE_SEARCH_FACTOR = 2.5
 """Radius of the second guided search as a multiple of ``search_px``, for a camera that moved unexpectedly."""
 _VERIFY_RADIUS_PX = 8.0
 """Radius around projected landmarks in which a solved pose is matched first."""
-_REFINE_RADIUS_PX = 5.0
-"""Radius around projected landmarks in which a fitted pose is matched again."""
-_VERIFY_LOWE_RATIO = 0.9
-"""Lowe's ratio for matches around the pixels of a solved pose: looser than elsewhere, since the radius is
-small."""
 _TRACKED_RATIO = 0.25
 """Smallest share of inliers among the matches of an accepted answer."""
 _JOIN_INTERVAL_FRAMES = 3
@@ -81,13 +82,6 @@ _LOOP_CANDIDATES = 2
 """Number of older keyframes that are compared with a new keyframe to find a loop closure."""
 _LOOP_AGE_KEYFRAMES = 15
 """Number of keyframes between the two keyframes of a loop closure, and between two loop closures."""
-_AGREEMENT_DEPTH_SHARE = 0.07
-"""Largest distance of the camera's centre between two measurements of one similarity that confirm each other,
-as a share of the median depth."""
-_AGREEMENT_DEG = 4.0
-"""Largest rotation, in degrees, between two measurements of one similarity that confirm each other."""
-_AGREEMENT_SCALE_RATIO = 1.1
-"""Largest ratio of the scales of two measurements of one similarity that confirm each other."""
 _MAX_SCALE_SPREAD = 0.15
 """Largest median deviation of the ratios of depths from their median, as a share of it, with which they give
 the scale between two segments."""
@@ -133,154 +127,6 @@ class MonocularOptions:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class AdjustedKeyframe:
-    """A keyframe as the bundle adjustment has it now.
-
-    Attributes:
-        timestamp_s: Time of the frame, in seconds.
-        T_world_camera: ``(4, 4)``, in the unit of the segment.
-        features: Features of the image, ``n`` of them.
-        kind: Kind of their descriptors.
-        depths: ``(n,)``, depth of each feature along the optical axis in the unit of the segment, NaN for
-            features without a landmark.
-    """
-
-    timestamp_s: float
-    T_world_camera: Array
-    features: ImageFeatures
-    kind: DescriptorKind
-    depths: Array
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _RelativePose:
-    """Pose of a frame relative to a keyframe, which it follows when the keyframe is adjusted."""
-
-    timestamp_s: float
-    keyframe: int
-    T_keyframe_camera: Array
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _PosedView:
-    """An image with its verified pose.
-
-    Attributes:
-        view: The image.
-        T_camera_world: ``(4, 4)``, in the frame and unit of its segment.
-        landmarks: ``(n,)``, landmark of each feature, or NO_LANDMARK.
-        matches: Number of matches of the image.
-        is_weak: Whether the solver calls the pose weak; the image never becomes a keyframe then.
-    """
-
-    view: MonocularView
-    T_camera_world: Array
-    landmarks: Rows
-    matches: int
-    is_weak: bool
-
-    @property
-    def inliers(self) -> int:
-        """The number of landmarks that agree with the pose."""
-        return int((self.landmarks != NO_LANDMARK).sum())
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Similarity:
-    """Where a segment lies in another one, or the newer part of a segment in its older part.
-
-    Attributes:
-        segment: The segment in which it lies.
-        keyframe: Keyframe of that segment that shows the same place.
-        T: ``(4, 4)``, rigid motion into that segment, after all lengths are multiplied by *scale*.
-        scale: Factor of all lengths.
-    """
-
-    segment: int
-    keyframe: int
-    T: Array
-    scale: float
-
-    def inverted(self, segment: int, keyframe: int) -> _Similarity:
-        """Return where that segment lies in *segment*, whose *keyframe* shows the same place."""
-        return _Similarity(
-            segment=segment,
-            keyframe=keyframe,
-            T=scaled(inverse(self.T), 1.0 / self.scale),
-            scale=1.0 / self.scale,
-        )
-
-    def agrees_with(self, other: _Similarity, centre: Array, depth: float) -> bool:
-        """Return whether two measurements confirm each other at a camera's *centre* ``(3,)``.
-
-        Distances are compared with the median *depth* of the place.
-        """
-        first, second = (transform(s.T, s.scale * centre[None])[0] for s in (self, other))
-        _, apart_deg = pose_difference(self.T, other.T)
-        scale_ratio = max(self.scale / other.scale, other.scale / self.scale)
-        return (
-            float(np.linalg.norm(first - second)) <= _AGREEMENT_DEPTH_SHARE * depth
-            and apart_deg <= _AGREEMENT_DEG
-            and scale_ratio <= _AGREEMENT_SCALE_RATIO
-        )
-
-
-@dataclass(slots=True, kw_only=True, eq=False)
-class _Segment:
-    """One segment of a drive.
-
-    Attributes:
-        map: Keyframes and landmarks.
-        length_factor: By what the lengths around the newest frames were multiplied since the segment began.
-        frames: Poses of all frames of the segment.
-        reference: The reference keyframe, around which frames are tracked.
-        reference_landmarks: Number of landmarks that it saw when it became the reference.
-    """
-
-    map: LandmarkMap
-    length_factor: float = 1.0
-    frames: list[_RelativePose] = field(default_factory=list)
-    reference: int = 0
-    reference_landmarks: int = 0
-
-    def set_reference(self, keyframe: int) -> None:
-        """Track frames around a keyframe from now on."""
-        self.reference = keyframe
-        self.reference_landmarks = len(self.map.landmarks_of(keyframe))
-
-    def add_frame(self, timestamp_s: float, T_camera_world: Array, keyframe: int) -> None:
-        """Add a frame with its pose, which follows a keyframe."""
-        relative = self.map.keyframes[keyframe].T_camera_world @ inverse(T_camera_world)
-        self.frames.append(
-            _RelativePose(timestamp_s=timestamp_s, keyframe=keyframe, T_keyframe_camera=relative)
-        )
-
-    def move(self, T_new_old: Array, scale: float) -> None:
-        """Express the segment in another frame: multiply all lengths by *scale*, then apply *T_new_old*."""
-        self.map.move(T_new_old, scale)
-        self.length_factor *= scale
-        self.frames = [
-            replace(frame, T_keyframe_camera=scaled(frame.T_keyframe_camera, scale)) for frame in self.frames
-        ]
-
-    def append(self, newer: _Segment) -> tuple[int, int]:
-        """Add all of a segment in the same frame; return its first keyframe's and landmark's numbers here."""
-        keyframe, landmark = self.map.append(newer.map)
-        self.frames += [replace(frame, keyframe=frame.keyframe + keyframe) for frame in newer.frames]
-        return keyframe, landmark
-
-    def trajectory(self) -> Trajectory:
-        """Return the poses of all frames in the order of time."""
-        stamps_s = np.array([frame.timestamp_s for frame in self.frames])
-        poses = [
-            inverse(self.map.keyframes[frame.keyframe].T_camera_world) @ frame.T_keyframe_camera
-            for frame in self.frames
-        ]
-        order = np.argsort(stamps_s, kind="stable")
-        return Trajectory(stamps_s[order], np.array(poses).reshape(-1, 4, 4)[order])
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _TrackState:
     """What a tracker knows of the camera between two frames.
 
@@ -296,11 +142,11 @@ class _TrackState:
     """
 
     segment: int = 0
-    last: _PosedView | None = None
+    last: PosedView | None = None
     timestamp_s: float = 0.0
     T_next_last: Array = field(default_factory=lambda: np.eye(4))
     unrecognised: int = 0
-    candidate: _Similarity | None = None
+    candidate: Similarity | None = None
     next_loop_keyframe: int = 0
 
 
@@ -342,7 +188,7 @@ class MonocularTracker:
         self._plugins = plugins or Plugins()
         self._T_world_start = np.eye(4) if T_world_start is None else T_world_start
         self._state = _TrackState()
-        self._segments: dict[int, _Segment] = {}
+        self._segments: dict[int, MonocularSegment] = {}
         self._next_segment = 0
         self._waiting: list[tuple[float, MonocularView]] = []
         """Times and images of frames without a pose that may be the first view of a segment."""
@@ -540,16 +386,17 @@ class MonocularTracker:
 
     def _track_from_last_pose(
         self, view: MonocularView
-    ) -> Generator[PoseQuery, QueryAnswer, tuple[_PosedView | None, str]]:
+    ) -> Generator[PoseQuery, QueryAnswer, tuple[PosedView | None, str]]:
         """Ask for the pose of a frame around its last pose; return it, or None and why there is none."""
+        # 1. Predict the pose.
         reason, search_px, min_inliers = "", self.options.search_px, self.options.min_inliers
+        guided = GuidedMatchLimits(radius_px=search_px)
+        wide = GuidedMatchLimits(radius_px=_WIDE_SEARCH_FACTOR * search_px)
+        T_predicted, guided_matches = self._predict_pose(), _GUIDED_MATCHES_FACTOR * min_inliers
+        # 2. Match: near the predicted pixels, in a wider radius, or with the last frame by appearance.
         attempts: tuple[tuple[Callable[[], Matches], Literal["map", "frame"], int], ...] = (
-            (lambda: self._match_predicted(view, search_px), "map", _GUIDED_MATCHES_FACTOR * min_inliers),
-            (
-                lambda: self._match_predicted(view, _WIDE_SEARCH_FACTOR * search_px),
-                "map",
-                _GUIDED_MATCHES_FACTOR * min_inliers,
-            ),
+            (lambda: self._present.match(view, T_predicted, guided), "map", guided_matches),
+            (lambda: self._present.match(view, T_predicted, wide), "map", guided_matches),
             (lambda: self._match_last_frame(view), "frame", min_inliers),
         )
         for match, against, min_matches in attempts:
@@ -557,16 +404,12 @@ class MonocularTracker:
             if len(matches) < min_matches:
                 reason = f"only {len(matches)} matches with the map"
                 continue
+            # 3. Solve and verify.
             answer = yield self._make_query(view, matches, against)
             posed, reason = self._verify(self._present, view, answer, len(matches))
             if posed is not None:
                 return posed, ""
         return None, reason
-
-    def _match_predicted(self, view: MonocularView, radius_px: float) -> Matches:
-        """Match the landmarks around the reference keyframe near the pixels of the predicted pose."""
-        limits = GuidedMatchLimits(radius_px=radius_px)
-        return _match_guided(self._present, view, self._predict_pose(), limits)
 
     def _predict_pose(self) -> Array:
         """Predict ``T_camera_world`` of the frame: by a user's motion model, or by a constant velocity.
@@ -594,7 +437,7 @@ class MonocularTracker:
     # --- Recognise known places ---
 
     @property
-    def _present(self) -> _Segment:
+    def _present(self) -> MonocularSegment:
         """The present segment."""
         return self._segments[self._state.segment]
 
@@ -605,7 +448,7 @@ class MonocularTracker:
 
     def _relocalise(
         self, view: MonocularView
-    ) -> Generator[PoseQuery, QueryAnswer, tuple[_PosedView | None, str]]:
+    ) -> Generator[PoseQuery, QueryAnswer, tuple[PosedView | None, str]]:
         """Ask for the pose of a frame at known places; return it, or None and why there is none."""
         present = self._state.segment
         keyframes = list_relocalisation_candidates(self._maps, view.place_vector, present)
@@ -673,8 +516,8 @@ class MonocularTracker:
         self.loop_scales.append(similarity.scale)
 
     def _measure_similarity(
-        self, posed: _PosedView, keyframes: Iterable[tuple[int, int]]
-    ) -> Generator[PoseQuery, QueryAnswer, _Similarity | None]:
+        self, posed: PosedView, keyframes: Iterable[tuple[int, int]]
+    ) -> Generator[PoseQuery, QueryAnswer, Similarity | None]:
         """Measure where the present segment lies by the place of a frame among keyframes.
 
         Args:
@@ -700,7 +543,7 @@ class MonocularTracker:
         if scale is None:
             return None
         # 3. Compare the measurement with that of an earlier frame.
-        measured = _Similarity(
+        measured = Similarity(
             segment=best.segment,
             keyframe=best.keyframe,
             T=inverse(there.T_camera_world) @ scaled(posed.T_camera_world, scale),
@@ -713,7 +556,7 @@ class MonocularTracker:
         centre, depth = inverse(posed.T_camera_world)[:3, 3], segment.map.median_depth(best.keyframe)
         return measured if previous.agrees_with(measured, centre, depth) else None
 
-    def _measure_scale(self, posed: _PosedView, there: _PosedView, other_map: LandmarkMap) -> float | None:
+    def _measure_scale(self, posed: PosedView, there: PosedView, other_map: LandmarkMap) -> float | None:
         """Return by what the lengths of the present segment are multiplied in another map.
 
         It is the median ratio of the depths of features that have a landmark in both maps; None if these are
@@ -729,7 +572,7 @@ class MonocularTracker:
         scale = float(np.median(ratios))
         return scale if np.median(np.abs(ratios - scale)) <= _MAX_SCALE_SPREAD * scale else None
 
-    def _join(self, segment: int, similarity: _Similarity, keyframe: int) -> None:
+    def _join(self, segment: int, similarity: Similarity, keyframe: int) -> None:
         """Move all of *segment*, the newer one, into an older one, which keeps its frame and its unit.
 
         Args:
@@ -768,7 +611,7 @@ class MonocularTracker:
         self._state = replace(state, T_next_last=scaled(state.T_next_last, scale), last=last)
         self._plugins.forget_poses()
 
-    def _merge_places(self, older: int, newer: int, bend_by: _Similarity | None = None) -> None:
+    def _merge_places(self, older: int, newer: int, bend_by: Similarity | None = None) -> None:
         """Fuse the landmarks around two keyframes of one place, and adjust the whole present map.
 
         With *bend_by* the map between the two keyframes is bent before, so that the newer one is in its
@@ -798,7 +641,8 @@ class MonocularTracker:
             self._frame,
             matches,
             view.features,
-            self.options,
+            inlier_px=self.options.inlier_px,
+            max_iterations=self.options.max_iterations,
             max_matches=self.options.max_matches,
             against=against,
         )
@@ -809,12 +653,12 @@ class MonocularTracker:
 
     def _verify(
         self,
-        segment: _Segment,
+        segment: MonocularSegment,
         view: MonocularView,
         answer: QueryAnswer,
         match_count: int,
         around: int | None = None,
-    ) -> tuple[_PosedView | None, str]:
+    ) -> tuple[PosedView | None, str]:
         """Fit the pose of an answer to all landmarks around it; return None and why if too few agree.
 
         Args:
@@ -828,51 +672,10 @@ class MonocularTracker:
         pose = answer.accepted_pose(max(self.options.min_inliers, _TRACKED_RATIO * sent))
         if pose is None:
             return None, "the matches agree on no pose"
-        fitted = self._fit(segment, view, pose, _VERIFY_RADIUS_PX, around)
+        fitted = segment.fit(view, pose, _VERIFY_RADIUS_PX, self.options.min_inliers, around)
         if fitted is None:
             return None, "too few landmarks agree with the pose"
         return replace(fitted, matches=match_count, is_weak=answer.is_weak), ""
-
-    def _fit(
-        self,
-        segment: _Segment,
-        view: MonocularView,
-        T_camera_world: Array,
-        radius_px: float,
-        around: int | None = None,
-    ) -> _PosedView | None:
-        """Match landmarks near the pixels of a pose, and fit the pose to them; None if too few agree.
-
-        Both are done twice, first within *radius_px*, then within 5 px.
-        """
-        limits, min_inliers = self.options.limits, self.options.min_inliers
-        for radius in (radius_px, _REFINE_RADIUS_PX):
-            near = GuidedMatchLimits(radius_px=radius, lowe_ratio=_VERIFY_LOWE_RATIO)
-            matches = _match_guided(segment, view, T_camera_world, near, around)
-            count = len(matches)
-            if count < min_inliers:
-                return None
-            observed = Observations(
-                points=matches.landmarks.points,
-                covariances=matches.landmarks.covariances,
-                pixels=view.features.pixels[matches.features],
-                pixel_sigmas_px=limits.pixel_sigma * view.features.sizes[matches.features],
-                depths_m=np.zeros(count),
-                depth_sigmas_m=np.ones(count),
-            )
-            fitted = fit_pose(observed, segment.map.camera, T_camera_world, gate2=limits.outlier_sigma**2)
-            if fitted is None or fitted.is_inlier.sum() < min_inliers:
-                return None
-            pose = rigid(fitted.T_camera_world)
-            if pose is None:
-                return None
-            T_camera_world, is_inlier = pose, fitted.is_inlier
-        inliers = np.flatnonzero(is_inlier)
-        landmarks = np.full(len(view.features), NO_LANDMARK)
-        landmarks[matches.features[inliers]] = matches.landmarks.numbers[inliers]
-        return _PosedView(
-            view=view, T_camera_world=T_camera_world, landmarks=landmarks, matches=count, is_weak=False
-        )
 
     # --- The start of a segment ---
 
@@ -948,7 +751,7 @@ class MonocularTracker:
         is_first = not self._segments
         number = self._next_segment
         self._next_segment += 1
-        segment = self._segments[number] = _Segment(map=new_map)
+        segment = self._segments[number] = MonocularSegment(map=new_map)
         segment.set_reference(1)
         segment.add_frame(first_s, np.eye(4), 0)
         second = new_map.keyframes[1]
@@ -956,7 +759,7 @@ class MonocularTracker:
         if not is_first:
             self.lost_frames -= len(segment.frames)
         # 3. The present frame is the last one now.
-        posed = _PosedView(
+        posed = PosedView(
             view=view,
             T_camera_world=second.T_camera_world,
             landmarks=second.landmarks,
@@ -971,7 +774,7 @@ class MonocularTracker:
         )
         return self._make_result(posed, is_keyframe=True)
 
-    def _pose_waiting_frames(self, segment: _Segment, T_second: Array) -> Array | None:
+    def _pose_waiting_frames(self, segment: MonocularSegment, T_second: Array) -> Array | None:
         """Fit the poses of the frames between the two views of a start, each from an interpolated guess.
 
         *T_second* is ``T_camera_world`` of the second view.  Returned is that of the frame just before it,
@@ -982,7 +785,7 @@ class MonocularTracker:
         for number, (timestamp_s, view) in enumerate(self._waiting[1:], start=1):
             guess = pose.copy()
             guess[:3, 3] += (T_second[:3, 3] - pose[:3, 3]) / (count - number + 1)
-            posed = self._fit(segment, view, guess, self.options.search_px)
+            posed = segment.fit(view, guess, self.options.search_px, self.options.min_inliers)
             newest = None
             if posed is not None:
                 newest = pose = posed.T_camera_world
@@ -992,7 +795,7 @@ class MonocularTracker:
 
     # --- Keep ---
 
-    def _keep(self, posed: _PosedView) -> bool:
+    def _keep(self, posed: PosedView) -> bool:
         """Take a frame with a verified pose as the last one, and into the map; return if it is a keyframe."""
         segment, last = self._present, self._state.last
         # 1. Update the motion model; after a loss the motion is not known.
@@ -1020,7 +823,7 @@ class MonocularTracker:
         )
         return is_keyframe
 
-    def _is_keyframe(self, posed: _PosedView) -> bool:
+    def _is_keyframe(self, posed: PosedView) -> bool:
         """Return whether a frame differs much from the reference keyframe, and the map may grow."""
         options, segment = self.options, self._present
         if segment.map.keyframe_count >= options.limits.max_keyframes:
@@ -1034,7 +837,7 @@ class MonocularTracker:
             or moved > options.keyframe_depth_percent / 100 * depth
         )
 
-    def _make_result(self, posed: _PosedView, *, is_keyframe: bool) -> TrackedFrame:
+    def _make_result(self, posed: PosedView, *, is_keyframe: bool) -> TrackedFrame:
         """Add the last pose to its segment, and return it as the result of the frame."""
         last = self._state.last
         assert last is not None
@@ -1066,19 +869,3 @@ class MonocularTracker:
             scale="up to scale",
             features=self._raw,
         )
-
-
-def _match_guided(
-    segment: _Segment,
-    view: MonocularView,
-    T_camera_world: Array,
-    limits: GuidedMatchLimits,
-    around: int | None = None,
-) -> Matches:
-    """Match the landmarks around a keyframe with an image near the pixels at which a pose predicts them.
-
-    The keyframe is the reference keyframe for None.
-    """
-    own = segment.map
-    numbers = own.local_landmarks(segment.reference if around is None else around)
-    return own.landmarks(numbers).match(T_camera_world, own.camera, view.features, limits, limits.radius_px)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Generator
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Literal
 
 import numpy as np
 
@@ -57,21 +57,13 @@ class QueryAnswer:
 FrameSteps = Generator[PoseQuery, QueryAnswer, TrackedFrame]
 
 
-class _QueryOptions(Protocol):
-    """The options of a tracker that its queries need."""
-
-    @property
-    def inlier_px(self) -> float: ...
-    @property
-    def max_iterations(self) -> int: ...
-
-
 def make_query(
     frame: Frame,
     matches: Matches,
     image: ImageFeatures,
-    options: _QueryOptions,
     *,
+    inlier_px: float,
+    max_iterations: int,
     max_matches: int,
     against: Literal["map", "frame", "keyframe", "segment"],
     T_world_reference: Array | None = None,
@@ -84,7 +76,8 @@ def make_query(
         frame: The frame whose pose is asked for.
         matches: Landmarks that the frame shows.
         image: Features of the frame.
-        options: Options of the tracker.
+        inlier_px: Largest reprojection error of an inlier, in pixels.
+        max_iterations: Largest number of RANSAC iterations.
         max_matches: Largest number of matches that are sent; an even sample is taken of more.
         against: The source of the landmarks, see `PoseQuery`.
         T_world_reference: ``(4, 4)``, pose of the reference camera, in whose frame points are sent; None
@@ -110,8 +103,8 @@ def make_query(
         timestamp_s=frame.timestamp_s,
         correspondences=Correspondences(points_world=points, pixels=pixels, depths_m=sent_depths_m),
         camera=frame.camera,
-        inlier_px=options.inlier_px,
-        max_iterations=options.max_iterations,
+        inlier_px=inlier_px,
+        max_iterations=max_iterations,
         against=against,
         depth_noise=depth_noise,
     )

@@ -7,7 +7,7 @@ pose (elsewhere, by a query), verify it, decide what becomes of the frame, and k
 
 from __future__ import annotations
 
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
@@ -153,25 +153,6 @@ class _TrackState:
     unrecognised: int = 0
     segment: int = -1
     join_candidate: tuple[int, Array] | None = None
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Attempt:
-    """Matches of a frame with landmarks around its last pose, and the conditions for a query.
-
-    Attributes:
-        matches: Landmarks that the frame shows.
-        T_world_reference: ``(4, 4)``, pose in whose frame the points are sent.
-        against: Source of the landmarks, see `PoseQuery`.
-        min_matches: Fewest matches for a query.
-        min_ratio: Smallest share of inliers of an accepted answer.
-    """
-
-    matches: Matches
-    T_world_reference: Array
-    against: Literal["map", "frame"]
-    min_matches: int
-    min_ratio: float
 
 
 class Tracker:
@@ -325,7 +306,7 @@ class Tracker:
             points_camera = with_offset(self._raw.points_camera, f_baseline, self.disparity_offset_px)
             self._raw = replace(self._raw, points_camera=points_camera)
         self.noise.model = frame.depth_noise
-        return self._open.begin(self._track())
+        return self._open.begin(self._track(self._make_view(frame, self._raw)))
 
     def accept(
         self, query: PoseQuery, T_camera_world: Array | None, inliers: int = 0, *, is_weak: bool = False
@@ -346,10 +327,10 @@ class Tracker:
 
     # --- The steps of one frame ---
 
-    def _track(self) -> FrameSteps:
+    def _track(self, view: View) -> FrameSteps:
         """Yield the queries of the present frame, and return its result."""
-        # 1. Extract: `prepare` did; undo the rolling shutter at the last rotation rate.
-        view = self._correct_view(self._make_view(), self._state.rotation_rate)
+        # 1. Undo the rolling shutter of the extracted features at the last rotation rate.
+        view = self._correct_view(view, self._state.rotation_rate)
         if not self._segments:
             return self._begin_or_lose(view, match_count=0)
         # 2. Predict, match, solve and verify around the last pose, then at all known places.
@@ -368,9 +349,8 @@ class Tracker:
             yield from self._find_join(posed)
         return self._make_result(posed, is_keyframe=is_keyframe)
 
-    def _make_view(self) -> View:
-        """Return the image of the present frame, with its rolling shutter."""
-        features, frame = self._raw, self._frame
+    def _make_view(self, frame: Frame, features: Features) -> View:
+        """Return the image of a frame, with its rolling shutter."""
         return View(
             features=features.for_matching(),
             points_camera=features.points_camera,
@@ -387,59 +367,54 @@ class Tracker:
         self, view: View
     ) -> Generator[PoseQuery, QueryAnswer, tuple[_PosedView | None, int]]:
         """Ask for the pose of a frame around its last pose; return it, and the largest number of matches."""
-        max_count = 0
-        ways = [self._match_predicted, self._match_last_frame]
+        # 1. Predict the pose.
+        min_inliers, max_count = self.options.min_inliers, 0
+        T_predicted, T_last = self._predict_pose(), self._state.T_world_camera
+        # 2. Match: near the predicted pixels, with the last frame by appearance, or widely around the last
+        # pose. #    An attempt is: how to match, the reference pose, its source, fewest matches, smallest
+        # inlier ratio.
+        attempts: list[tuple[Callable[[], Matches], Array, Literal["map", "frame"], int, float]] = [
+            (
+                lambda: self._match_guided(view, T_predicted, self.options.search_px, _GUIDED_LOWE_RATIO),
+                T_predicted,
+                "map",
+                _GUIDED_MATCHES_FACTOR * min_inliers,
+                _GUIDED_RATIO,
+            ),
+            (lambda: self._match_last_frame(view), T_last, "frame", min_inliers, _LAST_FRAME_RATIO),
+        ]
         if view.is_stereo:
-            ways.append(self._match_widely)
-        for match in ways:
-            attempt = match(view)
-            count = len(attempt.matches)
+            attempts.append(
+                (
+                    lambda: self._match_guided(view, T_last, _WIDE_RADIUS_PX, _GUIDED_LOWE_RATIO),
+                    T_last,
+                    "map",
+                    min_inliers,
+                    _GUIDED_RATIO,
+                )
+            )
+        for match, T_world_reference, against, min_matches, min_ratio in attempts:
+            matches = match()
+            count = len(matches)
             max_count = max(max_count, count)
-            if count < attempt.min_matches:
+            if count < min_matches:
                 continue
-            reference = attempt.T_world_reference
-            answer = yield self._make_query(view, attempt.matches, reference, attempt.against)
-            T_world_camera = self._read_pose(answer, reference, count, attempt.min_ratio)
+            # 3. Solve.
+            answer = yield self._make_query(view, matches, T_world_reference, against)
+            T_world_camera = self._read_pose(answer, T_world_reference, count, min_ratio)
             if T_world_camera is None or not self._is_plausible(T_world_camera):
                 continue
+            # 4. Verify.
             image, is_continuous = self._correct_view_at(view, T_world_camera, is_near=True)
             posed = self._verify(image, T_world_camera, answer, count, self._map, is_continuous=is_continuous)
             if posed is not None:
                 return posed, max_count
         return None, max_count
 
-    def _match_predicted(self, view: View) -> _Attempt:
-        """Match landmarks near the pixels at which the predicted motion shows them."""
-        T_world_camera = self._predict_pose()
-        return _Attempt(
-            matches=self._match_guided(view, T_world_camera, self.options.search_px, _GUIDED_LOWE_RATIO),
-            T_world_reference=T_world_camera,
-            against="map",
-            min_matches=_GUIDED_MATCHES_FACTOR * self.options.min_inliers,
-            min_ratio=_GUIDED_RATIO,
-        )
-
-    def _match_last_frame(self, view: View) -> _Attempt:
+    def _match_last_frame(self, view: View) -> Matches:
         """Match the landmarks of the last frame by appearance, wherever they are."""
         landmarks = self._landmarks_of_last_frame()
-        return _Attempt(
-            matches=match_by_appearance(landmarks, landmarks.descriptors, view.features),
-            T_world_reference=self._state.T_world_camera,
-            against="frame",
-            min_matches=self.options.min_inliers,
-            min_ratio=_LAST_FRAME_RATIO,
-        )
-
-    def _match_widely(self, view: View) -> _Attempt:
-        """Match landmarks in a wide radius around the pixels at which the last pose shows them."""
-        T_world_camera = self._state.T_world_camera
-        return _Attempt(
-            matches=self._match_guided(view, T_world_camera, _WIDE_RADIUS_PX, _GUIDED_LOWE_RATIO),
-            T_world_reference=T_world_camera,
-            against="map",
-            min_matches=self.options.min_inliers,
-            min_ratio=_GUIDED_RATIO,
-        )
+        return match_by_appearance(landmarks, landmarks.descriptors, view.features)
 
     def _predict_pose(self) -> Array:
         """Predict ``T_world_camera`` of the frame: by a user's motion model, or by a constant velocity.
@@ -610,7 +585,8 @@ class Tracker:
             self._frame,
             matches,
             view.features,
-            self.options,
+            inlier_px=self.options.inlier_px,
+            max_iterations=self.options.max_iterations,
             max_matches=self._max_matches,
             against=against,
             T_world_reference=T_world_reference,

@@ -13,7 +13,7 @@ from client_sdk.frontend import Frame, TrackedFrame
 from client_sdk.live import LiveMapper, LiveOptions
 from client_sdk.live.monocular_odometry import MonocularOdometry
 from client_sdk.simulator.renderer import add_image_noise
-from client_sdk.tracking.monocular_tracker import AdjustedKeyframe
+from client_sdk.tracking.monocular_segment import AdjustedKeyframe
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Array, exp_se3, inverse, pose_difference, scaled
 from rse_pf.maps.descriptors import ORB

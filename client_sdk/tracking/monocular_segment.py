@@ -1,0 +1,245 @@
+"""A segment of a camera without depth: its map, the poses of its frames, and where it lies in another
+segment."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from client_sdk.tracking.landmark_map import LandmarkMap, MonocularView
+from client_sdk.tracking.landmarks import NO_LANDMARK, Matches
+from client_sdk.trajectory import Trajectory
+from rse_pf.geometry import Array, inverse, pose_difference, rigid, scaled, transform
+from rse_pf.maps.descriptors import DescriptorKind
+from rse_pf.slam.tracking import GuidedMatchLimits, ImageFeatures, Observations, fit_pose
+
+__all__ = ["AdjustedKeyframe", "MonocularSegment", "PosedView", "Similarity"]
+
+Rows = npt.NDArray[np.int64]
+
+_REFINE_RADIUS_PX = 5.0
+"""Radius around projected landmarks in which a fitted pose is matched again."""
+_VERIFY_LOWE_RATIO = 0.9
+"""Lowe's ratio for matches around the pixels of a solved pose: looser than elsewhere, since the radius is
+small."""
+_AGREEMENT_DEPTH_SHARE = 0.07
+"""Largest distance of the camera's centre between two measurements of one similarity that confirm each other,
+as a share of the median depth."""
+_AGREEMENT_DEG = 4.0
+"""Largest rotation, in degrees, between two measurements of one similarity that confirm each other."""
+_AGREEMENT_SCALE_RATIO = 1.1
+"""Largest ratio of the scales of two measurements of one similarity that confirm each other."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class AdjustedKeyframe:
+    """A keyframe as the bundle adjustment has it now.
+
+    Attributes:
+        timestamp_s: Time of the frame, in seconds.
+        T_world_camera: ``(4, 4)``, in the unit of the segment.
+        features: Features of the image, ``n`` of them.
+        kind: Kind of their descriptors.
+        depths: ``(n,)``, depth of each feature along the optical axis in the unit of the segment, NaN for
+            features without a landmark.
+    """
+
+    timestamp_s: float
+    T_world_camera: Array
+    features: ImageFeatures
+    kind: DescriptorKind
+    depths: Array
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _RelativePose:
+    """Pose of a frame relative to a keyframe, which it follows when the keyframe is adjusted."""
+
+    timestamp_s: float
+    keyframe: int
+    T_keyframe_camera: Array
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PosedView:
+    """An image with its verified pose.
+
+    Attributes:
+        view: The image.
+        T_camera_world: ``(4, 4)``, in the frame and unit of its segment.
+        landmarks: ``(n,)``, landmark of each feature, or NO_LANDMARK.
+        matches: Number of matches of the image.
+        is_weak: Whether the solver calls the pose weak; the image never becomes a keyframe then.
+    """
+
+    view: MonocularView
+    T_camera_world: Array
+    landmarks: Rows
+    matches: int
+    is_weak: bool
+
+    @property
+    def inliers(self) -> int:
+        """The number of landmarks that agree with the pose."""
+        return int((self.landmarks != NO_LANDMARK).sum())
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Similarity:
+    """Where a segment lies in another one, or the newer part of a segment in its older part.
+
+    Attributes:
+        segment: The segment in which it lies.
+        keyframe: Keyframe of that segment that shows the same place.
+        T: ``(4, 4)``, rigid motion into that segment, after all lengths are multiplied by *scale*.
+        scale: Factor of all lengths.
+    """
+
+    segment: int
+    keyframe: int
+    T: Array
+    scale: float
+
+    def inverted(self, segment: int, keyframe: int) -> Similarity:
+        """Return where that segment lies in *segment*, whose *keyframe* shows the same place."""
+        return Similarity(
+            segment=segment,
+            keyframe=keyframe,
+            T=scaled(inverse(self.T), 1.0 / self.scale),
+            scale=1.0 / self.scale,
+        )
+
+    def agrees_with(self, other: Similarity, centre: Array, depth: float) -> bool:
+        """Return whether two measurements confirm each other at a camera's *centre* ``(3,)``.
+
+        Distances are compared with the median *depth* of the place.
+        """
+        first, second = (transform(s.T, s.scale * centre[None])[0] for s in (self, other))
+        _, apart_deg = pose_difference(self.T, other.T)
+        scale_ratio = max(self.scale / other.scale, other.scale / self.scale)
+        return (
+            float(np.linalg.norm(first - second)) <= _AGREEMENT_DEPTH_SHARE * depth
+            and apart_deg <= _AGREEMENT_DEG
+            and scale_ratio <= _AGREEMENT_SCALE_RATIO
+        )
+
+
+@dataclass(slots=True, kw_only=True, eq=False)
+class MonocularSegment:
+    """One segment of a drive.
+
+    Attributes:
+        map: Keyframes and landmarks.
+        length_factor: By what the lengths around the newest frames were multiplied since the segment began.
+        frames: Poses of all frames of the segment.
+        reference: The reference keyframe, around which frames are tracked.
+        reference_landmarks: Number of landmarks that it saw when it became the reference.
+    """
+
+    map: LandmarkMap
+    length_factor: float = 1.0
+    frames: list[_RelativePose] = field(default_factory=list)
+    reference: int = 0
+    reference_landmarks: int = 0
+
+    def set_reference(self, keyframe: int) -> None:
+        """Track frames around a keyframe from now on."""
+        self.reference = keyframe
+        self.reference_landmarks = len(self.map.landmarks_of(keyframe))
+
+    def add_frame(self, timestamp_s: float, T_camera_world: Array, keyframe: int) -> None:
+        """Add a frame with its pose, which follows a keyframe."""
+        relative = self.map.keyframes[keyframe].T_camera_world @ inverse(T_camera_world)
+        self.frames.append(
+            _RelativePose(timestamp_s=timestamp_s, keyframe=keyframe, T_keyframe_camera=relative)
+        )
+
+    def move(self, T_new_old: Array, scale: float) -> None:
+        """Express the segment in another frame: multiply all lengths by *scale*, then apply *T_new_old*."""
+        self.map.move(T_new_old, scale)
+        self.length_factor *= scale
+        self.frames = [
+            replace(frame, T_keyframe_camera=scaled(frame.T_keyframe_camera, scale)) for frame in self.frames
+        ]
+
+    def append(self, newer: MonocularSegment) -> tuple[int, int]:
+        """Add all of a segment in the same frame; return its first keyframe's and landmark's numbers here."""
+        keyframe, landmark = self.map.append(newer.map)
+        self.frames += [replace(frame, keyframe=frame.keyframe + keyframe) for frame in newer.frames]
+        return keyframe, landmark
+
+    def match(
+        self, view: MonocularView, T_camera_world: Array, limits: GuidedMatchLimits, around: int | None = None
+    ) -> Matches:
+        """Match the landmarks around a keyframe with an image near the pixels at which a pose predicts them.
+
+        Args:
+            view: The image.
+            T_camera_world: ``(4, 4)``, its predicted pose.
+            limits: Conditions of a match.
+            around: The keyframe; None for the reference keyframe.
+        """
+        numbers = self.map.local_landmarks(self.reference if around is None else around)
+        return self.map.landmarks(numbers).match(
+            T_camera_world, self.map.camera, view.features, limits, limits.radius_px
+        )
+
+    def fit(
+        self,
+        view: MonocularView,
+        T_camera_world: Array,
+        radius_px: float,
+        min_inliers: int,
+        around: int | None = None,
+    ) -> PosedView | None:
+        """Match landmarks near the pixels of a pose, and fit the pose to them; None if too few agree.
+
+        Both are done twice, first within *radius_px*, then within 5 px.
+
+        Args:
+            view: The image.
+            T_camera_world: ``(4, 4)``, its initial pose.
+            radius_px: Radius around projected landmarks of the first match.
+            min_inliers: Fewest matches, and fewest landmarks that agree with the pose.
+            around: Keyframe around which landmarks are matched; None for the reference keyframe.
+        """
+        limits = self.map.limits
+        for radius in (radius_px, _REFINE_RADIUS_PX):
+            near = GuidedMatchLimits(radius_px=radius, lowe_ratio=_VERIFY_LOWE_RATIO)
+            matches = self.match(view, T_camera_world, near, around)
+            count = len(matches)
+            if count < min_inliers:
+                return None
+            observed = Observations(
+                points=matches.landmarks.points,
+                covariances=matches.landmarks.covariances,
+                pixels=view.features.pixels[matches.features],
+                pixel_sigmas_px=limits.pixel_sigma * view.features.sizes[matches.features],
+                depths_m=np.zeros(count),
+                depth_sigmas_m=np.ones(count),
+            )
+            fitted = fit_pose(observed, self.map.camera, T_camera_world, gate2=limits.outlier_sigma**2)
+            if fitted is None or fitted.is_inlier.sum() < min_inliers:
+                return None
+            pose = rigid(fitted.T_camera_world)
+            if pose is None:
+                return None
+            T_camera_world, is_inlier = pose, fitted.is_inlier
+        inliers = np.flatnonzero(is_inlier)
+        landmarks = np.full(len(view.features), NO_LANDMARK)
+        landmarks[matches.features[inliers]] = matches.landmarks.numbers[inliers]
+        return PosedView(
+            view=view, T_camera_world=T_camera_world, landmarks=landmarks, matches=count, is_weak=False
+        )
+
+    def trajectory(self) -> Trajectory:
+        """Return the poses of all frames in the order of time."""
+        stamps_s = np.array([frame.timestamp_s for frame in self.frames])
+        poses = [
+            inverse(self.map.keyframes[frame.keyframe].T_camera_world) @ frame.T_keyframe_camera
+            for frame in self.frames
+        ]
+        order = np.argsort(stamps_s, kind="stable")
+        return Trajectory(stamps_s[order], np.array(poses).reshape(-1, 4, 4)[order])
