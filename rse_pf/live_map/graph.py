@@ -630,24 +630,6 @@ class MapGraph:
         """Return the numbers of accepted loop closures by keyframe, without empty lists, for a snapshot."""
         return {i: numbers for i, numbers in sorted(self._accepted_of.items()) if numbers}
 
-    def restore_scale(self, row: int, scale: float, reported_scale: float) -> None:
-        """Set the scales of a segment that is not metric, from a snapshot."""
-        segment = self.segments[row]
-        segment.is_metric, segment.scale, segment.reported_scale = False, scale, reported_scale
-
-    def restore_edge_scale(self, number: int, log_ratio: float, variance: float) -> None:
-        """Set the measured scale of a loop closure, from a snapshot."""
-        edge = self.edges[number] if number in self.edges else self.rejected[number]
-        edge.scale = log_ratio, variance
-
-    def restore_objects(
-        self, digests: Mapping[int, tuple[str, ...]], orphaned: list[tuple[str, str]]
-    ) -> None:
-        """Set the digests of the objects of keyframes, and those of forgotten robots, from a snapshot."""
-        for i, objects in digests.items():
-            self.keyframes[i].objects = objects
-        self.orphaned_objects = orphaned
-
     @classmethod
     def restore(
         cls,
@@ -657,10 +639,10 @@ class MapGraph:
         accepted_by_keyframe: dict[int, list[int]],
         tables: Mapping[str, object],
     ) -> MapGraph:
-        """Return the graph of a snapshot, without the encoded features of keyframes.
+        """Return the graph of a snapshot.
 
         Args:
-            keyframes: All keyframes by id, without data.
+            keyframes: All keyframes by id; without data if their features are restored later.
             arrays: Poses ``(n, 4, 4)`` in the component and in the odometry frame, steps of odometry
                 ``(n,)``, rows of segments ``(n,)``, and positions within segments ``(n,)``.
             accepted_by_keyframe: Numbers of accepted loop closures by keyframe.
@@ -675,6 +657,7 @@ class MapGraph:
             table[:n] = values
             setattr(graph, name, table)
         graph._has_features = np.zeros(capacity, dtype=np.bool_)
+        graph._has_features[:n] = [keyframe.data is not None for keyframe in keyframes]
         graph.keyframes, graph._accepted_of = keyframes, accepted_by_keyframe
         for name, value in tables.items():
             setattr(graph, name, value)

@@ -16,7 +16,7 @@ from typing import Literal
 
 import numpy as np
 
-from rse_pf.geometry import inverse
+from rse_pf.geometry import Array, inverse
 from rse_pf.live_map.graph import STEP_LENGTH_M, MapGraph
 from rse_pf.live_map.outcomes import Ambiguous, LoopClosureAccepted, LoopClosureRejected, Outcome
 from rse_pf.live_map.pairwise_consistency import (
@@ -229,7 +229,7 @@ def _reject_contradicted(graph: MapGraph, number: int, consistent: list[int], ch
         _join_if_consistent(graph, component_a, component_b, changes)
     # 3. If no connection could be rejected, a large error of the graph proves perceptual aliases.
     elif not has_rejected and weight >= MIN_ALIAS_SUPPORT:
-        error_m = _error_of_graph_m(graph, number)
+        error_m = _translation_error_m(graph, number, *graph.T_component_camera[[edge.a, edge.b]])
         steps = graph.shortest_paths(edge.a, [edge.b])[edge.b]
         if error_m > max(ALIAS_DISTANCE_M, steps * STEP_LENGTH_M * MAX_DRIFT_RATIO):
             _mark_aliases(graph, consistent, error_m, changes)
@@ -244,7 +244,7 @@ def _reject_contradicted_loops(
     """
     edge = graph.edges[number]
     row = int(graph.segment_rows[edge.a])
-    error_m = _error_of_odometry_m(graph, number)
+    error_m = _translation_error_m(graph, number, *graph.odometry_poses([edge.a, edge.b]))
     steps = abs(float(graph.odometry_steps[edge.a] - graph.odometry_steps[edge.b]))
     if error_m > max(ALIAS_DISTANCE_M, steps * STEP_LENGTH_M * MAX_DRIFT_RATIO):
         _mark_aliases(graph, consistent, error_m, changes)
@@ -262,19 +262,12 @@ def _reject_contradicted_loops(
         _accept(graph, consistent, changes)
 
 
-def _error_of_odometry_m(graph: MapGraph, number: int) -> float:
-    """Return the translation error, in metres, of odometry against a loop closure within one segment."""
-    edge = graph.edges[number]
-    T_odom_a, T_odom_b = graph.odometry_poses([edge.a, edge.b])
-    error = inverse(graph.relative_pose_of(edge)) @ inverse(T_odom_a) @ T_odom_b
-    return float(np.sqrt((error[:3, 3] ** 2).sum()))
+def _translation_error_m(graph: MapGraph, number: int, T_a: Array, T_b: Array) -> float:
+    """Return the translation error, in metres, of two poses against the loop closure between them.
 
-
-def _error_of_graph_m(graph: MapGraph, number: int) -> float:
-    """Return the translation error, in metres, of the poses of the graph against a loop closure."""
-    edge = graph.edges[number]
-    T_a, T_b = graph.T_component_camera[edge.a], graph.T_component_camera[edge.b]
-    error = inverse(graph.relative_pose_of(edge)) @ inverse(T_a) @ T_b
+    *T_a* and *T_b* ``(4, 4)`` are the poses of both ends in one frame, in the unit of the component.
+    """
+    error = inverse(graph.relative_pose_of(graph.edges[number])) @ inverse(T_a) @ T_b
     return float(np.sqrt((error[:3, 3] ** 2).sum()))
 
 

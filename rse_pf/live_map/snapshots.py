@@ -154,20 +154,36 @@ def decode_graph(data: bytes) -> tuple[MapGraph, dict[str, bytes]]:
         packed = msgspec.msgpack.decode(data, type=_Packed)
     except (msgspec.MsgspecError, ValueError) as error:
         raise _damaged(message_of(error)) from error
-    n = len(packed.keyframes)
+    # 1. Unpack the rows of the tables, with the scales and objects that some maps have.
+    keyframes = [LiveKeyframe(*row) for row in packed.keyframes]
+    segments = _unpack_segments(packed)
+    edges, rejected = _unpack_edges(packed.links), _unpack_edges(packed.removed)
+    extra, orphaned_objects = dict(packed.extra), list[tuple[str, str]]()
+    try:
+        if SCALES_FIELD in extra:
+            _restore_scales(extra.pop(SCALES_FIELD), segments, {**edges, **rejected})
+        if OBJECTS_FIELD in extra:
+            objects = msgspec.msgpack.decode(extra.pop(OBJECTS_FIELD), type=_PackedObjects)
+            orphaned_objects = objects.gone
+            for i, digests in objects.keyframes:
+                keyframes[i].objects = digests
+    except (msgspec.MsgspecError, LookupError) as error:
+        raise _damaged(message_of(error)) from error
+    # 2. Put the tables into a graph.
+    n = len(keyframes)
     layout = (("<f8", (4, 4)), ("<f8", (4, 4)), ("<f8", ()), ("<i8", ()), ("<i8", ()))
     next_edge, root, events, optimised_at = packed.numbers
     graph = MapGraph.restore(
-        keyframes=[LiveKeyframe(*row[:4], data=None) for row in packed.keyframes],
+        keyframes=keyframes,
         arrays=[
             np.frombuffer(raw, dtype=np.dtype(kind)).reshape(n, *shape)
             for (kind, shape), raw in zip(layout, packed.arrays, strict=True)
         ],
         accepted_by_keyframe={int(i): numbers for i, numbers in packed.links_of},
         tables={
-            "segments": _unpack_segments(packed),
-            "edges": _unpack_edges(packed.links),
-            "rejected": _unpack_edges(packed.removed),
+            "segments": segments,
+            "edges": edges,
+            "rejected": rejected,
             "pending": packed.open,
             "pair_consistency": {(i, j): is_consistent for i, j, is_consistent in packed.agreements},
             "next_edge": next_edge,
@@ -180,17 +196,9 @@ def decode_graph(data: bytes) -> tuple[MapGraph, dict[str, bytes]]:
             "source": packed.source,
             "equal_rooms_m": packed.equal_rooms_m,
             "aliased_keyframes": set(packed.lookalikes),
+            "orphaned_objects": orphaned_objects,
         },
     )
-    for i, row in enumerate(packed.keyframes):
-        if row[-1] is not None:
-            graph.restore_features(i, row[-1])
-    extra = dict(packed.extra)
-    try:
-        _restore_scales(graph, extra.pop(SCALES_FIELD, b""))
-        _restore_objects(graph, extra.pop(OBJECTS_FIELD, b""))
-    except (msgspec.MsgspecError, LookupError) as error:
-        raise _damaged(message_of(error)) from error
     return graph, extra
 
 
@@ -277,19 +285,14 @@ def _encode_scales(graph: MapGraph) -> bytes:
     return msgspec.msgpack.encode(_PackedScales(segments=segments, links=links))
 
 
-def _restore_scales(graph: MapGraph, data: bytes) -> None:
-    if data:
-        packed = msgspec.msgpack.decode(data, type=_PackedScales)
-        for row, scale, reported_scale in packed.segments:
-            graph.restore_scale(row, scale, reported_scale)
-        for number, log_ratio, variance in packed.links:
-            graph.restore_edge_scale(number, log_ratio, variance)
-
-
-def _restore_objects(graph: MapGraph, data: bytes) -> None:
-    if data:
-        packed = msgspec.msgpack.decode(data, type=_PackedObjects)
-        graph.restore_objects(dict(packed.keyframes), packed.gone)
+def _restore_scales(data: bytes, segments: list[Segment], edges: dict[int, LoopEdge]) -> None:
+    """Set the encoded scales of segments that are not metric and of their loop closures."""
+    packed = msgspec.msgpack.decode(data, type=_PackedScales)
+    for row, scale, reported_scale in packed.segments:
+        segments[row].is_metric = False
+        segments[row].scale, segments[row].reported_scale = scale, reported_scale
+    for number, log_ratio, variance in packed.links:
+        edges[number].scale = log_ratio, variance
 
 
 def _matrix(raw: bytes, n: int) -> Array:
