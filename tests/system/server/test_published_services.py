@@ -61,7 +61,7 @@ class Operator:
                 machine=Instance(server.identity["control_port"]), clients=clients, artifacts=self.bucket,
                 config=AgentConfig(
                     group="g", hook="h", launch_hook="l", keys_name="keys.json",
-                    keys_file=folder / "var" / "keys.json",
+                    keys_file=folder / "var" / "keys.json", state_folder=folder / "var",
                 ),
                 settings=PlatformSettings(), log=lambda event, **fields: self.log.append(event),
             )
