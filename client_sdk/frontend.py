@@ -129,8 +129,8 @@ class FrontEndOptions:
         keyframe_share: A frame that sees less than this share of the landmarks that the newest keyframe saw
             becomes a keyframe.
         search_px: Radius around the predicted pixel of a landmark in which features are compared.
-        segment_after: Number of frames in a row with enough features and no recognised place after which a
-            new segment begins.
+        segment_after: Number of frames since the last pose, with enough features and no recognised place,
+            after which a new segment begins.
         max_keyframes: Largest number of keyframes of a segment; beyond it older keyframes are thinned out.
     """
 

@@ -396,7 +396,7 @@ class Plugins:
     Attributes:
         features: Feature extractor; None for ORB.
         motion: Motion model; None for a constant velocity.
-        loops: Place recogniser; None for the visual words of the features.
+        loops: Place recogniser; None for the VLAD vector of the descriptors.
         optimiser: Bundle adjustment of a camera without depth; None for the built-in one.
         inertial: The IMU of the camera; None without one.
     """

@@ -1,5 +1,4 @@
-"""A segment of a camera without depth: its map, the poses of its frames, and where it lies in another
-segment."""
+"""A segment of a camera without depth: its map, its frames, and where it lies in another segment."""
 
 from __future__ import annotations
 

@@ -61,32 +61,38 @@ _START_DEPTH = 2.0
 """Median depth of a segment's first landmarks in its arbitrary unit: large enough that points rounded to
 0.0001 are exact."""
 _MAX_WAITING_FRAMES = 30
-"""Largest number of frames that wait for a second view with parallax; then the oldest is dropped."""
+"""Largest number of frames that are kept as possible first views of a new segment; then the oldest is
+dropped: bounds memory."""
 _MIN_START_MATCHES = 100
-"""Fewest features of a frame, and fewest matches of two frames, that can begin a segment."""
+"""Fewest features of a frame, and fewest matches between two frames, with which a segment can begin."""
 _MAX_RELOCALISATION_QUERIES = 3
-"""Largest number of keyframes that are asked for the place of one frame, those with the most matches
-first."""
+"""Largest number of pose queries by which one lost frame is relocalised, against the keyframes with the most
+matches: bounds the time of a lost frame."""
 _GUIDED_MATCHES_FACTOR = 3
-"""A frame is asked for near its predicted pose only with this many times ``min_inliers`` matches: with fewer,
-the prediction is wrong."""
+"""Fewest matches near the predicted pose for which a pose is queried, as a multiple of ``min_inliers``: with
+fewer the prediction is most likely wrong."""
 _WIDE_SEARCH_FACTOR = 2.5
 """Radius of the second guided search as a multiple of ``search_px``, for a camera that moved unexpectedly."""
 _VERIFY_RADIUS_PX = 8.0
-"""Radius around projected landmarks in which a solved pose is matched first."""
+"""Radius, in pixels, around projected landmarks in which features are matched to verify a solved pose, and to
+fuse the landmarks of two keyframes of one place."""
 _TRACKED_RATIO = 0.25
-"""Smallest share of inliers among the matches of an accepted answer."""
+"""Smallest share of inliers among the matches that a query sent, for its pose to be accepted."""
 _JOIN_INTERVAL_FRAMES = 3
 """Every third frame is compared with other segments, if there are any: bounds the time of a frame."""
 _LOOP_CANDIDATES = 2
-"""Number of older keyframes that are compared with a new keyframe to find a loop closure."""
+"""Number of similar older keyframes with which a new keyframe is matched to find a loop closure: bounds the
+time of a keyframe."""
 _LOOP_AGE_KEYFRAMES = 15
-"""Number of keyframes between the two keyframes of a loop closure, and between two loop closures."""
+"""Fewest keyframes between the two keyframes of a loop closure, and between two loop closures: nearer
+keyframes are connected by common landmarks anyway."""
 _MAX_SCALE_SPREAD = 0.15
 """Largest median deviation of the ratios of depths from their median, as a share of it, with which they give
 the scale between two segments."""
 _MERGE_ITERATIONS = 6
-"""Iterations of the adjustment of all keyframes after a join, a loop closure, and at the end of a drive."""
+"""Iterations of the bundle adjustment of all keyframes after a join, after a loop closure, and at the end of
+a
+drive: bounds its time to seconds."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -107,8 +113,8 @@ class MonocularOptions:
         keyframe_depth_percent: A frame that moved farther than this from its reference keyframe, in percent
             of the median depth, becomes a keyframe.
         start_parallax_deg: Smallest median parallax of the two views that begin a segment.
-        segment_after: Number of frames in a row with enough features and no recognised place after which a
-            new segment begins.
+        segment_after: Number of frames since the last pose, with enough features and no recognised place,
+            after which a new segment begins.
         limits: Limits of the map.
     """
 
@@ -525,7 +531,7 @@ class MonocularTracker:
             keyframes: (segment, keyframe) of the candidates.
 
         Returns:
-            The similarity, once two frames in a row agree on it; otherwise None.
+            The similarity, once two measurements of it agree; otherwise None.
         """
         # 1. Solve and verify the pose by the keyframe with the most matches.
         best = match_candidates(self._maps, keyframes, posed.view.features)[0]

@@ -76,12 +76,12 @@ class Candidate:
 def make_place_vector(
     descriptors: Descriptors, rgb: npt.NDArray[np.uint8], plugin: LoopsPlugin | None
 ) -> LazyPlaceVector:
-    """Make the place vector of an image by its visual words, or by a user's place recogniser.
+    """Make the place vector of an image from its descriptors, or by a user's place recogniser.
 
     Args:
         descriptors: ``(n, d)``, of the image's features.
         rgb: ``(h, w, 3)``, the image.
-        plugin: A user's place recogniser; None for visual words.
+        plugin: A user's place recogniser; None for the vector of the descriptors (VLAD).
     """
     if plugin is None:
         return LazyPlaceVector(lambda: place_vector(descriptors))

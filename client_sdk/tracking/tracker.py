@@ -52,8 +52,8 @@ Rows = npt.NDArray[np.int64]
 _LOCAL_KEYFRAMES = 6
 """Number of keyframes nearest to a predicted pose whose landmarks are matched with a frame."""
 _GUIDED_MATCHES_FACTOR = 3
-"""A frame is asked for near its predicted pose only with this many times ``min_inliers`` matches: with fewer,
-the prediction is wrong, and a match with the last frame is cheaper than a query that fails."""
+"""Fewest matches near the predicted pose for which a pose is queried, as a multiple of ``min_inliers``: with
+fewer the prediction is most likely wrong, and the frame is matched with the last one instead."""
 _GUIDED_RATIO = 0.35
 """Smallest share of inliers among the matches near a predicted pose."""
 _LAST_FRAME_RATIO = 0.4
@@ -86,8 +86,8 @@ _MAX_RATE_RAD_S = 3.0
 """Largest rotation rate, in rad/s, that is taken for a motion and not for a cut in a video: with a readout of
 20 ms it would shear an image by 3.4 degrees."""
 _MAX_RELOCALISATION_QUERIES = 3
-"""Largest number of keyframes that are asked for the place of one frame, those with the most matches
-first."""
+"""Largest number of pose queries by which one lost frame is relocalised, against the keyframes with the most
+matches: bounds the time of a lost frame."""
 _MAX_STEREO_MATCHES = 250
 """Largest number of matches in a query of a stereo pair: the robot itself fits the pose to all of them."""
 _JOIN_INTERVAL_FRAMES = 3
@@ -171,7 +171,8 @@ class Tracker:
     stereo pair is then matched in a wide radius around its last pose.  If no pose fits again, it is matched
     with the newest keyframes and with the most similar keyframes of all segments.  Otherwise the frame is
     lost, and the next one is tried in the same order.  After `FrontEndOptions.segment_after` unrecognised
-    frames a new segment begins; it is joined to an older one when two frames in a row were found there.  A
+    frames a new segment begins; it is joined to an older one when two
+    of its frames were found there.  A
     frame with a weak pose never becomes a keyframe.
 
     Attributes:
@@ -370,9 +371,9 @@ class Tracker:
         # 1. Predict the pose.
         min_inliers, max_count = self.options.min_inliers, 0
         T_predicted, T_last = self._predict_pose(), self._state.T_world_camera
-        # 2. Match: near the predicted pixels, with the last frame by appearance, or widely around the last
-        # pose. #    An attempt is: how to match, the reference pose, its source, fewest matches, smallest
-        # inlier ratio.
+        # 2. Match near the predicted pixels, then with the last frame by appearance, then widely around the
+        #    last pose.  An attempt holds the matching function, the reference pose, the source of the
+        #    landmarks, the fewest matches of a query, and the smallest inlier ratio of its answer.
         attempts: list[tuple[Callable[[], Matches], Array, Literal["map", "frame"], int, float]] = [
             (
                 lambda: self._match_guided(view, T_predicted, self.options.search_px, _GUIDED_LOWE_RATIO),

@@ -111,8 +111,13 @@ def best_matches(reference: Descriptors, view: Descriptors, ratio: float) -> tup
     empty: Rows = np.empty(0, dtype=np.int64)
     if len(reference) == 0 or len(view) < 2:
         return empty, empty
-    if ORB.is_kind_of(reference):
-        return match_orb(reference, view, ratio)
+    if not ORB.is_kind_of(reference):
+        return _match_by_numpy(reference, view, ratio)
+    return match_orb(reference, view, ratio)
+
+
+def _match_by_numpy(reference: Descriptors, view: Descriptors, ratio: float) -> tuple[Rows, Rows]:
+    """Match descriptors of any kind, as `best_matches` describes."""
     step = max(1, _BLOCK_DISTANCES // len(view))
     blocks = [_find_two_nearest(reference[row : row + step], view) for row in range(0, len(reference), step)]
     best, second, nearest = (np.concatenate(parts) for parts in zip(*blocks, strict=True))

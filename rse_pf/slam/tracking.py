@@ -699,8 +699,8 @@ def fit_readout_change(
     Raises:
         MissingExtra: The native core is not installed.
     """
-    displacements = aligned(displacements, np.float64)
     request, _referenced = _make_fit_request(observed, camera, T_camera_world, cauchy, 0.0)
+    displacements = aligned(displacements, np.float64)
     fitted = np.zeros(2)
     address = address_of(fitted)
     _core("fit_sway")(ctypes.byref(request), address_of(displacements), address, address + fitted.itemsize)

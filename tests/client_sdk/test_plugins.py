@@ -160,7 +160,7 @@ def test_a_function_that_fails_is_named_with_its_error() -> None:
     assert isinstance(refused.value.__cause__, ZeroDivisionError)
 
 
-def test_the_kind_must_not_change_on_the_way() -> None:
+def test_the_kind_of_features_must_not_change_during_a_drive() -> None:
     results = [found(), found(0, descriptors=None), found(descriptors=np.ones((6, 32), np.uint8))]
 
     def changing(_: npt.NDArray[np.uint8]) -> FoundFeatures:
@@ -322,7 +322,7 @@ def test_a_loops_function_says_which_keyframes_are_tried(depth: bool) -> None:
     assert set(seen) == {frame_at(0, depth=True).rgb.shape}
 
 
-def test_the_place_of_an_image_is_computed_once() -> None:
+def test_the_place_vector_of_an_image_is_computed_once() -> None:
     calls: list[int] = []
 
     def loops(rgb: npt.NDArray[np.uint8]) -> npt.NDArray[np.float64]:
@@ -346,7 +346,7 @@ def test_the_place_of_an_image_is_computed_once() -> None:
         (np.full(64, np.inf), "not finite"),
     ],
 )
-def test_what_is_no_place_is_refused(returned: Any, why: str) -> None:
+def test_an_invalid_place_vector_is_refused(returned: Any, why: str) -> None:
     with pytest.raises(UsageError, match=why) as refused:
         LoopsPlugin(lambda _: returned)(IMAGE)
     assert "\n" not in refused.value.message

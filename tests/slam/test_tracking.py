@@ -31,7 +31,7 @@ from tests.oracles import matching, pose_fit
 CAMERA = Camera(fx=525.0, fy=520.0, cx=319.5, cy=239.5, width=640, height=480)
 
 
-# --- landmarks where a pose expects them ---------------------------------------------------------
+# --- Landmarks near the pixels that a pose predicts ---
 
 
 def landmarks_of(rng: np.random.Generator, n: int) -> LandmarkAppearance:
@@ -47,7 +47,7 @@ def landmarks_of(rng: np.random.Generator, n: int) -> LandmarkAppearance:
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_landmarks_are_matched_where_a_pose_expects_them(seed: int) -> None:
+def test_landmarks_are_matched_where_a_pose_predicts_them(seed: int) -> None:
     rng = np.random.default_rng(seed)
     landmarks = landmarks_of(rng, 400)
     T = exp_se3(rng.normal(0.0, 0.1, 6))
@@ -71,7 +71,7 @@ def test_landmarks_are_matched_where_a_pose_expects_them(seed: int) -> None:
     np.testing.assert_array_equal(features, columns)
 
 
-# --- matches -----------------------------------------------------------------------------------
+# --- Matches of predicted features ---
 
 
 def places(rng: np.random.Generator, n: int, kind: str) -> Array:
@@ -205,7 +205,7 @@ def test_one_feature_goes_to_the_nearest_and_to_the_first_of_equals() -> None:
     assert matched(flat([(50, 50)], [5]), image_of([(50, 51), (50, 50)], [0, 0]), lowe_ratio=1.5) == [(0, 0)]
 
 
-def test_places_that_are_none_match_nothing_and_disturb_nothing() -> None:
+def test_pixels_that_are_not_finite_match_nothing_and_change_no_other_match() -> None:
     nan, inf = float("nan"), float("inf")
     wrong = [(nan, 5.0), (5.0, nan), (inf, 5.0), (5.0, -inf), (inf, inf), (2e9, 5.0)]
     image = image_of([*wrong, (-300.0, -7.0), (5000.0, 90_000.0)], [0] * 8)
@@ -284,7 +284,7 @@ def test_features_that_do_not_fit_are_refused(change: dict[str, Array]) -> None:
 
 
 @pytest.mark.parametrize("radius_px", [-1.0, np.nan, np.inf, 1e10])
-def test_a_radius_that_is_none_is_refused(radius_px: float) -> None:
+def test_an_invalid_radius_is_refused(radius_px: float) -> None:
     with pytest.raises(BadRequest, match="radius"):
         matched(flat([(0, 0)], [0]), image_of([(0, 0)], [0]), radius_px=radius_px)
 
@@ -363,7 +363,7 @@ def test_poses_are_those_of_the_definition(has_depth: bool, outliers: float) -> 
 
 
 @pytest.mark.parametrize("has_depth", [True, False])
-def test_motions_of_points_are_fitted_beside_the_pose(has_depth: bool) -> None:
+def test_the_change_of_the_readout_time_is_that_of_the_definition(has_depth: bool) -> None:
     observed, T, _ = observations(5, n=80, has_depth=has_depth)
     displacements = np.random.default_rng(5).normal(0.0, 1.0, (80, 3))
 
@@ -376,7 +376,7 @@ def test_motions_of_points_are_fitted_beside_the_pose(has_depth: bool) -> None:
 
 @pytest.mark.parametrize("has_depth", [True, False])
 @pytest.mark.parametrize("outliers", [0.0, 0.3])
-def test_poses_are_right_within_the_noise_that_was_put_in(has_depth: bool, outliers: float) -> None:
+def test_poses_are_right_within_the_simulated_noise(has_depth: bool, outliers: float) -> None:
     distances2, inliers, problems = [], 0, 60
     for seed in range(problems):
         observed, truth, start = observations(seed, has_depth=has_depth, outliers=outliers)
@@ -436,7 +436,7 @@ def test_numbers_that_no_camera_measures_give_no_pose(name: str, number: float) 
 
 
 @pytest.mark.parametrize("number", [NAN, INF, 2e9])
-def test_a_start_or_a_limit_that_is_none_gives_no_pose(number: float) -> None:
+def test_an_initial_pose_or_a_limit_that_is_not_finite_gives_no_pose(number: float) -> None:
     observed, _, start = observations(2)
     T = start.copy()
     T[1, 3] = number

@@ -1,4 +1,4 @@
-"""A rolling shutter is undone, and how long the camera reads an image is learnt from its images."""
+"""The rolling shutter is undone, and the camera's readout time is estimated from its images."""
 
 from __future__ import annotations
 
@@ -86,13 +86,13 @@ def test_features_of_a_turning_camera_are_where_a_global_shutter_shows_them() ->
     rng = np.random.default_rng(1)
     points = KINECT.back_project(rng.uniform([20, 20], [620, 460], (200, 2)), rng.uniform(1.0, 4.0, 200))
     shares = np.linspace(-0.5, 0.5, 200)
-    turns = exp_se3(np.concatenate([np.zeros((200, 3)), shares[:, None] * READOUT_S * RATE], axis=1))
-    read = np.einsum("nij,nj->ni", inverse(turns)[:, :3, :3], points)
+    rotations = exp_se3(np.concatenate([np.zeros((200, 3)), shares[:, None] * READOUT_S * RATE], axis=1))
+    read = np.einsum("nij,nj->ni", inverse(rotations)[:, :3, :3], points)
     pixels = KINECT.project(read)
     # The row of a pixel says when it was read, so the points are placed by it.
     shares = (pixels[:, 1] - 239.5) / 480.0
-    turns = exp_se3(np.concatenate([np.zeros((200, 3)), shares[:, None] * READOUT_S * RATE], axis=1))
-    true = np.einsum("nij,nj->ni", turns[:, :3, :3], read)
+    rotations = exp_se3(np.concatenate([np.zeros((200, 3)), shares[:, None] * READOUT_S * RATE], axis=1))
+    true = np.einsum("nij,nj->ni", rotations[:, :3, :3], read)
     raw = Features(
         pixels=pixels, descriptors=np.zeros((200, 32), np.uint8), points_camera=read,
         orientations=np.ones((200, 2)), sizes=np.ones(200),
@@ -112,7 +112,7 @@ def test_features_of_a_turning_camera_are_where_a_global_shutter_shows_them() ->
     )  # fmt: skip
 
 
-def test_the_rate_is_that_in_the_second_pose() -> None:
+def test_the_rotation_rate_is_that_at_the_second_pose() -> None:
     def turned(angle: float) -> Array:
         return exp_se3([1.0, 2.0, 3.0, 0.0, angle, 0.0])
 
@@ -124,7 +124,7 @@ def test_the_rate_is_that_in_the_second_pose() -> None:
 
 
 @pytest.mark.parametrize("planted_s", [0.0, 0.012, -0.02])
-def test_the_sway_that_was_planted_is_measured_beside_the_pose(planted_s: float) -> None:
+def test_a_wrong_readout_time_is_measured_together_with_the_pose(planted_s: float) -> None:
     rng = np.random.default_rng(5)
     points = KINECT.back_project(rng.uniform([20, 20], [620, 460], (150, 2)), rng.uniform(1.0, 4.0, 150))
     motions = ((KINECT.project(points)[:, 1] - 239.5) / 480.0)[:, None] * np.cross(RATE, points)
@@ -145,7 +145,7 @@ def test_the_sway_that_was_planted_is_measured_beside_the_pose(planted_s: float)
     )  # a motion
 
 
-def test_the_estimate_is_within_what_cameras_have_and_ignores_a_camera_that_stands() -> None:
+def test_the_readout_estimate_is_limited_and_ignores_a_stationary_camera() -> None:
     estimate = ReadoutEstimate()
 
     assert estimate.update(0.03, 1e6, np.full(3, 1e-3)) == 0.0
@@ -176,7 +176,7 @@ def test_a_camera_that_looks_around_is_tracked_whatever_its_shutter(
     assert (tracker.last_features.pixels == tracker._raw.pixels).all() == (tracker.readout.readout_s == 0.0)
 
 
-def test_a_cut_in_a_video_is_no_turn(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_cut_in_a_video_is_no_rotation(monkeypatch: pytest.MonkeyPatch) -> None:
     tracker, _ = drive(monkeypatch, READOUT_S, 90)
     elsewhere_s = np.pi / 6.0
 

@@ -9,15 +9,15 @@ from client_sdk.tracking.segments import KeyframePoints, SegmentRecord
 from client_sdk.tracking.stereo_adjustment import MAX_ADJUSTED_KEYFRAMES, StereoAdjustment
 
 
-def seen(count: int) -> list[KeyframePoints]:
+def points_of_keyframes(count: int) -> list[KeyframePoints]:
     points, colours = np.array([[0.0, 0.0, 2.0]], np.float32), np.zeros((1, 3), np.uint8)
     return [KeyframePoints(float(number), np.eye(4), points, colours) for number in range(count)]
 
 
 def record(count: int) -> SegmentRecord:
     made = SegmentRecord(cloud=PointMap(MapOptions()))
-    for each in seen(count):
-        made.add_keyframe_points([each])
+    for points in points_of_keyframes(count):
+        made.add_keyframe_points([points])
     return made
 
 
@@ -26,7 +26,7 @@ def test_points_of_keyframes_are_forgotten_once_they_are_too_many_to_be_adjusted
 
     assert len(most.keyframe_points or ()) == MAX_ADJUSTED_KEYFRAMES
     assert too_many.keyframe_points is None
-    too_many.add_keyframe_points(seen(1))
+    too_many.add_keyframe_points(points_of_keyframes(1))
     assert too_many.keyframe_points is None, "a part of them would replace the whole cloud"
 
 

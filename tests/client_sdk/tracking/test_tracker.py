@@ -120,7 +120,7 @@ def test_a_camera_that_was_carried_elsewhere_with_a_covered_lens_is_found_in_its
 
 
 @pytest.mark.parametrize(("row", "is_found"), [(15, True), (8, False)])
-def test_a_place_that_is_not_clear_is_believed_within_four_jumps_however_long_the_camera_was_lost(
+def test_an_unclear_place_is_accepted_only_within_four_jumps_however_long_the_camera_was_lost(
     row: int, is_found: bool
 ) -> None:
     tracker = Tracker(FrontEndOptions(max_jump_m=0.1))
