@@ -91,7 +91,7 @@ again."""
 
 _NAME = re.compile(r"[a-z][a-z0-9_-]{0,39}")  # pattern of a service's name
 _DIGEST = re.compile(r"[0-9a-f]{64}")  # pattern of a SHA-256 in hexadecimal digits
-_MAX_TRIES = 8  # attempts to replace the list while other operators publish at the same time
+_MAX_TRIES = 8  # attempts to replace the list of services while other operators publish; then StoreError
 
 # --- What the shared libraries of a service may need ---
 _ELF_MAGIC = b"\x7fELF\x02\x01"  # first bytes of a 64-bit little-endian ELF file

@@ -28,7 +28,7 @@ __all__ = [
 
 
 MAX_MAPS = 64
-"""Most maps of one request."""
+"""Most maps that one request merges; all maps together have at most 2,000 keyframes."""
 _MAX_PROJECTIONS = 20_000_000_000
 """Most projections of a point of the clouds into a keyframe: they take an hour, the longest time of a job."""
 

@@ -47,13 +47,13 @@ __all__ = [
 ]
 
 _CACHED_MAPS = 2
-"""Decoded maps with their indexes that a process keeps between requests."""
+"""Number of decoded maps with their indexes that a process keeps between requests, the last ones used."""
 MAX_KEYFRAMES = 2000
-"""Most keyframes of all maps of one request together."""
+"""Most keyframes of all maps of one request together, which bounds its time and memory."""
 MAX_FEATURES = 2_000_000
-"""Most features of all keyframes of one map."""
+"""Most features of all keyframes of one map together, which bounds the memory of a request."""
 MAX_VIEW_FEATURES = 20_000
-"""Most features of the view of a request."""
+"""Most features of the view (the image to localise) of a request, which bounds the time of matching."""
 _MAX_COMPARISONS = 2_000_000_000
 """Most comparisons of an ORB descriptor of the view with one of a candidate keyframe; they take about five
 seconds."""
@@ -191,7 +191,7 @@ open_map = functools.lru_cache(maxsize=_CACHED_MAPS)(index_map)
 def view_of(
     camera: Camera, pixels: Array, descriptors: bytes, features: FeatureKind | None, index: MapIndex
 ) -> View:
-    """Return the view of a request, after a comparison with the map.
+    """Return the view of a request, whose descriptors must be of the same kind as those of the map.
 
     Args:
         camera: Intrinsics of the view.

@@ -51,9 +51,9 @@ _FOLDS = 5  # folds of the cross-validation that calibrates the exponent
 _CALIBRATION_GRID_M = 0.5  # finest grid of the calibration in metres, to save time
 
 # --- Limits of a request ---
-MAX_FINGERPRINTS = 5000  # most fingerprints of a survey
+MAX_FINGERPRINTS = 5000  # most fingerprints (surveyed positions) of a request, which bounds its time
 _MAX_FLOORS = 100  # most floors, which are surveyed heights rounded to 1 m; each floor has a grid of its own
-_MAX_ACCESS_POINTS = 300  # most access points with a signal field
+_MAX_ACCESS_POINTS = 300  # most access points of a survey with five or more readings, which bounds the time
 # Most products of grid points and surveyed positions: calibration for five seconds.
 _MAX_POSTERIORS = 5_000_000
 _MAX_PREDICTIONS = 100_000_000  # most products of grid points and readings: predictions for five seconds
