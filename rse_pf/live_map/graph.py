@@ -127,7 +127,7 @@ class MapGraph:
     # --- Queries ---
 
     def exists(self, i: int) -> bool:
-        """Return whether keyframe *i* was added and its robot was not forgotten."""
+        """Return whether *i* is the id of a keyframe whose robot was not forgotten."""
         return 0 <= i < self._size and bool(self._segment_rows[i] >= 0)
 
     def segment_of(self, i: int) -> Segment:
@@ -187,7 +187,10 @@ class MapGraph:
         return scaled(T, np.array([self.segment_of(i).scale for i in ids])) if self.has_scales else T
 
     def anchor(self, row: int) -> int:
-        """Return the keyframe that defines the frame of the component of segment *row*, -1 if it is gone."""
+        """Return the keyframe that defines the frame of the component of segment *row*.
+
+        Return -1 if the robot of this keyframe was forgotten.
+        """
         component = self.segments[row].component
         ids = self.segments[self.root if component == self.root_component() else component].keyframes
         return ids[0] if ids else -1
@@ -312,7 +315,7 @@ class MapGraph:
     def add_keyframe(
         self, keyframe: LiveKeyframe, row: int, T_odom: Array, T_component: Array, odometry_steps: float
     ) -> int:
-        """Append a keyframe to segment *row*; return its id.
+        """Append a keyframe to segment *row*; return the id of the keyframe.
 
         The first metric segment of a robot defines the frame of a map that has none.
 

@@ -129,7 +129,7 @@ def total_weight(graph: MapGraph, numbers: Iterable[int]) -> float:
 
 
 def has_enough_support(graph: MapGraph, numbers: Sequence[int]) -> bool:
-    """Return whether loop closures have a weight of 3 together, and two different keyframes on both sides.
+    """Return whether loop closures together weigh at least 3 and touch at least two keyframes on each side.
 
     The sides are the two components; or within one component the two segments; or within one segment the
     keyframes that were measured and those that they were compared with.
@@ -150,7 +150,10 @@ def has_enough_support(graph: MapGraph, numbers: Sequence[int]) -> bool:
 
 
 def choose_testable_edges(graph: MapGraph, numbers: Sequence[int]) -> list[int]:
-    """Return the newest 48 of *numbers*, of which at most four share a keyframe, those with most inliers."""
+    """Return the loop closures of *numbers* that are tested: of each keyframe the four with most inliers.
+
+    Of those, at most the newest 48 are returned, sorted by number.
+    """
     edges_of_keyframe: Counter[int] = Counter()
     chosen = []
     for number in sorted(numbers, key=lambda each: (-graph.edges[each].inliers, each)):
@@ -334,7 +337,10 @@ def are_consistent_between_components(
 
 
 def decide_join(graph: MapGraph, first: int, second: int) -> Join | AmbiguousJoin | None:
-    """Return how pending loop closures join two components, or why not; None if too few of them agree."""
+    """Return the join of two components that pending loop closures prove, or why it is ambiguous.
+
+    Return None if too few loop closures agree.
+    """
     # 1. Find the largest consistent set of loop closures between both components.
     consistent = _find_consistent_edges(graph, first, second)
     if not has_enough_support(graph, consistent):
@@ -413,7 +419,11 @@ def _find_heaviest_clique(
 
 
 def _thin_out(graph: MapGraph, numbers: list[int], component: int, min_distance_m: float) -> list[int]:
-    """Return those of *numbers* whose end in *component* is away from that of the last one returned."""
+    """Return loop closures whose ends in *component* are apart, in the order of *numbers*.
+
+    A loop closure is left out if its end is within *min_distance_m* metres, along each axis, of the end of
+    the last one that was taken.
+    """
     chosen: list[int] = []
     last = np.full(3, np.inf)
     for number in numbers:
