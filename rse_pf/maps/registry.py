@@ -53,7 +53,7 @@ _MAX_VERSIONS = 10_000
 _CHUNK_BYTES = 1 << 20
 """Number of bytes of an object that are in memory at once while a map is committed from it: 1 MiB."""
 _REMOVED_AT_ONCE = 50
-"""Versions that are marked and then removed together: also a slow store removes this number within a minute,
+"""Number of versions that are marked and removed together: even a slow store removes them within a minute,
 after which a removal stops."""
 _MIN_MOTION_M = 1e-3
 """Translation of a keyframe between two versions in metres that counts as a motion; poses in messages are
