@@ -54,7 +54,7 @@ def live(data: bytes, meter: Meter) -> None:
     twice = decode_keyframe(again)
     for name in ("pixels", "depths_m", "descriptors"):
         expect(np.array_equal(getattr(twice.features, name), getattr(features, name)), f"{name} changed")
-    for name in ("timestamp_s", "camera", "others"):
+    for name in ("timestamp_s", "camera", "unknown_blocks"):
         expect(getattr(twice, name) == getattr(keyframe, name), f"{name} changed")
     vector = place_vector(features.descriptors)
     expect(bool(np.isfinite(vector).all()), "a vector that is not finite")
