@@ -155,7 +155,7 @@ class FrontEndOptions:
         if self.min_inliers < 4 or self.max_matches < self.min_inliers or self.features < self.min_inliers:
             raise UsageError(
                 f"features = {self.features} and max_matches = {self.max_matches} must not be below "
-                f"min_inliers = {self.min_inliers}, and that not below 4",
+                f"min_inliers = {self.min_inliers}, and min_inliers must not be below 4",
                 hint="leave them out to get the defaults",
             )
         if not (0 <= self.min_depth_m < self.max_depth_m and self.inlier_px > 0):

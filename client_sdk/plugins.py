@@ -312,7 +312,7 @@ class LoopsPlugin:
         is_fit = len(vector) == self._size and _MIN_PLACE_SIZE <= len(vector) <= _MAX_PLACE_SIZE
         if not (is_fit and length > 0.0):
             raise UsageError(
-                f"the loops function returned {len(vector)} numbers of length {length:g}",
+                f"the loops function returned a vector of {len(vector)} numbers with a norm of {length:g}",
                 hint=f"return a vector of {_MIN_PLACE_SIZE} to {_MAX_PLACE_SIZE} numbers, always as many, "
                 "not all 0",
             )
@@ -357,7 +357,7 @@ def _check_callable(argument: str, function: Any) -> Any:
 
 
 def _call_user(name: str, function: Callable[..., Any], *arguments: Any) -> Any:
-    """Call a user's function; turn any error of it into a UsageError that names the user's line."""
+    """Call a user's function; turn any exception into a UsageError that names the line which raised it."""
     try:
         return function(*arguments)
     except (Exception, asyncio.CancelledError, SystemExit) as error:  # also what would end a thread or a task
@@ -373,11 +373,17 @@ def _check_array(argument: str, given: Any, shape: tuple[int, ...]) -> Array:
         array = np.asarray(given, dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise UsageError(f"the {argument} function returned no numbers", hint="return an array") from error
-    if not _has_shape(array, shape) or not np.isfinite(array).all():
+    if not _has_shape(array, shape):
+        wanted = f"{shape}".replace("-1", "n")
         raise UsageError(
-            f"the {argument} function returned an array of shape {array.shape}, or numbers that are not "
+            f"the {argument} function returned an array of shape {array.shape}, not {wanted}",
+            hint=f"return an array of shape {wanted}",
+        )
+    if not np.isfinite(array).all():
+        raise UsageError(
+            f"the {argument} function returned {np.count_nonzero(~np.isfinite(array))} numbers that are not "
             "finite",
-            hint=f"return finite numbers of shape {shape}".replace("-1", "n"),
+            hint="return finite numbers only",
         )
     return array
 

@@ -65,8 +65,7 @@ class NoiseEstimate:
         optical_axis = T_camera_world[2, :3]
         landmark_variance = np.einsum("i,nij,j->n", optical_axis, observed.covariances[rows], optical_axis)
         model_variance = self.model.variance_m2(observed.depths_m[rows])
-        # The errors hold the noise of the image and that of the landmarks; the latter is known and
-        # subtracted.
+        # The errors hold the noise of image and landmarks; that of the landmarks is known and subtracted.
         squared = (_SIGMA_PER_MEDIAN * float(np.median(np.abs(error_m) / np.sqrt(model_variance)))) ** 2
         image_squared = squared - float(np.median(landmark_variance / model_variance))
         factor = float(np.sqrt(np.clip(image_squared, _MIN_FACTOR**2, _MAX_FACTOR**2)))

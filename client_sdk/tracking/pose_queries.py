@@ -24,7 +24,8 @@ __all__ = ["CLEAR_INLIERS", "FrameSteps", "OpenQuery", "QueryAnswer", "make_quer
 CLEAR_INLIERS = 40
 """Fewest inliers of an answer that recognises a place which the camera did not see just before."""
 _CLEAR_RATIO = 0.5
-"""Smallest share of inliers among the matches of such an answer: perceptual aliases have fewer."""
+"""Smallest share of inliers among the matches of an answer that recognises a place which the camera did not
+see just before: perceptual aliases have fewer."""
 _MIN_REFERENCE_DEPTH_M = 0.01
 """Depths are sent only if all points are farther from the reference camera than this, in metres."""
 
@@ -95,8 +96,7 @@ def make_query(
         points = transform(inverse(T_world_reference), points)
     points, pixels = round_for_wire(points, image.pixels[features])
     sent_depths_m = np.zeros(len(points))
-    # The solver compares depths with those of the reference camera, so all points must lie before that
-    # camera.
+    # The solver compares depths with those of the reference camera: all points must lie before it.
     if depths_m is not None and not (len(points) and points[:, 2].min() <= _MIN_REFERENCE_DEPTH_M):
         sent_depths_m = np.nan_to_num(depths_m[features], posinf=0.0, neginf=0.0).round(3)
     return PoseQuery(

@@ -55,11 +55,12 @@ _GUIDED_MATCHES_FACTOR = 3
 """Fewest matches near the predicted pose for which a pose is queried, as a multiple of ``min_inliers``: with
 fewer the prediction is most likely wrong, and the frame is matched with the last one instead."""
 _GUIDED_RATIO = 0.35
-"""Smallest share of inliers among the matches near a predicted pose."""
+"""Smallest share of inliers among the matches near a predicted pose, for a solved pose to be verified."""
 _LAST_FRAME_RATIO = 0.4
 """Smallest share of inliers among the matches with the last frame, which no prediction supports."""
 _NEARBY_RATIO = 0.25
-"""Smallest share of inliers among the matches with a keyframe near the camera's last pose."""
+"""Smallest share of inliers among the matches with a keyframe near the camera's last pose: low, because the
+place itself is plausible."""
 _VERIFIED_RATIO = 0.3
 """Smallest share of the landmarks matched around a solved pose that must agree with the fitted pose."""
 _VERIFY_RADIUS_PX = 8.0
@@ -67,7 +68,8 @@ _VERIFY_RADIUS_PX = 8.0
 _GUIDED_LOWE_RATIO = 0.8
 """Lowe's ratio for matches around the pixels of a predicted pose."""
 _VERIFY_LOWE_RATIO = 0.9
-"""Lowe's ratio for matches around the pixels of a solved pose: looser, since the radius is small."""
+"""Lowe's ratio for matches around the pixels of a solved pose: looser than usual, since the radius is
+small."""
 _WIDE_RADIUS_PX = 160.0
 """Radius of the last search of a stereo pair around its last pose: 10 degrees of unexpected rotation of a
 car's camera."""
@@ -440,7 +442,7 @@ class Tracker:
     ) -> Matches:
         """Match landmarks of the nearest keyframes and of the last frame near the pixels of a pose.
 
-        Features that the last frame shows, too, are matched as it shows them.
+        Where a feature matches both, the match with the last frame is taken.
 
         Args:
             view: The image.
@@ -678,8 +680,7 @@ class Tracker:
             observed = self._observe(view, matches, T_fitted)
             fitted = fit_pose(observed, view.camera, fitted.T_camera_world)
             if fitted is not None and not view.is_stereo:
-                # Stereo cameras have global shutters, and a pair that is not simultaneous looks like a
-                # readout.
+                # Not for stereo: its shutters are global, and an unsynchronised pair looks like a readout.
                 change = measure_readout_change(view, matches, observed, fitted)
                 self._pending_readout_s += self.readout.update(*change, rate)
         # 3. Accept the pose if enough landmarks agree.

@@ -283,7 +283,7 @@ def test_a_motion_function_that_is_far_off_costs_the_guided_match_only() -> None
     [
         (None, "an array of shape"),
         (np.eye(3), r"an array of shape \(3, 3\)"),
-        (np.full((4, 4), np.nan), "not finite"),
+        (np.full((4, 4), np.nan), "16 numbers that are not finite"),
         (2 * np.eye(4), "a matrix that is no pose"),
         ("text", "no numbers"),
     ],
@@ -339,7 +339,7 @@ def test_the_place_vector_of_an_image_is_computed_once() -> None:
 @pytest.mark.parametrize(
     ("returned", "why"),
     [
-        (np.zeros(64), "64 numbers of length 0"),
+        (np.zeros(64), "64 numbers with a norm of 0"),
         (np.ones(7), "7 numbers"),
         (np.ones(4097), "4097 numbers"),
         (np.ones((8, 8)), r"shape \(8, 8\)"),
