@@ -17,7 +17,6 @@ import msgspec
 
 from rse_pf.config.front_door import LOCALISE_PATH
 from rse_pf.data_server.http import HttpFailure
-from rse_pf.geometry import LENS_MODELS
 from rse_pf.maps.photos import MapOutline, PhotoLocation
 from rse_pf.maps.registry import MapRecord
 
@@ -209,10 +208,7 @@ _LENS = (
         for name in ("width", "height")
     ),
     Field(name="distortion", place="query", doc="k1,k2,p1,p2[,k3], or k1,k2,k3,k4 of a fisheye"),
-    Field(
-        name="model", place="query", doc="of the lens",
-        schema={"type": "string", "enum": list(LENS_MODELS)},
-    ),
+    Field(name="model", place="query", doc="of the lens: radial-tangential (the default) or fisheye"),
 )  # fmt: skip
 
 _CHANGED = {412: HttpFailure}

@@ -9,7 +9,6 @@ from __future__ import annotations
 import msgspec
 
 from rse_pf.errors import BadRequest, InvalidCamera
-from rse_pf.geometry import LENS_MODELS
 
 __all__ = ["MapOutline", "PhotoLens", "PhotoLocation"]
 
@@ -36,6 +35,9 @@ class PhotoLens(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     model: str = "radial-tangential"
 
     def __post_init__(self) -> None:
+        # Imported with the first photo: numpy would take a third of the start of a data server.
+        from rse_pf.geometry import LENS_MODELS
+
         model = LENS_MODELS.get(self.model)
         if model is None:
             raise BadRequest(
