@@ -203,7 +203,7 @@ def without_rates(w: BagWriter) -> list[Message]:
         (unplaced, "no tf_static joins the frame of /imu/data with that of the camera"),
         (of_another_clock, "no sample of /imu/data lies between the first and the last frame"),
         (of_one_sample, "/imu/data has fewer than 2 samples"),
-        (too_slow, "an IMU of 5 Hz is not within"),
+        (too_slow, "rate_hz = 5 is not within"),
         (without_rates, "/imu/data has fewer than 2 samples"),
     ],
 )
