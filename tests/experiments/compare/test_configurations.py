@@ -43,12 +43,12 @@ def test_every_name_of_the_help_is_a_configuration() -> None:
 
 
 def test_a_table_changes_options_of_a_base(tmp_path: Path) -> None:
-    text = 'base = "wide-baseline"\ndepth = true\n[frontend]\nfeatures = 700\nratio = 1\n'
+    text = 'base = "wide-baseline"\ndepth = true\n[frontend]\nfeatures = 700\ninlier_px = 3\n'
 
     (found,) = configurations_of([written(tmp_path, "many.toml", text)])
 
     assert (found.name, found.depth) == ("many", True)
-    assert (found.frontend.features, found.frontend.ratio, found.frontend.min_inliers) == (700, 1.0, 12)
+    assert (found.frontend.features, found.frontend.inlier_px, found.frontend.min_inliers) == (700, 3.0, 12)
 
 
 def test_a_python_file_sets_options_and_may_import_its_neighbour(tmp_path: Path) -> None:
