@@ -32,7 +32,8 @@ from client_sdk.frontend import Frame, TrackedFrame
 from client_sdk.simulator import SIMULATED_CAMERA, true_trajectory
 from client_sdk.simulator.renderer import Renderer, add_depth_noise, add_image_noise
 from client_sdk.simulator.world import make_world
-from client_sdk.tracking.tracker import Join, Tracker
+from client_sdk.tracking.segment_join import Join
+from client_sdk.tracking.tracker import Tracker
 from client_sdk.trajectory import Trajectory
 from rse_pf.experiments.results.trajectory_error import ate_m, motion_errors
 from rse_pf.geometry import Array, inverse
