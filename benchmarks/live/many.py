@@ -29,7 +29,7 @@ import rse_pf.experiments.demo.robot as demo_robot
 import rse_pf.experiments.demo.run as demo_run
 from benchmarks.frame.registry import Bar, benchmark
 from benchmarks.frame.statistics import percentile
-from client_sdk import frontend, mapping
+from client_sdk import frontend, point_map
 from client_sdk.frontend import Features, Frame, FrontEndOptions
 from client_sdk.simulator import SIMULATED_CAMERA, render_frames, true_trajectory
 from client_sdk.tracking import tracker
@@ -44,7 +44,7 @@ CORRECTION_P99_MS, POSES_RATIO = 1000.0, 1.3
 _FEATURES = "RSE_PF_BENCHMARK_FEATURES"
 _ABOUT = "about.json"
 _OPTIONS = FrontEndOptions().sent_with("zlib")
-_ARRAYS = ("pixels", "descriptors", "points_camera", "turns", "sizes")
+_ARRAYS = ("pixels", "descriptors", "points_camera", "orientations", "sizes")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -119,8 +119,8 @@ def run(folder: Path, out: Path, rounds: int) -> dict[str, Any]:
 def run_feature_robot(spec: RobotSpec, pipe: Connection) -> None:
     """Run a robot of the demo on frames whose features were computed beforehand; entry point of a process."""
     frames, features, truth = _read(Path(os.environ[_FEATURES]), spec.number)
-    tracker.extract = lambda frame, options, slot=None: features[frame.timestamp_s]
-    mapping.PointMap.add = lambda *_: 0
+    tracker.extract = lambda frame, options, plugin=None: features[frame.timestamp_s]
+    point_map.PointMap.add = lambda *_: 0
     loaded = demo_robot._Loaded(frames, truth, "ground truth", has_depth=True)
     demo_robot._load = lambda *_: loaded
     demo_robot.run_robot(spec, pipe)
