@@ -43,7 +43,7 @@ NARROW_CONTROL_PER_S = 3.0
 _CONTINUATION, _TEXT, _BINARY, _CLOSE, _PING, _PONG = 0, 1, 2, 8, 9, 10
 
 _CODECS = ("bin", "json", "zlib", "zlib")
-_encode = msgspec.json.Encoder(enc_hook=json_encode_hook).encode
+_encode = msgspec.msgpack.Encoder(enc_hook=json_encode_hook).encode
 _SHORT = 8192
 """Longer payloads are not tried on every service: time is better spent on other inputs."""
 _REGISTRY = builtin_services(PLATFORM)

@@ -167,13 +167,13 @@ def test_a_service_is_summed_up_by_its_docstring() -> None:
 
     assert {service.name: service.summary for service in registry} == {
         "pnp": "Estimate the camera pose of one frame.",
-        "echo": "Return what was sent.",
+        "echo": "Return the value of the request.",
         "icp": "Refine the pose between two overlapping point clouds.",
         "place": "Find the keyframes of a map that show what a view shows.",
         "localise": "Find the camera's pose in a map.",
         "merge": "Make one map of several robots' maps, or close the loops of one.",
         "optimise": "Fit the poses of a pose graph to its edges.",
-        "wifi": "Locate a robot by the access points it hears.",
+        "wifi": "Find the position of a robot by the Wi-Fi access points that it receives.",
     }
 
 

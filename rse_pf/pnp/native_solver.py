@@ -95,41 +95,40 @@ _REFUSALS: dict[int, tuple[type[RsePfError], str, str]] = {
     ),
     4: (
         NoConsensus,
-        "the best pose has {inliers} inliers within {inlier_px:g} px among {rows} correspondences, "
-        "no more than a random pose would have",
+        "the best pose agrees with {inliers} of {rows} correspondences within {inlier_px:g} px, "
+        "no more than chance would give",
         "tighten the matcher, or skip this frame",
     ),
     5: (
         DegenerateGeometry,
-        "the inliers lie on one line or coincide (width/length {width_to_length:.3f} is below "
+        "the points that agree lie on one line or coincide (width/length {width_to_length:.3f} is below "
         "{min_width_to_length})",
         _EVERYWHERE,
     ),
     6: (
         DegenerateGeometry,
-        "the {inliers} inliers lie in {independent_inliers} places of the image, and may be copies of each "
-        "other",
+        "the {inliers} correspondences that agree lie in {independent_inliers} places of the image, "
+        "and may be copies of each other",
         _EVERYWHERE,
     ),
     7: (
         DegenerateGeometry,
-        "the inliers lie {radius_px:.1f} px (rms) around their centroid in the image, less than the limit "
-        "of {inlier_px:g} px for an inlier",
+        "the pixels that agree lie {radius_px:.1f} px (rms) from their centre, less than {inlier_px:g} px",
         _EVERYWHERE,
     ),
     8: (
         DegenerateGeometry,
-        "the inliers leave some motion of the camera unconstrained",
+        "the correspondences do not constrain some motion of the camera",
         "match more of the scene",
     ),
     9: (
         DegenerateGeometry,
-        "two poses fit equally well (reprojection errors {rmse_px:.2f} and {second_pose_rmse_px:.2f} px)",
+        "two poses fit alike ({rmse_px:.2f} and {second_pose_rmse_px:.2f} px)",
         "match points that do not lie in one far plane",
     ),
     10: (
         DegenerateGeometry,
-        "{mirrored_inliers} points are inliers behind the camera or mirrored, and only {inliers} as they are",
+        "{mirrored_inliers} points agree behind the camera or mirrored, and only {inliers} as they are",
         "check the handedness of the world frame and the sign of the depth",
     ),
     11: (
@@ -138,14 +137,14 @@ _REFUSALS: dict[int, tuple[type[RsePfError], str, str]] = {
         "send the best matches only",
     ),
 }
-"""Error class, message and hint for each status of ``enum rse_pf_pnp_status`` that refuses a pose."""
+"""Error class, message and hint for each status of ``enum rse_pf_pnp_status`` that refuses a pose.
+
+The messages are part of the replies to robots.  A changed message would make recordings of earlier releases
+differ from their replay, which is compared byte by byte.
+"""
 _BAD_REQUEST = (BadRequest, "the options or sizes of the request do not fit", "leave the options out")
-_STATUSES_WITHOUT_EVIDENCE = (
-    1,
-    2,
-    3,
-    11,
-)  # statuses of requests that the core refuses before it computes anything
+_STATUSES_WITHOUT_EVIDENCE = (1, 2, 3, 11)
+"""Statuses of requests that the core refuses before it computes anything."""
 
 
 class NativeOptions(msgspec.Struct, frozen=True, kw_only=True):

@@ -132,7 +132,7 @@ WRONG_INPUTS: tuple[WrongInput, ...] = (
     WrongInput("demo --data nothing", USAGE, "no rgb.txt in nothing", "TUM layout"),
     WrongInput("demo --data rec-empty", USAGE, "rec-empty/rgb.txt lists no image", "a line for each image"),
     WrongInput("demo --data rec-unpaired", USAGE, "no colour image of rec-unpaired has a depth image within 0.02 s", "same clock"),
-    WrongInput("demo --data rec-words", USAGE, "rec-words/rgb.txt, line 1 is not an image", "timestamp filename"),
+    WrongInput("demo --data rec-words", USAGE, "rec-words/rgb.txt, line 1 has not 2 words", "timestamp filename"),
     WrongInput("demo --frontend wide", USAGE, "'wide' is not one of standard, wide-baseline", "--help"),
     WrongInput("demo --out results", USAGE, "results holds other files", "an empty folder"),
     WrongInput("demo --out empty", USAGE, "empty is a file", "--out"),

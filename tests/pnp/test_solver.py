@@ -123,7 +123,7 @@ def test_a_patch_of_forty_pixels_is_refused_with_the_reason():
     pixels = rng.uniform(300, 340, (80, 2))
     points = KINECT.back_project(pixels, rng.uniform(1, 5, 80))
 
-    with pytest.raises(DegenerateGeometry, match=r"80 inliers lie in \d places"):
+    with pytest.raises(DegenerateGeometry, match=r"80 correspondences that agree lie in \d places"):
         solve_pnp(points, pixels + rng.normal(size=(80, 2)) * 0.5, KINECT)
 
 
