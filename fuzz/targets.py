@@ -43,7 +43,11 @@ NARROW_CONTROL_PER_S = 3.0
 _CONTINUATION, _TEXT, _BINARY, _CLOSE, _PING, _PONG = 0, 1, 2, 8, 9, 10
 
 _CODECS = ("bin", "json", "zlib", "zlib")
-_encode = msgspec.msgpack.Encoder(enc_hook=json_encode_hook).encode
+# MessagePack has maps with keys of None, which JSON has not; JSON has integers of more than 64 bits.
+_ENCODERS = {
+    "bin": msgspec.msgpack.Encoder(enc_hook=json_encode_hook).encode,
+    "json": msgspec.json.Encoder(enc_hook=json_encode_hook).encode,
+}
 _SHORT = 8192
 """Longer payloads are not tried on every service: time is better spent on other inputs."""
 _REGISTRY = builtin_services(PLATFORM)
@@ -101,7 +105,7 @@ def _outcome(chosen: Codec, data: bytes) -> tuple[str, bytes]:
             message = msgspec.structs.replace(message, payload=request)
     except RsePfError as error:
         return "zlib" if "zlib" in error.message else error.code, b""
-    return "read", _encode(message)
+    return "read", _ENCODERS["bin" if chosen.name == "bin" else "json"](message)
 
 
 def _as_requests(payload: Any) -> None:

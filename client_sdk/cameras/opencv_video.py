@@ -135,7 +135,7 @@ def _has_times(cv2: Any, source: str) -> bool:
 
 
 def _is_text(path: Path) -> bool:
-    """Return whether a file begins with printable text; of all video formats, only YUV4MPEG2 does."""
+    """Return whether a file begins with printable text and is no YUV4MPEG2 video, whose head is text, too."""
     try:
         with path.open("rb") as file:
             start = file.read(_TEXT_PROBE_BYTES)

@@ -422,9 +422,10 @@ def _find_intrinsics(
 def _read_truth(
     folder: Path,
 ) -> tuple[Trajectory | None, Literal["ground truth", "reference", "none"], tuple[str, ...]]:
-    """Return the true path of the camera, its kind, and its file followed by notes on its time stamps.
+    """Return the reference path of the camera, its kind, and its file followed by notes on its time stamps.
 
-    ``groundtruth.txt`` is a ground truth, and ``reference_poses.txt`` an estimate of another program.
+    ``groundtruth.txt``, which is read if both files are there, is a ground truth; ``reference_poses.txt`` is
+    an estimate of another program.  Without either file the result is None, ``none`` and an empty file name.
 
     Raises:
         UsageError: The file is broken.

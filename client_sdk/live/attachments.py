@@ -84,12 +84,12 @@ class EncodedAttachments:
 
     @property
     def points_reference(self) -> ObjectReference | None:
-        """Digest and size of the points, which the keyframe holds; None without points."""
+        """Digest and size of the points, as they are written into the keyframe; None without points."""
         return _make_reference(self.points)
 
     @property
     def image_reference(self) -> ObjectReference | None:
-        """Digest and size of the image, which the keyframe holds; None without an image."""
+        """Digest and size of the image, as they are written into the keyframe; None without an image."""
         return _make_reference(self.image)
 
 

@@ -70,7 +70,11 @@ class BurstPolicy:
         return self.spent < self.commands_per_day and is_closed and self.in_flight < max_in_flight
 
     def count_sent(self) -> None:
-        """Count a command that is sent now."""
+        """Count a command that is sent now.
+
+        It is spent from the daily budget for good, and is in flight until `count_answer`, `count_failure` or
+        `count_withdrawal` is called for it.
+        """
         self.spent += 1
         self.in_flight += 1
 

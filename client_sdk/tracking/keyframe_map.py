@@ -334,7 +334,7 @@ class KeyframeMap:
         table.orientations[:] = np.einsum("nij,nj->ni", rotation, table.orientations)
         table.shutter_displacements[:] = np.einsum("nij,nj->ni", rotation, table.shutter_displacements)
         self._poses = T_world_camera.copy()
-        # 3. The points that the keyframes measured.
+        # 3. Add the offset to the disparities of the points that the keyframes measured.
         self._views = [
             replace(view, points_camera=with_offset(view.points_camera, f_baseline, offset_px))
             for view in self._views

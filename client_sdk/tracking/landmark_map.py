@@ -488,7 +488,10 @@ class LandmarkMap:
         return matches.features[is_free], matches.landmarks.numbers[is_free]
 
     def _neighbours(self, number: int) -> list[int]:
-        """Return the keyframes that share landmarks with one, most first, and the two before it."""
+        """Return the keyframes that share at least `MIN_SHARED_LANDMARKS` with one, most first.
+
+        The two keyframes before it follow, if they are not among them.
+        """
         shared = self.count_shared_landmarks(number)
         shared[number] = 0
         order = np.argsort(-shared, kind="stable")

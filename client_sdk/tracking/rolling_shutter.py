@@ -66,7 +66,10 @@ def undo_rolling_shutter(features: Features, camera: Camera, rotation_rad: Array
 
 
 def shutter_displacements(features: Features, points_camera: Array, camera: Camera, rate: Array) -> Array:
-    """Return how far points move for each second that the readout of the image takes longer.
+    """Return how far corrected points move for each second that the readout of the image takes longer.
+
+    The displacements are added to points that `undo_rolling_shutter` returned.  Points of the middle row do
+    not move, and only the rotation of the camera counts.
 
     Args:
         features: ``n`` features as the image shows them.

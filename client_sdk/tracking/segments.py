@@ -100,9 +100,10 @@ class SegmentRecord:
         self.keyframe_points = points if is_adjustable else None
 
     def corrected(self, adjustment: StereoAdjustment) -> SegmentRecord:
-        """Return the segment after an adjustment of its stereo keyframes.
+        """Return the segment with the poses and depths of its keyframes after an adjustment of stereo drives.
 
-        A cloud whose points were forgotten, or come from other sources, stays as it is.
+        The cloud of the segment is built again from the points of its keyframes.  It stays as it is if these
+        points were forgotten, or if the cloud has other sources, too.
         """
 
         def moved(stamp_s: float, pose: Array) -> Array:

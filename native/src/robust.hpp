@@ -120,7 +120,7 @@ static bool run_ransac(const rse_pf::Task& task, const FocalLengths& focal, cons
         for (int i = 0; i < solutions; ++i) {
             // 2. Drop a pose as soon as its cost exceeds the lowest cost.
             if (!(msac_cost(data.single, n, focal, poses[i], options.limit2, best.cost) < best.cost)) continue;
-            // 3. Refine it over all rows (local optimisation).
+            // 3. Refine it over all rows under the truncated loss (local optimisation).
             Hypothesis hypothesis = {poses[i], 0.0, 0};
             refine_locally(data.single, n, focal, options.limit2, hypothesis);
             if (!(hypothesis.cost < best.cost)) continue;

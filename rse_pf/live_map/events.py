@@ -64,9 +64,9 @@ class KeyframeAdded(msgspec.Struct, frozen=True, kw_only=True, dict=True, tag="k
 class MeasuredLoopClosure(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     """The measured pose of keyframe ``other`` relative to the keyframe of a `LoopClosuresMeasured`.
 
-    ``T_keyframe_other`` ``(4, 4)`` and its ``information`` ``(6, 6)``, the inverse covariance of its twist,
-    are bytes as `matrix_bytes` makes them.  Lengths are metres if one of both keyframes is metric, else in
-    the unit of the measured keyframe.  ``inliers`` of ``matches`` fit the pose.
+    ``T_keyframe_other`` ``(4, 4)`` and its ``information`` ``(6, 6)``, the inverse covariance of its twist
+    (metres, then radians), are bytes as `matrix_bytes` makes them.  Lengths are metres if one of both
+    keyframes is metric, else in the unit of the measured keyframe.  ``inliers`` of ``matches`` fit the pose.
 
     ``scale`` is None between two metric keyframes; else it holds the logarithm of the length of the other
     keyframe's unit in the unit of the measured one, and the variance of this logarithm.  ``off_scale`` is the

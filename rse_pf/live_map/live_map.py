@@ -39,6 +39,7 @@ from rse_pf.live_map.events import (
 from rse_pf.live_map.graph import MapGraph, count_odometry_steps
 from rse_pf.live_map.graph_rows import LiveKeyframe, LoopEdge, variances_of
 from rse_pf.live_map.measure import (
+    LOOP_CLOSURE_EVIDENCE,
     StoredView,
     assumed_scale,
     measure_stored_keyframes,
@@ -79,7 +80,6 @@ from rse_pf.slam.localise import LocalisationOptions, Localised, localise, sprea
 from rse_pf.slam.optimise import OptimiseOptions, optimise_graph
 from rse_pf.slam.place_recognition import PlaceIndex, place_vector
 from rse_pf.slam.pose_graph import PoseGraph
-from rse_pf.slam.relative_pose import RelativePoseOptions
 
 __all__ = ["LiveMap"]
 
@@ -90,9 +90,6 @@ MIN_KEYFRAMES_BETWEEN_OPTIMISATIONS = 20
 RELOCALISATION_POOL = 6
 """Candidates of place recognition for each one that a relocalisation compares, so that a second place that
 looks the same is compared as well."""
-MEASUREMENT = RelativePoseOptions(min_inliers=15, min_inlier_ratio=0.3, min_matches=15)
-"""Evidence that a measured relative pose needs to become a pending loop closure; below full weight, so that
-several weak loop closures can join robots together."""
 
 
 class LiveMap:
@@ -329,7 +326,7 @@ class LiveMap:
         others = [each for each in stored_candidates if each is not None]
         size = max(1, -(-len(others) // pieces))
         groups = [others[begin : begin + size] for begin in range(0, max(1, len(others)), size)]
-        return [partial(measure_stored_keyframes, stored, group, MEASUREMENT) for group in groups]
+        return [partial(measure_stored_keyframes, stored, group, LOOP_CLOSURE_EVIDENCE) for group in groups]
 
     def optimise(self) -> Optimised:
         """Optimise the whole graph; the map does not change.

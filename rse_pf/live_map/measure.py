@@ -28,6 +28,7 @@ from rse_pf.slam.relative_pose import (
 )
 
 __all__ = [
+    "LOOP_CLOSURE_EVIDENCE",
     "StoredView",
     "assumed_scale",
     "decode_view",
@@ -46,6 +47,10 @@ MIN_WRONG_LOG_SCALE = 0.04
 below: the three robots of the kitchen recordings differ by 1 to 2 %."""
 MIN_WRONG_SCALE_DEVIATIONS = 2.0
 """Standard deviations of the measured ratio of depths from which on two metric scales differ."""
+
+LOOP_CLOSURE_EVIDENCE = RelativePoseOptions(min_inliers=15, min_inlier_ratio=0.3, min_matches=15)
+"""Evidence that the measured relative pose of two keyframes needs to become a pending loop closure; below
+full weight, so that several weak loop closures can join robots together."""
 
 StoredView = tuple[int, bytes]
 """Id of a keyframe, and the keyframe as encoded by the robot."""

@@ -78,9 +78,11 @@ class GraphChanges:
 
 
 def process_new_edges(graph: MapGraph, keyframe: int, numbers: list[int]) -> GraphChanges:
-    """Accept or reject the pending loop closures *numbers* of *keyframe*, and join components by them.
+    """Accept, reject or leave pending the loop closures *numbers* of *keyframe*, and join components by them.
 
-    Return the outcomes, and the keyframes around which the graph must be smoothed.
+    The graph is changed.  Loop closures without enough support stay pending.  Other pending ones may be
+    accepted together with *numbers*, and accepted ones that *numbers* outweigh are rejected.  The result
+    holds the outcomes, and the keyframes around which the graph must be smoothed.
     """
     changes = GraphChanges()
     # 1. Classify the loop closures within the component of the keyframe by the poses of the graph.

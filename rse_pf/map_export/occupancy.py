@@ -49,7 +49,9 @@ _RAYS_AT_ONCE = 20_000
 """Number of lines of sight that are rasterised in one array operation; bounds its memory."""
 _MIN_POINTS = 2
 """Smallest number of points of the cloud that make a cell occupied: a single point may be an outlier."""
-_LAYER_M = 0.05  # height in metres of the horizontal layers in which the floor is looked for
+_LAYER_M = 0.05
+"""Height in metres of the horizontal layers whose areas are compared to find the floor; the height of the
+floor is then a median of points, which is finer."""
 _AREA_CELL_M = 0.1  # edge in metres of the squares whose number measures the area of a horizontal layer
 _FLOOR_SHARE = 0.3
 """The floor is the lowest layer whose area is at least this share of the area of the largest layer."""

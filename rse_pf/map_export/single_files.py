@@ -47,7 +47,10 @@ def _encode_ply(version: MapVersion, robot: str | None) -> bytes:
 
 
 def _encode_pcd(version: MapVersion, robot: str | None) -> bytes:
-    """Return the point cloud as a binary PCD file of version 0.7 with packed 24-bit RGB colours."""
+    """Return the whole point cloud as a binary PCD file of version 0.7 with packed 24-bit RGB colours.
+
+    *robot* is not used, since a point of a map belongs to no robot.
+    """
     n = len(version.points)
     rows = np.empty(n, dtype=[("xyz", "<f4", (3,)), ("rgb", "<u4")])
     red, green, blue = version.colours.astype(np.uint32).T if n else np.zeros((3, 0), dtype=np.uint32)

@@ -45,11 +45,12 @@ class CameraFit:
 
     Attributes:
         T_map_camera: ``(4, 4)``, m, pose with the fitted camera.
-        covariance: ``(6, 6)`` of the twist (m, rad) on the left of the pose.
+        covariance: ``(6, 6)`` of the twist (m, rad) on the left of the pose.  It contains the uncertainty of
+            the focal length, the principal point and the rolling shutter.
         log_focal: Logarithm of the fitted focal length over the stated one.
         log_focal_deviation: Standard deviation of that logarithm.
-        position_deviation_m: Standard deviation of the position of the camera, over all axes.
-        turn_deviation_deg: Standard deviation of the rotation of the camera, over all axes.
+        position_deviation_m: Root of the summed variances of the camera's position along the three axes.
+        turn_deviation_deg: Root of the summed variances of the camera's rotation about the three axes.
     """
 
     T_map_camera: Array

@@ -212,7 +212,9 @@ def are_pairwise_consistent(
 def fits_prediction(
     T_a_b: Array, edges: EdgeArrays, steps: Array, lever_m: Array, noise: OdometryNoise
 ) -> npt.NDArray[np.bool_]:
-    """Return ``(m,)``: whether each of *m* loop closures agrees with a predicted relative pose, at 99 %.
+    """Return ``(m,)``: whether each of *m* loop closures agrees with a predicted relative pose.
+
+    Translation and rotation are tested apart, each by a chi-squared test at 99 %.
 
     Args:
         T_a_b: ``(m, 4, 4)``, the relative poses that odometry or a pose graph predicts.

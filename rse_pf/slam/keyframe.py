@@ -597,7 +597,7 @@ def _decode_camera(data: bytes, begin: int, end: int) -> Camera:
 
 def _decode_noise(data: bytes, begin: int, end: int) -> DepthNoise:
     if end - begin != _NOISE_STRUCT.size:
-        raise _bad_keyframe(f"the block of the noise has {end - begin} bytes, not {_NOISE_STRUCT.size}")
+        raise _bad_keyframe(f"the block of the depth noise has {end - begin} bytes, not {_NOISE_STRUCT.size}")
     base_m, growth_per_m, from_m = _NOISE_STRUCT.unpack_from(data, begin)
     return DepthNoise(base_m=base_m, growth_per_m=growth_per_m, from_m=from_m)
 

@@ -562,7 +562,10 @@ class _DriveSystem:
         return np.concatenate([of_keyframes.ravel(), 1.0 / self._priors[self._free] ** 2])
 
     def step(self, state: _State, damping: float) -> _State:
-        """Return the state after a Levenberg-Marquardt step, shortened to `_MAX_STEP_RAD`."""
+        """Return the state after a Levenberg-Marquardt step from *state*, for which `linearise` was called.
+
+        The whole step is shortened if it would rotate a keyframe by more than `_MAX_STEP_RAD` about an axis.
+        """
         # 1. Solve for keyframes and calibration; priors pull zooms and values to 0.
         reduced = self._reduce(damping)
         keyframe_values = np.zeros((self._keyframe_count, self._keyframe_size))

@@ -95,7 +95,11 @@ class CppRuntime:
             raise ConfigurationError(f"{service.name}: rse_pf_service_open returned {code}")
 
     def call(self, payload: Any) -> Any:
-        """Return the library's reply to *payload*: fields of numbers, arrays and text, or any JSON value."""
+        """Return the library's reply to *payload*.
+
+        If the library exports ``rse_pf_service_call_arrays``, both are fields of numbers, arrays and text;
+        otherwise both are any JSON value.
+        """
         return (
             self._call_with_bytes(payload) if self._call_arrays is None else self._call_with_arrays(payload)
         )
