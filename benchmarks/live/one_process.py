@@ -143,8 +143,8 @@ def _send(played: Played, name: str, run: Run, number: int, tick: int) -> list[t
 
 
 def _random_links(runs: int, inliers: int) -> tuple[int, int]:
-    """Return how many random wrong links are believed, and how many there were."""
-    believed = sent = 0
+    """Return how many random wrong loop closures are accepted, and how many there were."""
+    accepted = sent = 0
     for seed in range(runs):
         world = GeneratedWorld(seed=seed, wrong_inliers=inliers)
         live_map = LiveMap()
@@ -153,9 +153,9 @@ def _random_links(runs: int, inliers: int) -> tuple[int, int]:
             live_map.apply(event)
         for a, b, T_a_b in live_map.accepted_loop_closures():
             off = inverse(T_a_b) @ inverse(world.seen[a]) @ world.seen[b]
-            believed += float(np.linalg.norm(off[:3, 3])) > 0.3
+            accepted += float(np.linalg.norm(off[:3, 3])) > 0.3
         sent += world.wrong_sent
-    return believed, sent
+    return accepted, sent
 
 
 def _plant(seed: int) -> int:
@@ -268,13 +268,13 @@ def foreign(recordings: Path, runs: int) -> dict[str, Any]:
 
 
 def wrong_links(runs: int) -> dict[str, Any]:
-    """Return how many random wrong links are believed, and how long four planted ones are."""
+    """Return how many random wrong loop closures are accepted, and how long four planted ones stay."""
     waited = spread(_plant(seed) for seed in range(runs))
-    believed = {
-        f"{inliers} inliers": dict(zip(("believed", "sent"), _random_links(runs, inliers), strict=True))
+    accepted = {
+        f"{inliers} inliers": dict(zip(("accepted", "sent"), _random_links(runs, inliers), strict=True))
         for inliers in (100, 20)
     }
-    return {"n": runs, "keyframes_until_four_are_removed": waited, "random_wrong_links": believed}
+    return {"n": runs, "keyframes_until_four_are_removed": waited, "random_wrong_links": accepted}
 
 
 def twins(runs: int) -> dict[str, Any]:
