@@ -1,8 +1,8 @@
 """Find and load the native core, the shared library of C++ functions that compute poses and features.
 
-The library is loaded at the first call, and is required wherever poses or features are computed.  This module
-does not compile or install the library; ``native/README.md`` says how.  A call releases Python's global
-interpreter lock.
+The library is loaded when its first function is needed, and is required wherever poses or features are
+computed.  This module does not compile or install the library; ``native/README.md`` says how.  A call of its
+functions releases Python's global interpreter lock.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ Part = TypeVar("Part")
 
 PART_ABIS = {"check": 2, "cloud": 1, "depth": 1, "match": 4, "native": 5, "stereo": 1, "track": 2}
 """For each part of the core the version of its C header ``native/include/rse_pf_PART.h`` that this package
-calls."""
+calls; a library with another version of a part is refused."""
 
 _FILE = "librse_pf_native.so"
 
@@ -68,7 +68,11 @@ def address_of(array: npt.NDArray[Any]) -> int:
 
 
 def aligned(array: npt.NDArray[Any], dtype: type | None = None) -> npt.NDArray[Any]:
-    """Return *array* as a contiguous, aligned array of *dtype*, as C reads it; a copy only where needed."""
+    """Return *array* as a C-contiguous, aligned array of *dtype*, as C reads it.
+
+    The result is *array* itself if *array* is such an array already, else a copy.  None keeps the type of the
+    elements.
+    """
     if type(array) is np.ndarray and array.dtype.type is dtype and array.flags.carray:
         return array
     contiguous = np.ascontiguousarray(array, dtype=dtype)
@@ -76,12 +80,15 @@ def aligned(array: npt.NDArray[Any], dtype: type | None = None) -> npt.NDArray[A
 
 
 class Workspace(threading.local):
-    """Scratch memory for calls of the native core: an array per thread, as large as its largest call."""
+    """Scratch memory for calls of the native core: one array in each thread, as large as its largest call."""
 
     _words = np.empty(0, dtype=np.uint64)
 
     def words(self, count: int) -> npt.NDArray[np.uint64]:
-        """Return an array of at least *count* 8-byte numbers with arbitrary values."""
+        """Return an array of at least *count* 8-byte numbers with arbitrary values.
+
+        All calls of one thread share the array, so its content is lost at the next call.
+        """
         if len(self._words) < count:
             self._words = np.empty(count, dtype=np.uint64)
         return self._words
@@ -99,7 +106,8 @@ def load_part(path: Path, part: str, abi: int, *functions: str) -> list[Any]:
         functions: Exported names of the functions.
 
     Returns:
-        The functions, as ctypes function objects without argument types.
+        The functions in the order of their names, as ctypes function objects of which neither the argument
+        types nor the result type are set.
 
     Raises:
         ConfigurationError: The library cannot be loaded, lacks a function, or has another version of the
@@ -135,6 +143,8 @@ def load_core(open_part: Callable[[Path], Part]) -> Part:
 
 def core_function(part: str, name: str, arguments: Sequence[Any], result: Any) -> Any:
     """Return one function of the native core with its ctypes signature.
+
+    Each call finds and opens the library again, so callers keep the result.
 
     Args:
         part: Part of the core, a key of `PART_ABIS`.

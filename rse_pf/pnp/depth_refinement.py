@@ -1,8 +1,9 @@
 """Refine the pose of `solve_pnp` with the depths that both cameras measured.
 
-PnP takes its points as exact, and minimises the errors of the pixels of one image.  Where depth cameras took
-both images, each correspondence is two noisy measurements of one point.  The refinement weighs the noise of
-both; it keeps the set of inliers.  The native core computes it (``native/src/depth.cpp``).
+PnP takes its points as exact, and minimises the errors of the pixels of one image.  If depth cameras took
+both images, each correspondence is two noisy measurements of one point.  The refinement weights each residual
+by the noise of both measurements; the set of inliers stays that of PnP.  The native core computes the refined
+pose (``native/src/depth.cpp``).
 """
 
 from __future__ import annotations
@@ -25,18 +26,19 @@ __all__ = ["DepthNoise", "refine_with_depth"]
 _PORTABLE = 1  # flag RSE_PF_DEPTH_PORTABLE of a request: compute without AVX2
 _REFINED = 0  # status RSE_PF_DEPTH_REFINED of a result: it holds the refined pose
 _KEPT = 1  # status RSE_PF_DEPTH_KEPT of a result: the pose of PnP stays
-_COLUMNS = 11  # numbers of the core's workspace for each row
+_COLUMNS = 11  # numbers (8 bytes each) of the core's workspace for each inlier
 _SPARE_ROWS = 4  # rows of the core's workspace that pad the inliers to a multiple of four
-_MAX_DEPTH_M = 1e3  # largest depth (metres) that the core accepts
+_MAX_DEPTH_M = 1e3  # largest depth (metres) that the core accepts; here it only appears in an error message
 
 
 class DepthNoise(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     """Noise model of a depth camera: depth z has the standard deviation base + growth * max(0, z - from)^2.
 
     Attributes:
-        base_m: Standard deviation up to the depth *from_m*, metres.
-        growth_per_m: Growth of the standard deviation with the square of the depth beyond *from_m*, 1/metre.
-        from_m: Depth from which on the standard deviation grows, metres.
+        base_m: Standard deviation up to the depth *from_m*, metres, 1e-5 to 1.
+        growth_per_m: Growth of the standard deviation with the square of the depth beyond *from_m*, 1/metre,
+            0 to 1.
+        from_m: Depth from which on the standard deviation grows, metres, 0 to 100.
 
     The defaults are those of a Kinect.
 
@@ -57,7 +59,7 @@ class DepthNoise(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
         require_within("from_m", self.from_m, 0.0, 100.0)
 
     def variance_m2(self, depth_m: Array) -> Array:
-        """Return the variance (square metres) of depths (metres), an array of the same shape."""
+        """Return the variances (square metres) of *depth_m* (metres), a new array of the same shape."""
         beyond = np.maximum(0.0, depth_m - self.from_m)
         variance: Array = (self.base_m + self.growth_per_m * beyond * beyond) ** 2
         return variance
@@ -78,31 +80,34 @@ def refine_with_depth(
 ) -> PnpSolution:
     """Refine the pose of *solution* with the depths that the cameras of both images measured.
 
-    Gauss-Newton with Cauchy weights on the residuals of pixel and depth in the second image.  The covariance
-    of a residual sums the noise of pixel and depth in both images; the pixel noise is derived from
-    ``solution.rmse_px``.
+    Minimise the residuals of pixel and depth of the inliers in the second image by Gauss-Newton with Cauchy
+    weights; an inlier without a depth there has the residual of its pixel only.  The covariance of a residual
+    sums the noise of pixel and depth in both images.  The standard deviation of a pixel coordinate is taken
+    as half of ``solution.rmse_px`` in each image.
 
     Args:
         solution: Result of `solve_pnp` for the same rows, where the world frame is that of the reference
             camera.
         points_reference: ``(n, 3)``, metres, in the frame of the reference camera, whose depth camera
-            measured them; all in front of it.
+            measured them; all in front of it, also the outliers.
         pixels: ``(n, 2)``, undistorted pixels of the second image.
-        depths_m: ``(n,)``, metres along the optical axis of the second camera at these pixels; 0 where there
-            is none.
+        depths_m: ``(n,)``, metres along the optical axis of the second camera at these pixels, at most 1000;
+            0 for a pixel without a depth.
         camera: Intrinsics of both images.
         noise: Noise of both depth cameras.
         portable: Compute without AVX2, which changes no byte of the result; for tests.
 
     Returns:
-        *solution* with the refined pose, its covariance and ``rmse_px``; or *solution* itself where no inlier
-        has a depth, where the reprojection error would grow by more than half, or where the refined pose is
-        not constrained.
+        A copy of *solution* with the refined pose, its covariance and its ``rmse_px`` over all inliers;
+        inliers, verdict and reason stay those of PnP.  *solution* itself if no inlier has a depth, if the
+        reprojection error would rise above 1.5 times the earlier one (above 0.3 px if that was below 0.2 px),
+        or if the refined pose is not constrained.
 
     Raises:
-        BadRequest: Shapes do not fit, a number is not finite or too large, or a point is not in front of the
-            reference camera.
+        BadRequest: Shapes do not fit, a number is not finite or too large, a depth is negative, or a point is
+            not in front of the reference camera.
         MissingExtra: The native core is not installed.
+        ConfigurationError: The native core cannot be loaded, or has another version.
 
     Source:
         Residual covariances as in Segal et al., Generalized-ICP, RSS 2009, here for pixels and depths;
@@ -205,7 +210,7 @@ class _Result(ctypes.Structure):
 
 
 _WORKSPACE = Workspace()
-"""Scratch memory of each thread for the core."""
+"""Scratch memory for calls of the core, one array in each thread."""
 
 
 @cache

@@ -1,4 +1,4 @@
-"""The two robust PnP engines: the native core, and OpenCV's ``solvePnPRansac``, which the paper used.
+"""Offer two robust PnP engines: the native core, and OpenCV's ``solvePnPRansac``, which the paper used.
 
 The native core measures the evidence of the poses of both.  Engines are deterministic (fixed seeds, one
 thread), and raise errors of this package only.
@@ -24,17 +24,18 @@ __all__ = [
     "native_options",
 ]
 
-# Most refinements of a pose by OpenCV, each over the inliers of the refinement before; they end earlier if
-# the inliers stay the same.
+# Most refinements of a pose by OpenCV, each over the inliers of the pose before it; they end earlier if the
+# inliers stay the same or are fewer than four.
 _MAX_REFINEMENTS = 4
-# Largest coordinate (metres or pixels) that OpenCV receives; the native core refuses larger and non-finite
-# numbers.
+# Largest absolute coordinate (metres or pixels) that OpenCV receives; a request with a larger or non-finite
+# number goes to the native core at once, which refuses it.
 _MAX_ABS = 1e6
 
 Engine = Callable[[Array, Array, Camera, PnpOptions, WeakLimits], Evidence]
 """A function of ``(points_world, pixels, camera, options, weak)`` that returns a pose with its evidence.
 
-The points are ``(n, 3)`` metres, the pixels ``(n, 2)``; ``n >= 4``.
+The points are ``(n, 3)`` metres in the world frame, the pixels ``(n, 2)`` and undistorted, both float64;
+``n >= 4``.  A pose that a rule refuses is returned too, with the error in its ``refusal``.
 
 Raises:
     BadRequest: A number is not finite or beyond 1e6.
@@ -77,11 +78,15 @@ def _opencv_engine() -> Engine:
     solver = native_solver()
 
     def estimate(points_world: Array, pixels: Array, camera: Camera, options: PnpOptions) -> Array | None:
-        """Return the ``(4, 4)`` pose of OpenCV, None if it finds none (RSE-PF paper, Sect. 6.1)."""
+        """Return OpenCV's estimate of ``T_camera_world``, ``(4, 4)``; None if OpenCV finds no pose or fails.
+
+        Source:
+            RSE-PF paper, Sect. 6.1.
+        """
         matrix = camera.matrix
         cv2.setRNGSeed(0)
         try:
-            # 1. RANSAC with P3P.
+            # 1. Find a pose and its inliers by RANSAC with P3P.
             has_pose, rotation, translation, inliers = cv2.solvePnPRansac(
                 points_world,
                 pixels,
@@ -95,14 +100,15 @@ def _opencv_engine() -> Engine:
             if not has_pose or inliers is None or len(inliers) < MIN_CORRESPONDENCES:
                 return None
             rows = inliers[:, 0]
-            # 2. SQPnP over the inliers: EPnP, the last step of solvePnPRansac, may converge to the wrong one
-            # of the two minima of a planar scene.
+            # 2. Estimate the pose again from the inliers by SQPnP: EPnP, the last step of solvePnPRansac, may
+            # converge to the wrong one of the two minima of a planar scene.
             has_global, global_rotation, global_translation = cv2.solvePnP(
                 points_world[rows], pixels[rows], matrix, None, flags=cv2.SOLVEPNP_SQPNP
             )
             if has_global:
                 rotation, translation = global_rotation, global_translation
-            # 3. Levenberg-Marquardt over the inliers, until they stay the same.
+            # 3. Refine the pose over its inliers by Levenberg-Marquardt, and find the inliers of the refined
+            # pose among all rows; repeat this until the inliers stay the same.
             for _ in range(_MAX_REFINEMENTS):
                 rotation, translation = cv2.solvePnPRefineLM(
                     points_world[rows], pixels[rows], matrix, None, rotation, translation
@@ -121,7 +127,7 @@ def _opencv_engine() -> Engine:
     def solve(
         points_world: Array, pixels: Array, camera: Camera, options: PnpOptions, weak: WeakLimits
     ) -> Evidence:
-        """Return the pose of OpenCV with the evidence of the native core."""
+        """Estimate a pose by OpenCV, and return it with the evidence that the native core measures."""
         pose = None
         if np.abs(points_world).max() <= _MAX_ABS and np.abs(pixels).max() <= _MAX_ABS:
             pose = estimate(points_world, pixels, camera, options)
@@ -134,7 +140,7 @@ def _opencv_engine() -> Engine:
 
 @lru_cache(maxsize=64)
 def native_options(options: PnpOptions, weak: WeakLimits) -> NativeOptions:
-    """Return the options of the native core that equal *options* and *weak*."""
+    """Return *options* and *weak* as options of the native core; ``options.engine`` is not used."""
     return NativeOptions(
         inlier_px=options.inlier_px,
         confidence=options.confidence,
@@ -154,7 +160,7 @@ def _native_engine() -> Engine:
     def solve(
         points_world: Array, pixels: Array, camera: Camera, options: PnpOptions, weak: WeakLimits
     ) -> Evidence:
-        """Run LO-RANSAC with P3P, then a robust refinement (``native/src/robust.hpp``)."""
+        """Estimate a pose by LO-RANSAC with P3P and a robust refinement (``native/src/robust.hpp``)."""
         return solver.evaluate(points_world, pixels, camera, native_options(options, weak))
 
     return solve
@@ -164,4 +170,5 @@ ENGINES: dict[str, Callable[[], Engine]] = {
     "native": _native_engine,
     "opencv": _opencv_engine,
 }
-"""For each name of an engine the function that loads its library and returns the engine."""
+"""For each name of an engine the function that loads its library and returns the engine; the function raises
+MissingExtra or ConfigurationError if that fails."""

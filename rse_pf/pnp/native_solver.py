@@ -1,4 +1,4 @@
-"""The PnP solver of the native core: correspondences to a pose with its evidence in one call of C++ code.
+"""Call the PnP solver of the native core: from correspondences to a pose with its evidence in one C++ call.
 
 ``native/include/rse_pf_native.h`` describes the C interface, whose structs are packed here by hand: a
 ``ctypes.Structure`` would take longer than the call itself needs for few correspondences.  Equal requests
@@ -34,19 +34,20 @@ __all__ = [
 ]
 
 MIN_WIDTH_TO_LENGTH = 0.02
-"""Smallest width over length of the inliers in the image of an accepted pose; 0 is a line.  The native core
-applies this limit (``kCollinear`` in ``native/src/solve.hpp``); here the value only appears in error
-messages."""
+"""Smallest width over length, in the image, of the inliers of an accepted pose; 0 is a line.  The native core
+applies this limit (``kCollinear`` in ``native/src/solve.hpp``); here the value only appears in error messages
+and in `rse_pf.pnp.rules`."""
 
 _FLAGS = {"avx512": 0, "avx2": 4, "portable": 1}
-"""Flag of a request for the widest vector instructions that the core may use."""
+"""Flag of a request by the widest vector instructions that the core may use for it; a processor without them
+uses narrower ones."""
 
 # --- Layout of rse_pf_pnp_request ---
 _HEAD = struct.Struct("=IIq")  # abi, flags, rows
 _ARRAYS = struct.Struct("=QQ")  # addresses of points_world and pixels
-_POINTER = struct.Struct("=Q")  # address of T_camera_world
+_POINTER = struct.Struct("=Q")  # address of T_camera_world; 0: estimate a pose
 _BODY = struct.Struct("=Qddddiiddiidddd")  # T_camera_world, then intrinsics, image size and options
-_BODY_AT = _HEAD.size + _ARRAYS.size  # byte offset of _BODY
+_BODY_AT = _HEAD.size + _ARRAYS.size  # byte offset of _BODY, and of _POINTER, its first field
 _REQUEST_BYTES = _BODY_AT + _BODY.size
 
 # --- Layout of rse_pf_pnp_result ---
@@ -57,16 +58,16 @@ _UPPER_AT = _COVARIANCE_AT + 36 * 8  # byte offset of upper_triangle
 _RESULT_BYTES = _UPPER_AT + 22 * 4
 
 # --- Layout of rse_pf_lists ---
-_LISTS_HEAD = struct.Struct("=Qq")  # address of numbers, room
-_LIST_ENDS = struct.Struct("=qqqq")  # count, ends of three lists
+_LISTS_HEAD = struct.Struct("=Qq")  # address of numbers, and for how many numbers there is room
+_LIST_ENDS = struct.Struct("=qqqq")  # number of lists, then for each of three lists the end of its numbers
 _REST_AT = _LISTS_HEAD.size + _LIST_ENDS.size  # byte offset of rest
-_MAX_REST_BYTES = 1024  # size of rest, RSE_PF_MAX_REST of the C header
+_MAX_REST_BYTES = 1024  # size of the JSON text without its lists: RSE_PF_MAX_REST of the C header
 
 _FIRST_ROWS = (
     512  # correspondences for which the first arrays of a thread have room; longer requests enlarge them
 )
 _MAX_NUMBERS = (
-    30_000  # numbers of a JSON text: a command of 5,000 matches has 3 + 2 + 1 numbers a match with depth
+    30_000  # most numbers in the lists of one JSON text: 5,000 matches of 3 + 2 + 1 numbers, with depth
 )
 
 _REASONS = (
@@ -137,14 +138,16 @@ _REFUSALS: dict[int, tuple[type[RsePfError], str, str]] = {
         "send the best matches only",
     ),
 }
-"""Error class, message and hint for each status of ``enum rse_pf_pnp_status`` that refuses a pose.
+"""Error class, message and hint for each status of ``enum rse_pf_pnp_status`` that refuses a pose, except
+status 1, whose error is `_BAD_REQUEST`.
 
 The messages are part of the replies to robots.  A changed message would make recordings of earlier releases
 differ from their replay, which is compared byte by byte.
 """
 _BAD_REQUEST = (BadRequest, "the options or sizes of the request do not fit", "leave the options out")
 _STATUSES_WITHOUT_EVIDENCE = (1, 2, 3, 11)
-"""Statuses of requests that the core refuses before it computes anything."""
+"""Statuses of requests that the core refuses before it computes anything: bad sizes or options (1), points
+(2) or pixels (3), and no memory (11)."""
 
 
 class NativeOptions(msgspec.Struct, frozen=True, kw_only=True):
@@ -154,7 +157,7 @@ class NativeOptions(msgspec.Struct, frozen=True, kw_only=True):
         lanes: Widest vector instructions that the core may use; the choice changes no byte of a result.
 
     The other fields are those of `rse_pf.pnp.PnpOptions` and, with the prefix ``weak_``, of
-    `rse_pf.pnp.WeakLimits`.
+    `rse_pf.pnp.WeakLimits`.  A ``min_iterations`` above ``max_iterations`` counts as ``max_iterations``.
     """
 
     inlier_px: float
@@ -171,21 +174,29 @@ class NativeOptions(msgspec.Struct, frozen=True, kw_only=True):
 class Evidence(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     """A camera pose with the measurements by which it is accepted, called weak, or refused.
 
+    A pose with fewer than four inliers is refused; only its matrix, its inliers and ``width_to_length`` are
+    then measured, and the other numbers are 0.
+
     Attributes:
-        T_camera_world: ``(4, 4)``, maps world points (metres) to the camera frame.
+        T_camera_world: ``(4, 4)``, maps world points (metres) to the camera frame; zeros if the core was to
+            estimate a pose and found none.
         inliers: Ascending row numbers of the inliers.
         rmse_px: Root mean square reprojection error of the inliers.
-        covariance: ``(6, 6)`` of the twist (metres, radians) that multiplies the pose on the left.
-        reason: Why the pose is weak, such as ``few-inliers``; empty for a pose that is not.
-        independent_inliers: Number of inliers when neighbours in the image count once.
+        covariance: ``(6, 6)`` of the twist (metres, radians) that multiplies the pose on the left; not finite
+            or without a positive diagonal if the inliers do not constrain the pose.
+        reason: Why the pose is weak, such as ``few-inliers``; empty for a pose that is not.  A refused pose
+            may have a reason too.
+        independent_inliers: Number of inliers of which those in the same cell or in adjacent cells of the
+            image count once (40 cells across its width); all inliers if they lie in 24 cells or more.
         log10_false_alarms: log10 of the expected number of random poses that have as many independent
-            inliers.
-        width_to_length: Width over length by which the rule about collinear matches decides: that of all
-            matches, in space or in the image, where a random pose would have as many inliers; otherwise that
-            of the inliers.
+            inliers, none with a larger error than the largest of this pose.
+        width_to_length: Width over length that the rule about collinear matches compares with its limit:
+            that of all matches, in space or in the image, if the pose has fewer than four inliers or a random
+            pose would have as many; 0 if the inliers may be copies of each other; else that of the inliers.
         inlier_width_to_length: Width over length of the inliers in the image; 0 is a line.
         radius_px: Root mean square distance of the inlier pixels from their centroid.
-        second_pose_rmse_px: Reprojection error of the second pose of a planar scene; 0 without a second pose.
+        second_pose_rmse_px: Root mean square reprojection error of the same inliers by the second pose of a
+            planar scene; 0 without a second pose.
         refusal: Error of the first rule that refuses the pose; None for an accepted pose.
     """
 
@@ -210,7 +221,8 @@ class AcceptedPose(NamedTuple):
         T_camera_world: ``(16,)``, a row-major 4x4 matrix.
         inliers: Ascending row numbers of the inliers, uint32.
         rmse_px: Root mean square reprojection error of the inliers.
-        covariance: ``(21,)`` float32, the upper triangle by rows of the ``(6, 6)`` covariance.
+        covariance: ``(21,)`` float32, the upper triangle by rows of the ``(6, 6)`` covariance of the twist
+            (metres, radians) that multiplies the pose on the left.
         reason: Why the pose is weak; empty for a pose that is not.
     """
 
@@ -222,7 +234,7 @@ class AcceptedPose(NamedTuple):
 
 
 class _ResultHead(NamedTuple):
-    """The numbers of rse_pf_pnp_result in the order of the C struct."""
+    """The numbers of rse_pf_pnp_result in the order of the C struct; ``inliers`` is its ``inlier_count``."""
 
     status: int
     reason: int
@@ -238,7 +250,11 @@ class _ResultHead(NamedTuple):
 
 
 class _Buffers(threading.local):
-    """Request, result and arrays of one thread; to look up a caller's addresses would take longer."""
+    """Request, result and arrays of one thread, at addresses that are looked up once.
+
+    A call copies its points and pixels into these arrays: to look up the addresses of the caller's arrays
+    would take longer.
+    """
 
     def __init__(self) -> None:
         request, result = np.zeros(_REQUEST_BYTES, dtype=np.uint8), np.zeros(_RESULT_BYTES, dtype=np.uint8)
@@ -251,7 +267,7 @@ class _Buffers(threading.local):
         self.allocate(_FIRST_ROWS)
 
     def allocate(self, rows: int) -> None:
-        """Replace the arrays by arrays for *rows* correspondences."""
+        """Replace the arrays by uninitialised ones for *rows* correspondences, and write their addresses."""
         points_world, pixels = np.empty(3 * rows), np.empty(2 * rows)
         inliers = np.empty(rows, dtype=np.uint32)
         # All allocations come first: if one fails, the request keeps the addresses of the old arrays.
@@ -261,7 +277,7 @@ class _Buffers(threading.local):
 
 
 class _ListBuffers(threading.local):
-    """The rse_pf_lists of one thread, with memory for the numbers."""
+    """The C struct rse_pf_lists of one thread, with memory for the numbers of a JSON text."""
 
     def __init__(self) -> None:
         self.numbers = np.empty(_MAX_NUMBERS)
@@ -318,8 +334,11 @@ class NativeSolver:
             camera: Intrinsics of the image that the pixels come from.
             options: Options of RANSAC, and limits of weak poses.
 
+        Returns:
+            The pose, which may be weak, in new arrays.
+
         Raises:
-            BadRequest: Sizes do not fit, or a number is not finite or beyond 1e6.
+            BadRequest: Sizes do not fit, ``n < 4``, or a number is not finite or beyond 1e6.
             NoConsensus: No pose has more inliers than a random pose would have.
             DegenerateGeometry: The inliers do not determine one pose.
         """
@@ -339,17 +358,20 @@ class NativeSolver:
         options: NativeOptions,
         T_camera_world: Array | None = None,
     ) -> Evidence:
-        """Return a camera pose with its evidence, also where a rule refuses the pose.
+        """Estimate a camera pose, or take a given one, and measure its evidence.
+
+        A pose that a rule refuses is returned as well, with the error as its ``refusal``.
 
         Args:
             points_world: As in `solve`.
             pixels: As in `solve`.
             camera: As in `solve`.
             options: As in `solve`.
-            T_camera_world: ``(4, 4)``, the pose whose evidence is wanted; None to estimate a pose.
+            T_camera_world: ``(4, 4)``, the pose whose evidence is wanted, which is not refined; None to
+                estimate a pose.
 
         Raises:
-            BadRequest: Sizes do not fit, or a number is not finite or beyond 1e6.
+            BadRequest: Sizes do not fit, ``n < 4``, or a number is not finite or beyond 1e6.
         """
         pose = None if T_camera_world is None else aligned(T_camera_world, np.float64)
         if pose is not None and pose.shape != (4, 4):
@@ -378,7 +400,11 @@ class NativeSolver:
     def _call(
         self, points_world: Array, pixels: Array, camera: Camera, options: NativeOptions, pose: Array | None
     ) -> tuple[tuple[Any, ...], npt.NDArray[np.uint32]]:
-        """Return the numbers of `_ResultHead` and the inliers; pose and covariance stay in the buffers."""
+        """Call the core; return the numbers of `_ResultHead`, and a copy of the row numbers of the inliers.
+
+        Pose and covariance stay in the buffers until the next call of this thread.  Without *pose* the core
+        estimates one.
+        """
         n = pixels.size // 2
         if points_world.size != 3 * n or pixels.size != 2 * n:
             raise BadRequest(
@@ -402,10 +428,11 @@ class NativeSolver:
         """Move the lists of numbers out of a JSON text, so that a JSON parser makes no object of each number.
 
         Returns:
-            The text in which the string ``"\\u000K"`` stands in the place of list K, valid until the next
-            call of this thread, and the lists.  None where the text must be parsed as usual: it has more than
-            three lists, or a list of something else than numbers; a number has more than 15 digits or an
-            exponent; the text has a backslash, or more than 1,024 bytes besides the lists.
+            The text in which the string ``"\\u000K"`` stands in the place of list K (from 0), valid until
+            the next call of this thread, and the lists as float64 arrays of their own.  None if the text must
+            be parsed as usual: it has more than three lists, more than 30,000 numbers in them, or a list that
+            is empty or holds anything but numbers; a number has more than 15 digits or an exponent; the text
+            has a backslash, or more than 1,024 bytes besides the lists.
         """
         buffers = self._lists
         size = self._cut_function(text, len(text), buffers.lists_address)

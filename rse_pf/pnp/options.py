@@ -1,5 +1,4 @@
-"""Options of a PnP request, such as the number of RANSAC samples, and the limits beyond which a pose is
-weak."""
+"""Define the options of a PnP request, such as the number of RANSAC samples, and the limits of weak poses."""
 
 from __future__ import annotations
 
@@ -31,10 +30,12 @@ class PnpOptions(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
 
     Attributes:
         engine: Name of the solver; None for the server's default.
-        inlier_px: Largest reprojection error of an inlier, pixels.
-        max_iterations: Most samples that RANSAC draws.
-        min_iterations: Fewest samples that RANSAC draws.
-        confidence: RANSAC stops when it has drawn a sample of inliers only with this probability.
+        inlier_px: Largest reprojection error of an inlier, pixels, 0.001 to 100.
+        max_iterations: Most samples that RANSAC draws, 1 to 100,000.
+        min_iterations: Fewest samples that RANSAC draws, 1 to 100,000; if it is above *max_iterations*, that
+            is the number of samples.  The estimate of the engine ``opencv`` does not use it.
+        confidence: RANSAC stops as soon as at least one of its samples has no outlier with this probability,
+            1e-6 to 1 - 1e-9.
 
     Raises:
         BadRequest: A number is out of its range.
@@ -58,12 +59,14 @@ class WeakLimits:
     """Limits beyond which a pose is weak instead of ok.
 
     Attributes:
-        inliers: Fewest inliers; and twice the fewest independent inliers.
-        inlier_ratio: Smallest share of the correspondences that are inliers.
-        translation_m: Largest standard deviation of the translation, metres.
-        rotation_rad: Largest standard deviation of the rotation, radians.
+        inliers: Fewest inliers of a pose that is ok.  At least half as many must be independent, which means
+            that inliers that are neighbours in the image count once.
+        inlier_ratio: Smallest share of the correspondences that are inliers, 0 to 1.
+        translation_m: Largest root of the summed variances of the translation along the three axes, metres.
+        rotation_rad: Largest root of the summed variances of the rotation about the three axes, radians.
 
-    The benchmarks call a pose correct within 0.1 m and 2 degrees, which are three standard deviations.
+    The benchmarks call a pose correct within 0.1 m and 2 degrees.  The default limits of both deviations are
+    a third of that: three standard deviations of a pose that is ok stay within both.
     """
 
     inliers: int = 12

@@ -1,4 +1,4 @@
-"""Random PnP problems with known poses, for tests and benchmarks; equal arguments give equal problems."""
+"""Make random PnP problems with known poses for tests and benchmarks; equal arguments give equal problems."""
 
 from __future__ import annotations
 
@@ -44,9 +44,12 @@ DEGENERATE = (
 )
 """Kinds of correspondences that determine no pose, for `make_degenerate`.
 
-``strayed-collinear`` is a line with one tenth of outliers; ``duplicated`` repeats four wrong correspondences
-with pixel noise; ``noise`` has random pixels; ``behind`` has points behind the camera; ``corner`` has all
-pixels within 5 px.
+``collinear`` has points on one line, ``noisy-collinear`` with noise of 5 mm and 0.5 px, and
+``strayed-collinear`` with one tenth of outliers besides.  ``coincident`` has one point for all rows, and
+``same-pixel`` one pixel; ``line-of-sight`` has points on one ray of the camera.  ``duplicated`` repeats four
+wrong correspondences with pixel noise; ``noise`` has random pixels; ``behind`` has points behind the camera;
+``mirrored`` has points reflected in the plane x = 0 of the world; ``corner`` has all pixels in a square of
+5 px.  ``nan``, ``infinite`` and ``huge`` (1e300) name the value of one coordinate of one point.
 """
 
 
@@ -56,9 +59,9 @@ class PnpProblem:
 
     Attributes:
         points_world: ``(n, 3)``, metres, world frame.
-        pixels: ``(n, 2)``; row *i* observes point *i*.
+        pixels: ``(n, 2)``, undistorted; row *i* observes point *i*.
         camera: Intrinsics.
-        T_camera_world: ``(4, 4)``, the true pose.
+        T_camera_world: ``(4, 4)``, the true pose, which maps world points (metres) to the camera frame.
         is_inlier: ``(n,)``, whether the pixel is the projection of the point with noise, and not a random
             pixel.
     """
@@ -84,9 +87,9 @@ def make_problem(
     Args:
         seed: Seed of the random generator.
         n: Number of correspondences.
-        noise_px: Standard deviation of the pixel noise.
+        noise_px: Standard deviation of the noise of each pixel coordinate.
         outlier_ratio: Share of the correspondences whose pixel is random.
-        depth_noise: Whether the points carry the depth error of a Kinect.
+        depth_noise: Whether each point is moved along its ray by the depth error of a Kinect.
         camera: Intrinsics.
 
     Source:
@@ -119,7 +122,7 @@ class TwoViews:
 
     Attributes:
         points_reference: ``(n, 3)``, metres, in the frame of the first camera, which measured them.
-        pixels: ``(n, 2)``, in the second image.
+        pixels: ``(n, 2)``, in the second image; row *i* observes point *i*, except for outliers.
         depths_m: ``(n,)``, depths that the second camera measured at these pixels; 0 where there is none.
         camera: Intrinsics of both images.
         T_camera_reference: ``(4, 4)``, the true pose, which maps the first camera's frame to the second's.
@@ -142,7 +145,7 @@ def make_two_views(
     Args:
         seed: Seed of the random generator.
         n: Number of correspondences.
-        noise_px: Standard deviation of the pixel noise in both images.
+        noise_px: Standard deviation of the noise of each pixel coordinate in both images.
         outlier_ratio: Share of the correspondences whose second pixel and depth are random.
         missing_ratio: Share of the depths in the second image that are missing.
     """
@@ -168,13 +171,26 @@ def make_two_views(
 
 
 def _add_depth_noise(rng: np.random.Generator, depth_m: Array) -> Array:
-    """Add the noise of a Kinect (Nguyen et al. 2012, eq. 5) to depths in metres."""
+    """Return depths (metres) with the noise of a Kinect (Nguyen et al. 2012, eq. 5), a new array."""
     noisy_m: Array = depth_m + rng.normal(size=len(depth_m)) * (0.0012 + 0.0019 * (depth_m - 0.4) ** 2)
     return noisy_m
 
 
 def make_degenerate(kind: str, *, seed: int, n: int = 100, camera: Camera = KINECT) -> PnpProblem:
-    """Make correspondences that determine no pose; *kind* is one of `DEGENERATE`."""
+    """Make *n* correspondences that determine no pose.
+
+    Args:
+        kind: One of `DEGENERATE`.
+        seed: Seed of the random generator.
+        n: Number of correspondences.
+        camera: Intrinsics.
+
+    Returns:
+        The correspondences, none of which is called an inlier, with the pose from which they were made.
+
+    Raises:
+        ValueError: There is no such kind.
+    """
     rng = np.random.default_rng(seed)
     problem = make_problem(seed=seed, n=n, noise_px=0.5, outlier_ratio=0.0, camera=camera)
     T, points, pixels = problem.T_camera_world, problem.points_world, problem.pixels

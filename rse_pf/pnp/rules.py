@@ -1,7 +1,9 @@
-"""The rules by which the native core refuses a pose or calls it weak, with measured values and limits.
+"""List the rules by which the native core refuses a pose or calls it weak, with measured values and limits.
 
-``native/src/solve.hpp`` applies these rules in this order, and the first rule that refuses a pose determines
-the error. This module only lists them, for the replay of a recorded pose.
+``native/src/solve.hpp`` applies the rules; this module only lists them, for the replay of a recorded pose.
+Of the violated rules that refuse poses, the first determines the error.  Of the other violated rules, the
+first gives the reason of a weak pose, except that ``ambiguous`` comes before all.  The test for mirrored
+points is not among the rules.
 """
 
 from __future__ import annotations
@@ -16,8 +18,7 @@ from rse_pf.pnp.options import MIN_CORRESPONDENCES, WeakLimits
 
 __all__ = ["Rule", "evaluate_rules"]
 
-# The five limits are those of native/src/evidence.hpp and native/src/solve.hpp, and change together with
-# them.
+# The five limits repeat constants of native/src/evidence.hpp and native/src/solve.hpp: change both together.
 _MAX_LOG10_FALSE_ALARMS = (
     -5.0
 )  # largest log10 of the expected number of random poses that fit as well as an accepted one
@@ -35,7 +36,7 @@ class Rule(msgspec.Struct, frozen=True, kw_only=True):
     """One rule about a pose, with the measured value and its limit.
 
     Attributes:
-        name: Error code of a rule that refuses poses, or reason of a weak pose.
+        name: Error code of a rule that refuses poses, or reason of a weak pose; several rules may share one.
         about: The measured quantity, in words.
         measured: Measured value.
         limit: Last value that satisfies the rule.
@@ -60,7 +61,11 @@ class Rule(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def margin(self) -> float:
-        """How many times better than its limit the measured value is; below 1 the rule is violated."""
+        """How many times better than its limit the measured value is.
+
+        The ratio of both, from 0 to infinity: 1 at the limit, above 1 if the rule is satisfied with a margin,
+        below 1 if the rule is violated.
+        """
         if self.measured == self.limit:
             return 1.0
         larger, smaller = (self.measured, self.limit) if self.at_least else (self.limit, self.measured)
@@ -72,9 +77,11 @@ class Rule(msgspec.Struct, frozen=True, kw_only=True):
 def evaluate_rules(
     correspondences: int, evidence: Evidence | None, *, inlier_px: float, weak: WeakLimits
 ) -> tuple[Rule, ...]:
-    """Return the rules about a pose in the order in which the native core applies them.
+    """Return the rules about a pose, satisfied or not, with the values that *evidence* holds.
 
-    Without enough correspondences or inliers, only the first rules can be measured.
+    With fewer than four correspondences only the rule ``too-few`` is returned; with fewer than four inliers,
+    the rules about the numbers of both and about the shape of all matches.  The rules about the second pose
+    of a planar scene are left out if there is no second pose.
 
     Args:
         correspondences: Number of correspondences of the request.
@@ -129,7 +136,12 @@ def evaluate_rules(
 
 
 def _constraint_rules(evidence: Evidence, weak: WeakLimits) -> tuple[Rule, ...]:
-    """Return the rules about the covariance of the pose."""
+    """Return the rules about the covariance of the pose.
+
+    A covariance that is not finite or has a variance that is not positive violates the one rule that is
+    returned: of six motions, at most five are constrained.  Otherwise, two rules limit the standard
+    deviations of position and rotation, each the root of the summed variances of its three axes.
+    """
     variances = evidence.covariance.diagonal()
     if not (np.isfinite(evidence.covariance).all() and (variances > 0.0).all()):
         return (_refusing("degenerate", "motions of the camera that the inliers constrain", 5, 6),)
@@ -154,7 +166,11 @@ def _constraint_rules(evidence: Evidence, weak: WeakLimits) -> tuple[Rule, ...]:
 
 
 def _ambiguity_rules(evidence: Evidence) -> tuple[Rule, ...]:
-    """Return the rules that compare the pose with the second pose of a planar scene by a likelihood ratio."""
+    """Return the rules that compare the pose with the second pose of a planar scene by a likelihood ratio.
+
+    They limit by how many pixel variances the sum of squared reprojection errors of the inliers is larger for
+    the second pose.  Without a second pose there is no rule.
+    """
     if not evidence.second_pose_rmse_px:
         return ()
     inliers = len(evidence.inliers)

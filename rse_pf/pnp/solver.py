@@ -22,7 +22,7 @@ class PnpSolution(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     Attributes:
         T_camera_world: ``(4, 4)``, maps world points (metres) to the camera frame.
         inliers: Ascending row numbers of the inliers among the correspondences.
-        rmse_px: Root mean square reprojection error of the inliers.
+        rmse_px: Root mean square reprojection error of the inliers, pixels.
         covariance: ``(6, 6)`` of the twist xi = (rho metres, phi radians) in
             ``T_true = exp_se3(xi) @ T_camera_world``.
         verdict: ``ok``, or ``weak`` for a pose that may be wrong or imprecise.
@@ -64,7 +64,7 @@ def solve_pnp(
         pixels: ``(n, 2)``, undistorted pixels; row *i* observes row *i* of *points_world*.
         camera: Intrinsics of the image the pixels come from.
         options: Options of RANSAC; None for the defaults.
-        default_engine: Name of the engine where *options* names none: ``native`` or ``opencv``.
+        default_engine: Name of the engine if *options* names none: ``native`` or ``opencv``.
         weak: Limits beyond which a pose is weak instead of ok.
 
     Raises:
@@ -73,6 +73,7 @@ def solve_pnp(
         DegenerateGeometry: The inliers do not determine one pose, such as points on a line.
         NoConsensus: No pose has more inliers than a random pose would have.
         MissingExtra: The engine is not installed.
+        ConfigurationError: The native core cannot be loaded, or has another version.
 
     Source:
         RSE-PF paper, Sect. 6.1 and Fig. 6; minimal solver after Gao et al. 2003, its ref. [13].
