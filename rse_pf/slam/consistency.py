@@ -34,7 +34,7 @@ __all__ = [
 CHI2_99_PERCENT_3 = 11.345  # 99 % quantile of the chi-squared distribution with three degrees of freedom
 CHI2_99_PERCENT_1 = 6.635  # 99 % quantile of the chi-squared distribution with one degree of freedom
 FULL_WEIGHT_INLIERS = 30  # a loop closure with fewer inliers has a weight below 1, since they may be chance
-FULL_WEIGHT_INLIER_RATIO = 0.5  # a loop closure with fewer inliers per match has a weight below 1
+FULL_WEIGHT_INLIER_RATIO = 0.5  # a loop closure with a smaller share of inliers has a weight below 1
 MANY_VERTICES = 128  # vertices from which the clique search colours by bit sets, since that is faster then
 MAX_CLIQUE_BRANCHES = 200_000
 """Branches that the clique search visits at most, so that hostile input cannot block a server; the largest
@@ -58,9 +58,9 @@ class OdometryNoise:
 class LoopClosure:
     """A measured relative pose between the keyframes in rows ``a`` and ``b`` of one list.
 
-    ``T_a_b`` ``(4, 4)`` maps points from the camera frame of *b* to that of *a*.  ``information`` ``(6, 6)``
-    is the inverse covariance of its twist (metres, radians).  ``inliers`` of the ``matches`` between both
-    images fit the pose.
+    ``T_a_b`` ``(4, 4)`` maps points from the camera frame of *b* to that of *a*, metres.  ``information``
+    ``(6, 6)`` is the inverse covariance of the twist (metres, radians) on its right.  ``inliers`` of the
+    ``matches`` between both images fit the pose; both are 0 where they are not known.
     """
 
     a: int
@@ -111,15 +111,20 @@ class EdgeArrays:
 
     @property
     def mean_variances(self) -> tuple[Array, Array]:
-        """Variances of one axis of each relative pose: ``(m,)`` square metres, ``(m,)`` square radians."""
+        """Mean variance of the three axes of each relative pose, as two arrays.
+
+        They are those of the translation, ``(m,)`` square metres, and of the rotation, ``(m,)`` square
+        radians.
+        """
         return self.variances[:, :3].mean(axis=1), self.variances[:, 3:].mean(axis=1)
 
 
 def evidence_weight(inliers: int, matches: int) -> float:
     """Return the weight of a loop closure within 0 to 1, by its inliers and by its inliers per match.
 
-    The smaller ratio to 30 inliers and to half of the matches decides.  Weights add up: two loop closures of
-    weight 0.5 count as one of full weight.
+    The weight is the smallest of 1, *inliers* over 30, and the share of inliers among *matches* over 0.5;
+    without *matches* only the inliers count.  Weights add up: two loop closures of weight 0.5 count as one of
+    full weight.
     """
     ratio = inliers / matches if matches else 1.0
     return min(1.0, inliers / FULL_WEIGHT_INLIERS, ratio / FULL_WEIGHT_INLIER_RATIO)
@@ -150,10 +155,10 @@ def find_consistent_set(
     for k in range(len(loop_closures)):
         steps = np.abs(order[edges.a] - order[edges.a[k]]) + np.abs(order[edges.b] - order[edges.b[k]])
         agree[k] = are_pairwise_consistent(T_world_camera, edges, edges.select(slice(k, k + 1)), steps, noise)
-    # 2. The test depends on which loop closure of a pair is the reference, so both directions must agree.
+    # 2. Keep the pairs that agree in both directions: the test depends on which of both is the reference.
     agree &= agree.T
     np.fill_diagonal(agree, False)
-    # 3. The largest set that agrees pairwise is a maximum clique of the graph of agreeing pairs.
+    # 3. Find the largest set that agrees pairwise: a maximum clique of the graph of agreeing pairs.
     return find_maximum_clique(agree)
 
 
@@ -170,7 +175,8 @@ def are_pairwise_consistent(
     and the round trip uses their mean, weighted by information.
 
     Args:
-        T: ``(n, 4, 4)``, poses of keyframes; all ends *a* are in one frame, and all ends *b* in one.
+        T: ``(n, 4, 4)``, poses of keyframes by odometry; those of all ends *a* are in one frame, and those of
+            all ends *b* in one frame, which may be another.
         edges: The *m* loop closures.
         reference: One loop closure between the same two trajectories.
         steps: ``(m,)``, steps of odometry between both ends *a* plus those between both ends *b*.
@@ -238,7 +244,10 @@ def are_scales_consistent(difference2: Array, variance: Array) -> npt.NDArray[np
 
 
 def _are_twists_noise(xi: Array, variance_m2: Array, variance_rad2: Array) -> npt.NDArray[np.bool_]:
-    """Return whether both halves of ``(m, 6)`` twists are noise of these variances of one axis, at 99 %."""
+    """Return ``(m,)``: whether translation and rotation of each twist ``(m, 6)`` are noise, each at 99 %.
+
+    *variance_m2* and *variance_rad2* are the variances ``(m,)`` of one axis of both.
+    """
     fits: npt.NDArray[np.bool_] = ((xi[:, :3] ** 2).sum(axis=1) <= CHI2_99_PERCENT_3 * variance_m2) & (
         (xi[:, 3:] ** 2).sum(axis=1) <= CHI2_99_PERCENT_3 * variance_rad2
     )
@@ -286,7 +295,12 @@ def find_maximum_clique(adjacency: npt.NDArray[np.bool_]) -> npt.NDArray[np.int6
 def _colour_vertices(
     vertices: list[int], neighbours: list[frozenset[int]], adjacency: npt.NDArray[np.bool_]
 ) -> list[tuple[int, int]]:
-    """Return (vertex, number of colours used so far): no clique of the vertices up to this one is larger."""
+    """Colour *vertices* greedily, so that neighbours have different colours.
+
+    Returns:
+        Pairs of a vertex and its colour, counted from 1, by ascending colour.  No clique of the vertices up
+        to and including a pair is larger than the colour of this pair.
+    """
     if len(vertices) >= MANY_VERTICES:
         return _colour_with_bit_sets(vertices, adjacency)
     classes: list[list[int]] = []

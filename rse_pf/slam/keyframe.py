@@ -116,7 +116,8 @@ _FINEST_PIXEL_FRACTION = 4
 _COARSEST_PIXEL_FRACTION = 2
 """Exponent of the coarsest unit of encoded pixels: 2**-2 px, for images up to 16,383 px wide."""
 _BORDER_PX = 64
-"""Distance in pixels by which an undistorted feature may lie outside the image."""
+"""Distance in pixels by which an undistorted feature may lie beyond the right or the lower edge of the image;
+beyond the other edges its coordinates would be negative, which are not encoded."""
 _DISPARITY_STEPS_PER_PX = 64  # disparities are encoded in units of 1/64 px
 _MAX_STEPS = 65_535  # largest number that encodes a depth or a disparity: a uint16
 _MIN_DEPTH_MM = 10  # smallest depth of a depth camera that is encoded, in millimetres
@@ -218,11 +219,15 @@ class SentKeyframe:
     def in_map(self, *, id: int, robot: str, T_world_camera: Array, metres_per_unit: float = 1.0) -> Keyframe:
         """Return this keyframe as a keyframe of a map, which has 3-D points instead of depths.
 
+        The point of a feature with an unknown depth is NaN.  The depth noise, IMU data, references to objects
+        and unknown blocks are left out.
+
         Args:
             id: The id in the map.
             robot: Name of the robot.
             T_world_camera: ``(4, 4)``, the pose in the world of the map, metres.
-            metres_per_unit: Metric scale of the segment, by which depths without scale are multiplied.
+            metres_per_unit: Metric scale of the segment, by which depths without scale are multiplied; not
+                used if the depths are metric.
         """
         points = self.features.points_camera(self.camera)
         if not self.features.is_metric:
@@ -243,7 +248,8 @@ class SentKeyframe:
     def from_map(keyframe: Keyframe) -> SentKeyframe:
         """Return a keyframe of a map as if a robot had sent it, with its pose in the map as odometry.
 
-        Features without a depth that can be encoded are left out, as `make_features` does.
+        Its depths count as those of a Kinect, rounded to 1 mm.  Features whose depth is unknown or not within
+        0.01..65 m are left out, as `make_features` does.
         """
         features = make_features(
             keyframe.pixels, keyframe.points_camera[:, 2], keyframe.descriptors, kind=keyframe.kind
@@ -307,7 +313,10 @@ def make_features(
 
 
 def _round_depths(depths_m: Array, f_baseline: float) -> Array:
-    """Return depths in metres, rounded as they are encoded; NaN where they cannot be encoded."""
+    """Return depths in metres, rounded as they are encoded; NaN where they cannot be encoded.
+
+    Depths are rounded to 1 mm if *f_baseline* (px m) is 0, else their disparities are rounded to 1/64 px.
+    """
     if f_baseline == 0.0:
         depths_mm = np.rint(depths_m * 1000.0)
         is_encodable = (depths_mm >= _MIN_DEPTH_MM) & (depths_mm <= _MAX_STEPS)
@@ -326,6 +335,9 @@ def make_scaleless_features(
     kind: DescriptorKind = ORB,
 ) -> KeyframeFeatures:
     """Return the features of a keyframe whose segment has no metric scale, those with a depth first.
+
+    A depth above 16 times the median depth becomes unknown, because such a far landmark is inaccurate.  Of
+    more than `max_features` features the first ones are used.  Pixels are rounded as by `make_features`.
 
     Args:
         pixels: ``(n, 2)``, undistorted; features outside 0..16383 px are left out.
@@ -415,7 +427,11 @@ def _max_pixel(fraction: int) -> float:
 
 
 def encode_keyframe(keyframe: SentKeyframe) -> bytes:
-    """Return *keyframe* as bytes, its features rounded as `make_features` rounds them."""
+    """Return *keyframe* as bytes, its features rounded as `make_features` rounds them.
+
+    Sizes and ranges are not checked, unlike in `decode_keyframe`: the features must come from
+    `make_features`, `make_scaleless_features` or `decode_keyframe`, which return only what can be encoded.
+    """
     camera, features = keyframe.camera, keyframe.features
     n = len(features)
     fraction = _pixel_fraction(float(features.pixels.max(initial=0.0)))
@@ -473,7 +489,7 @@ def decode_keyframe(data: bytes) -> SentKeyframe:
 
     Raises:
         BadRequest: *data* is too long or malformed, a required block is unknown or missing, a number is not
-            finite or out of its range, or a feature lies outside the image.
+            finite or out of its range, or a feature lies more than 64 px outside the image.
         InvalidCamera: The intrinsics are not those of a camera.
     """
     # 1. Read the head.

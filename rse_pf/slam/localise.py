@@ -39,8 +39,8 @@ _MAX_CAMERA_ROTATION_DEG = 6.0
 """Largest rotation between the poses of the fitted and of the stated camera at which the stated camera is
 accepted; photos with a right camera and a rolling shutter stay below 5.1 degrees."""
 _MAX_MAP_COORDINATE_M = 1e6
-"""A candidate farther than this from the origin of the map is ignored: no robot drives 1,000 km, and a false
-pose must not make a true one ambiguous."""
+"""Largest coordinate in metres of a candidate keyframe in the map; candidates beyond it are ignored: no robot
+drives 1,000 km, and a false pose must not make a true one ambiguous."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -50,14 +50,14 @@ class LocalisationOptions:
     Attributes:
         measured: Limits of matches; a pose needs its ``min_inliers`` and ``min_inlier_ratio`` to be ok.
         min_candidate_inliers: The estimate of a candidate with fewer inliers is dropped.
-        agree_m: Two estimates agree if their distance is at most this,
-        agree_deg: and the rotation between them is at most this.
+        agree_m: Largest distance between two estimates that agree.
+        agree_deg: Largest rotation between two estimates that agree.
         min_single_inliers: Inliers from which the estimate of one keyframe alone is enough.
         rival_ratio: An estimate that disagrees with the best one makes the pose ambiguous if it has at least
             this share of the inliers; in environments without repetition no such estimate was ever measured.
-        region_m: Candidates show the same region if their distance is at most this,
-        region_deg: and the rotation between them is at most this.
-        max_per_region: Number of candidates of one region that are compared.
+        region_m: Largest distance between two candidates that count as of one region.
+        region_deg: Largest rotation between two candidates that count as of one region.
+        max_per_region: Largest number of candidates of one region that are compared.
         has_equal_rooms: Whether the map may have rooms that look alike; a view shows less than a room, so
             that its pose is then always ambiguous.
         fits_camera: Whether the intrinsics of a view without depths may be wrong, as those of a photo.  Its
@@ -87,8 +87,9 @@ class Localised:
         reason: Why the verdict is not ``ok``.  For ``weak``: "ambiguous", "few-inliers", "low-inlier-ratio",
             "one-keyframe", "wrong-intrinsics", "no-scale", or a reason of PnP.  For ``none``: "no-candidates"
             or "no-pose".
-        T_map_camera: ``(4, 4)``, metres.
-        covariance: ``(6, 6)`` of the twist (metres, radians) on the left of ``T_map_camera``.
+        T_map_camera: ``(4, 4)``, metres; None if the verdict is ``none``.
+        covariance: ``(6, 6)`` of the twist (metres, radians) on the left of ``T_map_camera``; None if the
+            verdict is ``none``.
         inliers: Inliers of the best keyframe.
         matches: Matches of the best keyframe.
         rmse_px: Root mean square reprojection error of the inliers of the best keyframe.
@@ -162,13 +163,14 @@ def localise(
     best = estimates[0]
     agreeing = [estimate for estimate in estimates if _do_agree(estimate, best, options)]
     contradicting = [estimate for estimate in estimates if not _do_agree(estimate, best, options)]
-    # 3. Combine the agreeing estimates: by their inliers if pixels alone give the pose, else by their mean.
+    # 3. Take the mean of the agreeing poses, and the covariance of the best.  For a view without metric
+    # depths, replace this mean by the pose that PnP computes from the inliers of all of them.
     solution = best.measured.solution
     T_map_camera, covariance = _fuse_estimates(agreeing)
     if (view.depths_m is None or not view.is_metric) and len(agreeing) > 1:
         solution = _solve_jointly(agreeing, view, options)
         T_map_camera = best.T_map_keyframe @ inverse(solution.T_camera_world)
-    # 4. Find a reason not to trust the pose.
+    # 4. Find the first reason not to trust the pose; enlarge the covariance if the camera may be wrong.
     reason = _weakness(agreeing, contradicting, solution, options)
     if options.fits_camera and view.depths_m is None:
         fit = fit_camera(*_collect_matches(agreeing), T_map_camera, view.camera)
@@ -245,7 +247,7 @@ def _estimate_poses(
 
 
 def _estimate_scale(estimates: Sequence[_Estimate], options: LocalisationOptions) -> float | None:
-    """Return the metres in the unit of the view's depths; None if no estimate gives it.
+    """Return the length, in metres, of the unit of the view's depths; None if no estimate gives it.
 
     The logarithms of the estimates' scales are averaged, weighted by their inverse variances.
     """
@@ -258,7 +260,7 @@ def _estimate_scale(estimates: Sequence[_Estimate], options: LocalisationOptions
 
 
 def _collect_matches(estimates: Sequence[_Estimate]) -> tuple[Array, Array, Array]:
-    """Return all matches, inliers and outliers.
+    """Return all *k* matches of *estimates*, inliers and outliers.
 
     Returns:
         Landmarks ``(k, 3)`` in the map, the positions ``(k, 3)`` of the cameras of their keyframes in the
@@ -271,7 +273,11 @@ def _collect_matches(estimates: Sequence[_Estimate]) -> tuple[Array, Array, Arra
 
 
 def _camera_covariance(fit: CameraFit, T_map_camera: Array) -> Array:
-    """Return the ``(6, 6)`` covariance that an unknown error of the intrinsics adds to that of the pose."""
+    """Return the ``(6, 6)`` covariance that an unknown error of the intrinsics adds to that of a pose.
+
+    It is of the twist on the left of *T_map_camera*: the outer product of the difference between the fitted
+    and the given pose, plus the covariance of the fitted one.
+    """
     difference = log_se3((fit.T_map_camera @ inverse(T_map_camera))[None])[0]
     covariance: Array = np.outer(difference, difference) + fit.covariance
     return covariance

@@ -55,7 +55,7 @@ WEAK_POSE_VARIANCE = 4.0
 """Factor by which the covariance of a weakly determined relative pose is multiplied.  In rendered worlds the
 errors of such poses are 1.2 to 1.7 times, at most 2.7 times, their standard deviations; a third of the loop
 closures between two maps are weak, so a merge cannot do without them."""
-MIN_LOOP_KEYFRAMES = 3  # keyframes along a trajectory, at least, between both ends of a loop within one map
+MIN_LOOP_KEYFRAMES = 3  # smallest difference of `Atlas.order` between the ends of a loop within one map
 PAIRS_PER_REPORT = 16  # keyframe pairs between two reports of progress
 
 
@@ -100,7 +100,8 @@ class Atlas:
     Attributes:
         keyframes: All *n* keyframes.
         of_map: ``(n,)``, the map of each keyframe.
-        order: ``(n,)``, position of each keyframe along the trajectory of its robot.
+        order: ``(n,)``, position of each keyframe in the list.  A difference of two positions in one map is
+            taken as the number of odometry steps between them, also where another robot's keyframes begin.
         T_world_camera: ``(n, 4, 4)``, each pose in the world frame of its own map, metres.
         row_of: Row of each keyframe by (map, id).
     """
@@ -113,7 +114,7 @@ class Atlas:
 
     @classmethod
     def of(cls, versions: Sequence[MapVersion]) -> Atlas:
-        """Return the atlas of *versions*.
+        """Return the atlas of *versions*; a map is named by its index in *versions*.
 
         Raises:
             BadRequest: The maps have descriptors of two kinds.
@@ -147,7 +148,7 @@ def propose_loop_closures(
     """Measure the relative poses of keyframes that place recognition proposes as the same place.
 
     Args:
-        atlas: The keyframes of all maps.
+        atlas: The keyframes of all maps, at least one.
         options: How many candidates are compared, and what a loop closure needs.
         report: Receives the progress within 0.1 to 0.8, and a text.
 
@@ -181,7 +182,8 @@ def choose_candidate_pairs(
     Args:
         index: Place recognition vectors of all keyframes, by row.
         of_map: ``(n,)``, the map of each keyframe.
-        order: ``(n,)``, position of each keyframe along the trajectory of its robot.
+        order: ``(n,)``, position of each keyframe, see `Atlas`; keyframes of one map are paired if their
+            positions differ by 3 or more.
         options: How many candidates are chosen, and whether pairs within one map are.
         between: Two maps, or one map twice, if only pairs between them are wanted.
     """
@@ -211,7 +213,8 @@ def measure_pairs(
 ) -> tuple[list[LoopClosure], RejectionCounts]:
     """Return the loop closures of those *pairs* of rows that PnP can measure, and why the others failed.
 
-    *report* receives the progress within 0 to 1, and a text.
+    The landmarks of the first keyframe of a pair are matched with the image of the second.  *report* receives
+    the progress within 0 to 1, and a text.
     """
     pose_options = RelativePoseOptions(
         min_inliers=options.min_inliers,
@@ -252,18 +255,21 @@ def select_consistent(
 ) -> tuple[list[int], RejectionCounts]:
     """Return the indices of the loop closures that agree pairwise, and how many were rejected, by reason.
 
+    The reasons are "against-odometry" (within one map), "inconsistent", and "too-few-agree" (between two
+    maps; then all are rejected).
+
     Args:
         maps: The two maps that all loop closures connect, or one map twice.
         loop_closures: Their ends are rows of the two arrays.
         T_world_camera: ``(n, 4, 4)``, poses of the keyframes, each in the world frame of its own map.
-        order: ``(n,)``, position of each keyframe along the trajectory of its robot.
+        order: ``(n,)``, position of each keyframe, whose differences count steps of odometry, see `Atlas`.
         options: How many loop closures must agree to join two maps.
     """
     first, second = maps
     rejected: RejectionCounts = Counter()
     noise = OdometryNoise()
     candidates = list(range(len(loop_closures)))
-    # 1. A loop within one map must agree with the odometry as well.
+    # 1. Within one map, reject the loop closures that contradict the odometry.
     if first == second:
         candidates = _find_fitting_odometry(T_world_camera, order, loop_closures, noise)
         rejected[first, second, "against-odometry"] += len(loop_closures) - len(candidates)
@@ -271,7 +277,7 @@ def select_consistent(
     consistent = find_consistent_set(
         [loop_closures[index] for index in candidates], T_world_camera, order, noise
     )
-    # 3. Two maps are joined by several loop closures or not at all.
+    # 3. Between two maps, reject all loop closures if fewer than `min_links` agree.
     if first != second and len(consistent) < options.min_links:
         rejected[first, second, "too-few-agree"] += len(loop_closures)
         return [], rejected
@@ -303,9 +309,10 @@ def _find_fitting_odometry(
 
 
 def _lever_m(T_world_camera: Array, closure: LoopClosure) -> float:
-    """Return the largest distance, in metres, of the path between both ends of a loop closure from its end.
+    """Return the largest distance, in metres, from the last position of a path to its other positions.
 
-    This is the lever by which a rotation error along the path moves its end.
+    The path has the keyframes in the rows between both ends of *closure*.  The distance is the lever by which
+    a rotation error along the path moves its end.
     """
     first, last = sorted((closure.a, closure.b))
     path = T_world_camera[first : last + 1, :3, 3]

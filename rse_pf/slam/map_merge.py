@@ -62,11 +62,11 @@ class MergedMap:
 
     Attributes:
         version: The merged map, in the world of the first map.
-        joined: Indices of the maps that are part of it.
+        joined: Ascending indices of the maps that are part of it; the first map always is.
         not_joined: Index of each other map, with a sentence why.
         refused: The number of rejected pairs of keyframes, by the indices of their two maps and the reason.
-        loops: The number of accepted loop closures within a map.
-        merges: The number of accepted loop closures between two maps.
+        loops: The number of accepted loop closures within a map, of the joined maps.
+        merges: The number of accepted loop closures between two maps, of the joined maps.
         cost_before: The robust cost of the pose graph before the optimisation.
         cost_after: The robust cost of the pose graph after it.
     """
@@ -155,6 +155,9 @@ def merge_versions(
 ) -> MergedMap:
     """Merge *versions* into one map in the world of the first one.
 
+    A map that no chain of loop closures connects with the first one is left out; `MergedMap.not_joined` has
+    it with the reason.
+
     Args:
         versions: Maps with at least one keyframe each.
         options: None means the defaults.
@@ -178,7 +181,7 @@ def merge_versions(
     T_world_camera, joined = _align_maps(atlas, accepted)
     used = [c for c in accepted if {int(atlas.of_map[c.a]), int(atlas.of_map[c.b])} <= joined]
     rows = np.flatnonzero(np.isin(atlas.of_map, sorted(joined)))
-    # 3. Optimise the pose graph of odometry edges and loop closures.
+    # 3. Add loop closures from aligned point clouds, and optimise the pose graph of all edges.
     odometry = _odometry_edges(atlas, versions, joined)
     used += steps.align(atlas, T_world_camera, used)
     graph = _make_graph(atlas, T_world_camera, rows, odometry, used)
@@ -186,7 +189,7 @@ def merge_versions(
     report(0.95, "optimised")
     T_world_camera = T_world_camera.copy()
     T_world_camera[rows] = optimised.T_world_pose
-    # 4. Let the point clouds follow their keyframes, and build the map.
+    # 4. Move the points of the clouds with their keyframes, and build the merged map.
     points, colours = steps.deform(versions, atlas, T_world_camera, rows)
     version = _make_version(atlas, versions, T_world_camera, rows, odometry, used, points, colours)
     report(1.0, "merged")
@@ -255,14 +258,14 @@ def _odometry_edges(
     """
     edges: list[tuple[LoopClosure, EdgeKind]] = []
     connected: set[tuple[int, int]] = set()
-    # 1. Take over the edges of the maps.
+    # 1. Take over the edges that the joined maps have.
     for map_index in sorted(joined):
         _check_information(map_index, versions[map_index])
         for edge in versions[map_index].edges:
             a, b = atlas.row_of[map_index, edge.a], atlas.row_of[map_index, edge.b]
             edges.append((LoopClosure(a=a, b=b, T_a_b=edge.T_a_b, information=edge.information), edge.kind))
             connected.add((min(a, b), max(a, b)))
-    # 2. Connect consecutive keyframes.
+    # 2. Add an edge between consecutive keyframes of a robot that have none, from their poses in the map.
     deviations = np.array([_STEP_NOISE.step_m] * 3 + [math.radians(_STEP_NOISE.step_deg)] * 3)
     for a in range(len(atlas.keyframes) - 1):
         b = a + 1
@@ -296,7 +299,10 @@ def _make_graph(
     odometry: Sequence[tuple[LoopClosure, EdgeKind]],
     loop_closures: Sequence[LoopClosure],
 ) -> PoseGraph:
-    """Return the pose graph of the keyframes *rows*; only odometry edges are taken as free of outliers."""
+    """Return the pose graph of the keyframes *rows*, whose poses in the graph are in the order of *rows*.
+
+    Edges of the kind "odometry" are taken as free of outliers; all others may be outliers.
+    """
     graph_row = np.full(len(atlas.keyframes), -1)
     graph_row[rows] = np.arange(len(rows))
     edges = [edge for edge, _ in odometry] + list(loop_closures)

@@ -57,13 +57,13 @@ keyframe are correlated, so that more landmarks do not make it more accurate."""
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RelativePoseOptions:
-    """Limits for matches and inliers; the defaults were measured on the red-kitchen recording of 7-Scenes.
+    """Limits of matches and inliers; the defaults were measured on the red-kitchen recording of 7-Scenes.
 
     Attributes:
         ratio: Largest distance of the best match over that of the second best one (Lowe's ratio test).
         inlier_px: Largest reprojection error of an inlier.
-        max_matches: Number of best matches that are used.
-        min_matches: Fewer matches give no pose; None means half of ``min_inliers``.
+        max_matches: Largest number of matches that are used, those with the most similar descriptors.
+        min_matches: Fewer matches give no pose; None means half of ``min_inliers``.  PnP needs at least 4.
         min_inliers: Fewer inliers give no constraint.
         min_inlier_ratio: A smaller share of inliers among the matches gives no constraint.
         floor_m: Smallest standard deviation of the translation along each axis, because errors of depth and
@@ -148,7 +148,8 @@ class MeasuredPose:
         pixels: ``(k, 2)``, the matched pixels in the view.
         depths_view: ``(k,)``, the depths of the matched features in the view, 0 where unknown.
         depth_ratio: For a metric view with depths: the metre of the view in metres of the keyframe, which
-            differs from 1 if one of both has a wrong scale.
+            differs from 1 if one of both has a wrong scale; None if too few inliers have depths, or the
+            depths disagree.
     """
 
     solution: PnpSolution
@@ -178,7 +179,9 @@ class RelativePose:
             ``log(inverse(T_a_b) @ true_T_a_b)``.
         inliers: The number of inliers.
         matches: The number of matches.
-        scale: The unit of *b* in the unit of *a*, if *b* is not metric; else None.
+        scale: The ratio of the units of length of both keyframes, if the image that was matched is not metric
+            (`measure_inverse_relative_pose` matches that of *a*): the unit of *b*, expressed in that of *a*.
+            Else None.
         depth_ratio: The metre of *b* in metres of *a*, where both have metric depths and it was measured.
     """
 
@@ -356,7 +359,7 @@ def match_landmarks(
     Returns:
         The matched landmarks ``(k, 3)`` in the keyframe's frame, and the pixels ``(k, 2)`` and depths
         ``(k,)`` of the matched features in *view* (0 where unknown), sorted by the column of the pixel and
-        rounded to 0.1 mm, 0.01 px and 1 mm.
+        rounded to 0.1 mm, 0.01 px and 1 mm.  *k* is at most ``max_matches``, and may be 0.
 
     Raises:
         BadRequest: The descriptors of both are of different kinds.

@@ -20,11 +20,12 @@ class NormalEquations:
 
     Attributes:
         H: ``(c, c)``, the block of the camera parameters.
-        g: ``(c,)``, the gradient of the camera parameters.
+        g: ``(c,)``, the gradient ``J^T r`` of the camera parameters for the residuals *r*, model minus
+            observation; a step goes against it.
         E: ``(l, 3, c)``, the blocks between landmarks and camera parameters; the rows of a landmark are
             contiguous, so that the large product in `reduce` is that of one matrix with its own transpose.
         H_landmarks: ``(l, 3, 3)``, the blocks of the landmarks.
-        g_landmarks: ``(l, 3)``, the gradients of the landmarks.
+        g_landmarks: ``(l, 3)``, the gradients ``J^T r`` of the landmarks.
     """
 
     H: Array
@@ -35,6 +36,8 @@ class NormalEquations:
 
     def reduce(self, damping: float, prior: float | Array, landmark_prior: float) -> ReducedEquations:
         """Return the equations of the camera parameters alone, damped as Levenberg-Marquardt does.
+
+        Damping and priors are added to the matrices only, not to the right side.
 
         Args:
             damping: Share of each diagonal element that is added to this element.
@@ -59,7 +62,10 @@ class NormalEquations:
         return ReducedEquations(S, right, root.transpose(0, 2, 1) @ root)
 
     def landmark_steps(self, reduced: ReducedEquations, step: Array) -> Array:
-        """Return the steps ``(l, 3)`` of the landmarks for the *step* ``(c,)`` of the camera parameters."""
+        """Return the steps ``(l, 3)`` of the landmarks for the *step* ``(c,)`` of the camera parameters.
+
+        *reduced* is what `reduce` returned for these equations, with the damping of the landmarks.
+        """
         right = -(self.g_landmarks + self.E @ step)
         steps: Array = (reduced.landmark_covariance @ right[:, :, None])[:, :, 0]
         return steps
@@ -70,7 +76,7 @@ class ReducedEquations:
     """The equations ``S step = right`` of the camera parameters, after the landmarks were eliminated.
 
     Attributes:
-        S: ``(c, c)``, the Schur complement.
+        S: ``(c, c)``, the Schur complement, with the damping and the prior of the camera parameters.
         right: ``(c,)``, the right side.
         landmark_covariance: ``(l, 3, 3)``, the inverses of the damped blocks of the landmarks.
     """

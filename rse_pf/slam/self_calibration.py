@@ -40,35 +40,49 @@ UNKNOWNS = ("fx", "fy", "cx", "cy", "k1", "offset", "delay", "readout", "curve")
 - ``curve``: metres that measured depth is too large for each square metre of depth
 """
 PRIOR = np.array([0.15, 0.15, 40.0, 40.0, 0.15, 0.15, 0.3, 0.02, 0.01])
-"""Prior standard deviations of `UNKNOWNS`, in their units: typical errors of calibrations."""
+"""Prior standard deviations of `UNKNOWNS`, in their units: typical errors of calibrations.  For ``curve``,
+the last one, an adjustment takes `DriveObservations.curve_dev_per_m` instead."""
 _ZOOM_PRIOR = 0.15  # prior standard deviation of the logarithm of the focal length of one keyframe
-_CAUCHY_SCALE = 2.0  # of the Cauchy loss, in standard deviations of a residual: larger residuals lose weight
-_ITERATIONS = 12  # steps of an adjustment
-_ZOOM_ITERATIONS = 6  # steps of an adjustment with a focal length for each keyframe, begun near the solution
-_RESCALE_ITERATIONS = (1, 4)  # steps after which the noise is estimated again from the residuals
-_MIN_CONVERGED_ITERATION = 4  # the adjustment may end early only after this step, when the noise is estimated
+_CAUCHY_SCALE = 2.0  # residual, in its standard deviations, to which the Cauchy loss gives half the weight
+_ITERATIONS = 12  # largest number of steps of an adjustment in which all keyframes share one focal length
+_ZOOM_ITERATIONS = 6
+"""Largest number of steps of an adjustment with a focal length for each keyframe, which begins near its
+solution."""
+_RESCALE_ITERATIONS = (1, 4)
+"""Indices, from 0, of the steps after which the noise is estimated again from the residuals."""
+_MIN_CONVERGED_ITERATION = 4
+"""Index, from 0, of the step up to which convergence does not end an adjustment, because the noise is
+estimated again until then."""
 _CONVERGED_SHARE = 1e-4  # an adjustment ends when a step lowers the cost by less than this share
 _FIRST_DAMPING = 1e-4  # Levenberg-Marquardt's share of the diagonal: nearly Gauss-Newton at first
 _MIN_DAMPING = 1e-9  # Levenberg-Marquardt's share of the diagonal is not lowered below this
-_MAX_DAMPING = 1e4  # an adjustment ends when a step with more damping than this does not lower the cost
+_MAX_DAMPING = 1e4  # an adjustment ends when no step with damping up to this share lowers the cost
 _MIN_DEPTH_M = 0.02  # depth of a landmark in a camera: projections of nearer landmarks use this depth
-_BEHIND_COST = 1e3  # cost of an observation whose landmark is behind the camera: far above that of an outlier
-_TIME_BLOCKS = 6  # consecutive parts of a drive within which errors count as correlated
-_IMAGE_CELLS = 6  # columns, and rows, of image regions within which errors count as correlated
+_BEHIND_COST = 1e3
+"""Cost, far above that of an outlier, of a pixel whose landmark is behind the camera or nearer than
+`_MIN_DEPTH_M`."""
+_TIME_BLOCKS = 6  # number of consecutive parts of a drive; errors within a part count as correlated
+_IMAGE_CELLS = 6
+"""Number of columns, and of rows, of regions into which images are divided; errors within a region count as
+correlated."""
 _MAD_TO_SIGMA = 1.4826  # standard deviation of normal noise over its median absolute deviation
 _MIN_PIXEL_FACTOR = 0.05  # smallest ratio of the noise of pixels to their stated deviations
 _MIN_DEPTH_FACTOR = 0.1  # smallest ratio of the noise of depths to their stated deviations
-_MIN_DEPTHS = 20  # depths of a drive above which their noise is estimated from residuals
-_MAX_PARTS = 4  # parts of a drive that are adjusted alone to see whether they agree
-_MIN_PART_KEYFRAMES = 6  # keyframes of a part of a drive that is adjusted alone: fewer do not determine it
-_MAX_STEP_RAD = 0.5  # rotation of a keyframe in one step: the linearisation does not hold beyond it
+_MIN_DEPTHS = 20  # number of depths of a drive above which their noise is estimated from residuals
+_MAX_PARTS = 4  # largest number of parts of a drive that are adjusted alone to see whether they agree
+_MIN_PART_KEYFRAMES = 6
+"""Smallest number of keyframes of a part of a drive that is adjusted alone: fewer do not determine the
+calibration."""
+_MAX_STEP_RAD = 0.5
+"""Largest rotation, in radians, of a keyframe about an axis in one step, since the linearisation does not
+hold beyond it: the whole step is shortened."""
 _ZOOM_MEAN_INFORMATION = 1e8
-"""Information on the mean of the focal lengths of keyframes, which is held at 0, since ``fx`` and ``fy``
-already describe the common focal length."""
+"""Information, for each keyframe, on the mean of all zooms (logarithms of focal lengths of keyframes over the
+common one): it holds this mean at 0, since ``fx`` and ``fy`` already describe the common focal length."""
 _NOISE_SAMPLES = 8  # random perturbations of a drive from which the uncertainty of its path is computed
 _POSE_INFORMATION = 1.0
-"""Information added to each number of a pose, far below that of a drive: fixes the gauge, which is position
-and orientation of the world, and its scale without depth."""
+"""Information (1/m^2, 1/rad^2) added to each number of a keyframe's twist, far below that of a drive: it
+fixes the gauge, which is position and orientation of the world, and its scale without depth."""
 _POINT_INFORMATION = 1e-3  # information added to each landmark, 1/m^2, far below that of one pixel
 
 
@@ -127,10 +141,12 @@ class Calibrated:
         zooms_covariance: ``(k, k)`` of the zooms; 0 if they were not estimated.
         T_camera_world: ``(k, 4, 4)``, adjusted poses, metres.
         points_world: ``(l, 3)``, adjusted landmarks, metres.
-        bends_m: ``(9, k, 3)``, derivative of the keyframes' positions by each error of the calibration: by
-            how much the path bends if an unknown is held one unit too large.
-        noise_m: Uncertainty of the path: root mean square of its random error after alignment.
-        cost: The robust sum of squares at the end.
+        bends_m: ``(9, k, 3)``, derivative of the keyframes' positions in the world by each error of the
+            calibration: by how much the path bends if an unknown is held one unit too large; 0 for unknowns
+            that were not estimated.
+        noise_m: Uncertainty of the path: root mean square of the random errors of the keyframes' positions
+            after alignment, with those that the uncertainty of the estimated calibration causes.
+        cost: The Cauchy loss of all residuals plus the costs of the priors at the end.
         has_metric_scale: Whether depths determine the metric scale; else paths are compared up to scale.
         pixel_factor: Noise of the pixels over their stated standard deviations.
         depth_factor: Noise of the depths over their stated standard deviations.
@@ -169,7 +185,9 @@ class Calibrated:
 def triangulate_landmarks(observed: DriveObservations, T_camera_world: Array, count: int) -> Array:
     """Return the positions of *count* landmarks ``(count, 3)``, m, by linear least squares.
 
-    Each observation pulls its landmark to its ray, and to the point at its depth if it has one.
+    Each observation pulls its landmark to its ray with weight 1, and to the point at its depth, if it has
+    one, with the inverse variance of this depth.  A landmark with one ray and no depth gets the point of the
+    ray that is nearest to the origin of the world, and a landmark without observations gets the origin.
 
     Args:
         observed: Observations of the landmarks.
@@ -207,6 +225,8 @@ def adjust_with_calibration(
 ) -> Calibrated:
     """Adjust poses, landmarks and calibration until they agree best with the observed pixels and depths.
 
+    The result has new arrays; the arguments are not changed.
+
     The model of a pixel is ``f e^(fx + zoom) x (1 + k1 r^2) + c + cx`` for the point ``(x, y, 1)`` of the
     camera frame with ``r^2 = x^2 + y^2``, moved by the rolling shutter.  The model of a measured depth is ``z
     + offset + curve z^2 - rate * delay``.
@@ -217,7 +237,8 @@ def adjust_with_calibration(
         points_world: ``(l, 3)``, landmarks with which the adjustment begins, see `triangulate_landmarks`.
         free: The `UNKNOWNS` that are estimated; the others keep their values.
         zooms: Whether a focal length is estimated for each keyframe.
-        values: ``(9,)``, errors of the calibration with which the adjustment begins; None for 0.
+        values: ``(9,)``, errors of the calibration with which the adjustment begins; None for 0.  The priors
+            pull the estimated ones to 0, not to these values.
 
     Raises:
         BadRequest: *free* names an unknown that does not exist.
@@ -260,7 +281,7 @@ def adjust_with_calibration(
                 cost = system.cost(state)
             elif is_converged and iteration > _MIN_CONVERGED_ITERATION:
                 break
-        # 3. Compute covariances at the solution.
+        # 3. Estimate the noise at the solution, and compute the covariances with it.
         system.estimate_noise(state)
         system.linearise(state)
         return system.result(state)
@@ -276,9 +297,10 @@ def estimate_part_deviations(
 ) -> Array:
     """Return how far parts of a drive disagree about the calibration, as standard deviations ``(9,)``.
 
-    Parts that are adjusted alone disagree by more than their own deviations where the model lacks an effect,
-    such as errors of depth that change with the scene.  The result is 0 where a drive has too few keyframes
-    for two parts, and for unknowns that are not in *free*.
+    They are those of the mean of the parts, in the units of `UNKNOWNS`, as far as the covariances of the
+    parts do not explain them.  Parts that are adjusted alone disagree by more where the model lacks an
+    effect, such as errors of depth that change with the scene.  The result is 0 where fewer than two parts of
+    a drive have enough keyframes and can be adjusted, and for unknowns that are not in *free*.
 
     Args:
         observed: The observations of the whole drive.
@@ -307,9 +329,10 @@ def estimate_part_deviations(
 
 
 def disagreement(values: Array, variances: Array) -> Array:
-    """Return the standard deviation ``(n,)`` of means of estimates that their variances do not explain.
+    """Return the part ``(n,)`` of the standard deviation of a mean of estimates that their variances do not
+    explain; 0 where they explain all.
 
-    *values* and *variances* are ``(p, n)``: *n* quantities, each estimated *p* times.
+    *values* and *variances* are ``(p, n)``: *n* quantities, each estimated *p* times, with p at least 2.
 
     Source:
         DerSimonian and Laird, Controlled Clinical Trials 1986, Sect. 2: the variance between studies.
@@ -325,7 +348,10 @@ def disagreement(values: Array, variances: Array) -> Array:
 def _select_keyframes(
     observed: DriveObservations, adjusted: Calibrated, keyframes: Rows
 ) -> tuple[DriveObservations, Array, Array]:
-    """Return observations, poses and landmarks of *keyframes*, as far as two of them share a landmark."""
+    """Return the observations, poses and landmarks of *keyframes* alone, numbered anew.
+
+    All poses are returned, but only the landmarks that at least two of *keyframes* observe.
+    """
     new_index = np.full(len(adjusted.T_camera_world), -1)
     new_index[keyframes] = np.arange(len(keyframes))
     is_selected = new_index[observed.keyframes] >= 0
@@ -390,7 +416,8 @@ class _DriveSystem:
         self.depths_m = np.where(self.has_depth, observed.depths_m[order], 0.0)
         self.depths_dev_m = np.where(self.has_depth, observed.depths_dev_m[order], 1.0)
         self.rates_m_s = np.where(self.has_depth, observed.rates_m_s[order], 0.0)
-        # 2. Take the motion of the camera during the exposure of the rows of an image.
+        # 2. Take the velocity of the camera at each observation, and the time at which its row is exposed, as
+        # a share of the readout: -0.5 for the first row of the image, 0.5 for the last.
         twists = observed.twists_s[self.keyframes]
         self._velocities, self._angular_rates = twists[:, :3], twists[:, 3:]
         self._row_fractions = self.pixels[:, 1:] / self.camera.height - 0.5
@@ -410,9 +437,10 @@ class _DriveSystem:
         self._E_indices = self.landmarks[:, None, None], np.arange(3)[:, None], columns
 
     def residuals(self, state: _State) -> tuple[Array, Array]:
-        """Return residuals ``(n, 3)`` and points of the camera frame ``(n, 3)``, m.
+        """Return the residuals ``(n, 3)``, and the landmarks ``(n, 3)``, m, in the frames of their cameras.
 
-        A residual is model minus observation: two pixels, and metres of depth (0 without a depth).
+        A residual is model minus observation: two pixels, and metres of depth (0 without a depth).  The
+        landmarks are those at the moment of the middle row, without the motion of a rolling shutter.
         """
         T = state.T_camera_world[self.keyframes]
         points_camera = np.einsum("nij,nj->ni", T[:, :3, :3], state.points[self.landmarks]) + T[:, :3, 3]
@@ -453,7 +481,10 @@ class _DriveSystem:
         return np.stack([pixel, pixel, depth], axis=1)
 
     def estimate_noise(self, state: _State) -> None:
-        """Set the noise of pixels and depths from the median absolute deviation of their residuals."""
+        """Set `pixel_factor` and `depth_factor` from the medians of the absolute residuals at *state*.
+
+        `depth_factor` stays as it is if the drive has no more than `_MIN_DEPTHS` depths.
+        """
         residual, _ = self.residuals(state)
         pixel_ratios = np.abs(residual[:, :2] / self.pixels_px[:, None])
         self.pixel_factor = max(_MIN_PIXEL_FACTOR, _MAD_TO_SIGMA * float(np.median(pixel_ratios)))
@@ -519,7 +550,7 @@ class _DriveSystem:
             J_points,
         )
         self._r = whitened * roots
-        # 4. Sum the normal equations.
+        # 4. Sum the products of Jacobians and residuals in the normal equations.
         self._set_equations()
 
     def _set_equations(self) -> None:
@@ -548,7 +579,11 @@ class _DriveSystem:
         )
 
     def _reduce(self, damping: float) -> ReducedEquations:
-        """Return the equations of keyframes and calibration without landmarks, with all priors."""
+        """Return the equations of keyframes and calibration without landmarks.
+
+        Their matrix ``S`` contains the information of all priors; their right side does not yet contain that
+        the priors pull zooms and values to 0, which `step` adds.
+        """
         reduced = self._equations.reduce(damping, self._prior_information(), _POINT_INFORMATION)
         if self._keyframe_size == 7:
             zoom_columns = 7 * np.arange(self._keyframe_count) + 6
@@ -556,7 +591,7 @@ class _DriveSystem:
         return reduced
 
     def _prior_information(self) -> Array:
-        """Return the information of the priors of all parameters, the diagonal of a matrix."""
+        """Return the information ``(m,)`` of the priors of the *m* parameters: the diagonal of a matrix."""
         of_keyframes = np.full((self._keyframe_count, self._keyframe_size), _POSE_INFORMATION)
         of_keyframes[:, 6:] = 1.0 / _ZOOM_PRIOR**2
         return np.concatenate([of_keyframes.ravel(), 1.0 / self._priors[self._free] ** 2])
@@ -631,8 +666,8 @@ class _DriveSystem:
         """Return the factors ``(p,)`` by which correlated residuals make *p* variances larger.
 
         Residuals of one landmark, of one part of the drive and of one region of the image are correlated.
-        The sandwich estimator (White 1980) over each of these clusters replaces the variances that hold for
-        independent residuals, where it is larger.
+        For each of these three clusterings, a factor, which begins at 1, grows by the share by which the
+        sandwich estimator (White 1980) exceeds the variance that holds for independent residuals.
 
         Args:
             rows: ``(p, m)``, rows of the inverse of the reduced equations, one for each parameter.
@@ -672,7 +707,16 @@ class _DriveSystem:
         return bool(self.has_depth.any())
 
     def _path_noise_m(self, state: _State, poses_covariance: Array, rho_to_centre: Array) -> float:
-        """Return the root mean square error of the path, m, by draws from the covariance of the poses."""
+        """Return the root mean square error of the path after alignment, m.
+
+        It is that of `_NOISE_SAMPLES` random draws, always the same ones, from the covariance of the poses.
+
+        Args:
+            state: The adjusted poses.
+            poses_covariance: Covariance of the parameters of all keyframes, without those of the calibration.
+            rho_to_centre: ``(k, 3, 3)``, maps the translation of a twist on the left of ``T_camera_world`` to
+                the motion of the camera's centre in the world.
+        """
         values, vectors = np.linalg.eigh(0.5 * (poses_covariance + poses_covariance.T))
         root = vectors * np.sqrt(np.maximum(values, 0.0))
         drawn = root @ np.random.default_rng(3).standard_normal((len(root), _NOISE_SAMPLES))

@@ -22,16 +22,16 @@ _MAX_STEP_TRIALS = 4
 """Largest number of lengths of a Gauss-Newton step that are tried until the cost does not increase."""
 _STEP_REDUCTION = 0.25  # factor by which a Gauss-Newton step that increases the cost is shortened
 _CONVERGED_M = 6e-3
-"""Largest translation in metres of a step after which no further step is made: the next step would be ten
-times shorter, and the next keyframe's call of `smooth` makes it."""
+"""Translation in metres, along each axis of each pose, of a Gauss-Newton step below which no further step is
+made: the next step would be ten times shorter, and the next keyframe's call of `smooth` makes it."""
 _CONVERGED_RAD = 6e-3
-"""Largest rotation in radians of a Gauss-Newton step after which no further step is made: the next call
-makes it."""
+"""Rotation in radians, about each axis of each pose, of a Gauss-Newton step below which no further step is
+made: the next keyframe's call of `smooth` makes it."""
 _MIN_RELATIVE_DECREASE = 1e-3
 """Relative decrease of the cost below which a further Gauss-Newton step is not worth its time."""
 _MAX_ROTATION_STEP_RAD = 0.5
-"""Largest rotation in radians of a Gauss-Newton step; beyond it the linearisation is invalid, and the step
-is shortened."""
+"""Largest rotation in radians of a pose about an axis in a Gauss-Newton step; beyond it the linearisation is
+invalid, and the steps of all poses are shortened."""
 _DAMPING = 1e-6
 """Levenberg damping: each diagonal element h of the normal equations becomes h + 1e-6 (h + 1), so that a free
 pose without an edge stays where it is."""
@@ -64,9 +64,11 @@ class SmoothedPoses:
 
     Attributes:
         T: ``(n, 4, 4)``, all poses, metres.
-        squares: ``(m,)``, the squared Mahalanobis norm of the residual of each edge.
-        covariances: ``(w, 6, 6)`` of the wanted poses, of twists on their right, given the fixed poses.
-        log_scales: ``(k,)``, the natural logarithms of the fitted scales.
+        squares: ``(m,)``, the squared Mahalanobis norm of the residual of each edge at these poses, with that
+            of the ratio of scales if the edge measures one.
+        covariances: ``(w, 6, 6)`` of the *w* wanted poses, of twists (metres, radians) on their right, given
+            the fixed poses, with the Cauchy weights and the linearisation of the last step.
+        log_scales: ``(k,)``, the natural logarithms of the fitted scales; empty without scales.
     """
 
     T: Array
@@ -88,7 +90,7 @@ def smooth(
     wanted: Rows | None = None,
     scales: ScaleTerms | None = None,
 ) -> SmoothedPoses:
-    """Fit the first *free* poses to the edges, and keep the other poses fixed.
+    """Fit the first *free* poses to the edges, and keep the other poses fixed; the arguments do not change.
 
     Minimises the sum of squared Mahalanobis norms r^2 of the residuals of odometry edges, and of
     ``cauchy^2 log(1 + r^2 / cauchy^2)`` of robust edges, by iteratively reweighted Gauss-Newton.
@@ -116,7 +118,8 @@ def smooth(
     if scales is not None:
         squares = squares + _scale_squares(scales, log_scales)
     cost = _cost(squares, robust, cauchy)
-    # 2. Prepare the right sides that give columns of the inverse matrix: the covariances.
+    # 2. Prepare unit vectors as further right sides: their solutions are columns of the inverse of the
+    # matrix, which contain the covariances.
     wanted = np.empty(0, dtype=np.int64) if wanted is None else wanted
     size = 6 * free + len(log_scales)
     unit_vectors = np.zeros((size, 6 * len(wanted)))
@@ -186,7 +189,7 @@ def _cost(squares: Array, robust: npt.NDArray[np.bool_], cauchy: float) -> float
 def _normal_equations(
     T_a_b: Array, free: int, a: Rows, b: Rows, error: Array, information: Array, weights: Array
 ) -> tuple[Array, Array]:
-    """Return the damped matrix ``(6 f, 6 f)`` and the gradient ``(6 f,)`` of the *f* free poses.
+    """Return the damped matrix ``(6 f, 6 f)`` and the gradient ``(6 f,)`` of the first *f* = *free* poses.
 
     The unknowns are twists on the right of the poses; their Jacobians are first-order approximations
     for small residuals.
@@ -220,7 +223,10 @@ def _normal_equations(
 
 
 def _rescale(T_b_a_measured: Array, scales: ScaleTerms, scale_step: Array) -> Array:
-    """Return the inverse measured poses after the logarithms of the scales grew by *scale_step* ``(k,)``."""
+    """Return the inverses ``(m, 4, 4)`` of the measured relative poses after the scales have changed.
+
+    *scale_step* ``(k,)`` is what is added to the logarithms of the scales.
+    """
     factors = np.where(scales.of_edge >= 0, np.exp(scale_step)[scales.of_edge], 1.0)
     return scaled(T_b_a_measured, factors)
 
@@ -301,7 +307,7 @@ def _add_scales(
 
 
 def _limit_rotation(step: Array) -> Array:
-    """Return the twists *step* ``(f, 6)``, all shortened alike so that no rotation is above 0.5 rad."""
+    """Return the twists *step* ``(f, 6)``, all shortened alike if one is above 0.5 rad about an axis."""
     largest_rad = float(np.abs(step[:, 3:]).max())
     return step * (_MAX_ROTATION_STEP_RAD / largest_rad) if largest_rad > _MAX_ROTATION_STEP_RAD else step
 

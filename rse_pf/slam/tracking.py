@@ -55,9 +55,11 @@ _MIN_VIEW_COSINE = 0.6
 """Smallest cosine between the present and the last viewing ray of a landmark (53 degrees): seen from another
 direction, a landmark has another descriptor."""
 _MAX_APPROACH_RATIO = 2.0
-"""A landmark is not predicted where its distance is less than the last one divided by this ratio."""
+"""A landmark is not predicted where its distance from the camera is less than its distance in the last image
+that showed it, divided by this ratio."""
 _MAX_RETREAT_RATIO = 2.0
-"""A landmark is not predicted where its distance is more than the last one times this ratio."""
+"""A landmark is not predicted where its distance from the camera is more than its distance in the last image
+that showed it, times this ratio."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -170,7 +172,7 @@ class Observations:
     depth_sigmas_m: Array
 
     def select(self, rows: Rows) -> Observations:
-        """Return the observations of *rows*."""
+        """Return new observations that have only the *rows* ``(k,)`` of these, in their order."""
         return Observations(
             points=self.points[rows],
             covariances=self.covariances[rows],
@@ -318,7 +320,8 @@ def predict_features(
         margin_px: Width of the border around the image that counts as image; negative to leave a border out.
 
     Returns:
-        The ``(k,)`` rows of *numbers* that are predicted, and their predicted features.
+        The ``(k,)`` ascending indices into *numbers* (not rows of *landmarks*) of the landmarks that are
+        predicted, and their *k* predicted features.
     """
     # 1. Project the landmarks; keep those before the camera and in the image.
     points = transform(T_camera_world, landmarks.points[numbers])
@@ -375,10 +378,11 @@ def match_landmarks(
         margin_px: Width of the border around the image in which landmarks are predicted, too.
 
     Returns:
-        Rows of *numbers*, and the row of *image* that matches each of them.
+        Ascending indices into *numbers* (not rows of *landmarks*), and the row of *image* that matches each.
 
     Raises:
-        BadRequest: Shapes or the radius do not fit, or descriptors are neither uint8 nor int8.
+        BadRequest: Descriptors are not ORB, and shapes or the radius do not fit.  The shapes of ORB features
+            are not checked.
         MissingExtra: The descriptors are ORB, and the native core is not installed.
     """
     if not ORB.is_kind_of(image.descriptors):
@@ -467,7 +471,10 @@ def _make_near_request(
     predicted: Sequence[npt.NDArray[Any]] = (),
     predicted_count: int = 0,
 ) -> tuple[_NearRequest, list[npt.NDArray[Any]]]:
-    """Return a request for the native core, and the arrays that it points to, which must outlive the call."""
+    """Return a request for the native core, and the arrays that it points to, which must outlive the call.
+
+    *predicted* are the arrays of `PredictedFeatures`, aligned; none where the core predicts the features.
+    """
     arrays = _align_arrays(image.pixels, image.orientations, image.sizes, descriptors=image.descriptors)
     arrays.append(aligned(image.distinctiveness, np.int32))
     predicted_addresses: list[int | None] = [None] * 4
@@ -499,9 +506,9 @@ def _call_matcher(
 def _thresholds(
     limits: GuidedMatchLimits, image: ImageFeatures
 ) -> tuple[float, float, float, float, float, int]:
-    """Return the limits in the native core's order, without those that the image's features cannot meet.
+    """Return the six *limits* in the order in which the native core's request has them.
 
-    Features without orientations or sizes are not limited by them.
+    If the features of *image* have no orientations, or no sizes, the limit of these is one that all meet.
     """
     return (
         limits.radius_px,
@@ -523,7 +530,7 @@ def _match_by_numpy(
     empty = np.empty(0, dtype=np.int64)
     if not len(predicted.pixels) or not len(image):
         return empty, empty
-    # 1. Pairs within the radius whose orientations and sizes are similar.
+    # 1. Pair predictions and features within the radius whose orientations and sizes are similar.
     with np.errstate(invalid="ignore", over="ignore"):
         rows, features = _find_pairs_within(
             np.asarray(predicted.pixels, np.float64), np.asarray(image.pixels, np.float64), radius_px
@@ -540,7 +547,7 @@ def _match_by_numpy(
     rows, features = rows[is_similar], features[is_similar]
     if not len(rows):
         return empty, empty
-    # 2. The best and the second best feature of each prediction.
+    # 2. Find the best and the second best feature of each prediction by the distance of descriptors.
     distances = distances_of_pairs(predicted.descriptors[rows], image.descriptors[features])
     order = np.lexsort((features, distances, rows))
     rows, features, distances = rows[order], features[order], distances[order]
@@ -548,7 +555,7 @@ def _match_by_numpy(
     seconds = np.minimum(starts + 1, len(rows) - 1)
     has_second = (rows[seconds] == rows[starts]) & (seconds > starts)
     best = distances[starts]
-    # 3. The tests of distance, of distinctiveness and of Lowe's ratio.
+    # 3. Keep the best features that pass the tests of distance, of distinctiveness and of Lowe's ratio.
     max_distance = max_bits * image.descriptors.shape[1] // ORB.size
     if image.descriptors.dtype != np.uint8:
         max_distance = no_distance(image.descriptors)
@@ -558,7 +565,7 @@ def _match_by_numpy(
         & (~has_second | (best < lowe_ratio * distances[seconds]))
     )
     rows, features, best = rows[starts][is_clear], features[starts][is_clear], best[is_clear]
-    # 4. Each feature goes to the prediction that is most similar to it.
+    # 4. Of several predictions with the same best feature, keep the one whose descriptor is most similar.
     nearest_first = np.argsort(best, kind="stable")
     _, firsts = np.unique(features[nearest_first], return_index=True)
     chosen = np.sort(nearest_first[firsts])
@@ -606,7 +613,7 @@ def fit_pose(
     cauchy: float = 2.5,
     gate2: float = 11.3,
 ) -> FittedPose | None:
-    """Fit a pose to the pixels and depths of landmarks, weighted by the noise of all three.
+    """Fit a pose to pixels and depths of landmarks, weighted by the noise of pixels, depths and landmarks.
 
     The method is iteratively reweighted least squares with Cauchy weights; after three iterations only
     observations within the gate count.
@@ -682,7 +689,7 @@ def fit_readout_change(
     """Estimate by how many seconds a rolling shutter's readout time is wrong, from one image.
 
     The change of the readout time and the change of the pose are solved together by one Gauss-Newton step
-    from the pose that fits.
+    from the pose that fits; the change of the pose is discarded.
 
     Args:
         observed: Inliers of one image.
@@ -693,8 +700,8 @@ def fit_readout_change(
         cauchy: Distance, in standard deviations, at which an observation has half its weight.
 
     Returns:
-        The change in seconds, and its information (inverse variance, 1/s^2); 0 and 0 where the image does not
-        determine it.
+        The change in seconds, to be added to the readout time, and its information (inverse variance, 1/s^2);
+        0 and 0 where the image does not determine it.
 
     Raises:
         MissingExtra: The native core is not installed.
