@@ -28,7 +28,7 @@ PIXEL_CENTRE = 0.5
 def encode_colmap(
     version: MapVersion, report: Callable[[float], None] = lambda done: None
 ) -> dict[str, bytes]:
-    """Return the three text files of a COLMAP model by their names; images and cameras are numbered from 1.
+    """Return the three text files of a COLMAP model by their names; cameras, images and points begin at 1.
 
     Args:
         version: The map; its poses are written unchanged.
@@ -36,7 +36,7 @@ def encode_colmap(
 
     Raises:
         UsageError: The map has no keyframe.
-        MissingExtra: The native core, which matches features, is not installed.
+        MissingExtra: The native core, which matches ORB features, is not installed.
     """
     if not version.keyframes:
         raise UsageError("a map without keyframes is no COLMAP model", hint="export its cloud as ply")

@@ -103,8 +103,9 @@ def run_export(
         write_bag: Writes the map to a file as an MCAP bag and returns the size of the file in bytes.
 
     Raises:
-        UsageError: The options do not fit the format, the path is of the wrong type, or the map lacks what
-            the format needs.
+        UsageError: An option belongs to another format, ``--out`` is a folder where the format is one file or
+            the reverse, its parent folder is missing, an image cannot be read, or the map lacks what the
+            format needs.
     """
     _check_options(args)
     parent = args.out.absolute().parent
@@ -140,7 +141,11 @@ def _export_folder(args: argparse.Namespace, maps: MapRegistry) -> None:
 
 
 def _show_files(args: argparse.Namespace, files: list[tuple[Path, int]], notes: list[str]) -> None:
-    """Print the files with their sizes in bytes, images as one line with their number and total size."""
+    """Print the files with their sizes in bytes, images as one line with their number and total size.
+
+    With ``--json``, print one object instead: ``--out``, the total size, the names of several files, and
+    notes.
+    """
     if args.json:
         names = {} if len(files) == 1 else {"files": [str(file) for file, _ in files]}
         size = sum(size for _, size in files)
@@ -174,6 +179,9 @@ def _add_images(
     """Return *files* together with the images of the keyframes, and notes about missing images.
 
     The images come from the folder ``--images`` if it is named, else from the store of the maps.
+
+    Raises:
+        UsageError: The folder ``--images`` does not exist, or an image in it cannot be read or is too large.
     """
     if args.images is None:
         stored = {f"{IMAGES_FOLDER}/{keyframe.image_name}": data for keyframe, data in maps.images(version)}

@@ -31,8 +31,10 @@ _CLOUD_FILE = "points.ply"  # name of the file with the point cloud, to which tr
 def encode_nerfstudio(version: MapVersion) -> dict[str, bytes]:
     """Return the file ``transforms.json``, and ``points.ply`` if the map has points, by their names.
 
-    The intrinsics stand at the top of the document if all keyframes have the same camera, else in each frame.
-    The distortion coefficients are 0, since the pixels of a map are undistorted.
+    Poses and points are in the rotated world; a map without gravity, or whose z axis points up already, is
+    not rotated, and its document has no ``applied_transform``.  The intrinsics stand at the top of the
+    document if all keyframes have the same camera, else in each frame. The distortion coefficients are 0,
+    since the pixels of a map are undistorted.
 
     Raises:
         UsageError: The map has no keyframe.

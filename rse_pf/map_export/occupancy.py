@@ -1,8 +1,9 @@
 """Make the floor plan of a map: a 2-D occupancy grid, and its files in the format of the ROS map_server.
 
-A cell is occupied if the point cloud has at least two points in it between the floor and the height of the
-robot.  A cell is free if it is not occupied and the cloud shows the floor there, or the line of sight from a
-keyframe to one of its features passes through it between these heights.  All other cells are unknown.
+A cell is occupied if at least two points of the cloud in it are more than one step above the floor, and not
+above the height of the robot.  A cell is free if it is not occupied, and if a point of the cloud in it is
+within one step of the floor, or a line of sight from a keyframe to one of its features passes over it at a
+height from one step below the floor to the height of the robot.  All other cells are unknown.
 
 Source:
     ROS map_server and nav2_map_server: image, resolution, origin, negate, occupied_thresh, free_thresh.
@@ -38,13 +39,14 @@ FREE = 254  # grey level of a cell without an obstacle: white, as map_saver of R
 
 _MAX_CELLS = 1 << 24  # largest number of cells of an occupancy grid: 16 MiB of memory
 _MAX_DISTANCE_M = 30.0
-"""Points of a map that are farther than this outside the box around all camera positions are left out of its
-floor plan: no camera has seen them."""
+"""Largest distance in metres of a point from the box around all camera positions, along each axis of the
+grid; points beyond are left out of the floor plan, because no camera can have seen them."""
 _MAX_RAY_M = 10.0
-"""A feature with a coordinate in the camera's frame above this many metres does not mark cells as free, since
-its depth is inaccurate."""
+"""Largest absolute coordinate in metres, in the camera's frame, of a feature whose line of sight marks cells
+as free: the depth of a farther one is inaccurate."""
 _MAX_RAYS = 400_000
-"""Largest number of lines of sight of a map that mark cells as free; bounds the time of an export."""
+"""Largest number of lines of sight of a map that mark cells as free, divided equally among its keyframes;
+bounds the time of an export."""
 _RAYS_AT_ONCE = 20_000
 """Number of lines of sight that are rasterised in one array operation; bounds its memory."""
 _MIN_POINTS = 2
@@ -59,19 +61,24 @@ _FLOOR_SHARE = 0.3
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GridOptions:
-    """Limits that say which points of a map are floor and which are obstacles.
+    """The size of the cells of a floor plan, and which points of the map are floor and which are obstacles.
+
+    Points that are neither, since they are above the robot or more than one step below the floor, mark no
+    cell.
 
     Attributes:
-        resolution_m: Length of a cell's edge.
-        robot_height_m: Points higher than this above the floor are no obstacles.
-        step_m: Points lower than this above the floor are part of the floor.
-        floor_m: Height of the floor in the world whose z axis points up; None means the lowest large
-            horizontal surface.
-        up: ``(3,)`` direction against gravity in the world of the map, of any length; None means the
-            direction that `rse_pf.slam.level_surfaces.estimate_up` returns.
+        resolution_m: Length of a cell's edge, 0.01..10 m.
+        robot_height_m: Obstacles are the points above ``step_m`` up to this height above the floor,
+            0.05..100 m.
+        step_m: Points up to this distance above or below the floor are part of the floor, 0.005..10 m.
+        floor_m: Height of the floor in the frame of the grid, which is the world of the map rotated so that
+            its z axis points up; None means the lowest large horizontal surface.
+        up: ``(3,)`` direction against gravity in the world of the map, of a length within 0.001..1000; None
+            means the direction that `rse_pf.slam.level_surfaces.estimate_up` returns.
 
     Raises:
-        UsageError: A number is out of its range, or the step is not below the height of the robot.
+        UsageError: A number or the length of *up* is out of its range, or the step is not below the height of
+            the robot.
     """
 
     resolution_m: float = 0.05
@@ -109,12 +116,14 @@ class OccupancyGrid:
     Attributes:
         cells: ``(h, w)`` uint8, `OCCUPIED`, `UNKNOWN` or `FREE`; row 0 has the lowest y, column 0 the
             lowest x.
-        origin_m: x and y of the outer corner of ``cells[0, 0]``, in the frame of the grid.
+        origin_m: x and y of the corner of ``cells[0, 0]`` with the lowest x and y, in the frame of the grid.
         resolution_m: Length of a cell's edge.
         floor_m: Height of the floor in the frame of the grid.
-        T_grid_world: ``(4, 4)``, maps the world of the map to the frame of the grid, whose z axis points up.
+        T_grid_world: ``(4, 4)``, maps the world of the map to the frame of the grid, whose z axis points up;
+            a rotation without translation.
         up_source: How the direction against gravity was found.
-        points_left_out: The number of points that lie too far from all camera positions.
+        points_left_out: The number of points of the map that were not used, because they are more than 30 m
+            outside the box around all camera positions.
     """
 
     cells: npt.NDArray[np.uint8]
@@ -133,8 +142,9 @@ def make_occupancy_grid(version: MapVersion, options: GridOptions = _DEFAULT) ->
     """Return the floor plan of a map; the same map and options always give the same grid.
 
     Raises:
-        UsageError: The map has no points or no keyframes, the direction against gravity is unknown, or the
-            grid would have more than 2**24 cells.
+        UsageError: The map has no points or no keyframes, the direction against gravity is unknown, no point
+            is near the cameras, nothing is seen between the floor and the height of the robot, or the grid
+            would have more than 2**24 cells.
     """
     if not version.keyframes:
         raise UsageError("a map without keyframes has no floor plan", hint="export its cloud as ply")
@@ -144,7 +154,8 @@ def make_occupancy_grid(version: MapVersion, options: GridOptions = _DEFAULT) ->
     up, up_source = _find_up(version, options)
     T_grid_world = upright_rotation(-up)
     T_grid_camera = np.array([T_grid_world @ keyframe.T_world_camera for keyframe in version.keyframes])
-    # 2. Leave out points that no camera can have seen.
+    # 2. Leave out points that no camera can have seen: those far outside the box around the cameras.  Refuse
+    # a grid that would be too large for the cameras alone before the points are transformed.
     low = T_grid_camera[:, :3, 3].min(axis=0)
     high = T_grid_camera[:, :3, 3].max(axis=0)
     _check_cell_count(high - low, options)
@@ -156,12 +167,13 @@ def make_occupancy_grid(version: MapVersion, options: GridOptions = _DEFAULT) ->
         raise UsageError(
             f"no point of this map is within {_MAX_DISTANCE_M:g} m of a pose", hint="check its poses"
         )
-    # 3. Find the floor, and divide the points into floor and obstacles.
+    # 3. Find the height of the floor, and choose floor points and obstacles by their height above it.
     floor_m = _find_floor(points, T_grid_camera, options) if options.floor_m is None else options.floor_m
     height_m = points[:, 2] - floor_m
     obstacles = points[(height_m > options.step_m) & (height_m <= options.robot_height_m)]
     floor_points = points[np.abs(height_m) <= options.step_m]
-    # 4. Mark the floor and the lines of sight as free, then the obstacles as occupied.
+    # 4. Mark the cells of floor points and lines of sight as free, then those of obstacles as occupied, which
+    # replaces free.
     start, end = _lines_of_sight(version, T_grid_camera, floor_m, options)
     raster = _Raster.covering([obstacles, floor_points, start, end], options)
     raster.mark_free(raster.cell_numbers(floor_points))
@@ -181,7 +193,8 @@ def make_occupancy_grid(version: MapVersion, options: GridOptions = _DEFAULT) ->
 def encode_occupancy(grid: OccupancyGrid) -> dict[str, bytes]:
     """Return the image ``map.pgm`` and its description ``map.yaml`` for ROS's map_server, by their names.
 
-    Comments in ``map.yaml`` state the height of the floor and ``T_grid_world``.
+    The image has the row of cells with the highest y first.  Comments in ``map.yaml`` state the height of the
+    floor, ``T_grid_world``, and the ROS 2 command that publishes it.
     """
     height, width = grid.cells.shape
     image = f"P5\n{width} {height}\n255\n".encode("ascii") + grid.cells[::-1].tobytes()
@@ -205,7 +218,7 @@ def encode_occupancy(grid: OccupancyGrid) -> dict[str, bytes]:
 
 
 def _ros2_static_transform(T_grid_world: Array) -> str:
-    """Return the ROS 2 command that publishes ``T_grid_world`` from frame ``map`` to frame ``plan``."""
+    """Return the ROS 2 command to publish ``T_grid_world``, the pose of ``map`` in its parent ``plan``."""
     x, y, z = T_grid_world[:3, 3]
     qx, qy, qz, qw = to_quaternion(T_grid_world[:3, :3])
     return (
@@ -227,7 +240,10 @@ def _find_up(version: MapVersion, options: GridOptions) -> tuple[Array, UpSource
 
 
 def _check_cell_count(extent_m: Array, options: GridOptions) -> None:
-    """Raise UsageError if a grid over *extent_m* (x and y, metres) has more than 2**24 cells."""
+    """Raise UsageError if a grid over *extent_m* (x and y in metres; a third number is ignored) is too large.
+
+    The limit is 2**24 cells.
+    """
     sides = np.ceil(extent_m[:2] / options.resolution_m) + 1.0
     cells = float(sides[0] * sides[1])
     if cells > _MAX_CELLS:
@@ -244,11 +260,17 @@ def _check_cell_count(extent_m: Array, options: GridOptions) -> None:
 
 
 def _find_floor(points: Array, T_grid_camera: Array, options: GridOptions) -> float:
-    """Return the height in metres of the lowest large horizontal surface below the cameras.
+    """Return the height of the lowest large horizontal surface below the cameras, metres in the grid's frame.
 
-    Points below the median camera height are divided into layers of 5 cm.  The area of a layer is the number
-    of its 10 cm squares with a point; a layer is large if it has 30 % of the area of the largest layer.
-    Without points below the cameras, return the height of the lowest point.
+    Points below the median camera height are divided into horizontal layers of 5 cm.  The area of a layer is
+    the number of its 10 cm squares with a point; a layer is large if it has at least 30 % of the area of the
+    largest layer.  The result is the median height of the points within 5 cm of the middle of the lowest
+    large layer; without points below the median camera height, the height of the lowest point.
+
+    Args:
+        points: ``(n, 3)`` metres in the frame of the grid, at least one.
+        T_grid_camera: ``(k, 4, 4)``, the poses of the cameras.
+        options: Not used.
     """
     below = points[points[:, 2] < float(np.median(T_grid_camera[:, 2, 3]))]
     if not len(below):
@@ -267,14 +289,16 @@ def _find_floor(points: Array, T_grid_camera: Array, options: GridOptions) -> fl
 def _lines_of_sight(
     version: MapVersion, T_grid_camera: Array, floor_m: float, options: GridOptions
 ) -> tuple[Array, Array]:
-    """Return starts and ends ``(n, 3)`` of the lines from cameras to features, in the frame of the grid.
+    """Return starts and ends ``(n, 3)`` in metres of the lines from cameras to features, in the grid's frame.
 
-    Lines are cut to the heights between the floor and the robot, and end one cell before the feature, because
-    the cell of the feature itself is not free.
+    Lines are cut to the heights from one step below the floor to the height of the robot above it, and end
+    the length of a cell before the feature, because the cell of the feature itself is not free.  Lines of
+    which nothing is left are dropped, so that *n* may be 0.
     """
     starts, ends = [np.empty((0, 3))], [np.empty((0, 3))]
     max_per_keyframe = max(1, _MAX_RAYS // len(T_grid_camera))
-    # 1. Take the features of each keyframe whose point is near enough, evenly thinned.
+    # 1. Take the lines from each keyframe to those of its features that lie in front of the camera, not
+    # farther than `_MAX_RAY_M` along any axis; thin them evenly to the share of a keyframe.
     for keyframe, T in zip(version.keyframes, T_grid_camera, strict=True):
         points = keyframe.points_camera.astype(np.float64)
         points = points[(np.abs(points) <= _MAX_RAY_M).all(axis=1) & (points[:, 2] > 0.0)]
@@ -284,7 +308,9 @@ def _lines_of_sight(
     start, end = np.concatenate(starts), np.concatenate(ends)
     direction = end - start
     length_m = np.maximum(np.linalg.norm(direction, axis=1), 1e-9)
-    # 2. Find the shares of each line at which it crosses the lowest and the highest permitted height.
+    # 2. Find where each line crosses the lowest and the highest permitted height, as shares of its length: 0
+    # is the camera, 1 the feature.  A level line gets 0 and 1 at a permitted height, else 1 and 0: nothing is
+    # left.
     low = floor_m - options.step_m
     high = floor_m + options.robot_height_m
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -293,7 +319,8 @@ def _lines_of_sight(
     is_within = (start[:, 2] >= low) & (start[:, 2] <= high)
     crossing[is_level] = np.where(is_within[is_level, None], [0.0, 1.0], [1.0, 0.0])
     crossing[~is_level] = np.sort(crossing[~is_level], axis=1)
-    # 3. Cut each line there, and one cell before its feature; drop lines of which nothing is left.
+    # 3. Cut each line at these shares, and the length of a cell before its feature; drop lines of which
+    # nothing is left.
     first = np.maximum(crossing[:, 0], 0.0)
     last = np.minimum(crossing[:, 1], 1.0 - options.resolution_m / length_m)
     is_left = first < last
@@ -303,7 +330,13 @@ def _lines_of_sight(
 
 @dataclass(slots=True, kw_only=True, eq=False)
 class _Raster:
-    """The cells of a grid while they are marked; ``low`` ``(2,)`` is the corner of cell (0, 0), metres."""
+    """The cells of a grid, which the methods mark in place.
+
+    Attributes:
+        low: ``(2,)``, x and y in metres of the corner of cell (0, 0) with the lowest coordinates.
+        resolution_m: Length of a cell's edge.
+        cells: ``(h, w)`` as in `OccupancyGrid`; the row is along y, the column along x.
+    """
 
     low: Array
     resolution_m: float
@@ -311,7 +344,11 @@ class _Raster:
 
     @staticmethod
     def covering(point_sets: list[Array], options: GridOptions) -> _Raster:
-        """Return a raster of unknown cells around all points, with a margin of one cell."""
+        """Return a raster of unknown cells around all points ``(n, 3)``, with a margin of one cell.
+
+        Raises:
+            UsageError: The sets hold no point, or the raster would have more than 2**24 cells.
+        """
         xy = np.concatenate([points[:, :2] for points in point_sets])
         if not len(xy):
             raise UsageError(
@@ -326,7 +363,7 @@ class _Raster:
         return _Raster(low=low, resolution_m=options.resolution_m, cells=cells)
 
     def cell_numbers(self, points: Array) -> npt.NDArray[np.int64]:
-        """Return the number of the cell that holds each point, counted row by row."""
+        """Return ``(n,)``, the index of the cell that holds each point in ``cells`` flattened row by row."""
         column, row = np.floor((points[:, :2] - self.low) / self.resolution_m).astype(np.int64).T
         numbers: npt.NDArray[np.int64] = row * self.cells.shape[1] + column
         return numbers
@@ -335,12 +372,16 @@ class _Raster:
         self.cells.reshape(-1)[cell_numbers] = FREE
 
     def mark_occupied(self, cell_numbers: npt.NDArray[np.int64]) -> None:
-        """Mark the cells whose number occurs at least twice, once for each point."""
+        """Mark the cells that hold at least two points; *cell_numbers* has the cell of each point."""
         distinct, count = np.unique(cell_numbers, return_counts=True)
         self.cells.reshape(-1)[distinct[count >= _MIN_POINTS]] = OCCUPIED
 
     def mark_lines_free(self, start: Array, end: Array) -> None:
-        """Mark the cells under lines from *start* to *end* ``(n, 3)``, sampled at half the cell's edge."""
+        """Mark the cells under lines from *start* to *end* ``(n, 3)``, metres, as free.
+
+        A line marks the cells of samples at most half a cell's edge apart, so that it may miss a cell of
+        which it only cuts a corner.
+        """
         for first in range(0, len(start), _RAYS_AT_ONCE):
             rows = slice(first, first + _RAYS_AT_ONCE)
             origin, direction = start[rows, :2], end[rows, :2] - start[rows, :2]

@@ -28,8 +28,8 @@ def encode_single_file(version: MapVersion, format_name: str, robot: str | None 
         robot: For ``tum`` only: the robot whose keyframes are written; None writes those of all robots.
 
     Raises:
-        UsageError: The format is unknown, the map has no keyframe of *robot*, or the format is a point cloud
-            and the map has no points.
+        UsageError: The format is unknown, the format is ``tum`` and the map has no keyframe of *robot*, or
+            the format is a point cloud and the map has no points.
     """
     if format_name not in SINGLE_FILE_FORMATS:
         raise UsageError(
@@ -65,7 +65,14 @@ def _encode_pcd(version: MapVersion, robot: str | None) -> bytes:
 
 
 def _encode_tum(version: MapVersion, robot: str | None) -> bytes:
-    """Return the camera poses, ordered by time, as a trajectory file of the TUM RGB-D benchmark."""
+    """Return the camera poses, ordered by time, as a trajectory file of the TUM RGB-D benchmark.
+
+    Each line has the Unix time of a keyframe in seconds and its ``T_world_camera``; a map without keyframes
+    gives a file with the heading only.
+
+    Raises:
+        UsageError: *robot* is not None, and the map has no keyframe of it.
+    """
     keyframes = [keyframe for keyframe in version.keyframes if robot in (None, keyframe.robot)]
     if robot is not None and not keyframes:
         raise UsageError(f"no keyframe of robot {robot!r} is in this map", hint="see rse-pf map show")
@@ -76,7 +83,7 @@ def _encode_tum(version: MapVersion, robot: str | None) -> bytes:
 
 
 def _encode_g2o(version: MapVersion, robot: str | None) -> bytes:
-    """Return the pose graph as a g2o file whose first keyframe is fixed."""
+    """Return the whole pose graph as a g2o file whose first keyframe is fixed; *robot* is not used."""
     lines = [g2o_vertex(keyframe.id, keyframe.T_world_camera) for keyframe in version.keyframes]
     if version.keyframes:
         lines.append(f"FIX {version.keyframes[0].id}")

@@ -1,8 +1,8 @@
 """Find the feature tracks of a map, and triangulate their 3-D points with the poses of the map fixed.
 
 A track is the set of features in several keyframes that show the same point.  Features are matched in pairs
-of keyframes, and a feature leaves its track if the point is projected far from it, so that wrong matches
-leave no track.  Points that only one keyframe shows are left out.
+of keyframes.  A feature is removed from its track if the triangulated point is projected more than 4 px from
+it, which removes wrong matches.  A point that fewer than two keyframes show is left out.
 """
 
 from __future__ import annotations
@@ -26,13 +26,18 @@ Rows = npt.NDArray[np.int64]
 _NEXT_KEYFRAMES = 3
 """Number of the following keyframes of the same robot with which each keyframe is matched."""
 _OUTLIER_PX = 4.0
-"""Largest reprojection error in pixels of an observation; COLMAP filters its own models by the same."""
-_GAUSS_NEWTON_STEPS = 3  # steps in which the points are triangulated, after each removal of outliers
-_OUTLIER_ROUNDS = 2  # number of times that points are triangulated and outliers are removed
-_MAX_POINT_M = 1e5  # largest coordinate in metres of a feature's point in the frame of its camera
-_MIN_DEPTH_M = 0.05  # smallest depth in metres at which a feature's point is used
-_MAX_DEPTH_M = 200.0  # largest depth in metres at which a feature's point is used
-_DEPTH_NOISE = DepthNoise()
+"""Largest reprojection error in pixels of a match and of an observation, and the width of the Huber loss of
+the triangulation; COLMAP filters its own models by the same limit."""
+_GAUSS_NEWTON_STEPS = 3  # steps of each triangulation of the points
+_OUTLIER_ROUNDS = 2
+"""Number of rounds, each of which triangulates the points and then removes outliers; one more triangulation
+follows the last round."""
+_MAX_POINT_M = 1e5  # largest absolute coordinate in metres of a feature's point in the frame of its camera
+_MIN_DEPTH_M = 0.05
+"""Smallest depth in metres at which a feature's measured point is used; a point that is not deeper in the
+frame of a camera counts as behind it."""
+_MAX_DEPTH_M = 200.0  # largest depth in metres at which a feature's measured point is used
+_DEPTH_NOISE = DepthNoise()  # noise by which measured depths are weighted: the default, that of a Kinect
 _GREY = 128  # red, green and blue of a point without a coloured point of the cloud nearby
 _COLOUR_VOXEL_M = 0.05  # edge in metres of the voxels in which a point takes the colour of the cloud
 
@@ -43,7 +48,8 @@ class Tracks:
 
     Attributes:
         points: ``(n, 3)`` metres, in the world of the map.
-        colours: ``(n, 3)`` uint8, the colour of the map's cloud near the point; grey without cloud.
+        colours: ``(n, 3)`` uint8, red, green and blue of a point of the map's cloud in the same 5 cm voxel;
+            grey where the cloud has none.
         point: ``(m,)``, the row in ``points`` of each observation, ascending.
         keyframe: ``(m,)``, the index in the map of the keyframe of each observation.
         feature: ``(m,)``, the row of the feature in its keyframe.
@@ -63,13 +69,18 @@ def find_tracks(version: MapVersion, report: Callable[[float], None] = lambda do
 
     Args:
         version: The map; its poses are not changed.
-        report: Called with the completed share of the matching, 0 to 1.
+        report: Called with the completed share of the matching, 0 to 1; not called for a map without pairs of
+            keyframes.
+
+    Returns:
+        Empty tracks if no point is observed in two keyframes.
 
     Raises:
-        MissingExtra: The native core, which matches features, is not installed.
+        MissingExtra: The native core, which matches ORB features, is not installed.
     """
     features = _collect_features(version)
-    # 1. Match pairs of keyframes in both directions, and join matched features to sets.
+    # 1. Match pairs of keyframes in both directions.  Features that matches connect, directly or through
+    # other features, form a set; `roots` names the set of each feature.
     first_features, second_features = [np.empty(0, dtype=np.int64)], [np.empty(0, dtype=np.int64)]
     pairs = list(_keyframe_pairs(version))
     for number, (a, b) in enumerate(pairs):
@@ -81,7 +92,8 @@ def find_tracks(version: MapVersion, report: Callable[[float], None] = lambda do
     roots = connected_components(
         len(features.keyframe), np.concatenate(first_features), np.concatenate(second_features)
     )
-    # 2. Triangulate the point of each set, and remove observations far from its projection.
+    # 2. Triangulate the point of each set, and remove observations that are far from its projection, or that
+    # are not the best one in their keyframe.
     row = np.argsort(roots, kind="stable")
     for _ in range(_OUTLIER_ROUNDS):
         row = _keep_observed_twice(features, row, roots)
@@ -89,7 +101,7 @@ def find_tracks(version: MapVersion, report: Callable[[float], None] = lambda do
         points = _triangulate(version, features, row, point)
         error_px = _reprojection_errors(version, features, row, points[point])
         row = _remove_outliers(features, row, point, error_px)
-    # 3. Triangulate the points that are left.
+    # 3. Triangulate the points again from the observations that are left.
     row = _keep_observed_twice(features, row, roots)
     point = _number_runs(roots[row])
     points = _triangulate(version, features, row, point)
@@ -104,7 +116,11 @@ def find_tracks(version: MapVersion, report: Callable[[float], None] = lambda do
 
 
 def _keyframe_pairs(version: MapVersion) -> Iterator[tuple[int, int]]:
-    """Yield pairs of indices of keyframes: consecutive ones of a robot, and those that an edge connects."""
+    """Yield pairs of indices of keyframes that are matched, each pair once.
+
+    They are each keyframe with the three that follow it in time among those of its robot, and the keyframes
+    that an edge connects.
+    """
     pairs: dict[tuple[int, int], None] = {}
     by_robot: dict[str, list[int]] = {}
     for index, keyframe in enumerate(version.keyframes):
@@ -122,7 +138,10 @@ def _keyframe_pairs(version: MapVersion) -> Iterator[tuple[int, int]]:
 
 
 def _rows_with_point(keyframe: Keyframe) -> Rows:
-    """Return the rows of features whose 3-D point is plausible and is projected near their pixel."""
+    """Return the rows of features with a known 3-D point within the limits of coordinates and depth.
+
+    The point must also be projected at most 4 px from the feature's own pixel.
+    """
     points = keyframe.points_camera.astype(np.float64)
     is_usable = (np.abs(points) <= _MAX_POINT_M).all(axis=1)
     is_usable &= (points[:, 2] >= _MIN_DEPTH_M) & (points[:, 2] <= _MAX_DEPTH_M)
@@ -133,9 +152,11 @@ def _rows_with_point(keyframe: Keyframe) -> Rows:
 
 
 def _match(reference: Keyframe, view: Keyframe) -> tuple[Rows, Rows]:
-    """Return the rows of *reference* and of *view* that match and agree with the poses of the map.
+    """Return the rows ``(k,)`` of features in *reference* and in *view* that match and agree with the poses.
 
-    The point of the feature in *reference* must be projected near the pixel of the feature in *view*.
+    With the poses of the map, the measured point of the feature in *reference* must be projected at most 4 px
+    from the pixel of the feature in *view*; features without a measured point are not matched from
+    *reference*.
     """
     known = _rows_with_point(reference)
     options = RelativePoseOptions(max_matches=max(1, len(view.pixels)))
@@ -158,8 +179,10 @@ class _Features:
         starts: ``(k + 1,)``, the first row of the features of each keyframe, and *n*.
         keyframe: ``(n,)``, the index of the keyframe of each feature.
         pixel: ``(n, 2)``, undistorted.
-        measured_point: ``(n, 3)`` metres, the feature's own 3-D point in the world; 0 if unknown.
-        weight: ``(n,)``, the information of this point in 1/m^2; 0 if unknown.
+        measured_point: ``(n, 3)`` metres, the point that the depth of the feature gives, in the world; 0 if
+            unknown.
+        weight: ``(n,)``, the information of this point along each axis in 1/m^2: the inverse variance of the
+            depth; 0 if unknown.
     """
 
     starts: Rows
@@ -190,7 +213,13 @@ def _collect_features(version: MapVersion) -> _Features:
 
 
 def _keep_observed_twice(features: _Features, row: Rows, roots: Rows) -> Rows:
-    """Return those of the features *row* whose set has at least two features there, one with a depth."""
+    """Return the part of *row* whose sets have at least two features in *row*, one or more of them measured.
+
+    Args:
+        features: All features of the map.
+        row: ``(m,)``, rows of features.
+        roots: ``(n,)``, the set of each feature of the map.
+    """
     root = roots[row]
     is_observed_twice = np.bincount(root, minlength=len(roots))[root] > 1
     has_depth = np.bincount(root, features.weight[row], len(roots))[root] > 0.0
@@ -198,26 +227,27 @@ def _keep_observed_twice(features: _Features, row: Rows, roots: Rows) -> Rows:
 
 
 def _number_runs(sorted_roots: Rows) -> Rows:
-    """Return 0 for the first run of equal numbers, 1 for the second run, and so on."""
+    """Return for each number the index of its run of equal numbers: 0 in the first run, 1 in the second."""
     if not len(sorted_roots):
         return sorted_roots
     return np.concatenate([[0], np.cumsum(sorted_roots[1:] != sorted_roots[:-1])]).astype(np.int64)
 
 
 def _triangulate(version: MapVersion, features: _Features, row: Rows, point: Rows) -> Array:
-    """Return the points ``(n, 3)`` that fit the pixels, and the depths where they are known.
+    """Return the points ``(n, 3)`` in the world, metres, that fit the pixels and the measured points best.
 
-    Gauss-Newton with a Huber loss starts at the weighted mean of the measured points; a pixel has a standard
-    deviation of one pixel.
+    Three Gauss-Newton steps start at the weighted mean of the measured points.  Residuals of pixels have a
+    standard deviation of 1 px and a Huber loss of 4 px; those of measured points have a quadratic loss.
 
     Args:
         version: The map.
         features: All features of the map.
         row: ``(m,)``, the observing features.
-        point: ``(m,)``, the number of the point of each observation, ascending.
+        point: ``(m,)``, the number of the point of each observation, ascending from 0 without gaps; each
+            point has an observation with a measured point.
     """
     count = int(point[-1]) + 1 if len(point) else 0
-    # 1. Average the measured points.
+    # 1. Start each point at the mean of its measured points, weighted by their information.
     weight = features.weight[row]
     total_weight = np.bincount(point, weight, count)
     measured = features.measured_point[row]
@@ -229,12 +259,12 @@ def _triangulate(version: MapVersion, features: _Features, row: Rows, point: Row
         relative_error = np.linalg.norm(residual, axis=1) / _OUTLIER_PX
         root_weight = 1.0 / np.sqrt(np.maximum(relative_error, 1.0))
         residual, jacobian = root_weight[:, None] * residual, root_weight[:, None, None] * jacobian
-        # 3. Add the normal equations of pixels and measured points.
+        # 3. Make the normal equations of each observation: of its pixel, and of its measured point.
         H = np.einsum("mki,mkj->mij", jacobian, jacobian)
         H += weight[:, None, None] * np.eye(3)
         right = weight[:, None] * (measured - points[point])
         right += np.einsum("mki,mk->mi", jacobian, residual)
-        # 4. Sum them up for each point, and take a step.
+        # 4. Sum the normal equations of the observations of each point, and move the point by their solution.
         starts = np.flatnonzero(np.diff(point, prepend=-1))
         if count:
             left = np.add.reduceat(H, starts)
@@ -245,8 +275,8 @@ def _triangulate(version: MapVersion, features: _Features, row: Rows, point: Row
 def _residuals(version: MapVersion, features: _Features, row: Rows, points: Array) -> tuple[Array, Array]:
     """Return the pixels minus the projected points ``(m, 2)``, and the Jacobians of the projections.
 
-    The Jacobians ``(m, 2, 3)`` are in pixels per metre.  Residual and Jacobian of a point behind its camera
-    are 0.
+    The Jacobians ``(m, 2, 3)`` are derivatives of the projected points by the points in the world, in pixels
+    per metre.  Residual and Jacobian are 0 where a point is not more than 5 cm in front of its camera.
 
     Args:
         version: The map.
@@ -274,7 +304,10 @@ def _residuals(version: MapVersion, features: _Features, row: Rows, points: Arra
 
 
 def _reprojection_errors(version: MapVersion, features: _Features, row: Rows, points: Array) -> Array:
-    """Return the reprojection error of each observation in pixels, infinite behind the camera."""
+    """Return the reprojection errors ``(m,)`` in pixels; infinite where the point is behind the camera.
+
+    Row *i* of *points* ``(m, 3)``, in the world, is the point of the observing feature ``row[i]``.
+    """
     residual, jacobian = _residuals(version, features, row, points)
     errors: Array = np.linalg.norm(residual, axis=1)
     errors[~jacobian.any(axis=(1, 2))] = np.inf  # The Jacobian is 0 if the point is behind the camera.
@@ -282,9 +315,9 @@ def _reprojection_errors(version: MapVersion, features: _Features, row: Rows, po
 
 
 def _remove_outliers(features: _Features, row: Rows, point: Rows, error_px: Array) -> Rows:
-    """Return the inliers among the observations, only the best one of a point in each keyframe.
+    """Return the part of *row*, in its order, that are inliers: the reprojection error is at most 4 px.
 
-    The order of the observations stays.
+    Of several observations of a point in one keyframe only the one with the smallest error can be an inlier.
     """
     index = features.keyframe[row]
     order = np.lexsort((row, error_px, index, point))
@@ -295,7 +328,10 @@ def _remove_outliers(features: _Features, row: Rows, point: Rows, error_px: Arra
 
 
 def _colours(version: MapVersion, points: Array) -> npt.NDArray[np.uint8]:
-    """Return for each of *points* ``(n, 3)`` the colour of a point of the cloud in its voxel, else grey."""
+    """Return for each of *points* ``(n, 3)`` the colour of the first cloud point in its voxel, else grey.
+
+    The result is ``(n, 3)`` uint8; the voxels have an edge of 5 cm.
+    """
     colours = np.full((len(points), 3), _GREY, dtype=np.uint8)
     if not len(points) or not len(version.points):
         return colours
