@@ -45,44 +45,44 @@ __all__ = [
     "unresolved",
 ]
 
-MIN_MEDIAN_DEPTH_M = 0.05  # median of some depth images: no depth camera measures nearer
-MAX_MEDIAN_DEPTH_M = 30.0  # median of some depth images: no depth camera measures farther
+MIN_MEDIAN_DEPTH_M = 0.05  # median depth where the unit is stated: no depth camera measures nearer
+MAX_MEDIAN_DEPTH_M = 30.0  # median depth where the unit is stated: no depth camera measures farther
 MIN_ASSUMED_MEDIAN_DEPTH_M = 0.2  # median depth where the unit is assumed: nearer is a wrong unit
 MAX_ASSUMED_MEDIAN_DEPTH_M = 6.0  # median depth where the unit is assumed: rooms are smaller
 MIN_INTERVAL_S = 1e-4  # median time between images: no camera is faster than 10,000 Hz
 MAX_INTERVAL_S = 1e3  # median time between images: a longer one is a wrong unit of the time stamps
-_MIN_EPOCH_S = 1e9  # smallest time stamp that counts as seconds since 1970: the year 2001
-_MAX_EPOCH_S = 1e10  # largest time stamp that counts as seconds since 1970: the year 2286
+_MIN_EPOCH_S = 1e9  # smallest median of time stamps that count as seconds since 1970: the year 2001
+_MAX_EPOCH_S = 1e10  # median from which on time stamps do not count as seconds since 1970: the year 2286
 _TIME_UNITS_S = {"seconds": 1.0, "milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9}
 """Units that time stamps of recordings have, each with its length in seconds."""
 _USUAL_LOSS_SHARE = 0.1
-"""Share of images without a partner, up to which a loss is no finding: two cameras that are not triggered
-together always lose some."""
+"""Share of lost images, up to which a loss with `LossFacts.is_usual` is a note and no finding: two cameras
+that are not triggered together always lose some images without a partner."""
 _MAX_VIDEO_END_DIFFERENCE = 0.5
-"""Difference between the times of the last images of two videos, in image intervals: more means that one
-video lacks an image."""
+"""Difference between the times of the last images of two videos, in image intervals of the faster video: more
+means that one video lacks an image."""
 _MAX_NAMES_IN_SENTENCE = 12  # files that one sentence names at most; the others are counted
 
 
 class DoubtName(str, Enum):
     """Names of doubts, as users write them after ``--accept``; a value never changes."""
 
-    TIME_ORDER = "time-order"  # time stamps go back, because the clock was set during the recording
-    EQUAL_STAMPS = "equal-stamps"  # several images have the same time stamp
+    TIME_ORDER = "time-order"  # time stamps go back, or those of a live source do not increase
+    EQUAL_STAMPS = "equal-stamps"  # several images of a recording have the same time stamp
     REFERENCE_TIMES = "reference-times"  # ground truth or odometry has no time stamp within the recording
     LEFT_OUT = "left-out"  # images are not used: damaged, empty, or without a partner
     ENDED_EARLY = "ended-early"  # the source failed after it had delivered frames
     CAMERA_CHANGES = "camera-changes"  # several calibrations of one camera are stated in one recording
-    DEPTH_REGISTRATION = "depth-registration"  # nothing says that depth is registered to the colour image
+    DEPTH_REGISTRATION = "depth-registration"  # depth that may not be registered is used as if it were
     DEPTH_ALONG_RAY = "depth-along-ray"  # depth is measured along the ray, not along the optical axis
     STATIC_PATTERN = "static-pattern"  # something is fixed in the image while the camera moves, such as dirt
-    FROZEN_IMAGES = "frozen-images"  # the driver repeats an image
+    FROZEN_IMAGES = "frozen-images"  # the driver or the recorder repeats an image while the camera moves
     MOVING_OBJECTS = "moving-objects"  # something moves in most of the view
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Doubt:
-    """An unlikely fact about a source, which is used all the same until the user decides.
+    """An unlikely fact about a source; the source is used all the same until the user decides.
 
     Attributes:
         name: Kind of the doubt, which the user may accept.
@@ -174,7 +174,7 @@ class VideoFacts:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class TimeFacts:
-    """Time stamps ``(n,)`` of images or poses, seconds, in the order of the source.
+    """Time stamps ``(n,)`` of images or poses, seconds, in the order in which the source lists them.
 
     ``stated_by`` is the file or topic that holds them, for error messages.
     """
@@ -216,7 +216,10 @@ class SourceFacts:
 
     @property
     def span_s(self) -> tuple[float, float] | None:
-        """The first and last time stamp of the images, s; None if they are known only while images come."""
+        """The smallest and largest time stamp of the images of all cameras, s.
+
+        None if *times* is empty: the time stamps are then known only while images come.
+        """
         stamps_s = np.concatenate([times.stamps_s for times in self.times]) if self.times else np.empty(0)
         return (float(stamps_s.min()), float(stamps_s.max())) if len(stamps_s) else None
 
@@ -235,8 +238,8 @@ class DoubtLog:
     def add_reference(self, file: str, stamps_s: Array, span_s: tuple[float, float] | None) -> None:
         """Add a doubt if an odometry or ground truth has no time stamp within the span of the images.
 
-        *stamps_s* ``(n,)`` are the time stamps of *file*, *span_s* the first and last one of the images;
-        None for the span adds nothing.
+        *stamps_s* ``(n,)`` are the time stamps of *file*, *span_s* the first and last one of the images.
+        Without a time stamp, or with None for the span, nothing is added.
         """
         if span_s is not None:
             reference = TimeFacts(stated_by=file, stamps_s=stamps_s)
@@ -267,7 +270,9 @@ def ended_early(error: RsePfError, frames: int) -> Doubt:
 
 
 def check_source(facts: SourceFacts) -> tuple[Doubt, ...]:
-    """Compare the facts of a source with each other, and return the doubts about them.
+    """Compare the facts of a source with each other, and return all doubts about the source.
+
+    The doubts of the reader come first, then those of the comparison.
 
     Raises:
         UsageError: Two facts contradict each other, or a fact is impossible.
@@ -297,6 +302,7 @@ def time_unit_s(stamps: Array) -> tuple[str, float]:
 
     Time stamps since 1970 show their unit by their size.  All others show it by their median interval: below
     10 they are seconds, below 10,000 milliseconds, below 10 million microseconds, and else nanoseconds.
+    Without two different time stamps, there is no interval, and the unit is the second.
     """
     unit = _unit_since_1970(stamps)
     if unit is not None:
@@ -311,7 +317,10 @@ def time_unit_s(stamps: Array) -> tuple[str, float]:
 
 
 def is_since_1970(stamps_s: Array) -> bool:
-    """Return whether the median of time stamps ``(n,)`` is seconds since 1970 of the years 2001 to 2286."""
+    """Return whether time stamps ``(n,)`` are seconds since 1970: their median is in the years 2001 to 2286.
+
+    Without a time stamp, the result is False.
+    """
     return bool(len(stamps_s)) and _MIN_EPOCH_S <= float(np.median(stamps_s)) < _MAX_EPOCH_S
 
 
@@ -323,7 +332,7 @@ def _unit_since_1970(stamps: Array) -> tuple[str, float] | None:
 def stamps_in_seconds(
     stamps: Array, stated_by: str, layout_unit: str | None = None
 ) -> tuple[Array, tuple[str, ...]]:
-    """Return time stamps ``(n,)`` in seconds, and a note if their unit is not the expected one.
+    """Return time stamps ``(n,)`` in seconds, and a note, or none, on a unit that is not the expected one.
 
     Args:
         stamps: Time stamps in an unknown unit.
@@ -351,14 +360,15 @@ def median_depth_m(images: Iterable[npt.NDArray[np.float32]]) -> float | None:
 
 
 def rows_in_time(times: TimeFacts) -> tuple[list[int], tuple[Doubt, ...]]:
-    """Return the rows whose time stamps increase, and the doubts about all other rows.
+    """Return the indices of the time stamps that are used, which increase, and the doubts about all others.
 
-    A row with the time stamp of the row before is left out.  Where the clock was set back once, the recording
-    ends.
+    A time stamp that equals the one before is left out.  If a time stamp is earlier than the one before,
+    which may happen once, it and all later ones are left out.  There is one doubt for each of these two
+    reasons.
 
     Raises:
-        UsageError: The time stamps go back more than once, or between the first two rows, so that the rows
-            are not in the order of time.
+        UsageError: The time stamps go back more than once, or between the first two, so that they are not in
+            the order of time.
     """
     steps_s = np.diff(times.stamps_s)
     total = len(times.stamps_s)
@@ -370,7 +380,7 @@ def rows_in_time(times: TimeFacts) -> tuple[list[int], tuple[Doubt, ...]]:
             f"{times.stamps_s[backs[0] + 1]:.6f} s after {times.stamps_s[backs[0]]:.6f} s",
             hint="sort the images in the order in which they were taken, if their clock can be trusted",
         )
-    # 2. End the recording before the clock goes back.
+    # 2. Leave out all time stamps from the one on that goes back.
     doubts = []
     end = total
     if len(backs):
@@ -383,7 +393,7 @@ def rows_in_time(times: TimeFacts) -> tuple[list[int], tuple[Doubt, ...]]:
                 hint="make two recordings of it, one before and one after the jump",
             )
         )
-    # 3. Use the first of several rows with equal time stamps.
+    # 3. Use the first of several equal time stamps, and leave out the others.
     rows = [0][:total] + [row + 1 for row in range(end - 1) if steps_s[row] > 0.0]
     equal_count = end - len(rows)
     if equal_count:
@@ -400,7 +410,11 @@ def rows_in_time(times: TimeFacts) -> tuple[list[int], tuple[Doubt, ...]]:
 
 
 def check_reference(reference: TimeFacts, span_s: tuple[float, float]) -> tuple[Doubt, ...]:
-    """Return a doubt if a ground truth or an odometry has no time stamp within the span of the images, s."""
+    """Return a doubt if a ground truth or an odometry has no time stamp within the span of the images.
+
+    *span_s* is the first and the last time stamp of the images, s.  A reference without a time stamp gives no
+    doubt.
+    """
     stamps_s = reference.stamps_s
     if not len(stamps_s) or ((stamps_s >= span_s[0]) & (stamps_s <= span_s[1])).any():
         return ()
@@ -419,7 +433,10 @@ def some_names(names: Sequence[str]) -> str:
 
 
 def _check_cameras(facts: SourceFacts) -> Iterable[Doubt]:
-    """Refuse intrinsics of another image size than the images have, or with an implausible field of view."""
+    """Refuse intrinsics that do not fit the images.
+
+    Refused are another image size, a principal point outside of the image, and an implausible field of view.
+    """
     for stated in facts.cameras:
         camera, lens = stated.lens.camera, stated.lens
         size = (camera.width, camera.height)
@@ -447,7 +464,7 @@ def _check_cameras(facts: SourceFacts) -> Iterable[Doubt]:
 
 
 def _check_depth(facts: SourceFacts) -> Iterator[Doubt]:
-    """Refuse a unit of depth that gives an impossible median, and doubt depth that is not registered."""
+    """Refuse a unit of depth that gives an impossible median; doubt depth that is stated as unregistered."""
     depth = facts.depth
     if depth is not None and depth.is_registered is False:
         yield Doubt(
@@ -473,7 +490,7 @@ def _check_times(facts: SourceFacts) -> Iterator[Doubt]:
     """Refuse unordered time stamps and wrong units, and doubt time stamps that repeat or jump back once."""
     reported: set[DoubtName] = set()
     for times in facts.times:
-        # Colour and depth images of one driver have the same fault, which is reported once.
+        # Colour and depth images of one driver have the same fault: each kind of doubt is reported once.
         doubts = [doubt for doubt in rows_in_time(times)[1] if doubt.name not in reported]
         reported |= {doubt.name for doubt in doubts}
         yield from doubts
@@ -488,7 +505,10 @@ def _check_times(facts: SourceFacts) -> Iterator[Doubt]:
 
 
 def _is_finding(loss: LossFacts) -> bool:
-    """Return whether a loss is reported as a doubt, and not only as a note."""
+    """Return whether a loss is reported as a doubt, and not only as a note.
+
+    A usual loss is a doubt above a tenth of the images, any other loss from one image on.
+    """
     return loss.lost > (_USUAL_LOSS_SHARE * loss.total if loss.is_usual else 0)
 
 

@@ -83,7 +83,8 @@ def open_dataset(
     Args:
         path: The folder or file.
         scene: Name of a scene of the labelled file; None for all images, and for other formats.
-        camera: ``stereo`` for both cameras of a rig, ``left`` for one; None for both where there are two.
+        camera: ``stereo`` for both cameras of a rig, ``left`` for the left or only one; None for both where
+            there are two.
         imu: Whether frames carry samples of the IMU; None for yes where there is one.
         intrinsics: File of intrinsics or of a rig that is used instead of those of a folder in TUM layout (it
             must state ``depth_scale`` if there is depth) or of a bag; None for their own.
@@ -128,9 +129,10 @@ def is_listed(path: Path) -> bool:
 
 
 def _find_associations(folder: Path) -> Path | None:
-    """Return the list of associations, as TUM's ``associate.py`` writes it; None without one.
+    """Return the list of associations of a folder; None without one.
 
-    Each line has a colour and a depth image, each after its time stamp.
+    It is the first file ``*assoc*.txt`` by name, as TUM's ``associate.py`` writes it.  Each line has a colour
+    and a depth image, in either order, each after its time stamp.
     """
     return next(iter(sorted(folder.glob("*assoc*.txt"))), None)
 
@@ -170,8 +172,9 @@ def associate_stamps(
 ) -> list[tuple[int, int]]:
     """Return the pairs ``(row of first, row of second)`` of time stamps (s) that are nearest to each other.
 
-    Both sequences must ascend.  Each row is in one pair at most; if several rows have the same nearest
-    partner, the closest row gets the partner.  Pairs are at most *max_difference_s* apart.
+    Both sequences must ascend, and the pairs are in the order of *first*.  Each row is in one pair at most.
+    If several rows of *first* have the same nearest row of *second*, the closest one gets it, and the others
+    are in no pair.  The time stamps of a pair are at most *max_difference_s* apart.
     """
     return pair_stamps(np.asarray(first, dtype=float), np.asarray(second, dtype=float), max_difference_s)
 
@@ -184,9 +187,9 @@ class _ImageList:
     """The colour or the depth images of a folder in TUM layout, in the order of time.
 
     Attributes:
-        times: All time stamps of the list, for `check_source`.
-        stamps_s: Time stamps of the images that are used.
-        images: Their paths, relative to the folder.
+        times: All time stamps of the list, in its order, for `check_source`.
+        stamps_s: Time stamps of the images that are used, s, which increase.
+        images: Paths of the images that are used, relative to the folder.
         notes: Sentences on the unit of the time stamps.
     """
 
@@ -197,7 +200,10 @@ class _ImageList:
 
 
 def _open_tum(folder: Path, intrinsics_file: Path) -> Dataset:
-    """Return a folder in TUM layout; if *intrinsics_file* does not exist, files of other programs are tried.
+    """Return the recording of a folder in TUM layout.
+
+    If *intrinsics_file* is in the folder and does not exist, files of other programs are tried, and then the
+    cameras of the benchmark.  An *intrinsics_file* elsewhere must exist.
 
     Raises:
         UsageError: A file is missing or broken, or facts about the recording contradict each other.
@@ -217,7 +223,7 @@ def _open_tum(folder: Path, intrinsics_file: Path) -> Dataset:
     intrinsics, is_unit_stated, notes = _find_intrinsics(
         folder, intrinsics_file, None if stated is None else stated[1], has_depth=depths is not None
     )
-    # 2. Pair each colour image with the depth image that is nearest in time.
+    # 2. Pair each colour image with the depth image that is nearest in time; without depth, use all of them.
     pairs = [(row, row) for row in range(len(colours.images))]
     if depths is not None:
         pairs = associate_stamps(colours.stamps_s, depths.stamps_s, _MAX_STAMP_DIFFERENCE_S)
@@ -296,7 +302,11 @@ def _open_tum(folder: Path, intrinsics_file: Path) -> Dataset:
 
 
 def _read_lists(folder: Path) -> tuple[_ImageList, _ImageList | None]:
-    """Return the lists of the colour and of the depth images; None for depth without depth images.
+    """Return the lists of the colour and of the depth images.
+
+    ``rgb.txt`` is read rather than a list of associations.  The list of depth images is None if there is
+    neither ``depth.txt`` nor a folder ``depth``.  In a list of associations, the images whose path contains
+    ``depth`` are the depth images, else the second ones of a line.
 
     Raises:
         UsageError: A list is missing, empty or broken.
@@ -316,10 +326,13 @@ def _read_lists(folder: Path) -> tuple[_ImageList, _ImageList | None]:
 
 
 def _make_list(folder: Path, name: str, rows: Sequence[Sequence[str]]) -> _ImageList:
-    """Return the images of the *rows* of the file *name*, as far as their time stamps increase.
+    """Return the images of the *rows* of the file *name*, each row a time stamp and a path.
+
+    Images are left out as by `rows_in_time`: those with the time stamp of the image before, and all after the
+    clock went back.
 
     Raises:
-        UsageError: There is no row, or the time stamps are in no order.
+        UsageError: There is no row, or the time stamps go back more than once.
     """
     if not rows:
         raise UsageError(
@@ -380,6 +393,9 @@ def _find_intrinsics(
 ) -> tuple[Intrinsics, bool, tuple[str, ...]]:
     """Find the intrinsics of a folder in TUM layout.
 
+    They are *stated*, else those of *file*.  If *file* is in the folder and does not exist, they are those of
+    the camera of the benchmark whose name is part of the folder's name, else those of a Kinect.
+
     Args:
         folder: The folder, whose name may be that of a camera of the benchmark.
         file: ``intrinsics.json``, the file that the user named, or the file of another program.
@@ -387,7 +403,8 @@ def _find_intrinsics(
         has_depth: Whether the folder has depth images.
 
     Returns:
-        The intrinsics, whether the unit of depth is stated and not assumed, and notes on what was assumed.
+        The intrinsics, of the left camera if the file is one of a rig; whether the unit of depth is stated or
+        not needed, and not assumed; and notes on what was assumed.
 
     Raises:
         UsageError: The file cannot be read, or states no unit of depth although there is depth.
@@ -515,7 +532,7 @@ def _nyu_dataset(
 ) -> Dataset:
     """Return a recording of NYU Depth V2, whose camera and depth unit the toolbox of the data set states.
 
-    *read* reads the frame of a row; *stamps_s* has a time stamp for each row.
+    *read* reads the frame of a row, with depth in metres; *stamps_s* has a time stamp for each row.
     """
     camera = nyu.COLOUR_CAMERA
     depths_m = []

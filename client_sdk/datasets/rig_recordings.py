@@ -52,8 +52,8 @@ CameraChoice = Literal["stereo", "left"]
 
 _EUROC_TRUTH = "state_groundtruth_estimate0/data.csv"  # the file of the true path, in the folder mav0
 _MAX_PAIR_DIFFERENCE_S = 0.005
-"""Time between two images of a stereo pair: their shutters open together, so that images farther apart belong
-to different moments."""
+"""Largest time between both images of a stereo pair: their shutters open together, so that images farther
+apart belong to different moments."""
 _KITTI_PAIRS = (("image_0", "image_1"), ("image_2", "image_3"))
 """Folders of the grey and of the colour cameras of KITTI, left and right; the digit is that of the camera's
 projection in ``calib.txt``."""
@@ -74,14 +74,14 @@ class _RigImages:
     """The images of a recording with one camera or a stereo pair, in the order of time.
 
     Attributes:
-        lefts: Images of the left camera.
-        rights: For each of them the image of the right camera; None if that is not used.
-        stamps_s: ``(n,)``, time stamps of the images.
+        lefts: Images of the left camera, or of the only one.
+        rights: For each left image the image of the right camera; None if the right camera is not used.
+        stamps_s: ``(n,)``, s, time stamps of the left images.
         stated_by: The file of the calibration, and the file of the time stamps, for messages.
         truth: The file of the true path, for messages.
         notes: Sentences on what was assumed.
-        losses: Images without a partner.
-        doubts: Doubts about time stamps and lost images.
+        losses: Left images without a right one, of recordings that pair images by time.
+        doubts: Doubts about time stamps, and about left images without a right one of the same number.
     """
 
     lefts: Sequence[Path]
@@ -125,7 +125,7 @@ def open_euroc(folder: Path, camera: CameraChoice | None = None, imu: bool | Non
     rig = Rig(
         cameras=tuple(cameras), imu=read_euroc_imu(folder / "imu0" / "sensor.yaml") if has_imu else None
     )
-    # 2. Read the true path of the body.
+    # 2. Read the true path of the body, if the recording has one.
     body_path = None
     if (folder / _EUROC_TRUTH).is_file():
         rows = [row[:8] for row in _read_table(folder / _EUROC_TRUTH, 8)]
@@ -137,7 +137,7 @@ def open_euroc(folder: Path, camera: CameraChoice | None = None, imu: bool | Non
         body_path = Trajectory(truth_s, poses)
         notes += truth_notes
     name = folder.parent.name if folder.name == "mav0" else folder.name
-    # 3. Read the samples of the IMU.
+    # 3. Read the samples of the IMU, if they are used.
     samples = None
     if has_imu:
         rows = [row[:7] for row in _read_table(folder / "imu0" / "data.csv", 7)]
@@ -164,7 +164,8 @@ def open_kitti(folder: Path, camera: CameraChoice | None = None, imu: bool | Non
 
     The grey cameras are used where the sequence has them, else the colour cameras.
 
-    The true path is in ``poses.txt``, or in ``../../poses/NAME.txt``.
+    The true path is in ``poses.txt``, or in ``../../poses/NAME.txt``, where NAME is that of the folder; a
+    sequence with neither file has none.
 
     Args:
         folder: The folder of the sequence.
@@ -193,7 +194,7 @@ def open_kitti(folder: Path, camera: CameraChoice | None = None, imu: bool | Non
     rows, notes = _match_kitti_lines(paths, line_counts, folder)
     stamps_s = times_s[rows["times.txt"]]
     used, doubts = rows_in_time(TimeFacts(stated_by=str(folder / "times.txt"), stamps_s=stamps_s))
-    # 2. Find the right image of each left one.
+    # 2. Find the right image of each left one by its number, and leave out left images without a right one.
     rights: list[Path] | None = None
     if has_stereo:
         partners = {path.stem: path for path in image_files(folder / right)}
@@ -229,15 +230,18 @@ def open_kitti(folder: Path, camera: CameraChoice | None = None, imu: bool | Non
         truth=str(truth_file),
     )
     dataset = _make_dataset(folder.name, rig, images, truth, None)
-    # KITTI's true path is that of the rectified left camera itself, and not of a body.
+    # KITTI's poses are those of the camera P0, which `read_kitti_rig` takes as the body; no other body is
+    # known.
     return replace(dataset, T_body_camera=None)
 
 
 def _read_kitti_poses(path: Path) -> Array:
-    """Return the poses ``(n, 4, 4)`` of a file with the 12 numbers of a 3x4 matrix in each line.
+    """Return the poses ``(n, 4, 4)``, m, of the camera ``P0`` in the world.
+
+    Each line of the file has the 12 numbers of a 3x4 matrix, row by row.
 
     Raises:
-        UsageError: The file cannot be read, or has another number of numbers.
+        UsageError: The file cannot be read, or the count of its numbers is no multiple of 12.
     """
     values = read_numbers(path, read_text(path).split())
     if len(values) % 12:
@@ -253,10 +257,11 @@ def _read_kitti_poses(path: Path) -> Array:
 def _match_kitti_lines(
     paths: Sequence[Path], line_counts: Mapping[str, int], folder: Path
 ) -> tuple[dict[str, list[int]], tuple[str, ...]]:
-    """Return for each file of lines the line of each image, and notes on what was assumed.
+    """Return for each file, by its name, the line that belongs to each image, and notes on what was assumed.
 
-    Line *n* (from 0) belongs to the image of number *n*.  If a file is too short for these numbers, but has
-    as many lines as there are images, the file was cut together with the images, and the order counts.
+    Line *n* (from 0) belongs to the image of number *n*.  If a file is too short for these numbers, or a name
+    is no number, but the file has as many lines as there are images, the file was cut together with the
+    images, and line *n* belongs to the *n*-th image.
 
     Args:
         paths: The images; their names are their numbers.
@@ -264,7 +269,7 @@ def _match_kitti_lines(
         folder: The folder of the sequence, for messages.
 
     Raises:
-        UsageError: A file is too short for the images.
+        UsageError: A file is too short for the numbers of the images, and has not one line for each image.
     """
     numbers = [int(path.stem) if path.stem.isdecimal() else None for path in paths]
     rows: dict[str, list[int]] = {}
@@ -297,7 +302,7 @@ def _make_dataset(
         name: Name of the recording.
         rig: The cameras that are used, and the IMU.
         images: The images of these cameras.
-        body_path: True path of the body; None without a truth.
+        body_path: True poses of the body in the world; None without a truth.
         samples: ``(n, 7)``, samples of the IMU: time stamp (s), angular rate (rad/s), specific force (m/s^2);
             None without an IMU.
 
@@ -335,7 +340,8 @@ def _make_dataset(
             stereo=rectification.right(cv2.cvtColor(right_rgb, cv2.COLOR_RGB2GRAY)),
         )
 
-    # 2. Put IMU samples on the clock of the left camera, and the true path into the frame of that camera.
+    # 2. Put IMU samples on the clock of the left camera, and turn the path of the body into that of the
+    # camera of the frames.
     track = None
     if samples is not None and rig.imu is not None:
         track = ImuTrack(
@@ -385,10 +391,12 @@ def _make_dataset(
 def _pair_images(
     left_stamps_s: Array, right_stamps_s: Array, name: str
 ) -> tuple[list[tuple[int, int]], tuple[LossFacts, ...]]:
-    """Return the rows of left and right images that were taken together, and the loss of left images.
+    """Return the pairs (left row, right row) of images that were taken together, and the loss of left images.
+
+    The loss is an empty tuple if each left image has a right one.  *name* is the recording, for messages.
 
     Raises:
-        UsageError: No two images are within 5 ms; *name* is the recording, for messages.
+        UsageError: No two images are within 5 ms.
     """
     pairs = pair_stamps(left_stamps_s, right_stamps_s, _MAX_PAIR_DIFFERENCE_S)
     if not pairs:
@@ -423,7 +431,10 @@ def _mav0_of(folder: Path) -> Path:
 
 
 def _read_euroc_images(folder: Path) -> tuple[list[Path], Array, tuple[str, ...], tuple[Doubt, ...]]:
-    """Return images of a camera with increasing time stamps, these time stamps ``(n,)`` (s), notes, doubts.
+    """Return the images of a camera, their time stamps ``(n,)`` (s), notes, and doubts.
+
+    Images are left out as by `rows_in_time`, so that the time stamps increase.  The notes say in which unit
+    they were taken, if not in nanoseconds.
 
     Raises:
         UsageError: ``data.csv`` cannot be read, or names a file outside of the folder ``data``.

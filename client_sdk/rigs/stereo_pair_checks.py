@@ -36,34 +36,41 @@ ambiguous (Lowe's ratio test)."""
 _MAX_PYRAMID_SCALE = 2.0
 """Scale of the image pyramid at which a feature was found: positions of coarser levels are too imprecise."""
 _MAX_ROW_OFFSET_PX = 40.0  # between the rows of a match: larger offsets are wrong matches, not a faulty rig
-_MIN_MATCHES = 60  # of all pairs together: with fewer matches, no fault is reported
+_MIN_MATCHES = 60
+"""Matches of all measured pairs together, below which no fault is reported.  A delay needs as many fast
+features, and half as many inliers among them."""
 _MIN_SWAPPED_DISPARITY_PX = -1.5
 """Disparity (column in the left minus column in the right image) below which a match says that the cameras
 are swapped; the disparity of a distant point may be a little below 0 by noise."""
-_SWAPPED_SHARE = 0.6  # share of matches with such a disparity, above which the cameras are swapped
+_SWAPPED_SHARE = 0.6
+"""Share of matches with a disparity below `_MIN_SWAPPED_DISPARITY_PX`, above which the cameras are
+swapped."""
 _MAYBE_SWAPPED_SHARE = 0.2
-"""Share of matches with a disparity of swapped cameras, above which the error about wrong rows also names
-swapped cameras as a possible cause."""
-_MAX_MEDIAN_ROW_OFFSET_PX = 1.5  # median of |row offset|: beyond it, rows do not belong together
-_MIN_DELAY_S = 0.004  # delay of the right image, above which the cameras count as not synchronised
+"""Share of matches with a disparity below `_MIN_SWAPPED_DISPARITY_PX`, above which the error about wrong rows
+also names swapped cameras as a possible cause."""
+_MAX_MEDIAN_ROW_OFFSET_PX = 1.5
+"""Median of the absolute row offsets of all matches, above which the rectification counts as wrong.  Where
+the middle 80 % of the row offsets all lie beyond it on one side, no delay is looked for."""
+_MIN_DELAY_S = 0.004  # time between both images of a pair, above which the cameras are not synchronised
 _MIN_DELAY_EFFECT_PX = 0.7  # standard deviation of row offsets that a delay causes, above which it matters
 _MIN_EXPLAINED_VARIANCE = 0.3  # share of the variance of row offsets that a reported delay must explain
-_FAST_PX_S = 15.0  # motion of a feature across rows, above which a delay shifts the feature visibly
+_FAST_PX_S = 15.0  # speed of a feature across rows, above which a delay shifts the feature visibly
 _MAX_RESIDUAL_PX = 2.0  # between a row offset and what the delay predicts: beyond it a match is an outlier
 _ALL_FAST_SHARE = 0.9
 """Share of fast features, above which the slow ones are too few to show the row offset of the rectification
-alone."""
+alone: the median over all features is then taken for that offset."""
 _REFINEMENTS = 5  # least-squares fits of the delay, each to the inliers of the fit before
 _MAX_PAIRS = 14  # stereo pairs of a recording that are compared when it is opened, since each takes time
 
 
 class PairMeasurement(NamedTuple):
-    """The matched features of one stereo pair, three arrays ``(n,)``.
+    """The features that were matched between both images of one stereo pair, three arrays ``(n,)``.
 
     Attributes:
         disparities_px: Column in the left image minus column in the right one.
         row_offsets_px: Row in the left image minus row in the right one.
-        row_rates_px_s: Motion of the row in the left image until the next frame; NaN where it is not known.
+        row_rates_px_s: Speed of the feature across rows in the left image until the next frame, positive
+            downwards; NaN where the feature was not found in the left image of the next frame.
     """
 
     disparities_px: Array
@@ -72,7 +79,10 @@ class PairMeasurement(NamedTuple):
 
 
 def choose_pairs(rows: Sequence[int]) -> list[tuple[int, int]]:
-    """Return at most 14 rows of a recording, spread evenly, each together with the row after it."""
+    """Return at most 14 elements of *rows*, spread evenly, each in a pair with the element after it.
+
+    *rows* are those of a recording in the order of time; with fewer than two of them, the result is empty.
+    """
     places = np.unique(np.linspace(0, len(rows) - 2, _MAX_PAIRS).astype(int)) if len(rows) > 1 else ()
     return [(rows[place], rows[place + 1]) for place in places]
 
@@ -83,8 +93,9 @@ class PairFault:
 
     Attributes:
         what: ``swapped``, ``late`` (the images are of two moments), or ``rows`` (rectified wrongly).
-        value: The share of swapped matches, the delay of the right image (s), or the row offset (px).
-        unit: Of the value: ``share``, ``s`` or ``px``.
+        value: The share of matches that look swapped; the delay of the right image (s), negative if the right
+            image is the earlier one; or the median of the absolute row offsets (px).
+        unit: Unit of the value: ``share``, ``s`` or ``px``.
         message: One sentence for the user.
         hint: What the user can do.
     """
@@ -99,6 +110,8 @@ class PairFault:
 def check_stereo_pairs(pairs: Iterable[tuple[Frame, Frame]], name: str) -> None:
     """Refuse the source *name* if its stereo frames show a faulty rig, see `find_fault_of_frames`.
 
+    *pairs* are stereo frames, each with the frame after it.  A source with too few features is accepted.
+
     Raises:
         UsageError: The images are swapped, the right one is of another time, or rows do not fit.
         MissingExtra: OpenCV is not installed.
@@ -109,8 +122,9 @@ def check_stereo_pairs(pairs: Iterable[tuple[Frame, Frame]], name: str) -> None:
 
 
 def find_fault_of_frames(pairs: Iterable[tuple[Frame, Frame]]) -> PairFault | None:
-    """Return the fault of the rig that stereo frames show, each given with the frame after it.
+    """Return the fault of the rig that stereo frames show.
 
+    *pairs* are stereo frames, each with the frame after it, by which the motion in the image is measured.
     The result is None for a correct rig, and also where the images have too few features to tell.
 
     Raises:
@@ -120,9 +134,10 @@ def find_fault_of_frames(pairs: Iterable[tuple[Frame, Frame]]) -> PairFault | No
 
 
 def find_fault(measurements: Iterable[PairMeasurement]) -> PairFault | None:
-    """Return the fault of a stereo rig that *measurements* show; None without a fault, or with too few data.
+    """Return the fault of a stereo rig that *measurements* show together.
 
-    The first fault in this order is returned: swapped cameras, images of two moments, wrong rows.
+    The first fault in this order is returned: swapped cameras, images of two moments, wrong rows.  The result
+    is None without a fault, and with fewer than 60 matches in all measurements.
     """
     pairs = list(measurements)
     if not pairs:
@@ -131,7 +146,7 @@ def find_fault(measurements: Iterable[PairMeasurement]) -> PairFault | None:
     disparities_px, row_offsets_px, row_rates_px_s = columns
     if len(row_offsets_px) < _MIN_MATCHES:
         return None
-    # 1. Swapped cameras show points farther right in the right image.
+    # 1. Report swapped cameras: most points lie farther right in the right image.
     swapped_share = float(np.mean(disparities_px < _MIN_SWAPPED_DISPARITY_PX))
     if swapped_share > _SWAPPED_SHARE:
         return PairFault(
@@ -142,7 +157,9 @@ def find_fault(measurements: Iterable[PairMeasurement]) -> PairFault | None:
             "image: the cameras are swapped",
             hint="exchange left and right, in the rig or in the images",
         )
-    # 2. A delay shifts rows in proportion to their motion; rows that are all shifted one way show a rotation.
+    # 2. Report a delay, which shifts the row of a feature in proportion to the speed of the feature.  No
+    # delay is looked for if nearly all rows are shifted far to the same side: that shows a rotation of a
+    # camera.
     has_rate = np.isfinite(row_rates_px_s)
     low_px, high_px = np.percentile(row_offsets_px, (10, 90))
     is_rotated = bool(low_px * high_px > 0.0 and min(abs(low_px), abs(high_px)) > _MAX_MEDIAN_ROW_OFFSET_PX)
@@ -156,7 +173,7 @@ def find_fault(measurements: Iterable[PairMeasurement]) -> PairFault | None:
             f"{'after' if delay_s > 0 else 'before'} the left one: the cameras are not synchronised",
             hint="trigger both cameras together, or take one: --camera left",
         )
-    # 3. What else shifts rows is a wrong rectification.
+    # 3. Report a wrong rectification, if rows do not fit for another reason.
     median_offset_px = float(np.median(np.abs(row_offsets_px)))
     if median_offset_px > _MAX_MEDIAN_ROW_OFFSET_PX:
         swap = "the cameras are swapped, or " if swapped_share > _MAYBE_SWAPPED_SHARE else ""
@@ -172,9 +189,10 @@ def find_fault(measurements: Iterable[PairMeasurement]) -> PairFault | None:
 
 
 def measure_pair(frame: Frame, later: Frame) -> PairMeasurement:
-    """Match the features of a rectified stereo frame, and those of its left image with the frame after it.
+    """Match the features of both images of *frame*, and those of its left image with *later*, the next frame.
 
-    A frame without a right image gives no match.
+    Matches between rows that are 40 px or more apart are left out.  A frame without a right image gives empty
+    arrays.
 
     Raises:
         MissingExtra: OpenCV is not installed.
@@ -201,16 +219,19 @@ def _estimate_delay_s(row_offsets_px: Array, row_rates_px_s: Array) -> float | N
     """Return the delay of the right image, s, if a delay explains the row offsets ``(n,)``; else None.
 
     A right image that is late by *t* shows a point ``t * rate`` farther down, so that ``offset = -t * rate``.
+    A negative delay means that the right image is the earlier one.  Both arrays are those of
+    `PairMeasurement`, without NaN.
     """
     is_fast = np.abs(row_rates_px_s) > _FAST_PX_S
     if is_fast.sum() < _MIN_MATCHES:
         return None
-    # 1. Remove the offset that is left where nothing moves: that of the rectification.
+    # 1. Subtract the row offset that the rectification causes: the median over the slow features, or over all
+    # features if nearly all are fast.
     is_reference = np.ones_like(is_fast) if is_fast.mean() > _ALL_FAST_SHARE else ~is_fast
     row_offsets_px = row_offsets_px - np.median(row_offsets_px[is_reference])
-    # 2. Begin with the median of the delays that single features say.
+    # 2. Take as first estimate the median of the delays that explain each fast feature alone.
     delay_s = -float(np.median(row_offsets_px[is_fast] / row_rates_px_s[is_fast]))
-    # 3. Refine by the slope of a line through the inliers.
+    # 3. Fit a line to row offsets over speeds of the inliers: the delay is minus its slope.
     is_inlier = is_fast
     for _ in range(_REFINEMENTS):
         is_inlier = np.abs(row_offsets_px + delay_s * row_rates_px_s) <= _MAX_RESIDUAL_PX
@@ -229,9 +250,11 @@ def _estimate_delay_s(row_offsets_px: Array, row_rates_px_s: Array) -> float | N
 def match_features(
     first: DescribedKeypoints, second: DescribedKeypoints
 ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    """Return the rows of matching ORB features in two images, two arrays ``(m,)``.
+    """Return the indices into *first* and into *second* of ORB features that match, two arrays ``(m,)``.
 
-    Two features match if each is the nearest neighbour of the other, and Lowe's ratio test holds.
+    Two features match if each is the nearest neighbour of the other, and Lowe's ratio test holds.  Features
+    of coarse levels of the image pyramid are left out; the arrays are empty if an image has fewer than two
+    others.
 
     Raises:
         MissingExtra: OpenCV is not installed.
