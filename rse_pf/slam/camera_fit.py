@@ -15,12 +15,12 @@ from rse_pf.geometry import Array, Camera, adjoint, exp_se3, inverse, transform
 
 __all__ = ["CameraFit", "fit_camera"]
 
-_ITERATIONS = 16  # Gauss-Newton steps, while the scale of the loss shrinks from its first to its last value
+_ITERATIONS = 16  # number of Gauss-Newton steps, in which the scale of the loss shrinks from first to last
 _FIRST_SCALES_PX = (16.0, 32.0)
 """Scales of the loss with which two fits begin, px, of which the better one is used: large enough for matches
 that a focal length which is wrong by 20 or 40 % moves by that much."""
 _LAST_SCALE_PX = 2.0  # scale of the loss at the end, px: the noise of ORB corners
-_SCALE_SHRINK = 0.75  # factor of the scale of the loss after each step
+_SCALE_SHRINK = 0.75  # factor by which the scale of the loss is multiplied after each step
 _LOG_FOCAL_DEVIATION = 0.2
 """Prior standard deviation of the logarithm of the focal length over the stated one."""
 _CENTRE_DEVIATION = 0.1  # prior standard deviation of the principal point, as a share of the image width
@@ -28,11 +28,13 @@ _SHUTTER_DEVIATION_PX = 20.0
 """Prior standard deviation, px, of the shift between the first and the last row of an image that a rolling
 shutter and the motion of the camera cause."""
 _MIN_DEPTH_M = 0.05  # depth of a point in the camera: projections of nearer points use this depth
-_MIN_VARIANCE_PX2 = 0.1  # variance of a pixel, px^2, however well all matches fit
+_MIN_VARIANCE_PX2 = 0.1  # smallest variance of a pixel, px^2, that is assumed however well all matches fit
 _CORRELATION_FACTOR = 5.0
 """Measured ratio of the variance of a pose to that for independent errors: matches of one keyframe share the
 errors of its points, and one pixel may match several keyframes."""
-_MIN_EIGENVALUE = 1e-9  # of an information matrix scaled to a diagonal of 1: below it, rounding decides
+_MIN_EIGENVALUE = 1e-9
+"""Smallest eigenvalue of an information matrix scaled to a diagonal of 1; smaller ones, which rounding
+decides, are raised to it."""
 _DEPTH_DEVIATION = 0.01  # relative standard deviation of the depth of a map point: that of a Kinect at 6 m
 _CAMERA_PARAMETERS = slice(6, 11)
 """Columns of the camera among the 11 parameters: logarithm of the focal length, principal point (2), shift by
@@ -73,7 +75,7 @@ def fit_camera(
         points_map: ``(n, 3)`` m, matched points of the map, at least 6.
         origins_map: ``(n, 3)`` m, positions of the cameras that measured the points.
         pixels: ``(n, 2)``, pixels of the photo, undistorted by the stated camera.
-        T_map_camera: ``(4, 4)`` m, pose that was computed with the stated camera.
+        T_map_camera: ``(4, 4)`` m, pose that was computed with the stated camera, from which the fits begin.
         camera: The stated camera.
 
     Source:
@@ -93,14 +95,15 @@ def fit_camera(
         for scale_px in _FIRST_SCALES_PX
     ]
     fit = min(fits, key=lambda fit: fit.cost)
-    # 2. Compute the information of the matches, and the part of it that errors of the points' depths feign:
-    # before a flat wall, only these errors make points leave their plane, and seem to determine the camera.
+    # 2. Compute the information of the matches, and the part of it that is false because of errors of the
+    # points' depths: before a flat wall, only these errors make points leave their plane, and seem to
+    # determine the camera.
     shifted_map = points_map + _DEPTH_DEVIATION * (points_map - origins_map)
     jacobian_change = fit.jacobian_and_errors(shifted_map, pixels, camera)[0] - fit.jacobian
     weights = fit.weights[:, None, None]
     information = (fit.jacobian * weights).reshape(-1, 11).T @ fit.jacobian.reshape(-1, 11)
     feigned = (jacobian_change * weights).reshape(-1, 11).T @ jacobian_change.reshape(-1, 11)
-    # 3. Compute the covariance, with the variance of a pixel from the errors that remain.
+    # 3. Estimate the variance of a pixel from the errors that remain, and compute the covariance with it.
     squares_px2 = float(fit.weights @ np.square(fit.errors_px).sum(axis=1))
     variance_px2 = max(_MIN_VARIANCE_PX2, squares_px2 / (2.0 * float(fit.weights.sum())))
     covariance = _covariance_of(information, feigned, _CORRELATION_FACTOR * variance_px2, prior_information)
@@ -192,7 +195,7 @@ def _covariance_of(
 
     Args:
         information: ``(11, 11)``, information of the matches for pixels of variance 1.
-        feigned: ``(11, 11)``, information that noise of the points feigns, which is subtracted.
+        feigned: ``(11, 11)``, the part of it that only noise of the points causes, which is subtracted.
         variance_px2: Variance of a pixel, px^2.
         prior_information: ``(5,)``, prior information on the camera: all that is left if the rest is feigned.
     """

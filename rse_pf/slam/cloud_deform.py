@@ -54,11 +54,13 @@ def deform_clouds(
 
 
 def deform_cloud(points: Points, keyframes: Sequence[Keyframe], T_world_camera: Array) -> Array:
-    """Return the points ``(m, 3)`` of one map after each moved like the keyframe that observed it.
+    """Return the points ``(m, 3)`` of one map, m, after each moved like the keyframe that observed it.
+
+    That keyframe is the one that `find_observers` chooses.
 
     Args:
         points: ``(m, 3)`` metres, in the old world of the map.
-        keyframes: The *n* keyframes of the map, with their old poses.
+        keyframes: The *n* keyframes of the map, at least one, with their old poses.
         T_world_camera: ``(n, 4, 4)``, the new poses of the keyframes.
     """
     observers = find_observers(np.asarray(points, dtype=np.float64), keyframes)
@@ -71,7 +73,11 @@ def deform_cloud(points: Points, keyframes: Sequence[Keyframe], T_world_camera: 
 
 
 def merge_clouds(clouds: Sequence[Array], colours: Sequence[Colours]) -> tuple[Points, Colours]:
-    """Concatenate clouds that are in the same world, and thin them to one point in each voxel of 1 cm."""
+    """Concatenate clouds that are in the same world, and thin them to one point in each voxel of 1 cm.
+
+    The point of a voxel is the mean of its points, with the colour of the first of them.  Without clouds both
+    arrays are empty.
+    """
     if not clouds:
         return np.empty((0, 3), dtype=np.float32), np.empty((0, 3), dtype=np.uint8)
     return _thin(np.concatenate(clouds), np.concatenate(colours))
@@ -107,13 +113,16 @@ def find_observers(points: Array, keyframes: Sequence[Keyframe]) -> npt.NDArray[
 def voxel_keys(points: Array, voxel_m: float) -> npt.NDArray[np.int64]:
     """Return a key of the voxel of each point; equal keys mean the same voxel.
 
+    Voxels are counted from the lowest of these points, so that keys of two calls cannot be compared.
+
     Args:
         points: ``(n, 3)`` metres.
         voxel_m: Edge of a voxel.
 
     Returns:
-        ``(n,)``, sorted as the indices of x, y and z; ``(n, 3)`` with these indices if the points span more
-        than 2**21 voxels along an axis, which one number cannot hold.
+        ``(n,)`` numbers, of which the smaller one has the smaller voxel index along x, then y, then z; or
+        ``(n, 3)`` with these indices if the points span more than 2**21 voxels along an axis, which one
+        number cannot hold.
     """
     voxels = np.floor(points / voxel_m).astype(np.int64)
     voxels -= voxels.min(axis=0, initial=0)

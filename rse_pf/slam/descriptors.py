@@ -40,7 +40,10 @@ _WORKSPACE = Workspace()
 
 
 def no_distance(descriptors: Descriptors) -> int:
-    """Return a number that no distance of such ``(n, d)`` descriptors exceeds: 256 for 32 bytes."""
+    """Return a number that no distance between two rows of ``(n, d)`` descriptors exceeds.
+
+    It depends on their type and on *d* alone: 256 for uint8 and 32 bytes.
+    """
     size = int(descriptors.shape[1])
     return 8 * size if descriptors.dtype == np.uint8 else 4 * 128 * 128 * size
 
@@ -96,7 +99,8 @@ def best_matches(reference: Descriptors, view: Descriptors, ratio: float) -> tup
         ratio: Largest accepted ratio of the best and the second best distance, above 0.
 
     Returns:
-        Rows of the reference, and the row of the view that matches each of them.
+        Rows of the reference, and the row of the view that matches each of them; none if the view has fewer
+        than two descriptors, since the ratio test needs a second one.
 
     Raises:
         BadRequest: The two arrays hold descriptors of different types or lengths.
@@ -131,7 +135,10 @@ def _match_by_numpy(reference: Descriptors, view: Descriptors, ratio: float) -> 
 def _find_two_nearest(
     reference: Descriptors, view: Descriptors
 ) -> tuple[npt.NDArray[Any], npt.NDArray[Any], npt.NDArray[Any]]:
-    """Return the ``(n,)`` smallest and second smallest distances to *view*, and the rows of the nearest."""
+    """Return for each reference descriptor the smallest and second smallest distance to *view*, ``(n,)``.
+
+    The third array has the row of *view* at the smallest distance, ``(n,)``.
+    """
     distances = distance_matrix(reference, view)
     rows = np.arange(len(distances))
     nearest = np.argmin(distances, axis=1)

@@ -25,7 +25,7 @@ alignment."""
 _NEIGHBOURS = 20  # number of nearest points from which the normal and covariance of a point are estimated
 _MIN_GAIN = 0.02
 """Share by which the mean distance between the clouds must become smaller, for the refined pose to be
-accepted if it differs from the initial one."""
+accepted if it differs from the initial one; if it does not, the distance may become larger by this share."""
 _UNCHANGED_M = 0.002
 """Translation in metres up to which a pose refined by ICP counts as equal to the initial pose."""
 _UNCHANGED_DEG = 0.1
@@ -85,10 +85,12 @@ class CloudAlignment:
         reason: Why the refined pose was rejected, "" if it was accepted.  "worse": it fits worse than the
             initial pose; "poor-fit": the surfaces do not fit; "little-overlap"; "sliding": the surfaces do
             not constrain the pose; "jumped": it is too far from the initial pose; "not-converged".
-        overlap: Share of the source points with a correspondence, at the refined pose.
+        overlap: Share of the thinned source points with a target point within ``reach_m``, at the refined
+            pose, also if it was rejected.
         misfit_before_m: Mean distance of source points to the target's surface at the initial pose.
-        misfit_after_m: Mean distance of source points to the target's surface at the refined pose.
-        iterations: Iterations of the solver in both stages.
+        misfit_after_m: Mean distance of source points to the target's surface at the refined pose, also if it
+            was rejected.
+        iterations: Iterations of the solver in both stages together.
     """
 
     T_target_source: Array
@@ -195,7 +197,9 @@ class _Surfaces:
         return _Fit(float(has_match.mean()), float(distance.mean()))
 
     def measure_constraint(self, T_target_source: Array) -> float:
-        """Return how well the surfaces constrain a pose in its weakest direction; 0 if they can slide.
+        """Return how well the surfaces constrain a pose in its weakest direction.
+
+        The number is 0 if they can slide along each other, or have fewer than 100 correspondences.
 
         The measure is the smallest eigenvalue of the mean outer product of ``(normal, lever x normal)``,
         where levers are divided by their mean length.
@@ -214,7 +218,8 @@ class _Surfaces:
     def _correspondences(self, T_target_source: Array) -> tuple[npt.NDArray[np.bool_], Array, Array, Array]:
         """Return for each source point whether it has a correspondence, and its point-to-plane distance.
 
-        The last two arrays are the source points in the target's frame and the normals of the target there.
+        The last two arrays are the source points in the target's frame, and the normal of the nearest target
+        point of each.  A point without correspondence has numbers, too, which mean nothing.
         """
         points = transform(T_target_source, self._source)
         indices, squared_distances = self._tree.batch_nearest_neighbor_search(points, num_threads=1)

@@ -60,14 +60,17 @@ _MAX_DIRECTIONS = 200
 class InertialMotion:
     """A preintegrated motion in the axes of the IMU, as `client_sdk.imu.preintegration` defines it.
 
+    All vectors are in the axes that the IMU has at the first of the two keyframes.
+
     Attributes:
         duration_s: Time between the two keyframes.
-        rotation: ``(3,)`` rotation vector, rad.
+        rotation: ``(3,)`` rotation vector, rad, of the rotation that maps the axes of the IMU at the second
+            keyframe to those at the first.
         velocity: ``(3,)`` change of velocity without gravity, m/s.
         position: ``(3,)`` displacement without gravity and initial velocity, m.
         bias_gyro: ``(3,)`` bias that was subtracted from angular rates, rad/s.
         bias_accel: ``(3,)`` bias that was subtracted from accelerations, m/s^2.
-        covariance: ``(9, 9)``, of rotation, velocity and position, in this order.
+        covariance: ``(9, 9)``, of rotation (rad), velocity (m/s) and position (m), in this order.
     """
 
     duration_s: float
@@ -86,7 +89,7 @@ class KeyframeImu:
     Attributes:
         down_camera: ``(3,)`` unit vector in the direction of gravity, in the frame of the camera.
         deviation_rad: Standard deviation of this direction.
-        T_imu_camera: ``(4, 4)``, where the camera is mounted, metres.
+        T_imu_camera: ``(4, 4)``, maps points from the frame of the camera to that of the IMU, metres.
         motion: The motion since the previous keyframe of the segment, None if it was not measured.
     """
 
@@ -158,7 +161,8 @@ def agreed_gravity(downs: Sequence[Array]) -> Array | None:
     """Return the direction of gravity ``(3,)`` on which more than half of the robots agree, else None.
 
     Each robot has one vote, the median of its own directions, so that a robot with many keyframes does not
-    outvote others.  Two votes agree if they differ by at most 5 degrees.
+    outvote others.  Two votes agree if they differ by at most 5 degrees.  The result is a unit vector: the
+    median of the votes that agree with the vote on which most agree.  It is None without robots.
 
     Args:
         downs: For each robot the directions of gravity at its keyframes, unit vectors ``(n, 3)`` with n >= 1,
@@ -175,7 +179,10 @@ def agreed_gravity(downs: Sequence[Array]) -> Array | None:
 
 
 def upright_rotation(down: Array) -> Array:
-    """Return the smallest rotation, as ``(4, 4)``, that moves the direction *down* ``(3,)`` to -z."""
+    """Return the smallest rotation, as ``(4, 4)``, that moves the direction *down* ``(3,)`` to -z.
+
+    *down* may have any length above 0.
+    """
     down = down / np.linalg.norm(down)
     axis = np.cross(down, [0.0, 0.0, -1.0])
     sine, cosine = float(np.linalg.norm(axis)), -float(down[2])
@@ -187,9 +194,10 @@ def upright_rotation(down: Array) -> Array:
 
 
 def _median_direction(directions: Array) -> Array:
-    """Return that of unit vectors ``(n, 3)`` with the smallest sum of angles to the others.
+    """Return the medoid of unit vectors ``(n, 3)``: the one with the smallest sum of angles to the others.
 
-    This medoid is robust: fewer than half of the vectors cannot move it far.
+    The medoid is robust: fewer than half of the vectors cannot move it far.  Of more than `_MAX_DIRECTIONS`
+    vectors an even selection of so many is used.
     """
     if len(directions) > _MAX_DIRECTIONS:
         rows = np.linspace(0, len(directions) - 1, _MAX_DIRECTIONS).astype(np.int64)

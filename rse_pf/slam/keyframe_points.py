@@ -96,13 +96,14 @@ def encode_points(
 ) -> bytes:
     """Return coloured points as the bytes of an object, sorted by their pixels.
 
-    Of several points at one pixel the first is encoded, and of more than 16,000 pixels an even selection.
+    Of several points at one pixel the first is encoded, and of more than 16,000 pixels an even selection of
+    16,000.
 
     Args:
         pixels: ``(n, 2)`` columns and rows within the image, undistorted.
         depths_m: ``(n,)`` along the optical axis; points that are not within 0.01..65.535 m are left out.
         colours: ``(n, 3)``.
-        camera: The camera of the keyframe.
+        camera: The camera of the keyframe; only its width is used, and no pixel is checked.
     """
     # 1. Keep points whose depth can be encoded, one at each pixel.
     with np.errstate(invalid="ignore"):
@@ -125,6 +126,8 @@ def encode_points(
 
 def decode_points(data: bytes, camera: Camera) -> tuple[Array, Colours]:
     """Return points ``(n, 3)`` in metres in the frame of *camera*, and their colours ``(n, 3)``.
+
+    *camera* must be that of the keyframe, with which the points were encoded.
 
     Raises:
         BadRequest: *data* is longer than 160,000 bytes or malformed, holds more than 16,000 points, or a

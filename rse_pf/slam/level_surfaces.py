@@ -138,7 +138,7 @@ def floor_normal(points: npt.NDArray[np.float32], up: Array, camera_positions: A
     """Return the unit normal ``(3,)`` of the floor, fitted by iteratively reweighted least squares.
 
     The plane of a floor of many metres is known more accurately than the normals of small surfaces.  The
-    weights are those of Tukey's biweight, before they are squared by the least squares.
+    squared residuals have the weights of Tukey's biweight.
 
     Args:
         points: ``(n, 3)`` metres.
@@ -166,7 +166,8 @@ def floor_normal(points: npt.NDArray[np.float32], up: Array, camera_positions: A
     low = below[order][(first + count // 20)[count >= _MIN_CELL_POINTS]]
     if len(low) < _MIN_CELLS:
         return None
-    # 3. Fit the plane z = a x + b y + c from a level start, with a decreasing limit of the weights.
+    # 3. Fit the plane z = a x + b y + c from a level start, with a decreasing limit of the weights.  Each row
+    # is multiplied by the root of its weight, since least squares squares it.
     plane = np.array([0.0, 0.0, float(np.percentile(low[:, 2], 20))])
     rows = np.column_stack([low[:, :2], np.ones(len(low))])
     for limit_m in _TUKEY_LIMITS_M:

@@ -85,8 +85,8 @@ def optimise_graph(
     """Return the poses of *graph* that minimise its robust cost, see `robust_cost`.
 
     Levenberg-Marquardt runs from the given poses, and again from poses whose rotations come from the chordal
-    relaxation; the poses with the lowest cost are returned.  The pose with the smallest row of each connected
-    component stays fixed.
+    relaxation; the poses with the lowest cost, which may be the given ones, are returned.  The pose with the
+    smallest row of each connected component stays fixed.
 
     Args:
         graph: The pose graph.
@@ -104,7 +104,7 @@ def optimise_graph(
     """
     options = options or OptimiseOptions()
     gtsam = _load_gtsam()
-    # 1. Find the poses that stay fixed, and the cost to improve on.
+    # 1. Find the poses that stay fixed, and compute the cost of the given poses.
     anchors = np.unique(connected_components(len(graph.T_world_pose), graph.a, graph.b))
     cost_before = robust_cost(graph, graph.T_world_pose, options.cauchy)
     best_poses, best_cost = graph.T_world_pose, cost_before
@@ -175,7 +175,11 @@ def _minimise(
 
 
 def _chordal_poses(gtsam: Any, graph: PoseGraph, anchors: Rows) -> Array | None:
-    """Return poses from the chordal relaxation of the rotations, None if the graph has none."""
+    """Return poses ``(n, 4, 4)`` from the chordal relaxation of the rotations.
+
+    Returns:
+        None if the graph is not connected, or GTSAM finds no finite poses, as for a graph without loops.
+    """
     if len(anchors) > 1:
         return None
     try:

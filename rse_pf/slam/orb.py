@@ -75,7 +75,7 @@ class Keypoints(NamedTuple):
     octaves: npt.NDArray[np.int32]
 
     def select(self, rows: Sequence[int] | slice) -> Keypoints:
-        """Return the keypoints of *rows*."""
+        """Return only the keypoints of *rows*, in the order of *rows*."""
         return Keypoints(self.pixels[rows], self.responses[rows], self.angles_deg[rows], self.octaves[rows])
 
 
@@ -152,8 +152,8 @@ def describe_at(
         sizes: ``(n,)``, scale of each patch; the nearest level of the pyramid is taken.
 
     Returns:
-        The ``(k,)`` rows of *pixels* that could be described, which excludes those near the edge of the
-        image, and their ``(k, 32)`` descriptors.
+        The ``(k,)`` rows of *pixels* that could be described, not always in ascending order, which excludes
+        those near the edge of the image, and their ``(k, 32)`` descriptors.
 
     Raises:
         MissingExtra: OpenCV is not installed.
@@ -291,7 +291,10 @@ def _keypoints_per_level(count: int) -> npt.NDArray[np.int64]:
 def _describe(
     cv2: Any, gray: npt.NDArray[np.uint8], keypoints: Keypoints
 ) -> tuple[Keypoints, npt.NDArray[np.uint8]]:
-    """Return the keypoints that can be described, and their descriptors."""
+    """Return those *keypoints* that can be described, and their ``(k, 32)`` descriptors.
+
+    The native core describes all of them, or OpenCV leaves out those near the edge of the image.
+    """
     descriptors = describe_keypoints(gray, keypoints)
     if descriptors is not None:
         return keypoints, descriptors
@@ -327,7 +330,10 @@ def _describe_by_opencv(
     angles_deg: npt.NDArray[Any],
     octaves: npt.NDArray[Any],
 ) -> tuple[Any, npt.NDArray[np.uint8]]:
-    """Return OpenCV's keypoints that it can describe, whose ``class_id`` is the row of *pixels*."""
+    """Return the keypoints that OpenCV could describe, as OpenCV's objects, and their descriptors.
+
+    The ``class_id`` of a keypoint is its row of *pixels*.  Those near the edge of the image are left out.
+    """
     keypoints = [
         cv2.KeyPoint(
             float(u), float(v), float(_PATCH_PX * _LEVEL_SIZES[octave]), float(angle), 1.0, int(octave), row

@@ -47,7 +47,7 @@ PlaceVector = npt.NDArray[np.float32]
 
 _Vocabulary = tuple[npt.NDArray[np.float32], npt.NDArray[np.float64], npt.NDArray[np.float32]]
 """Visual words ``(32, d)``, directions of the residuals of each word ``(32, d, 16)``, and the squared lengths
-of the words ``(32,)``."""
+of the words ``(32,)``: 0 in a random vocabulary, whose words are equally long."""
 
 
 def place_vector(descriptors: Descriptors) -> PlaceVector:
@@ -67,11 +67,12 @@ def place_vector(descriptors: Descriptors) -> PlaceVector:
     # 1. Centre descriptors other than ORB: vectors without negative elements all lie in one direction.
     if not is_orb and len(vectors):
         vectors -= np.rint(vectors.sum(axis=0, dtype=np.float64) / len(vectors)).astype(np.float32)
-    # 2. Assign each descriptor to its nearest word.  All numbers are integers below 2**24, which float32
-    # holds exactly in whatever order a machine adds them.
+    # 2. Assign each descriptor to its nearest word.  All numbers are integers below 2**24, so that float32
+    # holds their sums exactly in whatever order a machine adds them.
     products = _multiply_in_one_thread(vectors, words.T)
     nearest = np.argmin(squared_lengths - (2.0 * _WORD_SCALE) * products, axis=1)
-    # 3. Sum the residuals of the descriptors of each word.
+    # 3. Sum for each word the residuals of its descriptors: descriptor minus word for ORB, and the centred
+    # descriptor itself for other kinds.
     counts = np.bincount(nearest, minlength=WORDS)
     residuals = np.zeros((WORDS, vectors.shape[1]))
     if len(vectors):
@@ -104,6 +105,7 @@ def _multiply_in_one_thread(
 class PlaceIndex:
     """The place vectors of keyframes by their ids, with a search for the most similar ones.
 
+    Ids are whole numbers from 0; the memory of the index also grows with the largest id.
     The vectors lie in the rows of one matrix in no particular order, so that a search is one product.
     """
 
@@ -115,7 +117,12 @@ class PlaceIndex:
 
     @classmethod
     def from_bytes(cls, data: bytes) -> PlaceIndex:
-        """Return the index that `to_bytes` encoded; raises BadRequest if *data* has an impossible length."""
+        """Return the index that `to_bytes` encoded.
+
+        Raises:
+            BadRequest: *data* has a length that no number of keyframes has.
+            ValueError: An id occurs twice.
+        """
         count, remainder = divmod(len(data), _INDEX_ROW_BYTES)
         if remainder:
             raise BadRequest(
@@ -151,7 +158,7 @@ class PlaceIndex:
         return index
 
     def vector_of(self, keyframe_id: int) -> PlaceVector:
-        """Return the vector of a keyframe; raises KeyError if the index does not have it."""
+        """Return a copy of the vector of a keyframe; raises KeyError if the index does not have it."""
         if keyframe_id not in self:
             raise KeyError(keyframe_id)
         vector: PlaceVector = self._vectors[self._row_of_id[keyframe_id]].copy()
@@ -187,7 +194,8 @@ class PlaceIndex:
     ) -> list[tuple[int, float]]:
         """Return ids and cosine similarities of the keyframes most similar to *vector*, the best first.
 
-        Keyframes of equal similarity are sorted by their ids.
+        Keyframes of equal similarity are sorted by their ids.  A similarity is the scalar product of two
+        vectors, within -1 to 1 for unit vectors; the list is empty where there is nothing to search.
 
         Args:
             vector: ``(512,)``.

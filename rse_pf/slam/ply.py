@@ -50,7 +50,7 @@ def encode_ply(points: npt.ArrayLike, colours: Colours, *, is_metric: bool = Tru
 
     Args:
         points: ``(n, 3)``, in metres or in an unknown unit; stored as float32.
-        colours: ``(n, 3)``.
+        colours: ``(n, 3)``, one for each point.
         is_metric: Whether the unit is the metre; a comment in the file states the unit.
     """
     vertices = np.empty(len(colours), dtype=_VERTEX)

@@ -42,6 +42,8 @@ _TO_G2O = np.linalg.inv(_FROM_G2O)
 class PoseGraph:
     """A pose graph of *n* poses and *m* edges, which is validated when it is made.
 
+    The rotations of ``T_world_pose`` and ``T_a_b`` are made orthonormal, in new arrays.
+
     Attributes:
         T_world_pose: ``(n, 4, 4)``, metres.
         a, b: ``(m,)``, the rows of the two poses of each edge.
@@ -94,7 +96,7 @@ class PoseGraph:
             )
 
     def chi2(self, T_world_pose: Array | None = None) -> float:
-        """Return the sum of the squared Mahalanobis norms of all residuals.
+        """Return the sum of the squared Mahalanobis norms of all residuals, without a robust kernel.
 
         Args:
             T_world_pose: ``(n, 4, 4)``; None means the poses of this graph.
@@ -145,7 +147,10 @@ def connected_components(n: int, a: npt.NDArray[np.int64], b: npt.NDArray[np.int
 
 
 def write_g2o(graph: PoseGraph) -> str:
-    """Return *graph* as g2o text with lines ``VERTEX_SE3:QUAT`` and ``EDGE_SE3:QUAT``."""
+    """Return *graph* as g2o text with lines ``VERTEX_SE3:QUAT`` and ``EDGE_SE3:QUAT``.
+
+    Which edges may be outliers is not written.
+    """
     lines = [g2o_vertex(name, T) for name, T in zip(graph.ids.tolist(), graph.T_world_pose, strict=True)]
     ids_a, ids_b = graph.ids[graph.a].tolist(), graph.ids[graph.b].tolist()
     lines += [
@@ -177,7 +182,10 @@ def g2o_edge(a: int, b: int, T_a_b: Array, information: Array) -> str:
 
 
 def read_g2o(text: str) -> PoseGraph:
-    """Return the pose graph of g2o *text*; edges between consecutive ids are odometry.
+    """Return the pose graph of g2o *text*.
+
+    Edges between ids that differ by 1 count as odometry, all others may be outliers (`PoseGraph.robust`).
+    Lines ``FIX`` and comments are ignored, and of several vertices with one id the last pose is used.
 
     Raises:
         BadRequest: A line is not one of ``VERTEX_SE3:QUAT``, ``EDGE_SE3:QUAT`` and ``FIX``, or has the wrong
@@ -209,7 +217,7 @@ def read_g2o(text: str) -> PoseGraph:
     ids = np.array(list(vertices), dtype=np.int64)
     a = np.array([row_of_id[edge[0]] for edge in edges], dtype=np.int64)
     b = np.array([row_of_id[edge[1]] for edge in edges], dtype=np.int64)
-    # 3. Convert the information matrices to our twist.
+    # 3. Convert the information matrices from g2o's error to the twist of `PoseGraph`.
     g2o_information = np.array([edge[3] for edge in edges]).reshape(m, 6, 6)
     return PoseGraph(
         T_world_pose=np.array(list(vertices.values())).reshape(-1, 4, 4),

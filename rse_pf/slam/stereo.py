@@ -26,8 +26,8 @@ Gray = npt.NDArray[np.uint8]
 _PORTABLE_FLAG = 1
 """Flag of the native core's ``rse_pf_disparities`` that forbids AVX2."""
 _BASE_NOISE_M = 1e-5
-"""Constant part of the noise of a stereo depth, in metres: the smallest that `DepthNoise` accepts, standing
-for 0."""
+"""Constant part of the noise of a stereo depth, in metres: the smallest that `DepthNoise` accepts, in place
+of 0, since this noise grows with the square of the depth alone."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -40,7 +40,10 @@ class StereoOptions:
         min_likeness: Smallest accepted likeness: the squared normalised correlation of the two patches.
         uniqueness: Ratio test: 1 minus the best likeness must be below this share of 1 minus the second best.
         left_right_px: Largest difference between the disparities of the search from left to right and of the
-            search back from right to left; the search back is left out below 0.
+            search back from right to left; -1 leaves the search back out.
+
+    Raises:
+        BadRequest: A number is out of its range.
     """
 
     min_disparity_px: float = 1.0
@@ -63,6 +66,8 @@ class StereoOptions:
 
 def stereo_noise(f_baseline: float, disparity_px: float) -> DepthNoise:
     """Return the noise model of depths ``f_baseline / d`` by the noise of their disparities ``d``.
+
+    The standard deviation of a depth z is that of the disparity times ``z^2 / f_baseline``, at most ``z^2``.
 
     Args:
         f_baseline: Focal length in pixels times the baseline in metres.
@@ -88,7 +93,7 @@ class StereoRequest(ctypes.Structure):
 def disparities(
     left: Gray, right: Gray, pixels: Array, options: StereoOptions | None = None, *, portable: bool = False
 ) -> Array:
-    """Measure the disparities of pixels of the left image.
+    """Measure the disparities of pixels of the left image: their column minus that in the right image.
 
     The patch of 11x11 pixels around the nearest whole pixel is compared with those along its row of the right
     image by the squared normalised correlation.  The best must be similar enough, unique, and found again

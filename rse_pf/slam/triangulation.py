@@ -36,8 +36,9 @@ def triangulate(
         max_error_px: Largest reprojection error of an accepted point, one number or ``(n,)``.
 
     Returns:
-        ``(n, 3)`` points in the world, and ``(n,)`` whether each point is accepted: finite, before both
-        cameras, and within the reprojection error in both views.
+        ``(n, 3)`` points in the world, in the unit of the poses, and ``(n,)`` whether each point is accepted:
+        not at infinity, before both cameras, and within the reprojection error in both views.  The numbers of
+        a point that is not accepted mean nothing.
 
     Source:
         Hartley and Zisserman 2004, Sect. 12.2 (linear triangulation, in normalised coordinates).
@@ -63,7 +64,10 @@ def triangulate(
 
 
 def parallax_deg(points: Array, first_centre: Array, second_centre: Array) -> Array:
-    """Return the ``(n,)`` angles in degrees between the rays from two camera centres to ``(n, 3)`` points."""
+    """Return the ``(n,)`` angles in degrees between the rays from two camera centres to ``(n, 3)`` points.
+
+    The centres are ``(3,)``, or ``(n, 3)`` with one for each point.
+    """
     first_rays, second_rays = points - first_centre, points - second_centre
     lengths = np.linalg.norm(first_rays, axis=1) * np.linalg.norm(second_rays, axis=1)
     cosines = np.einsum("ij,ij->i", first_rays, second_rays) / np.maximum(lengths, 1e-12)
@@ -83,8 +87,8 @@ def reprojection_errors(
         camera: Intrinsics.
 
     Returns:
-        ``(n,)`` errors in pixels, infinite for points behind the camera, and ``(n,)`` depths along the
-        optical axis, in the unit of the points.
+        ``(n,)`` errors in pixels, infinite for points whose depth is not above 0.001 units, and ``(n,)``
+        depths along the optical axis, in the unit of the points.
     """
     points = np.einsum("...ij,...j->...i", T_camera_world[..., :3, :3], points_world)
     points += T_camera_world[..., :3, 3]
