@@ -35,10 +35,9 @@ class DepthNoise(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     """Noise model of a depth camera: depth z has the standard deviation base + growth * max(0, z - from)^2.
 
     Attributes:
-        base_m: Standard deviation up to the depth *from_m*, metres, 1e-5 to 1.
-        growth_per_m: Growth of the standard deviation with the square of the depth beyond *from_m*, 1/metre,
-            0 to 1.
-        from_m: Depth from which on the standard deviation grows, metres, 0 to 100.
+        base_m: Standard deviation up to the depth *from_m*, metres.
+        growth_per_m: Growth of the standard deviation with the square of the depth beyond *from_m*, 1/metre.
+        from_m: Depth from which on the standard deviation grows, metres.
 
     The defaults are those of a Kinect.
 

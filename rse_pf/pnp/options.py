@@ -30,12 +30,10 @@ class PnpOptions(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
 
     Attributes:
         engine: Name of the solver; None for the server's default.
-        inlier_px: Largest reprojection error of an inlier, pixels, 0.001 to 100.
-        max_iterations: Most samples that RANSAC draws, 1 to 100,000.
-        min_iterations: Fewest samples that RANSAC draws, 1 to 100,000; if it is above *max_iterations*, that
-            is the number of samples.  The estimate of the engine ``opencv`` does not use it.
-        confidence: RANSAC stops as soon as at least one of its samples has no outlier with this probability,
-            1e-6 to 1 - 1e-9.
+        inlier_px: Largest reprojection error of an inlier, pixels.
+        max_iterations: Most samples that RANSAC draws.
+        min_iterations: Fewest samples that RANSAC draws.
+        confidence: RANSAC stops when it has drawn a sample of inliers only with this probability.
 
     Raises:
         BadRequest: A number is out of its range.
@@ -44,7 +42,9 @@ class PnpOptions(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     engine: Literal["native", "opencv"] | None = None
     inlier_px: float = 8.0
     max_iterations: int = 1000
+    # Above max_iterations, min_iterations counts as max_iterations; OpenCV's estimate does not use it.
     min_iterations: int = 10
+    # Probability that at least one sample had no outlier.
     confidence: float = 0.999
 
     def __post_init__(self) -> None:
