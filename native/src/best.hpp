@@ -28,8 +28,8 @@ inline void move_median_to_first(Ranked* first, Ranked* a, Ranked* b, Ranked* c)
     exchange(*first, low->rank > c->rank ? *low : high->rank > c->rank ? *c : *high);
 }
 
-// Partition [begin, end) into ranks above and below that of the pivot; return where the lower part begins.  The range
-// must hold a rank on either side of the pivot's, because the two searches do not test for its ends.
+// Partition [begin, end) in place into ranks above and below that of the pivot; return where the lower part begins.
+// The range must hold a rank on either side of the pivot's, because the two searches do not test for its ends.
 inline Ranked* partition(Ranked* begin, Ranked* end, const Ranked* pivot) {
     for (;;) {
         while (begin->rank > pivot->rank) ++begin;
@@ -41,9 +41,9 @@ inline Ranked* partition(Ranked* begin, Ranked* end, const Ranked* pivot) {
     }
 }
 
-// Move the `wanted` best of `count` candidates, and all that equal the last of them, to the front, and return their
-// number. Return -1 if the ranges become so unequal that libstdc++ would change to heap selection, whose order is not
-// known here.
+// Move the `wanted` best of `count` candidates, and all that equal the last of them, to the front, and return how many
+// these are: all, in their order, if there are not more than wanted.  Return -1 if the ranges become so unequal that
+// libstdc++ would change to heap selection, whose order is not known here.
 inline int64_t keep_best(Ranked* values, int64_t count, int64_t wanted) {
     if (count <= wanted || wanted <= 0) return count <= wanted ? count : 0;
     // 1. Narrow the range around the last wanted element until at most three elements are left.
@@ -61,7 +61,7 @@ inline int64_t keep_best(Ranked* values, int64_t count, int64_t wanted) {
     // 2. Sort the rest by insertion.
     for (Ranked* next = begin + 1; next < end; ++next)
         for (Ranked* at = next; at > begin && at->rank > (at - 1)->rank; --at) exchange(*at, *(at - 1));
-    // 3. Move all candidates that equal the last wanted one behind it, as std::partition does.
+    // 3. Move the other candidates that equal the last wanted one directly behind it, as std::partition does.
     const float min_rank = last->rank;
     Ranked *front = values + wanted, *back = values + count;
     for (;;) {

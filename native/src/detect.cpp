@@ -4,9 +4,10 @@
 // On each level of an image pyramid:
 // 1. Compute the FAST score of every pixel, 32 pixels at a time: the largest threshold at which nine contiguous pixels
 //    of a circle of 16 are all brighter or all darker than the centre (Rosten and Drummond, ECCV 2006).
-// 2. Keep local maxima, and of these the 2 n best, where n is the number of keypoints wanted of the level.
-// 3. Keep the n with the highest Harris response.
-// 4. Compute the orientation_deg of each from its intensity centroid.
+// 2. Keep the local maxima of the score, and of these the 2 n best, where n is the number of keypoints wanted of the
+//    level.
+// 3. Keep the n with the highest Harris response.  Here and before, those that equal the last one are kept as well.
+// 4. Compute the orientation (degrees) of each keypoint from the intensity centroid of the disc around it.
 //
 // Processors without AVX2 have no implementation here; the caller uses OpenCV.
 #include <cstdint>
@@ -49,7 +50,7 @@ constexpr int64_t kCircleRows[kCircle] = {3, 3, 2, 1, 0, -1, -2, -3, -3, -3, -2,
 
 RSE_PF_INLINE __m256i load_bytes(const uint8_t* at) { return _mm256_loadu_si256(reinterpret_cast<const __m256i*>(at)); }
 
-// Return the maximum over all arcs of nine contiguous numbers, of 16 on a circle, of the arc's minimum.
+// Return the largest of the minima of all arcs of nine contiguous numbers, of 16 on a circle; for 32 circles at a time.
 RSE_PF_INLINE __m256i max_of_arc_minima(const __m256i (&circle)[kCircle]) {
     __m256i two[kCircle / 2], four[kCircle / 2], highest = _mm256_setzero_si256();
     // Arcs of eight begin at odd positions; with the position before or behind they are the arcs of nine.
@@ -63,8 +64,8 @@ RSE_PF_INLINE __m256i max_of_arc_minima(const __m256i (&circle)[kCircle]) {
     return highest;
 }
 
-// Write the FAST score of the pixels [begin, end) of a row, 0 where it is not above the threshold.  Whole chunks are
-// written, so up to 31 pixels behind `end` are written as well.
+// Write the FAST score of the pixels [begin, end) of a row to scores[begin, end), 0 where it is below the threshold
+// (grey levels).  Whole chunks are written, so up to 31 scores behind `end` are written as well.
 RSE_PF_INLINE void score_row(const Image& image, int64_t row, int64_t begin, int64_t end, uint8_t threshold,
                              uint8_t* scores) {
     const __m256i limit = _mm256_set1_epi8(static_cast<char>(threshold)), one = _mm256_set1_epi8(1);
@@ -88,7 +89,7 @@ RSE_PF_INLINE void score_row(const Image& image, int64_t row, int64_t begin, int
 }
 
 // Write the corners of a level whose FAST score exceeds that of their eight neighbours, row by row, and return their
-// number. `lines` is memory for the scores of three rows.
+// number.  The rank of a corner is its score.  `lines` is scratch memory for the scores of three rows.
 RSE_PF_INLINE int64_t find_corners(const Image& image, uint8_t threshold, uint8_t* const (&lines)[3], Corner* corners) {
     const int64_t begin = kBorder, end = image.width - kBorder, bottom = image.height - kBorder;
     int64_t count = 0;
@@ -124,8 +125,8 @@ RSE_PF_INLINE __m128i load_eight(const uint8_t* at) {
     return _mm_cvtepu8_epi16(_mm_loadl_epi64(reinterpret_cast<const __m128i*>(at)));
 }
 
-// Return the Harris response of the 7x7 pixels around a pixel, from Sobel gradients and with Harris' constant k = 0.04,
-// as OpenCV scales it.
+// Return the Harris response of the 7x7 pixels around the pixel with an index in the image, from Sobel gradients and
+// with Harris' constant k = 0.04, as OpenCV scales it.
 RSE_PF_INLINE float harris_response(const Image& image, int64_t index) {
     constexpr int64_t kRadius = kHarrisSide / 2;
     const __m128i seven = _mm_setr_epi16(-1, -1, -1, -1, -1, -1, -1, 0);
@@ -169,7 +170,8 @@ struct Disc {
 
 constexpr Disc kWeights;
 
-// Return the angle of a vector in degrees, 0..360, by the polynomial of cv::fastAtan2.
+// Return the angle of a vector from the x axis towards the y axis in degrees, 0..360, by the polynomial of
+// cv::fastAtan2.
 RSE_PF_INLINE float angle_deg(float y, float x) {
     constexpr double kDegrees = 180.0 / 3.1415926535897932384626433832795;
     constexpr float kDegreesPerRadian = static_cast<float>(kDegrees);
@@ -185,8 +187,8 @@ RSE_PF_INLINE float angle_deg(float y, float x) {
     return y < 0.0f ? 360.0f - angle : angle;
 }
 
-// Return the orientation_deg of a keypoint in degrees: the direction from its pixel to the intensity centroid of the
-// disc around.
+// Return the orientation of the keypoint at the pixel with an index in the image: the direction from this pixel to the
+// intensity centroid of the disc around it, in degrees, 0..360, clockwise from the x axis.
 RSE_PF_INLINE float orientation_deg(const Image& image, int64_t index) {
     const __m256i ones = _mm256_set1_epi16(1);
     __m256i across = _mm256_setzero_si256(), down = across;
@@ -210,7 +212,9 @@ struct Keypoints {
     int64_t room, rows;
 };
 
-// Detect the keypoints of one level.  Return false if there is no room for them, or if OpenCV's order is not known.
+// Detect the keypoints of one level, about `wanted` of them, and append them to `keypoints`, with pixels of the whole
+// image.  Return false if there is no room for them, or if OpenCV's order is not known.  lines, corners: scratch
+// memory.
 RSE_PF_INLINE bool detect_level(const Image& image, int32_t octave, float scale, int64_t wanted, uint8_t threshold,
                                 uint8_t* const (&lines)[3], Corner* corners, Keypoints& keypoints) {
     int64_t count = find_corners(image, threshold, lines, corners);

@@ -5,7 +5,8 @@
 
 namespace RSE_PF_ISA {
 
-// Smallest squared error (px^2) of the false alarm test: messages are rounded, and four points may fit by luck.
+// Smallest squared error (px^2) of the false alarm test, to which a smaller largest error of the inliers is raised:
+// messages are rounded, and four points may fit by luck.
 constexpr double kMinError2 = 0.01;
 // Quantile of the distances of points from and along their main axis that is their width and length: up to a fifth of
 // the points may be outliers.
@@ -28,7 +29,8 @@ constexpr double kLog10E = 0.43429448190325183;
 
 // Return log10 of the expected number of random poses (number of false alarms, NFA) for which at least `inliers` of n
 // rows have a squared error of at most largest_error2 (px^2) in an image of area_px2; infinity for up to 3 inliers.
-// Sources: a-contrario RANSAC, Moisan and Stival, IJCV 2004; for PnP, Moulon et al., ACCV 2012.
+// The lower the number, the stronger the evidence.  Sources: a-contrario RANSAC, Moisan and Stival, IJCV 2004; for PnP,
+// Moulon et al., ACCV 2012.
 static double log10_false_alarms(int64_t n, int64_t inliers, double largest_error2, double area_px2) {
     if (inliers <= 3) return kInfinity;
     const double disc = kPi * (largest_error2 > kMinError2 ? largest_error2 : kMinError2) / area_px2;
@@ -38,9 +40,9 @@ static double log10_false_alarms(int64_t n, int64_t inliers, double largest_erro
     return log * kLog10E;
 }
 
-// Count the independent inliers: inliers in the same cell or in adjacent cells of the image count once.  Where
-// kManyCells cells are occupied, return the number of all inliers.  u, v: pixels relative to the principal point (cx,
-// cy).
+// Count the independent inliers: inliers in the same cell or in adjacent cells of the image count once.  Where at least
+// kManyCells cells are occupied, return the number of all inliers (`count`).  u, v: pixels relative to the principal
+// point (cx, cy); width: of the image, pixels.
 static int64_t count_independent_inliers(const double* u, const double* v, int64_t count, double cx, double cy,
                                          double width) {
     // 1. List the occupied cells.
@@ -57,7 +59,7 @@ static int64_t count_independent_inliers(const double* u, const double* v, int64
         rows[cells] = row;
         if (++cells == kManyCells) return count;
     }
-    // 2. Sort them by column, then by row (insertion sort).
+    // 2. Sort the cells by column, then by row (insertion sort).
     for (int i = 1; i < cells; ++i)
         for (int k = i; k > 0; --k) {
             if (columns[k - 1] < columns[k] || (columns[k - 1] == columns[k] && rows[k - 1] < rows[k])) break;
@@ -67,7 +69,7 @@ static int64_t count_independent_inliers(const double* u, const double* v, int64
             columns[k - 1] = column;
             rows[k - 1] = row;
         }
-    // 3. In this order, count each cell that touches no counted cell.
+    // 3. In this order, count each cell that touches no counted cell, and move it to the counted ones in front.
     int counted = 0;
     for (int i = 0; i < cells; ++i) {
         bool touches = false;
@@ -83,7 +85,7 @@ static int64_t count_independent_inliers(const double* u, const double* v, int64
     return counted;
 }
 
-// Return the k-th smallest number, counted from 0, and rearrange the numbers on the way (quickselect).
+// Return the k-th smallest number, counted from 0, and rearrange the numbers in place on the way (quickselect).
 // Source: Hoare, Algorithm 65: FIND, CACM 1961.
 static double select_kth(double* numbers, int64_t count, int64_t kth) {
     int64_t low = 0, high = count - 1;
@@ -108,8 +110,9 @@ static double select_kth(double* numbers, int64_t count, int64_t kth) {
 
 // Return width over length of a set of points: 0 if they are collinear or coincide, about 1 if they are round.
 //
-// Length and width are the 80 % quantiles of the distances of the points from their centroid along and across their
-// main axis.  z is null for points of the image.  length2, width2: scratch memory for `count` numbers each.
+// Length is the 80 % quantile of the distances of the points from their centroid along their main axis, width that of
+// their distances from the axis.  z is null for points of the image.  length2, width2: scratch memory for `count`
+// numbers each.
 static double width_to_length(const double* x, const double* y, const double* z, int64_t count, double* length2,
                               double* width2) {
     // 1. Compute centroid and second moments.
@@ -139,7 +142,7 @@ static double width_to_length(const double* x, const double* y, const double* z,
         length2[i] = along * along;
         width2[i] = (p[0] * p[0] + p[1] * p[1] + p[2] * p[2]) - length2[i];
     }
-    // 4. Take their quantiles.
+    // 4. Take the quantiles of these distances, and return the root of their ratio.
     const int64_t quantile_at = static_cast<int64_t>(kShapeQuantile * static_cast<double>(count));
     const int64_t kth = quantile_at < count - 1 ? quantile_at : count - 1;
     const double width_quantile2 = select_kth(width2, count, kth), length_quantile2 = select_kth(length2, count, kth);
@@ -147,11 +150,12 @@ static double width_to_length(const double* x, const double* y, const double* z,
     return square_root((width_quantile2 > 0.0 ? width_quantile2 : 0.0) / length_quantile2);
 }
 
-// Measure how the inliers lie in the image, and write it to the result: inlier_width_to_length, and radius_px, the root
-// mean square distance from their centroid.
+// Measure how the projections of the `count` inliers, as `project` wrote them, lie in the image, and write it to the
+// result: inlier_width_to_length (a lower bound where they are clearly wide), and radius_px, the root mean square
+// distance from their centroid.
 static void measure_shape(const rse_pf::Workspace& view, int64_t count, const rse_pf_pnp_request& request,
                           rse_pf_pnp_result& result) {
-    // 1. Sum the pixels and their products.
+    // 1. Sum the projected pixels and their products.
     typedef Lanes<double> F;
     F u = all(0.0), v = u, uu = u, uv = u, vv = u;
     const int64_t whole = count / kLanes * kLanes;
@@ -193,7 +197,7 @@ static void measure_shape(const rse_pf::Workspace& view, int64_t count, const rs
         result.inlier_width_to_length = width_to_length(view.u, view.v, nullptr, count, view.length2, view.width2);
 }
 
-// A symmetric 3x3 matrix by its upper triangle.
+// A symmetric 3x3 matrix by its upper triangle.  The inverse of a singular one has numbers that are not finite.
 struct Symmetric3 {
     double xx, xy, xz, yy, yz, zz;
 };
@@ -212,8 +216,9 @@ RSE_PF_INLINE double at(const Symmetric3& m, int i, int j) {
     return full[i][j];
 }
 
-// Write the covariance of the pose, variance (px^2) times the inverse of J^T J, by the inverse of a 2x2 block matrix.
-// Return false where it does not exist, because some motion of the camera changes no pixel.
+// Write the covariance of the twist (m, rad) on the left of the pose, variance (px^2) times the inverse of J^T J, by
+// the inverse of a 2x2 block matrix.  Return false where it does not exist, because some motion of the camera changes
+// no pixel; what was written is then no covariance.
 static bool compute_covariance(const Normal& normal, double variance, double (&out)[36]) {
     const double s = 1.0 / variance;
     // 1. Split J^T J / variance into the blocks A (translation), B (mixed) and D (rotation); P = A^-1.
@@ -243,7 +248,7 @@ static bool compute_covariance(const Normal& normal, double variance, double (&o
         }
     for (int i = 0; i < 3; ++i)
         for (int j = 0; j < 3; ++j) out[6 * i + j + 3] = out[6 * (j + 3) + i] = -X[i][j];
-    // 4. Refuse a covariance that is not finite (x - x is nan then) or has a variance that is not positive.
+    // 4. Return false for a covariance that is not finite (x - x is nan then) or has a variance that is not positive.
     double total = 0.0;
     for (const double element : out) total += element;
     if (!(total - total == 0.0)) return false;

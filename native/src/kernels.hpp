@@ -17,9 +17,9 @@ struct FocalLengths {
     double fx, fy;
 };
 
-// Return the MSAC cost of a pose (px^2): the sum of the squared reprojection errors, each truncated at limit2 (px^2).
-// As soon as the sum has reached `stop`, the loop ends and some number that is not below `stop` is returned.
-// Source: Torr and Zisserman, MLESAC, CVIU 2000.
+// Return the MSAC cost of a pose (px^2): the sum of the squared reprojection errors, each truncated at limit2 (px^2); a
+// point behind the camera costs limit2.  As soon as the sum has reached `stop`, the loop ends and some number that is
+// not below `stop` is returned.  Source: Torr and Zisserman, MLESAC, CVIU 2000.
 static double msac_cost(const rse_pf::Columns<float>& rows, int64_t count, const FocalLengths& focal, const Pose& pose,
                     double limit2, double stop) {
     typedef Lanes<float> F;
@@ -59,9 +59,10 @@ enum class Loss {
     kSquared,    // e2
 };
 
-// Fill in the normal equations at a pose, and return the cost (px^2).  The cost is infinite under the Cauchy and the
-// squared loss where a point lies behind the camera.  Under the truncated loss, `inliers` becomes the number of rows
-// with a squared error below limit2.
+// Write the normal equations at a pose, in which each row has the weight of the loss, and return the cost (px^2).  The
+// cost is infinite under the Cauchy and the squared loss where a point lies behind the camera; under the truncated loss
+// such a point costs limit2.  Under the truncated loss, `inliers` becomes the number of rows with a squared error below
+// limit2; under the others it is not written.  limit2 is not used by the squared loss.
 template <class T, Loss loss>
 static double linearise(const rse_pf::Columns<T>& rows, int64_t count, const FocalLengths& focal, const Pose& pose,
                          double limit2, Normal& normal, int64_t& inliers) {
@@ -152,7 +153,7 @@ static double linearise(const rse_pf::Columns<T>& rows, int64_t count, const Foc
         b4 = b4 + (eu * a1 + ev * ab);
         b5 = b5 + (ev * a - eu * b);
     }
-    // 4. Sum the lanes.
+    // 4. Sum the lanes of each element, and return the cost.
     const F* upper[6][6] = {{&A00, &zero, &A02, &A03, &A04, &A05}, {nullptr, &A11, &A12, &A13, &A14, &A15},
                             {nullptr, nullptr, &A22, &A23, &A24, &A25}, {nullptr, nullptr, nullptr, &A33, &A34, &A35},
                             {nullptr, nullptr, nullptr, nullptr, &A44, &A45}, {nullptr, nullptr, nullptr, nullptr, nullptr, &A55}};
@@ -169,8 +170,9 @@ static double linearise(const rse_pf::Columns<T>& rows, int64_t count, const Foc
     return loss == Loss::kCauchy ? limit2 * logs : static_cast<double>(sum<T>(cost));
 }
 
-// Project `count` rows by a pose, and write to the workspace for each row the pixel relative to the principal point,
-// the inverse depth (1/m), and the squared reprojection error (px^2), which is infinite behind the camera.
+// Project `count` rows by a pose, and write to the workspace (u, v, z_inverse, error2) for each row the projected pixel
+// relative to the principal point, the inverse depth (1/m), and the squared reprojection error (px^2), which is
+// infinite for a point behind the camera.
 static void project(const rse_pf::Columns<double>& rows, int64_t count, const FocalLengths& focal, const Pose& pose,
                     const rse_pf::Workspace& view) {
     typedef Lanes<double> F;

@@ -36,7 +36,8 @@ struct DepthImage {
     int64_t width, height;
 };
 
-// Return the index of the first depth of a pixel's patch, -1 if the patch is not inside the image.
+// Return the index of the first depth of the 3x3 patch around the nearest pixel, -1 if the patch is not inside the
+// image.
 int64_t first_of_patch(const DepthImage& image, const double* pixel) {
     const double column = __builtin_rint(pixel[0]), row = __builtin_rint(pixel[1]);
     const bool is_inside = column >= 1.0 && row >= 1.0 && column < static_cast<double>(image.width - 1) &&
@@ -51,8 +52,9 @@ void prefetch_patch(const DepthImage& image, int64_t first) {
     for (int64_t row = 0; row < 3; ++row) __builtin_prefetch(image.depth_m + first + row * image.width);
 }
 
-// Return the median depth (metres) of the 3x3 patch that begins at an index.  NaN where fewer than kMinDepths are
-// valid, where they differ by `spread` times the median or more (a depth edge), or where the median is out of range.
+// Return the median (the lower one of two) of the valid depths of the 3x3 patch that begins at an index, metres.  NaN
+// where fewer than kMinDepths are valid, where the largest and the smallest of them differ by `spread` times the median
+// or more (a depth edge), or where the median is not within min_depth_m..max_depth_m.
 double median_of_patch(const DepthImage& image, int64_t first, double min_depth_m, double max_depth_m, double spread) {
     // 1. Read the depths; invalid ones become infinite, and are sorted to the end.
     float ascending[kPatch];
@@ -64,14 +66,14 @@ double median_of_patch(const DepthImage& image, int64_t first, double min_depth_
         ascending[k] = is_valid ? depth : __builtin_inff();
     }
     if (count < kMinDepths) return not_a_number();
-    // 2. Sort them.
+    // 2. Sort the nine depths.
 #pragma GCC unroll 25
     for (const auto& pair : kExchanges) {
         const float a = ascending[pair[0]], b = ascending[pair[1]];
         ascending[pair[0]] = b < a ? b : a;
         ascending[pair[1]] = b < a ? a : b;
     }
-    // 3. Take the median of the valid depths, and test it.
+    // 3. Take the median of the valid depths, and test their difference and its range.
     const double median = static_cast<double>(ascending[(count - 1) / 2]);
     const double difference = static_cast<double>(ascending[count - 1]) - static_cast<double>(ascending[0]);
     const bool is_reliable = difference < median * spread && median >= min_depth_m && median <= max_depth_m;
@@ -132,7 +134,8 @@ __attribute__((visibility("default"))) int64_t rse_pf_match(const uint8_t* refer
         if (candidate < best_of_frame_row[nearest[row]]) best_of_frame_row[nearest[row]] = candidate;
     }
 
-    // 2. Write the matches by ascending distance, by a counting sort over the distances 0..256.
+    // 2. Write the pairs in which the frame row has kept the reference row that chose it, by ascending distance, by a
+    // counting sort over the distances 0..256.
     int64_t starts[kBits + 2] = {};
     const auto is_matched = [&](int64_t row) {
         return nearest[row] != kNone && row_of(best_of_frame_row[nearest[row]]) == static_cast<uint64_t>(row);

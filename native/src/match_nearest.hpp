@@ -35,13 +35,14 @@ constexpr int64_t kBlock = 32;
 constexpr uint64_t kNone = ~uint64_t{0};
 
 struct TwoNearest {
-    uint64_t first, second;  // candidates
+    uint64_t first, second;  // candidates, or kNone
 };
 
-// How descriptors are compared: word by word, or by vector instructions.
+// How descriptors are compared: word by word, or by vector instructions.  The results are equal.
 enum class Lanes { words, avx2, avx512 };
 
-// The descriptors to search in, and a copy of them in the layout that the vector instructions need.
+// The descriptors to search in, and a copy of them in the layout that the vector instructions need (none for
+// Lanes::words, whole blocks of 32 rows for Lanes::avx2).
 struct Search {
     const uint8_t* descriptors;
     int64_t rows;
@@ -55,7 +56,7 @@ inline uint64_t row_of(uint64_t candidate) { return candidate & 0xffffffffu; }
 
 inline uint64_t count_bits(uint64_t word) { return static_cast<uint64_t>(__builtin_popcountll(word)); }
 
-// Replace the second or both of two candidates by a smaller one.
+// Keep in `two` the two smallest of its candidates and another candidate.
 inline void keep_two(TwoNearest& two, uint64_t candidate) {
     if (candidate >= two.second) return;
     two.second = candidate < two.first ? two.first : candidate;
@@ -68,7 +69,8 @@ inline uint64_t read_word(const uint8_t* at) {
     return value;
 }
 
-// Continue a search at row `begin`, word by word, and return the two nearest of all rows.
+// Continue a search at row `begin`, word by word, with the two nearest of the rows before, and return the two nearest
+// of all rows.
 inline TwoNearest two_nearest_by_words(const Search& search, const uint8_t* query, int64_t begin, TwoNearest two) {
     uint64_t second = two.second == kNone ? kBits + 1 : distance_of(two.second);
     const uint64_t a = read_word(query), b = read_word(query + 8), c = read_word(query + 16), d = read_word(query + 24);
@@ -91,15 +93,15 @@ typedef int16_t Distances __attribute__((vector_size(32)));
 
 // Start value of a search for the smallest distance, larger than all Hamming distances.
 constexpr int16_t kFar = 0x7fff;
-// Bytes of a descriptor, three quarters of it, after which a block of rows is dropped if all rows are too far already:
-// most are.
+// Bytes of a descriptor, three quarters of it, after which a block of 32 rows is dropped if all its rows are already
+// too far from the query: most blocks are.
 constexpr int64_t kEarlyBytes = 24;
 // Most blocks of 32 rows of a search by AVX2: twice the number of a block, plus one, has to fit into a signed number of
 // 16 bits.
 constexpr int64_t kMaxBlocks = 0x3fff;
 
 // For each of 16 lanes the two smallest distances, and the half block (2 * block, plus 1 for odd rows) that holds the
-// row of the first of them.
+// row of the first of them.  Lane k compares the rows 2 k and 2 k + 1 of each block.
 struct SixteenLanes {
     Distances first, second, half;
 };
@@ -136,7 +138,7 @@ RSE_PF_AVX2 inline Block count_differing_bits(const uint8_t* descriptors, const 
 RSE_PF_AVX2 inline int min_of_eight(__m128i numbers) { return _mm_extract_epi16(_mm_minpos_epu16(numbers), 0); }
 
 // Return a distance that at least two rows do not exceed: the larger of the smallest distances of the two halves of the
-// lanes.  It bounds the second smallest distance of all rows.
+// lanes.  The second smallest distance of all rows so far is at most this one.
 RSE_PF_AVX2 inline int bound_second_distance(const SixteenLanes& lanes) {
     const __m256i first = reinterpret_cast<__m256i>(lanes.first);
     const int low = min_of_eight(_mm256_castsi256_si128(first));
@@ -144,7 +146,7 @@ RSE_PF_AVX2 inline int bound_second_distance(const SixteenLanes& lanes) {
     return low > high ? low : high;
 }
 
-// Return the two nearest rows by AVX2, in blocks of 32 rows.
+// Return the two rows nearest to a query by AVX2, in blocks of 32 rows; of the second one only the distance is valid.
 RSE_PF_AVX2 inline TwoNearest two_nearest_by_blocks(const Search& search, const uint8_t* query) {
     alignas(32) uint8_t query_bytes[kBytes * kBlock];
     for (int64_t k = 0; k < kBytes; ++k) std::memset(query_bytes + kBlock * k, query[k], kBlock);
@@ -191,7 +193,7 @@ RSE_PF_AVX512 inline Eight count_bits_of_eight(const uint64_t* at, uint64_t quer
     return reinterpret_cast<Eight>(_mm512_popcnt_epi64(reinterpret_cast<__m512i>(words ^ query)));
 }
 
-// Return the two nearest rows by AVX-512, eight rows at a time.
+// Return the two rows nearest to a query by AVX-512, eight rows at a time.
 RSE_PF_AVX512 inline TwoNearest two_nearest_by_eights(const Search& search, const uint8_t* query) {
     const uint64_t a = read_word(query), b = read_word(query + 8), c = read_word(query + 16), d = read_word(query + 24);
     const Eight none = {kNone, kNone, kNone, kNone, kNone, kNone, kNone, kNone};
@@ -216,8 +218,9 @@ RSE_PF_AVX512 inline TwoNearest two_nearest_by_eights(const Search& search, cons
 }
 #endif
 
-// Choose the widest instructions that the processor has and `widest` allows, and copy the descriptors to the layout
-// that they read: word k of eight rows one after the other (AVX-512), or byte k of 32 rows (AVX2).
+// Return a search in the descriptors with the widest instructions that the processor has and `widest` allows.  The
+// descriptors are copied to `layout`, memory of the caller, as these instructions read them: word k of eight rows one
+// after the other (AVX-512), or byte k of 32 rows (AVX2).
 inline Search prepare_search(const uint8_t* descriptors, int64_t rows, uint64_t* layout, Lanes widest) {
     Search search = {descriptors, rows, layout, Lanes::words};
 #if defined(__x86_64__)

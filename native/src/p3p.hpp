@@ -23,8 +23,8 @@ RSE_PF_INLINE double product_trace(const Conic& a, const Conic& b) {
     return a.xx * b.xx + a.yy * b.yy + a.zz * b.zz + 2.0 * (a.xy * b.xy + a.xz * b.xz + a.yz * b.yz);
 }
 
-// Return a real root of t^3 + a t^2 + b t + c by Newton's method, started outside of the two extrema, where it
-// converges.
+// Return a real root of t^3 + a t^2 + b t + c by Newton's method, started outside of the two extrema (if the cubic has
+// them), where it converges.
 static double find_real_root(double a, double b, double c) {
     const double discriminant = a * a - 3.0 * b;
     double t = -a / 3.0;
@@ -45,7 +45,7 @@ static double find_real_root(double a, double b, double c) {
         const double value = ((t + a) * t + b) * t + c;
         if (absolute(3.0 * t * t + 2.0 * a * t + b) < 1e-4) t += value > 0.0 ? -1.0 : 1.0;
     }
-    // 2. Iterate.
+    // 2. Apply Newton steps to t until they are as small as rounding errors.
     for (int i = 0; i < 24; ++i) {
         const double slope = (3.0 * t + 2.0 * a) * t + b;
         if (slope == 0.0) break;

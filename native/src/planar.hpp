@@ -24,7 +24,8 @@ constexpr double kSameTranslationM = 0.05;
 // Sine of the largest angle, 1 degree, between the rotations of two poses that count as the same.
 constexpr double kSameRotationSine = 0.017452406437283512;
 
-// Refine a pose by the Levenberg-Marquardt method under the squared loss; return false if it diverges.
+// Refine a pose in place over the rows by the Levenberg-Marquardt method under the squared loss.  Return false if it
+// diverges, or if a point lies behind the camera at the first pose.
 static bool refine_second_pose(const rse_pf::Columns<double>& rows, int64_t count, const FocalLengths& focal, Pose& pose) {
     Normal normal, next_normal;
     int64_t unused_inliers = 0;
@@ -54,10 +55,12 @@ static bool refine_second_pose(const rse_pf::Columns<double>& rows, int64_t coun
 }
 
 // Find the second pose of a planar scene, and return its sum of squared reprojection errors over the inliers (px^2), or
-// -1 where there is none: the refinement diverges, or returns to the first pose.
+// -1 where there is none: the plane faces the camera or contains the line of sight, or the refinement diverges or
+// returns to the first pose.
 //
-// data.inliers holds the `count` inliers of the first pose; `origin` is the caller's world origin that was subtracted
-// from the points.
+// data.inliers holds the `count` inliers of the first pose, `pose`; `origin` is the point of the caller's world
+// (metres) that was subtracted from the points.  The projections in the workspace become those of the second pose if
+// there is one.
 static double find_second_pose(const rse_pf::Workspace& data, int64_t count, const FocalLengths& focal, const Pose& pose,
                                const Vector3& origin, Pose& second) {
     const rse_pf::Columns<double>& rows = data.inliers;
@@ -96,7 +99,8 @@ static double find_second_pose(const rse_pf::Workspace& data, int64_t count, con
     second = compose(rotation, centre - rotate(rotation, centre), pose);
     // 3. Refine the rotated pose.
     if (!refine_second_pose(rows, count, focal, second)) return -1.0;
-    // 4. Compare both poses in the caller's world, as pose_difference of rse_pf/geometry.py does.
+    // 4. Compare both poses in the caller's world, as pose_difference of rse_pf/geometry/transforms.py does; equal ones
+    // are no second pose.
     double D[3][3];
     for (int i = 0; i < 3; ++i)
         for (int j = 0; j < 3; ++j)
@@ -107,14 +111,14 @@ static double find_second_pose(const rse_pf::Workspace& data, int64_t count, con
     const double angle_sine = 0.5 * square_root(a * a + b * b + d * d);
     const double angle_cosine = 0.5 * (D[0][0] + D[1][1] + D[2][2] - 1.0);
     if (distance_m < kSameTranslationM && angle_cosine > 0.0 && angle_sine < kSameRotationSine) return -1.0;
-    // 5. Sum the squared errors.
+    // 5. Sum the squared reprojection errors of the inliers at the second pose.
     project(rows, count, focal, second, data);
     double squares = 0.0;
     for (int64_t i = 0; i < count; ++i) squares += data.error2[i];
     return squares;
 }
 
-// Return the standard deviation of the inverse depth over its mean, for the first `count` rows that `project` wrote.
+// Return the ratio of standard deviation and mean of the inverse depths of the first `count` rows that `project` wrote.
 static double inverse_depth_variation(const rse_pf::Workspace& view, int64_t count) {
     double w = 0.0, ww = 0.0;
     for (int64_t i = 0; i < count; ++i) {

@@ -19,7 +19,7 @@ constexpr int64_t kFewRows = 32;
 constexpr int64_t kMinTrialsOfFewRows = 30;
 // Most Levenberg-Marquardt steps of the last refinement: a bound for input on which it does not converge.
 constexpr int kMaxRefinementSteps = 100;
-// Step (largest component, metres and radians) at which the last refinement stops: the remaining error is a tenth of
+// Step (largest component, metres and radians) below which the last refinement stops: the remaining error is a tenth of
 // it.
 constexpr double kConvergedStep = 1e-6;
 
@@ -50,8 +50,8 @@ struct Sampler {
     }
 };
 
-// Return the number of samples after which one of them holds three inliers with the wanted probability (confidence),
-// where `inliers` of n rows are inliers.
+// Return the number of samples after which at least one of them holds three inliers with the wanted probability
+// (confidence), where `inliers` of n rows are inliers; infinity for fewer than three inliers, 0 where all rows are.
 static inline double required_trials(int64_t inliers, int64_t n, double confidence) {
     if (inliers < 3) return kInfinity;
     const double k = static_cast<double>(inliers), all_rows = static_cast<double>(n);
@@ -60,15 +60,16 @@ static inline double required_trials(int64_t inliers, int64_t n, double confiden
     return natural_log(1.0 - confidence) / natural_log(1.0 - share);
 }
 
-// A pose with its MSAC cost (px^2) and its number of inliers.
+// A pose with its MSAC cost (px^2) and its number of inliers, both over all rows.
 struct Hypothesis {
     Pose pose;
     double cost;
     int64_t inliers;
 };
 
-// Refine a hypothesis by Gauss-Newton steps under the truncated loss, until a step does not lower the cost, lowers it
-// by less than 0.1 %, or kLocalSteps are done.  `limit2` is the squared inlier limit (px^2).
+// Refine the pose of a hypothesis in place by Gauss-Newton steps under the truncated loss, until a step does not lower
+// the cost, lowers it by less than 0.1 %, or kLocalSteps are done.  Cost and inliers of the hypothesis are written; the
+// values before are not read.  `limit2` is the squared inlier limit (px^2).
 static void refine_locally(const rse_pf::Columns<float>& rows, int64_t n, const FocalLengths& focal, double limit2,
                            Hypothesis& hypothesis) {
     Normal normal;
@@ -90,7 +91,7 @@ static void refine_locally(const rse_pf::Columns<float>& rows, int64_t n, const 
 struct RansacOptions {
     double limit2;      // squared inlier limit, px^2
     double confidence;  // probability with which some sample holds three inliers when RANSAC stops
-    int64_t max_iterations, min_iterations;
+    int64_t max_iterations, min_iterations;  // bounds of the number of samples; the maximum wins
 };
 
 // Find the hypothesis with the lowest MSAC cost by LO-RANSAC; return false if no sample has a pose.
@@ -118,13 +119,13 @@ static bool run_ransac(const rse_pf::Task& task, const FocalLengths& focal, cons
         Pose poses[4];
         const int solutions = solve_p3p(bearings, points, poses);
         for (int i = 0; i < solutions; ++i) {
-            // 2. Drop a pose as soon as its cost exceeds the lowest cost.
+            // 2. Drop a pose as soon as its cost reaches the lowest cost so far.
             if (!(msac_cost(data.single, n, focal, poses[i], options.limit2, best.cost) < best.cost)) continue;
-            // 3. Refine it over all rows under the truncated loss (local optimisation).
+            // 3. Refine the pose over all rows under the truncated loss (local optimisation).
             Hypothesis hypothesis = {poses[i], 0.0, 0};
             refine_locally(data.single, n, focal, options.limit2, hypothesis);
             if (!(hypothesis.cost < best.cost)) continue;
-            // 4. Keep it, and compute anew how many samples its inlier ratio requires.
+            // 4. Keep the hypothesis as the best one, and compute anew how many samples its inlier ratio requires.
             best = hypothesis;
             required = required_trials(best.inliers, n, options.confidence);
         }
@@ -132,8 +133,9 @@ static bool run_ransac(const rse_pf::Task& task, const FocalLengths& focal, cons
     return best.cost < kInfinity;
 }
 
-// Refine a pose over the rows by the Levenberg-Marquardt method, undamped (Gauss-Newton) until a step fails.  Return
-// false where the first cost is infinite: a point lies behind the camera.
+// Refine a pose in place over the rows by the Levenberg-Marquardt method, undamped (Gauss-Newton) until a step fails.
+// limit2 (px^2) is the scale of the loss.  Return false where the first cost is infinite, because a point lies behind
+// the camera: the pose stays then.  Return true also if kMaxRefinementSteps end the refinement before it has converged.
 template <Loss loss>
 static bool refine(const rse_pf::Columns<double>& rows, int64_t count, const FocalLengths& focal, double limit2,
                    Pose& pose) {
@@ -166,8 +168,9 @@ static bool refine(const rse_pf::Columns<double>& rows, int64_t count, const Foc
     return true;
 }
 
-// Copy the inliers, which are the rows whose squared error (as `project` wrote it) is at most limit2, to data.inliers,
-// pad the last vector, and write their row numbers unless `numbers` is null.  Return the number of inliers.
+// Copy the inliers, which are the rows whose squared error (as `project` wrote it) is at most limit2 (px^2), to
+// data.inliers, and pad the last vector.  Write their ascending row numbers unless `numbers`, memory for n numbers, is
+// null.  Return the number of inliers.
 static int64_t gather_inliers(const rse_pf::Workspace& data, int64_t n, double limit2, uint32_t* numbers) {
     const rse_pf::Columns<double>&from = data.all, &to = data.inliers;
     int64_t count = 0;
@@ -187,8 +190,9 @@ static int64_t gather_inliers(const rse_pf::Workspace& data, int64_t n, double l
     return count;
 }
 
-// Refine a pose over its inliers under the Cauchy loss, and return their number.  Afterwards data.inliers holds them,
-// and the projections in the workspace are those of the inliers at the refined pose.
+// Refine a pose in place over its inliers under the Cauchy loss, and return their number; with fewer than four the pose
+// stays.  The inliers are those of the pose before it is refined.  Afterwards data.inliers holds them, and the
+// projections in the workspace are those of these rows at the refined pose.
 static int64_t refine_over_inliers(const rse_pf::Workspace& data, int64_t n, const FocalLengths& focal, double limit2,
                                    Pose& pose) {
     project(data.all, n, focal, pose, data);
@@ -199,19 +203,20 @@ static int64_t refine_over_inliers(const rse_pf::Workspace& data, int64_t n, con
     return count;
 }
 
-// Estimate a pose of the rows in the workspace; return false if there is none.  `origin` is the caller's world origin
-// that was subtracted from the points.
+// Estimate a pose of the rows in the workspace; return false if there is none.  `origin` is the point of the caller's
+// world (metres) that was subtracted from the points; the pose maps the shifted points to the camera.
 static bool estimate_pose(const rse_pf::Task& task, const FocalLengths& focal, const RansacOptions& options,
                           const Vector3& origin, Pose& pose) {
-    // 1. Search by LO-RANSAC in single precision.
+    // 1. Search for the pose by LO-RANSAC, whose costs are computed in single precision.
     Hypothesis best;
     if (!run_ransac(task, focal, options, best)) return false;
-    // 2. Refine over the inliers in double precision.
+    // 2. Refine the pose over its inliers in double precision.
     const rse_pf::Workspace& data = *task.workspace;
     const int64_t n = task.request->rows;
     pose = best.pose;
     const int64_t count = refine_over_inliers(data, n, focal, options.limit2, pose);
-    // 3. For a planar scene, RANSAC may have found the worse one of its two poses: take the one with the lower cost.
+    // 3. For a planar scene, RANSAC may have found the worse one of its two poses: take the one with the lower MSAC
+    // cost.
     if (count >= 4 && inverse_depth_variation(data, count) < kWeakPerspective) {
         Pose second;
         if (find_second_pose(data, count, focal, pose, origin, second) >= 0.0) {

@@ -84,14 +84,15 @@ static inline Pose apply_twist(const double (&twist)[6], const Pose& pose) {
     return compose(step.R, step.t, pose);
 }
 
-// The normal equations of a left perturbation (rho, phi) of a pose: A = J^T W J and b = J^T W r.  Only the upper
-// triangle of A is filled.
+// The normal equations A x = b of a left perturbation x = (rho, phi) of a pose (m, rad): A = J^T W J and b = J^T W r,
+// where r is measured minus predicted, and J the Jacobian of the prediction.  Only the upper triangle of A is filled.
 struct Normal {
     double A[6][6];
     double b[6];
 };
 
-// Solve (A + damping diag(A)) x = b by Cholesky decomposition; return false where the matrix is not positive definite.
+// Solve (A + damping diag(A)) x = b by Cholesky decomposition.  Return false, with an x that is not valid, where the
+// matrix is not positive definite.
 static bool solve_normal_equations(const Normal& normal, double damping, double (&x)[6]) {
     // 1. Decompose the matrix into L L^T.
     double L[6][6], inverse[6];

@@ -17,7 +17,8 @@ constexpr double kEqualFit = 9.0;
 // Increase of the sum of squared errors from the first to the second pose of a planar scene, in units of the pixel
 // variance, below which both fit similarly well, and the pose is weak.
 constexpr double kSimilarFit = 40.0;
-// Smallest variance of a pixel (px^2): messages are rounded to 0.01 px, and four points may fit by luck.
+// Smallest variance of a pixel (px^2) that is derived from the errors of the inliers: messages are rounded to 0.01 px,
+// and four points may fit by luck.
 constexpr double kMinPixelVariance = 0.01;
 // Most RANSAC samples of the test whether the points are mirrored: a correct reflection has many inliers and is found
 // soon.
@@ -43,7 +44,8 @@ static Pose read_matrix(const double* T, const Vector3& centre) {
 }
 
 // Return the status of a request without an acceptable pose: COLLINEAR where all points or all pixels lie on a line,
-// which tells the caller more than NO_CONSENSUS.
+// which tells the caller more than NO_CONSENSUS.  The result gets `count` as its inlier_count, and the width_to_length
+// of the points, or of the pixels if the points do not lie on a line and the pixels are narrower.
 static int32_t status_without_pose(const rse_pf::Task& task, int64_t count) {
     const rse_pf::Workspace& data = *task.workspace;
     rse_pf_pnp_result& result = *task.result;
@@ -56,7 +58,8 @@ static int32_t status_without_pose(const rse_pf::Task& task, int64_t count) {
     return result.width_to_length < kCollinear ? RSE_PF_PNP_COLLINEAR : RSE_PF_PNP_NO_CONSENSUS;
 }
 
-// Return the first reason why a pose is weak, RSE_PF_PNP_OK where there is none.
+// Return the first reason why a pose is weak, RSE_PF_PNP_OK where there is none.  The standard deviations that are
+// compared are the roots of the summed variances of the three components of translation, and of those of rotation.
 static int32_t find_weakness(const rse_pf_pnp_request& request, const rse_pf_pnp_result& result) {
     const double count = static_cast<double>(result.inlier_count);
     const double(&C)[36] = result.covariance;
@@ -70,7 +73,7 @@ static int32_t find_weakness(const rse_pf_pnp_request& request, const rse_pf_pnp
     return RSE_PF_PNP_OK;
 }
 
-// Reflect all points in the origin, which mirrors the scene.
+// Reflect all points of the workspace in the origin, in place, which mirrors the scene.
 static void reflect_points(const rse_pf::Workspace& data, int64_t n) {
     for (int64_t i = 0; i < n; ++i) {
         data.single.x[i] = -data.single.x[i];
@@ -83,6 +86,7 @@ static void reflect_points(const rse_pf::Workspace& data, int64_t n) {
 }
 
 // Estimate the pose, or take the pose of the request; write its evidence to the result, and return the status.
+// `centre` (metres, caller's world) was subtracted from the points of the workspace, which may be mirrored afterwards.
 static int32_t solve_centred(const rse_pf::Task& task, const Vector3& centre) {
     const rse_pf_pnp_request& request = *task.request;
     const rse_pf::Workspace& data = *task.workspace;
@@ -91,7 +95,7 @@ static int32_t solve_centred(const rse_pf::Task& task, const Vector3& centre) {
     const double limit2 = request.inlier_px * request.inlier_px, area = static_cast<double>(request.width) * request.height;
     const int64_t n = request.rows;
     const RansacOptions options = {limit2, request.confidence, request.max_iterations, request.min_iterations};
-    // 1. Estimate the pose.
+    // 1. Take the pose of the request, or estimate one.
     Pose pose;
     if (request.T_camera_world != nullptr)
         pose = read_matrix(request.T_camera_world, centre);
@@ -99,7 +103,7 @@ static int32_t solve_centred(const rse_pf::Task& task, const Vector3& centre) {
         return status_without_pose(task, 0);
     write_matrix(result.T_camera_world, pose, centre);
 
-    // 2. Find its inliers; afterwards the projections in the workspace are those of the inliers only.
+    // 2. Find the inliers of the pose; afterwards the projections in the workspace are those of the inliers only.
     project(data.all, n, focal, pose, data);
     const int64_t count = gather_inliers(data, n, limit2, task.inliers);
     if (count < 4) return status_without_pose(task, count);
@@ -130,7 +134,7 @@ static int32_t solve_centred(const rse_pf::Task& task, const Vector3& centre) {
     int64_t unused_inliers = 0;
     linearise<double, Loss::kSquared>(data.inliers, count, focal, pose, 0.0, normal, unused_inliers);
     const bool is_constrained = compute_covariance(normal, variance, result.covariance);
-    // 5. Refuse degenerate geometry.
+    // 5. Refuse inliers on a line or in one spot of the image, and a pose with an unconstrained motion.
     if (status == RSE_PF_PNP_SOLVED) {
         result.width_to_length = result.inlier_width_to_length;
         if (result.width_to_length < kCollinear) status = RSE_PF_PNP_COLLINEAR;
@@ -138,7 +142,8 @@ static int32_t solve_centred(const rse_pf::Task& task, const Vector3& centre) {
         else if (!is_constrained) status = RSE_PF_PNP_UNCONSTRAINED;
     }
     result.reason = find_weakness(request, result);
-    // 6. Compare with the second pose of a planar scene by a likelihood ratio.
+    // 6. Compare the pose with the second pose of a planar scene by a likelihood ratio: an equal fit refuses the pose,
+    // a similar one makes it weak.
     if (inverse_depth_variation(data, count) < kWeakPerspective) {
         Pose second;
         const double second_squares = find_second_pose(data, count, focal, pose, centre, second);
@@ -152,8 +157,8 @@ static int32_t solve_centred(const rse_pf::Task& task, const Vector3& centre) {
     const bool has_enough_inliers = static_cast<double>(count) >= request.weak_inlier_ratio * static_cast<double>(n);
     if (status != RSE_PF_PNP_SOLVED || has_enough_inliers) return status;
 
-    // 7. Where few rows are inliers, test whether the world is mirrored: its reflection then has at least twice as
-    // many.
+    // 7. Where the inlier ratio is weak, test whether the world is mirrored: a pose of the reflected points then has at
+    // least twice as many inliers.
     RansacOptions mirror_options = options;
     mirror_options.max_iterations =
         mirror_options.max_iterations < kMirrorIterations ? mirror_options.max_iterations : kMirrorIterations;
@@ -168,7 +173,7 @@ static int32_t solve_centred(const rse_pf::Task& task, const Vector3& centre) {
 }
 
 // Copy the correspondences to the workspace: points relative to `centre`, pixels relative to the principal point, in
-// double and in single precision, with the last vector of eight rows padded.
+// double and in single precision, with the last vector of eight rows padded by rows that are never inliers.
 static void fill_rows(const rse_pf::Task& task, const Vector3& centre) {
     const rse_pf_pnp_request& request = *task.request;
     const rse_pf::Workspace& data = *task.workspace;
@@ -195,8 +200,8 @@ static void fill_rows(const rse_pf::Task& task, const Vector3& centre) {
     }
 }
 
-// Return the coordinate-wise median of up to 15 points, spread evenly over the rows.  Subtracting it keeps the digits
-// of single precision; a mean would be pulled away by outliers.
+// Return the coordinate-wise median (metres) of up to 15 points of the request, spread evenly over the rows.
+// Subtracting it keeps the digits of single precision; a mean would be pulled away by outliers.
 static Vector3 compute_centre(const rse_pf_pnp_request& request) {
     constexpr int64_t kMaxSamples = 15;
     const int64_t samples = request.rows < kMaxSamples ? request.rows : kMaxSamples;
@@ -214,7 +219,7 @@ static Vector3 compute_centre(const rse_pf_pnp_request& request) {
     return {median[0], median[1], median[2]};
 }
 
-// Solve a validated request, and write its result.
+// Solve a validated request, and write its result: status, pose, evidence, and the upper triangle of the covariance.
 static void solve_task(const rse_pf::Task& task) {
     const Vector3 centre = compute_centre(*task.request);
     fill_rows(task, centre);

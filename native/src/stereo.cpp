@@ -38,24 +38,26 @@ constexpr int64_t kStrip = RSE_PF_STEREO_MAX_DISPARITY_PX + kSide + kPaddedSide;
 constexpr int64_t kPeakRadius = 2;
 // Most Gauss-Newton steps of the sub-pixel refinement of a disparity.
 constexpr int kMaxSteps = 8;
-// Step (px) of the sub-pixel refinement of a disparity below which the refinement has converged.
+// Step (px) of the sub-pixel refinement of a disparity below which the refinement has converged and stops.
 constexpr double kConvergedPx = 0.002;
 // Largest distance (px) between the refined disparity and the integer disparity: farther away lies another peak of the
-// correlation.
+// correlation, and the feature gets no disparity.
 constexpr double kMaxShiftPx = 1.25;
-// Largest last step (px) of a sub-pixel refinement that is accepted, although it has not converged.
+// Largest last step (px) of a sub-pixel refinement whose result is accepted, although it has not converged.
 constexpr double kMaxLastStepPx = 0.05;
 
 double not_a_number() { return __builtin_nan(""); }
 RSE_PF_STEREO_INLINE double absolute(double value) { return value < 0.0 ? -value : value; }
 
-// The image that holds a feature, and the image in which it is searched for.
+// The image that holds a feature (`from`), and the image in which it is searched for (`to`); both are height x width
+// grey levels, row-major.
 struct Images {
     const uint8_t *from, *to;
     int64_t width, height;
 };
 
-// The pixels of a patch, their sum and the sum of their squares; sums of products times kCount stay below 2^30.
+// The pixels of a patch, their sum and the sum of their squares.  Such sums times kCount stay below 2^30, so they fit
+// into 32 bits.
 struct Patch {
     int16_t pixels[kSide][kPaddedSide];
     int32_t sum, sum2;
@@ -75,7 +77,8 @@ RSE_PF_STEREO_INLINE Patch read_patch(const Images& images, int64_t column, int6
     return patch;
 }
 
-// Write the sum of products of a patch with the pixels of a strip, for `count` horizontal offsets of the patch.
+// Write to products[k] the sum of the products of the patch's pixels with those of the strip from column k on, for k
+// from 0 to count - 1.
 void correlate_portably(const Patch& patch, const int16_t* strip, int64_t count, int32_t* products) {
     for (int64_t at = 0; at < count; ++at, ++strip) {
 #if defined(__x86_64__)
@@ -116,26 +119,28 @@ RSE_PF_STEREO_AVX2 void correlate_with_avx2(const Patch& patch, const int16_t* s
 
 using Correlate = void(const Patch& patch, const int16_t* strip, int64_t count, int32_t* products);
 
-// The best disparity with its signed squared correlation (-1..1), and that of the best one outside of its peak.
+// The best disparity (px) of a search, its squared correlation with the sign of the correlation (-1..1), and the same
+// of the best disparity that is more than kPeakRadius away.  A correlation is -1 where there is nothing to compare.
 struct Match {
     int64_t disparity = 0;
     double correlation2 = -1.0, rival_correlation2 = -1.0;
 };
 
-// Find the disparity d, 0..max_disparity, for which the patch at (column, row) of an image correlates best with that at
-// (column + sign * d, row) of the other image.  The smallest of equal disparities is taken.
+// Find the disparity d, 0..max_disparity, for which the patch at (column, row) of images.from correlates best with that
+// at (column + sign * d, row) of images.to.  The smallest of equally good disparities is taken.  A patch without
+// contrast, or without a patch in reach in the other image, has the correlation -1.
 RSE_PF_STEREO_INLINE Match find_match(const Images& images, int64_t column, int64_t row, int64_t max_disparity,
                                       int64_t sign, Correlate* correlate) {
     Match best;
     const Patch patch = read_patch(images, column, row);
     const int32_t variance = static_cast<int32_t>(kCount) * patch.sum2 - patch.sum * patch.sum;
     if (variance <= 0) return best;
-    // 1. Find the first and last column of the other image whose patch lies inside.
+    // 1. Find the first and last column of the search range whose patch lies inside the other image.
     int64_t first = sign < 0 ? column - max_disparity : column, last = sign < 0 ? column : column + max_disparity;
     first = first < kRadius + 1 ? kRadius + 1 : first;
     last = last > images.width - kRadius - 2 ? images.width - kRadius - 2 : last;
     if (first > last) return best;
-    // 2. Copy their pixels to a strip, and sum pixels and squares of each column of the strip.
+    // 2. Copy the pixels of these patches to a strip, and sum pixels and squares of each column of the strip.
     const int64_t count = last - first + 1, width = last - first + kSide;
     int16_t strip[kSide * kStrip];
     int32_t sums[kStrip], squares[kStrip];
@@ -180,7 +185,8 @@ RSE_PF_STEREO_INLINE Match find_match(const Images& images, int64_t column, int6
                                (patch_variance * static_cast<double>(other_variance > 0 ? other_variance : 1));
         correlation2[at] = other_variance > 0 ? squared : -1.0;
     }
-    // 5. In the order of ascending disparities, take the best one, then the best one outside of its peak.
+    // 5. In the order of ascending disparities, take the best one, then the best one more than kPeakRadius away from
+    // it.
     const int64_t start = sign < 0 ? count - 1 : 0, step = sign;
     const int64_t min_disparity = sign < 0 ? column - last : first - column;
     for (int64_t i = 0; i < count; ++i)
@@ -219,10 +225,12 @@ RSE_PF_STEREO_INLINE void subtract_mean(double (&values)[kCount]) {
 
 // Refine an integer disparity to a fraction of a pixel by least squares matching: Gauss-Newton steps on the difference
 // of the patches L (left) and R (right, interpolated), after the mean and the gain of brightness are removed.  Return
-// NaN where the steps do not converge, or where the patches correlate less than min_correlation2.
+// NaN where the steps do not converge or lead too far, where the right patch leaves the image, or where the squared
+// correlation of the patches is below min_correlation2.
 RSE_PF_STEREO_INLINE double refine_disparity(const Images& images, int64_t column, int64_t row, int64_t disparity,
                                              double min_correlation2) {
-    // 1. Read the left patch and its horizontal gradient, and remove from the gradient its part along the patch.
+    // 1. Read the left patch and its horizontal gradient, and subtract their means.  Subtract from the gradient its
+    // part that is a multiple of the patch: a change of gain would explain that part.
     double L[kCount], slopes[kCount], R[kCount];
     for (int64_t y = 0, i = 0; y < kSide; ++y) {
         const uint8_t* const line = images.from + (row - kRadius + y) * images.width + column - kRadius;
@@ -240,7 +248,7 @@ RSE_PF_STEREO_INLINE double refine_disparity(const Images& images, int64_t colum
     const auto start = static_cast<double>(disparity);
     double refined = start, last_step = kMaxShiftPx, correlation2 = 0.0;
     for (int step = 0; step < kMaxSteps && !(last_step < kConvergedPx); ++step) {
-        // 2. Interpolate the right patch at the present disparity.
+        // 2. Interpolate the right patch at the present disparity, and subtract its mean.
         const double x = static_cast<double>(column) - refined;
         const double whole = __builtin_floor(x), share = x - whole;
         const int64_t first = static_cast<int64_t>(whole) - kRadius;
@@ -251,7 +259,8 @@ RSE_PF_STEREO_INLINE double refine_disparity(const Images& images, int64_t colum
                 R[i] = (1.0 - share) * static_cast<double>(line[u]) + share * static_cast<double>(line[u + 1]);
         }
         subtract_mean(R);
-        // 3. Step by the difference of the patches along the gradient.
+        // 3. Scale the right patch to the gain of the left one, and add to the disparity the shift along the gradient
+        // that explains the difference of the patches.
         const double right2 = dot(R, R), product = dot(L, R);
         if (!(right2 > 0.0 && product > 0.0)) return not_a_number();
         const double move = product / right2 * dot(slopes, R) / information;
@@ -275,14 +284,15 @@ bool is_valid(const rse_pf_stereo_request& request) {
 // Return the disparity (px) of the feature at a pixel of the left image, NaN where no match passes the limits.
 RSE_PF_STEREO_INLINE double measure_disparity(const rse_pf_stereo_request& request, const double* pixel,
                                               Correlate* correlate) {
-    // 1. Round to the nearest pixel; its patch must lie inside.
+    // 1. Round the feature to the nearest pixel; the patch around it, with one pixel more on each side, must lie inside
+    // the image.
     const double u = __builtin_rint(pixel[0]), v = __builtin_rint(pixel[1]);
     const bool is_inside = u >= static_cast<double>(kRadius + 1) && v >= static_cast<double>(kRadius + 1) &&
                            u <= static_cast<double>(request.width - kRadius - 2) &&
                            v <= static_cast<double>(request.height - kRadius - 2);
     if (!is_inside) return not_a_number();
     const auto column = static_cast<int64_t>(u), row = static_cast<int64_t>(v);
-    // 2. Find the match in the right image; it must be good and unique.
+    // 2. Find the match in the right image; its correlation must be high enough, and clearly above that of its rival.
     const Images left_to_right = {request.left, request.right, request.width, request.height};
     const Match match = find_match(left_to_right, column, row, request.max_disparity_px, -1, correlate);
     if (!(match.correlation2 >= request.min_correlation2 &&
@@ -296,7 +306,7 @@ RSE_PF_STEREO_INLINE double measure_disparity(const rse_pf_stereo_request& reque
         const int64_t difference = back.disparity - match.disparity;
         if (difference > request.left_right_px || difference < -request.left_right_px) return not_a_number();
     }
-    // 4. Refine to a fraction of a pixel.
+    // 4. Refine the disparity to a fraction of a pixel; it must not be below the smallest one of the request.
     const double disparity = refine_disparity(left_to_right, column, row, match.disparity, request.min_correlation2);
     return disparity >= request.min_disparity_px ? disparity : not_a_number();
 }

@@ -32,23 +32,25 @@ constexpr int kMaxIterations = 10;
 // First iteration of a pose fit that leaves outliers out: before, the pose may be so far off that inliers look like
 // outliers.
 constexpr int kFirstGatedIteration = 3;
-// Largest component (m, rad) of a Gauss-Newton step below which a pose fit has converged.
+// A pose fit has converged when every component (m, rad) of a Gauss-Newton step without outliers is smaller than this.
 constexpr double kConvergedStep = 1e-6;
 // Smallest depth of an inlier (m); smaller depths are replaced by it, so that no division overflows.
 constexpr double kMinDepthM = 0.05;
 // Largest number of a valid request (m or px): a limit of plausible requests.
 constexpr double kMaxAbs = 1e9;
-// Largest component (m, rad) of a Gauss-Newton step: a larger step shows that the pose fit diverges.
+// Largest component (m, rad) of a Gauss-Newton step: a larger step shows that the pose fit diverges, and ends it
+// without a pose.
 constexpr double kMaxTwist = 1e6;
-// Largest squared Mahalanobis distance that counts as a number: larger ones come from a singular covariance.
+// Largest squared Mahalanobis distance of a measurement that is used: larger ones come from a singular covariance, and
+// the measurement is left out.
 constexpr double kMaxDistance2 = 1e300;
 // Smallest eigenvalue of the information matrix, scaled to a diagonal of 1, at which all motions are constrained:
 // points on a line have 1e-14 and less, a marker of 20 px without depths has 1e-9.
 constexpr double kMinEigenvalue = 1e-12;
 // Inverse iterations by which the smallest eigenvalue of the information matrix is estimated.
 constexpr int kInverseIterations = 6;
-// Pixels that are added to a search radius when the cells of the grid are chosen: the sum of a pixel and a radius is
-// rounded.
+// Pixels that are added to a search radius when the cells of the grid are chosen, so that the rounding of the sum of
+// pixel and radius leaves out no cell.
 constexpr double kSlackPx = 1.0;
 // Smallest divisor of a quotient of lengths, which avoids a division by 0.
 constexpr double kMinLength = 1e-9;
@@ -79,7 +81,8 @@ int64_t cell_of(double px) {
     return cell >= 0.0 ? (cell < static_cast<double>(kCells) ? static_cast<int64_t>(cell) : kCells - 1) : 0;
 }
 
-// A feature of the image, stored next to the others of its cell.
+// A feature of the image, stored next to the others of its cell: pixel (x, y), scale, cosine and sine of its
+// orientation, descriptor, and its row in the arrays of the request.
 struct GridFeature {
     double x, y, size, direction[2];
     uint64_t descriptor[4];
@@ -88,11 +91,13 @@ struct GridFeature {
 
 // The features of the image by cell: those of cell c are features[starts[c]] to features[starts[c + 1] - 1].
 struct Grid {
-    const uint64_t* starts;  // kCells * kCells + 1
+    const uint64_t* starts;  // kCells * kCells + 1 numbers
     const GridFeature* features;
 };
 
-// Sort the features of the image by cell with a counting sort, which keeps the order within a cell.
+// Sort the features of the image by cell with a counting sort; within a cell they stay in the order of their rows.
+// The grid that is returned lies in the memory of the caller: `starts` for kCells * kCells + 2 numbers, `features` for
+// one element for each feature.
 Grid build_grid(const rse_pf_near_request& request, uint64_t* starts, GridFeature* features) {
     std::memset(starts, 0, static_cast<size_t>(kCells * kCells + 2) * sizeof *starts);
     const auto cell = [&](int64_t row) {
@@ -109,14 +114,15 @@ Grid build_grid(const rse_pf_near_request& request, uint64_t* starts, GridFeatur
     return {starts, features};
 }
 
-// The two nearest features by Hamming distance, as 64-bit candidates: distance in the upper half, row in the lower
-// half.
+// The two nearest features by Hamming distance, as 64-bit candidates: distance (bits) in the upper half, row of the
+// feature in the lower half; kNone where there is no such feature.
 struct TwoNearest {
     uint64_t first = kNone, second = kNone;
 };
 
-// Return the two features within the radius of a predicted feature, with a matching size and orientation, whose
-// descriptors are nearest to it.  `candidates` is memory for a number per feature.
+// Return the two features whose descriptors are nearest to that of the predicted feature of row `predicted`, among
+// those within radius_px of its pixel whose size and orientation match.  A predicted pixel that is not a number has
+// none.  `candidates` is scratch memory for one number for each feature of the image.
 TwoNearest find_two_nearest(const rse_pf_near_request& request, const Grid& grid, int64_t predicted,
                             uint64_t* candidates) {
     TwoNearest two;
@@ -127,7 +133,7 @@ TwoNearest find_two_nearest(const rse_pf_near_request& request, const Grid& grid
     const double* const direction = request.predicted_directions + 2 * predicted;
     uint64_t descriptor[4];
     std::memcpy(descriptor, request.predicted_descriptors + kBytes * predicted, sizeof descriptor);
-    // 1. List the features of the cells within reach that pass the tests.
+    // 1. List the features of the cells within reach that pass the tests of radius, size and orientation.
     uint64_t count = 0;
     const int64_t left = cell_of(x - reach), right = cell_of(x + reach), bottom = cell_of(y + reach);
     for (int64_t line = cell_of(y - reach); line <= bottom; ++line) {
@@ -144,7 +150,7 @@ TwoNearest find_two_nearest(const rse_pf_near_request& request, const Grid& grid
                                            static_cast<int>(cosine >= request.min_cosine));
         }
     }
-    // 2. Compare their descriptors.
+    // 2. Compare the descriptors of the listed features with that of the predicted feature, and keep the two nearest.
     for (uint64_t i = 0; i < count; ++i) {
         const GridFeature& feature = grid.features[candidates[i]];
         uint64_t distance = 0;
@@ -158,6 +164,7 @@ TwoNearest find_two_nearest(const rse_pf_near_request& request, const Grid& grid
 }
 
 // Return whether the nearest feature is near enough, distinctive in its image, and clearly nearer than the second one.
+// Where there is no second one, the last test is left out; without a nearest feature, return false.
 bool is_match(const rse_pf_near_request& request, const TwoNearest& two) {
     if (two.first == kNone) return false;
     const auto distance = static_cast<double>(two.first >> 32);
@@ -167,17 +174,20 @@ bool is_match(const rse_pf_near_request& request, const TwoNearest& two) {
            (two.second == kNone || distance < request.ratio * static_cast<double>(two.second >> 32));
 }
 
-// A measurement (pixel u, v and depth z) linearised at a pose.
+// A measurement (pixel u, v and depth z) linearised at a pose.  The Jacobians are those of the predicted measurement,
+// and the residual is measured minus predicted: the step is the twist for which by_twist * twist fits r best, weighted
+// by W.
 struct Linearised {
     double by_point[3][3];  // Jacobian of (u, v, z) by the point in the camera frame
     double by_twist[3][6];  // Jacobian of (u, v, z) by the twist (rho, phi) left of the pose
     double W[3][3];         // inverse covariance of the residual
-    double r[3], q[3];      // residual r, and q = W r
+    double r[3], q[3];      // residual r (px, px, m), and q = W r
     double distance2;       // squared Mahalanobis distance r^T W r
     bool is_distance;       // whether distance2 is valid: a singular covariance gives nan or a negative number
-    bool is_in_front;       // whether the point lies in front of the camera
+    bool is_in_front;       // whether the point lies more than kMinDepthM in front of the camera
 };
 
+// Return measurement i of the request, linearised at `pose` (T_camera_world).
 Linearised linearise(const rse_pf_fit_request& request, const Pose& pose, int64_t i) {
     Linearised row;
     // 1. Transform the point into the camera frame, and compute the residual; a missing depth has a residual of 0.
@@ -189,14 +199,15 @@ Linearised linearise(const rse_pf_fit_request& request, const Pose& pose, int64_
     const double a = p.x / z, c = p.y / z, h0 = request.fx / z, h1 = request.fy / z;
     const double r[3] = {request.pixels[2 * i] - (request.fx * a + request.cx),
                          request.pixels[2 * i + 1] - (request.fy * c + request.cy), has * (depth - z)};
-    // 2. Compute the Jacobian by the point in the camera frame (J), and by the point in the world frame (A).
+    // 2. Compute the Jacobian of the predicted (u, v, z) by the point in the camera frame (J), and by the point in the
+    // world frame (A).
     const double J[3][3] = {{h0, 0.0, -(h0 * a)}, {0.0, h1, -(h1 * c)}, {0.0, 0.0, has}};
     double A[3][3], AS[3][3], V[3][3];
     for (int j = 0; j < 3; ++j)
         for (int k = 0; k < 3; ++k)
             A[j][k] = J[j][0] * pose.R[0][k] + J[j][1] * pose.R[1][k] + J[j][2] * pose.R[2][k];
-    // 3. Compute the covariance of the residual: V = A C A^T, where C is that of the landmark, plus the measurement
-    // noise.
+    // 3. Compute the covariance of the residual: V = A C A^T, where C is the covariance of the landmark, plus the
+    // variances of pixel and depth; a missing depth gets the variance 1.
     const double C[3][3] = {{S[0], S[1], S[2]}, {S[1], S[3], S[4]}, {S[2], S[4], S[5]}};
     for (int j = 0; j < 3; ++j)
         for (int k = 0; k < 3; ++k) AS[j][k] = A[j][0] * C[0][k] + A[j][1] * C[1][k] + A[j][2] * C[2][k];
@@ -218,7 +229,7 @@ Linearised linearise(const rse_pf_fit_request& request, const Pose& pose, int64_
     row.distance2 = r[0] * row.q[0] + r[1] * row.q[1] + r[2] * row.q[2];
     row.is_distance = is_within(row.distance2, 0.0, kMaxDistance2);
     row.is_in_front = p.z > kMinDepthM;
-    // 5. Compute the Jacobian by the twist, which moves the point by rho + phi x point.
+    // 5. Compute the Jacobian by the twist, which moves the point in the camera frame by rho + phi x point.
     for (int j = 0; j < 3; ++j) {
         row.by_twist[j][0] = J[j][0];
         row.by_twist[j][1] = J[j][1];
@@ -233,13 +244,13 @@ Linearised linearise(const rse_pf_fit_request& request, const Pose& pose, int64_
     return row;
 }
 
-// The normal equations of all measurements at a pose, and the number of inliers.
+// The normal equations of the measurements that were summed, and the number of inliers among all measurements.
 struct Fit {
     Normal normal;
     int64_t inliers;
 };
 
-// Add a linearised measurement to the normal equations.
+// Add a linearised measurement to the normal equations, times its robust weight.
 void add_row(Normal& normal, const Linearised& row, double weight) {
     const auto& W = row.W;
     const auto& q = row.q;
@@ -252,8 +263,10 @@ void add_row(Normal& normal, const Linearised& row, double weight) {
     }
 }
 
-// Sum the measurements at a pose with Cauchy weights; with is_gated only the inliers.  The last pass leaves the weights
-// out, so that the information is that of the inliers.  Writes is_inlier unless it is null.
+// Sum the normal equations of the measurements at a pose: with is_gated those of the inliers only, else of all whose
+// covariance can be inverted.  Each has its Cauchy weight, but the weight 1 with is_last, so that the information is
+// that of the inliers.  An inlier lies in front of the camera and below gate2.  `is_inlier` is written unless it is
+// null.
 Fit sum_measurements(const rse_pf_fit_request& request, const Pose& pose, bool is_gated, bool is_last,
                      uint8_t* is_inlier) {
     Fit fit = {};
@@ -269,8 +282,8 @@ Fit sum_measurements(const rse_pf_fit_request& request, const Pose& pose, bool i
 }
 
 // Return whether some motion of the camera is unconstrained: the smallest eigenvalue of the information matrix, scaled
-// to a diagonal of 1, is at most kMinEigenvalue.  Inverse iteration; Golub and Van Loan, Matrix Computations, Sect.
-// 8.2.
+// to a diagonal of 1, is at most kMinEigenvalue, or the matrix is not positive definite.  Inverse iteration; Golub and
+// Van Loan, Matrix Computations, Sect. 8.2.
 bool has_free_motion(const Normal& normal) {
     // 1. Scale the matrix to a diagonal of 1, and choose a start vector.
     Normal scaled = {};
@@ -283,7 +296,8 @@ bool has_free_motion(const Normal& normal) {
         for (int j = i; j < 6; ++j) scaled.A[i][j] = normal.A[i][j] * scales[i] * scales[j];
         scaled.b[i] = 1.0 / (1.0 + i);
     }
-    // 2. Iterate; 1 / |x| converges to the eigenvalue.
+    // 2. Solve A x = b for the present vector b, and take x / |x| as the next b; 1 / |x| converges to the smallest
+    // eigenvalue.
     double eigenvalue = 0.0;
     for (int k = 0; k < kInverseIterations; ++k) {
         double x[6], size2 = 0.0;
@@ -299,7 +313,8 @@ Pose read_matrix(const double (&T)[16]) {
     return {{{T[0], T[1], T[2]}, {T[4], T[5], T[6]}, {T[8], T[9], T[10]}}, {T[3], T[7], T[11]}};
 }
 
-// The features that a pose predicts, in memory of the caller; `rows` are rows of the request's `numbers`.
+// The features that a pose predicts, in arrays of the caller with room for every landmark that is looked for: two
+// pixel coordinates, two orientation coordinates, a scale, 32 bytes, and a row of the request's `numbers` for each.
 struct PredictedFeatures {
     int64_t count;
     double *pixels, *directions, *sizes;
@@ -307,8 +322,8 @@ struct PredictedFeatures {
     int64_t* rows;
 };
 
-// Predict the features of the landmarks that are in front of the camera, project into the image, and were seen last
-// from a similar direction and distance.
+// Append to `out` the predicted features of the landmarks that are farther than min_depth_m in front of the camera,
+// project into the image or its margin, and were seen last from a similar direction and distance.
 void predict_features(const rse_pf_seek_request& request, const Pose& pose, PredictedFeatures& out) {
     for (int64_t row = 0; row < request.rows; ++row) {
         const int64_t number = request.numbers[row];
@@ -321,7 +336,7 @@ void predict_features(const rse_pf_seek_request& request, const Pose& pose, Pred
         if (!(u > -request.margin_px && u < request.width + request.margin_px && v > -request.margin_px &&
               v < request.height + request.margin_px))
             continue;
-        // 2. Compare viewing direction and distance with those when it was seen last.
+        // 2. Compare viewing direction and distance of the landmark with those of the image that showed it last.
         const double* const last_ray = request.rays + 3 * number;
         const Vector3 ray = rotate(pose.R, {last_ray[0], last_ray[1], last_ray[2]});
         const double distance = square_root(dot(p, p)), last_distance = square_root(dot(ray, ray));
@@ -329,7 +344,8 @@ void predict_features(const rse_pf_seek_request& request, const Pose& pose, Pred
         if (!(cosine > request.min_cosine && distance < request.max_farther * last_distance &&
               last_distance < request.max_nearer * distance))
             continue;
-        // 3. Predict orientation and size.
+        // 3. Predict the orientation of the feature, by rotation into this image, and its size, by the ratio of the
+        // distances.
         const double* const world = request.directions + 3 * number;
         const Vector3 direction = rotate(pose.R, {world[0], world[1], world[2]});
         const double length = square_root(direction.x * direction.x + direction.y * direction.y);
@@ -421,7 +437,7 @@ __attribute__((visibility("default"))) int64_t rse_pf_match_near(const rse_pf_ne
         const uint64_t candidate = (two.first >> 32) << 32 | static_cast<uint64_t>(i);
         if (candidate < best_of_feature[nearest[i]]) best_of_feature[nearest[i]] = candidate;
     }
-    // 3. Write the matches.
+    // 3. Write the pairs in which the feature has kept the predicted feature that chose it.
     int64_t count = 0;
     for (int64_t i = 0; i < near.predicted_rows; ++i) {
         if (nearest[i] == kNone || (best_of_feature[nearest[i]] & 0xffffffffu) != static_cast<uint64_t>(i)) continue;
@@ -434,7 +450,7 @@ __attribute__((visibility("default"))) int64_t rse_pf_match_near(const rse_pf_ne
 __attribute__((visibility("default"))) int32_t rse_pf_fit_pose(const rse_pf_fit_request* request, uint8_t* is_inlier,
                                                                rse_pf_fit_result* result) {
     if (request == nullptr || is_inlier == nullptr || result == nullptr || !is_valid(*request)) return -1;
-    // 1. Iterate Gauss-Newton steps with Cauchy weights, from kFirstGatedIteration on without outliers.
+    // 1. Apply Gauss-Newton steps with Cauchy weights to the pose, from kFirstGatedIteration on without outliers.
     Pose pose = read_matrix(request->T_camera_world);
     for (int i = 0; i < kMaxIterations; ++i) {
         const Fit fit = sum_measurements(*request, pose, i >= kFirstGatedIteration, false, nullptr);
@@ -497,8 +513,8 @@ __attribute__((visibility("default"))) int32_t rse_pf_fit_sway(const rse_pf_fit_
     if (request == nullptr || displacements == nullptr || scalar == nullptr || information == nullptr ||
         !is_valid(*request))
         return -1;
-    // 1. Sum the normal equations of twist and scalar: by_pose (twist), mixed (twist and scalar), own (scalar), and the
-    // gradient of the scalar.
+    // 1. Sum the normal equations of twist and scalar: by_pose (twist), mixed (twist and scalar), own (scalar), and
+    // the gradient of the scalar.
     const Pose pose = read_matrix(request->T_camera_world);
     Normal by_pose = {};
     double mixed[6] = {}, own = 0.0, gradient = 0.0;

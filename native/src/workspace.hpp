@@ -17,14 +17,15 @@ struct Columns {
 struct Workspace {
     Columns<float> single;    // all correspondences in single precision, for the search
     Columns<double> all;      // all correspondences in double precision
-    Columns<double> inliers;  // the inliers of the pose, copied together
-    double *error2;           // squared reprojection error of each row at the last projected pose, px^2
+    Columns<double> inliers;  // the inliers of the pose without the rows between them, in double precision
+    double *error2;           // squared reprojection error at the last projected pose, of each row of `all` or of
+                              // `inliers`, whichever was projected last, px^2
     double *u, *v;            // projection of each row at that pose, pixels from the principal point
     double *z_inverse;        // inverse depth of each row at that pose, 1/m
     double *length2, *width2; // scratch of width_to_length: squared distances along and across the main axis
 };
 
-// One request with the memory that the solver uses for it.
+// One request with the memory that the solver uses for it: `inliers` of the caller gets the row numbers of the inliers.
 struct Task {
     const rse_pf_pnp_request* request;
     Workspace* workspace;
