@@ -11,7 +11,11 @@ __all__ = ["builtin_services"]
 
 
 def builtin_services(settings: PlatformSettings) -> Registry:
-    """Return a registry with the platform's own services, configured by *settings*."""
+    """Return a registry with the platform's own services, configured by *settings*.
+
+    Raises:
+        MissingExtra: The native core, which the service ``pnp`` needs, is not installed.
+    """
     registry = Registry()
     pnp.register(registry, settings.pnp)
     echo.register(registry)

@@ -20,7 +20,7 @@ def load_services(name: str, settings: PlatformSettings) -> Registry:
         settings: Settings of the platform.
 
     Raises:
-        ConfigurationError: There is no such module or function.
+        ConfigurationError: There is no such module or function, or the module cannot be imported.
     """
     module, _, function = name.partition(":")
     try:

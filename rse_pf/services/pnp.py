@@ -28,7 +28,7 @@ _FLAT_UPPER = 6 * _UPPER[0] + _UPPER[1]
 _POINT_DECIMALS = 4  # decimals of a coordinate in metres: 0.1 mm, below the noise of a depth camera
 _PIXEL_DECIMALS = 2  # decimals of a pixel coordinate: 0.01 px, below the noise of features
 _DEPTH_DECIMALS = 3  # decimals of a depth in metres: 1 mm, as depth cameras write
-_WEAK_LIMITS = WeakLimits()
+_WEAK_LIMITS = WeakLimits()  # limits beyond which a pose of the fast path is weak: those of `solve_pnp`
 MAX_CORRESPONDENCES = 5000  # most correspondences of a command: more take time and do not improve the pose
 
 
@@ -79,7 +79,7 @@ class PnpReply(msgspec.Struct, frozen=True, kw_only=True):
 
     @classmethod
     def of(cls, solution: PnpSolution) -> PnpReply:
-        """Return the reply that carries *solution*."""
+        """Return the reply that carries *solution*; its covariance is rounded to float32."""
         return cls(
             T_camera_world=solution.T_camera_world.ravel(),
             inliers=solution.inliers.astype(np.uint32),
@@ -91,7 +91,10 @@ class PnpReply(msgspec.Struct, frozen=True, kw_only=True):
         )
 
     def solution(self) -> PnpSolution:
-        """Return the pose of the reply as a `PnpSolution`, with a full covariance matrix."""
+        """Return the pose of the reply as a `PnpSolution`, with ``(4, 4)`` pose and ``(6, 6)`` covariance.
+
+        A verdict other than ``ok`` becomes ``weak``.
+        """
         covariance = np.zeros((6, 6))
         covariance[_UPPER] = self.covariance
         covariance.T[_UPPER] = self.covariance
@@ -193,7 +196,13 @@ def register(registry: Registry, settings: PnpSettings) -> None:
 
 
 def _check_sizes(points_world: Array, pixels: Array) -> None:
-    """Raise an error unless the arrays hold equally many points and pixels, at most `MAX_CORRESPONDENCES`."""
+    """Check that the arrays, flat or as rows, hold a pixel for each point, and neither too few nor too many.
+
+    Raises:
+        LimitExceeded: There are more than `MAX_CORRESPONDENCES` points.
+        TooFewCorrespondences: There are fewer than `MIN_CORRESPONDENCES` points.
+        BadRequest: The numbers of points and pixels differ, or the last point or pixel is incomplete.
+    """
     n = pixels.size // 2
     if (
         MIN_CORRESPONDENCES <= n <= MAX_CORRESPONDENCES

@@ -33,6 +33,7 @@ _HEAD_BYTES = 128
 """Bytes at the start of a message in which the name ``pnp`` must stand: our SDKs write it before the
 payload."""
 _UNREADABLE = (msgspec.DecodeError, RecursionError, ValueError, TypeError, IndexError, RsePfError)
+"""Errors after which the message is left to the codec, which decodes it or reports the error."""
 
 
 class _Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -61,7 +62,11 @@ class _Request(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
 
 
 class _TextRequest(_Request, kw_only=True, forbid_unknown_fields=True):
-    """A JSON request without its lists of numbers; a string holds one character, the number of its list."""
+    """A JSON request without its lists of numbers.
+
+    In place of a list stands a string of one character, whose code is the index of the list among those that
+    `cut_lists` returns.
+    """
 
     points_world: str
     pixels: str
@@ -183,5 +188,11 @@ def _decode_array(extension: Ext) -> Array:
 
 @lru_cache(maxsize=256)
 def _validated(fields: Any, kind: Callable[..., Value]) -> Value:
-    """Return a *kind* with the values of *fields*; cached, since a robot's frames have the same camera."""
+    """Return an instance of the class *kind* with the values of the struct *fields*, which *kind* checks.
+
+    Results are cached, since all frames of a robot have the same camera.
+
+    Raises:
+        RsePfError: A value is out of its range.
+    """
     return kind(**msgspec.structs.asdict(fields))

@@ -88,7 +88,7 @@ def register(registry: Registry) -> None:
 
 
 def _check_extent(request: IcpRequest) -> None:
-    """Raise BadRequest for coordinates that lie too many voxels from the origin."""
+    """Raise BadRequest if a coordinate of a cloud or the initial pose is too many voxels from the origin."""
     voxel_m = (request.options or IcpOptions()).voxel_m
     arrays = (request.target, request.source, request.T_target_source)
     extent_m = max(float(np.abs(array).max(initial=0.0)) for array in arrays)

@@ -136,7 +136,8 @@ def locate(
     # 1. Retrieve similar keyframes by place recognition.
     options = options or LocaliseOptions()
     similar = index.nearest(view.descriptors, _RETRIEVAL_FACTOR * options.candidates, within)
-    # 2. Choose candidates from all parts of the map that look alike.
+    # 2. Choose the candidates among them, at most three quarters from one region of the map, so that another
+    # region that looks alike is compared as well.
     limits = LocalisationOptions(
         measured=RelativePoseOptions(
             min_inliers=options.min_inliers,
@@ -155,7 +156,7 @@ def locate(
         LocalisationCandidate(id=k.id, landmarks=landmarks_of_keyframe(k), T_map_keyframe=k.T_world_camera)
         for k in keyframes
     ]
-    # 3. Estimate the pose by each candidate, and decide.
+    # 3. Estimate the pose of the view with each candidate, and decide by their agreement whether it is ok.
     located = localise(candidates, view, limits)
     return LocaliseReply(
         verdict="lost" if located.verdict == "none" else located.verdict,

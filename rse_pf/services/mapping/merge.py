@@ -30,7 +30,8 @@ __all__ = [
 MAX_MAPS = 64
 """Most maps that one request merges; all maps together have at most 2,000 keyframes."""
 _MAX_PROJECTIONS = 20_000_000_000
-"""Most projections of a point of the clouds into a keyframe: they take an hour, the longest time of a job."""
+"""Largest product of the numbers of keyframes and of cloud points of all maps of a request: to project each
+point into each keyframe then takes an hour, the longest time of a job."""
 
 
 class MergeRequest(msgspec.Struct, frozen=True, kw_only=True):
@@ -93,8 +94,11 @@ def merge_maps(request: MergeRequest, *, report: Report = ignore_progress) -> Me
         report: Function that receives the progress, and may raise Cancelled to stop the work.
 
     Raises:
-        BadRequest: There are no or too many maps, the bytes are not maps, or a map has no keyframes.
-        LimitExceeded: The maps are too large.
+        BadRequest: There are no or too many maps, the bytes are not maps, a map has no keyframes, the maps
+            have descriptors of different kinds, or the information of an edge is not positive definite.
+        LimitExceeded: The maps are too large, or have too many similar keyframes to compare.
+        MissingExtra: GTSAM or the native core is not installed.
+        Cancelled: *report* raised it.
     """
     if not 1 <= len(request.maps) <= MAX_MAPS:
         raise BadRequest(f"{len(request.maps)} maps are not within 1..{MAX_MAPS}", hint="send one or more")

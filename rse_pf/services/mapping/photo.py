@@ -28,27 +28,33 @@ __all__ = ["localise_photo", "location_of", "outline_of"]
 
 _MAX_FEATURES = 1000  # ORB features of a photo: as many as a robot finds in one of its frames
 _MAX_FOCAL_RATIO = 1.2
-"""Focal length of a photo over that of the map's images, in pixels: a photo with a longer one is made
-smaller, because beyond one level of ORB's image pyramid (1.2) the same corners get other descriptors."""
+"""Largest focal length of a photo over the median of the map's images, both in pixels: a photo with a longer
+one is made smaller, because beyond one level of ORB's image pyramid (1.2) the same corners get other
+descriptors."""
 _MAX_PIXEL_RATIO = 4
-"""Pixels of a photo over those of the map's largest image: a larger photo is made smaller."""
+"""Largest number of pixels of a photo over that of the map's largest image: a larger photo is made
+smaller."""
 _MAX_ASPECT_DIFFERENCE = 0.01
-"""Relative difference of aspect ratio between a photo and its intrinsics: rounding of a resized photo stays
-below 1 %, and a cropped or rotated photo differs by more."""
+"""Largest relative difference between the aspect ratios of a photo and of the image that its intrinsics
+describe: rounding of a resized photo stays below 1 %, and a cropped or rotated photo differs by more."""
 _MAX_ROUND_TRIP_PX = 0.5
-"""Distance between a pixel and the same pixel undistorted and distorted again: beyond it, the iterative
-inverse of the distortion has failed, and the feature at the pixel is not used."""
+"""Largest difference, in each coordinate, between a pixel and the same pixel undistorted and distorted again:
+beyond it, the iterative inverse of the distortion has failed, and the feature at the pixel is not used."""
 _MAX_OUTLINE_KEYFRAMES = 2000  # positions of keyframes in an outline, so that it stays below 100 kB
 _MAX_OUTLINE_POINTS = 4000  # map points in an outline, so that it stays below 100 kB
 
 
 def localise_photo(data: bytes, photo_lens: PhotoLens, index: MapIndex) -> LocaliseReply:
-    """Return the pose of the camera that took a photo, relative to the keyframes of *index*.
+    """Return the pose in the map of *index* of the camera that took a photo.
 
     Args:
         data: A JPEG or PNG file.
         photo_lens: The intrinsics and the distortion of the photo.
         index: The index of a map with ORB features.
+
+    Returns:
+        The reply of `locate`: ``T_map_camera`` is ``(4, 4)`` and ``covariance`` ``(6, 6)``, both None without
+        a pose.
 
     Raises:
         BadRequest, LimitExceeded: The photo or its intrinsics cannot be used, or the map has other features.
@@ -68,17 +74,18 @@ def localise_photo(data: bytes, photo_lens: PhotoLens, index: MapIndex) -> Local
     # 3. Undistort their pixels.
     lens = Lens(camera=camera, distortion=photo_lens.distortion, model=photo_lens.model)
     pixels, is_valid = _undistort_features(features.pixels, lens)
-    # 4. Localise the features in the map.
+    # 4. Localise the features in the map, without those whose pixels could not be undistorted.
     view = View(camera=camera, pixels=pixels[is_valid], descriptors=features.descriptors[is_valid])
     check_comparisons(index, view, LocaliseOptions().candidates)
     return locate(index, view)
 
 
 def location_of(reply: LocaliseReply, version: str) -> PhotoLocation:
-    """Return the result of `localise_photo` as the HTTP reply, with standard deviations for people.
+    """Return the result of `localise_photo` as the HTTP reply, with one number for each of two uncertainties.
 
-    ``position_sigma_m`` is the root of the trace of the covariance of the camera's position, and
-    ``turn_sigma_deg`` that of its rotation.  *version* is the id of the map version that was searched.
+    ``position_sigma_m`` is the square root of the sum of the variances of the camera's position along the
+    three axes, and ``turn_sigma_deg`` the same of its rotation.  Both, the pose and the covariance are None
+    if *reply* has no pose.  *version* is the id of the map version that was searched.
     """
     pose, covariance = reply.T_map_camera, reply.covariance
     location = PhotoLocation(
@@ -104,10 +111,11 @@ def location_of(reply: LocaliseReply, version: str) -> PhotoLocation:
 
 
 def outline_of(map_version: MapVersion, version: str) -> MapOutline:
-    """Return a map seen from above: positions of some keyframes and points, projected along the vertical.
+    """Return a map seen from above: positions of keyframes and points, projected along the vertical.
 
-    The vertical is what the map states, or what its floor and its cameras show; without either, the z axis of
-    the map.  The map must have a keyframe.  *version* is the id of the map version.
+    At most 2000 keyframes and 4000 points are chosen evenly; their positions are in metres, rounded to 1 mm.
+    The vertical is the one that `estimate_up` returns, or the z axis of the map if it returns None.  The map
+    must have a keyframe.  *version* is the id of the map version.
     """
     poses = np.array([keyframe.T_world_camera for keyframe in map_version.keyframes])
     up = estimate_up(map_version)
@@ -124,7 +132,7 @@ def outline_of(map_version: MapVersion, version: str) -> MapOutline:
 
 
 def _camera_of_photo(photo_lens: PhotoLens, width: int, height: int) -> Camera:
-    """Return the camera of a photo of *width* by *height* pixels, whose intrinsics may be of another size.
+    """Return the camera of a photo of *width* by *height* pixels; intrinsics of another size are scaled.
 
     Raises:
         BadRequest: The intrinsics are for an image of another aspect ratio.
@@ -148,12 +156,16 @@ def _camera_of_photo(photo_lens: PhotoLens, width: int, height: int) -> Camera:
 
 
 def _total_deviation(covariance: Array) -> float:
-    """Return the standard deviation over all axes: the root of the trace."""
+    """Return the square root of the sum of the variances along the axes of a ``(3, 3)`` covariance."""
     return math.sqrt(float(np.trace(covariance)))
 
 
 def _top_view_axes(up: Array) -> Array:
-    """Return two orthogonal unit vectors ``(2, 3)`` that span the plane orthogonal to *up* ``(3,)``."""
+    """Return the x and y axes ``(2, 3)`` of the view from above, in the world of the map.
+
+    Both are unit vectors orthogonal to each other and to the unit vector *up* ``(3,)``, and y is x turned
+    counter-clockwise as seen from above.  The x axis is the axis of the map that is most level, projected.
+    """
     right = np.eye(3)[int(np.argmin(np.abs(up)))]
     right = right - (right @ up) * up
     right /= np.linalg.norm(right)
@@ -165,9 +177,11 @@ def _take_evenly(points: Array, max_count: int) -> Array:
 
 
 def _camera_for_features(camera: Camera, map_cameras: list[Camera]) -> Camera:
-    """Return the camera of the photo, made smaller until it shows as much detail as the images of the map.
+    """Return the camera of the photo at the size in which features are detected, which may be its own size.
 
-    Limits are `_MAX_FOCAL_RATIO` and `_MAX_PIXEL_RATIO`; a photo within both keeps its size.
+    If the focal length is above `_MAX_FOCAL_RATIO` times the median of the map's cameras, it is scaled down
+    to this median.  If the photo has more than `_MAX_PIXEL_RATIO` times the pixels of the map's largest
+    image, it is scaled down to that number.  The smaller scale of both counts, and no photo is enlarged.
     """
     map_focal_px = float(np.median([map_camera.fx for map_camera in map_cameras]))
     scale = map_focal_px / camera.fx if camera.fx > _MAX_FOCAL_RATIO * map_focal_px else 1.0

@@ -47,7 +47,7 @@ __all__ = [
 ]
 
 _CACHED_MAPS = 2
-"""Number of decoded maps with their indexes that a process keeps between requests, the last ones used."""
+"""Number of decoded maps with their indexes that a process keeps between requests: those used last."""
 MAX_KEYFRAMES = 2000
 """Most keyframes of all maps of one request together, which bounds its time and memory."""
 MAX_FEATURES = 2_000_000
@@ -55,8 +55,8 @@ MAX_FEATURES = 2_000_000
 MAX_VIEW_FEATURES = 20_000
 """Most features of the view (the image to localise) of a request, which bounds the time of matching."""
 _MAX_COMPARISONS = 2_000_000_000
-"""Most comparisons of an ORB descriptor of the view with one of a candidate keyframe; they take about five
-seconds."""
+"""Most comparisons of an ORB descriptor of the view with one of a candidate keyframe in one request; they
+take about five seconds.  Comparisons of longer descriptors count in proportion to their size."""
 
 
 class FeatureKind(msgspec.Struct, frozen=True, kw_only=True):
@@ -132,7 +132,7 @@ class MapIndex:
     """An immutable index of the keyframes of a map for place recognition.
 
     Attributes:
-        keyframes: The keyframes; a row is a number of a keyframe in this tuple.
+        keyframes: The keyframes; a *row* of this index is the index of a keyframe in this tuple.
         kind: Kind of their descriptors.
         T_map_keyframe: ``(n, 4, 4)``, poses of the keyframes, metres.
     """
@@ -149,12 +149,15 @@ class MapIndex:
     def nearest(
         self, descriptors: Descriptors, count: int, within: Within | None = None
     ) -> list[tuple[int, float]]:
-        """Return up to *count* keyframes that are similar to a view, as ``(row, score)``, the best first.
+        """Return the *count* keyframes most similar to a view, as ``(row, score)``, the best first.
+
+        The score is the cosine similarity of the place vectors.  However low it is, the keyframe is returned.
 
         Args:
             descriptors: Descriptors of the view.
-            count: Most keyframes.
-            within: Prior; keyframes outside are left out.
+            count: Most keyframes that are returned; fewer only if fewer are searched.
+            within: Prior of the position: only keyframes whose cameras are within its radius are searched;
+                None to search all.
         """
         rows: npt.NDArray[np.int64] | None = None
         if within is not None:
@@ -185,7 +188,8 @@ def index_map(data: bytes) -> tuple[MapVersion, MapIndex]:
 
 
 open_map = functools.lru_cache(maxsize=_CACHED_MAPS)(index_map)
-"""`index_map` with a cache of the results for the last maps."""
+"""`index_map` with a cache of the results for the last `_CACHED_MAPS` encoded maps; callers share a
+result."""
 
 
 def view_of(
@@ -216,7 +220,10 @@ def view_of(
 
 
 def check_comparisons(index: MapIndex, view: View, candidates: int) -> None:
-    """Raise LimitExceeded if it would take too long to match *view* to *candidates* keyframes of *index*."""
+    """Raise LimitExceeded if it would take too long to match *view* to *candidates* keyframes of *index*.
+
+    Each candidate counts as the keyframe of the map with most features.
+    """
     largest = max(len(keyframe.descriptors) for keyframe in index.keyframes)
     comparisons = min(candidates, len(index.keyframes)) * largest * len(view.pixels)
     comparisons = comparisons * index.kind.size // ORB.size

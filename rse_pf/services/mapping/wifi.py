@@ -43,26 +43,35 @@ _MAX_DBM = 0.0  # strongest plausible signal, dBm: 1 mW at the antenna
 
 # --- Calibration of the uncertainty ---
 _ONE_SIGMA = 0.68  # probability that the true position lies within the radius of the reply
-# Candidate exponents of the likelihood.
+# Candidate exponents of the likelihood, ascending: 1 takes the errors of access points as independent.
 _TEMPERS = np.array([0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0])
 _DEFAULT_TEMPER = 0.4  # exponent of the likelihood where a survey is too small to calibrate the exponent
 _MIN_HELD_OUT = 30  # fewest held-out positions from which the exponent is calibrated
 _FOLDS = 5  # folds of the cross-validation that calibrates the exponent
-_CALIBRATION_GRID_M = 0.5  # finest grid of the calibration in metres, to save time
+_CALIBRATION_GRID_M = 0.5  # smallest distance of grid points in the calibration in metres, to save time
 
 # --- Limits of a request ---
 MAX_FINGERPRINTS = 5000  # most fingerprints (surveyed positions) of a request, which bounds its time
 _MAX_FLOORS = 100  # most floors, which are surveyed heights rounded to 1 m; each floor has a grid of its own
 _MAX_ACCESS_POINTS = 300  # most access points of a survey with five or more readings, which bounds the time
-# Most products of grid points and surveyed positions: calibration for five seconds.
+# Largest product of the numbers of grid points and of surveyed positions: the calibration then takes five
+# seconds.
 _MAX_POSTERIORS = 5_000_000
-_MAX_PREDICTIONS = 100_000_000  # most products of grid points and readings: predictions for five seconds
-# Distances of grid points and positions that are computed at once, which bounds the memory.
+# Largest product of the numbers of grid points and of readings: the predictions then take five seconds.
+_MAX_PREDICTIONS = 100_000_000
+# Number of distances between grid points and surveyed positions that are computed at once, which bounds the
+# memory.
 _BATCH = 1_000_000
 
 
 class AccessPointReading(msgspec.Struct, frozen=True, kw_only=True):
-    """An access point that a robot's radio received; its address never leaves the robot."""
+    """An access point that a robot's radio received; its address never leaves the robot.
+
+    Attributes:
+        mac: Hardware address: six bytes of hexadecimal, with or without ``:``, ``-`` or ``.`` between them.
+        ssid: Name of the network.
+        rssi_dbm: Received strength, dBm.
+    """
 
     mac: str
     ssid: str
@@ -136,13 +145,13 @@ def fingerprint_of(
     """Return a fingerprint of *readings* without hardware addresses; the robot calls this function.
 
     Left out are networks whose name ends in ``_nomap``, locally administered addresses (those of phones that
-    share their connection, which change) and implausible strengths.  An address becomes a keyed BLAKE2b hash:
-    robots with the same *key* give an access point the same name, and without the key the address cannot be
-    found out.
+    share their connection, which change) and strengths outside -120..0 dBm.  Of several readings of an
+    address the last one counts.  An address becomes a keyed BLAKE2b hash: robots with the same *key* give an
+    access point the same name, and without the key the address cannot be found out.
 
     Args:
         readings: Received access points.
-        key: Secret of the team, at least 16 bytes.
+        key: Secret of the team, at least 16 bytes; bytes after the 64th are not used.
         position: ``(x, y, z)`` in metres, map frame, for a survey; None for a scan.
 
     Raises:
@@ -169,8 +178,12 @@ class Locator:
     The posterior over a grid around the surveyed positions has a uniform prior, and for each received access
     point a Gaussian likelihood with the mean and variance of its signal field.  The errors of access points
     are correlated (walls, people), which the product of their likelihoods ignores.  The product is therefore
-    raised to a power below 1, chosen so that in a five-fold cross-validation of the survey 68 % of the
+    raised to a power of at most 1, chosen so that in a five-fold cross-validation of the survey 68 % of the
     positions lie within their stated radius.
+
+    Attributes:
+        temper: The power, 0.1..1; 0.4 if fewer than 30 positions of the survey could be located in the
+            cross-validation.
 
     Source:
         Ferris, Haehnel and Fox, Gaussian processes for signal strength-based location estimation,
@@ -178,12 +191,12 @@ class Locator:
     """
 
     def __init__(self, survey: Sequence[Survey], options: WifiOptions | None = None) -> None:
-        """Fit the signal fields of *survey*.
+        """Fit the signal fields of *survey*, predict them at the grid points, and calibrate the power.
 
         Raises:
-            BadRequest: No access point was received at five positions or more, or no grid point is near the
-                survey.
-            LimitExceeded: The survey would take too long.
+            BadRequest: No access point was received at five positions or more, or no grid point is within
+                ``reach_m`` of a surveyed position.
+            LimitExceeded: The survey has too many floors or access points, or would take too long.
         """
         self._options = options or WifiOptions()
         _check_work(survey, self._options)
@@ -193,7 +206,11 @@ class Locator:
         self.temper = _calibrate_temper(survey, model, self._options)
 
     def position_of(self, scan: Mapping[str, float]) -> WifiReply:
-        """Return the position at which *scan* (dBm by hashed access point) was taken."""
+        """Return the position at which *scan* (dBm by hashed access point) was taken.
+
+        Access points without a signal field are ignored; if fewer than ``min_common`` are left, the reply has
+        no position.  The radius ``sigma_m`` is never less than 0.3 times ``grid_m``.
+        """
         known = sorted(name for name in scan if name in self._fields)
         if len(known) < self._options.min_common:
             return WifiReply(
@@ -229,7 +246,11 @@ def register(registry: Registry) -> None:
 
 
 def _log_likelihood(scan: Mapping[str, float], fields: Mapping[str, tuple[Array, Array]]) -> Array:
-    """Return ``(g,)`` log likelihoods of *scan* at the grid points of *fields* (means, variances)."""
+    """Return ``(g,)`` log likelihoods of *scan* at the grid points, without their constant term.
+
+    *fields* has the predicted means (dBm) and variances (dBm^2), ``(g,)`` each, by access point.  Access
+    points of *scan* that *fields* lacks are ignored; at least one must be known.
+    """
     parts = [
         (scan[name] - fields[name][0]) ** 2 / fields[name][1] + np.log(fields[name][1])
         for name in sorted(scan)
@@ -240,7 +261,10 @@ def _log_likelihood(scan: Mapping[str, float], fields: Mapping[str, tuple[Array,
 
 
 def _posterior(grid: Array, log_likelihood: Array, temper: float) -> tuple[Array, float]:
-    """Return the ``(3,)`` mean of the posterior, and the horizontal radius (metres) that holds 68 % of it."""
+    """Return the ``(3,)`` mean of the posterior, and the horizontal radius around it that holds 68 %, metres.
+
+    The prior is uniform over *grid* ``(g, 3)``, and the likelihood is raised to the power *temper*.
+    """
     weight = np.exp(temper * (log_likelihood - log_likelihood.max()))
     weight /= weight.sum()
     mean = weight @ grid
@@ -249,8 +273,12 @@ def _posterior(grid: Array, log_likelihood: Array, temper: float) -> tuple[Array
 
 
 def _calibrate_temper(survey: Sequence[Survey], model: SignalModel, options: WifiOptions) -> float:
-    """Return the power of the likelihood at which 68 % of the held-out positions lie within their radius."""
-    # 1. Locate the scans of each fold by the others, with each candidate power.
+    """Return the power of the likelihood at which 68 % of the held-out positions lie within their radius.
+
+    The radius is horizontal.  The result is 0.4 if fewer than 30 scans know ``min_common`` access points.
+    """
+    # 1. Locate the scans of each fold by the readings of the other folds, with each candidate power.  Trends
+    # and parameters of the fields stay those of the whole survey.
     grid = _make_grid(model.positions, max(options.grid_m, _CALIBRATION_GRID_M), options.reach_m)
     inside = np.zeros(len(_TEMPERS))
     count = 0
@@ -269,7 +297,8 @@ def _calibrate_temper(survey: Sequence[Survey], model: SignalModel, options: Wif
                 inside[number] += math.hypot(mean[0] - position[0], mean[1] - position[1]) <= sigma_m
     if count < _MIN_HELD_OUT:
         return _DEFAULT_TEMPER
-    # 2. Interpolate.  A larger power makes the radius smaller, so the share of positions inside falls.
+    # 2. Interpolate the power between the candidates.  A larger power makes the radius smaller, so the share
+    # of positions inside falls; where it does not, the minimum of the shares so far is taken.
     share = np.minimum.accumulate(inside / count)
     return float(np.interp(-_ONE_SIGMA, -share, _TEMPERS))
 
@@ -289,7 +318,7 @@ def _surveyed_position(fingerprint: Fingerprint) -> tuple[float, float, float]:
 
 
 def _check_work(survey: Sequence[Survey], options: WifiOptions) -> None:
-    """Raise LimitExceeded if the calibration or the predictions of *survey* would take too long."""
+    """Raise LimitExceeded if *survey* has too many floors, or if a request with it would take too long."""
     if not survey:
         return
     positions = np.array([position for position, _ in survey], dtype=np.float64)
@@ -315,13 +344,24 @@ def _bounds(positions: Array, reach_m: float) -> tuple[Array, Array]:
 
 
 def _grid_pitch(low: Array, high: Array, grid_m: float) -> float:
-    """Return the distance of grid points: *grid_m*, or more, so that a floor has at most about 40,000."""
+    """Return the distance of grid points in metres: *grid_m*, or more where a floor would have too many.
+
+    The limit is about 40,000 grid points on a floor.  *low* and *high* are the ``(2,)`` corners of the area
+    of the grid, metres.
+    """
     area, longest = float(np.prod(high - low)), float((high - low).max())
     return max(grid_m, math.sqrt(area / 40_000.0), longest / 40_000.0)
 
 
 def _make_grid(positions: Array, grid_m: float, reach_m: float) -> Array:
-    """Return ``(g, 3)`` grid points within *reach_m* of a surveyed position, at the height of the nearest."""
+    """Return ``(g, 3)`` grid points on all floors, metres.
+
+    A floor is the surveyed positions whose heights round to the same metre.  Its grid points lie within a
+    horizontal distance of *reach_m* of one of its positions, and at the height of the nearest one.
+
+    Raises:
+        BadRequest: There is no grid point within *reach_m*.
+    """
     low, high = _bounds(positions, reach_m)
     pitch = _grid_pitch(low, high, grid_m)
     x, y = (np.arange(low[axis], high[axis] + pitch, pitch) for axis in (0, 1))

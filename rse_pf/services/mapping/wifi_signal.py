@@ -1,7 +1,7 @@
 """Model the signal strength of Wi-Fi access points: a path-loss trend, and a Gaussian process of residuals.
 
-The predicted variance grows with the distance from surveyed positions; the noise is estimated from the
-survey.
+The predicted variance grows with the distance from surveyed positions; the variance of the noise of a reading
+is estimated from the survey.
 """
 
 from __future__ import annotations
@@ -22,37 +22,42 @@ Rows = npt.NDArray[np.int64]
 __all__ = ["MAX_READINGS", "SignalField", "SignalModel", "fit_signals"]
 
 _MIN_READINGS = 5
-"""Fewest readings of an access point that is used: its position and its trend have four unknowns."""
+"""Fewest readings of an access point that is used: its horizontal position and its trend have four
+unknowns."""
 _LENGTHS_M = (2.0, 4.0, 8.0, 16.0)
 """Candidate correlation lengths of the Gaussian process, metres: from a room to a hall."""
 _SMOOTH_SHARES = (0.1, 0.3, 0.5, 0.7, 0.85)
-"""Candidate shares of the residual variance that is smooth in space; the rest is noise."""
+"""Candidate shares of the variance of the residuals that the Gaussian process explains, which is smooth in
+space; the rest is noise of the readings."""
 _MIN_VARIANCE_DBM2 = 1.0
 """Smallest variance of the noise (dBm^2), so that no reading counts as exact."""
 _NEAR_M = 1.0
-"""Smallest distance from an access point (metres, added in quadrature), since log10 of 0 is infinite."""
+"""Length in metres that is added in quadrature to each distance from an access point, since log10 of 0 is
+infinite."""
 _BATCH = 8192
 """Positions whose covariances with all readings are computed at once, which bounds the memory."""
 MAX_READINGS = 400
-"""Most readings of an access point in its Gaussian process, chosen evenly: time grows with their cube."""
+"""Most readings of an access point in its Gaussian process, since time grows with their cube; of more, this
+number is chosen evenly in the order of the survey."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SignalField:
     """The signal strength of one access point over space.
 
-    Its mean is the trend ``c0 + c1 log10(distance to the access point)`` plus a Gaussian process of the
-    residuals.
+    Its mean is the trend ``c0 + c1 log10(distance to the access point in metres)`` plus a Gaussian process of
+    the residuals.
 
     Attributes:
-        source: ``(3,)``, estimated position of the access point, metres.
+        source: ``(3,)``, estimated position of the access point, metres; its height is that of the strongest
+            reading.
         trend: ``(2,)``, c0 in dBm and c1 in dBm per decade.
         positions: ``(r, 3)``, positions of the readings, metres.
         residuals: ``(r,)``, readings minus trend, dBm.
         rows: ``(r,)``, rows of the survey that the readings are from.
         weights: ``(r,)``, inverse covariance times residuals, 1/dBm.
         inverse: ``(r, r)``, inverse covariance of the readings, 1/dBm^2.
-        signal_dbm2: Variance of the process.
+        signal_dbm2: Prior variance of the process, without any reading.
         noise_dbm2: Variance of the noise of a reading.
         length_m: Correlation length of the process.
     """
@@ -69,7 +74,10 @@ class SignalField:
     length_m: float
 
     def predict(self, positions: Array) -> tuple[Array, Array]:
-        """Return ``(n,)`` means (dBm) and variances (dBm^2) of readings at ``(n, 3)`` positions (metres)."""
+        """Return ``(n,)`` means (dBm) and variances (dBm^2) of readings at ``(n, 3)`` positions (metres).
+
+        The variances include the noise of a reading.
+        """
         parts = [
             self._predict(positions[begin : begin + _BATCH]) for begin in range(0, len(positions), _BATCH)
         ]
@@ -83,9 +91,9 @@ class SignalField:
         return mean, np.maximum(variance, 0.0) + self.noise_dbm2
 
     def without(self, held_out: Rows) -> SignalField | None:
-        """Return the field without the readings of the *held_out* survey rows, with the same parameters.
+        """Return the field without the readings of the *held_out* survey rows; None if under five are left.
 
-        Return None if fewer than five readings are left.
+        Position, trend and parameters of the process stay those that were fitted to all readings.
         """
         remains = ~np.isin(self.rows, held_out)
         if remains.sum() < _MIN_READINGS:
@@ -103,7 +111,7 @@ class SignalField:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SignalModel:
-    """The fields of all access points by their names, and the ``(n, 3)`` surveyed positions in metres."""
+    """The fields of access points by their names, and all ``(n, 3)`` surveyed positions in metres."""
 
     fields: Mapping[str, SignalField]
     positions: Array
@@ -114,13 +122,15 @@ def fit_signals(
 ) -> SignalModel:
     """Fit a signal model to a survey; equal surveys give equal models.
 
+    Access points that were received at fewer than five positions get no field.
+
     Args:
         survey: For each surveyed position (metres) the received strengths (dBm) by access point.
-        max_fields: Most access points; None for any number.
+        max_fields: Most access points with a field; None for any number.
 
     Raises:
         BadRequest: No access point was received at five positions or more.
-        LimitExceeded: More than *max_fields* access points were.
+        LimitExceeded: More than *max_fields* access points were received at five positions or more.
 
     Source:
         Path loss after Rappaport, Wireless Communications, 4.9; Gaussian processes after Ferris et al. 2006,
@@ -153,15 +163,16 @@ def _fit(all_positions: Array, rows: Rows, dbm: Array) -> SignalField:
     if len(rows) > MAX_READINGS:
         chosen = np.linspace(0, len(rows) - 1, MAX_READINGS).astype(np.int64)
         rows, dbm = rows[chosen], dbm[chosen]
-    # 1. Fit the trend.
+    # 1. Estimate the position of the access point, and fit the trend over the distance from it by least
+    # squares.
     positions = all_positions[rows]
     source = _estimate_source(positions, dbm)
     columns = _trend(positions, source)
     trend = np.linalg.lstsq(columns, dbm, rcond=None)[0].astype(np.float64)
     residuals = dbm - columns @ trend
     total = max(float(residuals.var()), _MIN_VARIANCE_DBM2) * len(residuals) / max(1, len(residuals) - 4)
-    # 2. Choose the correlation length, and the share of smooth variance, with the largest marginal
-    # likelihood.
+    # 2. Choose the correlation length and the share of smooth variance with which the residuals have the
+    # largest marginal likelihood.
     best: tuple[float, float, float] = (-math.inf, 0.0, 0.0)
     for length_m in _LENGTHS_M:
         for share in _SMOOTH_SHARES:
@@ -203,7 +214,12 @@ def _condition(
 
 
 def _estimate_source(positions: Array, dbm: Array) -> Array:
-    """Return the position of an access point: the grid point whose path-loss trend fits best."""
+    """Return the ``(3,)`` position of an access point: the grid point whose path-loss trend fits *dbm* best.
+
+    The grid has 24 x 24 points at the height of the strongest reading, up to 5 m beyond the *positions*
+    ``(n, 3)`` of the readings.  If the strength falls with the distance from no grid point, the result is the
+    position of the strongest reading.
+    """
     low, high = positions.min(axis=0) - 5.0, positions.max(axis=0) + 5.0
     axes = [np.linspace(low[axis], high[axis], 24) for axis in (0, 1)]
     height = float(positions[np.argmax(dbm), 2])
@@ -229,13 +245,26 @@ def _fit_line(x: Array, y: Array) -> tuple[float, float]:
 
 
 def _trend(positions: Array, source: Array) -> Array:
-    """Return the ``(n, 2)`` design matrix of the trend: ones, and log10 of distances to *source* (metres)."""
+    """Return the ``(n, 2)`` design matrix of the trend: ones, and log10 of the distances to *source*.
+
+    Distances are in metres, with `_NEAR_M` added in quadrature.
+    """
     distance = np.sqrt(((positions - source) ** 2).sum(axis=1) + _NEAR_M**2)
     return np.column_stack([np.ones(len(positions)), np.log10(distance)])
 
 
 def _kernel(a: Array, b: Array, signal: float, length_m: float) -> Array:
-    """Return the Matern covariance of order 3/2 of two sets; Rasmussen and Williams 2006, eq. 4.17."""
+    """Return the Matern covariance of order 3/2 of two sets of positions; Rasmussen and Williams, eq. 4.17.
+
+    Args:
+        a: ``(n, 3)`` metres.
+        b: ``(m, 3)`` metres.
+        signal: Variance at distance 0, dBm^2.
+        length_m: Correlation length.
+
+    Returns:
+        ``(n, m)``, dBm^2.
+    """
     squared = np.maximum((a**2).sum(axis=1)[:, None] + (b**2).sum(axis=1) - 2.0 * a @ b.T, 0.0)
     scaled = math.sqrt(3.0) * np.sqrt(squared) / length_m
     kernel: Array = signal * (1.0 + scaled) * np.exp(-scaled)
@@ -245,7 +274,13 @@ def _kernel(a: Array, b: Array, signal: float, length_m: float) -> Array:
 def _log_likelihood(
     positions: Array, residuals: Array, signal: float, noise: float, length_m: float
 ) -> float:
-    """Return the log marginal likelihood but for a constant; Rasmussen and Williams 2006, eq. 5.8."""
+    """Return the log marginal likelihood of *residuals* without its constant term.
+
+    The variance *noise* is raised to `_MIN_VARIANCE_DBM2` if it is smaller.
+
+    Source:
+        Rasmussen and Williams 2006, eq. 5.8.
+    """
     noise = max(noise, _MIN_VARIANCE_DBM2)
     factor = np.linalg.cholesky(
         _kernel(positions, positions, signal, length_m) + noise * np.eye(len(positions))
