@@ -41,10 +41,12 @@ class LensModel:
         coefficient_counts: Numbers of coefficients that OpenCV takes; 0 is valid for every model.
         is_perspective: Whether the model without coefficients is a pinhole camera.
         plausible_field_of_view_deg: Smallest and largest field of view of a lens that SLAM can use.
-        field_of_view_rad: Field of view along an image side that is this many focal lengths long.
+        field_of_view_rad: Image side divided by focal length, both in pixels, to the field of view along this
+            side in radians, without distortion.
         undistort_points: ``(cv2, pixels (n, 1, 2), K, coefficients, K_new or None)`` to ``(n, 1, 2)``: pixels
             of a pinhole camera with the matrix K_new, or coordinates in the plane z = 1 for None.
-        distort_points: ``(cv2, rays (n, 2), K, coefficients)`` to ``(n, 2)`` pixels of points ``(x, y, 1)``.
+        distort_points: ``(cv2, rays (n, 2), K, coefficients)`` to ``(n, 1, 2)``: the distorted pixels of
+            points ``(x, y, 1)`` of the camera frame.
         undistortion_maps: ``(cv2, K, coefficients, rotation (3, 3), K_new, (width, height))`` to the two
             float32 maps that ``cv2.remap`` takes.
         rectify: ``(cv2, K_left, coefficients_left, K_right, coefficients_right, (width, height), R, t)`` to
@@ -81,8 +83,8 @@ class LensModel:
         """Refuse coefficients that a file or a request may not state, although OpenCV would take them.
 
         Raises:
-            InvalidCamera: There are more than ``coefficient_names``, one is above `MAX_STATED_COEFFICIENT`,
-                or `check_coefficients` refuses them.
+            InvalidCamera: There are more coefficients than ``coefficient_names``, the absolute value of one
+                is above `MAX_STATED_COEFFICIENT`, or `check_coefficients` refuses them.
         """
         self.check_coefficients(coefficients)
         largest = max(map(abs, coefficients), default=0.0)
@@ -143,8 +145,8 @@ class Lens:
     def undistort_pixels(self, pixels: Array) -> Array:
         """Return ``(n, 2)`` distorted pixels as pixels of the pinhole camera with the same intrinsics.
 
-        The inverse of the distortion is iterative and may fail far from the centre: compare the result with
-        `distort_pixels`.
+        The inverse of the distortion is iterative and may fail far from the centre without an error:
+        `distort_pixels` of the result must give *pixels* again.
 
         Raises:
             MissingExtra: OpenCV is not installed.
@@ -177,7 +179,9 @@ class Lens:
         return directions
 
     def undistortion_maps(self, camera: Camera, rotation: Array | None = None) -> tuple[Any, Any]:
-        """Return the two maps with which ``cv2.remap`` gives the images of a pinhole *camera*.
+        """Return the two maps with which ``cv2.remap`` makes images of a pinhole *camera* from those of this.
+
+        Each is ``(height, width)`` float32 of the new image: the x and the y pixel in the distorted image.
 
         Args:
             camera: The pinhole camera of the new images.
@@ -216,6 +220,8 @@ def rectify_stereo_pair(
 ) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
     """Return the rotations and projections that rectify a stereo pair of two lenses of one model and size.
 
+    The model and the size of *left* are taken for both; whether *right* has the same is not checked.
+
     Args:
         left: The left lens.
         right: The right lens.
@@ -223,7 +229,8 @@ def rectify_stereo_pair(
 
     Returns:
         The ``(3, 3)`` rotations from the left and the right camera to the rectified ones, and the ``(3, 4)``
-        projections of both rectified cameras; ``P[0, 3]`` of the right one is minus fx times the baseline.
+        projections of both rectified cameras, in pixels; ``P[0, 3]`` of the right one is minus fx (pixels)
+        times the baseline (metres).
 
     Raises:
         MissingExtra: OpenCV is not installed.

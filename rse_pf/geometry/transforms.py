@@ -44,8 +44,8 @@ rotation whose numbers are rounded to three decimals deviates by up to 1.8e-3.""
 EXACT_TOLERANCE = 1e-9
 """Deviation of R^T R from the identity below which a rotation is kept as it is, so that a pose that was
 written by this platform is read back to the bit."""
-LAST_ROW_TOLERANCE = 1e-5  # deviation of the last row of a pose from 0 0 0 1: float32 rounds by less
-MAX_TRANSLATION_M = 1e9  # of each axis of a pose: larger than any map, and far from the limits of float64
+LAST_ROW_TOLERANCE = 1e-5  # largest deviation of a pose's last row from 0 0 0 1: float32 rounds by less
+MAX_TRANSLATION_M = 1e9  # metres along each axis of a pose: beyond any map, far from the limits of float64
 NEAR_HALF_TURN_COSINE = -0.999
 """Cosine of the rotation angle (177.4 degrees) beyond which the logarithm goes by way of the quaternion,
 because the antisymmetric part of the matrix vanishes at half a turn."""
@@ -78,7 +78,7 @@ def body_poses(T_world_camera: Array, T_body_camera: Array) -> Array:
 
 
 def scaled(T: Array, scale: float | Array) -> Array:
-    """Return poses ``(..., 4, 4)`` with their translations multiplied by *scale*, a number or ``(...)``."""
+    """Return new poses ``(..., 4, 4)`` with translations multiplied by *scale*, a number or ``(...)``."""
     scaled_poses: Array = T.copy()
     scaled_poses[..., :3, 3] *= np.asarray(scale)[..., None]
     return scaled_poses
@@ -88,9 +88,10 @@ def rigid(T: Array, max_m: float = MAX_TRANSLATION_M) -> Array | None:
     """Return a ``(4, 4)`` matrix as a rigid motion, or None if the matrix is no rigid motion.
 
     This is the one rule of the platform for poses, applied where a pose arrives.  A rigid motion has ``det R
-    > 0``, the last row 0 0 0 1, and no number of ``R^T R - I`` beyond `ROTATION_TOLERANCE`.  A rotation
-    beyond `EXACT_TOLERANCE` is replaced by the nearest rotation (singular value decomposition), so that poses
-    computed from accepted poses are accepted, too.
+    > 0``, the last row 0 0 0 1 within `LAST_ROW_TOLERANCE`, and no number of ``R^T R - I`` beyond
+    `ROTATION_TOLERANCE`.  If the last row is not exact, or the rotation is beyond `EXACT_TOLERANCE`, a new
+    matrix has the exact last row and the nearest rotation (singular value decomposition), so that poses
+    computed from accepted poses are accepted, too.  Otherwise *T* itself is returned.
 
     Args:
         T: Any ``(4, 4)`` numbers, NaN and infinity included.
@@ -118,7 +119,10 @@ def rigid(T: Array, max_m: float = MAX_TRANSLATION_M) -> Array | None:
 
 
 def rigid_many(T: Array, max_m: float = MAX_TRANSLATION_M) -> Array | None:
-    """Return ``(n, 4, 4)`` matrices as rigid motions by the rule of `rigid`; None if one matrix is none."""
+    """Return ``(n, 4, 4)`` matrices as rigid motions by the rule of `rigid`; None if one matrix is none.
+
+    If all are exact, *T* itself is returned; otherwise a copy, in which the others are replaced.
+    """
     # 1. Check that all matrices are rigid motions; a NaN makes each comparison false.
     rotations = T[:, :3, :3]
     with np.errstate(over="ignore", invalid="ignore"):
@@ -129,7 +133,8 @@ def rigid_many(T: Array, max_m: float = MAX_TRANSLATION_M) -> Array | None:
     is_within = (np.abs(T[:, :3, 3]) <= max_m).all(axis=1)
     if not (is_rotation & is_within).all() or (np.linalg.det(rotations) <= 0.0).any():
         return None
-    # 2. Replace those that are not exact by the nearest rotation (orthogonal Procrustes).
+    # 2. In a copy, replace the rotations of the poses that are not exact by the nearest rotations (orthogonal
+    #    Procrustes), and their last rows by 0 0 0 1.
     inexact = np.flatnonzero((deviation > EXACT_TOLERANCE) | (last_row_deviation > 0.0))
     if not len(inexact):
         return T
@@ -215,7 +220,9 @@ def adjoint(T_a_b: Array) -> Array:
 
 
 def median_pose(T_a_b: Array) -> Array:
-    """Return the medoid of poses ``(n, 4, 4)``: that with the smallest sum of differences to all others.
+    """Return the medoid ``(4, 4)`` of n >= 1 poses: that with the smallest sum of differences to the others.
+
+    Of equal sums, the first pose is returned.
 
     A difference is the distance of the positions in metres plus the Frobenius norm of the difference of the
     rotations, so that a metre weighs as much as about 41 degrees.

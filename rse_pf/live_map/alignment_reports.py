@@ -31,12 +31,15 @@ def report_alignments(
 ) -> list[Outcome]:
     """Return how the alignments of the robots' newest segments changed since they were last reported.
 
-    The graph notes the reported alignments.
+    Changes below all three limits of this module are not reported.  Segments without keyframes, and robots
+    that left, are left out.
 
     Args:
-        graph: The graph.
-        cause: The keyframe (robot, number) that caused the changes, None after an optimisation.
-        windows: The smoothed windows, which know the covariances of the newest poses.
+        graph: The graph; it notes the alignments that are reported.
+        cause: The keyframe (robot, number) that caused the changes, None after an optimisation or after a
+            robot was forgotten.
+        windows: The smoothed windows, which know the covariances of the newest poses; without them, or for
+            poses that were not smoothed, the covariance that was noted before is reported.
     """
     outcomes: list[Outcome] = []
     for row, T_map_odom, has_changed in _find_alignments(graph):
@@ -89,7 +92,11 @@ def alignment_of(segment: Segment) -> Alignment:
 
 
 def _find_alignments(graph: MapGraph) -> list[tuple[int, Array, bool]]:
-    """Return (row, ``T_map_odom``, whether it changed since the last report) of each newest segment."""
+    """Return (row, ``T_map_odom``, whether it changed since the last report) of each newest segment.
+
+    Segments without keyframes are left out.  ``T_map_odom`` leads to the frame of the segment's component,
+    which may not be the map.  Without a report, the third value says nothing.
+    """
     rows = [row for row in graph.newest_segments.values() if graph.segments[row].keyframes]
     # 1. The pose of the newest keyframe in the map and in its odometry frame give the alignment.
     newest = [graph.segments[row].keyframes[-1] for row in rows]

@@ -25,21 +25,23 @@ MAX_KEYFRAMES_OF_VIEW = 2  # keyframes of the map with the same view of a place 
 def choose_candidates(
     graph: MapGraph, places: PlaceIndex, keyframe: int, limit: int, *, is_overloaded: bool = False
 ) -> list[int]:
-    """Return up to *limit* keyframes that may show the same place as *keyframe*, by id.
+    """Return the ids of up to *limit* keyframes that may show the same place as *keyframe*, ascending.
 
-    Up to half of them are from other components, which they may join; the others are from the component of
-    the keyframe.
+    Up to half of *limit* are from other components, which loop closures may join with that of the keyframe;
+    the others are from the component of the keyframe.
 
     Args:
         graph: The graph.
         places: Place recognition vectors of all keyframes with features.
         keyframe: The new keyframe.
-        limit: Number of candidates.
-        is_overloaded: Whether to leave out what the robot saw within the last 12 steps of odometry.
+        limit: Largest number of candidates.
+        is_overloaded: Whether to leave out keyframes of the same segment within 12 steps of odometry, and not
+            only those within 0.8 steps.
     """
     rows = graph.segment_rows
     vector = places.vector_of(keyframe)
-    # 1. Leave out keyframes without features, of excluded segments, and shortly before on the same path.
+    # 1. Leave out keyframes without features, of excluded segments, and those shortly before or after on the
+    #    path of the same segment.
     is_excluded = np.array([segment.is_excluded for segment in graph.segments])[rows]
     is_allowed = graph.has_features & ~is_excluded
     is_allowed[keyframe] = False
@@ -56,9 +58,11 @@ def choose_candidates(
 
 
 def find_redundant_keyframes(graph: MapGraph, keyframe: int) -> tuple[int, ...]:
-    """Return the keyframes of the map with the same view as *keyframe*, except the newest two, by id.
+    """Return the ids of the keyframes with the same view as *keyframe*, except the newest two, ascending.
 
-    Two keyframes have the same view if they are within 0.12 m along each axis and within 8 degrees.
+    Two keyframes have the same view if they are within 0.12 m along each axis and within 8 degrees.  Only
+    keyframes with features that are connected with the map count; *keyframe* counts as one of them, but is
+    never returned.  The result is empty if *keyframe* is not connected with the map.
     """
     if not graph.is_aligned(int(graph.segment_rows[keyframe])):
         return ()

@@ -64,9 +64,10 @@ class KeyframeAdded(msgspec.Struct, frozen=True, kw_only=True, dict=True, tag="k
 class MeasuredLoopClosure(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     """The measured pose of keyframe ``other`` relative to the keyframe of a `LoopClosuresMeasured`.
 
-    ``T_keyframe_other`` ``(4, 4)`` and its ``information`` ``(6, 6)``, the inverse covariance of its twist
-    (metres, then radians), are bytes as `matrix_bytes` makes them.  Lengths are metres if one of both
-    keyframes is metric, else in the unit of the measured keyframe.  ``inliers`` of ``matches`` fit the pose.
+    ``T_keyframe_other`` ``(4, 4)`` and its ``information`` ``(6, 6)``, the inverse covariance of the twist on
+    its right (length, then radians), are bytes as `matrix_bytes` makes them.  Lengths are metres if one of
+    both keyframes is metric, else in the unit of the measured keyframe.  ``inliers`` of ``matches`` fit the
+    pose.
 
     ``scale`` is None between two metric keyframes; else it holds the logarithm of the length of the other
     keyframe's unit in the unit of the measured one, and the variance of this logarithm.  ``off_scale`` is the
@@ -84,7 +85,10 @@ class MeasuredLoopClosure(msgspec.Struct, frozen=True, kw_only=True, omit_defaul
 
 
 class LoopClosuresMeasured(msgspec.Struct, frozen=True, kw_only=True, tag="links"):
-    """The loop closures that were measured for a keyframe, and how many candidates failed, by reason."""
+    """The loop closures that were measured for a keyframe, and how many candidates failed, by reason.
+
+    The reasons are those that `rse_pf.slam.relative_pose.measure_relative_pose` returns.
+    """
 
     keyframe: int
     links: tuple[MeasuredLoopClosure, ...] = ()
@@ -94,7 +98,8 @@ class LoopClosuresMeasured(msgspec.Struct, frozen=True, kw_only=True, tag="links
 class Optimised(msgspec.Struct, frozen=True, kw_only=True, tag="optimised"):
     """The whole pose graph, as it was after ``up_to`` events, was optimised in the background.
 
-    ``T_map_camera`` has the poses ``(n, 4, 4)`` of the keyframes ``ids``, as `matrix_bytes` makes them.
+    ``T_map_camera`` has the poses ``(n, 4, 4)`` of the keyframes ``ids`` in the frame of the map, as
+    `matrix_bytes` makes them.
     """
 
     up_to: int
@@ -125,9 +130,11 @@ class StartKeyframe(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class StartEdge(msgspec.Struct, frozen=True, kw_only=True):
-    """An edge of the version that a live map starts from, between the keyframes ``a`` and ``b`` of the event.
+    """An edge of the version that a live map starts from.
 
-    ``T_a_b`` ``(4, 4)`` and ``information`` ``(6, 6)`` are bytes as `matrix_bytes` makes them.
+    ``a`` and ``b`` are positions in the keyframes of the `MapStarted`, from 0.  ``T_a_b`` ``(4, 4)``, which
+    maps points of the camera of *b* to that of *a*, and ``information`` ``(6, 6)``, the inverse covariance of
+    the twist on its right (metres, then radians), are bytes as `matrix_bytes` makes them.
     """
 
     a: int

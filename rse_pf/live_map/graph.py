@@ -25,17 +25,19 @@ __all__ = ["MapGraph", "count_odometry_steps"]
 
 STEP_LENGTH_M = 0.25  # metres of motion that are one step of odometry, for which its drift is stated
 STEP_ROTATION_DEG = 15.0  # degrees of rotation that are one step of odometry, for which its drift is stated
-MIN_STEP = 0.05  # steps of odometry of any motion, at least, so that a stationary robot has some variance
+MIN_STEP = 0.05  # steps of odometry that a motion counts as, at least: a stationary robot has some variance
 MAX_PATH_STEPS = 200.0
-"""Steps of odometry of a path between two keyframes beyond which odometry says nothing about their relative
-pose."""
+"""Steps of odometry that stand for a path which the search does not find: the upper limit along one segment,
+the lower limit elsewhere.  After so many steps odometry says nothing about the relative pose."""
 MAX_VISITED_KEYFRAMES = 250  # keyframes that one search for shortest paths visits, to bound its CPU time
-MAX_REJECTED_EDGES = 2000  # rejected loop closures that are kept, to decide again after a robot is forgotten
+MAX_REJECTED_EDGES = 2000
+"""Newest rejected loop closures that are kept, since a map decides about them again after a robot was
+forgotten or excluded."""
 MAX_ORPHANED_OBJECTS = 10_000  # newest objects of forgotten robots that are listed for deletion
-CONTRADICTION_HISTORY = 0xFFFFFFFF  # bit mask: the newest 32 keyframes with evidence decide about a robot
+CONTRADICTION_HISTORY = 0xFFFFFFFF  # bit mask: the newest 32 records of contradictions decide about a robot
 INHERITED_CONTRADICTIONS = 0xFFFF
-"""Bit mask: the contradictions of a robot's newest 16 keyframes count in its next segment, so that a hostile
-robot does not start without a record by opening a segment."""
+"""Bit mask: a robot's newest 16 records of contradictions count in its next segment, so that a hostile robot
+does not start without a record by opening a segment."""
 
 
 class MapGraph:
@@ -44,18 +46,20 @@ class MapGraph:
     Attributes:
         keyframes: All keyframes by id.  The id of a keyframe is its position in order of arrival.
         segments: All segments by row; a segment is never removed, but may have no keyframes any more.
-        edges: Pending and accepted loop closures by number, in the order in which they were measured.
+        edges: Pending and accepted loop closures by number; numbers count in the order of measurement.
         pending: Numbers of the pending loop closures, oldest first.
-        rejected: The newest rejected loop closures by number; they are decided again when a robot whose
-            evidence rejected them may be forgotten.
-        pair_consistency: Whether two pending loop closures agree, by their numbers, the lower first.
-        next_edge: Number of the next loop closure.
+        rejected: The newest rejected loop closures by number, which `reopen_rejected` makes pending again
+            after a robot was forgotten or excluded, since its evidence may have rejected them.
+        pair_consistency: By the numbers of two pending loop closures, the lower first: whether both agree.
+            Pairs that were not tested are missing.
+        next_edge: Number that the next added loop closure gets.
         root: Row of the segment whose first keyframe defines the frame of the map, -1 while there is none.
         events: Number of events that were applied.
         next_numbers: Number that the next keyframe of each robot must have.
         newest_segments: Row of the newest segment of each robot that has not left.
         optimised_at: Number of keyframes when an optimisation of the whole graph was last requested.
-        smoothing_debt: By robot, the keyframes that were smoothed because of it beyond its allowance.
+        smoothing_debt: By robot, the keyframes that were smoothed because of it beyond its allowance, less
+            those that its later keyframes paid back.
         aliased_keyframes: Keyframes at places that look like another place of the map (perceptual aliases).
         source: Name of the version that the map started from, empty if it started from none.
         equal_rooms_m: Metres: size of rooms that look the same, 0 if every place looks unique.
@@ -92,7 +96,7 @@ class MapGraph:
     def __len__(self) -> int:
         return self._size
 
-    # --- Tables with a row for each keyframe ---
+    # --- Tables with a row for each keyframe: views, which change with the graph ---
 
     @property
     def T_component_camera(self) -> Array:
@@ -135,7 +139,10 @@ class MapGraph:
         return self.segments[int(self._segment_rows[i])]
 
     def component_of(self, i: int) -> int:
-        """Return the component of keyframe *i*: the row of its first segment."""
+        """Return the component of keyframe *i*: the row of the first segment in it.
+
+        The robot of the keyframe must not have been forgotten.
+        """
         return self.segments[int(self._segment_rows[i])].component
 
     def find_segment(self, robot: str, number: int) -> Segment | None:
@@ -196,15 +203,21 @@ class MapGraph:
         return ids[0] if ids else -1
 
     def anchors(self) -> set[int]:
-        """Return the keyframes that define the frames of all components; they are never moved."""
+        """Return the keyframes that define the frames of all components, and which smoothing holds.
+
+        The set also has -1 if the robot of such a keyframe was forgotten.
+        """
         return {self.anchor(row) for row in range(len(self.segments))}
 
     def accepted_edges_of(self, i: int) -> list[int]:
-        """Return the numbers of the accepted loop closures of keyframe *i*."""
+        """Return the numbers of the accepted loop closures of keyframe *i*; do not change this list."""
         return self._accepted_of.get(i, [])
 
     def accepted_edges_by_segments(self) -> dict[tuple[int, int], list[int]]:
-        """Return the numbers of accepted loop closures by the rows of the two segments they connect."""
+        """Return the numbers of accepted loop closures by the rows of the two segments that they connect.
+
+        The lower row is first; both rows are equal for loop closures within one segment.
+        """
         by_segments: dict[tuple[int, int], list[int]] = {}
         for number, edge in self.edges.items():
             if edge.state == "accepted":
@@ -214,7 +227,7 @@ class MapGraph:
     def neighbours(self, i: int) -> Iterator[tuple[int, float]]:
         """Yield (keyframe, steps) of each keyframe that odometry or an accepted edge connects with *i*.
 
-        A loop closure counts as one step.
+        A loop closure counts as one step.  Keyframes of a stored version have no odometry.
         """
         segment = self.segments[self._segment_rows[i]]
         if not segment.is_from_version:
@@ -228,7 +241,10 @@ class MapGraph:
             yield (edge.b if edge.a == i else edge.a), 1.0
 
     def odometry_edges_of(self, i: int) -> list[tuple[int, int]]:
-        """Return the pairs of consecutive keyframes of a segment that keyframe *i* belongs to."""
+        """Return the pairs (before, *i*) and (*i*, after) of consecutive keyframes of the segment of *i*.
+
+        A pair is missing at an end of the segment; a segment of a stored version has none.
+        """
         segment = self.segments[self._segment_rows[i]]
         if segment.is_from_version:
             return []
@@ -245,8 +261,9 @@ class MapGraph:
     def shortest_paths(self, start: int, targets: Iterable[int]) -> dict[int, float]:
         """Return the steps of odometry from keyframe *start* to each target along the shortest path.
 
-        The search (Dijkstra) visits 250 keyframes at most.  A target that it does not reach counts the steps
-        along the segment, at most 200, if it is in the segment of *start*; else at least 200.
+        A loop closure counts as one step.  The search (Dijkstra) visits 250 keyframes at most.  A target that
+        it does not reach gets the steps along the segment, at most 200, if it is in the segment of *start*;
+        else the steps to the farthest visited keyframe, at least 200.
         """
         wanted = set(targets)
         steps: dict[int, float] = {}
@@ -278,16 +295,21 @@ class MapGraph:
         self.events += 1
 
     def start_from_version(self, source: str, equal_rooms_m: float, *, has_keyframes: bool) -> None:
-        """Note what the map starts from; keyframes of the version, if there are some, define its frame."""
+        """Note the version and the size of equal rooms that an empty map starts with.
+
+        If the version has keyframes, add the segment (row 0) that will hold them; it defines the frame of the
+        map.
+        """
         self.source, self.equal_rooms_m = source, equal_rooms_m
         if has_keyframes:
             self.segments.append(Segment(robot="", number=-1, is_from_version=True))
             self.root = 0
 
     def find_or_add_segment(self, robot: str, number: int) -> int:
-        """Return the row of a robot's segment; add the segment if there is none.
+        """Return the row of segment *number* of a robot; add the segment if there is none.
 
-        A new segment inherits the contradictions of the newest 16 keyframes of the robot's last segment.
+        If the robot has not left, only its newest segment is compared, since segment numbers never decrease.
+        A new segment inherits the newest 16 records of contradictions of the robot's last segment.
         """
         newest = self.newest_segments.get(robot)
         for row in range(len(self.segments)) if newest is None else (newest,):
@@ -303,9 +325,10 @@ class MapGraph:
         return row
 
     def begin_segment(self, row: int, assumed_scale: float | None, reason: str) -> None:
-        """State the unit of a segment without keyframes: metres, or *assumed_scale* metres until it is known.
+        """State the unit of length of a segment without keyframes.
 
-        *reason* says why a segment without metric scale has no alignment yet.
+        The unit is a metre if *assumed_scale* is None; else it is taken for *assumed_scale* metres until the
+        scale is estimated, and *reason* says why the segment has no alignment yet.
         """
         segment = self.segments[row]
         segment.is_metric = assumed_scale is None
@@ -317,13 +340,14 @@ class MapGraph:
     ) -> int:
         """Append a keyframe to segment *row*; return the id of the keyframe.
 
-        The first metric segment of a robot defines the frame of a map that has none.
+        The segment becomes the robot's newest one.  The first metric segment of a robot defines the frame of
+        a map that has none.
 
         Args:
             keyframe: The keyframe.
             row: Row of its segment.
-            T_odom: ``(4, 4)``, its pose in the odometry frame.
-            T_component: ``(4, 4)``, its pose in the frame of the component.
+            T_odom: ``(4, 4)``, its pose in the odometry frame, in the unit of the segment.
+            T_component: ``(4, 4)``, its pose in the frame and unit of the component.
             odometry_steps: Steps of odometry from the first keyframe of the segment.
         """
         self._grow()
@@ -371,7 +395,7 @@ class MapGraph:
         self._T_component_camera[ids] = T_component_camera
 
     def scale_segment(self, row: int, factor: float) -> None:
-        """Multiply the estimated scale of segment *row* by *factor*, after its poses were smoothed."""
+        """Multiply the estimated scale of segment *row* by *factor*; its poses and steps do not change."""
         self.segments[row].scale *= factor
 
     def remove_robot(self, robot: str) -> None:
@@ -382,7 +406,7 @@ class MapGraph:
         """Take out all keyframes of *robot* with their loop closures; return the ids of these keyframes.
 
         If the frame of the map was defined by the robot, another metric segment defines it afterwards, one of
-        the same component if there is one.
+        the same component if there is one.  If no metric segment has keyframes, the map has no frame then.
         """
         root_component = self.root_component()
         rows_of_root = [row for row, each in enumerate(self.segments) if each.component == root_component]
@@ -418,9 +442,9 @@ class MapGraph:
         return forgotten
 
     def note_contradiction(self, row: int, *, is_contradiction: bool, count: int = 1) -> int:
-        """Record *count* times whether the newest keyframe of segment *row* contradicts the map.
+        """Record *count* times whether a keyframe of segment *row* contradicts the map.
 
-        Return the number of contradictions among the newest 32 records.
+        Return the number of contradictions among the newest 32 records of the segment.
         """
         bits = (1 << count) - 1 if is_contradiction else 0
         segment = self.segments[row]
@@ -428,7 +452,11 @@ class MapGraph:
         return segment.contradictions.bit_count()
 
     def exclude_segment(self, row: int, reason: str) -> None:
-        """Take out the loop closures of segment *row* for good, and ignore later ones; its keyframes stay."""
+        """Take out the loop closures of segment *row* for good, and mark it, so that later ones are ignored.
+
+        Its keyframes stay.  If it defined the frame of the map, another metric segment of its component
+        defines it afterwards, if there is one.
+        """
         excluded = self.segments[row]
         excluded.is_excluded, excluded.reason = True, reason
         for number in [number for number, edge in self.edges.items() if row in self.segment_pair_of(edge)]:
@@ -454,7 +482,11 @@ class MapGraph:
         self.segments[row].reason = reason
 
     def report_alignment(self, row: int, T_map_odom: Array, covariance: Array | None) -> None:
-        """Note the alignment that the robot of segment *row* is sent; None keeps the last covariance."""
+        """Note the alignment, and the present scale, that the robot of segment *row* is sent.
+
+        *T_map_odom* ``(4, 4)`` has the *covariance* ``(6, 6)`` of a left twist (metres, radians); None keeps
+        the covariance that was noted before.
+        """
         segment = self.segments[row]
         segment.reported_T_map_odom, segment.reason = T_map_odom, ""
         segment.reported_scale = segment.scale
@@ -507,7 +539,7 @@ class MapGraph:
         return accepted
 
     def reject_edges(self, numbers: Iterable[int]) -> list[LoopEdge]:
-        """Reject pending or accepted loop closures; components may fall apart; return the loop closures."""
+        """Reject pending or accepted loop closures and return them; components may fall apart."""
         edges = [self._reject(number) for number in numbers]
         if any(self._segment_rows[edge.a] != self._segment_rows[edge.b] for edge in edges):
             self._update_components()
@@ -521,9 +553,10 @@ class MapGraph:
 
         Args:
             moving: The component that is moved.
-            T_stay_moving: ``(4, 4)``, frame of the moved component in that of the other one.
+            T_stay_moving: ``(4, 4)``, pose of the frame of the moved component in that of the other one, in
+                the unit of the other one.
             scale: Length of the unit of the moved component in that of the other one.
-            numbers: The loop closures between both components.
+            numbers: The pending loop closures between both components that are accepted.
 
         Returns:
             The accepted loop closures.
@@ -537,7 +570,7 @@ class MapGraph:
         return accepted
 
     def note_misfit(self, number: int, *, is_misfit: bool) -> int:
-        """Record whether a loop closure misfits the smoothed graph; return its misfits in a row."""
+        """Record whether an accepted loop closure misfits the smoothed graph; return its misfits in a row."""
         edge = self.edges[number]
         edge.misfits = edge.misfits + 1 if is_misfit else 0
         return edge.misfits
@@ -547,7 +580,7 @@ class MapGraph:
         self.pair_consistency[earlier, later] = is_consistent
 
     def drop_oldest_pending(self, limit: int) -> None:
-        """Reject the oldest pending loop closures beyond the newest *limit*."""
+        """Reject the oldest pending loop closures, so that the newest *limit* stay pending."""
         surplus = len(self.pending) - limit
         if surplus > 0:
             for number in self.pending[:surplus]:
@@ -555,9 +588,10 @@ class MapGraph:
             self._drop_pair_consistency()
 
     def reopen_rejected(self) -> None:
-        """Make all rejected loop closures pending again, and drop what they proved.
+        """Make all rejected loop closures pending again, and drop what was concluded from loop closures.
 
-        Segments without an alignment get the reason of a new segment; perceptual aliases are dropped.
+        No keyframe is a perceptual alias any more, and the consistency of all pairs is unknown.  Segments
+        without an alignment get the reason of a new segment, except excluded ones.
         """
         for number, edge in self.rejected.items():
             edge.state, edge.misfits = "pending", 0
@@ -573,7 +607,7 @@ class MapGraph:
         self._accepted_of.setdefault(edge.b, []).append(number)
 
     def _reject(self, number: int) -> LoopEdge:
-        """Take out a loop closure; keep the newest rejected ones for `reopen_rejected`."""
+        """Take a loop closure out and keep it for `reopen_rejected`; the caller updates the components."""
         edge = self.edges.pop(number)
         if edge.state == "accepted":
             self._accepted_of[edge.a].remove(number)
@@ -587,7 +621,10 @@ class MapGraph:
         return edge
 
     def _move_segment(self, segment: Segment, T_stay_moving: Array, scale: float) -> None:
-        """Express a segment in another frame, its lengths multiplied by *scale*."""
+        """Move the poses of a segment by *T_stay_moving*, after their lengths were multiplied by *scale*.
+
+        The scale of the segment and its steps of odometry change with *scale*.
+        """
         ids = segment.keyframes
         if scale == 1.0:
             self.set_poses(ids, T_stay_moving @ self.T_component_camera[ids])
@@ -649,7 +686,7 @@ class MapGraph:
             arrays: Poses ``(n, 4, 4)`` in the component and in the odometry frame, steps of odometry
                 ``(n,)``, rows of segments ``(n,)``, and positions within segments ``(n,)``.
             accepted_by_keyframe: Numbers of accepted loop closures by keyframe.
-            tables: The other attributes of the class by name.
+            tables: Values of the other public attributes of `MapGraph`, by name.
         """
         graph = cls()
         n = graph._size = len(keyframes)
@@ -670,8 +707,8 @@ class MapGraph:
 def count_odometry_steps(T_from_to: Array) -> float:
     """Return a motion in steps of odometry: 0.25 m or 15 degrees are one step, the larger count decides.
 
-    The standard deviation of odometry grows with the square root of these steps.  *T_from_to* is ``(4, 4)``,
-    in metres.
+    A motion counts as 0.05 steps at least.  The standard deviation of odometry grows with the square root of
+    these steps.  *T_from_to* is ``(4, 4)``, in metres.
     """
     by_length = float(np.sqrt((T_from_to[:3, 3] ** 2).sum())) / STEP_LENGTH_M
     by_rotation = rotation_angle_deg(T_from_to[:3, :3]) / STEP_ROTATION_DEG

@@ -23,8 +23,8 @@ EdgeState = Literal["pending", "accepted", "rejected"]
 NO_LOOP_CLOSURE_YET = "no loop closure between its keyframes and the map is accepted yet"
 
 MIN_RELATIVE_COVARIANCE: Array = np.diag([0.02**2] * 3 + [math.radians(0.7) ** 2] * 3)
-"""``(6, 6)``, square metres and square radians: covariance that an alignment has at least, because errors of
-depth and calibration are correlated and do not average out."""
+"""``(6, 6)``, square metres and square radians: covariance of a segment's alignment until smoothing has
+computed one.  The same numbers are added to the covariance of each measured relative pose."""
 
 
 @dataclass(slots=True, eq=False)
@@ -56,13 +56,13 @@ class Segment:
     reported_T_map_odom: Array | None = None
     """``(4, 4)``: the alignment with the map that the robot was last sent, None while it has none."""
     covariance: Array = field(default_factory=lambda: MIN_RELATIVE_COVARIANCE.copy())
-    """``(6, 6)``: covariance of the reported alignment as a left twist (metres, radians)."""
+    """``(6, 6)``: covariance of the reported alignment, of a twist on its left (metres, radians)."""
     reason: str = NO_LOOP_CLOSURE_YET
     """Why the segment has no alignment with the map; shown to operators and robots."""
     is_from_version: bool = False
     """Whether the keyframes come from the stored version that the map started from."""
     contradictions: int = 0
-    """Bits, newest lowest: whether each of the last 32 keyframes with evidence contradicted the map."""
+    """The newest 32 records of `MapGraph.note_contradiction` as bits, newest lowest; 1 is a contradiction."""
     is_excluded: bool = False
     """Whether loop closures of the segment are ignored, because it kept contradicting the map."""
     is_metric: bool = True
@@ -70,20 +70,22 @@ class Segment:
     scale: float = 1.0
     """Length of the segment's unit in the unit of its component, which is a metre if that is metric."""
     reported_scale: float = 1.0
-    """The scale that the robot was sent with the reported alignment."""
+    """The scale that was reported with the alignment; a robot with metres is not sent it."""
 
 
 @dataclass(slots=True, eq=False)
 class LoopEdge:
     """A loop closure: the measured relative pose of keyframes ``a`` and ``b``, of one robot or of two.
 
-    ``a`` is the keyframe that was compared with older ones when it arrived.  ``T_a_b`` is ``(4, 4)``,
-    ``information`` ``(6, 6)`` the inverse covariance of its twist, ``variances`` ``(6,)`` the diagonal of the
-    covariance (square metres, square radians).  Lengths are metres if *a* or *b* is in a metric segment, else
-    in the unit of the segment of *a*.  ``scale`` is None between two metric segments; otherwise it holds the
-    logarithm of the length of the unit of *b* in the unit of *a*, and the variance of this logarithm.
+    ``a`` is the keyframe that was compared with older ones when it arrived.  ``T_a_b`` ``(4, 4)`` maps points
+    of the camera of *b* to that of *a*.  ``information`` ``(6, 6)`` is the inverse covariance of the twist on
+    its right, ``variances`` ``(6,)`` are the diagonal of the covariance (squares of lengths, square radians).
+    Lengths are metres if *a* or *b* is in a metric segment, else in the unit of the segment of *a*.
+    ``scale`` is None between two metric segments; otherwise it holds the logarithm of the length of the unit
+    of *b* in the unit of *a*, and the variance of this logarithm.
     ``is_fixed`` marks an edge of the version that the map started from, which is never rejected.
-    ``misfits`` counts the updates in a row in which the loop closure did not fit the graph.
+    ``inliers`` of the ``matches`` between both images fit the pose.  ``misfits`` counts the last updates in a
+    row in which the loop closure did not fit the graph.
     """
 
     a: int

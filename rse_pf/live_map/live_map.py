@@ -86,10 +86,11 @@ __all__ = ["LiveMap"]
 MAX_SEGMENTS = 2**31  # segment numbers of a robot are below this, so that they fit into 32 bits
 MAX_PENDING_EDGES = 400  # newest pending loop closures of a map that are kept, to bound memory and CPU time
 MIN_KEYFRAMES_BETWEEN_OPTIMISATIONS = 20
-"""Keyframes between two requests to optimise the whole graph, at least, because each fits all poses."""
+"""Keyframes that arrive between two requests of the smoother to optimise the whole graph, at least, because
+an optimisation fits all poses.  A request after a robot was forgotten or excluded does not wait."""
 RELOCALISATION_POOL = 6
-"""Candidates of place recognition for each one that a relocalisation compares, so that a second place that
-looks the same is compared as well."""
+"""Keyframes that place recognition proposes for each one that a relocalisation compares.  Those compared are
+spread over the map, so that a second place that looks the same is compared as well."""
 
 
 class LiveMap:
@@ -234,7 +235,7 @@ class LiveMap:
         return None if found is None else alignment_of(found)
 
     def to_version(self) -> MapVersion:
-        """Return the keyframes that are connected with the frame of the map, and their edges, as a version.
+        """Return the keyframes with features that are connected with the map, and their edges, as a version.
 
         Raises:
             InternalError: The map holds something that does not fit into a version.
@@ -268,11 +269,12 @@ class LiveMap:
     def check_keyframe(self, event: KeyframeAdded) -> Literal["new", "known", "ahead"]:
         """Return whether a keyframe is the robot's next one, was added before, or comes too early.
 
+        Only its number decides: "known" does not say that the keyframe is equal to the one that was added.
         The map does not change.
 
         Raises:
-            BadRequest: The segment, pose, camera, features or time cannot be right, or the descriptors are of
-                another kind than those of the map.
+            BadRequest: The keyframe is the next one, and its segment, pose, camera, features or time cannot
+                be right, or its descriptors are of another kind than those of the map.
         """
         expected = self.next_number(event.robot)
         if event.number != expected:
@@ -310,11 +312,11 @@ class LiveMap:
 
         Args:
             keyframe: The keyframe that is compared with others.
-            pieces: Number of functions, among which the candidates are divided; `merge_measurements` merges
-                their results.
-            candidates: Keyframes to compare with; None for the number of the options.  An overloaded map
-                server asks for fewer; then keyframes of the same robot within 12 steps of odometry (3 m of
-                straight motion) are left out.
+            pieces: Largest number of functions, among which the candidates are divided; at least one is
+                returned, and `merge_measurements` merges their results.
+            candidates: Largest number of keyframes to compare with; None for that of the options.  An
+                overloaded map server states one; then keyframes of the same segment within 12 steps of
+                odometry (3 m of straight motion) are left out.
         """
         stored = self._stored(keyframe)
         if stored is None or self._is_ignored(keyframe):
@@ -329,7 +331,9 @@ class LiveMap:
         return [partial(measure_stored_keyframes, stored, group, LOOP_CLOSURE_EVIDENCE) for group in groups]
 
     def optimise(self) -> Optimised:
-        """Optimise the whole graph; the map does not change.
+        """Optimise the whole graph and return its new poses as an event; the map does not change.
+
+        A segment must define the frame of the map.
 
         Raises:
             MissingExtra: gtsam is not installed.
@@ -341,7 +345,8 @@ class LiveMap:
     ) -> Callable[[], Optimised]:
         """Return a function that does the work of `optimise`, in any thread while the map changes.
 
-        *solve* returns the poses of `optimise_graph`, for example from a process of its own.
+        A segment must define the frame of the map.  *solve* takes the place of `optimise_graph` and returns
+        the optimised poses ``(n, 4, 4)``, for example from a process of its own.
         """
         pose_graph, ids = whole_graph(self._graph)
         anchor, up_to = ids.index(self._graph.anchor(self._graph.root)), self._graph.events
@@ -377,7 +382,7 @@ class LiveMap:
         limit = self.options.candidates
         vector = place_vector(view.features.descriptors)
         nearest = self._places.nearest(vector, RELOCALISATION_POOL * limit, allowed)
-        # 2. Copy their poses, since the map may change before the returned function runs.
+        # 2. Copy the poses of these keyframes, since the map may change before the returned function runs.
         T = graph.T_component_camera
         chosen = [
             (self._stored(i), T[i].copy(), graph.segment_of(i).scale)
@@ -399,7 +404,7 @@ class LiveMap:
     def apply(self, event: Event) -> list[Outcome]:
         """Change the map by *event* and return what changed; deterministic.
 
-        Events about keyframes of forgotten robots change nothing.
+        Events about keyframes of forgotten robots, and a change of the map server, are counted only.
 
         Raises:
             BadRequest: The event starts a map that has keyframes already, or its data are damaged.
@@ -465,7 +470,8 @@ class LiveMap:
         graph, keyframe = self._graph, event.keyframe
         if not graph.exists(keyframe):
             return []
-        # 1. Add the measured loop closures as pending ones, unless odometry jumped at the keyframe.
+        # 1. Add the measured loop closures as pending ones, except those of forgotten or excluded robots,
+        #    unless odometry jumped at the keyframe.
         measured = [
             closure
             for closure in event.links
@@ -479,7 +485,8 @@ class LiveMap:
         numbers = graph.add_edges(_pending_edges(keyframe, measured))
         # 2. Accept or reject loop closures, and join components that they connect.
         changes = process_new_edges(graph, keyframe, numbers)
-        # 3. Exclude the robot if it keeps contradicting the map, and decide again about all loop closures.
+        # 3. Exclude the robot's segment if it keeps contradicting the map; then decide again about all loop
+        #    closures that are not accepted.
         if has_jumped:
             changes.fits.add("contrary")
         is_scale_wrong = has_wrong_scale(graph, keyframe, measured)
@@ -489,7 +496,7 @@ class LiveMap:
         robot, number = graph.keyframes[keyframe].robot, graph.keyframes[keyframe].number
         windows = self._smooth(changes, robot)
         graph.drop_oldest_pending(MAX_PENDING_EDGES)
-        # 5. Report the alignments of robots that changed.
+        # 5. Report the alignments that changed.
         reports = report_alignments(graph, (robot, number), windows)
         # 6. Drop redundant features, and those of a keyframe whose odometry jumped, since they would
         #    contradict every later keyframe.
@@ -524,7 +531,7 @@ class LiveMap:
         # 2. Move segments that joined the map later, and smooth the poses where they are connected.
         changes = GraphChanges(moved=self._move_joined_segments(motions))
         windows = self._smooth(changes)
-        # 3. Report the alignments of robots that changed.
+        # 3. Report the alignments that changed.
         return [*changes.outcomes, *report_alignments(graph, None, windows)]
 
     def _move_joined_segments(self, motions: dict[int, Array]) -> list[int]:
@@ -535,7 +542,8 @@ class LiveMap:
                 of the map; receives the motions of the moved segments.
 
         Returns:
-            The ends of loop closures between moved and optimised segments, to smooth around them.
+            Both ends of one loop closure between each moved segment and the one that it moved with, to smooth
+            around them.
         """
         graph = self._graph
         ends: list[int] = []
@@ -582,7 +590,11 @@ class LiveMap:
     # --- Steps that several events share ---
 
     def _decide_again(self) -> list[Outcome]:
-        """Decide again about all loop closures that are not accepted, and smooth the whole graph."""
+        """Decide again about all loop closures that are not accepted, and smooth the whole graph.
+
+        Return what became ambiguous, and a request to optimise; accepted and rejected loop closures are not
+        reported.
+        """
         graph = self._graph
         outcomes: list[Outcome] = []
         for changes in decide_again(graph):
@@ -594,7 +606,11 @@ class LiveMap:
         return outcomes
 
     def _smooth(self, changes: GraphChanges, robot: str | None = None) -> SmoothedWindows | None:
-        """Smooth around *changes*, which a keyframe of *robot* caused; request an optimisation if needed."""
+        """Smooth around *changes*, which a keyframe of *robot* caused, and return what was smoothed.
+
+        Add rejections to the outcomes of *changes*, and a request to optimise the whole graph if the largest
+        window was too small and the last request is 20 keyframes ago.  Return None if nothing moved.
+        """
         graph = self._graph
         windows = smooth_changes(graph, changes, self.options, robot)
         is_due = len(graph) - graph.optimised_at >= MIN_KEYFRAMES_BETWEEN_OPTIMISATIONS
@@ -611,12 +627,12 @@ class LiveMap:
         return [Culled(ids=ids)] if ids else []
 
     def _stored(self, i: int) -> StoredView | None:
-        """Return the id and encoded features of keyframe *i*, None if its features were dropped."""
+        """Return the id and the encoded keyframe *i*, None if its features were dropped."""
         data = self._graph.keyframes[i].data
         return None if data is None else (i, data)
 
     def _is_ignored(self, i: int) -> bool:
-        """Return whether loop closures of keyframe *i* are ignored: its robot was forgotten or excluded."""
+        """Return whether loop closures of *i* are ignored: it was forgotten, or its segment excluded."""
         return not self._graph.exists(i) or self._graph.segment_of(i).is_excluded
 
     def _aligned_mask(self) -> npt.NDArray[np.bool_]:

@@ -91,7 +91,7 @@ def measure_loop_closures(
         if isinstance(measured, str):
             failed[measured] += 1
             continue
-        # 2. Convert lengths and scale from assumed metres to the units of both robots.
+        # 2. Convert the pose and the ratio of scales from assumed metres to the units of both robots.
         measured = _in_robots_units(measured, features, other_features)
         scale = measured.scale
         loop_closures.append(
@@ -145,8 +145,8 @@ def decode_view(stored: StoredView) -> tuple[int, KeyframeFeatures, Camera]:
 def landmarks_of_features(features: KeyframeFeatures, camera: Camera) -> Landmarks:
     """Return the 3-D points of a keyframe in its camera frame, to be matched with the features of others.
 
-    Points are in metres, by `assumed_scale` if the keyframe is not metric; features without depth are left
-    out then.
+    Points are in metres, by `assumed_scale` if the keyframe is not metric.  Features without depth, which
+    only such a keyframe has, are left out.
     """
     if features.is_metric:
         return Landmarks(points_camera=features.points_camera(camera), descriptors=features.descriptors)
@@ -204,7 +204,10 @@ def placed_keyframe(stored: StoredView, T_map_keyframe: Array, scale: float = 1.
 
 
 def _wrong_log_scale(measured: RelativePose) -> float | None:
-    """Return the logarithm of the ratio of both keyframes' metres if it clearly differs from 0, else None."""
+    """Return the logarithm of the ratio of both keyframes' metres if it clearly differs from 0, else None.
+
+    The ratio is the length of the other keyframe's metre in metres of the measured one.
+    """
     ratio = measured.depth_ratio
     if ratio is None:
         return None
@@ -215,7 +218,11 @@ def _wrong_log_scale(measured: RelativePose) -> float | None:
 def _in_robots_units(
     measured: RelativePose, features: KeyframeFeatures, other: KeyframeFeatures
 ) -> RelativePose:
-    """Convert a relative pose from assumed metres to the units that both robots use."""
+    """Return a relative pose in the units that both robots use, given one in assumed metres.
+
+    If one keyframe is metric, the pose is in its metres already, and only the ratio of the units changes.  If
+    both are metric, nothing changes.
+    """
     if measured.scale is None:
         return measured
     scale_a, scale_b = assumed_scale(features), assumed_scale(other)

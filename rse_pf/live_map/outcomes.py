@@ -42,13 +42,13 @@ class Joined:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Corrected:
-    """The alignment of a robot's segment with the map changed.
+    """The alignment of a robot's segment with the map changed, or the segment has one for the first time.
 
     ``T_map_odom`` ``(4, 4)`` maps from the odometry frame of the segment to the frame of the map.
     ``covariance`` ``(6, 6)`` is that of its left twist (metres, radians).  ``cause`` is the keyframe (robot,
-    number) whose loop closures changed the alignment, None after an optimisation.  ``scale`` is the length
-    in metres of the segment's unit, by which odometry is multiplied before ``T_map_odom`` is applied; None if
-    the odometry is in metres.
+    number) that changed the alignment, None after an optimisation or after a robot was forgotten.  ``scale``
+    is the length in metres of the segment's unit, by which translations of the odometry are multiplied before
+    ``T_map_odom`` is applied; None if the odometry is in metres.
     """
 
     robot: str
@@ -98,7 +98,7 @@ class OptimiseWanted:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Ambiguous:
-    """A segment is not aligned, because of perceptual aliases or because it contradicts the map.
+    """A segment is not aligned because of perceptual aliases, or was excluded because it contradicts the map.
 
     ``reason`` is a sentence for the operator.
     """

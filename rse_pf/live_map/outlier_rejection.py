@@ -43,14 +43,14 @@ __all__ = [
 MAX_SQUARED_MISFIT = 30.0
 """Squared Mahalanobis norm of a loop closure's residual (six degrees of freedom) above which it counts as a
 misfit; one true loop closure in 25,000 is above."""
-MAX_MISFITS = 8  # updates in a row in which a loop closure may misfit the smoothed graph; then it is rejected
+MAX_MISFITS = 8  # updates in a row in which a loop closure misfits the smoothed graph until it is rejected
 MAX_EDGES_AFTER_JOIN = 48  # newest pending loop closures that are classified after a join, to bound CPU time
 MAX_ALIAS_RADIUS_M = 5.0
 """Metres around a place that looks like another one within which all keyframes are taken for aliases, at
 most."""
 MIN_ALIAS_SUPPORT = 12
-"""Summed weight of contrary loop closures between two robots, at least, that proves perceptual aliases
-against heavier accepted loop closures."""
+"""Summed weight of contrary loop closures between two segments, at least, that proves perceptual aliases
+where no connection weighs less, so that none can be rejected."""
 MAX_DRIFT_RATIO = 0.15
 """Error of odometry, in metres per metre of path, that is possible; a larger disagreement with loop closures
 means that two places look the same."""
@@ -64,7 +64,7 @@ class GraphChanges:
     """What an update of loop closures changed.
 
     ``outcomes`` are reported.  ``moved`` are the keyframes around which the graph must be smoothed.  ``fits``
-    says how the loop closures of full weight within one component fitted the graph; those at perceptual
+    collects how the loop closures of full weight within one component fitted the graph; those at perceptual
     aliases, which say nothing about the robot, are "alias".
     """
 
@@ -85,7 +85,7 @@ def process_new_edges(graph: MapGraph, keyframe: int, numbers: list[int]) -> Gra
     holds the outcomes, and the keyframes around which the graph must be smoothed.
     """
     changes = GraphChanges()
-    # 1. Classify the loop closures within the component of the keyframe by the poses of the graph.
+    # 1. Decide about the loop closures within the component of the keyframe by the poses of the graph.
     component = graph.component_of(keyframe)
     others = {
         number: graph.edges[number].b if graph.edges[number].a == keyframe else graph.edges[number].a
@@ -103,8 +103,8 @@ def decide_again(graph: MapGraph) -> Iterator[GraphChanges]:
     """Decide again about all loop closures that are not accepted, as if they arrived now, oldest first.
 
     Rejected loop closures become pending, and proofs of perceptual aliases are dropped before, since they may
-    rest on loop closures that were taken out.  The caller smooths the graph around each yielded change before
-    the next one is computed.
+    rest on loop closures that were taken out.  This is a generator: the graph changes while the caller
+    iterates, and the caller smooths it around each yielded change before the next one is computed.
     """
     graph.reopen_rejected()
     for keyframe, group in groupby(list(graph.pending), lambda number: graph.edges[number].a):
@@ -118,12 +118,12 @@ def decide_again(graph: MapGraph) -> Iterator[GraphChanges]:
 def reject_misfitting_edges(
     graph: MapGraph, squared_misfits: Mapping[int, float], changes: GraphChanges
 ) -> bool:
-    """Reject accepted loop closures that misfitted the graph in eight updates in a row.
+    """Count the misfits of accepted loop closures, and reject those with eight in a row.
 
     Args:
-        graph: The graph after smoothing.
+        graph: The graph after smoothing; the counts and the loop closures change.
         squared_misfits: Squared Mahalanobis norm of the residual of each smoothed loop closure, by number.
-        changes: Receives the outcomes.
+        changes: Receives the outcomes, and the ends of rejected loop closures as moved.
 
     Returns:
         Whether there was such a loop closure.
@@ -141,7 +141,10 @@ def reject_misfitting_edges(
 
 
 def _decide_within(graph: MapGraph, numbers: list[int], changes: GraphChanges) -> None:
-    """Accept loop closures within one component that agree with the graph; use the others as evidence."""
+    """Accept loop closures within one component that agree with the graph; use the others as evidence.
+
+    Others without enough support, and weak ones that repeat an accepted one of full weight, stay pending.
+    """
     # 1. Compare the loop closures with the poses of the graph.
     fits = classify_by_graph(graph, numbers)
     changes.fits |= {
@@ -162,6 +165,7 @@ def _decide_within(graph: MapGraph, numbers: list[int], changes: GraphChanges) -
         if fit == "agrees" or not _is_pending(graph, number):
             continue
         edge = graph.edges[number]
+        # A rejection for an earlier loop closure of this loop may have separated the components of both ends.
         if graph.component_of(edge.a) != graph.component_of(edge.b):
             continue
         supporting = find_supporting_edges(graph, number)
@@ -174,7 +178,7 @@ def _decide_within(graph: MapGraph, numbers: list[int], changes: GraphChanges) -
 def _drop_redundant_weak(graph: MapGraph, numbers: list[int]) -> list[int]:
     """Return the loop closures of one keyframe without weak ones to a segment that a full one leads to.
 
-    A weak loop closure adds nothing there, and costs the CPU time of a decision.
+    A weak loop closure adds nothing there, and costs the CPU time of a decision; it stays pending.
     """
     full = [number for number in numbers if graph.edges[number].weight == 1.0]
     connected = {int(graph.segment_rows[graph.edges[number].b]) for number in full}
@@ -206,7 +210,8 @@ def _reject_contradicted(graph: MapGraph, number: int, consistent: list[int], ch
     """Reject accepted loop closures that *consistent* ones, among them the contrary *number*, outweigh.
 
     Where accepted and contrary loop closures both have much weight, both are right: the robots saw two places
-    that look the same (perceptual aliases).
+    that look the same (perceptual aliases).  Between two segments, nothing changes if *number* is at a known
+    perceptual alias.
     """
     reason = f"{len(consistent)} later links agree with each other and contradict it"
     edge = graph.edges[number]
@@ -216,7 +221,8 @@ def _reject_contradicted(graph: MapGraph, number: int, consistent: list[int], ch
         return
     if is_at_alias(graph, number):
         return
-    # 1. Reject the weakest connection between both segments until they are in two components.
+    # 1. Reject the weakest connection between both segments, as long as it weighs less than the contrary loop
+    #    closures, until both segments are in two components.
     weight = total_weight(graph, consistent)
     has_rejected = False
     while graph.segments[row_a].component == graph.segments[row_b].component:
@@ -229,7 +235,8 @@ def _reject_contradicted(graph: MapGraph, number: int, consistent: list[int], ch
     # 2. Join the two components again where the contrary loop closures say.
     if has_rejected and component_a != component_b:
         _join_if_consistent(graph, component_a, component_b, changes)
-    # 3. If no connection could be rejected, a large error of the graph proves perceptual aliases.
+    # 3. If no connection was rejected, and the contrary loop closures weigh at least 12, an error of the
+    #    graph that drift cannot explain proves perceptual aliases.
     elif not has_rejected and weight >= MIN_ALIAS_SUPPORT:
         error_m = _translation_error_m(graph, number, *graph.T_component_camera[[edge.a, edge.b]])
         steps = graph.shortest_paths(edge.a, [edge.b])[edge.b]
@@ -265,9 +272,10 @@ def _reject_contradicted_loops(
 
 
 def _translation_error_m(graph: MapGraph, number: int, T_a: Array, T_b: Array) -> float:
-    """Return the translation error, in metres, of two poses against the loop closure between them.
+    """Return the distance of the relative pose of two poses from the loop closure between them.
 
-    *T_a* and *T_b* ``(4, 4)`` are the poses of both ends in one frame, in the unit of the component.
+    *T_a* and *T_b* ``(4, 4)`` are the poses of both ends in one frame.  They and the result are in the unit
+    of the component, which is a metre if one of its segments is metric.
     """
     error = inverse(graph.relative_pose_of(graph.edges[number])) @ inverse(T_a) @ T_b
     return float(np.sqrt((error[:3, 3] ** 2).sum()))
@@ -276,7 +284,8 @@ def _translation_error_m(graph: MapGraph, number: int, T_a: Array, T_b: Array) -
 def find_weakest_connection(graph: MapGraph, row_a: int, row_b: int) -> list[int]:
     """Return the loop closures of the weakest connection on the strongest path between two segments.
 
-    A *connection* is all accepted loop closures between two segments.  Connections with an edge of a stored
+    A *connection* is all accepted loop closures between two segments.  The strongest path is the one whose
+    weakest connection has the largest summed weight of loop closures.  Connections with an edge of a stored
     version are never returned; nor are those between two metric segments if segment *row_a* or *row_b* is
     not metric, because a segment of unknown scale proves nothing against known scales.  Return an empty list
     if there is no other connection on the path.
@@ -309,7 +318,10 @@ def _are_metric(graph: MapGraph, rows: Iterable[int]) -> bool:
 
 
 def _find_path(start: int, goal: int, pairs: list[tuple[int, int]]) -> list[tuple[int, int]]:
-    """Return the pairs of segments on a shortest path, by breadth-first search; empty if there is none."""
+    """Return the connections on a shortest path from *goal* back to *start*; empty if there is none.
+
+    Connections are *pairs* of rows of segments.  The search is breadth-first.
+    """
     came_from: dict[int, tuple[int, tuple[int, int]]] = {start: (start, (start, start))}
     frontier = [start]
     while frontier and goal not in came_from:
@@ -334,7 +346,10 @@ def _find_path(start: int, goal: int, pairs: list[tuple[int, int]]) -> list[tupl
 
 
 def _join_if_consistent(graph: MapGraph, first: int, second: int, changes: GraphChanges) -> None:
-    """Join two components if enough pending loop closures between them agree; note if they are ambiguous."""
+    """Join two components if enough pending loop closures between them agree, and decide about the rest.
+
+    Where the loop closures agree but are ambiguous, only the reason of segments changes.
+    """
     decision = decide_join(graph, first, second)
     if decision is None:
         return
@@ -346,7 +361,7 @@ def _join_if_consistent(graph: MapGraph, first: int, second: int, changes: Graph
     for edge in accepted:
         changes.outcomes.append(LoopClosureAccepted(a=edge.a, b=edge.b))
         changes.mark_moved(edge.a, edge.b)
-    # 2. Classify the pending loop closures that are now within one component.
+    # 2. Decide about the newest pending loop closures that are now within the joined component.
     joined = graph.component_of(accepted[0].a)
     within = [
         number
@@ -357,7 +372,7 @@ def _join_if_consistent(graph: MapGraph, first: int, second: int, changes: Graph
 
 
 def _note_ambiguity(graph: MapGraph, decision: AmbiguousJoin, changes: GraphChanges) -> None:
-    """Set the reason of all segments outside the map that the ambiguous loop closures touch, newest first."""
+    """Set and report the reason of all segments outside the map that the ambiguous loop closures touch."""
     root = graph.root_component()
     edges = [graph.edges[number] for number in decision.edges]
     for i in sorted({end for edge in edges for end in (edge.a, edge.b)}, reverse=True):
@@ -372,8 +387,8 @@ def _note_ambiguity(graph: MapGraph, decision: AmbiguousJoin, changes: GraphChan
 def _mark_aliases(graph: MapGraph, numbers: list[int], distance_m: float, changes: GraphChanges) -> None:
     """Mark the ends of loop closures as two places that look the same, and undo the joins that rest on them.
 
-    The places are *distance_m* metres apart.  All keyframes within half of this distance, at most 5 m, are
-    marked, since they may look like the other place as well.
+    The places are *distance_m* metres apart.  All keyframes of the same component within half of this
+    distance, at most 5 m, of an end are marked, since they may look like the other place as well.
     """
     # 1. Mark the keyframes around both ends of the loop closures.
     radius_m = min(0.5 * distance_m, MAX_ALIAS_RADIUS_M)

@@ -76,8 +76,8 @@ TEST_NOISE = OdometryNoise()
 """Drift of odometry that the tests of loop closures assume: two to three times that of the smoother, so that
 no true loop closure fails."""
 ALIAS_DISTANCE_M = 1.0
-"""Metres between two poses from which on they are two places that look the same, and not one place with an
-error."""
+"""Metres between two estimates of one pose above which they are taken for two places that look the same, and
+not for one place with an error."""
 RIVAL_WEIGHT = 0.5
 """Share of the weight of the best consistent set from which on a second set, which says another place, makes
 the join ambiguous."""
@@ -86,9 +86,9 @@ the join ambiguous."""
 class DirectedEdge(NamedTuple):
     """A loop closure in a stated direction and unit of length.
 
-    ``T_a_b`` ``(4, 4)`` leads from keyframe ``a`` to ``b``; ``variances`` ``(6,)`` are those of its twist
-    (squares of the unit, square radians).  ``scale`` is the logarithm of the length of the unit of *b* in the
-    unit of *a* with its variance, None if both units are the same.
+    ``T_a_b`` ``(4, 4)`` maps points of the camera of keyframe ``b`` to that of ``a``; ``variances`` ``(6,)``
+    are those of its twist (squares of the unit, square radians).  ``scale`` is the logarithm of the length of
+    the unit of *b* in the unit of *a* with its variance, None if both units are the same.
     """
 
     a: int
@@ -102,8 +102,9 @@ class DirectedEdge(NamedTuple):
 class Join:
     """The component ``moving`` is moved into the frame of another one by ``T_stay_moving`` ``(4, 4)``.
 
-    ``scale`` is the length of its unit in the unit of the other component.  ``edges`` are the numbers of the
-    loop closures that agree on this and are accepted.
+    ``scale`` is the length of the unit of the moved component in the unit of the other one; lengths of the
+    moved component are multiplied by it before ``T_stay_moving`` is applied.  ``edges`` are the numbers of
+    the loop closures that agree on this and are to be accepted.
     """
 
     moving: int
@@ -150,9 +151,10 @@ def has_enough_support(graph: MapGraph, numbers: Sequence[int]) -> bool:
 
 
 def choose_testable_edges(graph: MapGraph, numbers: Sequence[int]) -> list[int]:
-    """Return the loop closures of *numbers* that are tested: of each keyframe the four with most inliers.
+    """Return the loop closures of *numbers* that are tested: up to four of each keyframe.
 
-    Of those, at most the newest 48 are returned, sorted by number.
+    Loop closures are taken from the most inliers to the fewest, unless one of both ends has four already.  Of
+    those, at most the newest 48 are returned, sorted by number.
     """
     edges_of_keyframe: Counter[int] = Counter()
     chosen = []
@@ -234,8 +236,9 @@ def has_consistent_scale(graph: MapGraph, edge: LoopEdge, steps: float = 0.0) ->
 def find_consistent_by_odometry(graph: MapGraph, number: int, others: Iterable[int]) -> list[int]:
     """Return the largest set of loop closures that agree with *number* and pairwise, by odometry alone.
 
-    *others* are loop closures between the same two segments as *number*.  The poses of the graph are not
-    used, since they may rest on wrong loop closures.
+    *others* are loop closures between the same two segments as *number*; up to 24 of them are tested, see
+    `choose_testable_edges`.  The result is sorted and holds *number*, alone if no other one agrees.  The
+    poses of the graph are not used, since they may rest on wrong loop closures.
     """
     candidates = choose_testable_edges(graph, sorted({*others} - {number}))[-MAX_CONTRARY_EDGES:]
     if not candidates:
@@ -349,13 +352,14 @@ def decide_join(graph: MapGraph, first: int, second: int) -> Join | AmbiguousJoi
     reason = _find_ambiguity(graph, first, second, consistent)
     if reason:
         return AmbiguousJoin(edges=consistent, reason=reason)
-    # 3. Choose the component that stays: that of the map, else the older one; but always the metric one.
+    # 3. Choose the component that stays: that of the map, else the older one; but if only one is metric, that
+    #    one.
     root = graph.root_component()
     is_second = second == root or (first != root and second < first)
     stay, moving = (second, first) if is_second else (first, second)
     if choose_metric_component(graph, stay, moving) != stay:
         stay, moving = moving, stay
-    # 4. Compute scale and pose as medians over the loop closures.
+    # 4. Compute the scale and the pose of the moving component as medians over the loop closures.
     log_scale = _median_log_scale(graph, consistent, stay)
     T_stay_moving = _median_frame(graph, consistent, stay, log_scale)
     return Join(moving=moving, T_stay_moving=T_stay_moving, scale=math.exp(log_scale), edges=consistent)
@@ -372,7 +376,7 @@ def _find_consistent_edges(
 ) -> list[int]:
     """Return the largest set of pending loop closures between two components that agree pairwise.
 
-    The set is empty if all of them together have too little weight.  *excluded* ones are left out.
+    The set is empty if the tested ones together have too little weight.  *excluded* ones are left out.
     """
     # 1. Choose the pending loop closures between both components whose scale the graph does not contradict.
     pair = {first, second}
@@ -384,8 +388,8 @@ def _find_consistent_edges(
     ]
     base = choose_metric_component(graph, first, second)
     numbers = [number for number in numbers if has_consistent_scale(graph, graph.edges[number])]
-    # 2. Limit their number. Where rooms look the same, take them at a distance from each other, so that the
-    #    limited number extends over more than one room.
+    # 2. Limit the number of loop closures. Where rooms look the same, take them at a distance from each
+    #    other, so that the limited number extends over more than one room.
     if graph.equal_rooms_m:
         numbers = _thin_out(graph, numbers, base, 3.0 * graph.equal_rooms_m / MAX_TESTED_EDGES)
     numbers = choose_testable_edges(graph, numbers)
@@ -409,7 +413,10 @@ def _find_consistent_edges(
 def _find_heaviest_clique(
     graph: MapGraph, numbers: Sequence[int], adjacency: npt.NDArray[np.bool_]
 ) -> list[int]:
-    """Return a maximum clique of all loop closures, or of those with full weight if it weighs more."""
+    """Return a maximum clique of all loop closures, or of those with full weight if it weighs more.
+
+    Row and column *i* of *adjacency* are those of the loop closure ``numbers[i]``.
+    """
     full = np.flatnonzero([graph.edges[number].weight == 1.0 for number in numbers])
     of_all = [numbers[row] for row in find_maximum_clique(adjacency).tolist()]
     if len(full) == len(numbers):
@@ -441,12 +448,14 @@ def _find_ambiguity(graph: MapGraph, first: int, second: int, consistent: list[i
     distinct = [number for number in consistent if not is_at_alias(graph, number)]
     if not has_enough_support(graph, distinct):
         return "ambiguous: what it sees is in the map at several places"
-    # 2. Where rooms look the same, the loop closures must extend over more than one room on both sides.
+    # 2. Where rooms look the same, the loop closures must extend over more than one room in each metric
+    #    component; without a metric component no extent is known, and the set is ambiguous.
     size_m = graph.equal_rooms_m
     metric = [side for side in (first, second) if not graph.has_scales or graph.is_metric(side)]
     if size_m and min((_extent_m(graph, distinct, side) for side in metric), default=0.0) <= size_m:
         return f"ambiguous: what it shares with others lies within {size_m:g} m, the size of equal rooms"
-    # 3. A second consistent set of at least half of the weight must give the same pose.
+    # 3. A second consistent set without the loop closures of the first one must give the same pose within
+    #    1 m, if it has at least half of the weight.
     rivals = _find_consistent_edges(graph, first, second, frozenset(consistent))
     is_heavy = total_weight(graph, rivals) / RIVAL_WEIGHT >= total_weight(graph, consistent)
     if is_heavy and has_enough_support(graph, rivals):
@@ -461,7 +470,7 @@ def _find_ambiguity(graph: MapGraph, first: int, second: int, consistent: list[i
 
 
 def _extent_m(graph: MapGraph, numbers: list[int], component: int) -> float:
-    """Return the largest distance between the ends of loop closures in *component*, metres."""
+    """Return the largest distance between the ends of loop closures in *component*, in its unit."""
     edges = [graph.edges[number] for number in numbers]
     ends = [edge.a if graph.component_of(edge.a) == component else edge.b for edge in edges]
     positions = graph.T_component_camera[ends, :3, 3]
@@ -474,7 +483,7 @@ def _median_log_scale(graph: MapGraph, numbers: list[int], stay: int) -> float:
 
 
 def _median_frame(graph: MapGraph, numbers: list[int], stay: int, log_scale: float) -> Array:
-    """Return ``T_stay_moving`` ``(4, 4)``: the median over the poses that single loop closures say.
+    """Return ``T_stay_moving`` ``(4, 4)``: the medoid of the poses that single loop closures give.
 
     The lengths of the moving component are multiplied by the exponential of *log_scale* before.
     """

@@ -25,19 +25,19 @@ JUMP_NEIGHBOURS = 4
 so they cannot be at another place that looks the same."""
 MAX_JUMP_RATIO = 0.5  # error of odometry per length of motion above which the odometry has jumped
 MAX_CONTRADICTIONS = 16
-"""Contradictions among the last 32 keyframes from which on a robot is excluded; honest robots stay far below,
-also with 10 % of wheel slip."""
+"""Contradictions among the last 32 records of a segment from which on it is excluded; honest robots stay far
+below, also with 10 % of wheel slip."""
 WRONG_SCALE_COUNT = 2
-"""Contradictions that a keyframe with a wrong metric scale counts as, because two other robots measured the
-scale."""
+"""Records of a contradiction that a keyframe with a wrong metric scale counts as, because two other robots
+measured the scale."""
 
 
 def has_wrong_scale(graph: MapGraph, keyframe: int, measured: Iterable[MeasuredLoopClosure]) -> bool:
     """Return whether the metric scale of *keyframe* differs from that of all robots it was compared with.
 
-    At least two other robots (or one and the stored version) must find the scale too large, or all too
-    small: of two robots that differ nobody knows which one is wrong.  Only loop closures of full
-    weight count.
+    At least two other robots (or one and the stored version) must have been compared, because of two robots
+    that differ nobody knows which one is wrong.  All of their loop closures must find the scale of *keyframe*
+    too large, or all too small.  Only loop closures of full weight with metric segments count.
     """
     own = graph.keyframes[keyframe].robot
     signs: dict[tuple[str, bool], set[float]] = {}
@@ -54,7 +54,8 @@ def has_odometry_jump(graph: MapGraph, keyframe: int, measured: Iterable[Measure
     """Return whether the odometry of *keyframe* contradicts all loop closures with the keyframes before it.
 
     A jump is an error above 1 m and above half of the motion that odometry states.  Only loop closures of
-    full weight with the last four keyframes of the same metric segment count.
+    full weight with the last four keyframes of the same metric segment count; without them the result is
+    false.
     """
     segment = graph.segment_of(keyframe)
     if segment.is_from_version or not segment.is_metric:
@@ -74,10 +75,11 @@ def has_odometry_jump(graph: MapGraph, keyframe: int, measured: Iterable[Measure
 def exclude_if_contradicting(
     graph: MapGraph, keyframe: int, changes: GraphChanges, *, is_scale_wrong: bool
 ) -> bool:
-    """Record whether *keyframe* contradicts the map, and exclude its segment after 16 of the last 32 did.
+    """Record whether *keyframe* contradicts the map, and exclude its segment at 16 of 32 contradictions.
 
-    A keyframe contradicts the map if all its loop closures within the map do and none was accepted, or if its
-    metric scale is wrong.  Loop closures at perceptual aliases are no contradiction.
+    A keyframe contradicts the map if all its loop closures of full weight within its component do and none
+    was accepted, or if its metric scale is wrong, which counts twice.  Loop closures at perceptual aliases
+    are no contradiction.  Without such loop closures and with a right scale, nothing is recorded.
 
     Args:
         graph: The graph; the exclusion takes the loop closures of the segment out of it.

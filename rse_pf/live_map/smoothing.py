@@ -67,10 +67,10 @@ class GraphEdges:
 class SmoothedWindows:
     """The result of `smooth_around`.
 
-    ``is_strained`` says that the border of the largest window moved too far, so that the whole graph should
-    be optimised.  ``mean_misfit`` is the mean of ``squared_misfits``, which holds the squared Mahalanobis
-    norm of the residual of each smoothed loop closure by number.  ``keyframe_count`` sums the keyframes of
-    all windows that were tried.
+    ``is_strained`` says that the border of a window of the largest size moved too far, so that the whole
+    graph should be optimised.  ``squared_misfits`` holds the squared Mahalanobis norm of the residual of each
+    smoothed loop closure by number, and ``mean_misfit`` is their mean.  ``keyframe_count`` sums the keyframes
+    of all windows that were tried, also of those that were replaced by a larger one.
     """
 
     is_strained: bool = False
@@ -80,9 +80,10 @@ class SmoothedWindows:
     _covariances: dict[int, Array] = field(default_factory=dict)
 
     def covariance(self, graph: MapGraph, keyframe: int) -> Array | None:
-        """Return the ``(6, 6)`` covariance of the newest pose of a segment, None if it was not smoothed.
+        """Return the ``(6, 6)`` covariance of the pose of *keyframe*, None if it is not known.
 
-        It is that of a left twist (metres, radians) in the frame of the map, given the poses that were held.
+        It is known if *keyframe* was smoothed and is the newest one of a robot that has not left.  It is that
+        of a left twist (metres, radians) in the frame of the map, given the poses that were held.
         """
         right = self._covariances.get(keyframe)
         if right is None:
@@ -195,8 +196,9 @@ def smooth_everything(graph: MapGraph, options: LiveMapOptions) -> None:
 def select_edges(graph: MapGraph, ids: Iterable[int]) -> GraphEdges:
     """Return odometry and accepted loop closures with at least one end among the keyframes *ids*.
 
-    The information of odometry is that of a random walk.  The information of a loop closure is multiplied by
-    the square of its weight: half of the evidence counts as half of the precision.
+    Poses are in the unit of the component.  The information of odometry is that of a random walk.  The
+    information of a loop closure is multiplied by the square of its weight: half of the evidence counts as
+    twice the standard deviation.
     """
     # 1. Find the edges that touch the keyframes.
     loop_numbers: set[int] = set()
@@ -208,7 +210,8 @@ def select_edges(graph: MapGraph, ids: Iterable[int]) -> GraphEdges:
     loops = [graph.edges[number] for number in numbers]
     pairs = np.array(sorted(steps), dtype=np.int64).reshape(-1, 2)
     a, b = pairs[:, 0], pairs[:, 1]
-    # 2. Compute the relative poses of odometry, and their information by the steps between them.
+    # 2. Compute the relative poses of odometry, and their information: that of one step, divided by the
+    #    number of steps between both keyframes.
     T_odometry: Array = inverse(graph.T_odom_camera[a]) @ graph.T_odom_camera[b]
     if graph.has_scales:
         T_odometry = scaled(
@@ -263,9 +266,10 @@ def information_of(graph: MapGraph, edge: LoopEdge) -> Array:
 def _choose_window(
     graph: MapGraph, seeds: Sequence[int], size: int, held: set[int]
 ) -> tuple[list[int], bool]:
-    """Return up to *size* keyframes around *seeds*, and whether they are the whole component.
+    """Return up to *size* keyframes around *seeds*, and whether the search has reached no others.
 
-    The search is breadth-first and does not pass *held* keyframes.  Of too many seeds the last are taken.
+    The search is breadth-first along the graph, and neither takes nor passes *held* keyframes.  Of too many
+    seeds the last are taken.
     """
     frontier = [i for i in seeds if i not in held][-size:]
     seen = set(frontier)
@@ -287,10 +291,11 @@ def _choose_window(
 def _smooth_window(
     graph: MapGraph, ids: list[int], wanted: list[int], edges: GraphEdges, free_scales: list[int]
 ) -> tuple[SmoothedPoses, Rows, dict[int, int]]:
-    """Return the smoothed poses, the keyframes at the border of the window, and the row of each keyframe.
+    """Return the smoothed poses, the keyframes at the border of the window, and the row of each of *ids*.
 
-    The poses are those of *ids*, followed by their neighbours outside of the window, which are held.
-    Covariances are computed for the keyframes *wanted*.
+    The poses are those of *ids*, followed by the other ends of *edges*, which are held.  The border are the
+    keyframes of *ids* that an edge connects with one outside.  Covariances are computed for the keyframes
+    *wanted*.  The graph does not change.
     """
     row_of = np.full(len(graph), -1, dtype=np.int64)
     row_of[ids] = np.arange(len(ids))
@@ -359,7 +364,9 @@ def _select_edges_with_scales(graph: MapGraph, ids: list[int], free_scales: list
 
 
 def _scale_terms(graph: MapGraph, edges: GraphEdges, free_scales: list[int]) -> ScaleTerms | None:
-    """Return the scales that are estimated, and what edges measure of them; None if there are none.
+    """Return the scales of the segments *free_scales*, which are estimated, and what edges measure of them.
+
+    Return None if *free_scales* is empty.
 
     All measured ratios of depths that a segment causes count as one measurement, because an error of its
     depths is in all of them.  So the lengths of paths, measured in the metres of other robots, decide, and no
@@ -367,7 +374,7 @@ def _scale_terms(graph: MapGraph, edges: GraphEdges, free_scales: list[int]) -> 
     """
     if not free_scales:
         return None
-    # 1. Number the estimated scales, and look them up by the row of their segment.
+    # 1. Number the estimated scales by the row of their segment; -1 for other rows, and for the row -1.
     index_of_row = np.full(len(graph.segments) + 1, -1, dtype=np.int64)
     index_of_row[free_scales] = np.arange(len(free_scales))
     # 2. Compute the logarithm of the ratio of scales that each loop closure measures, and its information.
@@ -379,7 +386,8 @@ def _scale_terms(graph: MapGraph, edges: GraphEdges, free_scales: list[int]) -> 
             scale_a, scale_b = graph.segment_of(edge.a).scale, graph.segment_of(edge.b).scale
             difference[position] = edge.scale[0] + math.log(scale_a / scale_b)
             information[position] = edge.weight**2 / edge.scale[1]
-    # 3. Divide the information by the number of measurements of the segment, so that all count as one.
+    # 3. Divide the information of each measurement by the number of measurements of its segment (the larger
+    #    number of both segments), so that all of a segment count as one.
     measures = information > 0.0
     plus, minus = (
         np.where(measures, index_of_row[graph.segment_rows[ends]], -1) for ends in (edges.b, edges.a)

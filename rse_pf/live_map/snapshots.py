@@ -36,6 +36,8 @@ _ENCODED_STATES: dict[EdgeState, str] = {"pending": "open", "accepted": "believe
 _STATES: dict[str, EdgeState] = {encoded: state for state, encoded in _ENCODED_STATES.items()}
 
 _PackedEdge = tuple[int, int, int, bytes, bytes, int, int, bool, str, int]
+"""A loop closure: number, ids of both keyframes, ``T_a_b`` and information as bytes, inliers, matches,
+whether it is fixed, encoded state, and misfits in a row."""
 _PartRow = tuple[int, bytes, bytes]
 """Id of a keyframe, its encoded features, and its place recognition vector as float32."""
 
@@ -56,6 +58,17 @@ class _Versioned(msgspec.Struct):
 
 
 class _Packed(msgspec.Struct, kw_only=True):
+    """The tables of a `MapGraph`, under the names of earlier releases.
+
+    ``links`` are its edges, ``removed`` the rejected ones, ``open`` the pending numbers, ``agreements`` the
+    pair consistency (lower number, higher number, whether both agree), and ``links_of`` the numbers of
+    accepted loop closures by id of the keyframe.  ``numbers`` are next edge, root, events, and keyframes at
+    the last optimisation.  ``newest`` are the rows of the newest segments by robot, ``lookalikes`` the
+    aliased keyframes, ``smoothing`` the smoothing debts.  ``trust`` has the contradictions of each segment,
+    and whether it is excluded.  ``left`` is always empty.  ``arrays`` are the tables with a row for each
+    keyframe, as raw bytes.
+    """
+
     version: int
     keyframes: list[tuple[str, int, int, float, bytes | None]]
     segments: list[tuple[str, int, list[int], int, bytes | None, bytes, str, bool]]
@@ -96,7 +109,10 @@ class _PackedObjects(msgspec.Struct, kw_only=True):
 
 
 def encode_graph(graph: MapGraph, extra: dict[str, bytes], with_features: bool = True) -> bytes:
-    """Return *graph* as bytes, together with *extra* byte strings by name; equal graphs give equal bytes."""
+    """Return *graph* as bytes, together with *extra* byte strings by name; equal graphs give equal bytes.
+
+    If *with_features* is false, the encoded keyframes are left out: `SnapshotWriter` stores them in parts.
+    """
     if graph.has_scales:
         extra = {**extra, SCALES_FIELD: _encode_scales(graph)}
     objects = [(i, keyframe.objects) for i, keyframe in enumerate(graph.keyframes) if keyframe.objects]
@@ -304,14 +320,22 @@ def _matrix(raw: bytes, n: int) -> Array:
 
 
 class SnapshotWriter:
-    """Encodes snapshots of one map in parts, and remembers the full parts, which are no state of the map."""
+    """Encodes snapshots of one map in parts.
+
+    The writer remembers the names and keyframes of full parts, to use them again.  This memory is no state of
+    the map: without it a snapshot is encoded anew.
+    """
 
     def __init__(self, full_parts: dict[int, tuple[str, frozenset[int]]] | None = None) -> None:
-        """Begin with the names and keyframes of full parts, by number of the part."""
+        """Begin with full parts of an earlier snapshot: name and ids of keyframes, by number of the part."""
         self._full = full_parts or {}
 
     def encode(self, graph: MapGraph, places: PlaceIndex, stored: Collection[str]) -> SnapshotParts:
-        """Return a snapshot; full parts whose names are in *stored* are not encoded again."""
+        """Return a snapshot; its parts that are used again have no bytes (None).
+
+        A full part is used again if its name is in *stored* and at least half of its keyframes still have
+        features.
+        """
         names: list[str] = []
         parts: dict[str, bytes | None] = {}
         has_features = graph.has_features

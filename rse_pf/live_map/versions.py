@@ -188,8 +188,8 @@ def point_sources(graph: MapGraph, version: MapVersion) -> tuple[PointSource, ..
 def paths_of(graph: MapGraph, limit: int) -> list[tuple[str, int, Array]]:
     """Return (robot, segment, positions ``(n, 3)``) of the robots' segments that are connected with the map.
 
-    Positions are in the frame of the map, metres.  About *limit* keyframes are chosen evenly over all
-    segments; the first and the last keyframe of each segment are among them.
+    Positions are in the frame of the map, metres.  About *limit* keyframes, above 0, are chosen evenly over
+    all segments; the first and the last keyframe of each segment are among them, also beyond *limit*.
     """
     segments = [segment for segment in _aligned_segments(graph) if not segment.is_from_version]
     stride = -(-sum(len(segment.keyframes) for segment in segments) // limit) or 1
@@ -219,7 +219,11 @@ def image_references(graph: MapGraph, version: MapVersion) -> dict[str, dict[str
 
 
 def whole_graph(graph: MapGraph) -> tuple[PoseGraph, list[int]]:
-    """Return all that is connected with the frame of the map as a pose graph, and the ids of its poses."""
+    """Return all that is connected with the frame of the map as a pose graph, and the ids of its poses.
+
+    Keyframes without features are among them.  The poses are copies; without a frame of the map both results
+    are empty.
+    """
     ids = _aligned_keyframes(graph)
     index_of = np.full(len(graph), -1, dtype=np.int64)
     index_of[ids] = np.arange(len(ids))
@@ -251,7 +255,7 @@ def _odometry_edges(graph: MapGraph, ids: list[int]) -> list[Edge]:
     """Return edges between consecutive keyframes *ids* of a segment.
 
     Where keyframes in between have lost their features, the edge is the relative pose of the graph, which is
-    more accurate than the odometry over a longer path.
+    more accurate than the odometry over a longer path.  The information is that of the odometry in any case.
     """
     edges = []
     for a, b in pairwise(ids):
@@ -264,7 +268,7 @@ def _odometry_edges(graph: MapGraph, ids: list[int]) -> list[Edge]:
 
 
 def _kind_of(graph: MapGraph, edge: LoopEdge) -> EdgeKind:
-    if edge.is_fixed:
+    if edge.is_fixed:  # An edge of the version that the map started from: the log does not hold its kind.
         return "odometry"
     return "merge" if graph.segment_rows[edge.a] != graph.segment_rows[edge.b] else "loop"
 

@@ -253,7 +253,7 @@ def restore_backup(
         store: The store of the maps, for their charges.
         is_overwriting: Whether to set the heads of maps that have another head; their newer versions stay.
         check_room: Called once, before anything is written, with the bytes that all versions will be charged
-            with; may refuse them by an error.
+            with; may refuse them by an error.  Not called if the store lacks no version.
         charge: Called with the size of each version before it is written; may refuse it by an error.
 
     Raises:

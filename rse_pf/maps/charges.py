@@ -28,7 +28,7 @@ def charge_name(robot: RobotId, map_name: str, version: str, size: int) -> str:
 
 
 def sum_charges(store: ObjectStore, robot: RobotId, check: Callable[[], None] = lambda: None) -> Usage:
-    """Return number and charged bytes of all versions of maps that *robot* committed.
+    """Return the number and the charged bytes of all versions of maps that count for *robot*.
 
     Args:
         store: The store of the maps.
@@ -44,7 +44,7 @@ def sum_charges(store: ObjectStore, robot: RobotId, check: Callable[[], None] = 
 
 
 def remove_charges(store: ObjectStore, tenant: str, map_name: str, versions: Collection[str]) -> None:
-    """Stop counting versions of a map for any robot.
+    """Delete the objects that count versions of a map for robots, so that no robot is charged any more.
 
     Args:
         store: The store of the maps.

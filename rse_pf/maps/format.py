@@ -229,7 +229,11 @@ class MapVersion:
 
     @property
     def up(self) -> Array | None:
-        """The unit vector ``(3,)`` against gravity in the world of the map; None if gravity is unknown."""
+        """The unit vector ``(3,)`` against gravity in the world of the map; None if gravity is unknown.
+
+        It is the field ``up`` of the provenance.  A field that is no list of three floats, or whose length
+        differs from 1 by more than 0.01, counts as unknown.
+        """
         stated = self.provenance.get(UP_FIELD)
         if not isinstance(stated, list) or len(stated) != 3 or not all(type(x) is float for x in stated):
             return None
@@ -427,7 +431,7 @@ def _check_fields(content: bytes | bytearray, limits: MapLimits) -> None:
 
 
 def _field_budget(name: str, items: int) -> Budget:
-    """Return the decoding budget of the field *name* of a map file, whose value states *items* items."""
+    """Return the decoding budget of the field *name* of a map file, whose list announces *items* elements."""
     if name == "provenance":
         return PROVENANCE
     values = LIST_VALUES + items * _ITEM_VALUES[name] if name in _ITEM_VALUES else _OTHER_FIELD_VALUES
@@ -448,7 +452,11 @@ def _field_budget(name: str, items: int) -> Budget:
 def _check_feature_counts(
     keyframes: list[_EncodedKeyframe], limits: MapLimits, descriptor_bytes: int
 ) -> None:
-    """Raise LimitExceeded if one keyframe, or the map in total, has more features than *limits* allow."""
+    """Raise LimitExceeded if one keyframe, or the map in total, has more features than *limits* allow.
+
+    Pixels, descriptors (of *descriptor_bytes* bytes each) and points of a keyframe are counted by their
+    bytes, and the largest of the three numbers is taken.
+    """
     total = 0
     for keyframe in keyframes:
         count = max(
@@ -470,7 +478,10 @@ def _check_feature_counts(
 
 
 class _LazyProvenance(Mapping[str, Any]):
-    """The provenance of a map, which is decoded when a field of it is first read."""
+    """The provenance of a map, which is decoded when a field of it is first read.
+
+    Reading raises BadRequest if the bytes are damaged.
+    """
 
     def __init__(self, encoded: bytes) -> None:
         self._encoded = encoded
@@ -532,7 +543,7 @@ def _is_bounded(values: npt.NDArray[np.float32], bound: float = _MAX_COORDINATE_
 
 
 def _checked_pose(name: str, T: Array) -> Array:
-    """Return *T* with an exactly orthonormal rotation; *name* stands in the error.
+    """Return *T* as the pose that `rigid` makes of it; *name* begins the message of the error.
 
     Raises:
         BadRequest: The matrix is not ``(4, 4)``, not finite, or its upper left part is not a rotation.

@@ -60,9 +60,9 @@ class PhotoLocation(msgspec.Struct, frozen=True, kw_only=True):
     ``verdict`` is ``ok``, ``weak`` with a ``reason``, or ``lost`` with a reason and without a pose.
     ``T_map_camera`` is the 4x4 pose of the camera, metres.  ``covariance`` is the 6x6 covariance of the twist
     (metres, then radians) that perturbs the pose on its left.  ``position_sigma_m`` and ``turn_sigma_deg``
-    are standard deviations of the position and of the orientation of the camera, each over all three axes.
-    ``inliers`` and ``rmse_px`` belong to the best keyframe.  ``keyframes`` are the ids of the keyframes that
-    agree on the pose, best first.
+    are standard deviations of the position and of the orientation of the camera: the root of the summed
+    variances of the three axes.  ``inliers`` and ``rmse_px`` belong to the best keyframe.  ``keyframes`` are
+    the ids of the keyframes that agree on the pose, best first.
     """
 
     version: str

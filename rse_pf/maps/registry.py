@@ -71,8 +71,8 @@ class MapDiff:
         added: Ids of the keyframes that only the newer version has.
         removed: Ids of the keyframes that only the older version has.
         moved: Ids of the keyframes that moved by more than 1 mm or 0.05 degrees.
-        largest_move_m: The largest translation of a keyframe that both versions have.
-        largest_turn_deg: The largest rotation of a keyframe that both versions have.
+        largest_move_m: The largest translation of a keyframe that both versions have; 0 without such ones.
+        largest_turn_deg: The largest rotation of a keyframe that both versions have; 0 without such ones.
         edges_added: Edges that only the newer version has, as (id, id, kind).
         edges_removed: Edges that only the older version has, as (id, id, kind).
         points_before: Number of points in the older version.
@@ -194,8 +194,8 @@ class MapRegistry:
             name: Name of the map.
             data: The bytes that `encode_map` returned.
             origin: Who makes the version, and from which one.
-            charge: Called with the number of added bytes before they are written; may refuse them by an
-            error.
+            charge: Called with the number of added bytes before they are written, 0 if the store has these
+                bytes already; may refuse them by an error.
 
         Raises:
             As `commit`, and the errors of *charge*.
@@ -346,6 +346,8 @@ class MapRegistry:
     ) -> None:
         """Write versions from a backup, and set the head.
 
+        If *head* is *expected*, the head is neither compared nor changed, and no change is reported.
+
         Args:
             name: Name of the map, which may exist.
             records: Records of the versions to write; their bytes are written again if they exist.
@@ -374,7 +376,7 @@ class MapRegistry:
             self._on_change("map.restore", name, self.record(name, head))
 
     def _check_counts(self, base: str, *, is_new: bool) -> None:
-        """Raise LimitExceeded if the map has too many versions, or the tenant too many maps."""
+        """Raise LimitExceeded if the map has too many versions, or is new and the tenant has too many."""
         versions = self._store.usage(f"{base}versions/").objects
         if versions >= _MAX_VERSIONS:
             raise LimitExceeded(
@@ -474,7 +476,7 @@ class MapRegistry:
         return decode_map(self.data(name, version), self._max_bytes)
 
     def images(self, version: MapVersion) -> Iterator[tuple[Keyframe, bytes]]:
-        """Yield keyframes of *version* with the JPEG files that its provenance refers to.
+        """Yield keyframes of *version* with the bytes of the JPEG files that its provenance refers to.
 
         A robot may have written the provenance and the objects.  So images of other tenants, objects that are
         no JPEG or have another digest, and objects that do not exist are left out.
@@ -686,7 +688,7 @@ def compare_versions(before: MapVersion, after: MapVersion) -> MapDiff:
 
 @contextlib.contextmanager
 def _charge_once(charge: Callable[[int], None], size: int) -> Iterator[None]:
-    """Charge *size* bytes before they are written, and take nothing back if the write fails.
+    """Call *charge* with *size* when the context begins, and take nothing back if the write in it fails.
 
     The next count of the stored bytes corrects the charge.
     """

@@ -83,7 +83,7 @@ class Marks:
         return name
 
     def clear(self, name: str) -> None:
-        """Remove a mark; if the store fails, the mark stays and is ignored after ten minutes."""
+        """Remove the mark with this *name*; if the store fails, it stays and is ignored after ten minutes."""
         with contextlib.suppress(StoreError):
             self._store.delete(name)
 
