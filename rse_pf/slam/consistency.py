@@ -35,7 +35,7 @@ CHI2_99_PERCENT_3 = 11.345  # 99 % quantile of the chi-squared distribution with
 CHI2_99_PERCENT_1 = 6.635  # 99 % quantile of the chi-squared distribution with one degree of freedom
 FULL_WEIGHT_INLIERS = 30  # a loop closure with fewer inliers has a weight below 1, since they may be chance
 FULL_WEIGHT_INLIER_RATIO = 0.5  # a loop closure with a smaller share of inliers has a weight below 1
-MANY_VERTICES = 128  # vertices from which the clique search colours by bit sets, since that is faster then
+MANY_VERTICES = 128  # number of vertices from which the clique search colours by bit sets, which is faster
 MAX_CLIQUE_BRANCHES = 200_000
 """Branches that the clique search visits at most, so that hostile input cannot block a server; the largest
 clique found until then is returned."""

@@ -152,11 +152,12 @@ class KeyframeFeatures:
         depths_m: ``(n,)`` float32 along the optical axis.  In metres and above 0 if `unit` is None; otherwise
             in the unknown unit of length of the robot's segment, and 0 where the depth is unknown.
         descriptors: ``(n, d)``.
-        noise: Noise of the depths as the robot measured it.
+        noise: The robot's noise model of metric depths; not used for depths without metric scale.
         kind: The kind of the descriptors.
         f_baseline: Focal length in px times baseline in m of the stereo pair whose disparities are encoded;
             0 for a depth camera.
-        unit: None for metric depths; else the depths are multiples of this length.
+        unit: None for metric depths; else the length, in the segment's unit of length, of which the depths
+            are whole multiples.
     """
 
     pixels: npt.NDArray[np.float32]
@@ -176,7 +177,10 @@ class KeyframeFeatures:
         return self.unit is None
 
     def points_camera(self, camera: Camera) -> Array:
-        """Return the 3-D points ``(n, 3)`` in the frame of *camera*, in the unit of the depths."""
+        """Return the 3-D points ``(n, 3)`` in the frame of *camera*, in the unit of the depths.
+
+        Features whose depth is unknown get the origin, the centre of the camera.
+        """
         return camera.back_project(self.pixels.astype(np.float64), self.depths_m.astype(np.float64))
 
 
@@ -262,7 +266,7 @@ class SentKeyframe:
         )
 
 
-# --- Features that fit the encoding ---
+# --- Selection and rounding of features, so that they can be encoded ---
 
 
 def max_features(kind: DescriptorKind) -> int:

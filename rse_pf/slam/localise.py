@@ -53,8 +53,9 @@ class LocalisationOptions:
         agree_m: Largest distance between two estimates that agree.
         agree_deg: Largest rotation between two estimates that agree.
         min_single_inliers: Inliers from which the estimate of one keyframe alone is enough.
-        rival_ratio: An estimate that disagrees with the best one makes the pose ambiguous if it has at least
-            this share of the inliers; in environments without repetition no such estimate was ever measured.
+        rival_ratio: An estimate that disagrees with the best one, and that PnP does not call weak, makes the
+            pose ambiguous if it has at least this share of the best one's inliers; in environments without
+            repetition no such estimate was ever measured.
         region_m: Largest distance between two candidates that count as of one region.
         region_deg: Largest rotation between two candidates that count as of one region.
         max_per_region: Largest number of candidates of one region that are compared.
@@ -126,7 +127,10 @@ class LocalisationCandidate:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Estimate:
-    """The pose of the view that one keyframe estimates; the covariance is of the twist on its right."""
+    """The pose of the view that one keyframe estimates.
+
+    The covariance ``(6, 6)`` is of the twist (metres, radians) on the right of ``T_map_camera``.
+    """
 
     keyframe: int
     T_map_keyframe: Array

@@ -365,10 +365,10 @@ def _make_version(
 def _make_provenance(
     versions: Sequence[MapVersion], origins: list[list[int]], up: Array | None
 ) -> dict[str, Any]:
-    """Return the provenance of the merged map, with those of the merged maps as far as they fit.
+    """Return the provenance of the merged map, whose ``parents`` are the provenances of *versions*.
 
-    If the whole provenance is longer than a map may have, the parents of *versions* are left out, then all
-    provenances of *versions*.
+    If it is longer than a map may have, the ``parents`` within the provenances of *versions* are left out; if
+    it is still too long, it has no ``parents`` at all.
 
     Args:
         versions: The merged maps.

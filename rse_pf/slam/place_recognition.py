@@ -53,6 +53,8 @@ of the words ``(32,)``: 0 in a random vocabulary, whose words are equally long."
 def place_vector(descriptors: Descriptors) -> PlaceVector:
     """Return the VLAD vector ``(512,)`` of an image: a unit vector, or zero without descriptors.
 
+    Vectors of different kinds of descriptors cannot be compared.
+
     Args:
         descriptors: ``(n, d)`` of any kind.
 

@@ -53,8 +53,9 @@ class PoseGraph:
         ids: ``(n,)``, the ids of the poses in a file or a command.
 
     Raises:
-        BadRequest: Shapes do not agree, an edge connects a pose with itself or an unknown pose, a number is
-            not finite, a matrix is not a rotation, or an information matrix is not positive definite.
+        BadRequest: Shapes do not agree, there is no pose, two poses have one id, an edge connects a pose with
+            itself or an unknown pose, a number is not finite or too large, a matrix is not a rotation, or an
+            information matrix is not positive definite.
     """
 
     T_world_pose: Array
@@ -113,7 +114,10 @@ class PoseGraph:
 
 
 def is_positive_definite(information: Array) -> bool:
-    """Return whether all matrices ``(m, 6, 6)`` are symmetric, positive definite and at most 1e18."""
+    """Return whether all matrices ``(m, 6, 6)`` are symmetric and positive definite, with numbers up to 1e18.
+
+    A number that is not finite gives False; no matrices give True.
+    """
     if not len(information):
         return True
     if not (np.abs(information) <= _MAX_INFORMATION).all():

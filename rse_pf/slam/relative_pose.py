@@ -285,11 +285,13 @@ def measure_inverse_relative_pose(
 def measure_scale_ratio(measured: MeasuredPose, options: RelativePoseOptions = _DEFAULT) -> ScaleRatio | None:
     """Return the unit of the view's depths in the unit of the keyframe's landmarks.
 
-    The estimate is the median of the depth ratios of the inliers.  Its variance is the sum of those of the
-    median, of the correlated errors of landmarks, and of the pose along the optical axis.
+    The estimate is the median ratio, over the inliers, of the depth that a landmark has in the view by the
+    pose to the depth that the view measured.  Its variance is the sum of those of the median, of the
+    correlated errors of landmarks, and of the pose along the optical axis.
 
     Returns:
-        None if fewer than 12 inliers have a depth in both images, or their ratios spread by more than 15 %.
+        None if fewer than 12 inliers have a depth in both images, or the standard deviation of the logarithms
+        of their ratios is above 0.15.
     """
     rows = measured.solution.inliers[measured.depths_view[measured.solution.inliers] > 0.0]
     expected_depths = transform(measured.solution.T_camera_world, measured.points_keyframe[rows])[:, 2]

@@ -91,7 +91,7 @@ class DriveObservations:
     """What the *k* keyframes of a drive observe of *l* landmarks: *n* pixels, some of them with a depth.
 
     Attributes:
-        camera: The intrinsics that the drive was recorded with.
+        camera: The stated intrinsics of the drive, whose errors are estimated.
         keyframes: ``(n,)``, index of the keyframe of each observation.
         landmarks: ``(n,)``, index of its landmark; a keyframe observes a landmark at most once.
         pixels: ``(n, 2)``, undistorted pixels.
@@ -329,10 +329,10 @@ def estimate_part_deviations(
 
 
 def disagreement(values: Array, variances: Array) -> Array:
-    """Return the part ``(n,)`` of the standard deviation of a mean of estimates that their variances do not
-    explain; 0 where they explain all.
+    """Return the standard deviation ``(n,)`` of means of estimates that goes beyond their variances.
 
-    *values* and *variances* are ``(p, n)``: *n* quantities, each estimated *p* times, with p at least 2.
+    *values* and *variances* are ``(p, n)``: *n* quantities, each estimated *p* times, with p at least 2.  The
+    result is 0 where the variances explain how far the estimates of a quantity differ.
 
     Source:
         DerSimonian and Laird, Controlled Clinical Trials 1986, Sect. 2: the variance between studies.

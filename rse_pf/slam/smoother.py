@@ -43,9 +43,11 @@ class ScaleTerms:
 
     Attributes:
         count: The number *k* of scales; the logarithm of each scale starts at 0.
-        of_edge: ``(m,)``, the scale of each edge's translation, -1 for none.
-        plus: ``(m,)``, the first of two scales whose ratio an edge measures, -1 for a scale fixed at 1.
-        minus: ``(m,)``, the second of these two scales, -1 for a scale fixed at 1.
+        of_edge: ``(m,)``, index of the scale by which each edge's measured translation is multiplied, -1 for
+            none.
+        plus: ``(m,)``, index of the first of two scales whose ratio an edge measures, -1 for a scale fixed at
+            1.
+        minus: ``(m,)``, index of the second of these two scales, -1 for a scale fixed at 1.
         difference: ``(m,)``, the measured logarithm of the first scale less that of the second one.
         information: ``(m,)``, the inverse variance of this difference; 0 where an edge measures no ratio.
     """
@@ -93,7 +95,8 @@ def smooth(
     """Fit the first *free* poses to the edges, and keep the other poses fixed; the arguments do not change.
 
     Minimises the sum of squared Mahalanobis norms r^2 of the residuals of odometry edges, and of
-    ``cauchy^2 log(1 + r^2 / cauchy^2)`` of robust edges, by iteratively reweighted Gauss-Newton.
+    ``cauchy^2 log(1 + r^2 / cauchy^2)`` of robust edges, by iteratively reweighted Gauss-Newton.  The
+    residual of an edge is the twist ``log(inverse(T_a_b) @ inverse(T[a]) @ T[b])``.
 
     Args:
         T: ``(n, 4, 4)``, the poses, metres.
@@ -101,7 +104,7 @@ def smooth(
         a: ``(m,)``, the row in *T* of the first pose of each edge.
         b: ``(m,)``, the row in *T* of the second pose of each edge.
         T_a_b: ``(m, 4, 4)``, the measured relative poses.
-        information: ``(m, 6, 6)``, the inverse covariances of the twists (metres, radians).
+        information: ``(m, 6, 6)``, the inverse covariances of the residuals (metres, radians).
         robust: ``(m,)``, whether an edge may be an outlier.
         cauchy: Width of the Cauchy kernel in standard deviations, above 0.
         wanted: Rows of free poses whose covariances are returned; None means none.
@@ -171,7 +174,11 @@ def smooth(
 def _residuals(
     T: Array, a: Rows, b: Rows, T_b_a_measured: Array, information: Array
 ) -> tuple[Array, Array, Array]:
-    """Return for each edge ``T_a_b`` by the poses, the residual twist, and its squared Mahalanobis norm."""
+    """Return for each edge the relative pose, the residual and its squared Mahalanobis norm at the poses *T*.
+
+    The three arrays are ``inverse(T[a]) @ T[b]``, ``(m, 4, 4)``; its difference from the measured one as a
+    twist on the right, ``(m, 6)``; and ``(m,)``.
+    """
     T_a_b = inverse(T[a]) @ T[b]
     error = log_se3(T_b_a_measured @ T_a_b)
     weighted = (information @ error[:, :, None])[:, :, 0]

@@ -137,8 +137,10 @@ class GuidedMatchLimits:
             best within the radius.
         distinctiveness_ratio: The best descriptor distance must be below this share of the feature's
             distinctiveness: tiles and carpets repeat beyond the radius, too.
-        min_orientation_cosine: Smallest cosine between the predicted and the measured orientation.
-        max_size_ratio: Largest ratio of the predicted and the measured size, either way.
+        min_orientation_cosine: Smallest cosine of the angle between the predicted and the measured
+            orientation; not used for features without orientations.
+        max_size_ratio: Largest ratio of the predicted and the measured size, either way; not used for
+            features without sizes.
         max_distance: Largest Hamming distance in bits of 256; scaled for binary descriptors of other lengths,
             not used for vectors.
     """
@@ -188,10 +190,10 @@ class FittedPose:
     """A pose that was fitted to observations.
 
     Attributes:
-        T_camera_world: ``(4, 4)``.
-        information: ``(6, 6)``, inverse covariance of the pose's twist (translation, rotation), applied on
-            the left of ``T_camera_world``.
-        is_inlier: ``(n,)``, whether each observation agrees with the pose.
+        T_camera_world: ``(4, 4)``, metres.
+        information: ``(6, 6)``, inverse covariance of the pose's twist (metres, radians), applied on the left
+            of ``T_camera_world``.
+        is_inlier: ``(n,)``, whether each observation is within the gate at this pose.
     """
 
     T_camera_world: Array
@@ -261,8 +263,8 @@ def measure_distinctiveness(
 ) -> npt.NDArray[np.int32]:
     """Return the distance of each descriptor to the most similar other one of the same image.
 
-    Two features that are closer than *min_separation_px* both in columns and in rows show the same point, and
-    are not compared.
+    Two features that are closer than *min_separation_px* both in columns and in rows count as the same point,
+    and are not compared.
 
     Args:
         descriptors: ``(n, d)``, uint8 (Hamming distance) or int8 (squared Euclidean distance).
@@ -323,7 +325,7 @@ def predict_features(
         The ``(k,)`` ascending indices into *numbers* (not rows of *landmarks*) of the landmarks that are
         predicted, and their *k* predicted features.
     """
-    # 1. Project the landmarks; keep those before the camera and in the image.
+    # 1. Project the landmarks, and keep those before the camera and in the image with its margin.
     points = transform(T_camera_world, landmarks.points[numbers])
     rows = np.flatnonzero(points[:, 2] > _MIN_LANDMARK_DEPTH_M)
     pixels = camera.project(points[rows])
@@ -332,7 +334,7 @@ def predict_features(
         (u > -margin_px) & (u < camera.width + margin_px) & (v > -margin_px) & (v < camera.height + margin_px)
     )
     rows, pixels = rows[is_inside], pixels[is_inside]
-    # 2. Compare the viewing ray with that of the last image, in the axes of this camera.
+    # 2. Keep those whose viewing ray is similar, in direction and length, to that of the last image.
     distances = np.linalg.norm(points[rows], axis=1)
     last_rays = landmarks.rays[numbers[rows]] @ T_camera_world[:3, :3].T
     last_distances = np.linalg.norm(last_rays, axis=1)
@@ -496,7 +498,10 @@ def _make_near_request(
 def _call_matcher(
     function: Any, requests: Sequence[ctypes.Structure], predicted_count: int, feature_count: int
 ) -> tuple[Rows, Rows]:
-    """Call a matching function of the native core; return the rows that match on both sides."""
+    """Call a matching function of the native core; return the rows that match on both sides.
+
+    There are none if the core rejects a size.
+    """
     rows, features = np.empty((2, min(predicted_count, feature_count)), dtype=np.int64)
     workspace = _WORKSPACE.words(11 * predicted_count + 12 * feature_count + _GRID_WORDS)
     count = function(*map(ctypes.byref, requests), *map(address_of, (workspace, rows, features)))
