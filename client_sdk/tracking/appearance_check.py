@@ -37,9 +37,10 @@ def has_predicted_appearance(
     """Return whether enough of the landmarks that a pose predicts look as predicted in the frame's image.
 
     Args:
-        frame: Image with its depth; landmarks that something nearer hides are left out.
-        landmarks: ORB landmarks around the place.
-        T_world_camera: ``(4, 4)``, the pose to check.
+        frame: Image with its depth; landmarks that something nearer hides are left out.  Where the depth is
+            0, as everywhere in a stereo pair, no landmark counts as hidden.
+        landmarks: Landmarks around the place, with ORB descriptors.
+        T_world_camera: ``(4, 4)``, the pose to check, in the world of the landmarks.
         min_landmarks: Fewest landmarks that must be compared; with fewer the answer is False.
     """
     # 1. Predict the landmarks, and leave out those that are hidden.

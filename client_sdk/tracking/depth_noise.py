@@ -32,9 +32,9 @@ _SIGMA_PER_MEDIAN = 1.4826
 
 
 class NoiseEstimate:
-    """The factor by which a camera's depths are noisier than its model, averaged over the last images.
+    """The factor by which a camera's depths are noisier than its model, a running mean over the images.
 
-    ``model`` is a Kinect's until another one is set.
+    ``factor`` multiplies standard deviations.  ``model`` is a Kinect's until another one is set.
     """
 
     def __init__(self) -> None:

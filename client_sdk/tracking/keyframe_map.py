@@ -1,7 +1,8 @@
 """The map of one segment of a camera with depth: keyframes, and the landmarks that they measured.
 
 A landmark is a feature with depth.  Every frame that sees it again measures it again, and the measurements
-are fused by their covariances.  Keyframes are not adjusted one by one: they move only with the whole map.
+are fused by their covariances.  A keyframe keeps its pose in the map: there is no bundle adjustment here, and
+`KeyframeMap.move` and `KeyframeMap.correct` set the poses of all keyframes at once.
 """
 
 from __future__ import annotations
@@ -61,7 +62,9 @@ class View:
 
 
 def depths_for_noise(measured_m: Array, expected_m: Array) -> Array:
-    """Return the depths at which the noise of stereo depths is evaluated: the mean of measured and expected.
+    """Return the depths at which the noise of stereo depths is evaluated.
+
+    They are the geometric means of the measured depths and of those that the map predicts.
 
     The noise at the measured depth itself would favour points that are measured too near, and draw the map
     nearer.  At the geometric mean, the deviation of a depth is exactly that of its disparity.
@@ -84,11 +87,12 @@ def measure_points(
         T_world_camera: ``(4, 4)``, its pose.
         rows: ``(n,)`` rows of the features.
         noise: Noise model of the depths.
-        expected_m: ``(n,)`` depths by the map, at which the noise of stereo depths is evaluated; None where
-            they are not known.
+        expected_m: ``(n,)`` depths that the map predicts, for stereo pairs: the noise is evaluated between
+            them and the measured depths, see `depths_for_noise`.  None: it is evaluated at the measured
+            depths.
 
     Returns:
-        ``(n, 3)`` metres, and ``(n, 3, 3)`` square metres, world axes.
+        ``(n, 3)`` metres in the world, and ``(n, 3, 3)`` square metres, world axes.
     """
     points, camera = view.points_camera[rows], view.camera
     z = points[:, 2]
@@ -189,7 +193,11 @@ class KeyframeMap:
         return metres, np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0)))
 
     def nearest(self, T_world_camera: Array, count: int) -> list[int]:
-        """Return the *count* keyframes with the nearest poses, nearest first, and the newest keyframe."""
+        """Return the *count* keyframes with the nearest poses, nearest first, and the newest one.
+
+        The newest keyframe comes last, if it is not among the nearest.  The distance of a pose is that in
+        metres plus that in degrees divided by 30.
+        """
         metres, degrees = self.distances(T_world_camera)
         nearest: list[int] = np.argsort(metres + degrees / _DEG_PER_M, kind="stable")[:count].tolist()
         newest = len(self._views) - 1
@@ -243,7 +251,8 @@ class KeyframeMap:
     ) -> Landmarks:
         """Return the landmarks of an image, and its other features with depth as landmarks of no map.
 
-        All of them look as in this image.
+        Landmarks of the map have their fused points, the others the points that this image measured, and the
+        number NO_LANDMARK.  The appearance of all is that in this image.  The map is not changed.
 
         Args:
             view: The image, which need not be a keyframe.
@@ -270,7 +279,9 @@ class KeyframeMap:
         )
 
     def fuse(self, view: View, T_world_camera: Array, landmarks: Rows, noise: DepthNoise) -> None:
-        """Update landmarks by the measurements of an image, as a Kalman filter does.
+        """Update the landmarks that an image shows with a depth by its measurements, as a Kalman filter does.
+
+        Features without a landmark or without a depth change nothing, and no landmark is added.
 
         Args:
             view: The image.
@@ -308,9 +319,9 @@ class KeyframeMap:
             directions[:] = directions @ rotation.T
 
     def correct(self, T_world_camera: Array, f_baseline: float, offset_px: float) -> None:
-        """Set corrected poses, and add an offset to all disparities.
+        """Set corrected poses of all keyframes, and add an offset to all disparities.
 
-        Each landmark moves with the last keyframe that sees it.
+        Each landmark moves with the newest keyframe that sees it, and along its ray in that keyframe.
 
         Args:
             T_world_camera: ``(k, 4, 4)``, corrected poses of all keyframes.
@@ -322,11 +333,11 @@ class KeyframeMap:
             newest_keyframe[seen[seen != NO_LANDMARK]] = keyframe
         old, new = self._poses[newest_keyframe, :3], T_world_camera[newest_keyframe, :3]
         table = self._table.select(slice(self._count))
-        # 1. Points in the frame of their keyframe, moved along their rays by the offset.
+        # 1. Express each landmark in the old frame of its keyframe, and move it along its ray by the offset.
         local = np.einsum("nji,nj->ni", old[:, :, :3], table.points - old[:, :, 3])
         moved = with_offset(local, f_baseline, offset_px)
         local = np.where(np.isfinite(moved), moved, local)
-        # 2. Back to the world by the corrected poses.
+        # 2. Map the landmarks back to the world by the corrected poses.
         rotation = new[:, :, :3] @ old[:, :, :3].transpose(0, 2, 1)
         table.rays[:] = np.einsum("nij,nj->ni", new[:, :, :3], local)
         table.points[:] = table.rays + new[:, :, 3]
@@ -341,7 +352,10 @@ class KeyframeMap:
         ]
 
     def append(self, other: KeyframeMap) -> int:
-        """Add all of another map in the same world frame; return the number of its first landmark here."""
+        """Add all of another map in the same world frame, after the own keyframes and landmarks.
+
+        Returned is the number that the other map's first landmark has here.
+        """
         first = self._count
         self._views += other._views
         self._seen += [shift_landmarks(seen, first) for seen in other._seen]
@@ -361,7 +375,10 @@ class KeyframeMap:
         return np.flatnonzero(is_seen[:-1])
 
     def _update_appearance(self, numbers: Rows, view: View, T_world_camera: Array, rows: Rows) -> None:
-        """Note how landmarks look in the newest keyframe that sees them."""
+        """Set descriptor, ray, orientation and size of landmarks to those in an image.
+
+        *rows* are the image's features that show the landmarks *numbers*.
+        """
         table = self._table
         table.descriptors[numbers] = view.features.descriptors[rows]
         table.rays[numbers] = table.points[numbers] - T_world_camera[:3, 3]
@@ -380,7 +397,8 @@ class KeyframeMap:
     def _thin_out(self, current: Rows) -> Rows:
         """Remove every second keyframe of the older half, and landmarks that no keyframe sees any more.
 
-        Landmarks are renumbered; *current*, landmarks that must stay, is returned with the new numbers.
+        Landmarks are renumbered.  *current*, landmark numbers (or NO_LANDMARK) that must stay, is returned
+        with the new numbers.
         """
         is_kept = np.ones(len(self._views), dtype=bool)
         is_kept[: len(self._views) // 2 : 2] = False

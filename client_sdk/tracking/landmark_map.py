@@ -26,16 +26,18 @@ Rows = npt.NDArray[np.int64]
 MIN_SHARED_LANDMARKS = 15
 """Fewest common landmarks of two keyframes that are neighbours in the covisibility graph."""
 _LATEST_NEIGHBOURS = 2
-"""Number of newest keyframes that count as neighbours of a keyframe even without common landmarks."""
+"""Number of keyframes just before a keyframe that count as its neighbours even without common landmarks."""
 _DEPTH_LANDMARKS = 3
-"""Number of nearest landmarks in the image whose mean depth is taken for a feature without a landmark."""
+"""Number of nearest landmarks in the image whose mean inverse depth is taken for a feature without a
+landmark."""
 _MIN_LANDMARK_DEPTH = 1e-3
-"""Smallest depth, in the unit of the map, whose inverse is taken where depths are averaged."""
+"""Smaller depths, in the unit of the map, count as this one where inverse depths are averaged."""
 _MIN_BASELINE_DEPTH_SHARE = 0.01
 """Smallest distance of two keyframes that triangulate, as a share of the median depth: nearer, they see no
 parallax."""
 _OBSERVE_RADIUS_PX = 3.0
-"""Radius around a projected landmark in which a keyframe without it may observe it again."""
+"""Radius, in pixels, around a projected new landmark in which it is matched with a feature of a further
+keyframe."""
 _PROJECTED_LOWE_RATIO = 0.9
 """Lowe's ratio for matches around the pixels of a triangulated landmark in another keyframe."""
 _LOCAL_ITERATIONS = 5
@@ -53,12 +55,13 @@ class LandmarkLimits:
     Attributes:
         neighbours: Number of neighbours with which a new keyframe triangulates landmarks.
         local: Number of neighbours of a keyframe whose landmarks are matched with a frame.
-        search_px: Radius in which a feature is matched whose depth is taken from the landmarks around it.
+        search_px: Radius around its predicted pixel in which a feature of another keyframe is matched to be
+            triangulated; the prediction takes its depth from the landmarks around it.
         window: Number of keyframes that a local bundle adjustment moves.
         fixed: Number of further keyframes that take part in a local adjustment with fixed poses.
-        in_all: Number of landmarks, those seen most often, that an adjustment of all keyframes takes; the
-            others are adjusted to the result.
-        max_in_all: Number of keyframes beyond which they are no longer adjusted all together.
+        in_all: Number of landmarks, those seen most often, by which an adjustment moves the keyframes;
+            further landmarks are adjusted to the result.
+        max_in_all: Number of keyframes beyond which `LandmarkMap.adjust_all` changes nothing.
         min_parallax_deg: Smallest angle between the rays of a new landmark, in degrees.
         outlier_sigma: Observations whose reprojection error is larger than this many standard deviations are
             removed.
@@ -117,7 +120,7 @@ class LandmarkMap:
         limits: Limits of the map.
         keyframes: All keyframes, oldest first.
         points: ``(n, 3)`` landmarks in the world, in the unit of the map.
-        descriptors: ``(n, d)``, in the newest keyframe that sees each landmark.
+        descriptors: ``(n, d)``, descriptor of each landmark in the keyframe that saw it last.
         colours: ``(n, 3)`` uint8.
         is_alive: ``(n,)``; removed landmarks keep their number and are not alive.
     """
@@ -152,7 +155,7 @@ class LandmarkMap:
     # --- Add keyframes and landmarks ---
 
     def add_keyframe(self, view: MonocularView, T_camera_world: Array, landmarks: Rows) -> int:
-        """Add a keyframe and return its number.
+        """Add a keyframe and return its number; the landmarks that it sees get their appearance from it.
 
         Args:
             view: The image.
@@ -176,7 +179,7 @@ class LandmarkMap:
         Args:
             points: ``(n, 3)``, in the world.
             first: Number of a keyframe, and the ``(n,)`` rows of its features that show the landmarks.
-            second: The same of the other keyframe, which gives the colours.
+            second: The same of the other keyframe, which gives colours and appearance of the landmarks.
         """
         count = len(points)
         numbers = len(self.points) + np.arange(count)
@@ -196,7 +199,11 @@ class LandmarkMap:
             self._update_appearance(keyframe, numbers, features)
 
     def extend(self, number: int) -> int:
-        """Triangulate new landmarks from a keyframe and its neighbours; return how many were added."""
+        """Triangulate new landmarks from a keyframe and its neighbours; return how many were added.
+
+        All neighbours then observe the new landmarks, too, where a feature matches.  A keyframe that sees no
+        landmark adds none, since depths are guessed by landmarks.
+        """
         count = len(self.points)
         depths = self._interpolate_depths(number)
         if depths is None:
@@ -208,7 +215,10 @@ class LandmarkMap:
         return len(self.points) - count
 
     def append(self, other: LandmarkMap) -> tuple[int, int]:
-        """Add all of another map in the same frame; return the numbers of its first keyframe and landmark."""
+        """Add all of another map in the same frame and unit.
+
+        Returned are the numbers that the other map's first keyframe and first landmark have here.
+        """
         keyframe, landmark = len(self.keyframes), len(self.points)
         if not landmark:
             self.descriptors = other.descriptors[:0]
@@ -242,7 +252,7 @@ class LandmarkMap:
         return seen
 
     def landmarks(self, numbers: Rows) -> Landmarks:
-        """Return landmarks by their numbers, without uncertainty."""
+        """Return landmarks by their numbers; their covariances are 0."""
         count = len(numbers)
         return Landmarks(
             points=self.points[numbers],
@@ -282,7 +292,7 @@ class LandmarkMap:
         return ranked[:count]
 
     def count_shared_landmarks(self, number: int) -> Rows:
-        """Return how many landmarks each keyframe shares with keyframe *number*, ``(k,)``."""
+        """Return how many landmarks each keyframe, also *number* itself, shares with *number*, ``(k,)``."""
         is_seen = np.zeros(len(self.points), dtype=bool)
         is_seen[self.landmarks_of(number)] = True
         return np.array([int(is_seen[self.landmarks_of(k)].sum()) for k in range(len(self.keyframes))])
@@ -305,7 +315,10 @@ class LandmarkMap:
     # --- Adjust, move and clean up ---
 
     def adjust_around(self, number: int) -> None:
-        """Adjust a keyframe, its neighbours and all landmarks that they see; remove outlier observations."""
+        """Adjust a keyframe, its neighbours and all landmarks that they see; remove outlier observations.
+
+        At most ``window`` keyframes move, and at most ``fixed`` further ones take part with fixed poses.
+        """
         window = [number, *self._neighbours(number)[: self.limits.window - 1]]
         self._adjust(sorted(window), self.limits.fixed, iterations=_LOCAL_ITERATIONS)
 
@@ -322,7 +335,10 @@ class LandmarkMap:
         self._adjust(everything, 0, iterations=iterations)
 
     def cull(self) -> None:
-        """Remove landmarks that fewer than two keyframes see, and older ones that only two keyframes see."""
+        """Remove landmarks that fewer than two keyframes see, and older ones that only two keyframes see.
+
+        Older landmarks are those since which three or more keyframes were added.
+        """
         counts = self._count_observations()
         age = len(self.keyframes) - 1 - self._first_keyframes
         is_old = age >= _CULL_AGE_KEYFRAMES
@@ -330,7 +346,10 @@ class LandmarkMap:
         self._remove(np.flatnonzero(self.is_alive & is_doubtful))
 
     def move(self, T_new_old: Array, scale: float = 1.0) -> None:
-        """Express the map in another world frame: multiply all lengths by *scale*, then apply *T_new_old*."""
+        """Express the map in another world frame: multiply all lengths by *scale*, then apply *T_new_old*.
+
+        A point ``x`` of the world moves to ``T_new_old (scale x)``.
+        """
         rotation = T_new_old[:3, :3]
         self.points = transform(T_new_old, scale * self.points)
         self._rays = scale * self._rays @ rotation.T
@@ -347,8 +366,8 @@ class LandmarkMap:
         Args:
             older: Number of the keyframe that stays, with all before it.
             newer: Number of the keyframe that moves by the whole similarity, with all after it.
-            T_new_old: ``(4, 4)``, rigid motion, applied after the lengths are multiplied.
-            scale: Factor of all lengths, about the origin.
+            T_new_old: ``(4, 4)``, rigid motion in the world, applied after the lengths are multiplied.
+            scale: Factor of all lengths, about the origin of the world.
         """
         centre = inverse(self.keyframes[newer].T_camera_world)[:3, 3]
         moved_centre = transform(T_new_old, scale * centre[None])[0]
@@ -403,7 +422,7 @@ class LandmarkMap:
     # --- Private: triangulation ---
 
     def _match_projected(self, keyframe: MonocularKeyframe, landmarks: Rows, radius_px: float) -> Matches:
-        """Match landmarks that a keyframe does not see near their projections in it."""
+        """Match landmarks that are alive and that a keyframe does not see near their projections in it."""
         landmarks = landmarks[self.is_alive[landmarks] & ~np.isin(landmarks, keyframe.landmarks)]
         limits = GuidedMatchLimits(radius_px=radius_px, lowe_ratio=_PROJECTED_LOWE_RATIO)
         return self.landmarks(landmarks).match(
@@ -411,16 +430,17 @@ class LandmarkMap:
         )
 
     def _observe_again(self, number: int, landmarks: Rows) -> None:
-        """Match landmarks with the free features of a keyframe that does not see them yet."""
+        """Let a keyframe see landmarks that match its features without a landmark; others stay unseen."""
         keyframe = self.keyframes[number]
         matches = self._match_projected(keyframe, landmarks, _OBSERVE_RADIUS_PX)
         is_free = keyframe.landmarks[matches.features] == NO_LANDMARK
         keyframe.landmarks[matches.features[is_free]] = matches.landmarks.numbers[is_free]
 
     def _triangulate(self, number: int, neighbour: int, depths: Array) -> None:
-        """Add landmarks from the free features that a keyframe and its neighbour share.
+        """Match the features without a landmark of a keyframe and its neighbour, and add their points.
 
-        *depths* ``(n,)`` are guesses of the depths of the keyframe's features.
+        *depths* ``(n,)`` are guesses of the depths of the keyframe's features.  Nothing is added if the two
+        cameras are too near to each other; points with too little parallax or too large errors are left out.
         """
         one, two = self.keyframes[neighbour], self.keyframes[number]
         centres = [inverse(keyframe.T_camera_world)[:3, 3] for keyframe in (one, two)]
@@ -444,8 +464,8 @@ class LandmarkMap:
     def _interpolate_depths(self, number: int) -> Array | None:
         """Guess the depths of a keyframe's features by the three nearest landmarks in the image.
 
-        The guess is the mean of the inverse depths.  Returned is ``(n,)``, None if the keyframe sees no
-        landmark.
+        The inverse of a guess is the mean of the inverse depths of these landmarks.  Returned is ``(n,)``,
+        also for features with a landmark; None if the keyframe sees no landmark.
         """
         keyframe = self.keyframes[number]
         seen = np.flatnonzero(keyframe.landmarks != NO_LANDMARK)
@@ -462,9 +482,11 @@ class LandmarkMap:
     def _match_by_depth(
         self, one: MonocularKeyframe, two: MonocularKeyframe, depths: Array
     ) -> tuple[Rows, Rows]:
-        """Match features without a landmark of two keyframes by guesses *depths* of those of the second.
+        """Match the features without a landmark of two keyframes near the pixels that depths predict.
 
-        Returned are the rows of matched features in the first and in the second keyframe.
+        *depths* ``(n,)`` are guesses of the depths of all features of the second keyframe, which are
+        projected into the first one.  Returned are the rows of matched features in the first and in the
+        second keyframe.
         """
         image = two.view.features
         free = np.flatnonzero(two.landmarks == NO_LANDMARK)
@@ -500,7 +522,10 @@ class LandmarkMap:
         return covisible + [k for k in latest if k not in covisible]
 
     def _update_appearance(self, number: int, landmarks: Rows, features: Rows) -> None:
-        """Note how landmarks look in the newest keyframe that sees them."""
+        """Set descriptor, ray, orientation and size of landmarks to those in a keyframe.
+
+        *features* are the rows of the keyframe's features that show *landmarks*.
+        """
         keyframe = self.keyframes[number]
         image, T_world_camera = keyframe.view.features, inverse(keyframe.T_camera_world)
         self.descriptors[landmarks] = image.descriptors[features]
@@ -527,9 +552,11 @@ class LandmarkMap:
     def _adjust(self, window: list[int], fixed_count: int, *, iterations: int) -> None:
         """Adjust the keyframes of *window* and their landmarks; remove observations that do not fit.
 
-        *fixed_count* further keyframes that see most of the landmarks take part with fixed poses.
+        At most *fixed_count* further keyframes, those that see most of the landmarks, take part with fixed
+        poses.  The first keyframe of the map never moves; of all that take part, the two oldest are fixed if
+        fewer than two are.
         """
-        # 1. The landmarks of the window, and the keyframes with fixed poses.
+        # 1. Choose the landmarks that the window sees, and the keyframes with fixed poses.
         is_adjusted = np.zeros(len(self.points), dtype=bool)
         for number in window:
             is_adjusted[self.landmarks_of(number)] = True
@@ -543,7 +570,7 @@ class LandmarkMap:
         is_fixed = np.array([number in fixed or number == 0 for number in numbers])
         if is_fixed.sum() < 2:
             is_fixed[:2] = True
-        # 2. All observations as one bundle.
+        # 2. Collect all observations of these landmarks by these keyframes as one bundle.
         cameras, features, landmarks = self._observations(numbers, is_adjusted)
         used, points = np.unique(landmarks, return_inverse=True)
         images = [self.keyframes[number].view.features for number in numbers]
@@ -576,7 +603,8 @@ class LandmarkMap:
     def _observations(self, numbers: list[int], is_wanted: npt.NDArray[np.bool_]) -> tuple[Rows, Rows, Rows]:
         """Return all observations of wanted landmarks by keyframes.
 
-        Returned are, ``(n,)`` each, the row of *numbers*, the feature and the landmark of each observation.
+        Returned are, ``(n,)`` each, the row of *numbers*, the feature and the landmark of each observation;
+        they are sorted by the row of *numbers*.
         """
         cameras, features, landmarks = [], [], []
         for camera, number in enumerate(numbers):
@@ -589,12 +617,16 @@ class LandmarkMap:
         return np.concatenate(cameras), np.concatenate(features), np.concatenate(landmarks)
 
     def _solve(self, bundle: Bundle, iterations: int) -> Bundle:
-        """Return an adjusted bundle; of many landmarks, those seen most move the cameras, then all follow."""
+        """Return a new bundle with adjusted poses and points.
+
+        With more than ``in_all`` landmarks, only those seen most often adjust the cameras; then all landmarks
+        are adjusted to the cameras.
+        """
         limit = self.limits.in_all
         if len(bundle.points_world) <= limit:
             poses, points = self._adjust_bundle(bundle, self.camera, iterations=iterations)
             return replace(bundle, T_camera_world=poses, points_world=points)
-        # 1. Adjust cameras and the landmarks that are seen most.
+        # 1. Adjust the cameras and the landmarks that are seen most often.
         counts = np.bincount(bundle.points, minlength=len(bundle.points_world))
         is_used = np.zeros(len(counts), dtype=bool)
         is_used[np.argsort(-counts, kind="stable")[:limit]] = True

@@ -23,17 +23,20 @@ NO_LANDMARK = -1
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Landmarks:
-    """Points of the world with their uncertainty, and how each looked in the last keyframe that saw it.
+    """Points of the world with their uncertainty, and how each looked in the last image that showed it.
+
+    The last image is a keyframe, except for landmarks that were made of a single frame.
 
     Attributes:
         points: ``(n, 3)``, world, in metres or in the unit of the segment.
-        covariances: ``(n, 3, 3)`` of the points, world axes.
+        covariances: ``(n, 3, 3)`` of the points, in the squared unit of the points, world axes; 0 of a camera
+            without depth.
         shutter_displacements: ``(n, 3)``: how far each point moves in the world for each second that the
             camera's rolling-shutter readout takes longer.
         descriptors: ``(n, d)``.
-        rays: ``(n, 3)``, from the centre of the last camera to the point, world axes.
-        orientations: ``(n, 3)``, orientation of the feature in that camera as a direction in the world.
-        sizes: ``(n,)``, scale of the feature in that camera, 1 for the finest pyramid level.
+        rays: ``(n, 3)``, from the centre of the camera of that image to the point, world axes.
+        orientations: ``(n, 3)``, orientation of the feature in that image as a direction in the world.
+        sizes: ``(n,)``, scale of the feature in that image, 1 for the finest pyramid level.
         numbers: ``(n,)``, number of each landmark in its map; NO_LANDMARK for a point that is in no map.
     """
 
@@ -103,7 +106,7 @@ class Matches:
         return len(self.features)
 
     def replace_by(self, other: Matches, feature_count: int, landmark_count: int) -> Matches:
-        """Return *other* with those of these matches that share no feature and no landmark with it.
+        """Return *other* after those of these matches that share no feature and no landmark with it.
 
         Args:
             other: Matches that take precedence.

@@ -69,7 +69,7 @@ class PosedView:
         view: The image.
         T_camera_world: ``(4, 4)``, in the frame and unit of its segment.
         landmarks: ``(n,)``, landmark of each feature, or NO_LANDMARK.
-        matches: Number of matches of the image.
+        matches: Number of matches by which the pose was found.
         is_weak: Whether the solver calls the pose weak; the image never becomes a keyframe then.
     """
 
@@ -89,10 +89,12 @@ class PosedView:
 class Similarity:
     """Where a segment lies in another one, or the newer part of a segment in its older part.
 
+    A point ``x`` of the segment lies at ``T (scale x)`` in the other one.
+
     Attributes:
-        segment: The segment in which it lies.
-        keyframe: Keyframe of that segment that shows the same place.
-        T: ``(4, 4)``, rigid motion into that segment, after all lengths are multiplied by *scale*.
+        segment: Number of the other segment; the same one for its newer part.
+        keyframe: Keyframe of the other segment that shows the same place.
+        T: ``(4, 4)``, rigid motion into the other segment, after all lengths are multiplied by *scale*.
         scale: Factor of all lengths.
     """
 
@@ -102,7 +104,10 @@ class Similarity:
     scale: float
 
     def inverted(self, segment: int, keyframe: int) -> Similarity:
-        """Return where that segment lies in *segment*, whose *keyframe* shows the same place."""
+        """Return the inverse similarity: where the other segment lies in this one.
+
+        *segment* is the number of this segment, *keyframe* its keyframe that shows the same place.
+        """
         return Similarity(
             segment=segment,
             keyframe=keyframe,
@@ -111,9 +116,13 @@ class Similarity:
         )
 
     def agrees_with(self, other: Similarity, centre: Array, depth: float) -> bool:
-        """Return whether two measurements confirm each other at a camera's *centre* ``(3,)``.
+        """Return whether two measurements of one similarity confirm each other.
 
-        Distances are compared with the median *depth* of the place.
+        Args:
+            other: The other measurement.
+            centre: ``(3,)``, centre of the camera in this segment; both measurements move it to nearly the
+                same point of the other segment.
+            depth: Median depth of the place in the unit of the other segment; distances are compared with it.
         """
         first, second = (transform(s.T, s.scale * centre[None])[0] for s in (self, other))
         _, apart_deg = pose_difference(self.T, other.T)
@@ -131,7 +140,8 @@ class MonocularSegment:
 
     Attributes:
         map: Keyframes and landmarks.
-        length_factor: By what the lengths around the newest frames were multiplied since the segment began.
+        length_factor: Factor by which the lengths around the newest frames were multiplied since the segment
+            began.
         frames: Poses of all frames of the segment.
         reference: The reference keyframe, around which frames are tracked.
         reference_landmarks: Number of landmarks that it saw when it became the reference.
@@ -164,7 +174,10 @@ class MonocularSegment:
         ]
 
     def append(self, newer: MonocularSegment) -> tuple[int, int]:
-        """Add all of a segment in the same frame; return its first keyframe's and landmark's numbers here."""
+        """Add all of a segment that was moved into this one's frame and unit.
+
+        Returned are the numbers that its first keyframe and its first landmark have here.
+        """
         keyframe, landmark = self.map.append(newer.map)
         self.frames += [replace(frame, keyframe=frame.keyframe + keyframe) for frame in newer.frames]
         return keyframe, landmark
@@ -201,7 +214,7 @@ class MonocularSegment:
             view: The image.
             T_camera_world: ``(4, 4)``, its initial pose.
             radius_px: Radius around projected landmarks of the first match.
-            min_inliers: Fewest matches, and fewest landmarks that agree with the pose.
+            min_inliers: Fewest matches, and fewest of them that agree with the fitted pose.
             around: Keyframe around which landmarks are matched; None for the reference keyframe.
         """
         limits = self.map.limits
@@ -234,7 +247,7 @@ class MonocularSegment:
         )
 
     def trajectory(self) -> Trajectory:
-        """Return the poses of all frames in the order of time."""
+        """Return ``T_world_camera`` of all frames in the order of time, in the segment's frame and unit."""
         stamps_s = np.array([frame.timestamp_s for frame in self.frames])
         poses = [
             inverse(self.map.keyframes[frame.keyframe].T_camera_world) @ frame.T_keyframe_camera

@@ -56,10 +56,11 @@ _FEATURES_WIDTH_PX = 640
 """Image width for which `MonocularOptions.features` is meant; wider images have proportionally more
 features."""
 _MAX_FEATURES = 2000
-"""Largest number of features of a wide image: bounds the time of a frame."""
+"""Largest number of features of a wide image, unless `MonocularOptions.features` itself is larger: bounds the
+time of a frame."""
 _START_DEPTH = 2.0
-"""Median depth of a segment's first landmarks in its arbitrary unit: large enough that points rounded to
-0.0001 are exact."""
+"""Median depth of a segment's first landmarks in its arbitrary unit: large enough that the rounding of points
+to 0.0001 in a pose query does not matter."""
 _MAX_WAITING_FRAMES = 30
 """Largest number of frames that are kept as possible first views of a new segment; then the oldest is
 dropped: bounds memory."""
@@ -103,7 +104,7 @@ class MonocularOptions:
         features: Number of features of a frame of 640 px; wider frames have more, up to 2000.
         max_matches: Largest number of matches that a pose query sends, an even sample of all; 250 keep a
             command below 10 kB in every codec.
-        inlier_px: Largest reprojection error of an inlier.
+        inlier_px: Largest reprojection error, in pixels, of an inlier of a pose query.
         max_iterations: Largest number of RANSAC iterations.
         min_inliers: Smallest number of inliers of an accepted pose.
         search_px: Radius around the predicted pixel of a landmark in which features are compared.
@@ -138,12 +139,14 @@ class _TrackState:
 
     Attributes:
         segment: Number of the present segment.
-        last: The last frame; None after a loss.
+        last: The last frame with its pose; None after a loss and after `MonocularTracker.adjust`.
         timestamp_s: Time of the last pose, in seconds.
-        T_next_last: ``(4, 4)``, motion of the world from one camera frame to the next, assumed constant.
+        T_next_last: ``(4, 4)``, maps the frame of the last camera to that of the next one, assumed to be that
+            between the last two frames; the identity if these do not tell it.
         unrecognised: Number of frames since the last accepted pose that show enough features and no known
             place.
-        candidate: Where the segment may lie in another one, measured once and not confirmed.
+        candidate: Where the segment may lie in another one, or its newest part in an older one, measured once
+            and not confirmed; None without one.
         next_loop_keyframe: Number of the first keyframe for which a loop closure is looked for again.
     """
 
@@ -166,15 +169,17 @@ class MonocularTracker:
     is matched near the pixels at which a constant velocity predicts the landmarks around the reference
     keyframe, then in a wider radius, then with the last frame, then with the newest keyframes and with the
     most similar keyframes of all segments.  If no pose fits, the frame is lost, and waits for the start of a
-    new segment.  A segment is joined to an older one, whose unit it takes, when two of its images were found
-    there.  An older place of the same segment that is recognised twice closes a loop and corrects what
-    drifted in between.
+    new segment.  Two segments are joined when two measurements in a row agree where one lies in the other;
+    the newer segment is moved into the older one, whose unit it takes.  An older place of the same segment
+    that is recognised twice closes a loop and corrects what drifted in between.
 
     Attributes:
         options: Options of tracking.
         frames: Number of frames so far.
-        lost_frames: Number of frames without a pose after the first start.
-        starting_frames: Number of frames without a pose before the first start.
+        lost_frames: Number of frames without a pose after the first start.  Frames that get their poses when
+            a later segment begins are subtracted again.
+        starting_frames: Number of frames without a pose before the first start, also those that get their
+            poses then.
         joins: All joins of segments so far, in their order.
         loop_scales: By what each loop closure so far multiplied the lengths around the newest frames.
     """
@@ -222,7 +227,7 @@ class MonocularTracker:
 
     @property
     def segment(self) -> int:
-        """The number of the segment of the newest pose."""
+        """The number of the segment of the newest pose; 0 before the first pose."""
         return self._state.segment
 
     @property
@@ -232,12 +237,15 @@ class MonocularTracker:
 
     @property
     def length_factor(self) -> float:
-        """Product of all factors of the lengths around the newest frames since the segment began."""
+        """Factor by which `rescale` and loop closures multiplied the lengths around the newest frames so far.
+
+        It counts from the begin of the present segment, of which there must be one.
+        """
         return self._present.length_factor
 
     @property
     def segment_keyframes(self) -> int:
-        """The number of keyframes of the present segment."""
+        """The number of keyframes of the present segment, of which there must be one."""
         return self._present.map.keyframe_count
 
     def keyframe(self, number: int, segment: int | None = None) -> AdjustedKeyframe:
@@ -286,7 +294,8 @@ class MonocularTracker:
 
         Args:
             query: The query that `prepare` or `accept` returned last.
-            T_camera_world: ``(4, 4)`` as the PnP service returns it; None if there was no answer.
+            T_camera_world: ``(4, 4)`` as the PnP service returns it, where world is the frame of the query's
+                points and the unit is theirs; None if there was no answer.
             inliers: Number of correspondences that agree with the pose.
             is_weak: Whether the service calls the evidence for the pose weak; the frame becomes no keyframe
                 then.
@@ -297,14 +306,20 @@ class MonocularTracker:
         return self._open.answer(query, QueryAnswer(T_camera_world, inliers, is_weak))
 
     def trajectory(self, segment: int = 0) -> Trajectory:
-        """Return all poses of a segment in the order of time, as its keyframes are adjusted now."""
+        """Return all poses of a segment in the order of time, as its keyframes are adjusted now.
+
+        A segment that does not exist has none.
+        """
         if segment not in self._segments:
             return Trajectory(np.empty(0), np.empty((0, 4, 4)))
         path = self._segments[segment].trajectory()
         return Trajectory(path.timestamps_s, self._T_world_start @ path.T_world_camera)
 
     def points(self, segment: int = 0) -> tuple[Array, npt.NDArray[np.uint8]]:
-        """Return the ``(n, 3)`` landmarks of a segment in the world and their ``(n, 3)`` uint8 colours."""
+        """Return the ``(n, 3)`` landmarks of a segment in the world and their ``(n, 3)`` uint8 colours.
+
+        A segment that does not exist has none.
+        """
         if segment not in self._segments:
             return np.empty((0, 3)), np.empty((0, 3), dtype=np.uint8)
         own = self._segments[segment].map
@@ -321,7 +336,8 @@ class MonocularTracker:
     def adjust(self) -> None:
         """Adjust all keyframes and landmarks of each segment together, such as at the end of a drive.
 
-        This takes seconds, and corrects poses that were returned before.
+        This takes seconds, and corrects poses that were returned before.  A segment with more keyframes than
+        `LandmarkLimits.max_in_all` stays as it is.  The next frame is relocalised.
 
         Raises:
             UsageError: A query is open.
@@ -332,7 +348,11 @@ class MonocularTracker:
         self._state = replace(self._state, last=None, candidate=None)
 
     def rescale(self, scale: float, segment: int = 0) -> None:
-        """Multiply all lengths of a segment by *scale*, such as by the metres per unit."""
+        """Multiply all lengths of a segment by *scale*, such as by the metres per unit.
+
+        The start pose of the world is the centre, and stays; all other poses and points of the segment that
+        were returned before change.  A segment that does not exist is ignored.
+        """
         if segment not in self._segments:
             return
         self._segments[segment].move(np.eye(4), scale)
@@ -371,7 +391,7 @@ class MonocularTracker:
         return self._make_result(posed, is_keyframe=is_keyframe)
 
     def _extract(self, frame: Frame) -> Features:
-        """Return features that are spread over the image, without 3-D points."""
+        """Return features that are spread over the image; their 3-D points are NaN."""
         wider = max(1.0, frame.camera.width / _FEATURES_WIDTH_PX)
         count = int(min(max(self.options.features, _MAX_FEATURES), self.options.features * wider))
         described = describe(frame.rgb, count, plugin=self._plugins.features)
@@ -393,7 +413,11 @@ class MonocularTracker:
     def _track_from_last_pose(
         self, view: MonocularView
     ) -> Generator[PoseQuery, QueryAnswer, tuple[PosedView | None, str]]:
-        """Ask for the pose of a frame around its last pose; return it, or None and why there is none."""
+        """Ask for the pose of a frame around the camera's last pose.
+
+        Returned are the image with its verified pose and an empty text, or None and why the last attempt
+        failed.
+        """
         # 1. Predict the pose.
         reason, search_px, min_inliers = "", self.options.search_px, self.options.min_inliers
         guided = GuidedMatchLimits(radius_px=search_px)
@@ -410,7 +434,7 @@ class MonocularTracker:
             if len(matches) < min_matches:
                 reason = f"only {len(matches)} matches with the map"
                 continue
-            # 3. Solve and verify.
+            # 3. Solve the pose by a query, and verify it by the landmarks around the reference keyframe.
             answer = yield self._make_query(view, matches, against)
             posed, reason = self._verify(self._present, view, answer, len(matches))
             if posed is not None:
@@ -418,9 +442,10 @@ class MonocularTracker:
         return None, reason
 
     def _predict_pose(self) -> Array:
-        """Predict ``T_camera_world`` of the frame: by a user's motion model, or by a constant velocity.
+        """Predict ``T_camera_world`` ``(4, 4)`` of the frame by a user's motion model, if it returns a pose.
 
-        With an IMU the rotation is that of the gyroscope.
+        Otherwise the motion between the last two frames is repeated, whatever time has passed.  Its rotation
+        is replaced by that of the gyroscope, where there is one.
         """
         state, now_s = self._state, self._frame.timestamp_s
         assert state.last is not None
@@ -432,7 +457,7 @@ class MonocularTracker:
         return predicted
 
     def _match_last_frame(self, view: MonocularView) -> Matches:
-        """Match the landmarks of the last frame by appearance, wherever they are."""
+        """Match an image by appearance alone with the landmarks of the last frame that still exist."""
         last, own = self._state.last, self._present.map
         assert last is not None
         rows = np.flatnonzero(last.landmarks != NO_LANDMARK)
@@ -444,18 +469,22 @@ class MonocularTracker:
 
     @property
     def _present(self) -> MonocularSegment:
-        """The present segment."""
         return self._segments[self._state.segment]
 
     @property
     def _maps(self) -> dict[int, LandmarkMap]:
-        """The map of each segment."""
+        """The map of each segment by its number."""
         return {number: segment.map for number, segment in self._segments.items()}
 
     def _relocalise(
         self, view: MonocularView
     ) -> Generator[PoseQuery, QueryAnswer, tuple[PosedView | None, str]]:
-        """Ask for the pose of a frame at known places; return it, or None and why there is none."""
+        """Ask for the pose of a frame at the keyframes of all segments that may show its place.
+
+        If a pose is found, the segment of the keyframe becomes the present one, and the keyframe its
+        reference keyframe.  Returned are the image with its verified pose and an empty text, or None and why
+        there is none.
+        """
         present = self._state.segment
         keyframes = list_relocalisation_candidates(self._maps, view.place_vector, present)
         candidates = match_candidates(self._maps, keyframes, view.features)
@@ -479,14 +508,14 @@ class MonocularTracker:
         return None, reason
 
     def _find_join(self) -> Generator[PoseQuery, QueryAnswer, None]:
-        """Ask for the place of the last frame in other segments; join two segments if two frames agree."""
+        """Ask for the place of the last frame in other segments; join two once two measurements agree."""
         last, present = self._state.last, self._state.segment
         assert last is not None
         keyframes = list_other_segments(self._maps, last.view.place_vector, present)
         similarity = yield from self._measure_similarity(last, keyframes)
         if similarity is None:
             return
-        # The older segment keeps its frame and its unit: in it, the camera's poses stay.
+        # Move the newer of the two segments into the older one, whose poses and unit stay as they are.
         if similarity.segment < present:
             self._join(present, similarity, self._present.reference)
         else:
@@ -494,7 +523,7 @@ class MonocularTracker:
             self._join(similarity.segment, back, similarity.keyframe)
 
     def _find_loop(self) -> Generator[PoseQuery, QueryAnswer, None]:
-        """Ask for the place of a new keyframe among much older ones; close a loop if two frames agree."""
+        """Ask for the place of a new keyframe among older ones; close a loop once two measurements agree."""
         # 1. Choose older keyframes that share few landmarks with the new one.
         state, own = self._state, self._present.map
         assert state.last is not None
@@ -510,7 +539,7 @@ class MonocularTracker:
         )
         if similarity is None:
             return
-        # 3. Bend the map, so that both places are one.
+        # 3. Bend the map between the two keyframes, fuse the landmarks of both places, and adjust all.
         self._state = replace(
             self._state,
             T_next_last=scaled(self._state.T_next_last, similarity.scale),
@@ -531,7 +560,8 @@ class MonocularTracker:
             keyframes: (segment, keyframe) of the candidates.
 
         Returns:
-            The similarity, once two measurements of it agree; otherwise None.
+            The similarity, if the measurement before it is of the same segment and agrees.  Otherwise None;
+            the measurement is then kept for the comparison with the next one.
         """
         # 1. Solve and verify the pose by the keyframe with the most matches.
         best = match_candidates(self._maps, keyframes, posed.view.features)[0]
@@ -544,11 +574,11 @@ class MonocularTracker:
         there, _ = self._verify(segment, posed.view, answer, count, best.keyframe)
         if there is None:
             return None
-        # 2. The scale is the ratio of the depths of landmarks on both sides.
+        # 2. Measure the scale by the depths of landmarks in both maps.
         scale = self._measure_scale(posed, there, segment.map)
         if scale is None:
             return None
-        # 3. Compare the measurement with that of an earlier frame.
+        # 3. Keep the measurement as the candidate, and compare it with the candidate before it.
         measured = Similarity(
             segment=best.segment,
             keyframe=best.keyframe,
@@ -563,10 +593,11 @@ class MonocularTracker:
         return measured if previous.agrees_with(measured, centre, depth) else None
 
     def _measure_scale(self, posed: PosedView, there: PosedView, other_map: LandmarkMap) -> float | None:
-        """Return by what the lengths of the present segment are multiplied in another map.
+        """Return the factor that turns lengths of the present segment into lengths of another map.
 
-        It is the median ratio of the depths of features that have a landmark in both maps; None if these are
-        too few, or their ratios differ too much.
+        *posed* and *there* are the same image with its poses in the present segment and in the other map.
+        The factor is the median ratio of the depths of features that have a landmark in both maps; None if
+        these are too few, or their ratios differ too much.
         """
         both = np.flatnonzero((posed.landmarks != NO_LANDMARK) & (there.landmarks != NO_LANDMARK))
         points_here = self._present.map.points[posed.landmarks[both]]
@@ -620,8 +651,8 @@ class MonocularTracker:
     def _merge_places(self, older: int, newer: int, bend_by: Similarity | None = None) -> None:
         """Fuse the landmarks around two keyframes of one place, and adjust the whole present map.
 
-        With *bend_by* the map between the two keyframes is bent before, so that the newer one is in its
-        place.
+        With *bend_by*, where the newer keyframe lies by the older one, the map between the two is bent
+        before, so that the newer keyframe is in its place.  The last pose moves with the reference keyframe.
         """
         own, reference, last = self._present.map, self._present.reference, self._state.last
         T_camera_reference = None
@@ -665,7 +696,9 @@ class MonocularTracker:
         match_count: int,
         around: int | None = None,
     ) -> tuple[PosedView | None, str]:
-        """Fit the pose of an answer to all landmarks around it; return None and why if too few agree.
+        """Fit the pose of an answer to all landmarks around a keyframe.
+
+        Returned are the image with the fitted pose and an empty text, or None and why there is no pose.
 
         Args:
             segment: The segment in which the pose was solved.
@@ -688,7 +721,8 @@ class MonocularTracker:
     def _start_or_lose(self, view: MonocularView, reason: str) -> TrackedFrame:
         """Let a frame without a pose wait for a second view; or begin a segment with it as the second view.
 
-        A later segment begins only if enough frames before it were lost.
+        A frame with fewer than 100 features does neither.  A later segment begins only if more than
+        ``segment_after`` frames with enough features came since the last pose.
         """
         if len(view.features) >= _MIN_START_MATCHES:
             self._state = replace(self._state, unrecognised=self._state.unrecognised + 1)
@@ -784,7 +818,8 @@ class MonocularTracker:
         """Fit the poses of the frames between the two views of a start, each from an interpolated guess.
 
         *T_second* is ``T_camera_world`` of the second view.  Returned is that of the frame just before it,
-        None if that frame has no pose.
+        None if that frame has no pose.  Frames without a pose are left out; no frame waits any more
+        afterwards.
         """
         count = len(self._waiting)
         pose, newest = np.eye(4), None

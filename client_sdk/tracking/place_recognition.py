@@ -44,7 +44,7 @@ class LazyPlaceVector:
         self._vector: PlaceVector
 
     def get(self) -> PlaceVector:
-        """Return the ``(d,)`` unit vector."""
+        """Return the ``(d,)`` unit vector, or zeros for an image without features."""
         if self._compute is not None:
             self._vector, self._compute = self._compute(), None
         return self._vector
@@ -93,7 +93,8 @@ def list_relocalisation_candidates(
 ) -> Iterator[tuple[int, int]]:
     """Yield (segment, keyframe) of all keyframes that may show the place of an untracked frame.
 
-    These are the most similar keyframes of every segment, and the newest ones of the current segment.
+    These are the five most similar keyframes of every segment, and the three newest ones of the current
+    segment; each keyframe is yielded once.
     """
     for segment, segment_map in maps.items():
         keyframes = segment_map.rank_by_similarity(place, _SIMILAR_KEYFRAMES)
@@ -106,7 +107,7 @@ def list_relocalisation_candidates(
 def list_other_segments(
     maps: Mapping[int, RecognisableMap], place: LazyPlaceVector, current_segment: int
 ) -> Iterator[tuple[int, int]]:
-    """Yield (segment, keyframe) of the most similar keyframes of all segments but the current one."""
+    """Yield (segment, keyframe) of the five most similar keyframes of each segment but the current one."""
     for segment, segment_map in maps.items():
         if segment != current_segment:
             yield from ((segment, k) for k in segment_map.rank_by_similarity(place, _SIMILAR_KEYFRAMES))
@@ -115,7 +116,7 @@ def list_other_segments(
 def match_candidates(
     maps: Mapping[int, RecognisableMap], keyframes: Iterable[tuple[int, int]], image: ImageFeatures
 ) -> list[Candidate]:
-    """Match the landmarks of keyframes with an image by appearance; most matches first.
+    """Match the landmarks of each keyframe with an image by appearance; return all, most matches first.
 
     Args:
         maps: Map of each segment by its number.

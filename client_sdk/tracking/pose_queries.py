@@ -27,7 +27,7 @@ _CLEAR_RATIO = 0.5
 """Smallest share of inliers among the matches of an answer that recognises a place which the camera did not
 see just before: perceptual aliases have fewer."""
 _MIN_REFERENCE_DEPTH_M = 0.01
-"""Depths are sent only if all points are farther from the reference camera than this, in metres."""
+"""Depths are sent only if all points lie more than this, in metres, before the reference camera."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +35,8 @@ class QueryAnswer:
     """The answer to a pose query.
 
     Attributes:
-        T_camera_world: ``(4, 4)``, pose of the camera in the query's world; None if there is no pose.
+        T_camera_world: ``(4, 4)``, maps the world of the query, in which its points are, to the camera; None
+            if there is no pose.
         inliers: Number of correspondences that agree with the pose.
         is_weak: Whether the solver calls the evidence for the pose weak.
     """
@@ -83,7 +84,9 @@ def make_query(
         against: The source of the landmarks, see `PoseQuery`.
         T_world_reference: ``(4, 4)``, pose of the reference camera, in whose frame points are sent; None
             sends them in the frame of the map.
-        depths_m: ``(n,)``, depths of the features of *image*, NaN where there is none; None for no depths.
+        depths_m: ``(n,)``, depths of the features of *image*, NaN where there is none; None for no depths.  A
+            depth that is missing is sent as 0, and so are all depths if a point does not lie before the
+            reference camera.
         depth_noise: Noise model of the depths; None for a Kinect's.
     """
     rows = np.arange(len(matches))

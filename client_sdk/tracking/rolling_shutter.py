@@ -86,10 +86,10 @@ def shutter_displacements(features: Features, points_camera: Array, camera: Came
 
 
 def correct_view(view: View, features: Features, readout_s: float, rate: Array) -> View:
-    """Return an image without its rolling shutter.
+    """Return an image with pixels, points and displacements of its features computed without rolling shutter.
 
     Args:
-        view: The image; its features may have been corrected before.
+        view: The image; if its features were corrected before, that correction is replaced.
         features: Features as the image shows them.
         readout_s: Readout time of the camera, in seconds.
         rate: ``(3,)`` rad/s, rotation rate of the camera in its own frame.
@@ -119,7 +119,7 @@ def rotation_rate(
     """
     mean = _rotation_vector(T_world_first[:3, :3].T @ T_world_second[:3, :3]) / interval_s
     # The mean rate is that of the middle of the interval.  It is extrapolated by half the difference of the
-    # two # mean rates, that is by half an interval if both intervals are equally long.
+    # two mean rates, that is by half an interval if both intervals are equally long.
     return mean + 0.5 * (mean - previous_rate) if previous_rate.any() else mean
 
 
@@ -135,7 +135,8 @@ def measure_readout_change(
         fitted: The pose that fits them.
 
     Returns:
-        The change in seconds, and its information (1/s^2); 0 and 0 with fewer than 30 inliers with depth.
+        The seconds by which the readout takes longer than the present estimate (negative: shorter), and the
+        information of this number (1/s^2); 0 and 0 with fewer than 30 inliers with depth.
     """
     rows = np.flatnonzero(fitted.is_inlier & (observed.depths_m > 0.0))
     if len(rows) < _MIN_LANDMARKS:
@@ -155,7 +156,7 @@ class ReadoutEstimate:
         self._variance = _INITIAL_SIGMA_S**2
 
     def update(self, change_s: float, information: float, rate: Array) -> float:
-        """Update the estimate by one image; return by how many seconds it changed.
+        """Update the estimate by one image; return the seconds that were added to it.
 
         An image without information, or of a camera that rotates slowly, changes nothing.
 

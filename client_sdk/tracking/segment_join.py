@@ -16,7 +16,8 @@ NOT_JOINED = "in a segment that is not joined to the first one yet"
 class Join:
     """A segment became part of another one: poses of *segment* are ``T_into_segment @ pose`` in *into*.
 
-    Of a camera without depth, all lengths of *segment* are multiplied by *scale* before.
+    *segment* is the newer segment, which no longer exists, *into* the older one; both are numbers.  Of a
+    camera without depth, all lengths of *segment* are multiplied by *scale* before; with depth *scale* is 1.
     """
 
     segment: int

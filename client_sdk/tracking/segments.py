@@ -34,10 +34,11 @@ __all__ = [
 ]
 
 _MAX_DEPTH_DEVIATION = 0.05
-"""Largest deviation of a stereo pair's depth in a point cloud, as a share of the depth."""
+"""Largest uncertainty of the depth of a stereo pair's point that is added to a cloud, as a share of the
+depth."""
 _DISPARITY_SIGMAS = 2.0
-"""Number of standard deviations of a stereo pair's depth in a sharp image that are compared with that share:
-images are about twice as noisy."""
+"""Uncertainty of a stereo pair's depth that is compared with `_MAX_DEPTH_DEVIATION`, in standard deviations
+of a sharp image: other images are about twice as noisy."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,8 +67,8 @@ class SegmentRecord:
         stamps_s: Times of the frames with a pose, in seconds.
         poses: ``T_world_camera`` ``(4, 4)`` of these frames.
         keyframes: Keyframes of a map, if the mapper keeps them.
-        keyframe_points: Points that stereo keyframes added to the cloud, by which it is made again after an
-            adjustment; None once there are more than `MAX_ADJUSTED_KEYFRAMES`.
+        keyframe_points: Points that each stereo keyframe added to the cloud, by which the cloud is made again
+            after an adjustment; None once there were more than `MAX_ADJUSTED_KEYFRAMES` keyframes.
     """
 
     cloud: PointMap
@@ -94,16 +95,20 @@ class SegmentRecord:
         self.add_keyframe_points(moved)
 
     def add_keyframe_points(self, added: list[KeyframePoints] | None) -> None:
-        """Keep the points of stereo keyframes; None, or too many of them, forget all for good."""
+        """Keep the points of further stereo keyframes, or forget those of all keyframes for good.
+
+        All are forgotten if *added* is None, and if there are more than `MAX_ADJUSTED_KEYFRAMES` then.
+        """
         points = None if self.keyframe_points is None or added is None else self.keyframe_points + added
         is_adjustable = points is not None and len(points) <= MAX_ADJUSTED_KEYFRAMES
         self.keyframe_points = points if is_adjustable else None
 
     def corrected(self, adjustment: StereoAdjustment) -> SegmentRecord:
-        """Return the segment with the poses and depths of its keyframes after an adjustment of stereo drives.
+        """Return a new record of the segment after an adjustment of its stereo keyframes.
 
-        The cloud of the segment is built again from the points of its keyframes.  It stays as it is if these
-        points were forgotten, or if the cloud has other sources, too.
+        The poses of all frames and keyframes, and the depths of the keyframes, are corrected.  The cloud is
+        built anew from the points of the keyframes; without such points (they were forgotten, or the cloud
+        has other sources) it is the same object as before.
         """
 
         def moved(stamp_s: float, pose: Array) -> Array:
@@ -148,7 +153,7 @@ class SegmentRecord:
         )
 
     def trajectory(self) -> Trajectory:
-        """Return the poses in the order of time."""
+        """Return the poses in the order of time, in the frame of the segment."""
         order = np.argsort(self.stamps_s, kind="stable")
         return Trajectory(np.array(self.stamps_s)[order], np.array(self.poses).reshape(-1, 4, 4)[order])
 
@@ -187,13 +192,19 @@ class DriveRecords:
             record.add_keyframe_points([KeyframePoints(stamp_s, pose, points.astype(np.float32), colours)])
 
     def correct(self, adjusted: Mapping[int, StereoAdjustment]) -> None:
-        """Replace segments by their records after an adjustment of their stereo keyframes."""
+        """Replace the records of segments by those after an adjustment of their stereo keyframes.
+
+        *adjusted* is by the number of the segment; numbers without a record are ignored.
+        """
         for number, adjustment in adjusted.items():
             if number in self._segments:
                 self._segments[number] = self._segments[number].corrected(adjustment)
 
     def join(self, join: Join) -> None:
-        """Move all of a segment into the record of the segment that it was joined to."""
+        """Move all of a segment into the record of the segment that it was joined to.
+
+        A segment without a record is ignored.
+        """
         record = self._segments.pop(join.segment, None)
         if record is None:
             return
@@ -208,7 +219,10 @@ class DriveRecords:
 
 
 def read_segment(tracker: MonocularTracker, segment: int, options: MapOptions) -> SegmentRecord:
-    """Return a segment of a tracker without depth as it is adjusted now; its landmarks are the cloud."""
+    """Return a segment of a tracker without depth as it is adjusted now, without its keyframes.
+
+    Its landmarks are the cloud.  A segment that does not exist gives an empty record.
+    """
     cloud = PointMap(options)
     cloud.add_points(*tracker.points(segment))
     path = tracker.trajectory(segment)
@@ -238,7 +252,10 @@ def add_to_cloud(
 
 
 def _points_of_pair(frame: Frame, features: Features) -> tuple[Array, npt.NDArray[np.uint8]]:
-    """Return the ``(n, 3)`` points of a stereo pair whose depth is known to 5 %, and their colours."""
+    """Return the points of a stereo pair's features whose depth is known to 5 %, and their colours.
+
+    The shapes are ``(n, 3)``, metres in the left camera's frame, and ``(n, 3)`` uint8.
+    """
     rows = select_certain_rows(frame, features)
     columns, lines = np.rint(features.pixels[rows]).astype(np.int64).T
     columns, lines = np.clip(columns, 0, frame.camera.width - 1), np.clip(lines, 0, frame.camera.height - 1)
@@ -278,7 +295,7 @@ def make_keyframe(tracked: TrackedFrame, pose: Array, features: Features, robot:
 def landmark_keyframes(tracker: MonocularTracker, camera: Camera, robot: str) -> list[Keyframe]:
     """Return the keyframes of the first segment of a tracker without depth, as they are adjusted now.
 
-    Features without a landmark have no point (NaN).
+    All have the number 0.  Features without a landmark have no point (NaN).
 
     Args:
         tracker: The tracker.
@@ -302,7 +319,10 @@ def landmark_keyframes(tracker: MonocularTracker, camera: Camera, robot: str) ->
 
 
 def _move_pose(T_into_segment: Array, pose: Array) -> Array:
-    """Return a moved pose with a true rotation, where that can be made."""
+    """Return ``T_into_segment @ pose`` with an orthonormal rotation.
+
+    If the product is no rigid motion, it is returned as it is.
+    """
     moved = T_into_segment @ pose
     rigid_pose = rigid(moved)
     return moved if rigid_pose is None else rigid_pose

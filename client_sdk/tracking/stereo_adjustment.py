@@ -49,8 +49,9 @@ adjustment does not improve their drives."""
 _MIN_CLEAR_SIGMAS = 4.0
 """Smallest disparity offset that changes a map, in its own standard deviations."""
 _CURVE = UNKNOWNS.index("curve")
-"""Index of the error of inverse depths among the unknowns of a self-calibration; times focal length and
-baseline it is the disparity offset."""
+"""Index of ``curve`` among the unknowns of a self-calibration: the metres by which a measured depth is too
+large, for each square metre of depth.  Times focal length (pixels) and baseline (metres) it is the disparity
+offset."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -63,9 +64,10 @@ class StereoAdjustment:
         f_baseline: Focal length in pixels times the baseline in metres.
         offset_px: Pixels by which all disparities are too small.
         deviation_px: Standard deviation of the offset, in pixels.
-        bend_m_per_px: Metres by which an offset of a pixel bends the path, see `Calibrated.bend_m`.
+        bend_m_per_px: Root mean square change of the keyframes' positions, in metres, by an offset of one
+            pixel that is not corrected, see `Calibrated.bend_m`.
         growth_per_px: Relative growth of the path if the offset were larger by a pixel.
-        noise_m: Standard deviation of the keyframes' positions, in metres.
+        noise_m: Root mean square of the random error of the keyframes' positions, in metres.
     """
 
     stamps_s: Array
@@ -83,7 +85,10 @@ class StereoAdjustment:
         return abs(self.offset_px) >= max(_MIN_CLEAR_OFFSET_PX, _MIN_CLEAR_SIGMAS * self.deviation_px)
 
     def moved(self, stamps_s: Array, T_world_camera: Array) -> Array:
-        """Return ``(n, 4, 4)`` poses of any times ``(n,)`` in seconds, moved as the keyframes around them."""
+        """Return corrected ``(n, 4, 4)`` poses of frames at any times ``(n,)`` in seconds.
+
+        A frame moves as the keyframes around it in time: their motions ``T_new_old`` are interpolated.
+        """
         return Trajectory(self.stamps_s, self.T_new_old).at(stamps_s) @ T_world_camera
 
 
@@ -148,6 +153,7 @@ def _collect_observations(segment_map: KeyframeMap) -> tuple[int, DriveObservati
     """Return the number of landmarks that two keyframes see, at most 2,500, and all observations of them.
 
     Landmarks that are seen most often are taken first, and of those the nearest: they determine the scale.
+    The standard deviations of the depths are not set yet: they hold the depths themselves.
     """
     # 1. Landmark, keyframe and depth of every feature of every keyframe.
     views = [segment_map.view(k) for k in range(segment_map.keyframe_count)]
@@ -182,7 +188,10 @@ def _collect_observations(segment_map: KeyframeMap) -> tuple[int, DriveObservati
 def _set_depth_noise(
     observed: DriveObservations, T_camera_world: Array, points: Array, f_baseline: float
 ) -> DriveObservations:
-    """Return observations whose depths have the noise of their disparities, see `depths_for_noise`."""
+    """Return observations with the noise of stereo depths, and with the prior of the disparity offset.
+
+    The noise is that of disparities, evaluated as `depths_for_noise` says at these poses and points.
+    """
     T = T_camera_world[observed.keyframes]
     expected_m = np.einsum("ni,ni->n", T[:, 2, :3], points[observed.landmarks]) + T[:, 2, 3]
     noise_depths_m = depths_for_noise(np.nan_to_num(observed.depths_m, nan=1.0), expected_m)

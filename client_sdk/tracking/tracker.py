@@ -55,12 +55,14 @@ _GUIDED_MATCHES_FACTOR = 3
 """Fewest matches near the predicted pose for which a pose is queried, as a multiple of ``min_inliers``: with
 fewer the prediction is most likely wrong, and the frame is matched with the last one instead."""
 _GUIDED_RATIO = 0.35
-"""Smallest share of inliers among the matches near a predicted pose, for a solved pose to be verified."""
+"""Smallest share of inliers among the matches that a query sent, for a pose that was solved by matches near a
+predicted pose to be verified."""
 _LAST_FRAME_RATIO = 0.4
-"""Smallest share of inliers among the matches with the last frame, which no prediction supports."""
+"""Smallest share of inliers among the matches that a query sent, for a pose that was solved by matches with
+the last frame to be verified: no prediction supports these matches."""
 _NEARBY_RATIO = 0.25
-"""Smallest share of inliers among the matches with a keyframe near the camera's last pose: low, because the
-place itself is plausible."""
+"""Smallest share of inliers among all matches with a keyframe, also those that the query did not send, for a
+pose near the camera's last pose: low, because the place itself is plausible."""
 _VERIFIED_RATIO = 0.3
 """Smallest share of the landmarks matched around a solved pose that must agree with the fitted pose."""
 _VERIFY_RADIUS_PX = 8.0
@@ -77,11 +79,11 @@ _ENOUGH_MAP_MATCHES = 120
 """With this many matched landmarks of the map, a pose is verified without points of the last frame: a chain
 of frames drifts, the map does not."""
 _MAX_JUMPS = 4
-"""Largest number of frames for which the limit of plausible motion grows after a loss; farther away a place
-must be clear to be accepted."""
+"""Largest multiple of the plausible motion between two frames that is allowed after a loss; the multiple
+grows by one with each lost frame.  A recognised place farther away is accepted only by a clear answer."""
 _STEREO_JUMP_SHARE = 0.15
-"""Plausible motion of a stereo pair between two frames as a share of the median depth that it sees: a fast
-car sees far."""
+"""Largest plausible motion of a stereo pair between two frames, as a share of the median depth that it sees,
+where this is more than ``max_jump_m``: a fast car sees far."""
 _MIN_INTERVAL_S = 1e-3
 """Smallest time between two frames, in seconds, by which a rotation is divided: time stamps may repeat."""
 _MAX_RATE_RAD_S = 3.0
@@ -91,13 +93,16 @@ _MAX_RELOCALISATION_QUERIES = 3
 """Largest number of pose queries by which one lost frame is relocalised, against the keyframes with the most
 matches: bounds the time of a lost frame."""
 _MAX_STEREO_MATCHES = 250
-"""Largest number of matches in a query of a stereo pair: the robot itself fits the pose to all of them."""
+"""Largest number of matches that a query of a stereo pair sends: after the answer, the robot itself fits the
+pose to all matched landmarks."""
 _JOIN_INTERVAL_FRAMES = 3
 """Every third frame is compared with other segments, if there are any: bounds the time of a frame."""
 _JOIN_AGREEMENT_M = 0.15
-"""Largest translation, in metres, between two measurements of one segment's pose that confirm each other."""
+"""Largest translation, in metres, between two measurements of the pose of one segment in another one, for the
+two to confirm each other."""
 _JOIN_AGREEMENT_DEG = 4.0
-"""Largest rotation, in degrees, between two measurements of one segment's pose that confirm each other."""
+"""Largest rotation, in degrees, between two measurements of the pose of one segment in another one, for the
+two to confirm each other."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -107,10 +112,13 @@ class _PosedView:
     Attributes:
         view: The image.
         T_world_camera: ``(4, 4)``.
-        landmarks: ``(n,)``, landmark of each feature, or NO_LANDMARK.
-        inliers: Number of landmarks that agree with the pose.
-        matches: Number of matches of the image.
-        is_weak: Whether the solver calls the pose weak; the image never becomes a keyframe then.
+        landmarks: ``(n,)``, number of the landmark that each feature shows, or NO_LANDMARK; only features
+            that agree with the pose have one.
+        inliers: Number of features that agree with the pose; 0 for the first frame of a segment.
+        matches: Number of matches of the query or of the verification, whichever is larger; 0 for the first
+            frame of a segment.
+        is_weak: Whether the solver calls the pose weak; the image then changes no landmark, and never becomes
+            a keyframe.
         is_continuous: Whether the camera moved there from its last pose, so that its motion is known.
     """
 
@@ -130,17 +138,22 @@ class _TrackState:
     Attributes:
         T_world_camera: ``(4, 4)``, the last accepted pose, also after a loss.
         timestamp_s: Time of that pose, in seconds.
-        T_last_next: ``(4, 4)``, motion from one frame to the next, assumed constant.
-        rotation_rate: ``(3,)`` rad/s, mean rotation rate between the last two frames; zeros if not known.
-        last: The last frame; None after a loss.
-        features: Features of the last frame, without rolling shutter; None after a loss.
-        first: Features and image of a segment's first frame until a second one shows its rolling shutter.
-        keyframe_inliers: Number of landmarks that the newest keyframe saw.
+        T_last_next: ``(4, 4)``, pose of the next camera in the frame of the last one, assumed to be that
+            between the last two frames; the identity if these do not tell it.
+        rotation_rate: ``(3,)`` rad/s in the camera's frame, mean rate between the last two frames; zeros if
+            it is not known.
+        last: The last frame with its pose; None after a loss and after `Tracker.adjust_pairs`.
+        features: Features of the frame *last*, without rolling shutter; not to be used while *last* is None.
+        first: Features (with rolling shutter) and image of a segment's first frame, until the second frame
+            tells at which rate the camera rotated; None afterwards.
+        keyframe_inliers: Number of landmarks that agreed with the pose of the newest keyframe; for the first
+            keyframe of a segment, half the number of its features with depth.
         lost_in_a_row: Number of frames without a pose since the last accepted one.
         unrecognised: Number of frames since the last accepted pose that show enough features and no known
             place.
         segment: Number of the present segment, -1 before the first.
-        join_candidate: Another segment and ``T_other_present`` ``(4, 4)``, measured once and not confirmed.
+        join_candidate: Number of another segment and ``T_other_present`` ``(4, 4)``, the pose of the present
+            segment's world in that of the other one, measured once and not confirmed; None without one.
     """
 
     T_world_camera: Array
@@ -173,9 +186,9 @@ class Tracker:
     stereo pair is then matched in a wide radius around its last pose.  If no pose fits again, it is matched
     with the newest keyframes and with the most similar keyframes of all segments.  Otherwise the frame is
     lost, and the next one is tried in the same order.  After `FrontEndOptions.segment_after` unrecognised
-    frames a new segment begins; it is joined to an older one when two
-    of its frames were found there.  A
-    frame with a weak pose never becomes a keyframe.
+    frames a new segment begins at the last accepted pose.  Two segments are joined when two measurements in a
+    row agree where one lies in the other; the newer segment is moved into the older one.  A frame with a weak
+    pose never becomes a keyframe.
 
     Attributes:
         options: Options of the front end.
@@ -185,9 +198,10 @@ class Tracker:
         joins: All joins of segments so far, in their order.
         noise: Estimate of the noise of the camera's depths.
         readout: Estimate of the readout time of the camera's rolling shutter.
-        disparity_offset_px: Pixels by which the disparities of a stereo pair are too small, as `adjust_pairs`
-            found it.
-        pair_offsets: Result of the last `adjust_pairs` by segment, also where nothing was changed.
+        disparity_offset_px: Pixels that are added to the disparities of every further frame of a stereo pair:
+            the sum of the clear offsets that `adjust_pairs` found for the present segment.
+        pair_offsets: Result of the last `adjust_pairs` by segment, also where it was not clear and nothing
+            was changed.
     """
 
     def __init__(
@@ -218,12 +232,15 @@ class Tracker:
 
     @property
     def last_features(self) -> Features | None:
-        """Features of the last frame without its rolling shutter; None if that frame has no pose."""
+        """Features of the last frame without its rolling shutter.
+
+        None if that frame has no pose, and after `adjust_pairs`.
+        """
         return self._state.features if self._state.last is not None else None
 
     @property
     def segment(self) -> int:
-        """The number of the present segment, from 0."""
+        """The number of the present segment; 0 for the first one, and before there is one."""
         return max(0, self._state.segment)
 
     @property
@@ -235,7 +252,10 @@ class Tracker:
         return self._state.unrecognised
 
     def restart(self, T_world_start: Array) -> None:
-        """Forget all segments: the next frame with enough features begins a new one at *T_world_start*.
+        """Forget all segments: the next frame with enough features begins segment 0 at *T_world_start*.
+
+        *T_world_start* is the ``(4, 4)`` pose ``T_world_camera`` of that frame.  The counts of frames and
+        keyframes, the joins and all estimates (depth noise, readout time, disparity offset) are kept.
 
         Raises:
             UsageError: A query is open.
@@ -263,11 +283,13 @@ class Tracker:
     def adjust_pairs(self) -> dict[int, StereoAdjustment]:
         """Adjust all keyframes of each segment of a stereo drive together, such as at its end.
 
-        This takes seconds.  The next frame is relocalised afterwards.
+        This takes seconds.  A segment is changed only if its disparity offset is clear: its keyframes and
+        landmarks move, and if it is the present segment, the offset is added to the disparities of all
+        further frames.  The next frame is relocalised in any case.
 
         Returns:
-            By segment, how poses change that were returned before.  Segments in which nothing is clear enough
-            to be changed are left out.  Empty without stereo pairs, and if no frame came since the last call.
+            By segment, how the poses that were returned before change; only of the segments that were
+            changed.  Empty without stereo pairs, and if no frame came since the last call.
 
         Raises:
             UsageError: A query is open.
@@ -321,7 +343,8 @@ class Tracker:
             T_camera_world: ``(4, 4)`` as the PnP service returns it, where world is the frame of the query's
                 reference camera; None if there was no answer.
             inliers: Number of correspondences that agree with the pose.
-            is_weak: Whether the service calls the evidence for the pose weak.
+            is_weak: Whether the service calls the evidence for the pose weak; the frame then changes no
+                landmark and becomes no keyframe.
 
         Raises:
             UsageError: *query* is not the open one.
@@ -353,7 +376,7 @@ class Tracker:
         return self._make_result(posed, is_keyframe=is_keyframe)
 
     def _make_view(self, frame: Frame, features: Features) -> View:
-        """Return the image of a frame, with its rolling shutter."""
+        """Return a frame and its extracted features as a view, whose rolling shutter is not undone yet."""
         return View(
             features=features.for_matching(),
             points_camera=features.points_camera,
@@ -369,7 +392,11 @@ class Tracker:
     def _track_from_last_pose(
         self, view: View
     ) -> Generator[PoseQuery, QueryAnswer, tuple[_PosedView | None, int]]:
-        """Ask for the pose of a frame around its last pose; return it, and the largest number of matches."""
+        """Ask for the pose of a frame around the camera's last pose.
+
+        Returned are the image with its verified pose, None if no attempt gives one, and the largest number of
+        matches of an attempt.
+        """
         # 1. Predict the pose.
         min_inliers, max_count = self.options.min_inliers, 0
         T_predicted, T_last = self._predict_pose(), self._state.T_world_camera
@@ -402,12 +429,12 @@ class Tracker:
             max_count = max(max_count, count)
             if count < min_matches:
                 continue
-            # 3. Solve.
+            # 3. Solve the pose by a query; go on only if enough matches agree and the motion is plausible.
             answer = yield self._make_query(view, matches, T_world_reference, against)
             T_world_camera = self._read_pose(answer, T_world_reference, count, min_ratio)
             if T_world_camera is None or not self._is_plausible(T_world_camera):
                 continue
-            # 4. Verify.
+            # 4. Verify the pose by the landmarks around it.
             image, is_continuous = self._correct_view_at(view, T_world_camera, is_near=True)
             posed = self._verify(image, T_world_camera, answer, count, self._map, is_continuous=is_continuous)
             if posed is not None:
@@ -415,14 +442,15 @@ class Tracker:
         return None, max_count
 
     def _match_last_frame(self, view: View) -> Matches:
-        """Match the landmarks of the last frame by appearance, wherever they are."""
+        """Match an image by appearance alone with the landmarks and other points of the last frame."""
         landmarks = self._landmarks_of_last_frame()
         return match_by_appearance(landmarks, landmarks.descriptors, view.features)
 
     def _predict_pose(self) -> Array:
-        """Predict ``T_world_camera`` of the frame: by a user's motion model, or by a constant velocity.
+        """Predict ``T_world_camera`` ``(4, 4)`` of the frame by a user's motion model, if it returns a pose.
 
-        With an IMU the rotation is that of the gyroscope.
+        Otherwise the motion between the last two frames is repeated, whatever time has passed.  Its rotation
+        is replaced by that of the gyroscope, where there is one.
         """
         state, now_s = self._state, self._frame.timestamp_s
         T_world_camera = self._plugins.predict_pose(now_s)
@@ -442,7 +470,8 @@ class Tracker:
     ) -> Matches:
         """Match landmarks of the nearest keyframes and of the last frame near the pixels of a pose.
 
-        Where a feature matches both, the match with the last frame is taken.
+        Where a feature or a landmark has a match of both kinds, that with the last frame is taken.  The last
+        frame is left out in the map of another segment, and after a loss.
 
         Args:
             view: The image.
@@ -450,7 +479,7 @@ class Tracker:
             radius_px: Radius around predicted pixels.
             lowe_ratio: Lowe's ratio.
             segment_map: The map; None for that of the present segment.
-            enough: Number of matches of the map with which the last frame is not matched.
+            enough: If the keyframes give this many matches, the last frame is left out, too.
         """
         state, segment_map = self._state, segment_map or self._map
         T_camera_world = inverse(T_world_camera)
@@ -473,7 +502,12 @@ class Tracker:
     # --- Recognise known places ---
 
     def _relocalise(self, view: View) -> Generator[PoseQuery, QueryAnswer, tuple[_PosedView | None, int]]:
-        """Ask for the pose of a frame at known places; return it, and the largest number of matches."""
+        """Ask for the pose of a frame at the keyframes of all segments that may show its place.
+
+        If the pose is found in another segment, that one becomes the present segment.  Returned are the image
+        with its verified pose, None if no keyframe gives one, and the number of matches with the best
+        keyframe.
+        """
         segment = self._state.segment
         keyframes = list_relocalisation_candidates(self._segments, view.place_vector, segment)
         candidates = match_candidates(self._segments, keyframes, view.features)
@@ -507,8 +541,12 @@ class Tracker:
         return None, max_count
 
     def _find_join(self, posed: _PosedView) -> Generator[PoseQuery, QueryAnswer, None]:
-        """Ask for the place of a tracked frame in other segments; join two segments if two frames agree."""
-        # 1. Solve and verify the pose in the segment with the most matches.
+        """Ask for the place of a tracked frame in other segments; join two once two measurements agree.
+
+        Two measurements are compared if they are of the same other segment and no measurement lies between
+        them.
+        """
+        # 1. Solve and verify the pose against the keyframe of another segment with the most matches.
         keyframes = list_other_segments(self._segments, posed.view.place_vector, self._state.segment)
         best = match_candidates(self._segments, keyframes, posed.view.features)[0]
         count, segment_map = len(best.matches), self._segments[best.segment]
@@ -522,7 +560,7 @@ class Tracker:
         there = self._verify(posed.view, T_other_camera, answer, count, segment_map)
         if there is None or not self._has_predicted_appearance(there.T_world_camera, segment_map):
             return
-        # 2. Compare the measurement with that of an earlier frame.
+        # 2. Keep the measurement as the candidate; go on only if the candidate before it agrees.
         T_other_present = _orthonormalise(there.T_world_camera @ inverse(posed.T_world_camera))
         previous = self._state.join_candidate
         self._state = replace(self._state, join_candidate=(best.segment, T_other_present))
@@ -531,14 +569,17 @@ class Tracker:
         apart_m, apart_deg = pose_difference(previous[1], T_other_present)
         if apart_m > _JOIN_AGREEMENT_M or apart_deg > _JOIN_AGREEMENT_DEG:
             return
-        # 3. The older segment keeps its frame: in it, the camera's poses stay.
+        # 3. Move the newer of the two segments into the older one, whose poses stay as they are.
         if best.segment < self._state.segment:
             self._join(self._state.segment, best.segment, T_other_present)
         else:
             self._join(best.segment, self._state.segment, inverse(T_other_present))
 
     def _join(self, segment: int, into: int, T_into_segment: Array) -> None:
-        """Move all of *segment*, the newer one, into the map of *into*, which keeps its frame."""
+        """Move all of *segment*, the newer one, into the map of *into*, which keeps its world.
+
+        *T_into_segment* ``(4, 4)`` is the pose of the newer segment's world in that of the older one.
+        """
         segment_map = self._segments.pop(segment)
         segment_map.move(T_into_segment)
         first_landmark = self._segments[into].append(segment_map)
@@ -600,7 +641,14 @@ class Tracker:
     def _read_pose(
         self, answer: QueryAnswer, T_world_reference: Array, match_count: int, min_ratio: float
     ) -> Array | None:
-        """Return ``T_world_camera`` of an answer; None if too few matches agree or it is no rigid pose."""
+        """Return ``T_world_camera`` ``(4, 4)`` of an answer; None without a rigid pose and enough inliers.
+
+        Args:
+            answer: The answer.
+            T_world_reference: ``(4, 4)``, pose of the query's reference camera.
+            match_count: Number of matches, of which the query may have sent only a part.
+            min_ratio: Smallest share of inliers among the sent matches; ``min_inliers`` are needed, too.
+        """
         sent = min(match_count, self._max_matches)
         T_camera_reference = answer.accepted_pose(max(self.options.min_inliers, min_ratio * sent))
         return None if T_camera_reference is None else T_world_reference @ inverse(T_camera_reference)
@@ -608,7 +656,10 @@ class Tracker:
     # --- Verify ---
 
     def _is_plausible(self, T_world_camera: Array) -> bool:
-        """Return whether the camera can have moved to a pose since its last one."""
+        """Return whether the camera can have moved so far since its last pose; rotations are not limited.
+
+        The limit grows with the number of frames that were lost in a row.
+        """
         jump_m = self.options.max_jump_m
         depths_m = self._raw.points_camera[:, 2]
         if self._frame.stereo is not None and np.isfinite(depths_m).any():
@@ -619,9 +670,11 @@ class Tracker:
         return moved_m <= limit_m
 
     def _correct_view_at(self, view: View, T_world_camera: Array, *, is_near: bool) -> tuple[View, bool]:
-        """Return a frame's image at a solved pose, and whether the camera moved there from its last pose.
+        """Return a frame's image to verify at a solved pose, and whether its motion to there is known.
 
-        After a cut in a video it did not: its rotation rate is unknown, and the rolling shutter stays.
+        If the camera moved there from the pose of the frame before, the image stays as it is.  After a loss,
+        or a cut in a video (a pose that is not near, or a rotation that is too fast), the rotation rate is
+        unknown, and the image is returned with its rolling shutter.
         """
         rate = self._rate_at(T_world_camera, np.zeros(3))
         is_slow = float(np.linalg.norm(rate)) <= _MAX_RATE_RAD_S
@@ -630,13 +683,21 @@ class Tracker:
         return self._correct_view(view, np.zeros(3)), False
 
     def _rate_at(self, T_world_camera: Array, previous_rate: Array) -> Array:
-        """Return the rotation rate in rad/s of a camera that moved from the last pose to this one."""
+        """Return the ``(3,)`` rotation rate, rad/s, of a camera that moved from the last pose to this one.
+
+        *previous_rate* is the mean rate before the last pose; for zeros the mean rate since then is returned,
+        see `rotation_rate`.
+        """
         state = self._state
         interval_s = max(_MIN_INTERVAL_S, self._frame.timestamp_s - state.timestamp_s)
         return rotation_rate(state.T_world_camera, T_world_camera, interval_s, previous_rate)
 
     def _correct_view(self, view: View, rate: Array) -> View:
-        """Return the present image without the rolling shutter of a camera that rotates at *rate* rad/s."""
+        """Return an image without the rolling shutter of a camera that rotates at *rate* ``(3,)`` rad/s.
+
+        Pixels and points are computed anew from the extracted features of the present frame; for zeros they
+        keep their rolling shutter.
+        """
         return correct_view(view, self._raw, self.readout.readout_s, rate)
 
     def _verify(
@@ -650,6 +711,10 @@ class Tracker:
         is_continuous: bool = False,
     ) -> _PosedView | None:
         """Fit a solved pose to all landmarks of the map around it; None if too few agree.
+
+        An accepted pose updates the estimate of the depth noise.  With *is_continuous* the image of a depth
+        camera (not of a stereo pair) also updates the estimate of the readout time, and the second frame of a
+        segment corrects the first.
 
         Args:
             view: The image.
@@ -706,7 +771,11 @@ class Tracker:
         )
 
     def _observe(self, view: View, matches: Matches, T_world_camera: Array) -> Observations:
-        """Return what an image measured of matched landmarks, with the noise of each measurement."""
+        """Return what an image measured of matched landmarks, with the noise of each measurement.
+
+        The depth is 0 where there is none.  The noise of a stereo depth is that between the measured depth
+        and the one that the pose *T_world_camera* predicts; otherwise the pose is not used.
+        """
         depths_m = np.nan_to_num(view.points_camera[matches.features, 2], posinf=0.0, neginf=0.0)
         noise_depths_m = depths_m
         if view.is_stereo:
@@ -722,9 +791,10 @@ class Tracker:
         )
 
     def _correct_first_keyframe(self, raw: Features, view: View, rate: Array) -> None:
-        """Make the first keyframe of a segment again without its rolling shutter.
+        """Replace the map of the present segment by one with its first keyframe without rolling shutter.
 
-        Its rotation rate *rate* (rad/s) is known only after the second frame.
+        The rotation rate *rate* ``(3,)`` (rad/s) is known only after the second frame.  *raw* are the
+        features with rolling shutter, *view* is their image.
         """
         state = self._state
         assert state.last is not None
@@ -756,7 +826,7 @@ class Tracker:
             T_last_next = _orthonormalise(inverse(state.T_world_camera) @ T_world_camera)
             rate = self._rate_at(T_world_camera, np.zeros(3)) if posed.is_continuous else np.zeros(3)
         self._plugins.add_pose(timestamp_s, T_world_camera)
-        # 2. Fuse the measurements into the map; a weak pose changes nothing there.
+        # 2. Fuse the measurements into the landmarks, and add a keyframe; a weak pose does neither.
         is_keyframe, keyframe_inliers = self._is_keyframe(posed), state.keyframe_inliers
         landmarks = posed.landmarks
         if not posed.is_weak:
@@ -789,7 +859,10 @@ class Tracker:
         return is_keyframe
 
     def _is_keyframe(self, posed: _PosedView) -> bool:
-        """Return whether a frame is far from all keyframes, or sees much fewer landmarks than the newest."""
+        """Return whether a frame is far from all keyframes, or sees much fewer landmarks than the newest.
+
+        A frame with a weak pose, or with fewer than twice ``min_inliers``, is never a keyframe.
+        """
         options = self.options
         if posed.is_weak or posed.inliers < 2 * options.min_inliers:
             return False
@@ -801,7 +874,9 @@ class Tracker:
     def _begin_or_lose(self, view: View, match_count: int) -> TrackedFrame:
         """Lose a frame without a pose; or begin a segment with it, if enough frames before it were lost.
 
-        A segment begins only with enough features with depth.
+        The first segment begins at the start pose, with ``min_inliers`` features with depth.  Later ones
+        begin at the last accepted pose, with three times as many, after more than ``segment_after`` such
+        frames.
         """
         feature_count = int(np.isfinite(view.points_camera[:, 2]).sum())
         factor = _GUIDED_MATCHES_FACTOR if self._segments else 1
@@ -815,7 +890,10 @@ class Tracker:
         return self._begin_segment(view, start, feature_count)
 
     def _begin_segment(self, view: View, T_world_camera: Array, feature_count: int) -> TrackedFrame:
-        """Begin a segment with a frame at a pose."""
+        """Begin a segment with a frame at a pose; it is the present segment from now on.
+
+        *feature_count* is the number of features with depth.  Returned is the result of the frame.
+        """
         segment, timestamp_s = self._next_segment, self._frame.timestamp_s
         self._next_segment += 1
         self._segments[segment] = KeyframeMap(self.options.max_keyframes)
