@@ -4,9 +4,9 @@
 and a function that answers pose queries, such as `ask_robot` makes of a connected robot.
 
 **Choice of the tracker.**  The first frame decides.  A frame with depth or with a right image is tracked by
-`client_sdk.tracking.tracker.Tracker`, in metres.  A frame without (all depths zero, or ``depth=False``) is
-tracked by `client_sdk.tracking.monocular_tracker.MonocularTracker`, up to scale until odometry, a marker or
-an IMU gives the metric scale.
+`client_sdk.tracking.tracker.Tracker`, in metres.  A frame without a right image and without depth (all depths
+zero, or ``depth=False``) is tracked by `client_sdk.tracking.monocular_tracker.MonocularTracker`, up to scale
+until odometry, a marker or an IMU gives the metric scale.
 
 **Segment.**  A part of the drive whose poses are in one world.  After tracking was lost for too long the
 tracker begins another segment, with a world of its own.  Segment 0 is the trajectory and the map that users
@@ -65,17 +65,25 @@ __all__ = ["AskPose", "BlockingMapper", "Mapper", "ask_robot"]
 
 
 AskPose = Callable[[PoseQuery], Awaitable[PoseAnswer]]
-"""Function that answers one pose query.  If it raises an RsePfError, the query counts as not answered."""
+"""Function that answers one pose query.
+
+If it raises an RsePfError, the query counts as not answered.  `Mapper.track` raises a ConfigurationError
+(such as a UsageError) and every other exception of it again.
+"""
 
 _MIN_READINGS = 2  # readings that a voxel of a dense map needs to be saved: single ones are mostly noise
 _UP_TO_SCALE: Final = "up to scale"
 _GRAVITY_OF_LEVEL_CAMERA: Array = np.array([0.0, 9.81, 0.0])
-"""Gravity in m/s^2 in the frame of a level camera (y down), assumed while the IMU has not measured it."""
-_DEFAULT_DEPTH_M = 2.0  # median depth that is assumed for the noise of poses while no feature has a depth
+"""Gravity in m/s^2 in the frame of a level camera (y down): the first camera counts as level if the first IMU
+samples are not those of a stationary camera."""
+_DEFAULT_DEPTH_M = 2.0  # median depth for the position noise of poses while the last frame has no depth
 
 
 def ask_robot(solve_pnp: Callable[..., Awaitable[PoseAnswer]], deadline_s: float | None = None) -> AskPose:
-    """Return a function that answers pose queries with `Robot.solve_pnp`, each within *deadline_s*."""
+    """Return a function that answers pose queries with `Robot.solve_pnp`, each within *deadline_s* seconds.
+
+    None means ``session.answer_timeout_s``.  A query is answered even if newer ones follow.
+    """
 
     async def ask(query: PoseQuery) -> PoseAnswer:
         correspondences = query.correspondences
@@ -135,12 +143,14 @@ class Mapper:
             camera: Intrinsics; frames of another camera are refused.  None takes those of the first frame.
             options: Options of the tracker for depth and stereo pairs.
             monocular: Options of the tracker for frames without depth.
-            depth: Whether to use depth.  None: if the first frame has some.
+            depth: Whether to use the depth images of frames.  None: if the first frame has some depth.
+                Stereo pairs are used in each case.
             scale: Source of the metric scale of frames without depth.  None: the IMU, if frames carry its
                 samples, else the map stays up to scale.
             map_options: Density of the map of frames with depth.
-            T_world_start: ``(4, 4)`` pose of the first camera in the world.  None: the identity; with an
-                IMU a pose whose world has z up, in which a level camera looks along x.
+            T_world_start: ``(4, 4)`` pose of the first camera in the world; with it the world is not turned
+                when gravity becomes known.  None: the identity; with an IMU a pose whose world has z up, in
+                which a level camera looks along x.
             keyframes_of: Name of the robot whose keyframes are kept for `encoded_map`, about 50 kB each.
                 Empty: none is kept.
             adds_frames: Whether each frame with depth is added to the map.  With False the caller adds
@@ -199,7 +209,7 @@ class Mapper:
 
         Raises:
             UsageError: The frame is of another camera, not later than the one before, or its depth is not in
-                metres; such a frame changes nothing.
+                metres; such a frame changes nothing.  Or a function of the user, such as *features*, failed.
             ConfigurationError: The function that answers pose queries cannot work, such as without a package.
         """
         async with self._frame_lock:
@@ -240,7 +250,12 @@ class Mapper:
 
     @property
     def map(self) -> PointMap:
-        """Points of segment 0 so far: depth readings, features of stereo pairs, or monocular landmarks."""
+        """Points of segment 0 so far: depth readings, features of stereo pairs, or monocular landmarks.
+
+        With depth this is the map itself: later frames are added to it, until a turn of the world or an
+        adjustment replaces it by another map.  Of a camera without depth it is made anew from the landmarks
+        at each access, and later frames do not change it.
+        """
         tracker = self._tracker
         if not isinstance(tracker, MonocularTracker):
             return self._records.first.cloud
@@ -274,14 +289,15 @@ class Mapper:
 
     @property
     def keyframes(self) -> int:
-        """Number of keyframes of the tracker."""
+        """Number of keyframes in all segments; with depth also those that the tracker has thinned out."""
         return 0 if self._tracker is None else self._tracker.keyframes
 
     @property
     def scale(self) -> str:
         """Source of the metric scale of segment 0.
 
-        ``metric, by depth`` or another source, ``up to scale``, or ``unknown: no frame yet``.
+        ``metric, by depth``, ``metric, by stereo``, ``metric, by `` and the name of the source of scale,
+        ``up to scale``, or ``unknown: no frame yet``.
         """
         if self._tracker is None:
             return "unknown: no frame yet"
@@ -293,7 +309,11 @@ class Mapper:
 
     @property
     def imu(self) -> str:
-        """State of the IMU: ``none``, ``used``, ``not used yet``, or ``not used: `` with the reason."""
+        """State of the IMU: ``none``, ``used``, ``not used yet``, or ``not used: `` with the reason.
+
+        ``none``: the first frame had no samples.  ``not used yet``: the newest alignment with the poses of
+        the camera did not succeed.  ``not used``: the samples are faulty or contradict the camera.
+        """
         if self._imu is None:
             return "none"
         if self._imu.trouble:
@@ -308,7 +328,7 @@ class Mapper:
     def keyframe_imu(
         self, T_world_camera: Array, previous_s: float | None, timestamp_s: float
     ) -> KeyframeImu | None:
-        """Return gravity and preintegrated motion for a keyframe; None while gravity is not known.
+        """Return gravity and preintegrated motion for a keyframe; None without an IMU or known gravity.
 
         The arguments are those of `ImuEstimator.keyframe_imu`.
         """
@@ -338,7 +358,10 @@ class Mapper:
         return self._tracker.noise.noise if isinstance(self._tracker, Tracker) else DepthNoise()
 
     def restart(self, T_world_start: Array) -> None:
-        """Begin another world: the next frame gets the ``(4, 4)`` pose *T_world_start*, whatever it shows.
+        """Begin another world: the next frame with enough features gets the ``(4, 4)`` pose *T_world_start*.
+
+        The tracker forgets its keyframes, and gravity is estimated anew from the poses that follow.  Poses
+        and points so far stay in `trajectory` and `map`, and those that follow are added to them.
 
         Raises:
             UsageError: The camera has no depth, or no frame was tracked, or a frame is being tracked.
@@ -355,7 +378,10 @@ class Mapper:
             self._imu.forget_gravity()
 
     def report(self) -> dict[str, Any]:
-        """Return the figures of the drive, as `save` writes them to ``report.json``."""
+        """Return the figures of the drive, which `save` writes to ``report.json``.
+
+        ``map_points`` counts all voxels here, and in ``report.json`` only those that were saved.
+        """
         trips = np.array(self._round_trips_ms)
         trajectory, separate = self.trajectory, self._separate_segments()
         offset: dict[str, float] = {}
@@ -385,7 +411,7 @@ class Mapper:
         }
 
     def encoded_map(self) -> bytes:
-        """Return cloud and keyframes as one encoded map, for merging and for localisation.
+        """Return cloud and keyframes of segment 0 as one encoded map, for merging and for localisation.
 
         `DataClient.update_map` shares it, and `merge_maps` merges several.
 
@@ -410,7 +436,9 @@ class Mapper:
         """Write ``map.ply``, ``trajectory.txt`` and ``report.json`` to a folder; return the report.
 
         Keyframes of stereo pairs and of a camera without depth are adjusted before, which takes seconds;
-        those of stereo pairs change only if `adjust_pairs` finds a clear offset of the disparities.
+        those of stereo pairs change only if `adjust_pairs` finds a clear offset of the disparities.  With an
+        IMU, the world is turned so that z points up if gravity is known, unless *holds_world* or
+        *T_world_start* forbids it.
 
         A map with depth has the voxels that were read at least twice, and the report counts only these.
         Segments that were not joined to segment 0 have files of their own: ``map-2.ply``,
@@ -418,7 +446,7 @@ class Mapper:
         the rig's body.
 
         Raises:
-            UsageError: The folder cannot be written.
+            UsageError: The folder cannot be written, or a frame is being tracked.
         """
         # 1. Adjust the keyframes, and bring segments to metric scale and z up.
         if isinstance(self._tracker, MonocularTracker):
@@ -457,7 +485,10 @@ class Mapper:
         return report
 
     def adjust_pairs(self) -> Mapping[int, StereoAdjustment]:
-        """Adjust all keyframes of stereo pairs together with one offset of their disparities, as `save` does.
+        """Adjust the keyframes of stereo pairs together with an offset of their disparities, as `save` does.
+
+        Each segment has one offset.  Where it is clear, poses, keyframes and cloud of the segment are
+        corrected.
 
         Returns:
             The adjustment of each segment by its number, also those that are not clear enough to move poses.
@@ -475,7 +506,7 @@ class Mapper:
     # --- Contents of the map ---
 
     def _metric_keyframes(self) -> list[Keyframe]:
-        """Return the keyframes of segment 0, if they are in metres; only these may be shared."""
+        """Return the keyframes of segment 0 if they are in metres, else none; only these may be shared."""
         tracker = self._tracker
         if not isinstance(tracker, MonocularTracker):
             return self._records.first.keyframes
@@ -502,7 +533,10 @@ class Mapper:
     # --- First frame ---
 
     def _check(self, frame: Frame) -> None:
-        """Refuse a frame that cannot follow the one before; a refused frame changes nothing."""
+        """Raise UsageError for a frame that cannot follow the one before, else note its camera and time.
+
+        A refused frame changes nothing.
+        """
         own, camera = frame.camera, self.camera or frame.camera
         if own != camera:
             raise UsageError(
@@ -524,7 +558,10 @@ class Mapper:
         self.camera, self._last_stamp_s = camera, frame.timestamp_s
 
     def _tracker_for(self, frame: Frame) -> Tracker | MonocularTracker:
-        """Return the tracker, which the first frame chooses: with depth, with a stereo pair, or monocular."""
+        """Return the tracker, which the first frame chooses: with depth, with a stereo pair, or monocular.
+
+        The IMU is started if the first frame has samples of it.
+        """
         if self.T_body_camera is None:
             self.T_body_camera = frame.T_body_camera
         if self._tracker is None:
@@ -623,7 +660,7 @@ class Mapper:
         return replace(tracked, T_world_camera=T_new_old @ pose, corrected=True, T_new_old=T_new_old)
 
     def _align_imu(self, tracker: Tracker) -> None:
-        """Estimate gravity and biases from the poses of segment 0, which are in metres."""
+        """Estimate gravity and biases from the poses of segment 0 since the last `restart`, in metres."""
         assert self._imu is not None
         path = self._records.first.trajectory()
         first = int(np.searchsorted(path.timestamps_s, self._odometry_start_s, side="right"))
@@ -673,7 +710,11 @@ class Mapper:
         return replace(tracked, corrected=is_corrected, scale="metric" if is_metric else _UP_TO_SCALE)
 
     def _apply_scale(self, tracker: MonocularTracker, segment: int) -> bool:
-        """Scale a segment to metres by the newest estimate; return False if there is none."""
+        """Scale a segment of *tracker* to metres by the newest estimate; return False if there is none.
+
+        With segment 0 the world is turned so that z points up, if gravity is known and the world may be
+        turned.
+        """
         if self._scale is None or self.camera is None:
             return False
         path = tracker.trajectory(segment)

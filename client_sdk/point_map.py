@@ -26,7 +26,9 @@ if TYPE_CHECKING:
 __all__ = ["MapOptions", "PointMap", "read_ply", "write_ply"]
 
 _EMPTY = -1  # key of a slot of the hash table that holds no voxel
-_MAX_VOXEL_INDEX = 1 << 20  # voxels on either side of the origin: three indices of 21 bits make one int64 key
+_MAX_VOXEL_INDEX = 1 << 20
+"""Voxels on either side of the origin along each axis; points beyond are left out.  Three indices of 21 bits
+make one int64 key."""
 _FIRST_VOXELS = 2048  # voxels for which a new map has memory; the memory doubles when they are full
 _FIRST_SLOTS = 4096  # slots of a new hash table, at least twice as many as voxels
 _MIN_VOXEL_M = 0.001  # smallest edge of a voxel: no depth sensor is more exact
@@ -39,13 +41,17 @@ _NO_POINTS = np.empty((0, 3)), np.empty((0, 3), dtype=np.float32), np.empty(0, d
 class MapOptions:
     """Density of a point map, and the choice of the depth readings that are added to it.
 
+    Points of stereo pairs and landmarks of a camera without depth are chosen elsewhere: only *voxel_m* and
+    *max_points* apply to them.
+
     Attributes:
-        voxel_m: Edge of a voxel, 0.001 to 1 m; each voxel holds one point.
-        min_depth_m: Smallest depth that is added.
-        max_depth_m: Largest depth that is added.
+        voxel_m: Edge of a voxel, 0.001 to 1 m (in the unit of a map up to scale); each voxel holds one point.
+        min_depth_m: Smallest depth that is added, in metres.
+        max_depth_m: Largest depth that is added, in metres.
         every_px: Distance in pixels between the rows, and between the columns, of which readings are added.
-        edge_percent: Largest difference from the depth of a neighbouring pixel, in percent of the depth.  A
-            reading beyond it lies on a depth edge, between two surfaces, and is left out.
+        edge_percent: Largest difference between the depths of a pixel and of each of its four neighbours, in
+            percent of the right or lower depth of the two.  A reading beyond it lies on a depth edge, between
+            two surfaces, and is left out.
         max_points: Largest number of voxels; readings that need another one are left out.  A point takes
             about 60 to 120 bytes.
 
@@ -156,7 +162,10 @@ class PointMap:
         return self._voxels
 
     def add(self, frame: Frame, T_world_camera: Array) -> int:
-        """Add the depth readings of a frame at a ``(4, 4)`` pose; return how many readings were used."""
+        """Add the depth readings of a frame at a ``(4, 4)`` pose; return how many readings were added.
+
+        Those that `MapOptions` excludes are left out, and those beyond the end of the grid.
+        """
         options, camera = self.options, frame.camera
         depth_m, rgb = aligned(frame.depth_m, np.float32), aligned(frame.rgb, np.uint8)
         height, width = depth_m.shape
@@ -179,7 +188,7 @@ class PointMap:
         return self._call("add_frame", _NO_POINTS, ctypes.byref(native_frame))
 
     def add_map(self, other: PointMap, T_world_other: Array) -> None:
-        """Add the voxels of another map, moved by a ``(4, 4)`` pose, each with its number of readings."""
+        """Add the voxels of another map, moved by a ``(4, 4)`` pose, each weighted by its readings."""
         means = other._means[: other._voxels]
         points = transform(T_world_other, means[:, :3].astype(np.float64))
         self._add(points, means[:, 3:], other._counts[: other._voxels])
@@ -198,7 +207,10 @@ class PointMap:
         return means[:, :3].copy(), np.clip(np.round(means[:, 3:]), 0, 255).astype(np.uint8)
 
     def _add(self, points_world: Array, colours: npt.NDArray[Any], weights: npt.NDArray[np.int32]) -> int:
-        """Add points that are means of ``(n,)`` readings each; return how many readings were used."""
+        """Add points with ``(n,)`` *weights*, the numbers of readings of which each point is the mean.
+
+        Return how many readings were used: points beyond the grid or the limit of voxels are left out.
+        """
         arrays = aligned(points_world, np.float64), aligned(colours, np.float32), aligned(weights, np.int32)
         self._reserve(len(points_world))
         return self._call("add", arrays)

@@ -74,7 +74,7 @@ class Correction:
         covariance: ``(6, 6)`` of the twist (metres, radians) on the left of ``after``; None if unknown.
         by: Source of the new alignment.
         reason: Why the segment is not aligned any more; empty if it is.
-        version: Position in the log of the map.
+        version: Newest position in the log of the map that an update or reply named, this one included.
         cause: Name of the robot and number of the keyframe that changed the map; None if unknown.
         scale: Metres per unit of the odometry frame, 1 for a camera with depth.
     """
@@ -140,7 +140,10 @@ class Alignments:
         return [correction for correction in corrections if correction is not None]
 
     def get(self, segment: int) -> SegmentAlignment:
-        """Return the alignment of a segment of this robot, by the robot's own number."""
+        """Return the alignment of a segment of this robot, by the robot's own number.
+
+        A segment that the map has not named is not aligned.
+        """
         return self._segments.get(segment, _UNALIGNED)
 
     def apply_update(self, key: str, payload: Any) -> Correction | None:
@@ -151,7 +154,7 @@ class Alignments:
             payload: A value of the message type that belongs to the key.
 
         Raises:
-            BadMessage: The payload does not fit the key; nothing is applied.
+            BadMessage: The payload does not fit the key; no alignment and no robot has changed.
         """
         kind = key.partition("/")[0]
         if kind == "map":
@@ -172,6 +175,9 @@ class Alignments:
         self, segment: int, T_odom_camera: Array, reply: RelocaliseReply
     ) -> Correction | None:
         """Apply the reply to a relocalisation, unless the map has aligned the segment in the meantime.
+
+        Return a correction if the alignment changed.  A reply without a pose changes only the reason why a
+        segment is not aligned.
 
         Args:
             segment: The robot's number of the segment of the keyframe that was localised.

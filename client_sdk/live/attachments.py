@@ -46,7 +46,7 @@ StoreObject = Callable[[bytes], Awaitable[str]]
 
 _BURST_S = 2.0  # seconds of the byte rate that a robot can save up for the attachments of its next keyframe
 _BYTES_PER_POINT = 4.5  # mean size of an encoded point after zlib, to turn a byte budget into a point count
-_MIN_POINTS = 400  # points of a keyframe, about 2 kB, that are encoded even when the byte budget is spent
+_MIN_POINTS = 400  # smallest limit of a keyframe's points, about 2 kB, also when the byte budget is spent
 _JPEG_QUALITY = 85  # JPEG quality, 0 to 100, of the images of keyframes
 
 _MIN_POINT_DEPTH_M = 0.3  # nearer readings of a depth camera are not sent, as in the robot's own cloud
@@ -57,9 +57,10 @@ _MAX_DEPTH_STEP = 0.05
 pixel with a larger one lies between two surfaces, and its depth may belong to neither."""
 
 _REQUEST_BYTES = 1_000  # bytes of request head, token and answer that the rate limit counts for each object
-_MAX_WAITING_BYTES = 16 << 20  # objects that wait in memory for their upload; above it the oldest are dropped
+_MAX_WAITING_BYTES = 16 << 20
+"""Bytes of points, and of images, that wait in memory for their upload; above it the oldest are dropped."""
 _MAX_QUIET_WAIT_S = 1.0
-"""An upload waits no longer for poses and keyframes, which could else block it for ever."""
+"""Longest wait of an upload for pose queries and keyframes, in seconds; they could else block it for ever."""
 _FIRST_PAUSE_S = 0.5  # pause after the first failed upload of an object; it doubles with each failure
 _MAX_PAUSE_S = 30.0  # longest pause between two attempts to upload an object
 _OBJECT_REFUSALS = (LimitExceeded, BadRequest, UsageError)
@@ -135,7 +136,10 @@ class Attachments:
         )
 
     def make(self, frame: Frame, features: Features) -> EncodedAttachments:
-        """Encode points and image of a keyframe, as far as the rate limits allow; may run in any thread."""
+        """Encode points and image of a keyframe, and take their bytes from the budgets of the rate limits.
+
+        While a budget is short there are fewer points, but up to 400, and no image.  May run in any thread.
+        """
         points, image, now = None, None, self._clock()
         if self._point_uploader is not None:
             self._point_budget.fill(now)
@@ -286,8 +290,8 @@ def encode_keyframe_points(frame: Frame, features: Features, max_points: int) ->
     """Choose and encode at most *max_points* coloured points of a keyframe; return None if it has none.
 
     Of a depth image these are pixels on a regular grid that do not lie on depth edges, 0.3 to 3.5 m away; of
-    a stereo pair the features whose depth has a standard deviation of at most 5 %.  Points are thinned to one
-    in each voxel of 1 cm.
+    a stereo pair the features whose depth is known to 5 % (`select_certain_rows`).  Points are thinned to one
+    in each voxel of 1 cm, and of more than *max_points* the first ones are encoded.
     """
     # 1. Choose pixels with a trusted depth.
     if frame.stereo is None:
@@ -330,7 +334,7 @@ def _choose_grid_pixels(frame: Frame, max_points: int) -> _Pixels:
 
 
 def _encode_jpeg(frame: Frame) -> bytes | None:
-    """Encode the image of a frame as JPEG; return None if it is too large for one request (256 KiB)."""
+    """Encode the image of a frame as JPEG; None if that fails, or is too large for one request (256 KiB)."""
     cv2 = load_opencv()
     bgr = np.ascontiguousarray(frame.rgb[:, :, ::-1])
     is_encoded, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])

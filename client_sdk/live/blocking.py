@@ -34,7 +34,7 @@ class BlockingLiveMapper:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Send the queued keyframes, for `LiveOptions.leave_s` at most, and leave the map."""
+        """Send the queued keyframes and attachments, and leave the map; see `LiveMapper.__aexit__`."""
         self._wait(self.mapper.__aexit__(kind, error, trace))
 
     def track(self, frame: Frame) -> TrackedFrame:

@@ -39,7 +39,7 @@ def encode_depth_keyframe(
         frame: The frame; of a stereo pair the baseline is encoded, too.
         T_odom_camera: ``(4, 4)`` pose of the camera in the odometry frame, metres.
         features: Features of the frame.  Of those that have depth the first ones are encoded.
-        max_orb_features: Limit of the features, as if they were ORB's; larger descriptors lower it.
+        max_orb_features: Limit of the number of ORB features; descriptors of more bytes have a lower limit.
         depth_noise: Noise of the camera's depths.
         imu: Gravity, and motion since the previous keyframe; None where they are not known.
         attachments: Points and image, of which the keyframe gets the references.
@@ -81,7 +81,7 @@ def encode_monocular_keyframe(
             landmark, thus with a depth, are encoded before those without.
         T_odom_camera: ``(4, 4)`` pose of the camera in the odometry frame and its unit.
         camera: Intrinsics of the camera.
-        max_orb_features: Limit of the features, as if they were ORB's; larger descriptors lower it.
+        max_orb_features: Limit of the number of ORB features; descriptors of more bytes have a lower limit.
         imu: Gravity, and motion since the previous keyframe; None where they are not known.
     """
     limit = _feature_limit(max_orb_features, adjusted.kind)
@@ -102,5 +102,5 @@ def encode_monocular_keyframe(
 
 
 def _feature_limit(max_orb_features: int, kind: DescriptorKind) -> int:
-    """Return the limit of features of a descriptor kind, which is lower than that of ORB for larger ones."""
+    """Return the limit of features of a kind: *max_orb_features* scaled by the size of its descriptors."""
     return max_orb_features * max_features(kind) // MAX_FEATURES

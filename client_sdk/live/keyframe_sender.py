@@ -85,7 +85,7 @@ class RobotInMap:
     Attributes:
         name: Name of the robot in the map; empty while the map does not exist.
         next_number: Number that the map expects for the next keyframe of the robot.
-        unused_segment: Segment number that no keyframe of the robot in the map has.
+        unused_segment: First of the segment numbers that no keyframe of the robot in the map has.
         map_keyframes: Number of keyframes of all robots in the map.
         allows_images: Whether the operator allows robots to store the images of keyframes.
     """
@@ -167,7 +167,10 @@ class KeyframeSender:
             on_acknowledged: Called for each acknowledged keyframe with its number and times.
         """
         self.trouble = ""
-        """Why the last attempt to send a keyframe failed, as ``code: sentence``; empty after a success."""
+        """Why the last attempt to send a keyframe failed; empty after a success.
+
+        It is ``code: sentence``, and for a conflict about numbers the sentence alone.
+        """
         self.is_refused = False
         """Whether the platform refused the last attempt with one of `REFUSALS`."""
         self.refused_keyframes = 0
@@ -207,7 +210,7 @@ class KeyframeSender:
         await self._has_no_pose_query.wait()
 
     async def introduce(self) -> RobotInMap:
-        """Ask how the map knows this robot, and number the queued keyframes accordingly.
+        """Ask how the map knows this robot, number the queued keyframes accordingly, and return the reply.
 
         Keyframes that the map already has are removed from the queue: their acknowledgements were lost.
 
@@ -269,7 +272,11 @@ class KeyframeSender:
         self._is_empty.clear()
 
     async def _send_first(self) -> None:
-        """Send the oldest keyframe, and remove it from the queue once it is acknowledged or refused."""
+        """Send the oldest keyframe, and remove it from the queue once it is acknowledged or refused.
+
+        A failure raises an RsePfError, also the refusal of the keyframe.  Without an offset or a keyframe
+        nothing is done.
+        """
         queue, offset = self._queue, self._queue.offset
         if offset is None or not len(queue):
             return

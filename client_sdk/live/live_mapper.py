@@ -62,7 +62,7 @@ _LEAVE_DEADLINE_S = 1.0  # deadline of the call that leaves the map, so that a l
 _NEVER = 1_000_000_000
 """Number of lost frames after which the tracker begins a segment by itself, which it must never do in a live
 map: `LiveMapper` begins each segment, and numbers it for the map."""
-_MAX_SENT_RECORDS = 100_000  # acknowledged keyframes whose times are kept for measurements
+_MAX_SENT_RECORDS = 100_000  # newest acknowledged keyframes whose times are kept for measurements
 
 
 class LiveMapper:
@@ -104,12 +104,14 @@ class LiveMapper:
             camera: Intrinsics; frames of another camera are refused.  None takes those of the first frame.
             depth: Whether to use depth.  None: if the first frame has some, or is a stereo pair.  With True a
                 first frame without depth is refused.
-            spool: Folder for keyframes that the map has not acknowledged, for this robot alone; they survive
-                a restart of this program.  None keeps them in memory.
-            options: Options of the tracker.
+            spool: Folder for keyframes that the map has not acknowledged, for this robot alone, with a
+                subfolder for each map; they survive a restart of this program.  None keeps them in memory.
+            options: Options of the tracker, of which ``segment_after`` is not used (that of *live* is); None
+                means `FrontEndOptions.live`.
             live: Options of keyframes and of their sending.
             map_options: Density of the robot's own cloud, to which its keyframes are added.
-            T_world_start: ``(4, 4)`` pose of the first camera in the odometry frame; None: the identity.
+            T_world_start: ``(4, 4)`` pose of the first camera in the odometry frame.  None: the identity;
+                with an IMU a pose in an odometry frame with z up, in which a level camera looks along x.
             features: Function that finds the features of an image; None: ORB.  All robots of a map must use
                 the same.
             motion: Function that predicts the pose of the next frame; None: constant velocity.
@@ -167,6 +169,8 @@ class LiveMapper:
     async def __aenter__(self) -> LiveMapper:
         """Join the map; a robot without a connection joins it as soon as it is connected.
 
+        If the call fails in a way that may pass, it is repeated in the background, and `trouble` says why.
+
         Raises:
             Forbidden: The token has no scope for this map.
             UnknownService: The platform has no live maps.
@@ -211,8 +215,9 @@ class LiveMapper:
     ) -> None:
         """Send the queued keyframes and attachments, for `LiveOptions.leave_s` at most, and leave the map.
 
-        Keyframes that were not acknowledged by then stay in the spool folder, or are lost without one;
-        `keyframes_waiting` is their number.
+        Without a connection, and after a cancellation of the block, nothing is sent; any other exception of
+        the block makes no difference.  Keyframes that were not acknowledged by then stay in the spool folder,
+        or are lost without one; `keyframes_waiting` is their number.
         """
         self._is_joined = False
         try:
@@ -266,7 +271,7 @@ class LiveMapper:
             tracker = self._mapper.monocular_tracker
             if tracker is not None and tracked.T_world_camera is not None:
                 tracked = await self._follow_monocular(tracker, tracked, tracked.T_world_camera)
-            # 5. With depth, make a keyframe of the frame itself.
+            # 5. With depth, make a keyframe of the frame if it moved far enough from the last keyframe.
             pose = tracked.T_world_camera
             if pose is not None:
                 self._poses.append((frame.timestamp_s, self._segment, pose))
@@ -310,7 +315,7 @@ class LiveMapper:
 
     @property
     def covariance(self) -> Array | None:
-        """Covariance ``(6, 6)`` of the twist (metres, radians) on the left of `T_map_odom`, or None."""
+        """Covariance ``(6, 6)`` of the twist (metres, radians) on the left of `T_map_odom`; None: unknown."""
         return self._alignments.get(self._segment).covariance
 
     @property
@@ -320,7 +325,12 @@ class LiveMapper:
 
     @property
     def segment(self) -> int:
-        """Number of the present odometry frame, from 0; it grows when tracking was lost for too long."""
+        """The robot's own number of the present odometry frame, which grows with each new odometry frame.
+
+        A run begins with 0, or after the segment of the newest keyframe in the spool folder.  A new odometry
+        frame begins when tracking was lost for too long; without depth also when the tracker changed its
+        segment or a loop closure changed the scale.
+        """
         return self._segment
 
     @property
@@ -359,7 +369,7 @@ class LiveMapper:
 
     @property
     def trouble(self) -> str:
-        """The newest failure to send keyframes, receive updates or relocalise, as ``code: sentence``.
+        """The last failure to send keyframes, else to receive updates, else to relocalise, with its code.
 
         Empty if all of them succeed.  A failed relocalisation counts only while the segment is not aligned.
         """
@@ -369,7 +379,7 @@ class LiveMapper:
 
     @property
     def keyframes_waiting(self) -> int:
-        """Number of keyframes that the map has not acknowledged."""
+        """Number of queued keyframes, which the map has neither acknowledged nor refused."""
         return len(self._queue)
 
     @property
@@ -380,21 +390,27 @@ class LiveMapper:
     def relocalise(self) -> None:
         """Ask for the robot's pose in the map with the next keyframe, without the usual pause.
 
-        Nothing is asked while the segment is aligned.
+        Nothing is asked while the segment is aligned, without a connection, and while the map has no
+        keyframes but those of this run.
         """
         self._relocaliser.skip_pause()
 
     @property
     def map(self) -> PointMap:
-        """The robot's own cloud of its keyframes, in its odometry frame; the newest one may be missing.
+        """The robot's own cloud of its keyframes, each at its pose in its odometry frame, metres.
 
-        Of a camera without depth these are its landmarks, as in `Mapper.map`.
+        The newest keyframe may be missing.  Of a camera without depth these are its landmarks, as in
+        `Mapper.map`.
         """
         return self._mapper.map
 
     @property
     def trajectory(self) -> Trajectory:
-        """Poses of all frames in the odometry frame; without depth with the tracker's later adjustments."""
+        """Poses of all frames, each in the odometry frame of its segment.
+
+        Without depth these are the poses of `Mapper.trajectory`: those of the tracker's segment 0, in its
+        unit and with its later adjustments.
+        """
         return self._mapper.trajectory
 
     @property
@@ -450,7 +466,7 @@ class LiveMapper:
         return self._mapper.T_body_camera
 
     def report(self) -> dict[str, Any]:
-        """Return the figures of the drive: those of `Mapper.report`, and ``live`` of the live map."""
+        """Return the figures of the drive: those of `Mapper.report`, and under ``live`` those of the map."""
         has_sender = self._is_joined or self._was_left
         return {
             **self._mapper.report(),
@@ -501,7 +517,11 @@ class LiveMapper:
         return moved_m > self.options.keyframe_m or turned_deg > self.options.keyframe_deg
 
     async def _make_keyframe(self, tracked: TrackedFrame, T_odom_camera: Array, features: Features) -> None:
-        """Queue a frame with depth as a keyframe, and add it to the robot's own cloud in a thread."""
+        """Queue a frame with depth as a keyframe, and add it to the robot's own cloud in a thread.
+
+        The thread may still run at the end.  A keyframe for which the queue has no space is only in the
+        cloud.
+        """
         data, attachments = await asyncio.to_thread(
             self._encode_keyframe, tracked.frame, T_odom_camera, features
         )
@@ -516,7 +536,11 @@ class LiveMapper:
     async def _follow_monocular(
         self, tracker: MonocularTracker, tracked: TrackedFrame, T_world_camera: Array
     ) -> TrackedFrame:
-        """Queue the settled keyframes of a camera without depth; return the frame's pose in the odometry."""
+        """Queue the settled keyframes of a camera without depth, in a new segment if the odometry broke.
+
+        Return *tracked* with its pose in the odometry frame, whose unit the live map turns into metres.
+        *T_world_camera* is its pose by the tracker.
+        """
         if self._monocular_odometry is None:
             self._monocular_odometry = MonocularOdometry(tracker)
         odometry = self._monocular_odometry
@@ -626,7 +650,7 @@ class LiveMapper:
         self._publish(self._alignments.apply_relocalisation(segment, T_odom_camera, reply))
 
     def _publish(self, correction: Correction | None) -> None:
-        """Publish a correction, if there is one, and mark the next frame as corrected."""
+        """Publish a correction, if there is one; it marks the next frame if it is of the present segment."""
         if correction is not None:
             self._is_corrected |= correction.segment == self._segment
             self._correction_stream.publish(correction)

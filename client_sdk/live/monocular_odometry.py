@@ -44,10 +44,10 @@ class MonocularOdometry:
         self._T_odom_last_sent: Array
 
     def start_if_broken(self) -> bool:
-        """Return whether this frame begins another odometry frame, other than the very first one.
+        """Begin another odometry frame with this frame if needed; return whether one began after the first.
 
-        It does if the tracker began or changed its segment, if segments were joined since the last call, and
-        if a loop closure corrected lengths by more than 3 %.
+        It is needed if the tracker began or changed its segment, if segments were joined since the last call,
+        and if a loop closure corrected lengths by more than 3 %.
         """
         tracker = self._tracker
         segment_and_joins = (tracker.segment, len(tracker.joins))
@@ -69,6 +69,7 @@ class MonocularOdometry:
         """Return ``T_odom_camera`` ``(4, 4)`` for a ``(4, 4)`` pose in the tracker's present world and unit.
 
         The pose relative to the keyframe that was sent last is kept, in the unit of the odometry frame.
+        Before a keyframe of the odometry frame was sent, only the unit is changed.
         """
         tracker_to_odometry_scale = self._length_factor_at_start / self._tracker.length_factor
         if self._last_sent is None:

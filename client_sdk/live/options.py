@@ -36,7 +36,8 @@ class LiveOptions:
             four times as long after six replies in a row that found no place in the map.
         bytes_per_s: Rate limit of the keyframes.
         deadline_s: Deadline of one attempt to send a keyframe, and of one relocalisation.
-        leave_s: Longest time for which leaving waits until the map has acknowledged every keyframe.
+        leave_s: Longest time for which leaving waits until the map has acknowledged every keyframe and every
+            attachment is uploaded.
 
     Raises:
         UsageError: A number is not above 0 (``points``, ``leave_s``: below 0), or *points* is above 16,000.
@@ -65,5 +66,5 @@ class LiveOptions:
             raise UsageError(f"points = {self.points} is above {MAX_POINTS}", hint="use 12500")
 
     def sent_with(self, codec: str) -> LiveOptions:
-        """Return these options with as many features as fit into 34 kB in the codec of the connection."""
+        """Return these options with at most the features that take 34 kB in the codec of the connection."""
         return replace(self, features=min(self.features, _MAX_JSON_FEATURES)) if codec == "json" else self
