@@ -30,8 +30,8 @@ if TYPE_CHECKING:
 __all__ = ["BlockingRobot", "connect_blocking"]
 
 GRACE_S = 0.5
-"""How long a call waits after its deadline, in seconds: the event loop itself ends it unless the loop
-hangs."""
+"""A call with *deadline_s* waits this many seconds longer before it gives up: the event loop ends the call at
+its deadline, unless the loop hangs."""
 
 P = ParamSpec("P")
 T = TypeVar("T")

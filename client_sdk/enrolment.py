@@ -23,8 +23,8 @@ class EnrolledRobotAccess:
     Attributes:
         robot: Name of the robot.
         url: WebSocket address of the platform.
-        ssl_context: Trusts the authority in the file and no other; None trusts the authorities of the
-        machine.
+        ssl_context: Trusts the authority in the file and no other; None if the file names no authority: then
+            those of the machine are trusted.
         token: Async function for `client_sdk.connect`, which signs a new token at each call.
         fresh_token: Function for `client_sdk.DataClient`, which signs a new token at each call.
     """

@@ -27,11 +27,13 @@ async def merge_maps(
 ) -> MergeReply:
     """Return one map of several, merged by a server; the world frame is that of the first map.
 
+    A map that shows no place of the others is not in the result: ``not_joined`` of the reply says why.
+
     Args:
         robot: Sends the command, which may take minutes.
         data: Data client of the same robot, as whose objects the maps are stored.
         maps: Encoded maps, such as those of `Mapper.encoded_map` or `DataClient.download_map`.
-        options: None means the defaults.
+        options: Conditions of loop closures between the maps; None means the defaults.
         on_progress: Called with the share that is done (0..1), and the name of the step that was done last.
 
     Raises:

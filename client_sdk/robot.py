@@ -175,7 +175,10 @@ class Robot:
 
         Raises:
             Unauthorized: The token is missing, wrong or expired.
-            ConnectError: No server answers, and there is neither *offload* nor *burst_url*.
+            Forbidden: The servers forbid this robot to connect.
+            UnsupportedProtocol: Robot and servers share no protocol.
+            ConnectError: No server answers, and there is neither *offload* nor *burst_url*; or the address
+                itself is wrong, such as that of another program.
             MissingExtra: There is *offload*, and no solver is installed.
             UsageError: The enrolment file cannot be used.
         """
@@ -355,8 +358,8 @@ class Robot:
     ) -> Mapper:
         """Return a `Mapper` whose poses this robot requests from the cloud, each within *deadline_s* seconds.
 
-        The other arguments are those of `Mapper`.  The number of features in *options* is limited so that a
-        command fits into a message of this robot's codec.
+        The other arguments are those of `Mapper`.  ``max_matches`` of *options* is lowered to what fits into
+        a command of 10 kB in this robot's codec.
         """
         from client_sdk.frontend import FrontEndOptions
         from client_sdk.mapper import Mapper, ask_robot
@@ -399,7 +402,8 @@ class Robot:
 
         This robot requests the poses of the mapper from the cloud, each within *deadline_s* seconds.  The map
         *name* is shared with all robots of the tenant that use the same name.  The other arguments are those
-        of `LiveMapper`.
+        of `LiveMapper`; ``max_matches`` of *options* and ``features`` of *live* are lowered to what this
+        robot's codec carries.
         """
         from client_sdk.frontend import FrontEndOptions
         from client_sdk.live.live_mapper import LiveMapper
@@ -446,7 +450,7 @@ class Robot:
         Args:
             frame: Image and time.
             T_odom_camera: ``(4, 4)``, from the camera frame to the odometry frame, metres; None records no
-            pose.
+                pose.
         """
         if self._recorder is not None:
             self._recorder.record_frame(frame.timestamp_s, frame.rgb, T_odom_camera)

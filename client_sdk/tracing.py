@@ -34,7 +34,11 @@ def new_trace() -> str:
 
 @contextlib.contextmanager
 def traced(trace: str = "") -> Iterator[str]:
-    """Send the id *trace*, by default a new one, with all commands of a ``with`` block; yield the id."""
+    """Send the id *trace*, by default a new one, with all commands of a ``with`` block; yield the id.
+
+    Only the first `MAX_ID_CHARACTERS` of *trace* are sent.  The id takes precedence over an OpenTelemetry
+    span and over an outer block.
+    """
     trace_id = (trace or new_trace())[:MAX_ID_CHARACTERS]
     earlier = _trace_id.set(trace_id)
     try:

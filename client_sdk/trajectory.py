@@ -26,7 +26,7 @@ class Trajectory:
     """Poses of a camera over time.
 
     Attributes:
-        timestamps_s: ``(n,)``, in any order.
+        timestamps_s: ``(n,)`` seconds, in any order.
         T_world_camera: ``(n, 4, 4)``, translations in metres or up to scale.
 
     Raises:
@@ -49,12 +49,15 @@ class Trajectory:
 
     @property
     def positions(self) -> Array:
-        """Positions ``(n, 3)`` of the camera in the world, metres."""
+        """Positions ``(n, 3)`` of the camera in the world, in the unit of the poses."""
         return self.T_world_camera[:, :3, 3]
 
     @property
     def length_m(self) -> float:
-        """Length of the path in metres: the sum of the distances between poses that follow each other."""
+        """Length of the path in the unit of the poses: the sum of the distances between consecutive poses.
+
+        Poses count in the order of the arrays, whatever their time stamps are.
+        """
         return float(np.linalg.norm(np.diff(self.positions, axis=0), axis=1).sum())
 
     def at(self, stamps_s: npt.ArrayLike) -> Array:
@@ -108,7 +111,8 @@ def _write_poses(path: Path, timestamps_s: Array, poses: Array, comment: str) ->
 def read_trajectory(path: Path) -> Trajectory:
     """Return the trajectory of a file in TUM format; empty lines and lines that begin with ``#`` are skipped.
 
-    Commas count as spaces.
+    Commas count as spaces, and quaternions may have any length above 0.  The poses are in the order of the
+    lines; a file without poses gives an empty trajectory.
 
     Raises:
         UsageError: The file cannot be read, or a line does not hold eight finite numbers with a quaternion

@@ -65,7 +65,10 @@ class Updates:
         return key, self._unread.pop(key)
 
     def put(self, key: str, value: Any) -> None:
-        """Store the newest value of *key* until the program reads it."""
+        """Store the newest value of *key* until the program reads it.
+
+        Beyond `MAX_UNREAD_KEYS` the value that has waited longest is dropped.
+        """
         self.replaced += key in self._unread
         self._unread[key] = value
         if len(self._unread) > MAX_UNREAD_KEYS:

@@ -50,8 +50,8 @@ class Stats:
         region_changes: How often the robot changed to another of its addresses.
         bytes_out: Payload of all WebSocket messages that were sent.
         bytes_in: Payload of all WebSocket messages that were received.
-        payload_bytes_median: Median size of a command.
-        payload_bytes_max: Largest size of a command.
+        payload_bytes_median: Median size of the message of a command that a server answered, in bytes.
+        payload_bytes_max: Largest size of such a message, in bytes.
         round_trip_ms: From the call to the answer of a server.
         up_ms: Delay from robot to server.
         queue_ms: Time that commands waited on the server.

@@ -78,7 +78,11 @@ class UserCallbacks:
             asyncio.get_running_loop().call_soon(call)
 
     def call(self, name: str, function: Callable[..., Any], *arguments: Any, default: Any = None) -> Any:
-        """Call *function* now and return its value, or *default* after an exception, reported as *name*."""
+        """Call *function* now and return its value, or *default* after an exception, reported as *name*.
+
+        An async function counts as one that raised.  Ctrl-C and ``sys.exit`` in the main thread are raised
+        again.
+        """
         began_s, process = time.monotonic(), os.getpid()
         try:
             value = function(*arguments)

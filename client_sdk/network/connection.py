@@ -211,7 +211,8 @@ class Connection:
         """Connect for the first time, with at most four attempts, and start the tasks that keep connected.
 
         Args:
-            may_be_down: Return after a first attempt that no server answered, and go on in the background.
+            may_be_down: Return after a first attempt that failed by a cause that may pass, such as no answer,
+                and go on dialling in the background.
 
         Raises:
             Unauthorized: The token is missing, wrong or expired.
@@ -317,7 +318,10 @@ class Connection:
         return failures or [lost]
 
     async def _join_region(self, region: Region) -> DialError | None:
-        """Dial *region*, and measure its round trip if the robot has several; return the failure, if any."""
+        """Dial *region* and hold its socket; return the failure, or None.
+
+        A robot with several regions also waits for the first round trip, at most ``session.ping_timeout_s``.
+        """
         try:
             socket = await self._dial(region)
         except DialError as failure:
@@ -540,13 +544,17 @@ class Connection:
             self._discard_socket(socket)
 
     def _is_replaced_by_another_program(self, socket: RegionSocket) -> bool:
-        """Return whether no newer connection of this robot itself explains that *socket* was replaced."""
+        """Return whether no newer connection of this robot itself explains that *socket* was replaced.
+
+        The region of *socket* is marked if it is a duplicate of another one.
+        """
         is_own = self._detect_duplicate_region(socket) or socket.region.move_request is not None
         is_late_welcome = self._clock() < self._late_welcome_until_s
         return not is_own and not is_late_welcome and self._session.current is socket.state
 
     def _detect_duplicate_region(self, socket: RegionSocket) -> bool:
-        """Mark the region of *socket* if another region of this robot leads to the same platform.
+        """Mark the region of *socket* if another region leads to the same platform; return whether it is
+        marked.
 
         A platform keeps the newest connection of a robot only.  So the mark is set if a socket of another
         region was opened after *socket* and within the last `DUPLICATE_REGION_S`.

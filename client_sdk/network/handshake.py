@@ -136,7 +136,8 @@ class Dialler:
 
         Args:
             url: WebSocket address of the servers.
-            on_answered: Called for each attempt that a machine at the address accepted or refused.
+            on_answered: Called for each TCP connection that a machine at the address, or the proxy in front
+                of it, accepted or refused.
 
         Raises:
             DialError: There is no WebSocket; the error names the cause.

@@ -30,8 +30,8 @@ may have been suspended."""
 LOSS_MEMORY_S = 3600.0
 """Lost connections count for this long, in seconds."""
 MAX_DOUBLINGS = 4
-"""The time for which a region must be nearer doubles with each of its losses, at most this often (16
-times)."""
+"""The time for which a region must be nearer doubles with each of its losses after the first, at most this
+often: it becomes at most 16 times as long."""
 
 
 @dataclass(slots=True)
@@ -51,7 +51,8 @@ class RegionChoice:
         Args:
             count: Number of regions.
             hold_s: How many seconds another region must be clearly nearer before the robot changes to it.
-                After several losses of that region within an hour this time doubles with each loss.
+                It doubles with each loss of that region within the last hour, except the first one, and
+                becomes at most 16 times as long.
         """
         self._regions = [_RegionHistory() for _ in range(count)]
         self._hold_s = hold_s
@@ -76,7 +77,10 @@ class RegionChoice:
         return statistics.median(round_trips_s) if round_trips_s else math.inf
 
     def nearest(self, regions: Iterable[int]) -> int | None:
-        """Return the one of *regions* with the shortest round trip, the first of equal ones, None of none."""
+        """Return the one of *regions* with the shortest round trip; None if *regions* is empty.
+
+        Of equal ones, also of regions without a measured round trip, it is the one with the lowest number.
+        """
         return min(regions, key=lambda region: (self.round_trip_s(region), region), default=None)
 
     def find_nearer_region(self, current: int, regions: Iterable[int], now_s: float) -> int | None:

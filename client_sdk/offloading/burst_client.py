@@ -112,7 +112,11 @@ class BurstClient:
         self._tasks: set[asyncio.Task[Result | Failure]] = set()
 
     def read_welcome(self, welcome: Welcome) -> None:
-        """Take over the address of the function and the robot's daily budget from *welcome*."""
+        """Take over the address of the function and the robot's daily budget from *welcome*.
+
+        An address that the user gave stays in use.  A *welcome* without an address leaves the budget as it
+        is.
+        """
         self._welcome_url = welcome.burst_url
         if welcome.burst_url:
             self.policy.commands_per_day = max(0, welcome.limits.burst_commands_per_day)
@@ -133,7 +137,8 @@ class BurstClient:
     async def ask(self, command: Command, *, deadline_s: float, why: str) -> Answer | Failure:
         """Send *command* to the burst function; return an answer or failure within *deadline_s* seconds.
 
-        *why* says why no server was asked or answered; the answer carries this text.
+        *why* says why no server was asked or answered; the answer carries this text.  Without an address, and
+        while `BurstPolicy.may_send` forbids it, nothing is sent.
         """
         address, began_s = self.address, self._clock()
         if address is None or not self.policy.may_send(began_s):

@@ -36,8 +36,8 @@ ANSWER_MEMORY_S = 10.0
 """How long a measured answer of the burst function counts for the expected time of the next one, in seconds:
 one slow answer must not prevent all later attempts."""
 EXPECTED_PERCENTILE = 0.75
-"""The expected time of the burst function is this share of its recent answers, sorted by time: three of four
-are quicker, so that a single slow one does not count."""
+"""The expected time of an answer of the burst function is this percentile (0..1, nearest rank) of the times
+of its recent answers: three of four are at most as slow, so that a single slow one does not count."""
 
 
 @dataclass(slots=True, kw_only=True)
@@ -92,9 +92,13 @@ class BurstPolicy:
     def count_failure(self, now_s: float, *, retry_after_s: float = 0.0, jitter: float = 0.5) -> None:
         """Count a failure of the burst function; the third one in a row opens the circuit breaker.
 
+        Each later failure opens it again, for twice as long.  A failure that arrives while it is open is one
+        of a command that was sent before, and does not count towards this.
+
         Args:
             now_s: When the failure was noticed.
-            retry_after_s: How long the function asked the robot to send nothing.
+            retry_after_s: How long the function asked the robot to send nothing, which the robot obeys from
+                the first failure on.
             jitter: Uniform in 0..1; the breaker stays open for between half of its time and all of it.
         """
         self.in_flight -= 1
@@ -111,7 +115,11 @@ class BurstPolicy:
         self.in_flight -= 1
 
     def expected_s(self, now_s: float) -> float:
-        """Return the expected time of an answer: the 75th percentile of the answers of the last 10 s."""
+        """Return the expected seconds of an answer: the 75th percentile of those of the last 10 s, or
+        `first_s`.
+
+        `first_s` is returned while there is no such answer; at most the last 16 answers count.
+        """
         times_s = sorted(took_s for at_s, took_s in self._recent if now_s - at_s < ANSWER_MEMORY_S)
         if not times_s:
             return self.first_s

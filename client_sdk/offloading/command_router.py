@@ -99,7 +99,7 @@ class CommandRouter:
         self._tasks: set[asyncio.Task[Answer | Failure]] = set()
 
     async def ask(self, call: CallArguments) -> Answer | Failure:
-        """Return the first good answer to *call*, or a failure."""
+        """Return the first good answer to *call*, or a failure; see `_race`."""
         local, current = self._local, self._session.current
         self.read_welcome()
         plan = self._policy.plan(
@@ -147,7 +147,11 @@ class CommandRouter:
     async def _race(
         self, requests: deque[_PlannedRequest], call: CallArguments, why: str
     ) -> Answer | Failure:
-        """Ask each place at its time, or as soon as no other place is asked; return the first good answer."""
+        """Ask each place at its time, or as soon as no other place is asked; return the first good answer.
+
+        A failure of the command itself, and any answer of the robot, ends the race at once.  If all places
+        fail, the first failure is returned, and at the deadline the failure ``expired``.
+        """
         began_s = self._clock()
         running: dict[asyncio.Task[Answer | Failure], _PlannedRequest] = {}
         message = "neither the cloud nor the robot answered in time"

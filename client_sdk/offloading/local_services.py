@@ -17,7 +17,7 @@ from rse_pf.wire import Command, Failure, Result, make_codec
 __all__ = ["LocalServices"]
 
 RECENT_ANSWERS = 8
-"""How many of the last answers the expected time of the next one is taken from."""
+"""The robot expects that its next answer takes as long as the slowest of this many last ones."""
 
 
 class LocalServices:
@@ -52,7 +52,7 @@ class LocalServices:
             await self.ask(command)
 
     def offers(self, service: str) -> bool:
-        """Return whether the robot offers *service*."""
+        """Return whether the robot offers *service*; the built-in ones are not known before `prepare`."""
         return self._registry is not None and any(registered.name == service for registered in self._registry)
 
     async def ask(self, command: Command) -> Result | Failure:

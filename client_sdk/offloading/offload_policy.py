@@ -44,10 +44,10 @@ class Plan:
     Attributes:
         where: ``cloud`` asks the servers and never the robot, ``robot`` never the servers, ``both`` asks the
             servers at once and the robot later.
-        robot_after_s: Seconds after which the robot itself is asked if there is no answer by then.
+        robot_after_s: Seconds after which the robot itself is asked if there is no answer by then, or earlier
+            if all others have failed; not used if *where* is ``cloud``.
         burst_after_s: Seconds after which the burst function is asked if there is no answer by then, or
-        earlier
-            if the servers have failed; None never asks it.
+            earlier if the servers have failed; None never asks it.
         why: The reason that is given in an answer of the burst function or of the robot.
     """
 
@@ -96,13 +96,15 @@ class CloudFirst:
             robot_can: Whether the robot offers the service.
             burst_s: Expected time of an answer of the burst function, None if it cannot be asked.
         """
-        # 1. The latest moment at which the robot can start and still meet the deadline.
+        # 1. Compute the latest moment at which the robot can start and still meet the deadline; leave out a
+        #    burst function that needs more time than that.
         local_s = self.robot_solve_s if robot_solve_s is None else robot_solve_s
         robot_needs_s = FALLBACK_MARGIN * local_s if robot_can else 0.0
         latest_s = max(0.0, deadline_s - robot_needs_s - self.slack_s)
         if burst_s is not None and burst_s > latest_s:
             burst_s = None
-        # 2. Without a server that can be in time, the burst function and the robot start at once.
+        # 2. Without a server that can be in time, ask the burst function at once, and the robot as late as is
+        #    safe; without a burst function, ask the robot at once.
         where: Literal["cloud", "both"] = "both" if robot_can else "cloud"
         is_slow = expected_round_trip_s is not None and expected_round_trip_s >= deadline_s
         if not connected or is_slow:
@@ -115,7 +117,7 @@ class CloudFirst:
                 burst_after_s=None if burst_s is None else 0.0,
                 why=why,
             )
-        # 3. The rule of the paper: a cloud that is slower than the robot is not asked.
+        # 3. By the rule of the paper, ask the robot alone if it is not slower than the cloud.
         if self.take_faster and robot_can and expected_round_trip_s is not None:
             why = f"the robot takes {local_s * 1e3:.1f} ms, the cloud {expected_round_trip_s * 1e3:.1f} ms"
             if local_s <= expected_round_trip_s:

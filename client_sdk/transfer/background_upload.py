@@ -25,7 +25,7 @@ BYTES_PER_S = 262_144.0
 """Default rate of uploads, in bytes per second: a small part of a wireless link, so that poses are not
 delayed."""
 MAX_SPOOL_BYTES = 1 << 30
-"""Default size of the spool folder, in bytes: room for the keyframes of some hours without a network."""
+"""Default limit of the spool folder, in bytes: space for the keyframes of some hours without a network."""
 THREAD_JOIN_S = 5.0
 """How long `BackgroundUploader.close` waits for the upload that its thread works on, in seconds."""
 RETRY_PAUSE_S = 5.0
@@ -53,7 +53,7 @@ class BackgroundUploader:
         Args:
             uploads: Client of the data service.
             folder: The spool folder, which `start` creates; keyframes of an earlier run in it are uploaded,
-            too.
+                too.
             bytes_per_s: Highest rate of the uploads, in bytes per second.
             max_spool_bytes: Largest size of the spool folder; keyframes that do not fit are dropped.
             clock: Monotonic seconds.
@@ -118,12 +118,18 @@ class BackgroundUploader:
         return digest
 
     def wait_sent(self, timeout_s: float) -> bool:
-        """Wait until all keyframes are uploaded, at most *timeout_s* seconds; return whether they are."""
+        """Wait until each keyframe is uploaded or refused for good, at most *timeout_s* seconds.
+
+        Return whether none is left.
+        """
         with self._condition:
             return self._condition.wait_for(lambda: not self._spooled, timeout_s)
 
     def close(self) -> None:
-        """End the thread; keyframes that are not uploaded stay in the spool for the next run."""
+        """End the thread and close the connection of *uploads*; an upload that runs has at most 5 s to end.
+
+        Keyframes that are not uploaded stay in the spool for the next run.
+        """
         with self._condition:
             self._is_closed = True
             self._condition.notify_all()
@@ -146,7 +152,10 @@ class BackgroundUploader:
                 return
 
     def _upload(self, name: str) -> bool:
-        """Upload a file of the spool and remove it; return False if it has to be tried again."""
+        """Upload a file of the spool and remove it; return False if it has to be tried again.
+
+        A file that is refused for good is removed, and counts as dropped.
+        """
         path = self._folder / name
         try:
             self._uploads.upload(path, self._pause_between_parts)

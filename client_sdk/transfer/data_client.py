@@ -190,14 +190,15 @@ class DataClient:
             return digest
 
     def download(self, digest: str, to: Path | None = None, progress: OnBytes | None = None) -> bytes:
-        """Return the bytes of an object, or write them to the file *to* and return no bytes.
+        """Return the bytes of an object, or write them to the file *to* and return empty bytes.
 
         The bytes are verified by *digest*, the sha256 of the object.  The file appears only when it is
-        complete; a download that was interrupted is kept in the same folder and resumed.
+        complete; a download to a file that was interrupted is kept in the same folder and resumed.
 
         Raises:
             NotFound: This robot has no such object.
-            StoreError: The bytes do not match the digest.
+            StoreError: The bytes do not match the digest; they are removed.
+            ConnectError: There was no progress for ``deadline_s``, or no data service for 5 s.
         """
         with self._lock:
             return self._download(f"/data/v1/objects/{digest}", digest, to, progress)
@@ -224,14 +225,20 @@ class DataClient:
             return {entry.name: entry.head for entry in self._reply("GET", "/data/v1/maps", _MapPage).maps}
 
     def map_version(self, name: str, version: str = "head") -> dict[str, Any]:
-        """Return a version of the map *name* as a dict of ``id`` and ``record`` (digest, parent, note)."""
+        """Return a version of the map *name* as a dict of ``id`` and ``record`` (digest, parent, note).
+
+        *version* is the id of a version, or ``head`` for the newest one.
+
+        Raises:
+            NotFound: The tenant has no such map, or the map has no such version.
+        """
         with self._lock:
             reply = self._reply("GET", f"{_versions_path(name)}/{version}", _MapVersion)
         description: dict[str, Any] = msgspec.to_builtins(reply)
         return description
 
     def download_map(self, name: str, version: str = "head", progress: OnBytes | None = None) -> bytes:
-        """Return the encoded map of a version, for `rse_pf.maps.format.decode_map`."""
+        """Return the encoded map of a version, for `rse_pf.maps.format.decode_map`; see `map_version`."""
         description = self.map_version(name, version)
         with self._lock:
             path = f"{_versions_path(name)}/{description['id']}/content"
@@ -267,6 +274,8 @@ class DataClient:
 
     def localise(self, name: str, photo: bytes, lens: PhotoLens) -> PhotoLocation:
         """Return the pose from which a photo was taken, in the head of the map *name*.
+
+        A photo that shows no place of the map is no error: its ``verdict`` is ``lost``, without a pose.
 
         Args:
             name: Name of the map.

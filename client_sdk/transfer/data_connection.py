@@ -105,6 +105,7 @@ class DataConnection:
         Raises:
             ConnectError: There is no answer.
             Unauthorized: *token* is no text of a token.
+            UsageError: The environment variable names no HTTP proxy.
         """
         authorization = {"Authorization": f"Bearer {strip_token(token)}"}
         self.is_wrong_address = False

@@ -29,7 +29,7 @@ class SmallObjectStore:
         Args:
             read_token: Returns a valid token, None where the platform needs none.
             read_access: Returns the WebSocket address of the robot's servers, and what the robot trusts
-            there.
+                there.
         """
         self._read_token = read_token
         self._read_access = read_access
