@@ -33,7 +33,7 @@ async def merge_maps(
         robot: Sends the command, which may take minutes.
         data: Data client of the same robot, as whose objects the maps are stored.
         maps: Encoded maps, such as those of `Mapper.encoded_map` or `DataClient.download_map`.
-        options: Conditions of loop closures between the maps; None means the defaults.
+        options: Conditions of loop closures within and between the maps; None means the defaults.
         on_progress: Called with the share that is done (0..1), and the name of the step that was done last.
 
     Raises:

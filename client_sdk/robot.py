@@ -492,6 +492,7 @@ class Robot:
 
         Raises:
             Disconnected: The robot is not open, or its servers refuse it.
+            BadMessage: *request* cannot be encoded.
             LimitExceeded: The message would be larger than the limit.
         """
         self._check_open(is_refused=self._connection.refusal is not None)

@@ -39,7 +39,7 @@ class EventLoopThread:
     """Run coroutines for other threads between `start` and `close`."""
 
     def __init__(self, at_end: Callable[[], Coroutine[Any, Any, None]]) -> None:
-        """Prepare a thread for `start`; *at_end* makes the last coroutine of its loop, which has 5 s."""
+        """Prepare a thread for `start`; *at_end* makes the last coroutine of its loop, for 5 s at most."""
         self._at_end = at_end
         self._calls: set[_Call] = set()
         self._lock = (

@@ -91,14 +91,16 @@ class Backoff:
     ) -> float:
         """Return the seconds between the start of the last attempt and the next one.
 
-        Call it once for each attempt: each call after an answered one makes the next pause longer.
+        Call it once for each attempt: each call makes later pauses longer, unless the last attempt was
+        refused or not answered.
 
         While attempts are answered and fail, the pause is exponential with full jitter up to
         ``reconnect_max_s``.  When they have failed for more than three times ``reconnect_max_s``, it is
         between a sixth and a third of the time for which they have failed, up to ``reconnect_long_max_s``.
         After a refusal it is between half of ``reconnect_long_max_s`` and all of it, but at most half a
-        second longer than *valid_in_s*.  The time that the server asked for is added, and the pause is never
-        shorter than the token bucket demands.
+        second longer than *valid_in_s*; after an attempt that nobody answered it is 1 to 1.25 s.  The time
+        that the server asked for, up to 1.25 times as long, is added, and the pause is never shorter than the
+        token bucket demands.
 
         Args:
             now_s: Seconds of the robot's clock.

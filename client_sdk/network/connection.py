@@ -553,8 +553,7 @@ class Connection:
         return not is_own and not is_late_welcome and self._session.current is socket.state
 
     def _detect_duplicate_region(self, socket: RegionSocket) -> bool:
-        """Mark the region of *socket* if another region leads to the same platform; return whether it is
-        marked.
+        """Mark the region of *socket* if another region has the same platform; return whether it is marked.
 
         A platform keeps the newest connection of a robot only.  So the mark is set if a socket of another
         region was opened after *socket* and within the last `DUPLICATE_REGION_S`.

@@ -161,7 +161,7 @@ def untrusted_certificate_error(
 
     Args:
         address: The URL as shown to users.
-        error: Of the TLS handshake.
+        error: Error of the TLS handshake.
         issuer: Name of the authority that signed the certificate, empty if unknown.
         is_enrolled: Whether the robot trusts the authority in its enrolment file and no other.
     """
@@ -175,8 +175,8 @@ def http_status_error(address: str, status: int, headers: Mapping[str, str], bod
     Args:
         address: The URL as shown to users.
         status: HTTP status of the answer.
-        headers: Of the answer; upper and lower case do not matter.
-        body: Of the answer; an RSE-PF server writes the reason of a 401 or 403 into it.
+        headers: Headers of the answer; upper and lower case do not matter.
+        body: Body of the answer; an RSE-PF server writes the reason of a 401 or 403 into it.
     """
     lower = {name.lower(): value for name, value in headers.items()}
     retry_after = lower.get("retry-after", "")

@@ -251,7 +251,7 @@ def explain_certificate(
 
     Args:
         address: The URL as shown to users.
-        error: Of the TLS handshake.
+        error: Error of the TLS handshake.
         issuer: Name of the authority that signed the certificate, empty if unknown.
         is_enrolled: Whether the robot trusts the authority in its enrolment file and no other.
     """
@@ -293,7 +293,7 @@ def explain_proxy(
         address: The URL of the platform as shown to users.
         proxy: Address of the proxy without user name and password.
         variable: Environment variable that names the proxy, such as ``HTTPS_PROXY``.
-        answer: Of the proxy to CONNECT, None if it sent nothing that is HTTP.
+        answer: Answer of the proxy to CONNECT; None if the proxy sent nothing that is HTTP.
         has_credentials: Whether the variable holds a user name.
     """
     host = urlsplit(address).hostname

@@ -50,7 +50,7 @@ class ReconnectWait:
 
         Args:
             backoff: Computes the pause.
-            failure: Of the last attempt; None if there was none since the connection was lost.
+            failure: Failure of the last attempt; None if none has failed since the connection was lost.
             spent_s: How long the last attempt took.  It counts towards the pause, so that an attempt that
                 timed out is repeated at once; after a refusal it does not.
             is_move: Whether the robot is connected and only changes the server.
@@ -80,8 +80,8 @@ class ReconnectWait:
 
         Args:
             pause_s: Longest wait from now.
-            failure: Of the last attempt: a new network ends the wait after an unanswered one, a clock that
-                was set after a refusal.
+            failure: Failure of the last attempt; None if there was none.  A new network ends the wait after
+                an unanswered attempt, and a clock that was set ends it after a refusal.
             clock_offset_s: `clock_offset_s` at the start of the last attempt: the wall clock may have been
                 set since then.
         """

@@ -44,7 +44,7 @@ class Region:
         """Whether another address of the robot leads to the same platform, which keeps one connection
         only."""
         self.last_failure: DialError | None = None
-        """Why the last attempt failed or the server closed the socket; None allows an attempt at once."""
+        """Why the last attempt failed or the server closed the socket; None leads to a short pause only."""
         self.has_changed = asyncio.Event()
         """Set when the task that maintains this region has to look at its state again."""
 

@@ -279,6 +279,12 @@ class BurstClient:
         *,
         is_reused: bool,
     ) -> _Response:
+        """Send *data* and return the answer; then append the connection to *idle*, or abort it.
+
+        Raises:
+            _StaleConnection: *is_reused*, and the peer closed the connection before it sent anything.
+            _BrokenHttp: The answer is no HTTP/1 with a length, or is too long.
+        """
         is_kept = False
         try:
             try:

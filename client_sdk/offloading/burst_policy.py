@@ -92,8 +92,8 @@ class BurstPolicy:
     def count_failure(self, now_s: float, *, retry_after_s: float = 0.0, jitter: float = 0.5) -> None:
         """Count a failure of the burst function; the third one in a row opens the circuit breaker.
 
-        Each later failure opens it again, for twice as long.  A failure that arrives while it is open is one
-        of a command that was sent before, and does not count towards this.
+        Each later failure opens it again, for twice as long, up to `MAX_OPEN_S`.  A failure that arrives
+        while it is open belongs to a command that was sent before, and does not count.
 
         Args:
             now_s: When the failure was noticed.
@@ -115,10 +115,9 @@ class BurstPolicy:
         self.in_flight -= 1
 
     def expected_s(self, now_s: float) -> float:
-        """Return the expected seconds of an answer: the 75th percentile of those of the last 10 s, or
-        `first_s`.
+        """Return the expected seconds of an answer: the 75th percentile of the answers of the last 10 s.
 
-        `first_s` is returned while there is no such answer; at most the last 16 answers count.
+        At most the last 16 answers count.  Without an answer of the last 10 s it is `first_s`.
         """
         times_s = sorted(took_s for at_s, took_s in self._recent if now_s - at_s < ANSWER_MEMORY_S)
         if not times_s:

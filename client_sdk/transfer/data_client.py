@@ -54,7 +54,7 @@ from rse_pf.maps.record import MapRecord
 __all__ = ["DataClient", "DataOptions", "OnBytes", "is_allowed"]
 
 OnBytes = Callable[[int, int], None]
-"""Called after each part with the number of bytes that are transferred, and of all bytes."""
+"""Called after each part with two numbers of bytes: those transferred so far, and all of the object."""
 
 PIECE_BYTES = 1 << 20
 """Size of the ranges of a download, and of the pieces in which a file is read, in bytes."""
@@ -109,7 +109,7 @@ class DataOptions:
         deadline_s: How long a request is repeated; since each part of a transfer is a request, this is the
             longest time without progress.
         first_pause_s: Longest pause before the first repeat; it doubles with each repeat.
-        max_pause_s: Longest pause between repeats.
+        max_pause_s: Longest pause between repeats, unless the service asks for a longer one.
         part_bytes: Largest part of an upload.
         clock: Monotonic seconds.
         sleep: Waits for a number of seconds.
@@ -137,7 +137,7 @@ class DataClient:
         Args:
             url: ``http://HOST:PORT`` or ``https://...``, or the ``ws:`` or ``wss:`` address of the servers.
             token: The robot's token, or a callable that returns a valid one.
-            options: Timeouts, retries and part sizes.
+            options: Timeouts, retries and part sizes; None means the defaults.
 
         Raises:
             UsageError: *url* has another scheme, or no usable host or port.
@@ -437,10 +437,10 @@ class DataClient:
         All requests of this class are idempotent.
 
         Args:
-            method: Of HTTP.
-            path: With the query.
-            kind: Type of the reply.
-            body: Of the request.
+            method: HTTP method.
+            path: Path of the URL with the query.
+            kind: Type of the reply; `bytes` returns the body as it is.
+            body: Body of the request; None without one.
             headers: Further headers of the request.
             expected: Statuses of 300 and above that are no errors.
             digest: The object that the reply must be about, empty for any.

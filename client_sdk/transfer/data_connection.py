@@ -71,7 +71,7 @@ class DataConnection:
         Args:
             url: ``http://HOST:PORT`` or ``https://...``, or the ``ws:`` or ``wss:`` address of the servers.
             timeout_s: How long one request may wait for data.
-            ssl_context: For ``https:``; None trusts the authorities of the machine.
+            ssl_context: TLS context for ``https:``; None trusts the authorities of the machine.
 
         Raises:
             UsageError: *url* has another scheme, or no usable host or port.
