@@ -17,8 +17,8 @@ __all__ = ["CameraFit", "fit_camera"]
 
 _ITERATIONS = 16  # number of Gauss-Newton steps, in which the scale of the loss shrinks from first to last
 _FIRST_SCALES_PX = (16.0, 32.0)
-"""Scales of the loss with which two fits begin, px, of which the better one is used: large enough for matches
-that a focal length which is wrong by 20 or 40 % moves by that much."""
+"""Scales of the loss, px, with which the two fits of a photo begin; the fit with the lower cost is used.
+They are as large as the errors of pixels that a focal length which is wrong by 20 and by 40 % causes."""
 _LAST_SCALE_PX = 2.0  # scale of the loss at the end, px: the noise of ORB corners
 _SCALE_SHRINK = 0.75  # factor by which the scale of the loss is multiplied after each step
 _LOG_FOCAL_DEVIATION = 0.2

@@ -150,7 +150,7 @@ def find_consistent_set(
     if not loop_closures:
         return np.empty(0, dtype=np.int64)
     edges = EdgeArrays.of(loop_closures)
-    # 1. Test each pair of loop closures.
+    # 1. Test all loop closures against each of them as the reference.
     agree = np.zeros((len(loop_closures), len(loop_closures)), dtype=np.bool_)
     for k in range(len(loop_closures)):
         steps = np.abs(order[edges.a] - order[edges.a[k]]) + np.abs(order[edges.b] - order[edges.b[k]])
@@ -169,7 +169,8 @@ def are_pairwise_consistent(
 
     The round trip over both loop closures and the odometry between their ends must be the identity.
     Translation and rotation are tested separately, at 99 %, against the noise of both loop closures and of
-    the odometry.  Rotation noise moves the end of the trip with the length of the path as its lever.
+    the odometry.  Rotation noise moves the end of the trip, with the distance between both ends *a* and that
+    between both ends *b* as its levers.
 
     Where the two trajectories have different units of length, the two measured scales must agree as well,
     and the round trip uses their mean, weighted by information.
@@ -238,7 +239,12 @@ def fits_prediction(
 
 
 def are_scales_consistent(difference2: Array, variance: Array) -> npt.NDArray[np.bool_]:
-    """Return whether squared differences of logarithms of scales are noise of the given variance, at 99 %."""
+    """Return ``(m,)``: whether differences of logarithms of scales are noise, at 99 %.
+
+    Args:
+        difference2: ``(m,)``, the squares of the differences.
+        variance: ``(m,)``, the variances of the differences.
+    """
     fits: npt.NDArray[np.bool_] = difference2 <= CHI2_99_PERCENT_1 * variance
     return fits
 

@@ -34,7 +34,7 @@ Rows = npt.NDArray[np.int64]
 _INSTRUCTION_FLAGS = {"portable": 1, "avx2": 2, "avx512": 0}
 """Flags of the native core's ``rse_pf_match`` by the widest instructions that it may use."""
 _BLOCK_DISTANCES = 4_000_000
-"""Distances that are in memory at a time where numpy matches descriptors: 16 MB of float32."""
+"""Largest number of distances in memory at a time where numpy matches descriptors: 16 MB of float32."""
 _BIT_COUNTS = np.array([bin(value).count("1") for value in range(256)], dtype=np.uint8)
 _WORKSPACE = Workspace()
 
@@ -61,7 +61,8 @@ def distances_of_pairs(first: Descriptors, second: Descriptors) -> npt.NDArray[n
 def distance_matrix(first: Descriptors, second: Descriptors) -> npt.NDArray[np.float32]:
     """Return the ``(n, m)`` distances between all rows of ``(n, d)`` and all rows of ``(m, d)`` descriptors.
 
-    The distances are whole numbers and exact in float32, whatever the order of summation.
+    They are Hamming distances of uint8, and squared Euclidean distances of int8: whole numbers, which float32
+    holds exactly up to 2**24, whatever the order of summation.
     """
     a, b = as_vectors(first), as_vectors(second)
     distances: npt.NDArray[np.float32]

@@ -53,7 +53,8 @@ _MAX_MOTION_DEVIATION = 1e3
 _MAX_GRAVITY_DIFFERENCE_DEG = 5.0
 """Largest angle in degrees up to which two robots agree on the direction of gravity."""
 _MAX_DIRECTIONS = 200
-"""Largest number of directions of gravity of one robot whose median is computed; bounds time and memory."""
+"""Largest number of directions of gravity whose median is computed; of more, an even selection is taken,
+which bounds time and memory."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -65,9 +65,11 @@ __all__ = [
 ]
 
 MAX_KEYFRAME_BYTES = 36_000
-"""Size of one encoded keyframe in bytes; the 894 ORB features that a robot sends by default need 33.3 kB."""
+"""Largest size in bytes of one encoded keyframe; the 894 ORB features that a robot sends by default need
+33.3 kB."""
 MAX_FEATURES = 894
-"""Number of features of one keyframe with ORB descriptors; `max_features` gives it for larger descriptors."""
+"""Largest number of features of one keyframe with ORB descriptors; `max_features` gives that for larger
+descriptors."""
 MAX_BLOCKS = 16
 """Largest number of blocks in one encoded keyframe; this release knows seven kinds of blocks."""
 
@@ -136,7 +138,8 @@ _MAX_UNIT = 1e3
 """Largest unit in which depths without metric scale are encoded, as a multiple of their segment's unit of
 length."""
 _MAX_TIME_S = 1e12
-"""Largest time of a keyframe in seconds from 1970; larger numbers overflow in later computations."""
+"""Largest time of a keyframe in seconds after or before 1970; larger numbers overflow in later
+computations."""
 _MAX_ODOMETRY_M = 1e6
 """Largest coordinate in metres of a camera in the odometry of its robot: no robot drives 1,000 km in one
 run."""

@@ -155,6 +155,7 @@ def localise(
         options: Conditions under which the pose is ok.
 
     Raises:
+        BadRequest: The descriptors of a candidate and of the view are of different kinds.
         MissingExtra: The native core is not installed.
     """
     if not candidates:

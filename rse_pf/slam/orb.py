@@ -107,7 +107,8 @@ def describe_orb(rgb: npt.NDArray[np.uint8], count: int, *, is_spread: bool = Tr
 
     Args:
         rgb: ``(h, w, 3)``, red first.
-        count: Largest number of features.
+        count: Largest number of features; without *is_spread*, those that are as strong as the weakest one of
+            their pyramid level come in addition.
         is_spread: Take the strongest features of each cell of 40 px, also weak ones where a cell has no
             others; otherwise take the strongest of the image.
 
@@ -211,12 +212,14 @@ def detect_keypoints(gray: npt.NDArray[np.uint8], count: int, threshold: int) ->
 
     Args:
         gray: ``(h, w)``.
-        count: Number of keypoints; those that are as strong as the weakest of them are returned as well.
+        count: Number of keypoints that are wanted; those that are as strong as the weakest of their pyramid
+            level are returned as well.
         threshold: Threshold of the FAST corner detector, 0 to 255 grey levels.
 
     Returns:
-        None where the processor lacks AVX2, where more than twice *count* keypoints are equally strong, or
-        where a side of the image is below 2 or above 16,384 px.
+        The keypoints, by pyramid level, the finest first; None where the processor lacks AVX2, where equally
+        strong ones make them more than twice *count* and 64, or where a side of the image is below 2 or above
+        16,384 px.
 
     Raises:
         MissingExtra: The native core is not installed.
