@@ -71,19 +71,19 @@ _PNM_HEAD = re.compile(rb"(P[56])\s+(?:#[^\n]*\n\s*)*(\d{1,5})\s+(\d{1,5})\s+(\d
 """Header of a binary PNM file: kind, comments, width, height and largest value.  A comment ends with its
 line, so that the pattern matches a header in one way only, and takes linear time."""
 _SIZE_PX = (COLOUR_CAMERA.width, COLOUR_CAMERA.height)  # width and height of all images of the data set
-_MAX_IMAGES = 10_000  # in a labelled file: a multiple of what the published one has
+_MAX_IMAGES = 10_000  # images, or names of scenes, in a labelled file: a multiple of the published one's
 _MAX_NAME_LENGTH = 256  # characters in the name of a scene; a longer text is the sign of a damaged file
-_MAX_CHUNK_VALUES = 1 << 26  # in a compressed chunk of a labelled file, since HDF5 inflates whole chunks
+_MAX_CHUNK_VALUES = 1 << 26  # values in a chunk of an array of a labelled file: HDF5 inflates whole chunks
 _MAT_HINT = "name nyu_depth_v2_labeled.mat as it was published"
 _H5PY_ERRORS = (OSError, RuntimeError, KeyError, TypeError, ValueError, OverflowError, MemoryError)
 """Errors that h5py raises for a damaged file."""
 _SHAPES = {"images": (3, *_SIZE_PX), "depths": _SIZE_PX, "rawDepths": _SIZE_PX}
-"""Shape of one image in each array of the labelled file, columns before rows."""
+"""Shape of one image in each array of the labelled file: (channels,) columns, rows."""
 _RAW_FILE_NAME = re.compile(r"[dr]-(\d+(?:\.\d+)?)-\d+\.(?:pgm|ppm)$")
 
 
 class RawFile(NamedTuple):
-    """An image of a raw dump, with the time stamp in its name (s)."""
+    """An image file of a raw dump, with the time stamp (s) that its name states."""
 
     timestamp_s: float
     path: Path
@@ -135,7 +135,7 @@ def register_depth(depth_m: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
 
 
 def raw_files(folder: Path, prefix: str) -> list[RawFile]:
-    """Return the images of a raw dump by time, without truncated ones.
+    """Return the images of a raw dump in the order of time, without those of `truncated_files`.
 
     *prefix* is ``d`` for depth, or ``r`` for colour; a file is named ``PREFIX-SECONDS-TICKS.pgm`` or
     ``.ppm``.
@@ -144,7 +144,11 @@ def raw_files(folder: Path, prefix: str) -> list[RawFile]:
 
 
 def truncated_files(folder: Path) -> list[str]:
-    """Return the names of images whose files are too small for a whole image; the published dump has some."""
+    """Return the names of images whose files are far too small: at most one byte for each pixel.
+
+    Depth images come first, then colour images; the published dump has some.  `read_pnm` refuses others that
+    are cut off.
+    """
     files = [*_list_raw_files(folder, "d"), *_list_raw_files(folder, "r")]
     return [file.path.name for file in files if _is_truncated(file)]
 
@@ -159,9 +163,10 @@ def _is_truncated(file: RawFile) -> bool:
 
 
 def read_pnm(path: Path) -> npt.NDArray[Any]:
-    """Return the pixels of a binary PPM ``(h, w, 3)`` uint8 or a 16-bit PGM ``(h, w)`` uint16.
+    """Return the pixels of a binary PPM ``(h, w, 3)`` or PGM ``(h, w)``.
 
-    The 16-bit files of the raw dump are little endian, contrary to the format.
+    They are uint16 if the header states a largest value above 255, as for depth, else uint8, as for colour.
+    Values of 16 bits are read as little endian: those of the raw dump are, contrary to the format.
 
     Raises:
         UsageError: The file cannot be read, is cut off, or is no binary PPM or PGM.
@@ -261,10 +266,11 @@ class LabelledFile:
 
 
 def _has_valid_arrays(h5py: Any, file: Any) -> bool:
-    """Return whether all arrays of images have the shape of the data set, and are stored in *file* itself.
+    """Return whether the arrays of images of *file* are safe to read.
 
-    A virtual array takes no space in the file, but memory here; a linked one may show any file of this
-    machine.
+    They must hold numbers in the shape of the data set, all the same number of images up to `_MAX_IMAGES`, in
+    chunks of at most `_MAX_CHUNK_VALUES`, stored in *file* itself: a virtual array takes no space in the
+    file, but memory here, and a linked one may show any file of this machine.
     """
     counts = set()
     for name in _SHAPES.keys() & file.keys():

@@ -24,8 +24,9 @@ def find_folder_camera(
 ) -> tuple[Path, Intrinsics] | None:
     """Return the file that states the camera of *folder*, and its intrinsics; None if there is no such file.
 
-    A text file holds ``fx fy cx cy``, or the camera matrix as 3x3 or 4x4 numbers row by row.  The file does
-    not state the size of the images, so that *size_px* is called for their width and height.
+    Of several files, the first of `_JSON_FILES` is read, then the first of `_TEXT_FILES`.  A text file holds
+    ``fx fy cx cy``, or the camera matrix as 3x3 or 4x4 numbers row by row.  It does not state the size of the
+    images, so that *size_px* is called for their width and height, px.
 
     Raises:
         UsageError: The file cannot be read, or its numbers are no intrinsics.

@@ -19,7 +19,7 @@ class ImuTrack:
     """All samples of the IMU of a recording, with time stamps on the clock of the camera.
 
     Attributes:
-        timestamps_s: ``(n,)``, ascending.
+        timestamps_s: ``(n,)``, strictly ascending.
         gyro: ``(n, 3)`` angular rates, rad/s, in the frame of the IMU.
         accel: ``(n, 3)`` specific forces, m/s^2, in the frame of the IMU.
         model: The noise of the IMU and its pose relative to the camera.
@@ -37,7 +37,10 @@ class ImuTrack:
         check_samples(self.timestamps_s, self.gyro, self.accel)
 
     def between(self, since_s: float, until_s: float) -> ImuSamples:
-        """Return the samples from the last at or before *since_s* to the first at or after *until_s*."""
+        """Return the samples from the last at or before *since_s* to the first at or after *until_s*.
+
+        Where the track begins later or ends earlier, the samples begin or end with those of the track.
+        """
         first = max(0, int(np.searchsorted(self.timestamps_s, since_s, side="right")) - 1)
         end = int(np.searchsorted(self.timestamps_s, until_s, side="left")) + 1
         rows = slice(first, end)

@@ -8,9 +8,10 @@
 
 Lengths are pixels.  These fields may be left out: ``distortion`` (coefficients in OpenCV's order), ``model``
 (``radial-tangential`` by default, or ``fisheye`` with ``[k1, k2, k3, k4]``), ``depth_scale`` (units of a
-16-bit depth image in a metre), ``rate_hz`` (of images that have no time stamps), ``rms_px`` (reprojection
-error of the calibration) and ``views`` (number of its images).  Fields that other programs name differently
-are read too.  A field that is not known is refused, because the camera may differ by what the field states.
+16-bit depth image in a metre), ``depth_registered_to_color`` (whether depth images show the view of the
+colour camera), ``rate_hz`` (of images that have no time stamps), ``rms_px`` (reprojection error of the
+calibration) and ``views`` (number of its images).  Fields that other programs name differently are read too.
+A field that is not known is refused, because the camera may differ by what the field states.
 """
 
 from __future__ import annotations
@@ -95,7 +96,7 @@ _FIELDS = {
 }
 """Fields of ``intrinsics.json`` that are read, after `_FIELD_ALIASES` has replaced other names."""
 _REMARKS = {"name", "comment", "description", "source", "serial", "camera_name", "depth_unit"}
-"""Fields of ``intrinsics.json`` that are for people, and are accepted without being read."""
+"""Fields of ``intrinsics.json`` that are for people: any value is accepted, and none is used."""
 INTRINSICS_HINT = (
     "write fx fy cx cy width height, and distortion [k1 k2 p1 p2 k3] and depth_scale if they are known, as "
     "JSON into intrinsics.json; files of OpenCV, ROS, ORB-SLAM and COLMAP hold them (docs/cameras.md)"
@@ -175,7 +176,8 @@ def read_json(path: Path, hint: str) -> Any:
     """Return the content of a JSON file of intrinsics of at most 1 MiB.
 
     Raises:
-        UsageError: The file is missing, too large, or no JSON; *hint* then says what the file should hold.
+        UsageError: The file is missing (the hint says how to calibrate), or cannot be read, is too large,
+            or is no JSON (the hint is *hint*).
     """
     if not path.exists():
         raise UsageError(f"there is no {path}, and the intrinsics are not known", hint=TYPICAL_HINT)
@@ -211,7 +213,7 @@ def parse_intrinsics(values: Any) -> Intrinsics:
     # 1. Give all fields the names of intrinsics.json.
     values = _replace_field_aliases(values)
     model = parse_lens_model(values.get("model"))
-    # 2. Read the camera matrix, if it is stated instead of fx fy cx cy.
+    # 2. Take those of fx fy cx cy that are not stated from the camera matrix, if there is one.
     if "matrix" in values:
         K = np.array(values["matrix"], dtype=np.float64).reshape(3, 3)
         K = K.T if K[2, 0] or K[2, 1] else K  # Open3D writes column after column
@@ -255,8 +257,11 @@ def parse_lens_model(stated: Any) -> str:
 def _replace_field_aliases(values: Any) -> dict[str, Any]:
     """Return the fields of a file by the names of ``intrinsics.json``.
 
+    Of several fields for the lens model, the last one counts that says more than that the projection is
+    perspective.
+
     Raises:
-        UsageError: A field is not known, or two aliases of one field state different values.
+        UsageError: A field is not known, or two names of another field state different values.
     """
     fields: dict[str, Any] = {}
     for alias, value in values.items():
@@ -278,8 +283,11 @@ def _replace_field_aliases(values: Any) -> dict[str, Any]:
 def _parse_distortion(values: dict[str, Any], model: str) -> tuple[float, ...]:
     """Return the distortion coefficients of a file, which states them as a list or as ``k1``, ``k2``, ...
 
+    The result is empty if the file states none, or by names only zeros.
+
     Raises:
-        UsageError: Both are stated, or a coefficient is not 0 that the lens model does not have.
+        UsageError: There is a list, and a named coefficient is not 0; or there is no list, and a named
+            coefficient is not 0 that the lens model does not have.
     """
     names = LENS_MODELS[model].coefficient_names
     nonzero = {name for name in _COEFFICIENT_NAMES if float(values.get(name, 0.0))}

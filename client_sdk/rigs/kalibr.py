@@ -30,7 +30,8 @@ _IMU_FILES = ("imu.yaml", "imu0.yaml")  # names under which users keep the IMU f
 def read_kalibr(path: Path) -> Rig:
     """Return the rig of a camchain.
 
-    The camera ``cam0`` is called left, and ``cam1`` right; further cameras keep their names.
+    The camera ``cam0`` is called left, and ``cam1`` right; further cameras keep their names.  The rig has an
+    IMU if the camchain states ``T_cam_imu`` of ``cam0``, and a file of the IMU is in its folder.
 
     Raises:
         UsageError: The file is no camchain, or has an unknown lens model or an impossible number.
@@ -87,7 +88,7 @@ def _read_imu_of_camchain(camchain: Path) -> RigImu | None:
     """Return the IMU of the file that Kalibr writes into the folder of a camchain; None without a file.
 
     The file is called like the camchain with ``imu`` for ``camchain`` or ``camchain-imucam``, else
-    ``imu.yaml`` or ``imu0.yaml``.
+    ``imu.yaml`` or ``imu0.yaml``.  The pose of the IMU is the identity, since the IMU is the body of the rig.
 
     Raises:
         UsageError: The file lacks a number, or a number is impossible.

@@ -29,9 +29,9 @@ class Rectification:
 
     Attributes:
         camera: The pinhole camera of both rectified images.
-        baseline_m: Distance from the left camera to the right one.
+        baseline_m: Distance from the left camera to the right one, metres.
         T_body_camera: ``(4, 4)``, metres, pose of the rectified left camera in the body.  It has the position
-            of the left camera and is rotated against it.
+            of the left camera, and is rotated against it unless the pair is rectified already.
 
     Source:
         Bouguet's method, see `rse_pf.geometry.rectify_stereo_pair`.
@@ -94,7 +94,9 @@ class Rectification:
 
 
 def _check_pair(left: RigCamera, right: RigCamera, right_in_left_m: Array) -> None:
-    """Refuse two cameras that are no stereo pair; *right_in_left_m* ``(3,)`` is the right camera's position.
+    """Refuse two cameras that are no stereo pair.
+
+    *right_in_left_m* ``(3,)`` is the position of the right camera in the frame of the left one, metres.
 
     Raises:
         UsageError: See `Rectification.__init__`.
@@ -125,7 +127,7 @@ def _check_pair(left: RigCamera, right: RigCamera, right_in_left_m: Array) -> No
 
 
 def _is_rectified(left: Intrinsics, right: Intrinsics, T_right_left: Array) -> bool:
-    """Whether both cameras are one pinhole camera, and differ by a translation along x only."""
+    """Return whether both lenses are one pinhole, and the cameras differ by a translation along x only."""
     deviation = T_right_left - np.eye(4)
     deviation[0, 3] = 0.0
     are_equal_pinholes = left.camera == right.camera and left.is_pinhole and right.is_pinhole

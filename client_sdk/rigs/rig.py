@@ -18,7 +18,7 @@ from rse_pf.geometry import Array, inverse, rigid
 __all__ = ["Rig", "RigCamera", "RigImu"]
 
 _MAX_CAMERAS = 8  # of a rig: only the first two are used, and a longer list is no rig
-_MAX_LEVER_ARM_M = 10.0  # between a sensor and the origin of the body: a longer one is in millimetres
+_MAX_LEVER_ARM_M = 10.0  # along each axis, from the body's origin to a sensor: more is in millimetres
 _MAX_TIME_OFFSET_S = 1.0  # between the clocks of a camera and the IMU: a larger one is in milliseconds
 _MAX_NAME_LENGTH = 64  # characters in the name of a camera, which error lines repeat
 
@@ -84,7 +84,11 @@ class RigImu:
         self.model(self.T_body_imu)
 
     def model(self, T_body_camera: Array) -> ImuModel:
-        """Return the model of the IMU as seen from a camera with the pose *T_body_camera* ``(4, 4)``."""
+        """Return the noise and range of the IMU with its pose relative to a camera.
+
+        *T_body_camera* ``(4, 4)`` is the pose of the camera of the frames, metres: of a stereo pair that of
+        the rectified left one.
+        """
         return ImuModel(
             T_imu_camera=inverse(self.T_body_imu) @ T_body_camera,
             gyro_noise=self.gyro_noise,
@@ -132,11 +136,12 @@ class Rig:
 
 
 def _normalise_pose(sensor: object, field: str, name: str) -> None:
-    """Replace a pose of a frozen *sensor* by the nearest rigid motion.
+    """Replace in place the pose *field* of a frozen *sensor* by the rigid motion that `rigid` returns.
+
+    Rounding errors of a rotation are removed in this way.  *name* is how the error calls the pose.
 
     Raises:
-        UsageError: The pose is no ``(4, 4)`` rigid motion within 10 m; *name* is how the error calls the
-            pose.
+        UsageError: The pose is no ``(4, 4)`` rigid motion within 10 m on each axis.
     """
     stated = np.asarray(getattr(sensor, field), dtype=np.float64)
     pose = rigid(stated, _MAX_LEVER_ARM_M) if stated.shape == (4, 4) else None

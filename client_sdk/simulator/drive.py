@@ -39,12 +39,14 @@ _OVERLAP_M = 0.6  # distance that a robot drives beyond the start of the next ro
 _LUMA_WEIGHTS = (0.299, 0.587, 0.114)  # weights of red, green and blue in a grey image (ITU-R BT.601)
 _EYE_HEIGHT_M = 1.25  # mean height of the camera above the floor
 _LOOK_AHEAD_M = 1.0  # the camera looks at the point of the loop that is this far ahead
-_SWAY_M = 1.7  # length of the path in which the swaying of the camera repeats
+_SWAY_M = 1.7  # length of the path after which the swaying in height repeats; pitch and roll sway more slowly
 _PATH_STEP_M = 0.01  # distance between the points that describe the loop
 _SMOOTHING_POINTS = 45
-"""Points, 1 cm apart, on either side over which the loop is averaged to round its corners."""
+"""Points of the loop, 1 cm apart, on either side of a point, over which each of two passes averages the loop
+to round its corners."""
 
-# Corners of the loop in metres, from the left wall of a room and from the front wall of all rooms.
+# Corners (x, y) of the loop, metres: x from the wall of their room that has the smaller x, y from the wall of
+# all rooms at y = 0.  The way there leads to larger x, the way back to smaller x.
 _Corners = tuple[tuple[float, float], ...]
 _WAY_THERE_WITHOUT_TABLE: _Corners = ((1.4, 1.75), (2.5, 1.65), (3.6, 1.75))
 _WAY_THERE_WITH_TABLE: _Corners = ((1.3, 1.35), (2.5, 1.0), (3.7, 1.35))
@@ -71,7 +73,8 @@ def render_frames(robot: int, robots: int, frames: int, seed: int, rooms: int = 
         rooms: Number of rooms in a row, 2 or more.
 
     Raises:
-        UsageError: The robot is not one of *robots*, there are no frames, or fewer than 2 rooms.
+        UsageError: The robot is not one of *robots*, there are no frames, or fewer than 2 rooms; raised when
+            the first frame is asked for.
     """
     truth = true_trajectory(robot, robots, frames, seed, rooms)
     yield from render_along(truth, make_world(seed, rooms), (seed, robots, robot))
@@ -83,7 +86,7 @@ def render_along(truth: Trajectory, world: World, noise: Sequence[int]) -> Itera
     Args:
         truth: Pose and time stamp of each frame.
         world: The world to draw.
-        noise: Numbers of which, with the number of the frame, the sensor noise is seeded.
+        noise: Numbers that, followed by the row of the frame in *truth*, seed the noise of image and depth.
     """
     renderer = Renderer(world, SIMULATED_CAMERA)
     for row in range(len(truth)):
@@ -100,11 +103,13 @@ def render_along(truth: Trajectory, world: World, noise: Sequence[int]) -> Itera
 def render_pairs(truth: Trajectory, world: World, noise: Sequence[int], baseline_m: float) -> Iterator[Frame]:
     """Yield the frames of a rectified stereo camera whose left camera is on a trajectory.
 
+    Their depth images are all 0.
+
     Args:
         truth: Pose of the left camera and time stamp of each frame.
         world: The world to draw.
-        noise: Numbers of which, with the number of the frame, the image noise is seeded.
-        baseline_m: Distance from the left camera to the right one.
+        noise: Numbers that, followed by the row of the frame in *truth*, seed the noise of both images.
+        baseline_m: Distance from the left camera to the right one, along x of the left camera.
     """
     renderer, T_left_right = Renderer(world, SIMULATED_CAMERA), np.eye(4)
     T_left_right[0, 3] = baseline_m
@@ -144,11 +149,13 @@ def loop_trajectory(
 ) -> Trajectory:
     """Return exact poses ``T_world_camera`` on the loop, with time stamps 0.2 s apart from 0 on.
 
-    The loop begins at the door between rooms 0 and 1, leads through each room before the last one in 5 m,
-    then around the last room, back through the others, and around room 0.
+    The time stamps do not depend on *step_m*.  The loop begins at the door between rooms 0 and 1, leads
+    through each room before the last one in 5 m, then around the last room, back through the others, and
+    around room 0.
 
     Args:
-        begin_m: Distance along the loop at which the first pose lies; the loop is closed.
+        begin_m: Distance along the loop at which the first pose lies; the loop is closed, so that distances
+            beyond its length begin again.
         frames: Number of poses.
         seed: Seed of the phase of the camera's swaying.
         rooms: Number of rooms in a row.
@@ -166,13 +173,13 @@ def loop_trajectory(
 def frames_to_overlap(robots: int, rooms: int = ROOMS) -> int:
     """Return how many frames a robot needs to reach the start of the next robot and drive 0.6 m past it.
 
-    A single robot reaches its own start.
+    The starts are spread evenly over the loop.  A single robot reaches its own start.
     """
     return math.ceil((_make_loop(rooms)[1] / robots + _OVERLAP_M) / STEP_M)
 
 
 def _make_loop(rooms: int) -> tuple[Array, float]:
-    """Return the closed loop as ``(n, 2)`` points x and y, one centimetre apart, and its length in metres."""
+    """Return the closed, rounded loop as ``(n, 2)`` points x and y about 1 cm apart, and its length (m)."""
     path = _resample(np.array(_loop_corners(rooms)))[0]
     for _ in range(2):
         path = _resample(_smooth(path))[0]
@@ -196,7 +203,7 @@ def _loop_corners(rooms: int) -> list[tuple[float, float]]:
 
 
 def _resample(points: Array) -> tuple[Array, float]:
-    """Return points one centimetre apart on a closed path ``(n, 2)``, and its length in metres."""
+    """Return points about 1 cm apart on the closed path through *points* ``(n, 2)``, and its length (m)."""
     closed = np.vstack((points, points[:1]))
     along = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1))))
     distances = np.linspace(0.0, along[-1], round(along[-1] / _PATH_STEP_M), endpoint=False)
@@ -215,7 +222,8 @@ def _smooth(path: Array) -> Array:
 def _pose_at(path: Array, length_m: float, distance_m: float, phase_rad: float) -> Array:
     """Return ``T_world_camera`` ``(4, 4)`` at a distance along the loop.
 
-    The camera looks 1 m ahead and 7 degrees down, and sways a little in height, pitch and roll.
+    The camera is turned towards the point of the loop that is 1 m ahead, looks 7 degrees down, and sways a
+    little in height, pitch and roll.  Its x axis points to the right, y down, and z forward.
     """
     position = _point_at(path, length_m, distance_m)
     ahead = _point_at(path, length_m, distance_m + _LOOK_AHEAD_M)

@@ -23,7 +23,7 @@ _Image = npt.NDArray[np.float32]
 _NEAR_M = 0.05  # depth of the near plane: what is nearer to the camera is not drawn
 _MIP_BIAS = 0.7  # added to a mip level before it is truncated: 0.5 would round, 0.7 prefers the coarser one
 _MIN_MIP_COSINE = 0.05  # smallest cosine of incidence for the choice of the mip level, to limit its blur
-_MAX_MIP_LEVELS = 12  # levels of a texture of 2048 texels, the largest that is supported
+_MAX_MIP_LEVELS = 12  # levels of a texture of 2048x2048 texels, the largest that is supported
 
 # Brightness of the surfaces in a room
 _LAMP_BELOW_CEILING_M = 0.35  # distance of each room's lamp from the middle of the ceiling, downwards
@@ -74,8 +74,8 @@ class Renderer:
 
         Returns:
             Colours ``(h, w, 3)`` of 0..255, depths ``(h, w)`` in metres along the optical axis, and cosines
-            ``(h, w)`` of the angle between ray and surface normal.  Depth and colour are 0 where a ray leaves
-            the world.
+            ``(h, w)`` of the angle between ray and surface normal, 0..1.  Where a ray meets no face, depth
+            and colour are 0, and the cosine has no meaning.
         """
         # 1. Find the nearest face of each pixel.
         R_world_camera = T_world_camera[:3, :3].astype(np.float32)
@@ -114,7 +114,9 @@ class Renderer:
     ) -> tuple[_Image, npt.NDArray[np.int32]]:
         """Return depth ``(h, w)`` (infinite without a face) and face number (-1 without) of each pixel.
 
-        Each face is tested only within its bounding box in the image.
+        The face is the nearest one whose visible side the camera is on.  *rays* ``(3, h, w)`` are the
+        directions of the pixels in the world, of depth 1, and *origin* ``(3,)`` is the position of the
+        camera.  Each face is tested only within its bounding box in the image.
         """
         depth_m = np.full(rays.shape[1:], np.inf, dtype=np.float32)
         face_numbers = np.full(rays.shape[1:], -1, dtype=np.int32)
@@ -138,7 +140,10 @@ class Renderer:
         return depth_m, face_numbers
 
     def _bounding_box(self, face: Face, T_world_camera: Array) -> tuple[slice, slice] | None:
-        """Return rows and columns of a face's bounding box in the image, clipped at the near plane."""
+        """Return rows and columns of a face's bounding box in the image; None if the face is not in view.
+
+        Only the part of the face in front of the near plane counts.
+        """
         u_axis, v_axis = (axis for axis in range(3) if axis != face.axis)
         corners = np.empty((4, 3))
         corners[:, face.axis] = face.offset
@@ -166,9 +171,10 @@ class Renderer:
     ) -> _Image:
         """Return texture values 0..1, bilinear in the mip level whose texel is about as large as the pixel.
 
-        All arguments are ``(n,)`` for n pixels; *u*, *v* and *depths* are in metres.
+        All arguments are ``(n,)`` for n pixels: the number of the face, the coordinates *u* and *v* of the
+        point from the lower corner of the face (m), the depth (m), and the cosine of the angle of incidence.
         """
-        # 1. Choose the mip level.
+        # 1. Choose the mip level by the width of a pixel on the face over that of a texel.
         texel_m = self._texel_m[face]
         pixel_m = (
             depths / np.float32(self._camera.fx) / np.sqrt(np.maximum(cosine, np.float32(_MIN_MIP_COSINE)))
@@ -190,7 +196,7 @@ class Renderer:
         lower_left, lower_right, upper_left, upper_right = (
             self._texels.take(index) for index in (lower + left, lower + right, upper + left, upper + right)
         )
-        # 3. Interpolate.
+        # 3. Interpolate between the four texels.
         below = lower_left + (lower_right - lower_left) * fx
         above = upper_left + (upper_right - upper_left) * fx
         value: _Image = below + (above - below) * fy
@@ -199,7 +205,11 @@ class Renderer:
     def _brightness(
         self, face: npt.NDArray[np.intp], points: _Image, edge_distance: _Image, cosine: _Image
     ) -> _Image:
-        """Return the brightness of ``(3, n)`` points: a lamp in each room, and darker edges of faces."""
+        """Return the factors ``(n,)`` by which the light changes the colours of ``(3, n)`` points.
+
+        The lamp is that of the room of each point's *face*; edges of faces are darker, and surfaces that face
+        the camera a little brighter.  *edge_distance* ``(n,)`` is in metres.
+        """
         x, y = points[0] - self._lamp_x[face], points[1] - DEPTH_M / 2
         z = points[2] - (HEIGHT_M - _LAMP_BELOW_CEILING_M)
         lamp = _AMBIENT + _LAMP / (1.0 + _LAMP_FALLOFF * (x * x + y * y + z * z))
@@ -209,7 +219,7 @@ class Renderer:
 
 
 def add_depth_noise(depth_m: _Image, cosine: _Image, rng: np.random.Generator) -> _Image:
-    """Return depths ``(h, w)`` in metres as a Kinect measures them; 0 where it measures none.
+    """Return a new image of depths ``(h, w)``, metres, as a Kinect measures them; 0 where it measures none.
 
     The noise has a standard deviation of ``0.0012 + 0.0019 (z - 0.4)^2`` m, and depths are multiples of 1/8
     px of disparity.  Depth is missing below 0.4 m and above 6 m, at grazing angles of incidence (*cosine*
@@ -239,6 +249,8 @@ def add_image_noise(colour: _Image, rng: np.random.Generator) -> npt.NDArray[np.
 
 def _make_mip_maps(world: World) -> tuple[npt.NDArray[np.int32], _Image, npt.NDArray[np.int32]]:
     """Return the mip maps of all textures of a world in one array.
+
+    Level 0 is the texture itself; a texel of each further level is the mean of four of the level before.
 
     Returns:
         The start of each level ``(textures, 12)`` in the array, the array of all texels, and the number of

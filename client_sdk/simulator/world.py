@@ -78,7 +78,7 @@ _MOTIFS: tuple[Callable[[_Image, _Image], _Image], ...] = (
     lambda a, b: np.maximum(np.abs(a), 2.2 * np.abs(b)),
 )
 _MOTIF_CELL_PX = 64  # texels between the motifs of a wallpaper, before each is moved at random
-_MOTIF_REACH_PX = 40  # texels around the centre of a motif that are drawn; the largest motif has 26
+_MOTIF_REACH_PX = 40  # texels drawn on each side of a motif's centre; the largest motif reaches 26 texels
 _POSTER_SHAPES = 26  # number of discs and bars that are drawn on a poster
 _DRAWN_SIZES = 1.06
 """Half the side of the square of texels that is drawn for a disc or bar of a poster, in sizes of the shape:
@@ -95,7 +95,7 @@ class Face:
         sign: 1 if the face is visible from larger coordinates, -1 if from smaller ones.
         low: Smallest coordinates on the two other axes, in the order x, y, z, metres.
         high: Largest coordinates on these axes, metres.
-        texture: Index of the texture in `World.textures`; it repeats.
+        texture: Index of the texture in `World.textures`; the texture begins at *low*, and repeats.
         texel_m: Width of a texel, metres.
         colour_0: Colour of the texture value 0; values between are blended.
         colour_1: Colour of the texture value 1.
@@ -144,7 +144,12 @@ class _Builder:
         skin: tuple[int, float],
         colours: _Colours,
     ) -> None:
-        """Add the six faces of a box, visible from outside; *skin* is texture index and texel width."""
+        """Add the six faces of a box, visible from outside.
+
+        *low* and *high* are opposite corners (x, y, z), metres; *skin* is the index of the texture and the
+        width of a texel, metres; *colours* are those of the texture values 0 and 1; the lamp of *room* lights
+        the box.
+        """
         for axis in range(3):
             u_axis, v_axis = (other for other in range(3) if other != axis)
             face_low, face_high = (low[u_axis], low[v_axis]), (high[u_axis], high[v_axis])
@@ -153,7 +158,11 @@ class _Builder:
 
 
 def make_world(seed: int, rooms: int = ROOMS) -> World:
-    """Return the world of a seed: the seed chooses textures and pictures; rooms and furniture are fixed."""
+    """Return the world of a seed, with a number of rooms in a row.
+
+    The seed chooses textures, pictures, and the sizes of the small boxes on the sideboards.  Rooms and other
+    furniture are the same for all seeds.
+    """
     builder = _Builder(np.random.default_rng([seed, 11]), rooms)
     # 1. Make the textures that all rooms share.
     floor = builder.add_texture(_make_planks(builder.rng))
@@ -190,7 +199,11 @@ def make_world(seed: int, rooms: int = ROOMS) -> World:
 
 
 def _wall_pieces(has_door: bool) -> list[tuple[float, float, float]]:
-    """Return the rectangles of a wall, up to the ceiling: smallest and largest y, and smallest z."""
+    """Return the rectangles of a wall, metres: smallest and largest y, and smallest z.
+
+    All of them end at the ceiling.  A wall with a door has three: both sides of the door, and the part above
+    it.
+    """
     if not has_door:
         return [(0.0, DEPTH_M, 0.0)]
     left, right = DOOR_Y_M
@@ -238,7 +251,7 @@ def _add_furniture(builder: _Builder, room: int, wood: int, cloth: int) -> None:
 def _add_table(
     builder: _Builder, room: int, low: tuple[float, float], high: tuple[float, float], wood: int
 ) -> None:
-    """Add a table between two corners x and y: a top, four legs, and a bowl."""
+    """Add a table between two opposite corners (x, y), metres: a top, four legs, and a bowl."""
     skin, colours = (wood, _FURNITURE_TEXEL_M), _TABLE_COLOURS
     builder.add_box((*low, 0.68), (*high, 0.74), room, skin, colours)
     for x in (low[0] + 0.04, high[0] - 0.12):
@@ -253,7 +266,10 @@ def _add_table(
 def _add_shelf(
     builder: _Builder, room: int, low: tuple[float, float], high: tuple[float, float], wood: int
 ) -> None:
-    """Add a bookshelf between two corners x and y; the books are a texture on its side to the room."""
+    """Add a bookshelf between two opposite corners (x, y), metres.
+
+    The books are a texture on the side of the shelf that faces the room.
+    """
     builder.add_box((*low, 0.0), (*high, 1.9), room, (wood, _FURNITURE_TEXEL_M), (_OAK, _WALNUT))
     books = builder.add_texture(_make_books(builder.rng))
     sign, y = (1, high[1] + 0.002) if low[1] == 0.0 else (-1, low[1] - 0.002)
@@ -264,7 +280,8 @@ def _add_shelf(
 def _add_pictures(builder: _Builder, room: int) -> None:
     """Add square pictures to the four walls of a room, 1 cm in front of them."""
     x = room * ROOM_M
-    # Axis and offset of the wall, side to the room, then position along the wall, height and size, metres.
+    # Of each picture: axis, offset and sign of its wall as in `Face`, then the position along the wall and
+    # the height of its lower corner, and its side, metres.
     pictures = [
         (1, 0.0, 1, x + 0.7, 1.35, 0.75),
         (1, DEPTH_M, -1, x + 1.6, 1.2, 0.9),
