@@ -21,8 +21,8 @@ __all__ = ["Board", "find_corners", "write_board"]
 
 _MARKER_SHARE = 0.75  # side of a ChArUco marker over that of its square
 _SQUARE_PX = 8
-"""Pixels of a square in the smallest exact image of a board: the 6 modules of a ChArUco marker fill 0.75 of
-the square."""
+"""Side of a square, pixels, in the smallest exact image of a board: a ChArUco marker of 6x6 modules, a pixel
+each, fills 0.75 of that side."""
 _MIN_CHARUCO_CORNERS = 6  # corners of a ChArUco board that must be found in an image
 _MIN_CORNERS = 3  # corners of a board in a row or column: OpenCV needs at least three
 _MAX_CORNERS = 40
@@ -97,7 +97,8 @@ def find_corners(gray: npt.NDArray[np.uint8], board: Board) -> tuple[npt.NDArray
     A chessboard is found whole or not at all; of a ChArUco board, six corners are enough.
 
     Returns:
-        Indices ``(n,)`` of the corners in `Board.points`, and their pixels ``(n, 2)``; None without a board.
+        Indices ``(n,)`` of the corners in `Board.points`, and their pixels ``(n, 2)``, column and row, to a
+        fraction of a pixel; None if too few corners are found.
 
     Raises:
         MissingExtra: OpenCV is not installed.
@@ -122,7 +123,9 @@ def find_corners(gray: npt.NDArray[np.uint8], board: Board) -> tuple[npt.NDArray
 
 
 def write_board(path: Path, board: Board) -> None:
-    """Write an image of a board that prints at its true size: ``.pdf``, or ``.png`` with 300 dots per inch.
+    """Write an image of a board: ``.pdf``, which prints at its true size, or ``.png``.
+
+    A PNG has the true size if it is printed at 300 dots per inch, which the file does not state.
 
     Raises:
         UsageError: The file name has another ending, or the file cannot be written.

@@ -23,11 +23,14 @@ _MAX_FOCAL_DEVIATION_PERCENT = 2.0
 """Largest standard deviation of the focal length, percent of the focal length: above it the views are too
 similar."""
 _MIN_TILT_DEG = 20.0
-"""Angle that the boards of two views must have at least: without it, focal length and distance of the board
-cannot be told apart, and the standard deviation of the focal length says nothing."""
+"""Smallest value of the largest angle between the boards of any two views: without such an angle, focal
+length and distance of the board cannot be told apart, and the standard deviation of the focal length says
+nothing."""
 _MIN_MOTION_SHARE = 0.05
-"""Motion of the corners against any other view, as a share of the image width, above which a view is new."""
-_MAX_VIEW_ERROR_FACTOR = 2.5  # error of a view over the median of all views, above which the view is left out
+"""Motion of the corner that moved most, as a share of the image width, which a new view must reach against
+each earlier view."""
+_MAX_VIEW_ERROR_FACTOR = 2.5
+"""Reprojection error of a view over the median of all views, above which the view is left out."""
 _MAX_GOOD_VIEW_ERROR_PX = 0.1  # reprojection error of a view below which the view is never left out
 
 
@@ -38,7 +41,7 @@ class BoardViews:
     Attributes:
         board: The calibration board.
         size: Width and height of the images, px; None before the first image.
-        images: Number of images that were searched.
+        images: Number of images that were searched for the board.
         similar: Number of images that show the board, but too similar to an earlier view.
         views: Of each view, indices ``(n,)`` of the corners on the board, and their pixels ``(n, 2)``.
     """
@@ -51,6 +54,9 @@ class BoardViews:
 
     def add(self, gray: npt.NDArray[np.uint8]) -> bool:
         """Find the board in a grey image ``(h, w)``, and return whether the image is a new view of the board.
+
+        A new view is added to *views*; an image without the board, or too similar to an earlier view, is only
+        counted.
 
         Raises:
             UsageError: The image has another size than the images before.
@@ -76,7 +82,10 @@ class BoardViews:
     def _is_similar(
         self, first: tuple[npt.NDArray[np.int64], Array], second: tuple[npt.NDArray[np.int64], Array]
     ) -> bool:
-        """Return whether the corners that two views share have nearly the same pixels."""
+        """Return whether all corners that two views share have nearly the same pixels.
+
+        Views without a common corner are not similar.
+        """
         _, first_rows, second_rows = np.intersect1d(first[0], second[0], return_indices=True)
         assert self.size is not None
         if not len(first_rows):
@@ -86,10 +95,13 @@ class BoardViews:
 
 
 def calibrate(views: BoardViews, *, max_rms_px: float = 1.0, depth_scale: float | None = None) -> Intrinsics:
-    """Return the radial-tangential intrinsics that explain all views of a board best.
+    """Return the radial-tangential intrinsics that explain the views of a board best.
+
+    Views with a far larger error than the others are left out, unless fewer than 8 views remain; `rms_px` and
+    `views` of the result count the other ones only.
 
     Args:
-        views: The views of the board.
+        views: The views of the board, which stay as they are.
         max_rms_px: Largest root mean square reprojection error, px, of a calibration that is accepted.
         depth_scale: Units of the camera's depth images in a metre, which is copied into the result.
 
@@ -115,7 +127,8 @@ def calibrate(views: BoardViews, *, max_rms_px: float = 1.0, depth_scale: float 
     rms_px, K, distortion, rotations, _, deviations, _, view_errors_px = cv2.calibrateCameraExtended(
         points, pixels, views.size, None, None
     )
-    # 2. Calibrate again without views that are far worse than the others: blurred or half found.
+    # 2. Calibrate again without views that are far worse than the others (blurred or half found), if enough
+    # views remain.
     max_error_px = max(_MAX_VIEW_ERROR_FACTOR * float(np.median(view_errors_px)), _MAX_GOOD_VIEW_ERROR_PX)
     good_rows = np.flatnonzero(view_errors_px.ravel() <= max_error_px)
     if MIN_VIEWS <= len(good_rows) < len(points):

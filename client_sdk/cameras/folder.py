@@ -51,8 +51,11 @@ _PAIR_FOLDERS = ("{}", "image_{}", "images_{}", "{}_images", "img_{}", "rgb_{}")
 """Names of the folders of a stereo pair, with ``left`` or ``right`` in the place of the braces."""
 _ASSUMED_PERIOD_S = 0.1  # time between images where neither names nor intrinsics state times or a rate
 _MAX_PAIR_DIFFERENCE_S = 0.02  # between the times in the names of two images that are paired by time
-_NANOSECOND_DIGITS = 9  # ROS names images SECONDS.NANOSECONDS, often without leading zeros of the nanoseconds
+_NANOSECOND_DIGITS = 9
+"""Digits of whole nanoseconds in a name: ROS names images SECONDS.NANOSECONDS, often without leading zeros of
+the nanoseconds."""
 _NAME_WITH_TIME = re.compile(r"(?:[A-Za-z][A-Za-z_]*[-_]?)?(-?\d+(?:\.\d+)?)(?:[._-][A-Za-z]+)?")
+"""Name of an image that may state its time: a word or none, the number, and a word after a mark or none."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -62,8 +65,9 @@ class FolderImages:
     Attributes:
         name: Path of the folder, for messages.
         images: Colour images, or images of the left camera.
-        partners: For each image its depth image, or the image of the right camera; None without any.
-        stamps_s: ``(n,)``, time stamps of the images.
+        partners: For each image its depth image, or the image of the right camera; None if the folder has
+            neither.
+        stamps_s: ``(n,)``, s, time stamps of the images, which increase.
         doubts: Doubts about the time stamps, and about images without a partner.
         assumed: Sentences on what the folder does not state.
     """
@@ -120,7 +124,9 @@ class FolderImages:
         return width, height
 
     def frames(self, log: DoubtLog, depth_units_per_m: float | None) -> Iterator[RawFrame]:
-        """Yield the frames, not undistorted; *log* counts images that cannot be read.
+        """Yield the frames, not undistorted; *log* counts frames of which an image cannot be read.
+
+        These are left out.
 
         *depth_units_per_m* are the units of a depth image in a metre; with None, depth is not read.
         """
@@ -134,7 +140,10 @@ class FolderImages:
         return readable(range(len(self.images)), read, log)
 
     def pairs(self, log: DoubtLog) -> Iterator[RawPair]:
-        """Yield the stereo pairs, not rectified; *log* counts images that cannot be read."""
+        """Yield the stereo pairs, not rectified; *log* counts pairs of which an image cannot be read.
+
+        These are left out.  The partners must be the images of the right camera.
+        """
         rights = self.partners or ()
 
         def read(row: int) -> RawPair:
@@ -144,7 +153,9 @@ class FolderImages:
 
 
 def list_folder(folder: Path, rate_hz: float | None = None) -> FolderImages:
-    """Return the images of a folder; *rate_hz* is the rate of images whose names state no time (None: 10 Hz).
+    """Return the images of a folder, with their depth images if there are some.
+
+    *rate_hz* is the rate of images whose names state no time; None for 10 Hz.
 
     Raises:
         UsageError: There is no image, or there are depth images and none belongs to a colour image.
@@ -162,7 +173,10 @@ def list_folder(folder: Path, rate_hz: float | None = None) -> FolderImages:
 
 
 def pair_folders(folder: Path) -> tuple[Path, Path] | None:
-    """Return the folders of the left and of the right images of a stereo pair; None if one is missing."""
+    """Return the folders of the left and of the right images of a stereo pair, inside *folder*.
+
+    The first names of `_PAIR_FOLDERS` count of which both folders exist; None if there are none.
+    """
     for name in _PAIR_FOLDERS:
         left, right = (folder / name.format(side) for side in ("left", "right"))
         if left.is_dir() and right.is_dir():
@@ -196,7 +210,7 @@ def _order_by_time(
         rate_hz: Rate of images whose names state no time; None for 10 Hz.
 
     Raises:
-        UsageError: No image has a partner, or the time stamps are in no order.
+        UsageError: No image has a partner.
     """
     # 1. Take time stamps from names, or from the rate.
     doubts: tuple[Doubt, ...] = ()
@@ -227,7 +241,7 @@ def _order_by_time(
         images = [images[row] for row, _ in pairs]
         paired = [partners[row] for _, row in pairs]
         stamps_s = stamps_s[[row for row, _ in pairs]]
-    # 3. Sort the images by time, and leave out repeated time stamps.
+    # 3. Sort the images by time, and leave out images with the time stamp of the image before.
     order = np.argsort(stamps_s, kind="stable")
     times = TimeFacts(stated_by=name, stamps_s=stamps_s[order])
     rows, time_doubts = rows_in_time(times)
@@ -245,7 +259,8 @@ def _order_by_time(
 def _find_folder(folder: Path, names: Sequence[str]) -> Path | None:
     """Return the folder inside *folder* with the first of *names* that exists, None if none does.
 
-    Case and a number at the end are ignored: ``rgb_0`` has the name ``rgb``.
+    Case and a number at the end are ignored: ``rgb_0`` has the name ``rgb``.  Of several folders with the
+    same name, the first in alphabetical order is returned.
     """
     folders = sorted((path for path in folder.iterdir() if path.is_dir()), reverse=True)
     by_name = {path.name.lower().rstrip("_0123456789"): path for path in folders}
@@ -253,10 +268,12 @@ def _find_folder(folder: Path, names: Sequence[str]) -> Path | None:
 
 
 def _match_names(firsts: list[Path], seconds: list[Path]) -> list[tuple[int, int]]:
-    """Return the rows of files that belong together by their names; empty if no rule joins most of them.
+    """Return the pairs (index in *firsts*, index in *seconds*) of files that belong together by their names.
 
     The rules, in this order: equal names, equal numbers in the names, equal last numbers, equal first
-    numbers, and at last the nearest times.
+    numbers.  The first rule counts that tells all files of a list apart and joins more than half of the
+    shorter list.  If there is none, files whose names state times are paired with the nearest time within
+    20 ms, also if these are few.  The result is empty if no file is joined.
     """
     keys: tuple[Callable[[Path], Hashable], ...] = (
         lambda path: path.stem,
@@ -308,7 +325,8 @@ def _times_in_names(paths: Sequence[Path], name: str) -> tuple[Array | None, tup
 def _parse_seconds_and_nanoseconds(words: Sequence[str]) -> Array | None:
     """Return the times ``(n,)``, s, of words ``SECONDS.NANOSECONDS`` whose leading zeros are missing.
 
-    None means that the words are decimal numbers: no word has nine digits after the point, or all words have.
+    None means that the words are decimal numbers: the most digits after a point are not nine, or all words
+    have the same number of digits there.
     """
     parts = [word.partition(".") for word in words]
     lengths = {len(fraction) for _, _, fraction in parts}
@@ -318,7 +336,10 @@ def _parse_seconds_and_nanoseconds(words: Sequence[str]) -> Array | None:
 
 
 def _unevenness(stamps_s: Array) -> float:
-    """Return the median absolute deviation of the intervals of times ``(n,)`` over their median."""
+    """Return the median absolute deviation of the intervals of times ``(n,)``, divided by their median.
+
+    The times are sorted first.  The result is 0 for two times, and NaN for fewer.
+    """
     intervals_s = np.diff(np.sort(stamps_s))
     median_s = float(np.median(intervals_s)) if len(intervals_s) else 1.0
     return float(np.median(np.abs(intervals_s - median_s))) / max(median_s, 1e-12)

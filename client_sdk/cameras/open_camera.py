@@ -52,16 +52,19 @@ def open_camera(
 
     Args:
         source: ``0`` (a device), a video, a stream ``rtsp://...``, a folder of images, a recording of
-            `open_dataset`, ``realsense``, or the ``.bag`` of a RealSense camera.  Stereo: two devices ``0,2``
-            or videos ``LEFT,RIGHT``, a device or video that shows both images side by side (with a rig), a
-            folder with ``left/`` and ``right/``, or ``realsense-stereo``.
+            `open_dataset` other than a ROS bag, ``realsense``, or the ``.bag`` of a RealSense camera.
+            Stereo: two devices ``0,2`` or videos ``LEFT,RIGHT``, a device or video that shows both images
+            side by side (with a rig), a folder with ``left/`` and ``right/``, or ``realsense-stereo``.
         intrinsics: Intrinsics or rig of the cameras, or a file of them (``intrinsics.json``, ``rig.json``).
-            None for folders, recordings and RealSense cameras that state their own.
+            None for folders, recordings and RealSense cameras that state their own.  A recording takes a file
+            only; ``realsense`` uses intrinsics and no rig, folders of a stereo pair and ``realsense-stereo``
+            use a rig and no intrinsics: otherwise their own are used.
         rate_hz: Frames a second to deliver on average, see `client_sdk.datasets.thinning`; None for all.
         depth: Whether depth is read, where there is some.
         camera: ``left`` for the left camera of a rig alone, ``stereo`` for both; None for both where there
-            are two.
-        imu: Whether frames carry samples of an IMU; None for yes where there is one.
+            are two.  ``realsense`` ignores it.
+        imu: Whether frames carry samples of an IMU; None for yes where there is one, which only recordings
+            have.  RealSense cameras and stereo sources that are no recordings ignore it.
 
     Raises:
         UsageError: There is no such source, its intrinsics are missing, or facts about it contradict each
@@ -208,10 +211,10 @@ def source_of_frames(
     log: DoubtLog | None = None,
     span_s: tuple[float, float] | None = None,
 ) -> FrameStream:
-    """Return *frames* that are undistorted and registered already as a `FrameSource`.
+    """Return a `FrameSource` of *frames* that are undistorted already, and whose depth is registered.
 
-    Without *has_depth*, their depth is removed.  *close* releases the file of the frames.  All other
-    arguments are the fields of `SourceInfo`.
+    Without *has_depth*, the depth of each frame is replaced by one without readings.  *close* releases the
+    file of the frames.  All other arguments are the fields of `SourceInfo`.
     """
     empty_depth = make_empty_depth(camera)
 
@@ -231,7 +234,11 @@ def source_of_frames(
 
 
 def is_recording(path: Path) -> bool:
-    """Return whether `open_dataset` reads a path: a layout of TUM, EuRoC or KITTI, or NYU Depth V2."""
+    """Return whether a path is a recording for `open_dataset`, other than a ROS bag.
+
+    These are folders in the layout of TUM, EuRoC or KITTI, raw folders of NYU Depth V2, and any ``.mat``
+    file.
+    """
     is_raw = any(path.glob("d-*.pgm"))
     return path.suffix == ".mat" or is_listed(path) or is_raw or is_euroc(path) or is_kitti(path)
 
@@ -260,7 +267,9 @@ def _open_pair(
     close: Callable[[], None] | None = None,
     span_s: tuple[float, float] | None = None,
 ) -> FrameStream:
-    """Check the facts of a stereo pair, and return its frames, or those of the left camera for ``left``.
+    """Check the facts of a stereo pair, and return its frames, or for ``left`` those of the left camera.
+
+    Frames of the left camera alone are undistorted, not rectified.
 
     Raises:
         UsageError: Two facts contradict each other, or the rig has no stereo pair.

@@ -49,7 +49,10 @@ class Video:
 
     @property
     def span_s(self) -> tuple[float, float] | None:
-        """First and last presentation time of a file, s, by its stated number of frames; None of a device."""
+        """Start and end of a file, s: 0, and its stated number of frames times the time between two frames.
+
+        None of a device, a stream, or a file that states no number of frames.
+        """
         return (0.0, self.frame_count * self.period_s) if self.frame_count else None
 
 
@@ -123,7 +126,10 @@ def open_video(source: str, clock: Callable[[], float] = time.monotonic) -> Vide
 
 
 def _has_times(cv2: Any, source: str) -> bool:
-    """Return whether the presentation times of a file increase; some containers have none."""
+    """Return whether the presentation times of the first three frames of a file increase.
+
+    Some containers have no presentation times.  The result is True for fewer than two frames.
+    """
     capture = cv2.VideoCapture(source)
     try:
         times_ms = [
@@ -135,7 +141,10 @@ def _has_times(cv2: Any, source: str) -> bool:
 
 
 def _is_text(path: Path) -> bool:
-    """Return whether a file begins with printable text and is no YUV4MPEG2 video, whose head is text, too."""
+    """Return whether the first 64 bytes of a file are printable text; True also for an empty file.
+
+    A YUV4MPEG2 video, whose head is printable, too, is no text.
+    """
     try:
         with path.open("rb") as file:
             start = file.read(_TEXT_PROBE_BYTES)
@@ -145,7 +154,10 @@ def _is_text(path: Path) -> bool:
 
 
 def _silence_warnings(cv2: Any) -> None:
-    """Keep OpenCV from printing warnings of its own; since 4.14, the function is in another module."""
+    """Keep OpenCV from printing warnings of its own, in the whole process.
+
+    Since OpenCV 4.14, the function that does so is in another module.
+    """
     logging = cv2 if hasattr(cv2, "setLogLevel") else cv2.utils.logging
     logging.setLogLevel(0)
 

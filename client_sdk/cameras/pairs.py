@@ -31,7 +31,11 @@ class PairVideos:
     right: Video
 
     def facts(self, names: tuple[str, str]) -> SourceFacts:
-        """Return the facts that two videos state; *names* are their file names.  Devices state none."""
+        """Return the facts about both: of videos also the number of images and the time between them.
+
+        *names* are the names of both, left first; devices, and videos that state no number, give no such
+        facts.
+        """
         stated = {
             name: VideoFacts(frames=video.frame_count, period_s=video.period_s)
             for name, video in zip(names, (self.left, self.right), strict=True)
@@ -40,9 +44,11 @@ class PairVideos:
         return SourceFacts(name=self.name, videos=stated, assumed=(*self.left.notes, *self.right.notes))
 
     def pairs(self, log: DoubtLog) -> Iterator[RawPair]:
-        """Yield pairs: of devices, images as they come; of videos, images within 0.4 intervals of time.
+        """Yield pairs, with the time stamps of the left images, until one side has no more images.
 
-        *log* counts images of videos without a partner.
+        Of devices, images are paired as they come; of videos, images whose times differ by at most 0.4 image
+        intervals of the faster video.  *log* counts images of videos without a partner, but not those that
+        the longer video has left at the end.
         """
         # 0 for devices, whose images are taken as they come.
         max_difference_s = _MAX_TIME_DIFFERENCE * min(self.left.period_s, self.right.period_s)

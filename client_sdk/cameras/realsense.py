@@ -1,8 +1,8 @@
 """Open Intel RealSense cameras, and ``.bag`` files that they recorded: colour with depth, or infrared stereo.
 
 librealsense aligns depth to the colour image, and states the intrinsics.  The infrared cameras are used with
-the projector off, because its dots move with the camera, and would look like a scene that does not.  This
-module is tested with a stand-in of ``pyrealsense2`` only, not on a device.
+the projector off, because its dots move with the camera, and would look like a scene in which the camera is
+stationary.  This module is tested with a stand-in of ``pyrealsense2`` only, not on a device.
 """
 
 from __future__ import annotations
@@ -24,14 +24,15 @@ __all__ = ["open_realsense", "open_realsense_stereo"]
 
 _SIZE = (640, 480)  # width and height of the images that the camera is asked for, px
 _RATE_HZ = 30  # images a second that the camera is asked for
-_TIMEOUT_MS = 5000  # wait for an image, after which the camera counts as disconnected
+_TIMEOUT_MS = 5000  # wait for an image, after which a camera counts as disconnected, or a recording ends
 
 
 def open_realsense(bag: Path | None = None) -> tuple[Iterator[RawFrame], Intrinsics, Callable[[], None]]:
     """Open the colour and depth images of the first RealSense camera, or of a *bag* that a camera recorded.
 
     Returns:
-        The images, the intrinsics of the colour camera, and the function that closes the camera.
+        The images with their depth, the intrinsics of the colour camera, and the function that closes the
+        camera or the recording.
 
     Raises:
         MissingExtra: ``pyrealsense2`` is not installed.

@@ -46,7 +46,9 @@ __all__ = [
 
 _CHECKED_AT_START = 8  # stereo frames whose images are compared before the first one is delivered
 _CHECK_INTERVAL = 5  # stereo frames from one comparison of both images to the next, after the start
-_CHECKS_TO_REFUSE = 2  # successive comparisons that must show a fault: one alone may be of a blurred image
+_CHECKS_TO_REFUSE = 2
+"""Successive comparisons whose matches are taken together to find a fault: one comparison alone may be of a
+blurred image."""
 _Item = TypeVar("_Item", bound=tuple[Any, ...])
 
 RawFrame = tuple[float, npt.NDArray[np.uint8], "npt.NDArray[np.float32] | None"]
@@ -109,7 +111,8 @@ class FrameStream(AutoClose):
     """A `FrameSource` that makes a frame of each item of an iterator, in the order of time.
 
     An item is a tuple whose first element is the time stamp (s).  Items that exceed the wanted rate, and
-    items that are not later than the one before, are dropped before a frame is made; the latter add a doubt.
+    items that are not later than the frame delivered last, are dropped before a frame is made.  The first
+    item that is not later adds a doubt to *log*.
     """
 
     def __init__(
@@ -170,7 +173,10 @@ class FrameStream(AutoClose):
                 return self._make_frame(item)
 
     def _report_disorder(self, timestamp_s: float) -> None:
-        """Add a doubt about the first image that is not later than the image before."""
+        """Add a doubt about an image that is not later than the frame delivered last.
+
+        If the log has a doubt about the order of time already, nothing is added.
+        """
         if any(doubt.name is DoubtName.TIME_ORDER for doubt in self.log.doubts):
             return
         sentence = (
@@ -201,6 +207,8 @@ class RawSource(FrameStream):
         close: Callable[[], None] | None = None,
     ) -> None:
         """Take images from *raw* and undistort them by *intrinsics*; other arguments as of `FrameStream`.
+
+        The camera of *info* must be that of *intrinsics*.
 
         Raises:
             UsageError: The rate is not above 0.
@@ -260,6 +268,8 @@ class StereoSource(FrameStream):
     def __next__(self) -> Frame:
         """Return the next frame; both images of the first frames and of every fifth later one are compared.
 
+        The first call reads eight frames, which are delivered after their comparison, one in each call.
+
         Raises:
             UsageError: The cameras are swapped, not synchronised, or rectified wrongly.
         """
@@ -278,10 +288,11 @@ class StereoSource(FrameStream):
     def _check_later_pair(self, frame: Frame) -> None:
         """Refuse pairs that fitted at the start and no longer do.
 
-        If a camera loses an image, all its later images belong to another moment than those of the other one.
+        Each call counts a frame; every fifth frame is compared.  If a camera loses an image, all its later
+        images belong to another moment than those of the other one.
 
         Raises:
-            UsageError: Two successive comparisons show a fault.
+            UsageError: The matches of the last two comparisons together show a fault.
         """
         if self._delivered % _CHECK_INTERVAL == 1 and self._previous is not None:
             self._measurements.append(measure_pair(self._previous, frame))

@@ -29,9 +29,9 @@ class StereoCalibration:
 
     Attributes:
         rig: The rig; the frame of its body is that of the left camera.
-        baseline_m: Distance between both cameras.
-        rms_px: Root mean square reprojection error in both images.
-        views: Number of views in which both cameras see the board.
+        baseline_m: Distance between both cameras, metres.
+        rms_px: Root mean square reprojection error over both images, px.
+        views: Number of pairs of views that were used: their images have six or more corners in common.
     """
 
     rig: Rig
@@ -62,6 +62,9 @@ class PairViews:
     def add(self, left: npt.NDArray[np.uint8], right: npt.NDArray[np.uint8]) -> bool:
         """Find the board in two grey images ``(h, w)``, and return whether both are new views of the board.
 
+        Only then they are a pair.  If one of them is a new view, it still counts for the intrinsics of its
+        camera.
+
         Raises:
             UsageError: An image has another size than the images of this camera before.
         """
@@ -72,7 +75,7 @@ class PairViews:
 
 
 def calibrate_pair(views: PairViews, *, max_rms_px: float = 1.0) -> StereoCalibration:
-    """Return the stereo rig that explains all views of a board best.
+    """Return the stereo rig that explains the views of a board best.
 
     Args:
         views: The views of the board by both cameras.
@@ -95,7 +98,7 @@ def calibrate_pair(views: PairViews, *, max_rms_px: float = 1.0) -> StereoCalibr
             lenses.append(calibrate(views_of_side, max_rms_px=max_rms_px))
         except CommandFailed as error:
             raise CommandFailed(f"the {side} camera: {error.message}", hint=error.hint) from error
-    # 2. Select the corners that both cameras see.
+    # 2. Select of each pair the corners that both cameras see, and leave out pairs with fewer than six.
     points, left_pixels, right_pixels = [], [], []
     for left_view, right_view in views.pairs:
         left_indices, left_corners = views.left.views[left_view]
@@ -110,7 +113,7 @@ def calibrate_pair(views: PairViews, *, max_rms_px: float = 1.0) -> StereoCalibr
             f"both cameras see the board in {len(points)} views at once; a pair needs {MIN_VIEWS}",
             hint="hold the board where both cameras see it whole, still, from many sides",
         )
-    # 3. Estimate the pose between both cameras.
+    # 3. Estimate the pose between both cameras from these corners, with the intrinsics held fixed.
     cv2 = load_opencv()
     camera = lenses[0].camera
     rms_px, _, _, _, _, R, t, _, _ = cv2.stereoCalibrate(

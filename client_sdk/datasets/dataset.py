@@ -30,7 +30,7 @@ class Dataset:
         name: Name of the recording, for messages.
         camera: The pinhole camera of all frames; the rectified left one of a stereo pair.
         timestamps_s: Time stamps of the frames, s.
-        truth: Measured path of the camera, or None.
+        truth: Path of the camera to compare with, of the kind *truth_kind*; None without one.
         truth_kind: ``ground truth``, ``reference`` for poses that are an estimate of another program, or
             ``none``.
         rows: For each time stamp, the argument with which *read* reads its frame.
@@ -98,7 +98,13 @@ class Dataset:
             check_stereo_pairs(self.sample_pairs(), self.name)
 
     def sample_pairs(self) -> Iterator[tuple[Frame, Frame]]:
-        """Yield up to 14 frames spread over the recording, each with the next one, without damaged images."""
+        """Yield up to 14 frames, spread over the recording, each with the frame after it.
+
+        Pairs with an image that cannot be read are left out, and not counted in `doubts`.
+
+        Raises:
+            UnreadableImage: Each pair has an image that cannot be read.
+        """
 
         def read(rows: tuple[int, int]) -> tuple[Frame, Frame]:
             return self.read(rows[0]), self.read(rows[1])
@@ -106,9 +112,10 @@ class Dataset:
         return readable(choose_pairs(self.rows), read, DoubtLog())
 
     def thinned(self, rate_hz: float) -> Dataset:
-        """Return the recording at *rate_hz* on average; unchanged if its own rate is not higher.
+        """Return a recording of some of the frames: *rate_hz* on average, or all if there are not more.
 
-        `Thinning` selects the frames, so that jitter of the time stamps drops no frame.
+        This recording stays as it is; both share their *log*.  `Thinning` selects the frames, so that jitter
+        of the time stamps drops no frame.
 
         Raises:
             UsageError: The rate is not above 0.
@@ -118,7 +125,9 @@ class Dataset:
         return self._select(indices)
 
     def share(self, robot: int, robots: int) -> Dataset:
-        """Return the ``ceil(n / robots)`` consecutive frames that *robot* 0, 1, ... plays.
+        """Return a recording of the consecutive frames that *robot* 0, 1, ... plays.
+
+        They are ``ceil(n / robots)`` of the n frames; the last robots get what is left, fewer or none.
 
         Raises:
             UsageError: The robot is not within 0..robots - 1.

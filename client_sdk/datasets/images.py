@@ -39,7 +39,7 @@ _NO_READING = 65535  # value of a 16-bit depth image with which some recorders m
 _WHITE_PERCENTILE = 99.9
 """Percentile of a 16-bit image's values that becomes white: brighter pixels are defects of the sensor."""
 _BRIGHTNESS_STRIDE = 4
-"""Rows and columns between the pixels from which the brightness of an image is measured."""
+"""Step in rows and columns between the pixels from which the brightness of a 16-bit image is measured."""
 
 
 class UnreadableImage(UsageError):
@@ -72,7 +72,7 @@ def is_image(path: Path) -> bool:
 
 
 def image_files(folder: Path) -> list[Path]:
-    """Return the image files of a folder, in the order of the numbers in their names, then of their names."""
+    """Return the image files directly in a folder, by the numbers in their names and then by their names."""
     paths = [path for path in folder.iterdir() if is_image(path)]
     return sorted(paths, key=lambda path: (numbers_in_name(path), path.name))
 
@@ -83,10 +83,12 @@ def numbers_in_name(path: Path) -> tuple[int, ...]:
 
 
 def readable(rows: Iterable[_Row], read: Callable[[_Row], _Result], log: DoubtLog) -> Iterator[_Result]:
-    """Yield ``read(row)`` for each row, and count in *log* the rows whose image cannot be read.
+    """Yield ``read(row)`` for each row, and leave out rows whose image cannot be read.
+
+    *log* counts the rows that are left out.
 
     Raises:
-        UnreadableImage: The image of every row cannot be read.
+        UnreadableImage: There are rows, and the image of none can be read; raised after the last row.
     """
     failed: UnreadableImage | None = None
     is_empty = True
@@ -105,6 +107,8 @@ def readable(rows: Iterable[_Row], read: Callable[[_Row], _Result], log: DoubtLo
 
 def probe(rows: Sequence[_Row], read: Callable[[_Row], _Result]) -> list[_Result]:
     """Return ``read(row)`` for the first, the middle and the last row, without those that cannot be read.
+
+    The list is empty if there is no row.
 
     Raises:
         UnreadableImage: None of the three can be read.

@@ -15,7 +15,7 @@ _SAME_RATE_RATIO = 1.05
 """Ratio of the frame interval at the wanted rate to that of the recording, up to which both rates count as
 the same: cameras of 30 Hz have 29.97 or 30.2 Hz."""
 _INTERVAL_WINDOW = 31
-"""Latest time stamps of a live camera, whose median interval is taken as its frame interval."""
+"""Number of the latest time stamps of a live camera, whose median interval is taken as its frame interval."""
 _ROUNDING_S = 1e-6  # error of time stamps and periods that are rounded decimal fractions
 
 
@@ -45,7 +45,10 @@ class Thinning:
         self._start_s = self._due_s = self._selected_s = -math.inf
 
     def selects(self, timestamp_s: float) -> bool:
-        """Return whether the next frame, whose time stamp is *timestamp_s*, is selected."""
+        """Return whether the next frame, whose time stamp is *timestamp_s*, is selected.
+
+        Call it once for each frame, in the order of time: the answer depends on the frames before.
+        """
         if self._interval_s is None:
             self._recent.append(timestamp_s)
         interval_s = median_interval_s(self._recent) if self._interval_s is None else self._interval_s
