@@ -90,8 +90,9 @@ class MapServerThreads:
     def compute(self, urgency: Urgency, act: Callable[[], _T]) -> Awaitable[_T]:
         """Call *act* in the thread of the map, the only thread that reads or changes the map.
 
-        Work of the same urgency is done in the order of the calls.  The work goes on if its caller is
-        cancelled.
+        Work of the same urgency is done in the order of the calls.  If the caller that awaits the result is
+        cancelled, the work is done all the same.  An exception of *act* is raised where the result is
+        awaited.
         """
         future: Future[_T] = Future()
 
@@ -107,11 +108,11 @@ class MapServerThreads:
         return asyncio.shield(asyncio.wrap_future(future))
 
     def match(self, act: Callable[[], _T]) -> Awaitable[_T]:
-        """Call *act* in one of three threads for matching; *act* works on copies of data of the map."""
+        """Call *act* in one of three threads for matching; *act* must work on copies of the map's data."""
         return self._run(self._matching, act)
 
     def store(self, act: Callable[[], _T]) -> Awaitable[_T]:
-        """Call *act*, which may block on the object store, in the thread that writes the log."""
+        """Call *act*, which may block on the object store, in the thread that writes entries of the log."""
         return self._run(self._log, act)
 
     def lease(self, act: Callable[[], _T]) -> Awaitable[_T]:
@@ -119,7 +120,10 @@ class MapServerThreads:
         return self._run(self._lease, act)
 
     def background(self, act: Callable[[], _T]) -> Awaitable[_T]:
-        """Call *act*, which may block, in the low-priority thread for snapshots, versions and deletions."""
+        """Call *act*, which may block, in the low-priority thread for snapshots, versions and deletions.
+
+        The thread does one thing at a time, in the order of the calls.
+        """
         return self._run(self._background, act)
 
     def _run(self, pool: ThreadPoolExecutor, act: Callable[[], Any]) -> Awaitable[Any]:
@@ -146,8 +150,10 @@ class MapImplementation:
 
     Attributes:
         empty: Makes a map without keyframes.
-        restore: Makes a map from the head of a snapshot and a function that reads its parts by name.
-        started_from: Makes the first event of a map that starts from a version of the registry and its name.
+        restore: Makes a map from the head of a snapshot and a function that reads its parts by name; raises
+            BadRequest if the snapshot is damaged.
+        started_from: Makes the first event of a map that starts from a version of the registry, given the
+            version and its name.
     """
 
     empty: Callable[[], LiveMap]
@@ -177,8 +183,8 @@ class MapServerEnvironment:
         log: Log of the server.
         send_update: Sends an update payload to every worker that has subscribers of the map.
         on_renewal: Called with the number of each successful renewal of the lease.
-        on_use: Called with True when the first command arrives, and with False after a time without any.
-        optimise: Optimises the whole pose graph of the map; called in a thread.
+        on_use: Called with True when commands begin to arrive, and with False after a time without any.
+        optimise: Optimises the whole pose graph of the map; called in a thread for matching.
     """
 
     map_name: str

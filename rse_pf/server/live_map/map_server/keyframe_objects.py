@@ -26,7 +26,7 @@ from rse_pf.slam.ply import Colours, Points
 __all__ = ["KeyframeObjects", "PointCloud"]
 
 _MAX_SOURCES = 4_000
-"""Largest number of keyframes whose points are read for one point cloud, which bounds the time of a
+"""Largest number of keyframes whose points are used in one point cloud, which bounds the time of a
 publication."""
 _MAX_POINTS = 3_000_000
 """Largest number of points of a cloud before it is thinned to one for each voxel: they take about 400 MB of
@@ -35,8 +35,8 @@ _MAX_CACHED_BYTES = 128 << 20
 """Memory in bytes for encoded points of keyframes that are kept for the cloud of the next version, so that
 they need not be read from the object store again."""
 _MAX_DISTANCE_M = 100.0
-"""Points are left out if a coordinate in the camera frame is above this distance in metres: a camera that
-reports such points has no metric depth."""
+"""Points are left out if the absolute value of a coordinate in the camera frame is above this distance in
+metres: a camera that reports such points has no metric depth."""
 _DELETIONS = 2
 """How often the objects of a forgotten robot are deleted: an upload may arrive after the first deletion."""
 _CULLED_OBJECTS_DELAYED = 64
@@ -51,7 +51,8 @@ class PointCloud:
         points: ``(m, 3)`` float32 in metres, in the world frame of the version.
         colours: ``(m, 3)`` uint8, RGB.
         keyframes: Number of keyframes whose points are in the cloud.
-        missing: Number of keyframes whose points could not be read.
+        missing: Number of keyframes that were selected for the cloud, but whose points are missing or not
+            valid.
     """
 
     points: Points
@@ -78,9 +79,9 @@ class KeyframeObjects:
     def build_cloud(self, sources: Sequence[PointSource]) -> PointCloud:
         """Build the point cloud of a version from the stored points of its keyframes.
 
-        Of more than 4,000 keyframes an even selection is used, with the same number from each robot.  The
-        points are transformed by the optimised poses of their keyframes and thinned to one for each voxel of
-        1 cm.
+        Of more than 4,000 keyframes, `_select_evenly` chooses 4,000.  The points are transformed by the
+        optimised poses of their keyframes and thinned to one for each voxel of 1 cm.  Without any readable
+        points the cloud is empty.
 
         Raises:
             StoreError: The store fails.
@@ -106,7 +107,9 @@ class KeyframeObjects:
         )
 
     def delete(self, objects: Iterable[tuple[str, str]]) -> None:
-        """Delete objects, given as pairs of a robot's folder and a digest; missing objects are skipped.
+        """Delete objects, given as pairs of a robot's folder and a digest, and credit the tenant's account.
+
+        Missing objects are skipped.
 
         Raises:
             StoreError: The store fails; the remaining objects are not deleted.
@@ -120,7 +123,7 @@ class KeyframeObjects:
                 self._account.release(size_bytes)
 
     def delete_of_forgotten(self, objects: Iterable[tuple[str, str]]) -> None:
-        """Delete the objects of forgotten robots; each object is deleted by the first two calls for it only.
+        """Delete the objects of forgotten robots; a third and later call with the same object ignores it.
 
         The second deletion removes an object whose upload arrived after the first one.
 
@@ -133,7 +136,9 @@ class KeyframeObjects:
                 self._deletions[folder_and_digest] += 1
 
     def delete_of_culled(self, objects: Iterable[tuple[str, str]]) -> None:
-        """Delete the objects of culled keyframes, except for the last 64, whose uploads may still arrive.
+        """Queue the objects of culled keyframes, and delete all but the 64 that were queued last.
+
+        The uploads of those 64 may still arrive; they are deleted by later calls.
 
         Raises:
             StoreError: The store fails; the object that was due is then deleted only when its robot is
@@ -144,9 +149,11 @@ class KeyframeObjects:
             self.delete([self._culled.popleft()])
 
     def _read_points(self, source: PointSource, old_cache: dict[str, bytes]) -> tuple[Array, Colours] | None:
-        """Return the points (m, in the camera frame) and colours of one keyframe, or None if unreadable.
+        """Return the points (m, in the camera frame) and colours of one keyframe.
 
-        *old_cache* has the objects that were read for the last cloud, by object name.
+        Points that are too far away are left out.  None if the object is missing, has another size or digest
+        than the keyframe says, or holds no valid points.  The bytes are kept in the cache if there is room.
+        *old_cache* has the objects that were kept for the last cloud, by object name.
         """
         digest, size_bytes = source.reference.digest, source.reference.size
         name = f"objects/{source.robot}/{digest}"
@@ -172,7 +179,10 @@ class KeyframeObjects:
 
 
 def _select_evenly(sources: Sequence[PointSource]) -> list[PointSource]:
-    """Select at most 4,000 keyframes: equally many of each robot, spread evenly over its trajectory."""
+    """Select at most 4,000 keyframes, spread evenly over the trajectory of each robot, in the given order.
+
+    Each robot gets the same number; what a robot with fewer keyframes does not need goes to the others.
+    """
     rows_by_robot: dict[str, list[int]] = {}
     for row, source in enumerate(sources):
         rows_by_robot.setdefault(source.robot, []).append(row)

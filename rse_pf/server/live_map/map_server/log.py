@@ -46,23 +46,27 @@ __all__ = [
 ]
 
 _MIN_ENTRIES_BETWEEN_SNAPSHOTS = 40
-"""Log entries between two snapshots of a small map; a restart applies them again in less than 0.2 s."""
+"""Fewest log entries between two snapshots, as of a small map; a restart applies them again in less than
+0.2 s."""
 _MAX_ENTRIES_BETWEEN_SNAPSHOTS = 200
-"""Log entries between two snapshots of a large map; a restart applies them again in less than 0.8 s."""
+"""Most log entries between two snapshots, as of a large map; a restart applies them again in less than
+0.8 s."""
 _ENTRIES_PER_KEYFRAME = 0.25
-"""Log entries between two snapshots for each keyframe in the map: a snapshot of a larger map costs more, so
-snapshots are written less often."""
+"""Log entries between two snapshots for each keyframe in the map, within the two limits above: a snapshot of
+a larger map costs more, so snapshots are written less often."""
 _SNAPSHOTS_KEPT = 2
 """Number of snapshots of a map that are kept: if the newest is damaged, a restart uses the one before."""
 _MAX_ENTRY_EVENTS = 64
 """Largest number of events in one log entry; it bounds the time for which an entry occupies the map."""
 _MAX_ENTRY_BYTES = 4 << 20
-"""Largest total size in bytes of the keyframes that share one log entry; it bounds the time of a write."""
+"""Largest total size in bytes of the keyframes that share one log entry; it bounds the time of a write.  A
+larger keyframe has an entry of its own."""
 _MAX_QUEUED_EVENTS = 1024
-"""Number of events that may wait for the object store; beyond it, keyframes are refused with Busy."""
+"""Number of events that may wait for the object store; beyond it, keyframes are refused with Busy, and other
+events still wait."""
 SLOW_STORE_S = 1.0
-"""Seconds after which a write to the object store counts as slow, and robots are sent the state "waiting for
-the store"."""
+"""Seconds after which a write to the object store counts as slow, and subscribers are sent the state "waiting
+for the store"."""
 BUSY_RETRY_MS = 200.0
 """Milliseconds after which a robot sends a request again that a live map refused as busy."""
 
@@ -92,7 +96,7 @@ class LogEntry(msgspec.Struct, frozen=True, array_like=True):
 
 class _StoredSnapshot(msgspec.Struct, frozen=True, array_like=True):
     digest: str  # SHA-256 of the head, by which a damaged snapshot is recognised
-    unmeasured: tuple[int, ...]
+    unmeasured: tuple[int, ...]  # see MapSnapshot
     head: bytes
     parts: dict[str, str] = {}  # names of the objects below features/, keyed by the name of the part
 
@@ -120,7 +124,7 @@ _decode_snapshot = msgspec.msgpack.Decoder(_StoredSnapshot).decode
 
 
 def entries_between_snapshots(keyframes: int) -> int:
-    """Return after how many log entries the next snapshot of a map with this many *keyframes* is written.
+    """Return how many log entries after the last snapshot of a map with *keyframes* the next one is written.
 
     The number balances the time of a restart, which applies each entry again in 2 to 4 ms, against the cost
     of a snapshot, which grows with the map: a quarter of the keyframes, at least 40, at most 200.
@@ -159,7 +163,8 @@ class LiveLog:
         self.position = base
         """Number of the entry that was read or written last."""
         self.stored_parts: dict[str, str] = {}
-        """Names of the objects of the parts of the newest snapshot that was read or written, by part."""
+        """For each part of the newest snapshot that was read or written, the name of its object below
+        ``features/``, keyed by the name of the part."""
         self._store = store
         self._entry_prefix = f"{folder}log/"
         self._snapshot_prefix = f"{folder}snapshot/"
@@ -170,10 +175,10 @@ class LiveLog:
         self._keeps_all = keeps_all
 
     def read_snapshots(self) -> Iterator[MapSnapshot]:
-        """Yield the undamaged snapshots, the newest first, with None for each part.
+        """Yield the snapshots whose heads are undamaged, the newest first, with None for each part.
 
         `position` and `stored_parts` are set to those of the yielded snapshot.  After the last one, they are
-        set to the base of the log and to no parts.
+        set to the base of the log and to no parts.  Snapshots up to the base do not belong to the map.
 
         Raises:
             StoreError: The store fails.
@@ -203,7 +208,7 @@ class LiveLog:
         return self._store.get(f"{self._part_prefix}{self.stored_parts.get(name, name)}")
 
     def read_entries(self) -> Iterator[LogEntry]:
-        """Yield the entries after `position` in their order; `position` is set to each yielded entry.
+        """Yield the entries after `position` in their order; `position` is set to the number of each.
 
         Raises:
             StoreError: The store fails, or an entry is missing or damaged.
@@ -249,10 +254,14 @@ class LiveLog:
     def write_snapshot(self, snapshot: MapSnapshot) -> None:
         """Write a snapshot durably, and delete snapshots, parts and entries that a restart no longer needs.
 
+        The two newest snapshots stay.  Entries up to the older of both are deleted, or only those up to the
+        base of the log if it keeps all.  `stored_parts` is set to the parts of *snapshot*.
+
         Raises:
-            StoreError: The store fails, or a part of the snapshot is neither given nor stored.
+            StoreError: The store fails, and the snapshot may be stored or not; or a part of the snapshot is
+                neither given nor stored, and the snapshot is not written.
         """
-        # 1. The parts are written first, so that a snapshot in the store is always complete.
+        # 1. Write the parts first, so that a snapshot in the store is always complete.
         parts: dict[str, str] = {}
         for name, data in snapshot.parts.items():
             if data is None:
@@ -265,10 +274,10 @@ class LiveLog:
             else:
                 parts[name] = f"{self._epoch:09d}-{name}"
                 self._store.put(f"{self._part_prefix}{parts[name]}", data)
-        # 2. The head of the snapshot is written.
+        # 2. Write the head of the snapshot.
         stored = _StoredSnapshot(digest_of(snapshot.head), snapshot.unmeasured, snapshot.head, parts)
         self._store.put(self._snapshot_name(snapshot.position), _encode(stored))
-        # 3. Older snapshots are deleted, then the parts and the entries that only they needed.
+        # 3. Delete older snapshots, and then the parts and the entries that only they needed.
         stored_snapshots = self._store.list(self._snapshot_prefix)
         numbers = sorted(_number_in(stored_object.name) for stored_object in stored_snapshots)
         remaining = [number for number in numbers if number > self._base][-_SNAPSHOTS_KEPT:]
@@ -280,7 +289,7 @@ class LiveLog:
             self._delete_entries_until(remaining[0])
 
     def charged_bytes(self) -> int:
-        """Return the bytes of log, snapshots and parts that count for the tenant's quota.
+        """Return for how many bytes of the tenant's quota the log, its snapshots and their parts count.
 
         Raises:
             StoreError: The store fails.
@@ -289,7 +298,9 @@ class LiveLog:
         return sum(self._store.usage(prefix).charged_bytes for prefix in prefixes)
 
     def delete_until(self, number: int) -> None:
-        """Delete all entries and snapshots up to *number*, at which the map was stopped, and their parts.
+        """Delete all entries and snapshots up to *number*, at which the map was stopped, and all parts.
+
+        Parts of later epochs stay.
 
         Raises:
             StoreError: The store fails; the remaining objects are not deleted.
@@ -347,7 +358,8 @@ class SubmittedEvent:
     Attributes:
         event: The event.
         size_bytes: Size of the keyframe in the event; 0 for short events.
-        applied: Gets the outcomes of the event when it is durable and applied to the map.
+        applied: Gets the outcomes of the event when it is durable and applied to the map, or the error with
+            which it is refused.
     """
 
     event: Event
@@ -376,8 +388,9 @@ class LogWriter:
             log: Log of the map.
             environment: Environment of the map server.
             apply_entry: Called with the number and the events of each entry when it is durable; applies the
-                events to the map and sets the result of each ``applied``.
-            on_waiting: Called with True when the store is slow or fails, with False when it works again.
+                events to the map and completes each ``applied``.
+            on_waiting: Called during and after each try to write an entry: with True if the try takes longer
+                than 1 s, or if it failed and was not the first one, else with False.
             on_lost: Called with a reason when another process has taken the map over.
         """
         self._log = log
@@ -392,11 +405,12 @@ class LogWriter:
     def submit(self, event: Event, size_bytes: int = 0) -> asyncio.Future[list[Outcome]]:
         """Queue *event* for the log and return a future for its outcomes.
 
-        The future is done when the event is durable and applied to the map.
+        The future is done when the event is durable and applied to the map, or fails with the error with
+        which the event is refused.  To cancel the future does not withdraw the event.
 
         Args:
             event: Keyframe or other event.
-            size_bytes: Size of the keyframe in the event.
+            size_bytes: Size of the keyframe in the event; 0 for an event without one.
 
         Raises:
             Busy: The event is a keyframe, and 1,024 events wait for the store.
@@ -428,7 +442,11 @@ class LogWriter:
                 future.set_exception(make_error())
 
     async def run(self) -> None:
-        """Write queued events to the log, and have them applied, until this task is cancelled."""
+        """Write queued events to the log, and have them applied, until this task is cancelled.
+
+        If the store has no space for an entry, its keyframes are refused, and its other events are written
+        without them.
+        """
         while True:
             await self._has_events.wait()
             batch = self._next_batch()
@@ -456,8 +474,8 @@ class LogWriter:
     async def _make_durable(self, batch: list[SubmittedEvent]) -> int:
         """Write *batch* as the next entry, retry while the store fails, and return the entry's number.
 
-        Every try writes the same bytes, because a failed one may have been stored.  After the loss of the
-        lease, this method reports the loss and never returns.
+        Every try writes the same bytes, because the entry of a failed try may be stored.  If another process
+        has written an entry with this number, the loss of the map is reported, and this method never returns.
 
         Raises:
             StoreFull: There is no space for the keyframes of *batch*, and the entry was not stored.

@@ -87,20 +87,22 @@ from rse_pf.wire.live_map import (
 __all__ = ["MapMoving", "MapServer", "ServiceEnd"]
 
 PUBLISH_INTERVAL_S = 600.0
-"""Seconds between two automatic versions of a live map that changes and is in use."""
+"""Seconds between two requests of a map server to its `Publisher` for a version of the map with the note
+`NOTE_CHANGED`; a map that has not changed gets none."""
 _SETTLED_S = 5.0
-"""Seconds after which a map server counts as stable, so that earlier failures no longer delay a takeover.  A
-map server that has measured all its keyframes counts as stable at once."""
+"""Seconds after its start at which a map server counts as stable, so that earlier failures no longer delay a
+takeover.  A map server that has measured keyframes and has none left to measure counts as stable at once."""
 _MAX_FINAL_PUBLICATION_S = 3.0
 """Seconds for which the release of a map waits for the publication of its last version; if that takes longer,
 the next map server publishes the version."""
 _UNUSED_SHARE = 1.0 / 6.0
-"""A map counts as watched only, and not used, when it got no command for this share of ``live.idle_s``."""
+"""A map without any command for this share of ``live.idle_s`` counts as watched only, and not used: its
+process may be taken for another map."""
 _EVENT_OVERHEAD_BYTES = 512
-"""Bytes that are charged to the quota for the event of a keyframe in the log, in addition to the keyframe."""
-_WAITING_FOR_STORE = "waiting for the store"
+"""Bytes that are charged to the tenant's quota for each keyframe in the log, in addition to its own bytes."""
+_WAITING_FOR_STORE = "waiting for the store"  # state of the map that subscribers are sent
 _ALIGNMENT_OUTCOMES = (Joined, Corrected, Unaligned, Ambiguous, LoopClosureRejected)
-"""Classes of outcomes after which the alignments of robots are compared with those that were sent."""
+"""Classes of outcomes after which the alignments of robots are compared with those that were sent last."""
 
 ServiceEnd = Literal["lost", "released", "stopped", "defect"]
 """Why a map server stopped serving: another process took the map, it was given up, an operator ended it, or
@@ -119,7 +121,8 @@ class MapMoving(Busy):
 class MapServer:
     """Answers requests to one live map, writes its log, and keeps its lease.
 
-    All methods are called in the event loop; the map itself is used in a thread of its own.
+    All methods are called in the event loop, except those whose docstrings name the thread of the map, the
+    only thread that uses the map itself.
     """
 
     def __init__(
@@ -134,7 +137,8 @@ class MapServer:
             lease: Lease of the map, which this process has claimed.
         """
         self.users = 0
-        """Number of connected workers, which `WorkerConnections` maintains; a map without any is given up."""
+        """Number of connected workers, which `WorkerConnections` maintains; after ``live.idle_s``
+        without one, the map is given up."""
         self._environment = environment
         self._state = state
         self._log = log
@@ -152,11 +156,11 @@ class MapServer:
         self._publisher = Publisher(state, environment, server=lease.record.server)
         # Keyframes that are being added, keyed by RobotId.folder and keyframe number.
         self._additions: dict[tuple[str, int], asyncio.Task[None]] = {}
-        self._present_robots: dict[str, None] = {}
+        self._present_robots: dict[str, None] = {}  # robots that sent keyframes and have not left, by folder
         self._renewed = asyncio.Event()
-        self._snapshot_position = 0
-        self._bytes_since_snapshot = 0
-        self._has_unsent_updates = False
+        self._snapshot_position = 0  # entry of the log at the last snapshot of this process; 0: none
+        self._bytes_since_snapshot = 0  # bytes that were charged for entries since then
+        self._has_unsent_updates = False  # whether an update was not sent because the lease was too old
         self._is_waiting_for_store = False
         self._is_closing = False
         self._idle_since_s = self._began_s = environment.clock()
@@ -167,11 +171,17 @@ class MapServer:
         self._tasks: set[asyncio.Task[None]] = set()
 
     def current_updates(self) -> list[dict[str, Any]]:
-        """Return the newest updates for a new subscriber; none while another process may hold the lease."""
+        """Return the newest update of each key for a new subscriber.
+
+        The list is empty while another process may hold the lease.
+        """
         return self._updates.all() if self._holds_lease() else []
 
     async def run(self) -> ServiceEnd:
-        """Serve until the map is lost, released or stopped, or a task fails; return which."""
+        """Serve until the map is lost, released or stopped, or a task of this object fails; return which.
+
+        At the end, all tasks are cancelled, and events that are not applied yet are refused with `MapMoving`.
+        """
         alignments = await self._environment.threads.compute(Urgency.APPLY, self._state.live_map.alignments)
         self._updates.set_alignments(alignments, (), self._state.position)
         self._send_map_state()
@@ -192,6 +202,9 @@ class MapServer:
 
     async def answer(self, robot: RobotId, operation: str, request: bytes) -> dict[str, Any]:
         """Do what a robot or an operator requests, and return the reply.
+
+        While the lease is too old, the finished reply is held back until the lease is renewed or lost; only
+        that of ``live-stop``, which gives the lease up, is not.
 
         Args:
             robot: Robot that asks.
@@ -216,7 +229,11 @@ class MapServer:
         return reply
 
     async def release(self) -> None:
-        """Write what waits and a snapshot, and give the lease up, so that any server may take the map."""
+        """Give the map up, so that any server may take it.
+
+        Submitted events are written and applied, a snapshot is written, a requested version is published if
+        that takes at most 3 s, and the lease is released, which is tried until the store works.
+        """
         await self._close(self._lease.release, "released")
 
     # --- Requests of robots and operators to the live map ---
@@ -260,24 +277,31 @@ class MapServer:
         return {"number": event.number + 1, "version": self._state.position}
 
     async def _add_keyframe(self, event: KeyframeAdded) -> None:
-        """Return when a keyframe is durable and applied; raise the error with which it is refused."""
+        """Write a keyframe to the log and wait until it is applied to the map.
+
+        A keyframe that the map has already is not written again.
+
+        Raises:
+            RsePfError: The keyframe is refused, for example because it is not valid, or above the quota.
+        """
         compute, live_map = self._environment.threads.compute, self._state.live_map
         while True:
-            # 1. The keyframe is validated against the map.
+            # 1. Validate the keyframe against the map; the robot may have sent it before.
             verdict = await compute(Urgency.VALIDATE, functools.partial(live_map.check_keyframe, event))
             if verdict == "known":
                 return
-            # 2. The robot's next keyframe is charged, logged and applied.
+            # 2. Charge, log and apply the keyframe if it is the robot's next one.
             if verdict == "new":
                 await self._charge(len(event.data) + _EVENT_OVERHEAD_BYTES)
                 await asyncio.shield(self._writer.submit(event, len(event.data)))
                 return
-            # 3. A later keyframe waits until the one before is applied, and is validated again.
+            # 3. Otherwise its number is too high: wait for the keyframe before it, if that is being added,
+            # and validate this one again.
             previous = self._additions.get((event.robot, event.number - 1))
             if previous is not None:
                 await asyncio.wait({previous})
                 continue
-            # 4. A later keyframe whose predecessor was not sent is refused.
+            # 4. Refuse the keyframe if the one before it was not sent.
             expected = await compute(Urgency.VALIDATE, functools.partial(live_map.next_number, event.robot))
             if event.number > expected:
                 raise Conflict(
@@ -286,14 +310,16 @@ class MapServer:
                 )
 
     async def _charge(self, size_bytes: int) -> None:
-        """Charge the tenant's quota with a log entry of *size_bytes*.
+        """Charge the tenant's quota with *size_bytes* that are written to the log next.
 
         A snapshot stores the features of keyframes a second time before the log is shortened, so the bytes
-        that were logged since the last snapshot must be free as well.
+        that were logged since the last snapshot must be free as well.  If the store fails in
+        another way than by StoreFull, nothing is charged: the entry waits for the store and is counted later.
 
         Raises:
             QuotaExceeded: The tenant would store more than its quota.
             StoreFull: The disk is nearly full, and the tenant holds more than its share.
+            Busy: Other processes changed the account at each try.
         """
         account = self._environment.account
         if not account.try_charge(size_bytes):
@@ -333,9 +359,15 @@ class MapServer:
         return {}
 
     async def _forget_robot(self, request: LiveForget) -> dict[str, Any]:
-        """Remove all that a robot contributed to the map; raises NotFound if it contributed nothing.
+        """Remove all that a robot contributed to the map, and delete its stored points and images.
 
-        A robot that was enrolled several times under one name is removed completely.
+        A robot that was enrolled several times under one name is removed completely; the reply counts these
+        enrolments.
+
+        Raises:
+            NotFound: The robot contributed nothing.
+            StoreError: The objects could not be deleted; the robot is removed from the map all the same, and
+                the next publication deletes them.
         """
         contributors = await self._environment.threads.compute(
             Urgency.ANSWER, lambda: list(self._state.live_map.contributors)
@@ -353,7 +385,7 @@ class MapServer:
         return {"forgotten": len(folders), "version": self._state.position}
 
     async def _delete_objects_of_forgotten(self) -> None:
-        """Delete points and images of forgotten robots from the store; raises StoreError."""
+        """Delete points and images of all robots that were forgotten from the store; raises StoreError."""
         threads, objects = self._environment.threads, self._environment.objects
         forgotten = await threads.compute(Urgency.ANSWER, lambda: self._state.live_map.deletable_objects)
         if forgotten:
@@ -375,7 +407,10 @@ class MapServer:
             await self._delete_objects_of_forgotten()
 
     async def _start_map(self, request: LiveStart) -> dict[str, Any]:
-        """Begin an empty map, or a map with the keyframes of a version; raises Conflict if it has begun."""
+        """Begin an empty map, or a map with the keyframes of a version; raises Conflict if it has begun.
+
+        An empty map without ``equal_rooms_m`` is not written to the log, and may be begun again.
+        """
         map_name, background = self._environment.map_name, self._environment.threads.background
         if self._state.changes or self._state.keyframes:
             raise Conflict(
@@ -396,15 +431,19 @@ class MapServer:
         return {"keyframes": self._state.keyframes, "version": self._state.position}
 
     async def _stop_map(self) -> dict[str, Any]:
-        """Publish the map, give its lease up as stopped, and delete its log."""
+        """Publish the map, give its lease up as stopped, and delete its log.
+
+        The reply names the version; it is empty if the map has no keyframes.  If the publication fails, the
+        map goes on, and the error is raised.
+        """
         background, record = self._environment.threads.background, None
-        # 1. The map becomes a version, also above the quota, because its log is deleted afterwards.
+        # 1. Publish the map as a version; the bytes of its log, which is deleted afterwards, count as free.
         if self._state.keyframes:
             freed_bytes = await background(self._log.charged_bytes)
             record = await self._publisher.publish("the live map was stopped", freed_bytes)
-        # 2. The lease is given up, and states the position of the log at which the map was stopped.
+        # 2. Give the lease up, and write into it the position of the log at which the map was stopped.
         await self._close(lambda: self._lease.stop(self._log.position), "stopped")
-        # 3. The log is deleted; entries that stay after an error are ignored by the next map server.
+        # 3. Delete the log; entries that stay after an error are ignored by the next map server.
         with contextlib.suppress(StoreError):
             await background(functools.partial(self._log.delete_until, self._lease.record.base))
         return {} if record is None else version_reply(self._environment.map_name, record)
@@ -427,30 +466,32 @@ class MapServer:
     async def apply_entry(self, position: int, batch: list[SubmittedEvent]) -> None:
         """Apply the events of the durable log entry *position*, and acknowledge them."""
         events = [submitted.event for submitted in batch]
-        # 1. The thread of the map applies the events.
+        # 1. Apply the events in the thread of the map.
         applied, updates, culled = await self._environment.threads.compute(
             Urgency.APPLY, functools.partial(self._apply_events, position, events)
         )
-        # 2. Requests that wait for the events are answered, and new keyframes are queued for measurement.
+        # 2. Answer the requests that wait for the events, and queue new keyframes for measurement.
         self._complete_events(batch, applied)
-        # 3. Objects of keyframes that the map dropped as redundant are deleted.
+        # 3. Delete the stored points and images of keyframes whose features the map dropped.
         if culled:
             self._start_task(self._delete_objects_of_culled(culled))
-        # 4. Subscribers are sent the alignments and poses that changed.
+        # 4. Send subscribers the alignments and poses that changed.
         for update in updates:
             self._send_update(update)
-        # 5. A snapshot is written if enough entries were applied since the last one.
+        # 5. Begin to write a snapshot if enough entries were applied since the last one.
         if self._state.is_snapshot_due:
             self._start_task(self._write_snapshot(await self._make_snapshot()))
 
     def _apply_events(
         self, position: int, events: list[Event]
     ) -> tuple[AppliedEntry, list[dict[str, Any]], list[tuple[str, str]]]:
-        """Apply the events of an entry; called in the thread of the map.
+        """Apply the events of an entry, and log the alignments that were made or lost.
+
+        Called in the thread of the map.
 
         Returns:
-            The effects, the updates to send, and the objects of culled keyframes as pairs of a robot's folder
-            and a digest.
+            The effects, the updates that changed and must be sent, and the objects of culled keyframes as
+            pairs of a robot's folder and a digest.
         """
         applied = self._state.apply(position, events)
         outcomes = [outcome for event_outcomes in applied.outcomes for outcome in event_outcomes]
@@ -484,7 +525,11 @@ class MapServer:
                 )
 
     def _complete_events(self, batch: list[SubmittedEvent], applied: AppliedEntry) -> None:
-        """Complete the futures of the events of an entry, and queue its keyframes for measurement."""
+        """Complete the futures of the events of an entry, and queue the work that follows from them.
+
+        An event on which the map failed gets an InternalError.  New keyframes are queued for measurement, and
+        the whole pose graph for an optimisation if the map asks for that.
+        """
         for submitted, outcomes, defect in zip(batch, applied.outcomes, applied.defects, strict=True):
             if defect is not None:
                 self._environment.log.error(
@@ -509,7 +554,7 @@ class MapServer:
         )
 
     async def _write_snapshot(self, snapshot: MapSnapshot) -> None:
-        """Write a snapshot; if the store fails, a restart reads more entries until the next snapshot."""
+        """Write a snapshot; if the store fails, log that: a restart reads more entries until the next one."""
         saved_bytes = self._bytes_since_snapshot
         try:
             await self._environment.threads.background(lambda: self._log.write_snapshot(snapshot))
@@ -524,7 +569,10 @@ class MapServer:
     # --- Renewal of the lease, and the end of the service ---
 
     async def _keep_lease(self) -> None:
-        """Renew the lease until the service ends or another process has taken the lease."""
+        """Renew the lease until the service ends; end it as lost if another process has taken the lease.
+
+        The lease is renewed three times within ``live.lease_s``, and 0.05 s after a failure of the store.
+        """
         environment = self._environment
         while not self._ended.done():
             age_s = environment.clock() - self._began_s
@@ -546,10 +594,13 @@ class MapServer:
             await environment.sleep(wait_s)
 
     def _after_renewal(self) -> None:
-        """Send, publish or give up what is due, after each successful renewal of the lease."""
+        """Send updates and replies that waited, and publish or give up the map if that is due.
+
+        Called after each successful renewal of the lease.
+        """
         environment = self._environment
         now = environment.clock()
-        # 1. Replies and updates that waited for the renewal are sent.
+        # 1. Send replies and updates that waited for the renewal; while the map is given up, do no more.
         self._renewed.set()
         if self._has_unsent_updates:
             self._has_unsent_updates = False
@@ -559,11 +610,11 @@ class MapServer:
         self._send_map_state()
         if self._is_closing:
             return
-        # 2. A changing map is published at intervals.
+        # 2. Request a version of the map every 10 minutes.
         if now >= self._publish_due_s:
             self._publish_due_s = now + PUBLISH_INTERVAL_S
             self._publisher.request(NOTE_CHANGED)
-        # 3. The worker learns that the map is not used, and a map without connections is given up.
+        # 3. Notify the worker if commands have ceased, and give up a map that had no connections for long.
         if now - self._last_command_s >= _UNUSED_SHARE * environment.settings.idle_s:
             self._set_used(is_used=False)
         if self.users:
@@ -571,11 +622,11 @@ class MapServer:
         elif now - self._idle_since_s >= environment.settings.idle_s:
             self._idle_since_s = now
             self._start_task(self._give_up_idle_map())
-        # 4. A version that was requested is published if the interval allows it.
+        # 4. Publish the requested version if the map has changed and ``live.publish_pause_s`` has passed.
         self._start_task(self._publisher.publish_due())
 
     def _set_used(self, *, is_used: bool) -> None:
-        """Note whether commands arrive, and notify the worker of a change."""
+        """Note that a command has arrived, or that none has for a while; notify the worker of a change."""
         if is_used:
             self._last_command_s = self._environment.clock()
         if is_used != self._is_used:
@@ -583,7 +634,7 @@ class MapServer:
             self._environment.on_use(is_used)
 
     async def _give_up_idle_map(self) -> None:
-        """Publish the map when the interval allows it, and release it, unless a worker connects meanwhile.
+        """Wait until the map may be published, publish and release it, unless a worker connects meanwhile.
 
         If the publication fails, the map is released, and the next map server publishes it.
         """
@@ -595,28 +646,33 @@ class MapServer:
             await self.release()
 
     def _holds_lease(self) -> bool:
-        """Return whether no other process can have taken the map until now."""
+        """Return whether no other process can have taken the map until now, since the lease is new enough."""
         return not self._ended.done() and self._lease.age_s < self._environment.settings.lease_s
 
     async def _close(self, give_up: Callable[[], bool], end: ServiceEnd) -> None:
-        """Write what waits, change the lease by *give_up*, and end the service with *end*."""
+        """Write what waits, change the lease by *give_up*, and end the service with *end*.
+
+        The service ends with "lost" if *give_up* returns False, because another process has the lease.  While
+        the map is already being given up, a further call only waits for the end.
+        """
         if self._is_closing:
             await asyncio.shield(self._ended)
             return
         self._is_closing = True
         self._send_map_state()
-        # 1. Submitted events are written and applied.
+        # 1. Wait until submitted events are written and applied.
         await self._writer.wait_empty()
         snapshot = await self._make_snapshot()
         if end == "released":
-            # 2. A snapshot makes the start of the next map server fast.
+            # 2. Write a snapshot unless this process wrote one after the last entry, so that the next map
+            # server starts fast.
             if snapshot.position > self._snapshot_position:
                 await self._write_snapshot(snapshot)
-            # 3. A requested version is published early, because the next map server may start late.
+            # 3. Publish a requested version without a pause, because the next map server may start late.
             await asyncio.wait(
                 {asyncio.ensure_future(self._publisher.publish_now())}, timeout=_MAX_FINAL_PUBLICATION_S
             )
-        # 4. The lease is given up, however long the store fails.
+        # 4. Give the lease up; try again until the store works or the lease is lost.
         wait_s = FIRST_RETRY_S
         while not self._ended.done():
             try:
@@ -640,14 +696,14 @@ class MapServer:
     # --- Updates for subscribers ---
 
     def _send_update(self, payload: dict[str, Any]) -> None:
-        """Send an update, or note that all updates are sent again after the next renewal of the lease."""
+        """Send an update; if the lease is too old, let all updates be sent after its next renewal instead."""
         if self._holds_lease():
             self._environment.send_update(payload)
         else:
             self._has_unsent_updates = True
 
     def _send_map_state(self) -> None:
-        """Send size and state of the map if they changed."""
+        """Send the update ``map`` (size, position in the log, server and state) if it has changed."""
         service_state = self._service_state()
         for payload in self._updates.set_map(
             keyframes=self._state.keyframes,
@@ -666,7 +722,7 @@ class MapServer:
         return _WAITING_FOR_STORE if self._is_waiting_for_store else "live"
 
     def set_waiting_for_store(self, is_waiting: bool) -> None:
-        """Notify subscribers that the store is slow or fails, or that it works again."""
+        """Set whether the map waits for the store; notify subscribers if that changes."""
         if is_waiting != self._is_waiting_for_store:
             self._is_waiting_for_store = is_waiting
             self._send_map_state()
@@ -683,7 +739,7 @@ class MapServer:
         )
 
     def _start_task(self, work: Coroutine[Any, Any, None]) -> None:
-        """Run *work* as a task of this map server; an unexpected exception ends the service as a defect."""
+        """Run *work* as a task until the service ends; an exception of it ends the service as a defect."""
         task = asyncio.get_running_loop().create_task(work)
         self._tasks.add(task)
         task.add_done_callback(self._on_task_end)

@@ -37,8 +37,8 @@ __all__ = [
 ]
 
 _CONCURRENT_MEASUREMENTS = 2
-"""Number of threads that measure loop closures: they share the candidates of one keyframe, or measure one
-keyframe each while more keyframes wait."""
+"""Largest number of keyframes that are measured at the same time.  If no further keyframe waits, the
+candidates of a keyframe are divided into this number of parts, which are measured in parallel."""
 _SHORT_QUEUE = 4
 """With at most this number of waiting keyframes, each keyframe is compared with all candidates that the map
 chooses."""
@@ -51,11 +51,11 @@ _OPTIMISATION_NICE = 10
 _MAX_OPTIMISATION_S = 120.0
 """Seconds after which the child process that optimises a whole graph is killed."""
 _GRAPH_FIELDS = ("T_world_pose", "a", "b", "T_a_b", "information", "robust", "ids")
-"""Fields of `PoseGraph`, all arrays, that are sent to the child process."""
+"""The fields of `PoseGraph`, all of them arrays, that are sent to the child process."""
 
 
 def choose_candidate_count(waiting: int) -> int | None:
-    """Return with how many candidates a keyframe is compared while *waiting* other keyframes wait.
+    """Return with how many candidates at most a keyframe is compared while *waiting* other keyframes wait.
 
     None stands for the map's own limit.  Fewer candidates let a map server that is behind catch up.  A replay
     does not depend on this number, because the measured loop closures are in the log.
@@ -66,7 +66,9 @@ def choose_candidate_count(waiting: int) -> int | None:
 
 
 class KeyframeMeasurer:
-    """Measures the loop closures of keyframes in their order, and optimises the whole graph when none waits.
+    """Measures the loop closures of keyframes, and optimises the whole graph on request when none waits.
+
+    Measurements begin in the order of the keyframes; the results are submitted to the log as events.
 
     All methods are called in the event loop.
     """
@@ -82,7 +84,7 @@ class KeyframeMeasurer:
         Args:
             state: The map.
             environment: Environment of the map server.
-            submit: Queues an event for the log.
+            submit: Queues an event for the log; its result is not used.
         """
         self._state = state
         self._environment = environment
@@ -96,7 +98,7 @@ class KeyframeMeasurer:
 
     @property
     def is_proven(self) -> bool:
-        """Whether keyframes were measured and none is unmeasured, so that none killed this process."""
+        """Whether this process has measured a keyframe and none is left, so that none of them kills it."""
         return self._has_measured and not self._state.unmeasured
 
     def add_keyframes(self, keyframes: Iterable[int]) -> None:
@@ -105,7 +107,7 @@ class KeyframeMeasurer:
         self._has_work.set()
 
     def request_optimisation(self) -> None:
-        """Optimise the whole pose graph as soon as no keyframe waits."""
+        """Optimise the whole pose graph as soon as no keyframe waits; requests until then count once."""
         self._needs_optimisation = True
         self._has_work.set()
 
@@ -127,14 +129,14 @@ class KeyframeMeasurer:
     async def _measure_keyframe(self, keyframe: int) -> None:
         waiting = len(self._waiting)
         parts = 1 if waiting else _CONCURRENT_MEASUREMENTS
-        # 1. The thread of the map chooses the candidates and copies what is compared.
+        # 1. Choose the candidates, and copy what is compared, in the thread of the map.
         prepare = functools.partial(
             self._state.prepare_measurement, keyframe, parts, choose_candidate_count(waiting)
         )
         measurements = await self._threads.compute(Urgency.MEASURE, prepare)
-        # 2. Threads for matching estimate the relative poses.
+        # 2. Estimate the relative poses in threads for matching.
         begun = [self._threads.match(measure) for measure in measurements]
-        # 3. The measured loop closures are queued for the log.
+        # 3. Queue the measured loop closures for the log.
         self._submit(merge_measurements(keyframe, [await measured for measured in begun]))
         self._has_measured = True
 
@@ -149,7 +151,7 @@ class KeyframeMeasurer:
 
 
 def optimise_in_process(graph: PoseGraph, options: OptimiseOptions) -> Array:
-    """Optimise a pose graph in the calling process and return its ``(n, 4, 4)`` poses.
+    """Optimise a pose graph in the calling process and return its ``(n, 4, 4)`` poses, a new array.
 
     Raises:
         MissingExtra: gtsam is not installed.
@@ -158,13 +160,14 @@ def optimise_in_process(graph: PoseGraph, options: OptimiseOptions) -> Array:
 
 
 def optimise_in_child(graph: PoseGraph, options: OptimiseOptions) -> Array:
-    """Optimise a pose graph in a child process of low priority and return its ``(n, 4, 4)`` poses.
+    """Optimise a pose graph in a child process of low priority; return its ``(n, 4, 4)`` poses, read-only.
 
     gtsam holds Python's interpreter lock (GIL) while it optimises, so in the map server's own process no
     keyframe could be applied meanwhile.  The poses are equal to the bit to those of `optimise_in_process`.
 
     Raises:
-        Crashed: The child process failed; its error output is in the log of the server.
+        Crashed: The child process failed, also if gtsam is not installed; its error output is in the log of
+            the server.
         TimeoutError: The optimisation took longer than 120 s.
     """
     buffer = io.BytesIO()
@@ -186,7 +189,10 @@ def optimise_in_child(graph: PoseGraph, options: OptimiseOptions) -> Array:
 
 
 def run_optimisation(parent: socket.socket) -> None:
-    """Read one pose graph from the *parent* process, optimise it and send its poses back."""
+    """Read one pose graph from the *parent* process, optimise it and send its poses back as float64 bytes.
+
+    The entry point of the child process of `optimise_in_child`.
+    """
     with np.load(io.BytesIO(receive(parent)), allow_pickle=False) as fields:
         graph = PoseGraph(**{name: fields[name] for name in _GRAPH_FIELDS})
         poses = optimise_in_process(graph, OptimiseOptions(cauchy=float(fields["cauchy"])))

@@ -26,11 +26,11 @@ __all__ = ["MapUpdates", "decode_request", "paths_reply", "relocalise_reply", "s
 
 Payload = dict[str, Any]
 _MAX_PATH_POINTS = 4_000
-"""Largest number of keyframe positions in the reply of ``live-show``: they are about 100 kB of JSON, of the
-256 KiB that a message may have."""
+"""Number of keyframe positions to which the reply of ``live-show`` is thinned, about 100 kB of JSON of the
+256 KiB that a message may have; the first and the last position of each segment are sent in any case."""
 _UPPER_TRIANGLE = np.triu_indices(6)  # row and column indices of the upper triangle of a 6 x 6 covariance
 _FIELDS_NOT_COMPARED = ("cause", "version")
-"""Fields of an update in which a change alone is not sent to robots."""
+"""Fields of an alignment or pose update in which a change alone is not sent to robots."""
 
 
 def decode_request(operation: str, data: bytes) -> LiveRequest:
@@ -56,7 +56,7 @@ def decode_request(operation: str, data: bytes) -> LiveRequest:
 
 
 def relocalise_reply(localised: Localised, version: int) -> Payload:
-    """Return the reply of ``live-relocalise`` with the pose of the camera in the map, if it was found.
+    """Return the reply of ``live-relocalise``; its pose and covariance are None if no pose was found.
 
     *version* is the position of the map's log at which the search began.
     """
@@ -83,6 +83,8 @@ def show_reply(
     is_present: Callable[[str], bool],
 ) -> Payload:
     """Return the reply of ``live-show``: the robots and the state of a live map.
+
+    Robots that have left are not listed.
 
     Args:
         robot: Robot that asks; the field ``you`` says how it numbers its next keyframe and segment.
@@ -124,8 +126,9 @@ def show_reply(
 def paths_reply(state: MapState, name_of: Callable[[str], str]) -> list[Payload]:
     """Return the trajectories of all aligned segments: robot, segment, and positions (m, in the map frame).
 
-    At most 4,000 positions of keyframes are returned, rounded to 1 mm.  *name_of* returns the displayed name
-    of a robot, given its `RobotId.folder`.
+    Of more than 4,000 keyframes, about 4,000 are chosen evenly, and the first and the last of each segment in
+    any case.  Positions are rounded to 1 mm.  *name_of* returns the displayed name of a robot, given its
+    `RobotId.folder`.
     """
     return [
         {"robot": name_of(robot), "segment": segment, "points": points.round(3).tolist()}
@@ -141,8 +144,9 @@ def version_reply(map_name: str, record: MapRecord) -> Payload:
 class MapUpdates:
     """The newest update of each key of one live map, which new subscribers get first.
 
-    Keys are ``map``, ``alignment/ROBOT`` and ``pose/ROBOT``.  Each method that changes updates returns those
-    that differ from the last one of their key, and so must be sent.
+    Keys are ``map``, ``alignment/ROBOT`` and ``pose/ROBOT``, with the displayed name of the robot.  Each
+    method that changes updates returns those that must be sent, because they differ from the last one of
+    their key.  A difference in ``cause`` or ``version`` alone does not count, except for the key ``map``.
     """
 
     def __init__(self, name_of: Callable[[str], str]) -> None:
@@ -162,7 +166,7 @@ class MapUpdates:
 
         Args:
             alignments: Where the newest segment of each robot lies in the map.  Updates of robots that are
-                not among them are removed.
+                not among them are removed, and nothing is sent for them.
             outcomes: Outcomes of the last entry; those of the class `Corrected` name the keyframe that caused
                 a correction.
             version: Position of the map in its log.
@@ -194,7 +198,10 @@ class MapUpdates:
         return changed
 
     def add_pose(self, event: KeyframeAdded) -> list[Payload]:
-        """Set the update ``pose/ROBOT`` to the pose of a new keyframe if its segment is aligned."""
+        """Set the update ``pose/ROBOT`` to the pose of a new keyframe, and return it if it must be sent.
+
+        Nothing is set or returned if the segment of the keyframe is not aligned with the map.
+        """
         alignment = self._alignments.get(event.robot)
         if alignment is None or not alignment.aligned or alignment.segment != event.segment:
             return []
@@ -212,12 +219,12 @@ class MapUpdates:
         )
 
     def has_segment(self, event: KeyframeAdded) -> bool:
-        """Return whether the last alignment of a keyframe's robot belongs to the segment of the keyframe."""
+        """Return whether the alignment that was set last for a keyframe's robot is that of its segment."""
         alignment = self._alignments.get(event.robot)
         return alignment is not None and alignment.segment == event.segment
 
     def set_map(self, *, keyframes: int, version: int, server: str, state: str) -> list[Payload]:
-        """Set the update of the key ``map``.
+        """Set the update of the key ``map``; return it if any field has changed.
 
         Args:
             keyframes: Number of keyframes in the map.

@@ -72,7 +72,7 @@ _SWITCH_INTERVAL_S = 0.0005
 """Seconds after which a running thread passes the interpreter lock (GIL) to a waiting one.  Python's default
 of 5 ms would delay each step of a keyframe while other threads compute."""
 _MAX_VERSION_OBJECTS = 4
-"""A version of a map may be this many times as large as ``data.max_object_bytes``."""
+"""The limit of the size of a map's version is ``data.max_object_bytes`` times this number."""
 _PROBE_ADDRESS_IPV4 = ("192.0.2.1", 9)
 _PROBE_ADDRESS_IPV6 = ("2001:db8::1", 9)
 """Addresses reserved for documentation (RFC 5737, RFC 3849).  Nothing is sent to them; the operating system's
@@ -104,9 +104,10 @@ def advertised_address(host: str) -> str:
 def run(worker: socket.socket) -> None:
     """Claim and serve the map that the worker orders over its socket *worker*; the child's entry point.
 
-    This function never returns after an order: it exits the process with code 0, or with 1 after an error.
+    This function returns only if the worker closes the socket before it has sent an order.  After an order,
+    it exits the process: with code 0, or with 1 after an error.
     """
-    # 1. The process reads the settings, imports its modules and makes its certificate.
+    # 1. Read the settings, import the modules of the map, and make a certificate.
     start = receive(worker)
     if start is None:
         return
@@ -117,13 +118,13 @@ def run(worker: socket.socket) -> None:
     store = open_data_store(settings)
     address = advertised_address(settings.live.host)
     context, certificate = server_context(address, now_s=time.time())
-    # 2. The process is ready and waits for an order.
+    # 2. Report to the worker that the process is ready, and wait for an order.
     worker.sendall(encode_message(["ready"]))
     order = receive(worker)
     if order is None:
         return
-    # 3. Only now it listens: before, it accepts no connections, and unauthenticated clients could fill the
-    # backlog of the socket.
+    # 3. Listen for connections of workers only now: the process accepts none before, so unauthenticated
+    # clients could have filled the backlog of the socket.
     endpoint = _Endpoint(
         address=address,
         listener=listen(settings.live.host, live_ports(settings.live)),
@@ -133,7 +134,7 @@ def run(worker: socket.socket) -> None:
     process = _MapServerProcess(
         worker, settings, store, implementation, msgspec.convert(order, ClaimOrder), endpoint
     )
-    # 4. The map is claimed and served.
+    # 4. Claim and serve the map.
     exit_code = 1
     try:
         asyncio.new_event_loop().run_until_complete(process.run())
@@ -197,11 +198,11 @@ class _MapServerProcess:
     async def run(self) -> None:
         self._threads.start()
         self._log.start()
-        # 1. The lease is claimed.
+        # 1. Claim the lease.
         if not await self._retry(self._threads.lease, lambda: self._lease.claim(self._order.known)):
             self._worker.sendall(encode_message(["lost"]))
             return
-        # 2. The map is restored, while the lease is renewed.
+        # 2. Restore the map, while the lease is renewed.
         renewal = asyncio.ensure_future(self._renew_until_lost())
         takeover = asyncio.ensure_future(self._take_over())
         await asyncio.wait({renewal, takeover}, return_when=asyncio.FIRST_COMPLETED)
@@ -214,7 +215,7 @@ class _MapServerProcess:
             self._worker.sendall(encode_message(["lost"]))
             return
         renewal.cancel()
-        # 3. The map is served until it is lost, released or stopped.
+        # 3. Serve the map until it is lost, released or stopped.
         await self._serve(*takeover.result())
 
     async def _renew_until_lost(self) -> None:
@@ -226,8 +227,11 @@ class _MapServerProcess:
     async def _take_over(self) -> tuple[MapState, LiveLog]:
         """Restore the map from its log, and write the log entry that excludes the previous map server.
 
+        This is tried again as long as the store fails, or an entry of the log is missing or damaged.
+
         Raises:
             LeaseLost: Another process has taken the map over meanwhile.
+            BadRequest: The events of an entry are damaged.
         """
         record = self._lease.record
         log = LiveLog(
@@ -263,7 +267,8 @@ class _MapServerProcess:
             certificate=endpoint.certificate,
             expires_s=0.0,
         )
-        # 1. The map server and the connections of workers refer to each other.
+        # 1. Make the map server and the connections of workers, which refer to each other, and accept
+        # connections.
         environment = self._make_environment(
             send_update=lambda payload: connections.send_update(payload),
             on_renewal=lambda number: connections.send_renewal(number),
@@ -277,7 +282,7 @@ class _MapServerProcess:
             on_defect=traceback.print_exception,
         )
         connections.open(endpoint.listener, endpoint.context)
-        # 2. The lease and the worker learn that the map is served.
+        # 2. Write into the lease where the map server listens, and notify the worker that it serves the map.
         publish_endpoint = functools.partial(
             self._lease.serve, endpoint.address, endpoint.port, endpoint.certificate
         )
@@ -285,7 +290,7 @@ class _MapServerProcess:
             self._worker.sendall(encode_message(["lost"]))
             return
         self._worker.sendall(encode_message(["serving", self._lease.record.epoch]))
-        # 3. Requests are answered until the service ends.
+        # 3. Answer requests until the service ends.
         release_order = asyncio.ensure_future(self._release_on_order(map_server))
         end = await map_server.run()
         release_order.cancel()
@@ -323,7 +328,7 @@ class _MapServerProcess:
             self._worker.sendall(encode_message(["used", is_used]))
 
     async def _release_on_order(self, map_server: MapServer) -> None:
-        """Read orders of the worker, and release the map when it orders that."""
+        """Read messages of the worker until it disconnects, and release the map when it orders that."""
         self._worker.setblocking(False)
         frames = FrameReader(_READ_BYTES)
         while data := await asyncio.get_running_loop().sock_recv(self._worker, _READ_BYTES):
@@ -333,7 +338,7 @@ class _MapServerProcess:
     async def _retry(
         self, run_in_thread: Callable[[Callable[[], _T]], Awaitable[_T]], act: Callable[[], _T]
     ) -> _T:
-        """Return the result of *act*, called in a thread and repeated while the object store fails.
+        """Return the result of *act*, called in a thread and repeated after 0.1 s if it raises StoreError.
 
         Raises:
             LeaseLost: Another process has taken the map over.

@@ -1,9 +1,9 @@
 """Publish versions of a live map to the registry of maps, and remove old ones that nobody asked for.
 
-Two versions are at least ``live.publish_pause_s`` apart.  The time of the last version is read from the
-registry, so the interval also holds across a change of the map server.  A new map server does not know
-whether the one before published the newest state; it publishes once, and the registry keeps equal versions
-only once.
+Two versions are at least ``live.publish_pause_s`` apart, except for one that is published when the map is
+given up.  A new map server reads the time of the last version from the registry, so the interval also holds
+across a change of the map server.  It does not know whether the one before published the newest state; it
+publishes once, and the registry keeps equal versions only once.
 """
 
 from __future__ import annotations
@@ -38,15 +38,16 @@ __all__ = ["NOTE_ALL_LEFT", "NOTE_CHANGED", "NOTE_UNUSED", "Publisher", "read_st
 NOTE_ALL_LEFT = "the last robot left"
 """Note of a version that is published because all robots have left the live map."""
 NOTE_CHANGED = "live map"
-"""Note of a version that is published at an interval because the live map has changed."""
+"""Note of a version that the map server requests every 10 minutes while it serves a map that changes."""
 NOTE_UNUSED = "nobody used the live map"
 """Note of a version that is published because the live map is not used and is given up."""
 _AUTOMATIC_NOTES = (NOTE_ALL_LEFT, NOTE_CHANGED, NOTE_UNUSED)
 """Notes of versions that nobody asked for, which may be removed automatically."""
 _AUTHOR_PREFIX = "live map on "
-"""Begin of the author of each version of a live map; the id of the backend server follows."""
+"""Beginning of the author of each version of a live map; the id of the backend server follows."""
 _QUOTA_DIVISOR = 4
-"""The automatic versions of one map take at most the tenant's storage quota divided by this number."""
+"""The automatic versions of one map take at most the tenant's storage quota divided by this number, but the
+newest one stays in any case."""
 _MAX_REMOVED_AT_ONCE = 10
 """Largest number of old versions that are removed after a publication, so that the publication ends soon,
 also when the server drains."""
@@ -54,11 +55,13 @@ _MAX_WAIT_S = 10.0
 """Longest time in seconds for which a request for a version waits until ``live.publish_pause_s`` has passed;
 a request that would wait longer is refused with Busy."""
 _FIRST_RETRY_S = 5.0
-"""Seconds after which a failed publication is tried again for the first time; the wait doubles each time."""
+"""Seconds after which a failed automatic publication is tried again for the first time; the wait doubles each
+time."""
 _MAX_RETRY_S = 600.0
-"""Longest wait in seconds before a failed publication is tried again: encoding a large map takes seconds."""
+"""Longest wait in seconds before a failed automatic publication is tried again: encoding a large map takes
+seconds."""
 _MAX_COMMIT_TRIES = 5
-"""How often a version is committed again after another process has moved the head of the map."""
+"""Largest number of tries to commit a version; a try fails if another process moves the head of the map."""
 
 
 class Publisher:
@@ -84,20 +87,22 @@ class Publisher:
         self._source_up: tuple[str, list[float] | None] = "", None
         self._published_changes: int | None = None  # MapState.changes at the last publication
         self._last_record: MapRecord | None = None
-        self._next_allowed_s: float | None = None
-        self._due_note = ""
+        self._next_allowed_s: float | None = None  # None: the registry was not read yet
+        self._due_note = ""  # note of the last request
         self.has_failed = False
-        """Whether the due version could not be published when its time had come; it stays due."""
+        """Whether the last try to publish the due version failed; the version stays due."""
         self._retry_s = _FIRST_RETRY_S
         self._retry_at_s = float("-inf")
 
     @property
     def is_due(self) -> bool:
-        """Whether a version was requested by `request` and the map has changed since the last version."""
+        """Whether `request` was called at any time and the map has changed since this object published it."""
         return bool(self._due_note) and self._is_changed
 
     async def publish(self, note: str, freed_bytes: int = 0) -> MapRecord:
-        """Publish the map and return the record of the version; an unchanged map is not published again.
+        """Publish the map and return the record of the version.
+
+        If the map has not changed since this object published it, the record of that version is returned.
 
         Args:
             note: Reason, which is stored with the version.
@@ -109,6 +114,7 @@ class Publisher:
             Busy: The version would have to wait for more than 10 s until ``live.publish_pause_s`` has passed;
                 ``retry_after_ms`` says when to ask again.
             NotFound: The map has no keyframes.
+            Conflict, InternalError, StoreError: The version could not be committed; see `_commit_version`.
         """
         async with self._lock:
             if not self._state.keyframes:
@@ -130,15 +136,20 @@ class Publisher:
             return await self._publish(note, freed_bytes)
 
     def request(self, note: str) -> None:
-        """Let `publish_due` publish the map, with this *note*, if the map has changed."""
+        """Let `publish_due` publish the map, with this *note*, if the map has changed.
+
+        A request holds until the next one replaces its note: each change after a version makes another one
+        due.
+        """
         if not self.is_due:
             self.has_failed = False
         self._due_note = note
 
     async def publish_due(self) -> None:
-        """Publish the version that `request` asked for, if the interval since the last version has passed.
+        """Publish the due version if ``live.publish_pause_s`` has passed since the last version.
 
-        After an error, the version stays due and is tried again with exponential back-off.
+        Do nothing if no version is due, or a publication is under way.  After an error, the version stays due
+        and is tried again with exponential back-off; a call before that time does nothing.
         """
         if not self.is_due or self._lock.locked() or self._clock() < self._retry_at_s:
             return
@@ -147,7 +158,7 @@ class Publisher:
                 await self.publish_now()
 
     async def publish_now(self) -> None:
-        """Publish the version that `request` asked for without waiting for the interval.
+        """Publish the due version, if there is one, although ``live.publish_pause_s`` may not have passed.
 
         An error is logged, and the version stays due.
         """
@@ -170,10 +181,10 @@ class Publisher:
     async def _publish(self, note: str, freed_bytes: int = 0) -> MapRecord:
         environment, background = self._environment, self._threads.background
         changes = self._state.changes
-        # 1. The version is made: keyframes, point cloud, and the up direction.
+        # 1. Make the version: keyframes, point cloud, and the up direction.
         version = await self._make_version()
         version = await background(functools.partial(self._add_source_up, version))
-        # 2. The tenant is charged and the version becomes the head of the map.
+        # 2. Charge the tenant, and make the version the head of the map.
         origin = MapOrigin(parent=None, author=self._author, created_s=environment.wall_clock(), note=note)
         charge = functools.partial(environment.account.reserve, freed=freed_bytes)
         commit = functools.partial(_commit_version, environment.maps, self._map_name, version, origin, charge)
@@ -182,7 +193,7 @@ class Publisher:
         self._published_changes, self._last_record = changes, record
         self.has_failed, self._retry_s = False, _FIRST_RETRY_S
         environment.log.info("live-map-published", map=self._map_name, id=record.id, number=record.number)
-        # 3. Old automatic versions are removed.
+        # 3. Remove old automatic versions.
         try:
             removed = await background(self._remove_old_versions)
         except RsePfError as error:  # the next publication removes the old versions
@@ -193,9 +204,10 @@ class Publisher:
         return record
 
     async def _make_version(self) -> MapVersion:
-        """Return the map as a version with its point cloud.
+        """Return the map as a version, with its point cloud if keyframes have stored points.
 
-        If a robot is forgotten while its points are read, the version is made again without them.
+        Stored objects of forgotten robots are deleted before the points are read.  If a robot is forgotten
+        while points are read, the version is made again without its contributions.
         """
         compute, live_map = self._threads.compute, self._state.live_map
         environment, objects = self._environment, self._environment.objects
@@ -225,9 +237,10 @@ class Publisher:
         return dataclasses.replace(version, points=cloud.points, colours=cloud.colours)
 
     def _add_source_up(self, version: MapVersion) -> MapVersion:
-        """Copy the up direction from the version that the map started from, whose axes the map keeps.
+        """Return *version* with the up direction of the version that the map started from.
 
-        Blocks on the object store.  If the source version was removed, *version* is returned unchanged.
+        The map keeps the axes of that version.  Blocks on the object store.  *version* itself is returned if
+        the map started from none, or from one that was removed, is not valid or has no up direction.
 
         Raises:
             StoreError: The store fails.
@@ -246,7 +259,9 @@ class Publisher:
     def _remove_old_versions(self) -> int:
         """Remove the oldest automatic versions, at most ten, and return their number; blocks on the store.
 
-        ``live.keep_versions`` of them are kept, and no more than fit into a quarter of the tenant's quota.
+        The newest ``live.keep_versions`` of them stay (0: all), as far as they fit into a quarter of the
+        tenant's quota.  The newest one, the head of the map, and versions that share their bytes with one
+        that stays are not removed.
 
         Raises:
             Busy, StoreError: The removal is not complete; the next publication goes on.
@@ -266,14 +281,21 @@ class Publisher:
         return len(removed)
 
     async def _seconds_until_allowed(self) -> float:
-        """Return the seconds until the next version may be published; negative if it may be now."""
+        """Return the seconds until the next version may be published; 0 or negative if it may be now.
+
+        Raises:
+            StoreError: The registry had to be read, and the store fails.
+        """
         if self._next_allowed_s is None:
             age_s = await self._threads.background(self._newest_version_age_s)
             self._next_allowed_s = self._clock() + max(0.0, self._min_interval_s - max(0.0, age_s))
         return self._next_allowed_s - self._clock()
 
     def _newest_version_age_s(self) -> float:
-        """Return the age of the newest version in the registry, infinity if there is none; blocks."""
+        """Return the age in seconds of the head of the map in the registry, infinity without one.
+
+        Blocks on the object store; raises StoreError.
+        """
         try:
             return self._environment.wall_clock() - self._environment.maps.head(self._map_name).created_s
         except NotFound:
@@ -289,7 +311,8 @@ def _commit_version(
 ) -> MapRecord:
     """Make *version* the head of the map *name* in the registry; an equal head stays and is returned.
 
-    Blocks on the object store.  The parent in *origin* is replaced by the present head.
+    Blocks on the object store.  The parent in *origin* is replaced by the present head; the committed version
+    therefore replaces that head without merging it.
 
     Raises:
         QuotaExceeded, StoreFull: *charge* refuses the bytes that the version adds to the store.
@@ -322,8 +345,9 @@ def read_start_version(maps: MapRegistry, request: LiveStart) -> tuple[MapVersio
     Blocks on the object store.
 
     Raises:
-        InternalError: The version is damaged.
+        InternalError: The version is no valid map, or larger than the limits.
         NotFound: The registry has no such map or version.
+        StoreError: The store fails, or the stored bytes are damaged.
     """
     name, version = request.source_version()
     record = maps.record(name, version)

@@ -44,8 +44,8 @@ class AppliedEntry:
     """The effects of the events of one log entry.
 
     Attributes:
-        outcomes: For each event, what it changed in the map.
-        defects: For each event, the exception that the map raised while it was applied; else None.
+        outcomes: For each event, what it changed in the map; empty for an event with a defect.
+        defects: For each event, the exception that the map raised while the event was applied; else None.
     """
 
     outcomes: list[list[Outcome]]
@@ -53,7 +53,7 @@ class AppliedEntry:
 
 
 class MapState:
-    """A live map with its position in the log, and the keyframes whose loop closures are not measured yet.
+    """A live map with its position in the log, and the keyframes whose loop closures are not logged yet.
 
     All methods are called by one thread at a time; functions that they return may be called in any thread.
     """
@@ -69,17 +69,19 @@ class MapState:
         self.live_map = live_map
         self.position = position
         self.unmeasured = dict.fromkeys(unmeasured)
+        """Ids of keyframes whose loop closures have not been logged, in the order of their arrival."""
         self.changes = 0
-        """Number of events that have changed the map since this object was made."""
+        """Number of events since this object was made, without those that leave a version of the map as it
+        was (`_EVENTS_WITHOUT_CHANGE`) and those that failed."""
         self.keyframes = live_map.keyframes
-        """Number of keyframes in the map."""
-        self._snapshot_position = position
+        """Number of keyframes in the map whose features are kept, after the last applied entry."""
+        self._snapshot_position = position  # entry after which the last snapshot was made or restored
 
     def apply(self, position: int, events: Sequence[Event]) -> AppliedEntry:
-        """Apply the events of the durable log entry *position* to the map.
+        """Apply the events of the durable log entry *position* to the map, in their order.
 
-        If the map raises an exception for an event (a defect of the program), the event has no effect, here
-        and in every replay, and the next event is applied.  MemoryError is raised, and ends the process.
+        If the map raises an exception for an event (a defect of the program), the exception is returned, and
+        the next event is applied; every replay does the same.  MemoryError is raised, and ends the process.
         """
         outcomes: list[list[Outcome]] = []
         defects: list[Exception | None] = []
@@ -94,7 +96,9 @@ class MapState:
     def prepare_measurement(
         self, keyframe: int, parts: int, candidates: int | None = None
     ) -> list[Callable[[], LoopClosuresMeasured]]:
-        """Return functions that measure the loop closures of a keyframe, while the map may change.
+        """Return functions that measure the loop closures of a keyframe; the map does not change.
+
+        The functions work on copies, so the map may change while they run.
 
         Args:
             keyframe: Id of the keyframe.
@@ -112,20 +116,27 @@ class MapState:
         return [functools.partial(_measure_guarded, measure, defect) for measure in measurements]
 
     def prepare_optimisation(self, optimise: GraphOptimiser) -> Callable[[], Optimised | None]:
-        """Return a function that optimises a copy of the whole pose graph, while the map may change.
+        """Return a function that optimises a copy of the whole pose graph; the map does not change.
 
-        The function calls *optimise* and returns the event with the new poses; None if that fails.
+        The function calls *optimise*, while the map may change, and returns the event with the new poses;
+        None if any exception but MemoryError was raised.
         """
         optimisation = _call_guarded(lambda: self.live_map.prepare_optimisation(optimise))
         return lambda: None if optimisation is None else _call_guarded(optimisation)
 
     @property
     def is_snapshot_due(self) -> bool:
-        """Whether `entries_between_snapshots` log entries were applied since the last snapshot was made."""
+        """Whether `entries_between_snapshots` log entries were applied since the last snapshot.
+
+        That is the last one that `make_snapshot` made, else the one from which the map was restored.
+        """
         return self.position - self._snapshot_position >= entries_between_snapshots(self.keyframes)
 
     def make_snapshot(self, stored_parts: Collection[str]) -> MapSnapshot:
-        """Return the snapshot after the last applied entry, without the content of *stored_parts*."""
+        """Return the snapshot after the last applied entry; `is_snapshot_due` counts entries from it on.
+
+        Parts whose names are in *stored_parts* are not encoded again: their content is None.
+        """
         self._snapshot_position = self.position
         parts = self.live_map.snapshot_parts(stored_parts)
         return MapSnapshot(
@@ -133,7 +144,7 @@ class MapState:
         )
 
     def digest(self) -> str:
-        """Return the SHA-256 in hex of the complete state of the map, by which replays are compared."""
+        """Return the SHA-256 in hex of the pose graph with all features, by which replays are compared."""
         return self.live_map.digest()
 
     def _apply_event(self, event: Event) -> tuple[list[Outcome], Exception | None]:
@@ -152,7 +163,10 @@ class MapState:
 
 
 def _call_guarded(act: Callable[[], _T]) -> _T | None:
-    """Return the result of *act*, or None if it raises: a defect must not end the map server."""
+    """Return the result of *act*, or None if it raises anything but MemoryError.
+
+    A defect must not end the map server; the exception is not logged.
+    """
     try:
         return act()
     except MemoryError:
@@ -169,7 +183,12 @@ def _measure_guarded(
 
 
 def restore(log: LiveLog, implementation: MapImplementation) -> MapState:
-    """Return the map at the end of its log, without writing anything; raises StoreError."""
+    """Return the map at the end of its log, without writing anything.
+
+    Raises:
+        StoreError: The store fails, or an entry of the log is missing or damaged.
+        BadRequest: The events of an entry are damaged.
+    """
     state = _restore_snapshot(log, implementation)
     for entry in log.read_entries():
         state.apply(log.position, decode_events(entry.events))
@@ -187,20 +206,21 @@ def take_over(log: LiveLog, implementation: MapImplementation, *, owner: str, ep
 
     Raises:
         LeaseLost: A process with a later epoch has written to the log.
-        StoreError: The store fails, or the log is damaged.
+        StoreError: The store fails, or an entry of the log is missing or damaged.
+        BadRequest: The events of an entry are damaged.
     """
-    # 1. The newest snapshot is restored.
+    # 1. Restore the newest snapshot.
     state = _restore_snapshot(log, implementation)
     owner_change = [MapServerChanged(owner=owner, epoch=epoch)]
     data = encode_events(owner_change)
     while True:
-        # 2. The entries after it are applied.
+        # 2. Apply the entries after the last applied one.
         for entry in log.read_entries():
             if entry.epoch > epoch:
                 raise LeaseLost(f"the process {entry.owner} has taken the map over")
             state.apply(log.position, decode_events(entry.events))
-        # 3. The change of the map server is written.  If the previous one has just written an entry with this
-        # number, step 2 reads it.
+        # 3. Write and apply an entry that names this map server.  If the previous one has just written an
+        # entry with this number, go back to step 2, which reads that entry.
         try:
             state.apply(log.write_entry(data), owner_change)
         except LeaseLost:
@@ -209,7 +229,10 @@ def take_over(log: LiveLog, implementation: MapImplementation, *, owner: str, ep
 
 
 def _restore_snapshot(log: LiveLog, implementation: MapImplementation) -> MapState:
-    """Return the map of the newest snapshot that can be restored, or an empty map if there is none."""
+    """Return the map of the newest snapshot that can be restored, or an empty map if there is none.
+
+    ``log.position`` is then the position of that snapshot, or the base of the log.
+    """
     for snapshot in log.read_snapshots():
         with contextlib.suppress(BadRequest, NotFound):
             live_map = implementation.restore(snapshot.head, log.read_part)

@@ -32,16 +32,18 @@ __all__ = ["WorkerConnections", "listen"]
 
 _READ_BYTES = 1 << 18  # largest number of bytes that one read of a worker's socket returns
 _MAX_CONCURRENT_REQUESTS = 256
-"""Number of unanswered requests of one worker; further ones stay in its socket, so that memory is bounded."""
+"""Largest number of unanswered requests of one worker; while there are so many, nothing more is read from its
+socket, so that memory is bounded."""
 _FLUSH_S = 2.0
-"""Seconds for which a map server that ends waits until workers have read their last messages."""
+"""Seconds for which a map server waits until its last messages are written to the sockets of workers: when
+the map is given up, and before a refused connection is closed."""
 
 
 def listen(host: str, ports: range) -> socket.socket:
     """Return a socket that listens on *host*, on the first free port of *ports*; port 0 is any free port.
 
     Raises:
-        OSError: No port of *ports* is free.
+        OSError: No port of *ports*, which is not empty, is free, or *host* is no address of this machine.
     """
     last_error: OSError | None = None
     for port in ports:
@@ -98,9 +100,9 @@ class WorkerConnections:
             connection.send_renewal(number)
 
     async def close(self) -> None:
-        """Accept no more connections, answer the running requests, and send ``moving`` to every worker.
+        """Accept no more connections, wait until running requests are answered, and send workers ``moving``.
 
-        After 2 s the rest is given up.
+        Return after 2 s in any case, although requests may have no answer yet.
         """
         if self._listener is not None:
             self._listener.close()
@@ -185,18 +187,21 @@ class _WorkerConnection:
         self._has_unsent.set()
 
     async def flush(self) -> None:
-        """Wait until all queued messages and updates are written to the socket."""
+        """Wait until all queued messages and updates are written to the socket; one must have been queued."""
         await self._is_flushed.wait()
 
     async def finish(self) -> None:
-        """Wait until the requests of the worker are answered, and send ``moving``: the map is given up."""
+        """Wait until the requests of the worker are answered, and send ``moving``: the map is given up.
+
+        Further requests of the worker are not handled any more.
+        """
         for _ in range(_MAX_CONCURRENT_REQUESTS):
             await self._request_slots.acquire()
         self.send(["moving"])
         await self._is_flushed.wait()
 
     def close(self) -> None:
-        """Cancel the requests of the worker and close its socket."""
+        """Cancel the requests of the worker and the writing of messages, and close its socket."""
         for task in self._tasks:
             task.cancel()
         self._writer.close()
@@ -227,7 +232,11 @@ class _WorkerConnection:
                 self._updates.clear()
 
     async def _answer(self, number: int, robot: RobotId, operation: str, request: bytes) -> None:
-        """Answer the request *number* of the worker; every exception is sent to it as a refusal."""
+        """Answer the request *number* of the worker: with ``answer``, ``again`` or ``refused``.
+
+        A map that is being given up answers ``again``.  Every other exception is sent as a refusal, and one
+        that is no RsePfError is reported as a defect.
+        """
         try:
             self.send(["answer", number, await self._map_server.answer(robot, operation, request)])
         except MapMoving:
@@ -261,7 +270,7 @@ class _WorkerConnection:
 
 
 async def _read_hello(reader: asyncio.StreamReader, frames: FrameReader) -> tuple[bytes, list[Any]]:
-    """Return the token of the first message, and the messages that came with it.
+    """Read the first message; return its token, and the messages that came with it.
 
     Raises:
         ConnectionResetError: The peer disconnected, or the first message is not ``hello``.
