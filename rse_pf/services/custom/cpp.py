@@ -39,7 +39,7 @@ _MAX_RANK = 4  # most axes of an array, the size of ``shape`` in the C struct
 _MAX_FIELDS = 1024  # most fields of a reply: more are a defect of the library, whose memory must not be read
 _MAX_BYTES = 1 << 28  # largest reply, snapshot or field in bytes: more is a defect of the library
 _ERRORS: dict[int, type[RsePfError]] = {1: BadRequest, 2: CommandFailed, 3: DegenerateGeometry}
-"""Error of each code of ``enum rse_pf_status``."""
+"""Error of each code of ``enum rse_pf_status`` but success; any other code becomes CommandFailed."""
 
 
 class _Field(ctypes.Structure):
@@ -105,11 +105,15 @@ class CppRuntime:
         )
 
     def snapshot(self) -> bytes:
-        """Return the state of the library as bytes."""
+        """Return the state of the library as bytes; only for a library with ``has_snapshots``.
+
+        Raises:
+            RsePfError: The library returns an error code, or passes out a snapshot that is too large.
+        """
         return self._read_bytes(self._snapshot, self._state)
 
     def restore(self, data: bytes) -> None:
-        """Replace the state of the library by the snapshot *data*."""
+        """Replace the state of the library by the snapshot *data*; only with ``has_snapshots``."""
         self._check(self._restore(self._state, data, ctypes.c_uint64(len(data))))
 
     def _call_with_bytes(self, payload: Any) -> Any:
@@ -143,7 +147,12 @@ class CppRuntime:
             self._free(self._state, reply)
 
     def _read_bytes(self, function: Any, *arguments: Any) -> bytes:
-        """Call a function that passes out bytes, and return a copy of them."""
+        """Call a function that passes out bytes, give them back to the library, and return a copy of them.
+
+        Raises:
+            RsePfError: The function returns an error code.
+            InternalError: The bytes are too many, or at NULL.
+        """
         data, size = ctypes.POINTER(ctypes.c_uint8)(), ctypes.c_uint64()
         self._check(function(*arguments, ctypes.byref(data), ctypes.byref(size)))
         try:
@@ -192,7 +201,13 @@ class CppRuntime:
 
 
 def _encode_fields(payload: Any) -> tuple[Any, list[Any]]:
-    """Return *payload* as an array of C fields, and the buffers that they point to."""
+    """Return *payload* as an array of C fields, and the buffers to which they point.
+
+    The caller keeps the buffers as long as the fields are read.
+
+    Raises:
+        BadRequest: The payload is not an object, or a field is neither text nor finite numbers.
+    """
     if not isinstance(payload, Mapping):
         raise BadRequest("the request is not an object of fields", hint='send {"name": value}')
     fields, buffers = (_Field * len(payload))(), []
@@ -226,7 +241,14 @@ def _as_array(name: str, value: Any) -> Any:
 
 
 def _decode_field(field: Any, service: str) -> tuple[str, Any]:
-    """Return name and value of a field of a reply; raises InternalError if the field is invalid."""
+    """Return name and value of a field of a reply: a text, a float, or a flat float64 array.
+
+    One number of rank 0 becomes a float.  All other numbers become an array ``(count,)``, whose shape in the
+    C field is checked but not returned, since arrays are flat in messages.
+
+    Raises:
+        InternalError: The description of the field is invalid.
+    """
     name = (field.name or b"").decode("utf-8", "replace")
     problem = _find_problem(field)
     if problem:

@@ -66,9 +66,10 @@ _REMOVED_VARIABLES = {
     "PIP_USER",
     "PIP_REQUIRE_HASHES",
 }
-"""Environment variables of pip that would change which files are installed, or where."""
+"""Environment variables that pip does not get, since they would change which files are installed, or
+where."""
 _MAX_REASON = 300
-"""Characters of pip's reason that an error quotes."""
+"""Largest number of characters of pip's reason that an error quotes."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -106,8 +107,8 @@ def read_lock(folder: Path) -> list[LockedRequirement]:
     """Return the packages of the lock in *folder*, sorted by name; an empty list without a lock.
 
     Raises:
-        UsageError: A line is not one version with hashes, names a package twice, or one that every sandbox
-            provides.
+        UsageError: The lock cannot be read, or a line is not one version of a package with hashes, or names a
+            package that an earlier line names or that every sandbox provides.
     """
     path = folder / LOCK_FILE
     text = _read_text(path)
@@ -137,7 +138,8 @@ def read_lock(folder: Path) -> list[LockedRequirement]:
 def build_dependencies(folder: Path, store: Path) -> Dependencies | None:
     """Install the packages that the service in *folder* locks; return None if it locks none.
 
-    Packages of the same lock that are already installed below *store* are returned without a call of pip.
+    Packages of the same lock that are already installed below *store*, and unchanged, are returned without a
+    call of pip.  A file below *store*, named by the digest of the lock, records them.
 
     Args:
         folder: The service.
@@ -202,7 +204,10 @@ def require_same_versions(packages: Mapping[str, Mapping[str, str]]) -> None:
 
 
 def copy_dependencies(dependencies: Dependencies, store: Path) -> None:
-    """Copy packages to the folder below *store* named by their digest, unless a copy is there."""
+    """Copy packages to the folder below *store* named by their digest, unless an unchanged copy is there.
+
+    A changed copy is replaced.  The copy is not compared with the digest.
+    """
     target = store / dependencies.digest
     if target.is_dir() and tree_digest(target) == dependencies.digest:
         return
@@ -213,7 +218,11 @@ def copy_dependencies(dependencies: Dependencies, store: Path) -> None:
 
 
 def tree_digest(folder: Path) -> str:
-    """Return the SHA-256 of names and contents of all files below *folder*; a link contains its target."""
+    """Return the SHA-256 of paths and contents of all files below *folder*.
+
+    Modes of files and empty folders do not count.  The content of a symbolic link is the path to which it
+    points; the link is not followed.
+    """
     digest = hashlib.sha256()
     for path in sorted(folder.rglob("*")):
         if path.is_dir() and not path.is_symlink():
@@ -227,11 +236,14 @@ def tree_digest(folder: Path) -> str:
 def lock_dependencies(folder: Path) -> list[LockedRequirement]:
     """Resolve ``requirements.in`` in *folder* with pip, write ``requirements.txt``, and return its packages.
 
-    Without ``requirements.in``, the lines of ``requirements.txt`` are moved there first.  Only wheels for
-    this interpreter and machine are chosen.
+    Without ``requirements.in``, the wanted packages are the lines of ``requirements.txt``, whose text becomes
+    ``requirements.in`` after pip has resolved it.  Only wheels for this interpreter and machine are chosen.
+    Packages that every sandbox provides are left out of the lock.  The lock stays as it is if an error is
+    raised.
 
     Raises:
-        UsageError: There is neither file, a line is more than a name with versions, or pip is not installed.
+        UsageError: There is neither file, it cannot be read, a line is more than a name with extras,
+            versions, marker and hashes, or pip is not installed.
         CommandFailed: pip finds no versions that fit together, or no wheel.
         MissingExtra: The package ``packaging``, which parses the lines, is not installed.
     """
@@ -305,7 +317,10 @@ def _install(requirements: Sequence[LockedRequirement], folder: Path, store: Pat
 
 
 def _publish_folder(fresh: Path, target: Path) -> None:
-    """Make *fresh* readable for all users and its files read-only, then rename it to *target*."""
+    """Make *fresh* readable for all users and its files read-only, then rename it to *target*.
+
+    A folder *target* is removed first.
+    """
     for path in (fresh, *fresh.rglob("*")):
         if not path.is_symlink():
             path.chmod(0o755 if path.is_dir() else 0o444)
@@ -314,7 +329,10 @@ def _publish_folder(fresh: Path, target: Path) -> None:
 
 
 def _find_built(record: Path, store: Path) -> Dependencies | None:
-    """Return the packages that the file *record* describes, None if they are missing or changed."""
+    """Return the packages below *store* that the file *record* describes.
+
+    The result is None if the record is missing or damaged, or the packages are missing or changed.
+    """
     try:
         document = json.loads(record.read_text(encoding="utf-8"))
         built = Dependencies(**{**document, "folder": store / document["digest"]})
@@ -325,7 +343,11 @@ def _find_built(record: Path, store: Path) -> Dependencies | None:
 
 
 def _read_text(path: Path) -> str | None:
-    """Return the text of the file *path*, None if there is no such file."""
+    """Return the text of the file *path*, None if there is no such file.
+
+    Raises:
+        UsageError: The file is not a regular file, cannot be read, or is not UTF-8.
+    """
     try:
         return read_regular_file(path).decode("utf-8")
     except FileNotFoundError:
@@ -335,7 +357,12 @@ def _read_text(path: Path) -> str | None:
 
 
 def _validate_wanted(line: str, where: str) -> str:
-    """Return a wanted package in the form for pip: a name, extras, versions, a marker, and hashes."""
+    """Return the line of a wanted package as pip gets it: a name, extras, versions, a marker, and hashes.
+
+    Raises:
+        UsageError: The line is anything else; the error names the place *where*.
+        MissingExtra: The package ``packaging`` is not installed.
+    """
     try:
         from packaging.requirements import InvalidRequirement, Requirement
     except ImportError as error:
@@ -356,7 +383,12 @@ def _validate_wanted(line: str, where: str) -> str:
 
 
 def _run_pip(*arguments: str, hint: str) -> None:
-    """Run ``pip install`` for wheels only; raises CommandFailed with pip's first reason and *hint*."""
+    """Run ``pip install`` with *arguments*, for wheels only.
+
+    Raises:
+        CommandFailed: pip fails; the error quotes its first reason, with *hint*.
+        UsageError: pip is not installed.
+    """
     options = ["--only-binary=:all:", "--quiet", "--no-input", "--disable-pip-version-check"]
     command = [sys.executable, "-m", "pip", "install", *options, *arguments]
     variables = {name: value for name, value in os.environ.items() if name not in _REMOVED_VARIABLES}
@@ -373,7 +405,11 @@ def _run_pip(*arguments: str, hint: str) -> None:
 
 
 def _read_report_entry(entry: Mapping[str, Any]) -> LockedRequirement | None:
-    """Return the package of an entry of pip's report; None if every sandbox provides the package."""
+    """Return the package of an entry of pip's report; None if every sandbox provides the package.
+
+    Raises:
+        CommandFailed: The entry has no SHA-256, since it is not a file of an index.
+    """
     name, version = _normalised(entry["metadata"]["name"]), entry["metadata"]["version"]
     if name in PROVIDED:
         return None
@@ -386,7 +422,10 @@ def _read_report_entry(entry: Mapping[str, Any]) -> LockedRequirement | None:
 
 
 def _numbered_lines(text: str) -> Iterator[tuple[int, str]]:
-    """Yield number and text of each line without comments; a backslash at the end continues a line."""
+    """Yield number and text of each line that is not empty without its comment.
+
+    A backslash at the end of a line continues it; both lines are one, with the number of the first.
+    """
     number, continued = 0, ""
     for line_number, raw in enumerate(text.splitlines(), 1):
         number = number if continued else line_number

@@ -117,7 +117,8 @@ def read_service(folder: Path) -> InstalledService:
     """Return the service that ``service.json`` in *folder* describes.
 
     Raises:
-        UsageError: The file is missing, is not JSON, or has an invalid field.
+        UsageError: The file is missing, is not a regular file, is not JSON, has an invalid or unknown field,
+            or names an entry outside of the folder.  Whether the entry exists is not checked.
     """
     path = folder / _MANIFEST
     try:
@@ -141,7 +142,8 @@ def read_service(folder: Path) -> InstalledService:
 def install(folder: Path, into: Path, dependencies: Dependencies | None = None) -> InstalledService:
     """Copy the service in *folder* to the services folder *into*, and write the hash of every file.
 
-    An installed service of the same name is replaced at once, when the copy is complete.
+    An installed service of the same name is replaced when the copy is complete: it is renamed, and then the
+    copy gets its name.  Its Python packages stay in the services folder.
 
     Args:
         folder: The service.
@@ -149,8 +151,8 @@ def install(folder: Path, into: Path, dependencies: Dependencies | None = None) 
         dependencies: Packages that `build_dependencies` installed for the service, which are copied as well.
 
     Raises:
-        UsageError: The folder is not a service, holds a link, its entry is missing (such as a library that
-            was not built), or it locks packages and *dependencies* is None.
+        UsageError: The folder is not a service, holds a link, pipe, socket or device, its entry is missing
+            (such as a library that was not built), or it locks packages and *dependencies* is None.
         ConfigurationError: An installed service needs another version of a package.
     """
     # 1. Check the folder and the versions of its packages.
@@ -188,7 +190,7 @@ def install(folder: Path, into: Path, dependencies: Dependencies | None = None) 
         )
     pins = {path: _file_sha256(fresh / path) for path in _list_files(fresh)}
     (fresh / _PINS).write_text(json.dumps(pins, indent=1, sort_keys=True) + "\n", encoding="utf-8")
-    # 3. Let it take the place of the installed service.
+    # 3. Let the copy take the place of the installed service.
     if target.exists():
         target.rename(old)
     fresh.rename(target)
@@ -198,6 +200,8 @@ def install(folder: Path, into: Path, dependencies: Dependencies | None = None) 
 
 def installed_services(folder: Path) -> list[InstalledService]:
     """Compare the services in the services folder *folder* with their hashes, and return them sorted by name.
+
+    Folders whose names begin with a dot are no services.
 
     Raises:
         ConfigurationError: The folder is missing; a file of a service or of its packages was changed, added
@@ -223,10 +227,12 @@ def installed_services(folder: Path) -> list[InstalledService]:
 def packaged_services() -> list[InstalledService]:
     """Return the services that Python packages offer by entry points; the packages are not imported.
 
-    The module of an entry point defines ``serve`` or ``Service``, like the file of a service folder.
+    The module of an entry point defines ``serve`` or ``Service``, like the file of a service folder.  The
+    kind of these services is always ``per_robot_state``, and their identity is empty: their files are not
+    verified.
 
     Raises:
-        ConfigurationError: A name is invalid, or two packages use it.
+        ConfigurationError: A name is invalid, or used by two entry points.
     """
     services: dict[str, InstalledService] = {}
     for point in metadata.entry_points(group=ENTRY_POINTS):
@@ -261,7 +267,10 @@ def _dependencies_in(folder: Path) -> Iterator[tuple[str, Dependencies]]:
 
 
 def read_dependencies(target: Path) -> Dependencies | None:
-    """Return the packages of the installed service in the folder *target*, None if it has none.
+    """Return the packages of the installed service in the folder *target*, without a look at their files.
+
+    The result is None if the service has no packages, or if it was not installed: its folder has no
+    ``pins.json``.
 
     Raises:
         ConfigurationError: ``dependencies.json`` is damaged.
@@ -282,12 +291,19 @@ def read_dependencies(target: Path) -> Dependencies | None:
 
 
 def read_identity(target: Path) -> str:
-    """Return `InstalledService.identity` of the installed service in the folder *target*; raises OSError."""
+    """Return `InstalledService.identity` of the installed service in the folder *target*.
+
+    Raises:
+        OSError: ``pins.json`` is missing or cannot be read.
+    """
     return _file_sha256(target / _PINS)
 
 
 def verify_installed(target: Path) -> None:
     """Check that the folder *target* holds an installed service with unchanged files.
+
+    Files in folders ``__pycache__`` are ignored.  The service's Python packages, which lie in another folder,
+    are not checked.
 
     Raises:
         ConfigurationError: The service was not installed, or a file was changed, added or removed.

@@ -27,11 +27,12 @@ from rse_pf.wire.arrays import json_encode_hook
 
 __all__ = ["LuaRuntime", "warm_up"]
 
-# Most bytes that zlib.inflate returns to a script: 16 MiB, so that a bomb cannot fill the memory.
+# Most bytes that zlib.inflate returns to a script: 16 MiB, so that a bomb cannot fill the memory.  Longer
+# output is cut off there without an error.
 _MAX_INFLATED = 1 << 24
 _MAX_LEVELS = 64
-"""Most levels of nested tables in a reply, so that a table that holds itself ends; a message has fewer
-levels."""
+"""Most levels of nested tables in a reply or snapshot, so that a table that holds itself causes an error
+instead of an endless recursion; a message has fewer levels."""
 _SETUP = """
 local json_decode, json_encode, inflate, deflate, folder = ...
 package.preload.json = function() return {decode = json_decode, encode = json_encode} end
@@ -42,6 +43,8 @@ service_folder = folder
 python = nil
 return pcall
 """
+"""Lua code that runs before a script: it makes the modules ``json`` and ``zlib``, restricts ``require`` to
+the folder of the service, hides Python, and returns ``pcall``, by which the script is called."""
 
 
 def warm_up() -> Any:
@@ -102,7 +105,12 @@ class LuaRuntime:
     def call(self, payload: Any) -> Any:
         """Return the reply of the script to *payload*.
 
-        A table with ``takes_text = true`` receives and returns JSON text instead of tables.
+        If the table that the script returned has ``takes_text = true``, its ``serve`` receives and returns
+        JSON text instead of tables.
+
+        Raises:
+            RsePfError: The script raised an error, see `_convert_error`.
+            InternalError: The reply is not JSON, or holds a value that no message can hold.
         """
         if self._takes_text:
             return self._parse(self._run("serve", msgspec.json.encode(payload, enc_hook=json_encode_hook)))
@@ -163,10 +171,16 @@ class LuaRuntime:
     def _from_lua(self, value: Any, what: str = "reply", level: int = 0) -> Any:
         """Return a Lua value as plain Python values: a table with the keys 1..n as a list, others as dicts.
 
+        An empty table becomes an empty dict.  Keys of dicts become text.
+
         Args:
             value: The Lua value.
             what: What the value is, for the error: ``reply`` or ``snapshot``.
-            level: Levels of tables around the value.
+            level: Number of tables around the value.
+
+        Raises:
+            InternalError: The value, or one inside of it, is a function or something else that no message can
+                hold, or tables are nested in more than `_MAX_LEVELS` levels.
         """
         if self._lupa.lua_type(value) != "table":
             if value is None or isinstance(value, bool | int | float):

@@ -25,7 +25,8 @@ class OutputLines:
 
     A token bucket lets 200 lines pass at once and 50 per second; the next line that passes is preceded by one
     with the number of dropped lines.  A line of more than `MAX_LINE` characters is cut, and ends with the
-    number of missing ones.
+    number of characters that are missing.  `feed` and `end` are generators, which the caller must exhaust:
+    they change the state while they yield.
     """
 
     def __init__(self) -> None:

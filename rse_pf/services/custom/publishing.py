@@ -58,7 +58,8 @@ __all__ = [
 LIST_NAME = f"{SERVICES_PREFIX}/list.json"
 """Name of the list in the artifact bucket."""
 LIST_POLL_PERIOD_S = 15
-"""Seconds between two reads of the list by a server: a new service runs everywhere after this time."""
+"""Seconds between two reads of the list by a server: every server begins to install a new list within this
+time."""
 SERVER_PLATFORM = "cp311-linux-x86_64"
 """Platform tag of servers on AWS, which run Debian 12 on x86-64; packages of services must have the same
 tag."""
@@ -73,10 +74,10 @@ _ARCHIVES = "archives"  # folder of the unpacked archives, each named by its dig
 _LISTS = "lists"  # folder of the services folders, each named by the digest of its list
 
 # --- Limits of an archive, above which it is refused while it is unpacked ---
-_MAX_UNPACKED_BYTES = 1 << 30  # total size of the files in bytes, so that a bomb cannot fill the disk
-_MAX_FILES = 20_000  # number of files
-_MAX_PATH = 2000  # bytes of a path within the archive
-_MAX_PART = 200  # characters of a file name, below the limit of file systems
+_MAX_UNPACKED_BYTES = 1 << 30  # largest total size of the files in bytes, so that a bomb cannot fill the disk
+_MAX_FILES = 20_000  # largest number of files
+_MAX_PATH = 2000  # largest number of bytes of a file's path within the archive
+_MAX_PART = 200  # largest number of characters of one name in a path, below the limit of file systems
 _ARCHIVE_ERRORS = (
     tarfile.TarError,
     EOFError,
@@ -86,8 +87,8 @@ _ARCHIVE_ERRORS = (
     NotADirectoryError,
     ValueError,
 )
-"""Errors that a damaged archive causes.  Others, such as that of a full disk, pass, and the list is tried
-again."""
+"""Errors that a damaged archive causes, which become a ConfigurationError.  Others, such as that of a full
+disk, pass, and the server tries the list again."""
 
 _NAME = re.compile(r"[a-z][a-z0-9_-]{0,39}")  # pattern of a service's name
 _DIGEST = re.compile(r"[0-9a-f]{64}")  # pattern of a SHA-256 in hexadecimal digits
@@ -98,8 +99,9 @@ _ELF_MAGIC = b"\x7fELF\x02\x01"  # first bytes of a 64-bit little-endian ELF fil
 _ELF_MACHINE = slice(18, 20)  # bytes of an ELF header that hold the machine, little-endian
 _ELF_X86_64 = 62  # the machine x86-64 in an ELF header
 _SYMBOL_VERSION = re.compile(rb"\b(GLIBC|GLIBCXX)_(\d+)\.(\d+)(?:\.(\d+))?\b")
+"""The name of a symbol version in a shared library, such as ``GLIBC_2.34``."""
 _NEWEST_VERSIONS = {b"GLIBC": (2, 36, 0), b"GLIBCXX": (3, 4, 30)}
-"""Newest symbol versions of the C and C++ libraries of Debian 12."""
+"""Newest symbol versions (major, minor, patch) of the C and C++ libraries of Debian 12."""
 _BUILD_HINT = "build it on Debian 12 (x86-64), for example in a container, and publish from there"
 
 
@@ -132,7 +134,12 @@ class PublishedList(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
 
 
 def decode_list(data: bytes) -> PublishedList:
-    """Return the list that *data* encodes as JSON; raises ConfigurationError if the list is damaged."""
+    """Return the list that *data* encodes as JSON.
+
+    Raises:
+        ConfigurationError: The list is damaged: it is not JSON, a name is invalid, occurs twice or is out of
+            order, or an archive is not named by a SHA-256.
+    """
     try:
         published = msgspec.json.decode(data, type=PublishedList)
     except msgspec.MsgspecError as error:
@@ -147,7 +154,11 @@ def decode_list(data: bytes) -> PublishedList:
 
 
 def read_list(store: ObjectStore) -> PublishedList:
-    """Return the list in *store*; an empty list if nothing was published."""
+    """Return the list in *store*; an empty list if nothing was published.
+
+    Raises:
+        ConfigurationError: The list is damaged.
+    """
     return _read(store)[1]
 
 
@@ -161,9 +172,10 @@ def publish(service: InstalledService, root: Path, store: ObjectStore, *, now_s:
         now_s: Unix time, seconds.
 
     Raises:
-        ConfigurationError: Servers cannot run the service, the archive is too large, or another published
-            service needs another version of a package.
-        StoreError: The store fails; the list stays.
+        ConfigurationError: Servers cannot run the service, the archive is too large, the published list is
+            damaged, or another published service needs another version of a package.
+        UsageError: An entry below *root* is neither a regular file nor a folder.
+        StoreError: The store fails, or other operators change the list all the time; the list stays.
     """
     dependencies = require_server_platform(service, root)
     archive = pack_archive(root)
@@ -202,7 +214,10 @@ def unpublish(name: str, store: ObjectStore) -> None:
 
 
 def require_server_platform(service: InstalledService, root: Path) -> Dependencies | None:
-    """Check that servers on AWS can load *service* in the services folder *root*; return its packages.
+    """Check that servers on AWS can load *service* in the services folder *root*.
+
+    Returns:
+        The Python packages of the service, None if it has none.
 
     Raises:
         ConfigurationError: Packages or shared libraries are for another platform, or need a newer C library.
@@ -221,6 +236,8 @@ def require_server_platform(service: InstalledService, root: Path) -> Dependenci
 
 def pack_archive(root: Path) -> bytes:
     """Return all files below *root* as a gzip-compressed tar archive; equal files give equal bytes.
+
+    Times, owners and modes of the files are not kept, and empty folders are left out.
 
     Raises:
         UsageError: An entry below *root* is neither a regular file nor a folder.
@@ -245,7 +262,16 @@ def _read(store: ObjectStore) -> tuple[bytes | None, PublishedList]:
 
 
 def _change_list(store: ObjectStore, changes: Mapping[str, PublishedService | None]) -> None:
-    """Apply *changes* (name to new entry, None to remove) to the list by compare-and-swap, with retries."""
+    """Apply *changes* to the list in *store* by compare-and-swap.
+
+    Args:
+        store: The artifact bucket.
+        changes: For each name of a service its new entry, or None to remove the service.
+
+    Raises:
+        ConfigurationError: The list is damaged, or two services would need different versions of a package.
+        StoreError: The list was changed by others at each of `_MAX_TRIES` attempts.
+    """
     for _ in range(_MAX_TRIES):
         before, published = _read(store)
         merged = {**{entry.name: entry for entry in published.services}, **changes}
@@ -260,7 +286,10 @@ def _change_list(store: ObjectStore, changes: Mapping[str, PublishedService | No
 
 
 def _require_compatible_packages(entries: Sequence[PublishedService]) -> None:
-    """Raise ConfigurationError if two services need different versions; of equal names the first counts."""
+    """Raise ConfigurationError if two services need different versions of a package.
+
+    Of several entries with the same name of a service only the first one counts.
+    """
     first_of_name: dict[str, PublishedService] = {}
     for entry in entries:
         first_of_name.setdefault(entry.name, entry)
@@ -306,11 +335,12 @@ class PublishedFolder:
 
     Below one root lie the unpacked archives, a services folder for each list, and the link ``current`` to the
     services folder that runs.  A new list gets a new folder, and the link moves when all of it is verified: a
-    server that still reads the old folder is not disturbed, and a server that fails in between keeps it.
+    server that still reads the old folder is not disturbed, and a server that fails in between keeps the old
+    services.
     """
 
     def __init__(self, root: Path) -> None:
-        """Use the folder *root*, which is created by the first `install`."""
+        """Remember the folder *root*; the first `install` creates it."""
         self._root = root
 
     @property
@@ -319,7 +349,7 @@ class PublishedFolder:
         return self._root / CURRENT
 
     def holds(self, data: bytes) -> bool:
-        """Return whether the link leads to the services of the list *data*."""
+        """Return whether the link leads to the services of the encoded list *data*; False without a link."""
         return self.link.is_dir() and self.link.resolve().name == _folder_name(data)
 
     def install(self, data: bytes, fetch: Callable[[PublishedService], bytes]) -> list[InstalledService]:
@@ -339,7 +369,7 @@ class PublishedFolder:
         archives, target = self._root / _ARCHIVES, self._root / _LISTS / _folder_name(data)
         for folder in (archives, target.parent):
             folder.mkdir(parents=True, exist_ok=True)
-        # 1. Fetch and unpack the archives that are missing.
+        # 1. Fetch and unpack the archives that are not unpacked yet, each under a temporary name.
         for entry in entries:
             if not (archives / entry.archive).is_dir():
                 if entry.size > MAX_ARCHIVE_BYTES:
@@ -353,10 +383,11 @@ class PublishedFolder:
         # 2. Make the services folder of the list, and verify its services.
         shutil.rmtree(target, ignore_errors=True)
         services = assemble_folder(entries, archives, target)
-        # 3. Move the link.
+        # 3. Move the link ``current`` to the new services folder.
         former = self.link.resolve() if self.link.is_dir() else target
         self._move_link(target)
-        # 4. Remove what no server reads any more.
+        # 4. Remove all services folders but the new and the former one, which a server may still read, and
+        # the archives that the new list does not name.
         self._remove_others({target.name, former.name}, {entry.archive for entry in entries})
         return services
 
@@ -367,7 +398,10 @@ class PublishedFolder:
         fresh.replace(self.link)
 
     def _remove_others(self, lists: set[str], archives: set[str]) -> None:
-        """Remove all but the named services folders and archives; files that are linked elsewhere stay."""
+        """Remove all but the named services folders and archives.
+
+        Files of a removed archive stay in the services folders that hold hard links to them.
+        """
         for folder, keep in ((_LISTS, lists), (_ARCHIVES, archives)):
             for path in (self._root / folder).iterdir():
                 if path.name not in keep:
@@ -376,6 +410,8 @@ class PublishedFolder:
 
 def unpack_archive(entry: PublishedService, archive: bytes, into: Path) -> None:
     """Write the files of *archive* below *into*, which must be empty or missing.
+
+    Files that were written before an error stay; the caller removes them.
 
     Raises:
         ConfigurationError: The digest of the archive is not that of *entry*, or the archive holds what no

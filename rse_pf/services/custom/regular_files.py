@@ -26,6 +26,8 @@ _REFUSED_KINDS = (
     (stat.S_ISCHR, "a device", "remove it"),
     (stat.S_ISBLK, "a device", "remove it"),
 )
+"""Kinds of entries that no service may have: the function that recognises the mode of a file, and the name of
+the kind and the hint for the error."""
 
 
 def read_regular_file(path: Path) -> bytes:

@@ -56,13 +56,18 @@ class Runtime(Protocol):
     has_snapshots: bool
 
     def call(self, payload: Any) -> Any:
-        """Return the reply to *payload*: a struct, or plain values and arrays."""
+        """Return the reply to *payload*: a struct, or plain values and arrays.
+
+        Raises:
+            RsePfError: The service refuses the request, fails, or replies with what no message can hold.
+                Code in Python may raise any other exception as well.
+        """
 
     def snapshot(self) -> bytes:
-        """Return the state of the service, for `restore` in another process."""
+        """Return the state of the service, for `restore` in another process; only with ``has_snapshots``."""
 
     def restore(self, data: bytes) -> None:
-        """Replace the state of the service by the snapshot *data*."""
+        """Replace the state of the service by the snapshot *data*; only with ``has_snapshots``."""
 
 
 def open_runtime(service: InstalledService, scratch: Path) -> Runtime:
@@ -88,7 +93,10 @@ def open_runtime(service: InstalledService, scratch: Path) -> Runtime:
 
 
 class _PythonRuntime:
-    """The runtime of Python: calls a function ``serve`` or the method ``serve`` of a class ``Service``."""
+    """The runtime of Python: calls the method ``serve`` of a class ``Service``, else a function ``serve``.
+
+    One object of the class is made when the service is loaded, and keeps the state between calls.
+    """
 
     def __init__(self, service: InstalledService) -> None:
         module = _load_module(service)

@@ -87,7 +87,7 @@ class VerifiedCopy:
 
     Attributes:
         original: The service in the services folder.
-        service: The service in the copy, once `make` has returned.
+        service: The service in the copy, once `make` has returned; before, the same as *original*.
     """
 
     def __init__(self, original: InstalledService, into: Path) -> None:
@@ -98,7 +98,7 @@ class VerifiedCopy:
         self._file_statuses: dict[str, _FileStatus] = {}
 
     def make(self) -> None:
-        """Copy the service and its packages, and compare the copy with the hashes.
+        """Copy the service and its packages, and compare the copy with the hashes; sets ``service``.
 
         Raises:
             ConfigurationError: The files are not those that the server verified when it started, or cannot be

@@ -41,7 +41,8 @@ struct Degenerate : std::runtime_error {
   using std::runtime_error::runtime_error;
 };
 
-// A value of a request or a reply: a number, a text, or an array of doubles with its shape.
+// A value of a request or a reply: a number (one element in `values`, an empty `shape`), a text (in `text`), or an
+// array of doubles (row-major in `values`, at most 4 axes in `shape`).
 struct Field {
   uint32_t type = RSE_PF_FLOAT64;
   std::vector<uint64_t> shape;
@@ -68,7 +69,8 @@ class Fields : public std::map<std::string, Field> {
     if (found == end()) throw BadRequest("the request has no field '" + name + "'");
     return found->second;
   }
-  // Return the numbers of an array of rows, each of `columns` numbers; throw BadRequest for any other field.
+  // Return the numbers of the field `name`, row by row, whatever its shape; there may be none.  Throw BadRequest if the
+  // field is missing, is a text, or the count of its numbers is not a multiple of `columns`.
   const std::vector<double> &rows(const std::string &name, std::size_t columns) const {
     const Field &field = at(name);
     if (field.type != RSE_PF_FLOAT64 || field.values.size() % columns != 0)
@@ -79,13 +81,14 @@ class Fields : public std::map<std::string, Field> {
 
 namespace detail {
 
+// What the C functions receive as their state: the service, and why its last call failed.
 template <class Service>
 struct State {
   Service service;
   std::string error;
 };
 
-// Copy the C fields of a request.
+// Return copies of the C fields of a request; of several fields with the same name the last one counts.
 inline Fields copy_fields(const rse_pf_field *fields, uint32_t count) {
   Fields copies;
   for (uint32_t i = 0; i < count; ++i) {
@@ -103,7 +106,8 @@ inline Fields copy_fields(const rse_pf_field *fields, uint32_t count) {
   return copies;
 }
 
-// Copy a reply to C fields in one block of memory: fields, then numbers, then texts.  free() releases the block.
+// Return a reply as C fields in one block of memory: the fields, then all numbers, then all names and texts.  free()
+// releases the block.  Of a shape only the first 4 axes are kept; the platform refuses the field if count differs then.
 inline rse_pf_field *allocate_fields(const Fields &fields) {
   std::size_t numbers = 0, bytes = 0;
   for (const auto &entry : fields) {
@@ -142,7 +146,7 @@ inline rse_pf_field *allocate_fields(const Fields &fields) {
   return out;
 }
 
-// Run `work`, and convert an exception to a code of rse_pf_status and its message.
+// Run `work`, return a code of rse_pf_status, and set `error` to the message of the exception, empty after success.
 template <class Work>
 int run_guarded(std::string &error, Work work) {
   try {
