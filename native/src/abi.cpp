@@ -33,6 +33,7 @@ struct Memory {
 
     static void release(void* memory) { std::free(static_cast<Memory*>(memory)->block); }
 
+    // Return the memory at `next` as an array of `count` elements, and move `next` behind it.
     template <class T>
     static T* take_array(char*& next, int64_t count) {
         T* const array = reinterpret_cast<T*>(next);
@@ -50,7 +51,8 @@ struct Memory {
         return columns;
     }
 
-    // Enlarge the workspace to a number of rows; return false if there is no memory.
+    // Enlarge the workspace to at least a number of rows, whose values are lost then; return false, with the workspace
+    // as it was, if there is no memory.
     bool reserve(int64_t wanted_rows) {
         if (wanted_rows <= rows) return true;
         int64_t size = rows > kFirstRows ? rows : kFirstRows;

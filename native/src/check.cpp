@@ -7,7 +7,7 @@ namespace {
 constexpr int64_t kMaxSide = int64_t{1} << 16;
 // Most pixels at which depths are read in one call: a limit of plausible requests.
 constexpr int64_t kMaxRows = int64_t{1} << 24;
-// Distance (px) over which the contrast of an edge is measured: wider than a blurred edge.
+// Distance (px) along the line over which the contrast of an edge is measured: wider than a blurred edge.
 constexpr int64_t kContrastPx = 16;
 // Distance (px) over which the steepest part of an edge is measured.
 constexpr int64_t kSlopePx = 2;
@@ -17,7 +17,8 @@ constexpr int64_t kMinLength = 48;
 constexpr int64_t kLevels = 256;
 // Distance (px) of the four neighbours of a pixel whose depths join the median: near enough to show the same surface.
 constexpr int64_t kNeighbourPx = 2;
-// Number of pixels by which memory is fetched ahead, so that the depths are in the cache when they are needed.
+// Number of requested pixels by which memory is fetched ahead, so that the depths are in the cache when they are
+// needed.
 constexpr int64_t kAhead = 16;
 
 int absolute_difference(uint8_t a, uint8_t b) { return a < b ? b - a : a - b; }
@@ -40,7 +41,7 @@ struct DepthImage {
     }
 };
 
-// Exchange two numbers unless they are in ascending order.
+// Exchange two numbers in place unless they are in ascending order.
 void sort_two(float& a, float& b) {
     const float smaller = a < b ? a : b;
     b = a < b ? b : a;
@@ -59,7 +60,7 @@ __attribute__((visibility("default"))) int64_t rse_pf_edges(const uint8_t* gray,
     if (gray == nullptr || sharpness == nullptr || lines < 1 || lines > kMaxSide || length < kMinLength ||
         length > kMaxSide || wanted_edges < 1 || min_contrast < 1 || max_edges < 1)
         return -1;
-    // 1. Count the pixels of each contrast.
+    // 1. Count the pixels of all lines by their contrast.
     int64_t counts[kLevels] = {};
     const uint8_t* line = gray;
     for (int64_t number = 0; number < lines; ++number, line += length)
@@ -108,7 +109,8 @@ __attribute__((visibility("default"))) int32_t rse_pf_depths_at(const float* dep
                          at[-kNeighbourPx * column_stride], at[kNeighbourPx * column_stride]};
         depths_m[i] = __builtin_nan("");
         if (!(five[0] > 0.0f && five[1] > 0.0f && five[2] > 0.0f && five[3] > 0.0f && five[4] > 0.0f)) continue;
-        // 3. Sort them by a network of nine exchanges (Knuth, TAOCP 3, Sect. 5.3.4), and take the median.
+        // 3. Sort them by a network of nine exchanges (Knuth, TAOCP 3, Sect. 5.3.4), and take the median, unless they
+        // differ too much.
         sort_two(five[0], five[1]);
         sort_two(five[3], five[4]);
         sort_two(five[2], five[4]);

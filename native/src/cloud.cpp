@@ -25,7 +25,8 @@ int64_t axis_index(double coordinate, double voxel_m, int64_t reach) {
     return index > -limit && index < limit ? static_cast<int64_t>(index) + reach : -1;
 }
 
-// Return the slot that holds a key, or the empty slot that ends the search for it (linear probing).
+// Return the slot that holds a key, or the empty slot that ends the search for it (linear probing); count the slots
+// that are read in grid.probes.
 uint64_t find_slot(rse_pf_cloud_request& grid, int64_t key) {
     const auto mask = static_cast<uint64_t>(grid.slots - 1);
     uint64_t slot = hash_key(key) & mask;
@@ -58,7 +59,8 @@ struct PreviousVoxel {
     int64_t key = kEmpty, row = -1;
 };
 
-// Add a point (metres, world frame), which is the mean of `weight` measurements, to the running means of its voxel.
+// Add a point (metres, world frame), which is the mean of `weight` measurements, to the running means of its voxel, and
+// `weight` to grid.used.  A point outside of the grid, or in a new voxel of a full grid, is left out.
 void add_point(rse_pf_cloud_request& grid, PreviousVoxel& previous, const double (&point)[3], const double (&colour)[3],
                int32_t weight) {
     const int64_t x = axis_index(point[0], grid.voxel_m, grid.reach), y = axis_index(point[1], grid.voxel_m, grid.reach);
@@ -78,11 +80,12 @@ void add_point(rse_pf_cloud_request& grid, PreviousVoxel& previous, const double
     }
 }
 
-// Return whether two neighbouring depths belong to one surface: they differ by at most a share of the right or lower
-// one.
+// Return whether two neighbouring depths belong to one surface: they differ by at most a share of `after`, the right or
+// lower one of the two.
 bool is_smooth(float before, float after, float share) { return __builtin_fabsf(after - before) <= after * share; }
 
-// Return whether a depth is in range, and not on a depth edge.
+// Return whether the depth of a pixel is in range, and not on a depth edge with one of its four neighbours in the
+// image.
 bool is_usable(const rse_pf_cloud_frame& frame, int64_t row, int64_t column) {
     const float* const at = frame.depth_m + row * frame.width + column;
     return *at >= frame.min_depth_m && *at <= frame.max_depth_m &&

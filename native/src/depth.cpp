@@ -36,18 +36,19 @@ constexpr double kMaxDepthM = 1e3;
 // Smallest standard deviation of a pixel (px) that is derived from the reprojection error, which may be small by chance
 // where matches are few.
 constexpr double kMinPixelPx = 0.05;
-// Smallest factor by which the residuals may scale the covariance of the pose: few residuals may be small by chance.
+// Smallest factor by which the residuals may scale the covariance of the pose (1: they are as large as the assumed
+// noise): few residuals may be small by chance.
 constexpr double kMinScale = 0.01;
-// Largest ratio of the reprojection errors after and before the refinement: a larger ratio shows that depths and pixels
-// disagree.
+// Largest ratio of the root mean square reprojection errors after and before the refinement: a larger ratio shows that
+// depths and pixels disagree, and the input pose stays.
 constexpr double kMaxRmseGrowth = 1.5;
-// Smallest reprojection error (px) with which the error after the refinement is compared: smaller errors may grow more
-// by chance.
+// Smallest root mean square reprojection error (px) with which the error after the refinement is compared: smaller
+// errors of the input pose may grow more by chance.
 constexpr double kMinRmsePx = 0.2;
 
 bool is_within(double value, double low, double high) { return value >= low && value <= high; }
 
-// Sum the rows without AVX2; add_rows_with_avx2 gives the same bytes.
+// Write the sums of the rows at a pose without AVX2; add_rows_with_avx2 gives the same bytes.
 template <bool kIsLast>
 void add_rows_portably(const Rows& rows, const Pose& pose, const Sensor& sensor, Sums& sums) {
     const double t[3] = {pose.t.x, pose.t.y, pose.t.z};
@@ -102,8 +103,8 @@ int64_t validate(const rse_pf_depth_request& request, const double* workspace) {
     return RSE_PF_DEPTH_REFINED;
 }
 
-// Copy the inliers to columns, and pad the last vector with copies of the first inlier.  Return whether any inlier has
-// a depth in the second image.
+// Copy the inliers to columns in the workspace, and pad the last vector with copies of the first inlier, which must
+// exist.  Return whether any inlier has a depth in the second image.
 bool gather_inliers(const rse_pf_depth_request& request, const Sensor& sensor, double* workspace, Rows& rows) {
     rows.count = (request.inlier_rows + kFour - 1) / kFour * kFour;
     double** const columns[] = {&rows.x, &rows.y, &rows.z,     &rows.z_inverse, &rows.depth_variance, &rows.z2,
@@ -147,10 +148,11 @@ Normal assemble_normal_equations(const Sums& sums) {
     return normal;
 }
 
-// Write the covariance of the twist: that of an M-estimator, Huber, Robust Statistics (1981), Sect. 7.6.  Return false
-// where some motion of the camera is unconstrained, or where most residuals are outliers (a mean slope of 0 or less).
+// Write the covariance of the twist (m, rad) left of the pose from the sums of the last pass: that of an M-estimator,
+// Huber, Robust Statistics (1981), Sect. 7.6.  Return false where some motion of the camera is unconstrained, or where
+// most residuals are outliers (a mean slope of 0 or less).
 bool compute_covariance(const Sums& sums, double (&covariance)[36]) {
-    // 1. Compute the factor by which the residuals exceed their assumed noise.
+    // 1. Compute the factor by which the variance of the residuals exceeds that of their assumed noise.
     const double mean_slope = sums.slope / sums.residuals;
     if (!(mean_slope > 0.0)) return false;
     const double degrees_of_freedom = sums.residuals - 6.0 > 1.0 ? sums.residuals - 6.0 : 1.0;
@@ -169,21 +171,23 @@ bool compute_covariance(const Sums& sums, double (&covariance)[36]) {
             covariance[6 * i + j] = 0.5 * (columns[i][j] + columns[j][i]) * scale;
             total += covariance[6 * i + j];
         }
-    // 3. Refuse a covariance that is not finite or has a variance that is not positive.
+    // 3. Return false for a covariance that is not finite or has a variance that is not positive.
     for (int i = 0; i < 6; ++i)
         if (!(covariance[7 * i] > 0.0)) return false;
     return total - total == 0.0;
 }
 
-// Refine the pose of a valid request, and return RSE_PF_DEPTH_REFINED, or RSE_PF_DEPTH_KEPT where that fails.
+// Refine the pose of a valid request, write pose, covariance and error to the result, and return RSE_PF_DEPTH_REFINED.
+// Return RSE_PF_DEPTH_KEPT where that fails: the fields of the result are then not valid.
 int64_t refine(const rse_pf_depth_request& request, double* workspace, rse_pf_depth_result& result) {
-    // 1. Derive the pixel noise from the reprojection error: half of it is due to each image.
+    // 1. Derive the standard deviation of a pixel coordinate from the reprojection error, whose square sums two
+    // coordinates in each of two images: it is half of the error.
     const double pixel_px = 0.5 * request.rmse_px > kMinPixelPx ? 0.5 * request.rmse_px : kMinPixelPx;
     const Sensor sensor = {request.fx,     request.fy,           request.cx,     request.cy,
                            request.base_m, request.growth_per_m, request.from_m, pixel_px * pixel_px};
     Rows rows;
     if (request.inlier_rows == 0 || !gather_inliers(request, sensor, workspace, rows)) return RSE_PF_DEPTH_KEPT;
-    // 2. Iterate Gauss-Newton steps.
+    // 2. Apply Gauss-Newton steps to the pose until they are small.
     const bool has_avx2 = may_use_avx2(request.flags);
     const double* const T = request.T_camera_reference;
     Pose pose = {{{T[0], T[1], T[2]}, {T[4], T[5], T[6]}, {T[8], T[9], T[10]}}, {T[3], T[7], T[11]}};
@@ -199,7 +203,7 @@ int64_t refine(const rse_pf_depth_request& request, double* workspace, rse_pf_de
         pose = apply_twist(twist, pose);
         if (largest < kConvergedStep) break;
     }
-    // 3. Keep the input pose if the reprojection error has grown or the pose is not finite.
+    // 3. Keep the input pose if the reprojection error has grown too much or the refined pose is not finite.
     add_all_rows<true>(rows, pose, sensor, has_avx2, sums);
     result.rmse_px = square_root(sums.error2 / static_cast<double>(request.inlier_rows));
     const double before_px = request.rmse_px > kMinRmsePx ? request.rmse_px : kMinRmsePx;

@@ -19,7 +19,7 @@ constexpr double kMinDepthM = 1e-3;
 // Squared Mahalanobis distance at which the Cauchy weight of a residual is one half: 2.5 standard deviations, squared.
 constexpr double kCauchy2 = 6.25;
 
-// Inliers as a structure of arrays; `count` is a multiple of four, and the last vector is padded.
+// Inliers as a structure of arrays; `count`, a multiple of four, includes the rows that pad the last vector.
 struct Rows {
     int64_t count;
     double *x, *y, *z;        // point in the reference camera, metres
@@ -33,17 +33,17 @@ struct Rows {
 
 struct Sensor {
     double fx, fy, cx, cy;               // pinhole intrinsics, pixels
-    double base_m, growth_per_m, from_m; // standard deviation of depth z: base + growth * max(0, z - from)^2
-    double pixel_px2;                    // variance of a pixel coordinate, px^2
+    double base_m, growth_per_m, from_m; // standard deviation of depth z: base + growth * max(0, z - from)^2, metres
+    double pixel_px2;                    // variance of a pixel coordinate in each image, px^2
 };
 
-// The sums of one pass over the rows.
+// The sums of one pass over the rows.  b is 0 after the last pass, and what follows b is 0 after the others.
 struct Sums {
     // Blocks of A = J^T W J (upper triangles of translation P and rotation D, all of the mixed block M), and b = J^T W
     // r.
     double P[6], M[9], D[6], b[6];
-    // For the covariance of an M-estimator: the squared weighted distances, the sum of the derivatives of the influence
-    // function, and the number of residuals.
+    // For the covariance of an M-estimator: the sum of the squared Mahalanobis distances times the squared weights, the
+    // sum of the derivatives of the influence function, and the number of residuals (two of a pixel, one of a depth).
     double weight2_distance2, slope, residuals;
     // Sum of the squared reprojection errors, px^2.
     double error2;
@@ -55,8 +55,8 @@ RSE_PF_ROWS_INLINE Four all(double value) { return Four{value, value, value, val
 RSE_PF_ROWS_INLINE void load(const double* from, Four& lanes) { __builtin_memcpy(&lanes, from, sizeof lanes); }
 RSE_PF_ROWS_INLINE double total(const Four& lanes) { return (lanes[0] + lanes[1]) + (lanes[2] + lanes[3]); }
 
-// Sum the rows at the pose (R, t), which maps the reference camera to the second camera.  The last pass, at the final
-// pose, leaves the robust weights out of A, and sums what covariance and rmse need instead of b.
+// Write the sums of the rows at the pose (R, t), which maps the reference camera to the second camera.  The last pass,
+// at the final pose, leaves the robust weights out of A, and sums what covariance and rmse need instead of b.
 template <bool kIsLast>
 RSE_PF_ROWS_INLINE void add_rows(const Rows& rows, const double (&R)[3][3], const double (&t)[3],
                                  const Sensor& sensor, Sums& sums) {
@@ -81,7 +81,8 @@ RSE_PF_ROWS_INLINE void add_rows(const Rows& rows, const double (&R)[3][3], cons
         Four y = R[1][0] * X + R[1][1] * Y + R[1][2] * Z;
         Four z = R[2][0] * X + R[2][1] * Y + R[2][2] * Z;
         const Four rx = x * z_inverse, ry = y * z_inverse, rz = z * z_inverse;
-        // 2. Translate the point, and compute the residuals of pixel and depth.
+        // 2. Translate the point, and compute the residuals of pixel and depth, measured minus predicted.  A missing
+        // depth has the residual 0.
         x += all(t[0]);
         y += all(t[1]);
         z += all(t[2]);
@@ -98,7 +99,7 @@ RSE_PF_ROWS_INLINE void add_rows(const Rows& rows, const double (&R)[3][3], cons
         const Four g12 = dy * rz + gx * (R[1][0] * R[2][0]) + gy * (R[1][1] * R[2][1]);
         const Four g22 = dz * rz + gx * (R[2][0] * R[2][0]) + gy * (R[2][1] * R[2][1]);
         // 4. Compute the covariance S of the residuals: G through the Jacobian [h0 0 k0; 0 h1 k1; 0 0 has] of (u, v, z)
-        // by the point, plus the noise of the second image.
+        // by the point, plus the noise of the second image.  A missing depth has the variance 1.
         const Four h0 = fx * inverse, h1 = fy * inverse, k0 = -(h0 * a), k1 = -(h1 * c);
         const Four e0 = h0 * g02 + k0 * g22, e1 = h1 * g12 + k1 * g22;
         Four beyond = z - all(sensor.from_m);
@@ -109,7 +110,7 @@ RSE_PF_ROWS_INLINE void add_rows(const Rows& rows, const double (&R)[3][3], cons
         const Four s11 = h1 * (h1 * g11 + k1 * g12) + k1 * e1 + pixel;
         const Four s02 = has * e0, s12 = has * e1;
         const Four s22 = has * (g22 + deviation * deviation) + (one - has);
-        // 5. Invert S to W.
+        // 5. Invert S to W by its adjugate, and multiply W with the residuals.
         const Four m00 = s11 * s22 - s12 * s12, m01 = s02 * s12 - s01 * s22, m02 = s01 * s12 - s02 * s11;
         const Four scale = one / (s00 * m00 + s01 * m01 + s02 * m02);
         const Four w00 = m00 * scale, w01 = m01 * scale, w02 = m02 * scale;

@@ -31,9 +31,9 @@ constexpr int64_t kBlurRadius = 3;
 // Smallest distance (px) of a keypoint from the border of its level: the rotated pattern and the smoothing must stay
 // inside.
 constexpr int64_t kReach = kPatternReach + kBlurRadius;
-// Weights of the Gaussian smoothing along an axis: 3 pixels on each side, and the middle one.
+// Number of weights of the Gaussian smoothing along an axis: 3 pixels on each side, and the middle one.
 constexpr int64_t kTaps = 7;
-// A Gaussian with a standard deviation of 2 px, in the rounding of OpenCV.
+// Weights of the Gaussian smoothing, with a standard deviation of 2 px, in the rounding of OpenCV.
 constexpr float kGauss[kTaps] = {0x1.1f5f62p-4f, 0x1.0c70fcp-3f, 0x1.869472p-3f, 0x1.ba95cp-3f,
                                  0x1.869472p-3f, 0x1.0c70fcp-3f, 0x1.1f5f62p-4f};
 
@@ -48,8 +48,9 @@ struct Box {
     int64_t left, top, right, bottom;
 };
 
-// Smooth the box of an image, which has at least kBlurRadius pixels around it: horizontally from the first tap, then
-// vertically from the middle tap outwards.
+// Smooth the box of an image, which has at least kBlurRadius pixels around it, and write it to the same place of `to`,
+// an image of the same size.  OpenCV's order of the sums: horizontally from the first weight on, then vertically from
+// the middle weight outwards.
 RSE_PF_INLINE void smooth(const Image& image, const Box& box, uint8_t* to, const Workspace& work) {
     const int64_t w = image.width, box_width = box.right - box.left;
     float* __restrict const pixel_line = work.lines + kTaps * w;
@@ -81,10 +82,11 @@ RSE_PF_INLINE void smooth(const Image& image, const Box& box, uint8_t* to, const
     }
 }
 
-// Write the descriptor of a keypoint at a pixel of a smoothed image.
+// Write the 32 bytes of the descriptor of a keypoint at the pixel `centre` of a smoothed image with `width` columns.
+// cosine, sine: of the keypoint's orientation.
 RSE_PF_INLINE void write_descriptor(const uint8_t* centre, int64_t width, float cosine, float sine,
                                     uint8_t* descriptor) {
-    // 1. Rotate the pattern.
+    // 1. Rotate the pattern by the orientation, and round it to whole pixels.
     int32_t offsets[2 * kPairs];
     const float row_step = static_cast<float>(width);
     for (int64_t k = 0; k < 2 * kPairs; ++k) {
@@ -92,7 +94,7 @@ RSE_PF_INLINE void write_descriptor(const uint8_t* centre, int64_t width, float 
         const float y = __builtin_rintf(kPatternX[k] * sine + kPatternY[k] * cosine);
         offsets[k] = static_cast<int32_t>(y * row_step + x);  // exact, since it is below 2^24
     }
-    // 2. Compare the pairs.
+    // 2. Set bit k if pixel k of the pattern is darker than pixel k + 256.
     for (int64_t byte = 0; byte < kBytes; ++byte) {
         uint32_t bits = 0;
         for (int64_t bit = 0; bit < 8; ++bit) {
@@ -109,8 +111,8 @@ struct Keypoints {
     int64_t rows;
 };
 
-// Return the index of a keypoint's pixel in its level, -1 if it is within kReach of the border.  `pixel` is that of the
-// whole image, `inverse` the inverse scale of the level.
+// Return the index of a keypoint's pixel in its level, -1 if it is within kReach of the border.  `image` is the level,
+// `pixel` that of the whole image, `inverse` the inverse scale of the level.
 RSE_PF_INLINE int64_t index_in_level(const Image& image, const float* pixel, float inverse) {
     const float x = pixel[0] * inverse, y = pixel[1] * inverse;
     constexpr float kMaxCoordinate = static_cast<float>(kMaxSide);
@@ -121,8 +123,8 @@ RSE_PF_INLINE int64_t index_in_level(const Image& image, const float* pixel, flo
     return is_inside ? row * image.width + column : -1;
 }
 
-// Write the descriptors of the keypoints of one level.  Return false if one of them lies within kReach of the border,
-// or has a cosine and sine that are not those of an angle.
+// Write the descriptors of the keypoints of one level, each to its row of `descriptors`.  Return false, without
+// writing, if one of them lies within kReach of the border, or has a cosine and sine that are not those of an angle.
 RSE_PF_INLINE bool describe_level(const Image& image, const Keypoints& keypoints, int32_t octave, float scale,
                             const Workspace& work, uint8_t* descriptors) {
     const float inverse = 1.0f / scale;
@@ -140,7 +142,7 @@ RSE_PF_INLINE bool describe_level(const Image& image, const Keypoints& keypoints
         box.bottom = row + kPatternReach >= box.bottom ? row + kPatternReach + 1 : box.bottom;
     }
     if (box.right == 0) return true;
-    // 2. Smooth it, and write the descriptors.
+    // 2. Smooth this part, and write the descriptors.
     smooth(image, box, work.smoothed, work);
     for (int64_t i = 0; i < keypoints.rows; ++i) {
         if (keypoints.octaves[i] != octave) continue;

@@ -80,7 +80,8 @@ struct LanesOf<double> {
 template <class T>
 using Lanes = typename LanesOf<T>::type;
 
-// Read eight numbers; the arrays of a Workspace are aligned to 64 bytes and padded to a multiple of eight.
+// Read eight numbers from an address that is aligned to 32 bytes: the arrays of a Workspace are aligned to 64 bytes and
+// padded to a multiple of eight.
 template <class T>
 RSE_PF_INLINE Lanes<T> load(const T* from) {
     Lanes<T> lanes;
@@ -105,6 +106,7 @@ RSE_PF_INLINE void fill(Pair<V>& lanes, T value) {
     fill(lanes.low, value);
     fill(lanes.high, value);
 }
+// Return a vector with a value in all eight lanes.
 template <class T>
 RSE_PF_INLINE Lanes<T> all(T value) {
     Lanes<T> lanes;

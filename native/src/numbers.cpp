@@ -20,14 +20,14 @@ const char* skip_spaces(const char* at, const char* end) {
     return at;
 }
 
-// Append decimal digits to a value, and return the address behind them.
+// Append the decimal digits at an address, of which there may be none, to a value, and return the address behind them.
 const char* read_digits(const char* at, const char* end, uint64_t& value) {
     for (; at < end && *at >= '0' && *at <= '9'; ++at) value = 10 * value + static_cast<uint64_t>(*at - '0');
     return at;
 }
 
-// Read the number at an address and return the address behind it; null where there is no number, or one with an
-// exponent, with more than kMaxDigits digits, or with a leading zero.
+// Read the number at an address and return the address behind it; null where there is no number of JSON, or one with an
+// exponent or with more than kMaxDigits digits, or -0.
 const char* read_number(const char* at, const char* end, double& number) {
     const bool is_negative = at < end && *at == '-';
     const char* const first = at + (is_negative ? 1 : 0);
@@ -49,8 +49,9 @@ const char* read_number(const char* at, const char* end, double& number) {
     return next;
 }
 
-// Read the list that begins at an address and return the address behind it; null if it holds anything but numbers, or
-// more numbers than there is room for.
+// Read the list whose bracket is at an address and return the address behind the list.  Its numbers are written from
+// `next` on, which moves behind them.  Null if the list is empty, holds anything but numbers, or more of them than fit
+// before `last`.
 const char* read_list(const char* at, const char* end, double*& next, const double* last) {
     while (next < last) {
         at = read_number(skip_spaces(at + 1, end), end, *next++);

@@ -10,7 +10,8 @@ struct Processor {
     bool avx512_popcount;  // AVX-512 F and VPOPCNTDQ
 };
 
-// Return the instructions that this process may use; they are determined once, when the library is loaded.
+// Return the instructions that this process may use; they are determined once, when the library is loaded.  All are
+// false on processors other than x86-64.
 const Processor& processor();
 
 }  // namespace rse_pf

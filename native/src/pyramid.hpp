@@ -18,6 +18,7 @@ constexpr int32_t kMaxLevels = 32;
 // Size of an EightPixels in bytes: the caller, who provides the memory, counts with it.
 constexpr int64_t kEightPixelsBytes = 80;
 
+// Grey levels, height x width, row-major.
 struct Image {
     const uint8_t* pixels;
     int64_t width, height;
@@ -30,17 +31,19 @@ struct Weights {
     uint16_t* weight;
 };
 
-// Memory for the computation of one level; it has room for the widest level.
+// Memory for the computation of one level, with room for the width of the whole image.
 struct ResizeMemory {
     Weights columns;
     uint16_t *above, *below;  // two input lines after horizontal interpolation, in 1/256 grey levels
     uint8_t* eights;          // EightPixels of a line
 };
 
+// Return the nearest integer; halves go to the even one.
 inline int64_t round_to_integer(float value) { return static_cast<int64_t>(__builtin_rintf(value)); }
 
-// Find the two neighbouring input pixels (or lines) between which output pixel `at` lies: the first one, and the weight
-// of the second in 1/256.  `scale` is the input size over the output size, `size` the input size.
+// Find the two neighbouring input pixels (or lines) between which output pixel `at` lies: the first one is written to
+// `from`, the weight of the second in 1/256 to `weight`.  `scale` is the input size over the output size, `size` the
+// input size, which is at least 2.
 inline void find_neighbours(int64_t at, double scale, int64_t size, int64_t& from, uint16_t& weight) {
     const double position = scale * (static_cast<double>(at) + 0.5) - 0.5;
     const double whole = __builtin_floor(position);
@@ -52,7 +55,7 @@ inline void find_neighbours(int64_t at, double scale, int64_t size, int64_t& fro
     }
 }
 
-// Interpolate a line horizontally, one pixel at a time.
+// Interpolate a line horizontally, one pixel at a time, and write the `width` output pixels in 1/256 grey levels.
 inline void interpolate_line(const uint8_t* line, const Weights& weights, int64_t width, uint16_t* to) {
     for (int64_t x = 0; x < width; ++x) {
         const uint8_t* const at = line + weights.from[x];
@@ -60,7 +63,8 @@ inline void interpolate_line(const uint8_t* line, const Weights& weights, int64_
     }
 }
 
-// Interpolate vertically between two lines, one pixel at a time, from column `begin` on.
+// Interpolate vertically between two lines, one pixel at a time, from column `begin` on.  `weight` is that of the line
+// below, in 1/256.
 inline void blend_lines(const uint16_t* above, const uint16_t* below, uint32_t weight, int64_t begin, int64_t width,
                         uint8_t* to) {
     for (int64_t x = begin; x < width; ++x)
@@ -103,7 +107,7 @@ inline int64_t prepare_eights(const Weights& weights, int64_t width, int64_t siz
     return count;
 }
 
-// Interpolate a line horizontally, eight pixels at a time.
+// Interpolate a line horizontally, eight pixels at a time, by `count` groups, and write it in 1/256 grey levels.
 inline void interpolate_line(const uint8_t* line, const EightPixels* eights, int64_t count, uint16_t* to) {
     for (int64_t i = 0; i < count; ++i) {
         const EightPixels& eight = eights[i];
@@ -138,7 +142,7 @@ inline int64_t blend_eights(const uint16_t* above, const uint16_t* below, uint32
     return x;
 }
 
-// Write the image, reduced to width x height by bilinear interpolation that is rounded once.
+// Write to `to` the image, reduced to width x height pixels by bilinear interpolation that is rounded once.
 inline void resize(const Image& image, uint8_t* to, int64_t width, int64_t height, const ResizeMemory& memory) {
     // 1. Prepare the horizontal interpolation, which is the same for all lines.
     const double column_scale = 1.0 / (static_cast<double>(width) / static_cast<double>(image.width));
@@ -173,7 +177,7 @@ inline void resize(const Image& image, uint8_t* to, int64_t width, int64_t heigh
             interpolate_row(row + 1, below);
             row_below = row + 1;
         }
-        // 3. Interpolate between them.
+        // 3. Interpolate vertically between the two lines.
         const int64_t done = blend_eights(above, below, weight, width, to + y * width);
         blend_lines(above, below, weight, done, width, to + y * width);
     }
@@ -198,8 +202,9 @@ struct Pyramid {
         return reinterpret_cast<uint8_t*>((reinterpret_cast<uintptr_t>(next + width * height) + 3) / 4 * 4);
     }
 
-    // Replace a level by the next one, `scale` times smaller than the whole image.  Return false if that would have
-    // fewer than 2 pixels on a side, or more than the present level.
+    // Replace `image`, the present level, by the next one, which is computed from it and `scale` times smaller than the
+    // whole image.  Return false if that would have fewer than 2 pixels on a side, or more than the present level.  The
+    // pixels of the level before stay valid until the next call.
     bool shrink(Image& image, const Image& whole, float scale) {
         const float inverse = 1.0f / scale;
         const int64_t width = round_to_integer(static_cast<float>(whole.width) * inverse);
