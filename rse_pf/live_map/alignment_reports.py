@@ -53,7 +53,7 @@ def report_alignments(
                 graph.report_unaligned(row, segment.reason or default)
                 outcomes.append(Unaligned(robot=segment.robot, segment=segment.number, reason=segment.reason))
             continue
-        # 2. Report a segment that has an alignment for the first time.
+        # 2. Report that a segment without a reported alignment has one now, or again.
         if not is_reported:
             connections = graph.accepted_edges_by_segments().items()
             count = sum(len(numbers) for pair, numbers in connections if row in pair)

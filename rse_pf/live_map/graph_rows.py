@@ -46,7 +46,11 @@ class LiveKeyframe:
 
 @dataclass(slots=True, eq=False)
 class Segment:
-    """The keyframes that one robot made in one odometry frame, by id, oldest first."""
+    """The keyframes that one robot made in one odometry frame, by id, oldest first.
+
+    ``robot`` and ``number`` are those of its `KeyframeAdded` events; "" and -1 in the segment that holds the
+    keyframes of the version that the map started from.
+    """
 
     robot: str
     number: int
@@ -68,7 +72,7 @@ class Segment:
     is_metric: bool = True
     """Whether odometry and depths of the segment are in metres; a single camera has no metric scale."""
     scale: float = 1.0
-    """Length of the segment's unit in the unit of its component, which is a metre if that is metric."""
+    """Length of the segment's unit in the unit of its component: a metre if the component is metric."""
     reported_scale: float = 1.0
     """The scale that was reported with the alignment; a robot with metres is not sent it."""
 

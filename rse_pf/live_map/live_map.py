@@ -185,7 +185,11 @@ class LiveMap:
         return len(self._graph.pending)
 
     def accepted_loop_closures(self) -> list[tuple[int, int, Array]]:
-        """Return the accepted loop closures as (keyframe a, keyframe b, measured ``T_a_b`` ``(4, 4)``)."""
+        """Return the accepted loop closures as (keyframe a, keyframe b, measured ``T_a_b`` ``(4, 4)``).
+
+        Edges of the version that the map started from are among them.  Lengths are metres if *a* or *b* is in
+        a metric segment, else in the unit of the segment of *a*.
+        """
         edges = self._graph.edges.values()
         return [(edge.a, edge.b, edge.T_a_b) for edge in edges if edge.state == "accepted"]
 
@@ -273,8 +277,9 @@ class LiveMap:
         The map does not change.
 
         Raises:
-            BadRequest: The keyframe is the next one, and its segment, pose, camera, features or time cannot
-                be right, or its descriptors are of another kind than those of the map.
+            BadRequest: The keyframe is the next one, and its segment, pose, features or time cannot be right,
+                or its descriptors are of another kind than those of the map.
+            InvalidCamera: The keyframe is the next one, and its camera model cannot be right.
         """
         expected = self.next_number(event.robot)
         if event.number != expected:
@@ -408,6 +413,7 @@ class LiveMap:
 
         Raises:
             BadRequest: The event starts a map that has keyframes already, or its data are damaged.
+            InvalidCamera: The camera model of an added keyframe cannot be right.
         """
         self._graph.count_event()
         match event:
@@ -426,7 +432,7 @@ class LiveMap:
         return []
 
     def _add_keyframe(self, event: KeyframeAdded) -> list[Outcome]:
-        """Add a keyframe where odometry says that it is."""
+        """Add a keyframe at the pose that odometry gives it after the newest keyframe of its segment."""
         graph, keyframe = self._graph, event.keyframe
         # 1. Find the segment of the keyframe, or begin a new one.
         row = graph.find_or_add_segment(event.robot, event.segment)
@@ -565,7 +571,11 @@ class LiveMap:
         return [*self._decide_again(), *report_alignments(self._graph, None)]
 
     def _start(self, event: MapStarted) -> list[Outcome]:
-        """Begin with the keyframes and edges of a stored version, or with none."""
+        """Begin with the keyframes and edges of a stored version, or with none.
+
+        Raises:
+            BadRequest: The map has keyframes already, or a keyframe of the version is damaged.
+        """
         graph = self._graph
         if len(graph):
             raise BadRequest("the map has keyframes already", hint="start a new map from the version")

@@ -60,11 +60,11 @@ MIN_SUPPORT = 3.0
 """Summed weight of loop closures that agree pairwise, at least, before they join components or reject others;
 0 of 2,000 random wrong loop closures were accepted on generated drives."""
 MIN_SUPPORTING_KEYFRAMES = 2
-"""Different keyframes on each side that loop closures must connect before they join components, because loop
-closures of one keyframe share its errors."""
+"""Different keyframes on each side, at least, that loop closures must connect before they join components or
+reject others, because loop closures of one keyframe share its errors."""
 MAX_TESTED_EDGES = 48  # newest loop closures between two components that are tested, to bound CPU time
 MAX_EDGES_OF_KEYFRAME = 4  # tested loop closures that share a keyframe, at most; more repeat its evidence
-MAX_CONTRARY_EDGES = 24  # newest loop closures that are tested against a contrary one, to bound CPU time
+MAX_CONTRARY_EDGES = 24  # newest loop closures that are tested against one by odometry, to bound CPU time
 MAX_CONFIRMED_STEPS = 12.0
 """Steps of odometry between both ends of a loop closure beyond which drift makes the graph too vague to
 confirm a single loop closure."""
@@ -264,6 +264,10 @@ def find_consistent_by_odometry(graph: MapGraph, number: int, others: Iterable[i
 def _agree_by_odometry(
     graph: MapGraph, edges: Sequence[DirectedEdge], reference: DirectedEdge
 ) -> npt.NDArray[np.bool_]:
+    """Return ``(m,)``: whether each of *m* loop closures agrees with *reference* by odometry alone.
+
+    All lead from one segment to one other, or within one segment, in the unit of the first one.
+    """
     arrays = _stack_edges(edges)
     steps = graph.odometry_steps
     steps_a, steps_b = steps[arrays.a] - steps[reference.a], steps[arrays.b] - steps[reference.b]
@@ -501,6 +505,7 @@ def _median_frame(graph: MapGraph, numbers: list[int], stay: int, log_scale: flo
 
 
 def _stack_edges(edges: Sequence[DirectedEdge]) -> EdgeArrays:
+    """Return loop closures as arrays; either all of them have a scale, or none has."""
     scales = [edge.scale for edge in edges if edge.scale is not None]
     return EdgeArrays(
         a=np.array([edge.a for edge in edges], dtype=np.int64),

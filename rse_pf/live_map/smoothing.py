@@ -196,9 +196,9 @@ def smooth_everything(graph: MapGraph, options: LiveMapOptions) -> None:
 def select_edges(graph: MapGraph, ids: Iterable[int]) -> GraphEdges:
     """Return odometry and accepted loop closures with at least one end among the keyframes *ids*.
 
-    Poses are in the unit of the component.  The information of odometry is that of a random walk.  The
-    information of a loop closure is multiplied by the square of its weight: half of the evidence counts as
-    twice the standard deviation.
+    Relative poses are in the unit of the component.  The information of odometry is that of a random walk.
+    The information of a loop closure is multiplied by the square of its weight: half of the evidence counts
+    as twice the standard deviation.
     """
     # 1. Find the edges that touch the keyframes.
     loop_numbers: set[int] = set()
@@ -266,7 +266,7 @@ def information_of(graph: MapGraph, edge: LoopEdge) -> Array:
 def _choose_window(
     graph: MapGraph, seeds: Sequence[int], size: int, held: set[int]
 ) -> tuple[list[int], bool]:
-    """Return up to *size* keyframes around *seeds*, and whether the search has reached no others.
+    """Return up to *size* keyframes around *seeds*, and whether no others are connected with them.
 
     The search is breadth-first along the graph, and neither takes nor passes *held* keyframes.  Of too many
     seeds the last are taken.
@@ -293,7 +293,7 @@ def _smooth_window(
 ) -> tuple[SmoothedPoses, Rows, dict[int, int]]:
     """Return the smoothed poses, the keyframes at the border of the window, and the row of each of *ids*.
 
-    The poses are those of *ids*, followed by the other ends of *edges*, which are held.  The border are the
+    The poses are those of *ids*, followed by all other ends of *edges*, which are held.  The border are the
     keyframes of *ids* that an edge connects with one outside.  Covariances are computed for the keyframes
     *wanted*.  The graph does not change.
     """

@@ -68,7 +68,8 @@ def as_internal_error(prefix: str) -> Iterator[None]:
 def started_from(version: MapVersion, source: str) -> MapStarted:
     """Return the event by which a live map starts from *version*, whose name is *source*.
 
-    Features without a depth are left out, and so is the point cloud of the version.
+    Features without a depth are left out, and so is the point cloud of the version.  ``equal_rooms_m`` of the
+    event is 0; the caller sets it.
 
     Raises:
         InternalError: The information of an edge is not positive definite.

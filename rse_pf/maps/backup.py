@@ -30,9 +30,11 @@ __all__ = ["BackupContent", "CheckedBackup", "check_backup", "restore_backup", "
 _CONTENT_FILE = "backup.json"
 """Name of the last member in the tar archive of a backup, with heads and charges."""
 _MEMBER = re.compile(r"(?P<map>[a-z0-9][a-z0-9-]{0,63})/(?P<kind>blobs|versions)/(?P<id>[0-9a-f]{64})")
+"""Name of a member that holds an encoded map or a record: map, kind, and sha256."""
 _CHARGE = re.compile(
     r"[A-Za-z0-9][A-Za-z0-9._=-]{0,127}/(?P<map>[a-z0-9-]{1,64})/(?P<id>[0-9a-f]{64})\.\d{1,15}"
 )
+"""Name of a charge below ``charges/TENANT/``: robot, map, id of the version, and size in bytes."""
 _MAX_RECORD_BYTES = 1 << 20
 """Largest size in bytes of the record of one version in a backup file: 1 MiB, though a record with many
 robots has some KiB only."""
@@ -169,7 +171,7 @@ class CheckedBackup:
 
 
 def check_backup(file: BinaryIO) -> CheckedBackup:
-    """Read and check all of *file*, and return the backup.
+    """Read and check all of *file*, and return the backup, which reads maps from *file* later.
 
     Raises:
         UsageError: The file is no backup, is truncated, or was changed.
@@ -247,13 +249,16 @@ def restore_backup(
 ) -> int:
     """Write the versions of a backup that the store lacks, set the heads, and return the number of versions.
 
+    Versions that are damaged in the store are written again.  The charges of all versions in the backup are
+    written, also of those that exist.
+
     Args:
         backup: The backup.
         maps: The maps of the tenant of the backup.
         store: The store of the maps, for their charges.
         is_overwriting: Whether to set the heads of maps that have another head; their newer versions stay.
-        check_room: Called once, before anything is written, with the bytes that all versions will be charged
-            with; may refuse them by an error.  Not called if the store lacks no version.
+        check_room: Called once, before anything is written, with the bytes that all versions to write will be
+            charged with; may refuse them by an error.  Not called if the store lacks no version.
         charge: Called with the size of each version before it is written; may refuse it by an error.
 
     Raises:

@@ -261,6 +261,8 @@ class MapVersion:
 
 
 class _EncodedKeyframe(msgspec.Struct, frozen=True, kw_only=True):
+    """A `Keyframe` in a map file: ``pose`` is ``T_world_camera``, ``points`` are ``points_camera``."""
+
     id: int
     robot: str
     timestamp_s: float
@@ -272,6 +274,8 @@ class _EncodedKeyframe(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class _EncodedEdge(msgspec.Struct, frozen=True, kw_only=True):
+    """An `Edge` in a map file: ``step`` is ``T_a_b``."""
+
     a: int
     b: int
     step: bytes

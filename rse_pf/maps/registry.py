@@ -617,7 +617,10 @@ class MapRegistry:
                 marks.clear(mark)
 
     def _used_digests(self, name: str, digests: dict[str, str], excluded: Collection[str]) -> set[str]:
-        """Return the digests of the head and of all versions except those with the ids *excluded*."""
+        """Return the digests of the head and of all versions except those with the ids *excluded*.
+
+        *digests* has the digests by id that are known; those that are read are added to it.
+        """
         prefix = f"{self._base(name)}versions/"
         ids = {info.name.removeprefix(prefix) for info in self._store.list(prefix)} - set(excluded)
         head = self._head(name)
