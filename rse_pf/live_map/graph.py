@@ -163,7 +163,7 @@ class MapGraph:
         return self.segments[self.root].component if self.root >= 0 else -1
 
     def is_aligned(self, row: int) -> bool:
-        """Return whether segment *row* is in the component that the map consists of; false if there is none."""
+        """Return whether segment *row* is in the component that the map consists of, if there is one."""
         return self.root >= 0 and self.segments[row].component == self.segments[self.root].component
 
     def is_metric(self, component: int) -> bool:
