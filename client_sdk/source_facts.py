@@ -372,7 +372,7 @@ def rows_in_time(times: TimeFacts) -> tuple[list[int], tuple[Doubt, ...]]:
     """
     steps_s = np.diff(times.stamps_s)
     total = len(times.stamps_s)
-    # 1. Find where the clock goes back.
+    # 1. Find where time stamps go back, and refuse those that do so more than once or at the start.
     backs = np.flatnonzero(steps_s < 0.0)
     if len(backs) > 1 or (len(backs) == 1 and backs[0] == 0):
         raise UsageError(

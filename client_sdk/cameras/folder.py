@@ -46,7 +46,9 @@ from rse_pf.geometry import Array
 __all__ = ["FolderImages", "list_folder", "list_pairs", "pair_folders"]
 
 _COLOUR_FOLDERS = ("rgb", "color", "colour", "image", "images", "results")
+"""Names of the folder of the colour images, the first of which that exists is used, see `_find_folder`."""
 _DEPTH_FOLDERS = ("depth", "depths", "aligned_depth", "depth_image", "depth_images")
+"""Names of the folder of the depth images, as for `_COLOUR_FOLDERS`."""
 _PAIR_FOLDERS = ("{}", "image_{}", "images_{}", "{}_images", "img_{}", "rgb_{}")
 """Names of the folders of a stereo pair, with ``left`` or ``right`` in the place of the braces."""
 _ASSUMED_PERIOD_S = 0.1  # time between images where neither names nor intrinsics state times or a rate

@@ -117,7 +117,7 @@ def open_camera(
             log=dataset.log,
             span_s=dataset.span_s,
         )
-    # 4. Open the devices or videos of a stereo rig.
+    # 4. Take a rig of one camera as the lens of that camera, and open the devices or videos of a stereo rig.
     if isinstance(own, Rig) and own.right is None:
         own = own.left.lens
     if isinstance(own, Rig) and path.is_dir():

@@ -107,7 +107,7 @@ def open_video(source: str, clock: Callable[[], float] = time.monotonic) -> Vide
             f"{source} has images of {width}x{height} px, above {MAX_IMAGE_PIXELS} pixels",
             hint="make them smaller",
         )
-    # 3. A device delivers its latest image; a file delivers all of them with their presentation times.
+    # 3. Let a device deliver its latest image, and a file all images, with presentation times or a rate.
     if is_device:
         capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
     if not is_file:

@@ -130,7 +130,7 @@ class FrameStream(AutoClose):
             info: Description of the source.
             items: Items in the order of time.
             make_frame: Makes a frame of an item.
-            rate_hz: Frames a second that are delivered at most, see `Thinning`; None for all.
+            rate_hz: Frames a second that are delivered on average, see `Thinning`; None for all.
             close: Releases the device or file; None if there is none.
 
         Raises:

@@ -261,7 +261,7 @@ def _match_kitti_lines(
 
     Line *n* (from 0) belongs to the image of number *n*.  If a file is too short for these numbers, or a name
     is no number, but the file has as many lines as there are images, the file was cut together with the
-    images, and line *n* belongs to the *n*-th image.
+    images, and the lines belong to the images in their order.
 
     Args:
         paths: The images; their names are their numbers.
@@ -433,8 +433,8 @@ def _mav0_of(folder: Path) -> Path:
 def _read_euroc_images(folder: Path) -> tuple[list[Path], Array, tuple[str, ...], tuple[Doubt, ...]]:
     """Return the images of a camera, their time stamps ``(n,)`` (s), notes, and doubts.
 
-    Images are left out as by `rows_in_time`, so that the time stamps increase.  The notes say in which unit
-    they were taken, if not in nanoseconds.
+    Images are left out as by `rows_in_time`, so that the time stamps increase.  A note names
+    the unit in which the time stamps were read, if that is not the nanosecond.
 
     Raises:
         UsageError: ``data.csv`` cannot be read, or names a file outside of the folder ``data``.

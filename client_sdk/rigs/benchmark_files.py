@@ -119,7 +119,8 @@ def read_kitti_rig(path: Path, size: tuple[int, int], projection_names: Sequence
                 fx=numbers[0], fy=numbers[5], cx=numbers[2], cy=numbers[6], width=size[0], height=size[1]
             )
             T_body_camera = np.eye(4)
-            # P = K [I | t], where t moves points of the body (P0) into this camera.
+            # P = K [I | t], where t moves points of the body (P0) into this camera; the images are rectified,
+            # so that no camera is rotated against the body.
             T_body_camera[:3, 3] = -np.linalg.solve(projection[:, :3], projection[:, 3])
             cameras.append(RigCamera(name=name, lens=Intrinsics(camera=camera), T_body_camera=T_body_camera))
         except (InvalidCamera, UsageError) as error:

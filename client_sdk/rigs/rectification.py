@@ -27,6 +27,8 @@ counts as rectified already."""
 class Rectification:
     """The rectified cameras of a stereo pair, and the maps that rectify its images.
 
+    Images of a pair that is rectified already are returned as they are, not copied.
+
     Attributes:
         camera: The pinhole camera of both rectified images.
         baseline_m: Distance from the left camera to the right one, metres.
