@@ -96,8 +96,9 @@ spread over the map, so that a second place that looks the same is compared as w
 class LiveMap:
     """One map that several robots build together.
 
-    The id of a keyframe is its position in order of arrival.  The frame of the map is that of the first
-    metric segment, or of the stored version that the map started from.
+    The id of a keyframe is its position in order of arrival, from 0; ids are never used again.  The frame of
+    the map is that of the first metric segment, or of the stored version that the map started from.  If that
+    robot is forgotten or excluded, another metric segment defines the frame.
     """
 
     def __init__(self, options: LiveMapOptions | None = None) -> None:
@@ -618,8 +619,9 @@ class LiveMap:
     def _smooth(self, changes: GraphChanges, robot: str | None = None) -> SmoothedWindows | None:
         """Smooth around *changes*, which a keyframe of *robot* caused, and return what was smoothed.
 
-        Add rejections to the outcomes of *changes*, and a request to optimise the whole graph if the largest
-        window was too small and the last request is 20 keyframes ago.  Return None if nothing moved.
+        Add rejections to the outcomes of *changes*.  Add a request to optimise the whole graph if the largest
+        window was too small, and at least 20 keyframes arrived since the last such request.  Return None if
+        nothing moved.
         """
         graph = self._graph
         windows = smooth_changes(graph, changes, self.options, robot)

@@ -348,7 +348,7 @@ def _find_path(start: int, goal: int, pairs: list[tuple[int, int]]) -> list[tupl
 def _join_if_consistent(graph: MapGraph, first: int, second: int, changes: GraphChanges) -> None:
     """Join two components if enough pending loop closures between them agree, and decide about the rest.
 
-    Where the loop closures agree but are ambiguous, only the reason of segments changes.
+    If too few agree, nothing changes.  If they agree but are ambiguous, only the reasons of segments change.
     """
     decision = decide_join(graph, first, second)
     if decision is None:

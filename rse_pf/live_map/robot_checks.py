@@ -35,9 +35,9 @@ measured the scale."""
 def has_wrong_scale(graph: MapGraph, keyframe: int, measured: Iterable[MeasuredLoopClosure]) -> bool:
     """Return whether the metric scale of *keyframe* differs from that of all robots it was compared with.
 
-    At least two other robots (or one and the stored version) must have been compared, because of two robots
-    that differ nobody knows which one is wrong.  All of their loop closures must find the scale of *keyframe*
-    too large, or all too small.  Only loop closures of full weight with metric segments count.
+    Only loop closures of full weight with metric segments of other robots count.  They must be with at least
+    two robots, or with one and the stored version: where only two robots differ, nobody knows which one is
+    wrong.  All of them must find the scale of *keyframe* too large, or all of them too small.
     """
     own = graph.keyframes[keyframe].robot
     signs: dict[tuple[str, bool], set[float]] = {}

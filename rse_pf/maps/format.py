@@ -84,7 +84,7 @@ _UNSAFE_IN_FILE_NAMES = re.compile(r"[^A-Za-z0-9._-]+")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MapLimits:
-    """The numbers of items that a map may hold; a larger map is rejected before it is decoded.
+    """The largest numbers of items that a map may hold; a larger map is rejected before it is decoded.
 
     Attributes:
         keyframes: Keyframes of the map.
@@ -213,7 +213,8 @@ class MapVersion:
 
     Raises:
         BadRequest: Two keyframes have the same id or different kinds of descriptors, an edge refers to a
-            missing keyframe, or the shapes of points and colours do not fit.
+            missing keyframe, the shapes of points and colours do not fit, or a coordinate of a point is not
+            finite or beyond 1e9 m.
     """
 
     keyframes: tuple[Keyframe, ...]
