@@ -197,7 +197,8 @@ def _covariance_of(
         information: ``(11, 11)``, information of the matches for pixels of variance 1.
         feigned: ``(11, 11)``, the part of it that only noise of the points causes, which is subtracted.
         variance_px2: Variance of a pixel, px^2.
-        prior_information: ``(5,)``, prior information on the camera: all that is left if the rest is feigned.
+        prior_information: ``(5,)``, prior information on the camera: all that is known of the camera where
+            noise alone makes the information of the matches.
     """
     # 1. Scale to a diagonal of 1, subtract, and keep the result positive definite.
     scale = 1.0 / np.sqrt(np.diag(information))

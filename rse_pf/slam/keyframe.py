@@ -374,7 +374,7 @@ def make_scaleless_features(
     # 3. Round the depths; those beyond the farthest accurate depth become unknown.
     steps = np.rint(np.where(has_depth & (known_depths <= max_depth), known_depths, 0.0) / unit)
     steps = np.where(steps <= _MAX_STEPS, steps, 0.0)
-    # 4. Order the features, and use as many as a keyframe can have.
+    # 4. Take the features with a depth, then those without, up to the number that a keyframe can have.
     order = np.concatenate(
         [np.flatnonzero(is_usable & (steps > 0)), np.flatnonzero(is_usable & (steps == 0))]
     )
@@ -516,7 +516,7 @@ def decode_keyframe(data: bytes) -> SentKeyframe:
         raise _bad_keyframe(
             "T_odom_camera is no rigid motion", "send three rows of a rotation and a translation in metres"
         )
-    # 2. Find the blocks.
+    # 2. Find where the content of each block begins and ends; unknown optional blocks are kept.
     spans: dict[int, tuple[int, int]] = {}
     unknown_blocks = []
     for kind, begin, end in _find_blocks(data, block_count):

@@ -57,8 +57,8 @@ class ObjectReference:
     """A reference to an object that the robot of a keyframe has stored: its points, or its image.
 
     Attributes:
-        digest: The sha256 of the object's bytes, 64 hexadecimal digits.
-        size: The number of the object's bytes, 1 to 1 MiB.
+        digest: The sha256 of the object's bytes, 64 hexadecimal digits in lower case.
+        size: The number of the object's bytes, from 1 to 2**20.
 
     Raises:
         BadRequest: *digest* is no sha256, or *size* is out of its range.
@@ -110,7 +110,7 @@ def encode_points(
         depths_mm = np.rint(np.asarray(depths_m, dtype=np.float64) * 1000.0)
         usable = np.flatnonzero((depths_mm >= _MIN_DEPTH_MM) & (depths_mm <= _MAX_DEPTH_MM))
     indices, first = np.unique(pixels[usable, 1] * camera.width + pixels[usable, 0], return_index=True)
-    # 2. Thin them evenly.
+    # 2. Of more than `MAX_POINTS` points take an even selection.
     if len(indices) > MAX_POINTS:
         even = np.linspace(0, len(indices) - 1, MAX_POINTS).astype(np.int64)
         indices, first = indices[even], first[even]
@@ -158,7 +158,7 @@ def decode_points(data: bytes, camera: Camera) -> tuple[Array, Colours]:
     colours = np.stack(
         [np.cumsum(_decode_planes(raw, (6 + i) * n, n, "u1")) & 0xFF for i in range(3)], axis=1
     )
-    # 3. Project the pixels back.
+    # 3. Back-project the pixels with their depths to points.
     pixels = np.column_stack((indices % camera.width, indices // camera.width)).astype(np.float64)
     return camera.back_project(pixels, depths_mm / 1000.0), colours.astype(np.uint8)
 

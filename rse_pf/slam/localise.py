@@ -164,7 +164,7 @@ def localise(
     estimates = _estimate_poses(candidates, view, options)
     if not estimates:
         return Localised(verdict="none", reason="no-pose")
-    # 2. Divide the estimates into those that agree with the best one and those that contradict it.
+    # 2. Divide the estimates into those that agree with the best one, which has most inliers, and the others.
     best = estimates[0]
     agreeing = [estimate for estimate in estimates if _do_agree(estimate, best, options)]
     contradicting = [estimate for estimate in estimates if not _do_agree(estimate, best, options)]
@@ -372,13 +372,13 @@ def _fuse_estimates(estimates: Sequence[_Estimate]) -> tuple[Array, Array]:
     the map in common.  It is of the twist on the left of the pose.
     """
     best = estimates[0]
-    # 1. Average the twists from the best estimate to all estimates.
+    # 1. Average the twists from the best pose to all poses, and move the best pose by the mean twist.
     T_camera_map = inverse(best.T_map_camera)
     twists = log_se3(np.array([T_camera_map @ estimate.T_map_camera for estimate in estimates]))
     information = np.array([np.linalg.inv(estimate.covariance) for estimate in estimates])
     twist = np.linalg.solve(information.sum(axis=0), np.einsum("kij,kj->i", information, twists))
     T_map_camera: Array = best.T_map_camera @ exp_se3(twist)
-    # 2. Move the covariance from the right of the pose to its left.
+    # 2. Convert the covariance of the twist on the right of the pose to that of the twist on its left.
     to_left = adjoint(T_map_camera)
     covariance: Array = to_left @ best.covariance @ to_left.T
     return T_map_camera, 0.5 * (covariance + covariance.T)

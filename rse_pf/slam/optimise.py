@@ -142,7 +142,10 @@ def robust_cost(graph: PoseGraph, T_world_pose: Array, cauchy: float) -> float:
 
 
 def _make_factors(gtsam: Any, graph: PoseGraph, anchors: Rows, cauchy: float) -> Any:
-    """Return GTSAM's factor graph: priors on the anchors, and a between factor for each edge."""
+    """Return GTSAM's factor graph: priors on the anchors, and a between factor for each edge.
+
+    Edges that may be outliers have a Cauchy kernel of the width *cauchy*, unless this is 0.
+    """
     factors = gtsam.NonlinearFactorGraph()
     anchor_noise = gtsam.noiseModel.Isotropic.Sigma(6, _ANCHOR_SIGMA)
     for row in anchors.tolist():

@@ -217,9 +217,9 @@ def detect_keypoints(gray: npt.NDArray[np.uint8], count: int, threshold: int) ->
         threshold: Threshold of the FAST corner detector, 0 to 255 grey levels.
 
     Returns:
-        The keypoints, by pyramid level, the finest first; None where the processor lacks AVX2, where equally
-        strong ones make them more than twice *count* and 64, or where a side of the image is below 2 or above
-        16,384 px.
+        The keypoints, by pyramid level, the finest first.  None where the processor lacks AVX2, where equally
+        strong ones make them more than twice *count* and 64, where the order in which OpenCV would return
+        them is not known, or where a side of the image is below 2 or above 16,384 px.
 
     Raises:
         MissingExtra: The native core is not installed.

@@ -334,18 +334,18 @@ def measure_pose(
         BadRequest: The descriptors of both are of different kinds.
         MissingExtra: They are ORB descriptors, and the native core is not installed.
     """
-    # 1. Match the features.
+    # 1. Match the landmarks with the features of the view.
     points, pixels, depths_m = match_landmarks(landmarks, view, options)
     min_matches = options.min_inliers // 2 if options.min_matches is None else options.min_matches
     if len(points) < max(4, min_matches):
         return "no-matches"
-    # 2. Solve PnP.
+    # 2. Compute the pose by PnP from the matches.
     try:
         solution = solve_pnp(points, pixels, view.camera, _pnp_options(options.inlier_px))
     except PnpError:
         return "no-pose"
     measured = MeasuredPose(solution=solution, points_keyframe=points, pixels=pixels, depths_view=depths_m)
-    # 3. Refine the pose with the depths of both images.
+    # 3. Refine the pose with the depths of both images, if the view has metric ones.
     if view.depths_m is None or not view.is_metric or points[:, 2].min() < _MIN_DEPTH_M:
         return measured
     refined = refine_with_depth(solution, points, pixels, depths_m, view.camera, view.noise)

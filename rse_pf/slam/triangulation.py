@@ -38,7 +38,7 @@ def triangulate(
     Returns:
         ``(n, 3)`` points in the world, in the unit of the poses, and ``(n,)`` whether each point is accepted:
         not at infinity, before both cameras, and within the reprojection error in both views.  The numbers of
-        a point that is not accepted mean nothing.
+        a point at infinity mean nothing.
 
     Source:
         Hartley and Zisserman 2004, Sect. 12.2 (linear triangulation, in normalised coordinates).
