@@ -70,7 +70,7 @@ __attribute__((visibility("default"))) int64_t rse_pf_edges(const uint8_t* gray,
     int64_t threshold = kLevels - 1, edges = counts[threshold];
     while (threshold > 0 && edges < wanted_edges) edges += counts[--threshold];
     for (; threshold < min_contrast && threshold < kLevels - 1; ++threshold) edges -= counts[threshold];
-    // 3. Measure the sharpness of every n-th edge.
+    // 3. Measure the sharpness of every n-th edge, so that at most max_edges are written.
     const int64_t every_nth = (edges + max_edges - 1) / max_edges;
     int64_t visited = 0, written = 0;
     line = gray;

@@ -208,7 +208,7 @@ int64_t refine(const rse_pf_depth_request& request, double* workspace, rse_pf_de
     result.rmse_px = square_root(sums.error2 / static_cast<double>(request.inlier_rows));
     const double before_px = request.rmse_px > kMinRmsePx ? request.rmse_px : kMinRmsePx;
     if (!(is_finite(pose) && result.rmse_px <= kMaxRmseGrowth * before_px)) return RSE_PF_DEPTH_KEPT;
-    // 4. Write the covariance and the pose.
+    // 4. Write the covariance and the pose; keep the input pose if there is no covariance.
     if (!compute_covariance(sums, result.covariance)) return RSE_PF_DEPTH_KEPT;
     const double out[16] = {pose.R[0][0], pose.R[0][1], pose.R[0][2], pose.t.x, pose.R[1][0], pose.R[1][1],
                             pose.R[1][2], pose.t.y,     pose.R[2][0], pose.R[2][1], pose.R[2][2], pose.t.z,

@@ -25,7 +25,7 @@
 extern "C" {
 #endif
 
-/* Version of this interface. */
+/* Version of this interface; a library that was compiled with another version is not loaded. */
 #define RSE_PF_SERVICE_ABI 1
 
 #if defined(_WIN32)
@@ -34,7 +34,8 @@ extern "C" {
 #define RSE_PF_EXPORT __attribute__((visibility("default")))
 #endif
 
-/* Result of a function; the comments name the error code that the robot receives. */
+/* Result of a function; the comments name the error code that the robot receives.  Any other number counts as
+ * RSE_PF_FAILED. */
 enum rse_pf_status {
   RSE_PF_OK = 0,
   RSE_PF_BAD_REQUEST = 1, /* the request is invalid: "bad-request" */
@@ -48,7 +49,7 @@ enum rse_pf_type {
   RSE_PF_TEXT = 2     /* data: count bytes of UTF-8, without a terminating zero */
 };
 
-/* A named field of a request or a reply. */
+/* A named field of a request or a reply.  The numbers of a request are finite. */
 typedef struct rse_pf_field {
   const char *name;  /* UTF-8 with a terminating zero */
   uint32_t type;     /* enum rse_pf_type */

@@ -12,9 +12,10 @@
 //   };
 //   RSE_PF_SERVICE(Centroid)
 //
-// Throw rse_pf::BadRequest, rse_pf::Degenerate or any std::exception to fail a request: the robot receives an error.
-// The state of a class with `std::string snapshot() const` and `void restore(const std::string &)` survives its server:
-// write RSE_PF_SERVICE_WITH_SNAPSHOTS(Class) instead.
+// Throw rse_pf::BadRequest, rse_pf::Degenerate or any std::exception to fail a request: the robot receives the error
+// "bad-request", "degenerate" or "failed" with its text.
+// The class needs a constructor without arguments.  The state of a class with `std::string snapshot() const` and
+// `void restore(const std::string &)` survives its server: write RSE_PF_SERVICE_WITH_SNAPSHOTS(Class) instead.
 #ifndef RSE_PF_SERVICE_HPP
 #define RSE_PF_SERVICE_HPP
 
@@ -54,6 +55,7 @@ struct Field {
   static Field array(std::vector<double> values, std::vector<uint64_t> shape) {
     return Field{RSE_PF_FLOAT64, std::move(shape), std::move(values), {}};
   }
+  // Return the number of a field with one number, also in an array; throw BadRequest for any other field.
   double as_number() const {
     if (type != RSE_PF_FLOAT64 || values.size() != 1) throw BadRequest("expected one number");
     return values[0];
@@ -170,6 +172,9 @@ int run_guarded(std::string &error, Work work) {
 }  // namespace detail
 }  // namespace rse_pf
 
+// Define the functions of rse_pf_service.h for a class with `rse_pf::Fields call(const rse_pf::Fields &)`; write it
+// once, in one source file, outside of any namespace.  After an exception of the constructor the robot receives the
+// error that the service cannot be loaded, without the message of the exception.
 #define RSE_PF_SERVICE(Class)                                                                                       \
   using RsePfState = rse_pf::detail::State<Class>;                                                                  \
   extern "C" RSE_PF_EXPORT uint32_t rse_pf_service_abi(void) { return RSE_PF_SERVICE_ABI; }                         \
@@ -192,6 +197,7 @@ int run_guarded(std::string &error, Work work) {
     });                                                                                                             \
   }
 
+// Define what RSE_PF_SERVICE defines, and the functions that pass out and restore the state of the class.
 #define RSE_PF_SERVICE_WITH_SNAPSHOTS(Class)                                                                        \
   RSE_PF_SERVICE(Class)                                                                                             \
   extern "C" RSE_PF_EXPORT int rse_pf_service_snapshot(void *state, uint8_t **data, uint64_t *size) {               \
