@@ -190,7 +190,7 @@ class Mapper:
         self._adds_frames = adds_frames
         self._recorder = recorder
         self._plugins = Plugins.wrap(features=features, motion=motion, loops=loops, optimiser=optimiser)
-        self._processed_joins = 0  # of a monocular tracker also its loop closures
+        self._processed_joins = 0  # joins that were applied; of a monocular tracker also its loop closures
         self._depth_source: Literal["depth", "stereo"] = "depth"
         self._metric_segments: set[int] = set()  # segments of a monocular tracker whose scale is known
         self._frame_lock = asyncio.Lock()
@@ -458,7 +458,7 @@ class Mapper:
             if self._imu is not None:
                 self._align_imu(self._tracker)
                 self._turn_upright(self._tracker)
-        # 2. Collect report and points.
+        # 2. Collect the report, and the points of the voxels that were read often enough.
         report = self.report()
         points, colours = self.map.points(min_readings=self._min_readings)
         report["map_points"] = len(points)
@@ -606,7 +606,7 @@ class Mapper:
                 reason = "no matches: it shows nothing that was seen just before"
         if pose is not None and answer is not None and answer.solution.verdict == "weak":
             reason = answer.solution.reason
-        # 2. Determine the status.
+        # 2. Set the status: lost without a pose, first for the first pose of a camera with depth.
         status = tracked.status
         if pose is None and status == "tracked":
             status = "lost"
@@ -614,7 +614,7 @@ class Mapper:
             self._lost_reasons[reason] += 1
         if isinstance(tracker, Tracker) and pose is not None and not self._records.first.poses:
             status = "first"
-        # 3. Add what the answer says.
+        # 3. Count round trip and source of the last answer, and add them to the result with its covariance.
         if answer is not None:
             self._round_trips_ms.append(answer.round_trip_ms)
             self._answer_sources[answer.source] += 1
@@ -641,7 +641,10 @@ class Mapper:
         return self._apply_gravity(tracker, self._apply_joins(tracker, tracked))
 
     def _apply_joins(self, tracker: Tracker, tracked: TrackedFrame) -> TrackedFrame:
-        """Move the segments that were joined since the last frame; these correct poses returned before."""
+        """Move the records of the segments that were joined since the last frame into those they joined.
+
+        Return *tracked*, marked as corrected if there were any: poses that were returned before have moved.
+        """
         joins = tracker.joins[self._processed_joins :]
         for join in joins:
             self._records.join(join)

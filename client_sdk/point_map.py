@@ -194,7 +194,11 @@ class PointMap:
         self._add(points, means[:, 3:], other._counts[: other._voxels])
 
     def add_points(self, points_world: Array, colours: npt.NDArray[np.uint8]) -> int:
-        """Add ``(n, 3)`` points in metres with ``(n, 3)`` uint8 colours; return how many were used."""
+        """Add ``(n, 3)`` points in metres with ``(n, 3)`` uint8 colours; return how many were added.
+
+        Points beyond the end of the grid, and those that need a voxel beyond `MapOptions.max_points`, are
+        left out.
+        """
         return self._add(points_world, colours, np.ones(len(points_world), dtype=np.int32))
 
     def points(self, min_readings: int = 1) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.uint8]]:
@@ -242,7 +246,7 @@ class PointMap:
         return used
 
     def _reserve(self, more_points: int) -> None:
-        """Enlarge the arrays so that each of *more_points* points may need a voxel of its own."""
+        """Enlarge the arrays so that each of *more_points* points may need a voxel, up to *max_points*."""
         wanted = min(self._voxels + more_points, self.options.max_points)
         if wanted > len(self._counts):
             capacity = min(max(2 * len(self._counts), wanted), self.options.max_points)

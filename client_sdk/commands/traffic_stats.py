@@ -11,9 +11,9 @@ from random import Random
 __all__ = ["Percentiles", "Stats", "TrafficCounter"]
 
 SAMPLE_SIZE = 2048
-"""Size of the uniform sample of a run's commands from which percentiles are computed."""
+"""Largest number of values in the uniform sample of each quantity, from which percentiles are computed."""
 RECENT_ROUND_TRIPS = 32
-"""From how many of the last round trips to a server the next one is predicted."""
+"""Number of the last round trips to a server whose 95th percentile is expected of the next one."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -32,8 +32,8 @@ TOKEN_TIMEOUT_S = 30.0
 """A token function that takes longer than this has failed: services that issue tokens answer within
 seconds."""
 SLOW_CALL_S = 3.0
-"""A function that blocks the event loop for longer than this is reported: it is the default of the setting
-session.ping_timeout_s, after which a server closes a silent connection."""
+"""A function that blocks the event loop for more than this many seconds is reported: it is the default of the
+setting session.ping_timeout_s, after which a connection without an answer to a ping counts as lost."""
 THREAD_JOIN_S = 0.2
 """How long the end of a robot waits for a function that still runs; such a function may block for ever."""
 CREDENTIAL_FUNCTION = "the token callable"
@@ -62,7 +62,10 @@ class UserCallbacks:
         self._thread.start()
 
     def end_thread(self) -> None:
-        """End the thread after the calls that wait in its queue; the thread itself may call this."""
+        """End the thread after the calls that wait in its queue; the thread itself may call this.
+
+        Another thread waits `THREAD_JOIN_S` for this end; a function that still runs then goes on.
+        """
         if self._calls is not None and self._thread is not None:
             self._calls.put(None)
             self._end_token_loop()

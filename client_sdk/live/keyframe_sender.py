@@ -113,7 +113,9 @@ class KeyframeSent:
 
 
 async def fetch_robot_in_map(robot: LiveRobot, map_name: str, deadline_s: float) -> RobotInMap:
-    """Ask the service ``live-show`` how the live map knows this robot; a map that does not exist is empty.
+    """Ask the service ``live-show`` how the live map knows this robot.
+
+    For a map that does not exist the name is empty, and all numbers are 0.
 
     Raises:
         BadMessage: The reply lacks a field.
@@ -299,10 +301,10 @@ class KeyframeSender:
             # The map expects numbers without gaps: the next keyframe gets the number of the refused one.
             queue.set_offset(NumberOffset(offset.number - 1, offset.segment))
             raise
-        # 3. Take the acknowledgement.
+        # 3. Remove the acknowledged keyframe from the queue, and report its times.
         queue.remove_first()
         self._on_acknowledged(KeyframeSent(number, sent_s, self._clock()))
-        # 4. Compare the number that the map expects next with the robot's own.
+        # 4. Find out whether the map was started again: it then expects a smaller number than the next one.
         if answer.reply.number < number + 1:
             raise Conflict("the map was started again", hint="nothing: the robot renumbers its keyframes")
         if not self._is_known_to_map:

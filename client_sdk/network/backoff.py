@@ -33,7 +33,7 @@ UNANSWERED_MAX_S = 1.25
 """Longest time between the starts of two attempts that nobody answers; it differs from the shortest one so
 that robots of one site do not dial at the same moment."""
 REVOCATION_JITTER_S = 0.5
-"""After a revocation, robots come back spread over this time, counted from when new tokens are valid."""
+"""After a revocation, robots come back spread over this many seconds from when new tokens are valid."""
 MOVE_RESERVE = 0.5
 """While a robot is connected and moves to another server, this share of its token bucket is kept for the case
 that it loses its connection."""

@@ -199,7 +199,10 @@ def _bracket_ipv6(host: str) -> str:
 
 
 def _read_head(connection: socket.socket, deadline_s: float) -> bytes:
-    """Read byte by byte: the bytes after the head belong to the server behind the proxy."""
+    """Return the proxy's answer to CONNECT: complete, or cut off at its limit or where the proxy closed.
+
+    It is read byte by byte: the bytes after it belong to the server behind the proxy.
+    """
     head = b""
     while not is_complete_head(head) and (byte := receive_until(connection, 1, deadline_s)):
         head += byte

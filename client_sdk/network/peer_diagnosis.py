@@ -157,24 +157,24 @@ def explain_answer(address: str, answer: HttpAnswer) -> ConnectError:
     The cause is told by the status first, then by headers and body.
     """
     status, statement = answer.status, f"{address} answers {answer.shown_status}"
-    # 1. A wrong scheme in the URL, or headers of the upgrade that a proxy removed on the way to RSE-PF.
+    # 1. Recognise a wrong scheme in the URL, and a 400 of RSE-PF for headers that a proxy on the way removed.
     if status == 400 and TLS_WANTED.search(answer.body) and not _is_tls_address(address):
         return _explain_tls(address)
     if status == 400 and refusal_in(answer.body, "bad-message") is not None:
         status = 426
-    # 2. A status with one usual cause.
+    # 2. Look up the cause of a status that has one usual cause.
     retry = _retry_hint(answer)
     if status in CAUSE_AND_HINT:
         cause, hint = CAUSE_AND_HINT[status]
         variable = f"{WEB_SCHEME[urlsplit(address).scheme].upper()}_PROXY"
         hint = hint.format(retry=retry, login=_login_hint(address), variable=variable)
         return ConnectError(f"{statement}{cause}", hint=hint)
-    # 3. Redirects and pages, whose target or content tells the cause.
+    # 3. Explain redirects and pages by their target or content.
     if 300 <= status < 400:
         return _explain_redirect(address, answer)
     if 200 <= status < 300 or status == 101:
         return _explain_success(address, answer)
-    # 4. A server that failed, or another program.
+    # 4. Report that the server failed, or that another program answers.
     if status >= 500 and status not in (501, 505):
         return ConnectError(f"{statement}: the server failed", hint=f"see the log of the server; {retry}")
     server = _shorten(answer.headers.get("server", ""))
@@ -210,19 +210,19 @@ def explain_silence(
     """
     answer = parse_answer(data)
     is_http = answer is not None
-    # 1. The scheme of the URL says TLS and the peer speaks none, or the reverse.
+    # 1. Compare the scheme of the URL with the peer: one of both uses TLS, and the other does not.
     if not _is_tls_address(address) and (certificate is not None or is_tls_server_answer(data)):
         return _explain_tls(address)
     if _is_tls_address(address) and certificate is None and is_http and not is_tls_server_answer(data):
         hint = f"write {OTHER_SCHEME[urlsplit(address).scheme]}:// in the URL, or a port that speaks TLS"
         return ConnectError(f"{address} speaks HTTP without TLS", hint=hint)
-    # 2. Another program answered the second connection.
+    # 2. Explain what another program answered to the second connection.
     if answer is not None and answer.is_login:
         # A login page may close the first connection before it has read the request.
         return explain_answer(address, answer)
     if data and not is_http and not is_tls_server_answer(data):
         return explain_bytes(address, data)
-    # 3. The TLS handshake failed.
+    # 3. Explain a failed TLS handshake.
     if isinstance(error, ssl.SSLError) and not isinstance(error, ssl.SSLEOFError):
         reason = (error.reason or str(error)).replace("_", " ").lower()
         hint = CHECK_PORT
@@ -232,7 +232,7 @@ def explain_silence(
                 "robot"
             )
         return ConnectError(f"{address} ends the TLS handshake: {reason}", hint=hint)
-    # 4. The peer is slow, or speaks another protocol.
+    # 4. Report a peer that is slow (HTTP or TLS is spoken there), or that speaks another protocol.
     is_late = isinstance(error, (TimeoutError, asyncio.TimeoutError))
     within = "" if within_s is None else f" within {within_s:g} s"
     cause = f"sends no answer{within}" if is_late else "closed the connection without an answer"

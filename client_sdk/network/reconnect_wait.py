@@ -18,9 +18,9 @@ from client_sdk.network.network_changes import NetworkChanges
 __all__ = ["ReconnectWait"]
 
 CLOCK_POLL_S = 1.0
-"""How often the wall clock is compared with the monotonic clock while a refused robot waits."""
+"""Seconds between two comparisons of the wall clock with the monotonic clock while a refused robot waits."""
 CLOCK_STEP_S = 0.5
-"""A wall clock that moved by more than this against the monotonic clock was set by somebody."""
+"""A wall clock that moved by more than this many seconds against the monotonic clock was set by somebody."""
 SHORT_REFUSAL_S = 2.0
 """A refusal that ends within this time is not reported: commands and a first connect wait for its end."""
 

@@ -28,7 +28,7 @@ MAX_MEASUREMENT_GAP_S = 10.0
 """If a region was not compared for this long, the time for which it has been nearer starts again: the robot
 may have been suspended."""
 LOSS_MEMORY_S = 3600.0
-"""Lost connections count for this long, in seconds."""
+"""Lost connections of a region make a change to this region harder for this long, in seconds."""
 MAX_DOUBLINGS = 4
 """The time for which a region must be nearer doubles with each of its losses after the first, at most this
 often: it becomes at most 16 times as long."""

@@ -39,7 +39,10 @@ class Region:
         self.first_join: asyncio.Task[DialError | None] | None = None
         """The attempt of the robot's first connect that was still running when another region was chosen."""
         self.move_request: tuple[RegionSocket, float] | None = None
-        """The socket that its server wants closed, and the time until which another server is looked for."""
+        """The socket that its server wants closed, and until when another server is looked for.
+
+        The time is in seconds of the robot's monotonic clock.  None: no server asks for a move.
+        """
         self.is_duplicate = False
         """Whether another address of the robot leads to the same platform, which keeps one connection
         only."""

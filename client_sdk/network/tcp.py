@@ -49,7 +49,7 @@ class TcpDialler:
 
     async def _find_addresses(self, host: str, port: int, within_s: float) -> list[_AddressInfo]:
         key = (host, port)
-        # 1. An IP address needs no name server.
+        # 1. Return an IP address as it is, without a name server.
         with contextlib.suppress(socket.gaierror):
             numeric = socket.AI_NUMERICHOST | socket.AI_NUMERICSERV
             return socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=numeric)

@@ -62,7 +62,10 @@ class BurstPolicy:
     """When each of the last answers arrived, and how long it took."""
 
     def may_send(self, now_s: float) -> bool:
-        """Return whether a command may be sent at *now_s*, and begin a new day after 24 hours."""
+        """Return whether a command may be sent at *now_s*, without counting one.
+
+        A new day with the whole budget begins here, 24 hours after the last one began.
+        """
         if now_s - self._day_began_s >= DAY_S:
             self._day_began_s, self.spent = now_s, 0
         max_in_flight = 1 if self._failures >= BREAKER_FAILURES else MAX_IN_FLIGHT
