@@ -68,7 +68,12 @@ def _camera_line(number: int, camera: Camera) -> str:
 
 
 def _image_lines(version: MapVersion, tracks: Tracks, camera_ids: dict[Camera, int]) -> list[str]:
-    """Return two lines for each image: its pose, and its features with the id of their 3-D point or -1."""
+    """Return two lines for each keyframe, in their order.
+
+    The first line has the number of the image, ``T_camera_world``, the number of the camera, and the name of
+    the image file; the second line has the pixel of each feature and the number of its 3-D point, or -1
+    without one.
+    """
     order = np.argsort(tracks.keyframe, kind="stable")
     first = np.searchsorted(tracks.keyframe[order], np.arange(len(version.keyframes) + 1))
     lines = []
@@ -91,7 +96,10 @@ def _image_lines(version: MapVersion, tracks: Tracks, camera_ids: dict[Camera, i
 
 
 def _point_lines(tracks: Tracks) -> list[str]:
-    """Return a line for each 3-D point: position, colour, mean reprojection error in px, and its track."""
+    """Return a line for each 3-D point: number, position, colour, mean reprojection error in px, and track.
+
+    The track names each observation by the number of its image and the row of its feature, from 0.
+    """
     first = np.searchsorted(tracks.point, np.arange(len(tracks.points) + 1))
     lines = []
     for row, (point, colour) in enumerate(zip(tracks.points.tolist(), tracks.colours.tolist(), strict=True)):

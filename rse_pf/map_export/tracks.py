@@ -335,7 +335,8 @@ def _colours(version: MapVersion, points: Array) -> npt.NDArray[np.uint8]:
     colours = np.full((len(points), 3), _GREY, dtype=np.uint8)
     if not len(points) or not len(version.points):
         return colours
-    # 1. Number the voxels around the points, and sort the cloud by them.
+    # 1. Number the voxels of the box around the points, and sort the cloud points inside of it by their
+    # voxel.
     low = points.min(axis=0) - 1.5 * _COLOUR_VOXEL_M
     sides = np.ceil((points.max(axis=0) - low) / _COLOUR_VOXEL_M) + 2
     is_inside = ((version.points >= low) & (version.points < low + sides * _COLOUR_VOXEL_M)).all(axis=1)
@@ -343,7 +344,7 @@ def _colours(version: MapVersion, points: Array) -> npt.NDArray[np.uint8]:
     if not len(cloud_voxels):
         return colours
     order = np.argsort(cloud_voxels, kind="stable")
-    # 2. Look up the voxel of each point by binary search.
+    # 2. Look up the voxel of each point among those of the cloud by binary search.
     voxels = _voxel_numbers(points, low, sides)
     position = np.minimum(np.searchsorted(cloud_voxels[order], voxels), len(cloud_voxels) - 1)
     has_colour = cloud_voxels[order[position]] == voxels

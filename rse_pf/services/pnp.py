@@ -125,7 +125,8 @@ def make_request(
     about 0.02 mm.
 
     Args:
-        points_world: ``(n, 3)``, metres, world frame.
+        points_world: ``(n, 3)``, metres, world frame; with *depths_m* the frame of the camera that measured
+            the points.
         pixels: ``(n, 2)``, undistorted pixels.
         camera: Intrinsics of the image.
         options: Options of RANSAC; None for the server's defaults.

@@ -56,7 +56,7 @@ class _Field(ctypes.Structure):
 
 
 class CppRuntime:
-    """A loaded library with its state.
+    """A loaded library with the state that its ``rse_pf_service_open`` returned, which is never closed.
 
     Attributes:
         has_snapshots: Whether the library exports ``rse_pf_service_snapshot`` and ``rse_pf_service_restore``.

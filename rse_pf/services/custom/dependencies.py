@@ -275,7 +275,7 @@ def lock_dependencies(folder: Path) -> list[LockedRequirement]:
             hint=f"correct {source}; a package must have a wheel for {platform_tag()}",
         )
         document = json.loads(report.read_text(encoding="utf-8"))
-    # 3. Write the lock.
+    # 3. Write ``requirements.in`` if it did not exist, and the lock.
     if source == lock:
         replace_file(wanted, text.encode())
     resolved = filter(None, map(_read_report_entry, document["install"]))

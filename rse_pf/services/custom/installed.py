@@ -109,7 +109,7 @@ class InstalledService:
 
     @property
     def entry_path(self) -> Path:
-        """Path of the file that is loaded."""
+        """Path of the file that is loaded; no path for the language ``package``, whose entry is a module."""
         return self.folder / self.entry
 
 
@@ -174,7 +174,8 @@ def install(folder: Path, into: Path, dependencies: Dependencies | None = None) 
         packages = {name: installed.packages for name, installed in _dependencies_in(into)}
         require_same_versions({**packages, service.name: dependencies.packages})
         copy_dependencies(dependencies, into / DEPENDENCIES_FOLDER)
-    # 2. Copy the folder under a temporary name, and write packages and hashes.
+    # 2. Copy the folder under a temporary name, write which packages belong to it, and the hash of every
+    # file.
     fresh, old, target = (into / f"{prefix}{service.name}" for prefix in (".new-", ".old-", ""))
     for leftover in (fresh, old):
         shutil.rmtree(leftover, ignore_errors=True)

@@ -117,11 +117,16 @@ class LuaRuntime:
         return self._from_lua(self._run("serve", self._to_lua(payload)))
 
     def snapshot(self) -> bytes:
-        """Return the state of the script as JSON; raises InternalError if JSON cannot hold it."""
+        """Return what the script's ``snapshot`` returns as JSON; only with ``has_snapshots``.
+
+        Raises:
+            InternalError: JSON cannot hold the state.
+            RsePfError: The script raised an error, see `_convert_error`.
+        """
         return msgspec.json.encode(self._from_lua(self._run("snapshot"), "snapshot"))
 
     def restore(self, data: bytes) -> None:
-        """Call the script's ``restore`` with the state of a snapshot."""
+        """Call the script's ``restore`` with the state that `snapshot` encoded; needs ``has_snapshots``."""
         self._run("restore", self._to_lua(msgspec.json.decode(data)))
 
     def _run(self, function: str, *arguments: Any) -> Any:
@@ -136,10 +141,10 @@ class LuaRuntime:
         return value
 
     def _convert_error(self, error: Any) -> RsePfError:
-        """Return the error that a script raised.
+        """Return the error that a script raised, as an error of the platform.
 
-        ``error({code = "bad-request", message = "..."})`` becomes a failure with this code, any other error
-        an InternalError.
+        ``error({code = "bad-request", message = "..."})`` becomes a failure with this code, or with the code
+        ``failed`` if the table has none.  Any other error becomes an InternalError.
         """
         if isinstance(error, RsePfError):
             return error

@@ -214,7 +214,7 @@ def unpublish(name: str, store: ObjectStore) -> None:
 
 
 def require_server_platform(service: InstalledService, root: Path) -> Dependencies | None:
-    """Check that servers on AWS can load *service* in the services folder *root*.
+    """Check the platform of the packages and shared libraries of *service* in the services folder *root*.
 
     Returns:
         The Python packages of the service, None if it has none.
@@ -297,7 +297,12 @@ def _require_compatible_packages(entries: Sequence[PublishedService]) -> None:
 
 
 def _require_loadable_library(service: str, path: Path) -> None:
-    """Raise ConfigurationError unless the shared library *path* can be loaded on Debian 12 (x86-64)."""
+    """Raise ConfigurationError if the shared library *path* certainly cannot be loaded on Debian 12 (x86-64).
+
+    The library must be an ELF file for x86-64, and must not contain the name of a symbol version that is
+    newer than the C and C++ libraries of Debian 12.  Whether other libraries that it needs exist is not
+    checked.
+    """
     data = path.read_bytes()
     if not data.startswith(_ELF_MAGIC) or int.from_bytes(data[_ELF_MACHINE], "little") != _ELF_X86_64:
         raise ConfigurationError(
@@ -361,8 +366,8 @@ class PublishedFolder:
                 yet.
 
         Raises:
-            ConfigurationError: The list or an archive is damaged, or two services cannot run together; the
-                link stays.
+            ConfigurationError: The list or an archive is damaged, or two services need different versions of
+                a package; the link stays.
             StoreError: An archive cannot be fetched; the link stays.
         """
         entries = decode_list(data).services
@@ -380,7 +385,7 @@ class PublishedFolder:
                     fresh.rename(archives / entry.archive)
                 finally:
                     shutil.rmtree(fresh, ignore_errors=True)
-        # 2. Make the services folder of the list, and verify its services.
+        # 2. Make the services folder of the list from the archives, and compare all files with their hashes.
         shutil.rmtree(target, ignore_errors=True)
         services = assemble_folder(entries, archives, target)
         # 3. Move the link ``current`` to the new services folder.
@@ -454,7 +459,8 @@ def assemble_folder(
         into: Path of the new folder, which must not exist; it appears once all services are verified.
 
     Raises:
-        ConfigurationError: A file is not as it was published, or two services cannot run together.
+        ConfigurationError: A file is not as it was published, or two services need different versions of a
+            package.
     """
     fresh = Path(tempfile.mkdtemp(prefix=".new-", dir=into.parent))
     try:

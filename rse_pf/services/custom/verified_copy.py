@@ -156,7 +156,10 @@ class VerifiedCopy:
 
 
 def _file_statuses(service: InstalledService) -> dict[str, _FileStatus]:
-    """Return the status of each file of *service* and its packages by path; it changes with the file."""
+    """Return the status of each file and link of *service* and its packages, by path.
+
+    The status differs after any change of the file.  Files that are removed meanwhile are left out.
+    """
     statuses = {}
     for root in filter(None, (service.folder, service.dependencies)):
         for folder, folders, files in os.walk(root):

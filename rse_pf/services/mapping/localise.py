@@ -128,7 +128,8 @@ def locate(
         within: Prior of the camera's position; None to search the whole map.
 
     Returns:
-        The reply of the service, with ``T_map_camera`` as ``(4, 4)`` and ``covariance`` as ``(6, 6)``.
+        The reply of the service, with ``T_map_camera`` as ``(4, 4)`` and ``covariance`` as ``(6, 6)``; both
+        are None, and the verdict is ``lost``, if no candidate gives a pose.
 
     Raises:
         MissingExtra: The native core is not installed.

@@ -40,8 +40,8 @@ describe: rounding of a resized photo stays below 1 %, and a cropped or rotated 
 _MAX_ROUND_TRIP_PX = 0.5
 """Largest difference, in each coordinate, between a pixel and the same pixel undistorted and distorted again:
 beyond it, the iterative inverse of the distortion has failed, and the feature at the pixel is not used."""
-_MAX_OUTLINE_KEYFRAMES = 2000  # positions of keyframes in an outline, so that it stays below 100 kB
-_MAX_OUTLINE_POINTS = 4000  # map points in an outline, so that it stays below 100 kB
+_MAX_OUTLINE_KEYFRAMES = 2000  # largest number of keyframes in an outline, so that it stays below 100 kB
+_MAX_OUTLINE_POINTS = 4000  # largest number of map points in an outline, so that it stays below 100 kB
 
 
 def localise_photo(data: bytes, photo_lens: PhotoLens, index: MapIndex) -> LocaliseReply:
@@ -65,13 +65,13 @@ def localise_photo(data: bytes, photo_lens: PhotoLens, index: MapIndex) -> Local
     check_same_kind(index.kind, ORB, "the map")
     camera_of_photo = _camera_of_photo(photo_lens, *photo_size(data))
     camera = _camera_for_features(camera_of_photo, [keyframe.camera for keyframe in index.keyframes])
-    # 2. Detect ORB features in this image.
+    # 2. Detect ORB features in the photo, resized for that camera.
     rgb = decode_photo(data)
     if camera != camera_of_photo:
         cv2 = load_opencv()
         rgb = cv2.resize(rgb, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
     features = describe_orb(rgb, _MAX_FEATURES)
-    # 3. Undistort their pixels.
+    # 3. Undistort the pixels of the features.
     lens = Lens(camera=camera, distortion=photo_lens.distortion, model=photo_lens.model)
     pixels, is_valid = _undistort_features(features.pixels, lens)
     # 4. Localise the features in the map, without those whose pixels could not be undistorted.
@@ -193,7 +193,7 @@ def _camera_for_features(camera: Camera, map_cameras: list[Camera]) -> Camera:
 
 
 def _resize_camera(camera: Camera, width: int, height: int) -> Camera:
-    """Return the camera of the same image, resampled to *width* by *height* pixels."""
+    """Return the camera of the image of *camera*, resampled to *width* by *height* pixels."""
     scale_x, scale_y = width / camera.width, height / camera.height
     # The first pixel's centre is (0, 0), so that the corner of the image, which stays, is (-0.5, -0.5).
     return Camera(

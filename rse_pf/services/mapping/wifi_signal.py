@@ -185,7 +185,13 @@ def _fit(all_positions: Array, rows: Rows, dbm: Array) -> SignalField:
 
 
 class _Kernel(NamedTuple):
-    """The parameters of a Gaussian process: variances of signal and noise, and correlation length."""
+    """The parameters of a Gaussian process.
+
+    Attributes:
+        signal_dbm2: Variance of the process.
+        noise_dbm2: Variance of the noise of a reading.
+        length_m: Correlation length of the process.
+    """
 
     signal_dbm2: float
     noise_dbm2: float
@@ -195,7 +201,10 @@ class _Kernel(NamedTuple):
 def _condition(
     positions: Array, residuals: Array, rows: Rows, source: Array, trend: Array, kernel: _Kernel
 ) -> SignalField:
-    """Return the field of a Gaussian process with *kernel*, given *residuals* at *positions*."""
+    """Return the field of a Gaussian process with *kernel*, given *residuals* at *positions* ``(r, 3)``.
+
+    *rows*, *source* and *trend* are attributes of the field, and are not changed.
+    """
     signal, noise, length_m = kernel
     covariance = _kernel(positions, positions, signal, length_m) + noise * np.eye(len(positions))
     inverse = np.linalg.inv(covariance).astype(np.float64)

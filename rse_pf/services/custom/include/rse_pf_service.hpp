@@ -109,7 +109,8 @@ inline Fields copy_fields(const rse_pf_field *fields, uint32_t count) {
 }
 
 // Return a reply as C fields in one block of memory: the fields, then all numbers, then all names and texts.  free()
-// releases the block.  Of a shape only the first 4 axes are kept; the platform refuses the field if count differs then.
+// releases the block.  Of a shape only the first 4 axes are kept; if they do not hold all numbers, the platform
+// refuses the reply.
 inline rse_pf_field *allocate_fields(const Fields &fields) {
   std::size_t numbers = 0, bytes = 0;
   for (const auto &entry : fields) {
