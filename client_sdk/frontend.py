@@ -54,7 +54,7 @@ class Frame:
     """One undistorted colour image, with registered depth or with the right image of a stereo pair.
 
     Attributes:
-        timestamp_s: Seconds.
+        timestamp_s: Time of the image, in seconds.
         rgb: ``(h, w, 3)`` uint8, red first; the rectified left image of a stereo pair.
         depth_m: ``(h, w)`` floats, metres along the optical axis, 0 where there is no reading; all 0 for
             stereo pairs and for cameras without depth.
@@ -116,22 +116,28 @@ class FrontEndOptions:
         is_spread: Whether features are spread over the image; otherwise the strongest of the image are taken.
         max_matches: Largest number of matches that a pose query sends, an even sample of all; 530 keep a
             command below 10 kB with the codec zlib, see `sent_with` for other codecs.
-        min_depth_m: Smallest depth reading that is used.
-        max_depth_m: Largest depth reading that is used.
-        depth_spread_percent: A pixel has no depth if the depths of its 3x3 patch differ by more than this
-            percentage of their median: the patch lies on the edge of an object.
-        inlier_px: Largest reprojection error of an inlier.
+        min_depth_m: Smallest depth of a feature that is used; not for stereo pairs.
+        max_depth_m: Largest depth of a feature that is used; not for stereo pairs.
+        depth_spread_percent: A pixel has no depth if the largest and the smallest depth of its 3x3 patch
+            differ by more than this percentage of their median: the patch lies on the edge of an object.  Not
+            for stereo pairs.
+        inlier_px: Largest reprojection error, in pixels, of an inlier of a pose query.
         max_iterations: Largest number of RANSAC iterations.
-        min_inliers: Smallest number of inliers of an accepted pose.
-        max_jump_m: Largest plausible motion between two frames.
-        keyframe_m: A frame farther than this from every keyframe becomes a keyframe.
-        keyframe_deg: A frame rotated by more than this from every keyframe becomes a keyframe.
+        min_inliers: Smallest number of inliers of an accepted pose; a keyframe needs twice as many.
+        max_jump_m: Largest plausible translation between two frames; after a loss, and for a stereo pair that
+            sees far, the tracker allows more.
+        keyframe_m: A frame becomes a keyframe if it is farther than this from every keyframe, or rotated by
+            more than *keyframe_deg*: for each keyframe one of both suffices.
+        keyframe_deg: See *keyframe_m*.
         keyframe_share: A frame that sees less than this share of the landmarks that the newest keyframe saw
             becomes a keyframe.
         search_px: Radius around the predicted pixel of a landmark in which features are compared.
         segment_after: Number of frames since the last pose, with enough features and no recognised place,
             after which a new segment begins.
         max_keyframes: Largest number of keyframes of a segment; beyond it older keyframes are thinned out.
+
+    Raises:
+        UsageError: An option is outside its range.
     """
 
     features: int = 1000
@@ -253,13 +259,14 @@ class Features:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Correspondences:
-    """Correspondences between 3-D points of a reference view and pixels of another view, as they are sent.
+    """Correspondences between 3-D points and pixels of one view, as they are sent.
 
     Attributes:
-        points_world: ``(n, 3)``, metres in the frame of the *reference camera*, which is the world of this
-            one query; rounded to 0.1 mm.
+        points_world: ``(n, 3)`` in the world of this one query, rounded to 0.0001: metres in the frame of a
+            *reference camera*; of a camera without depth, in the frame and unit of the segment's map.
         pixels: ``(n, 2)``: pixel *i* shows point *i*; rounded to 0.01 px.
-        depths_m: ``(n,)``, depth measured at each pixel, 0 where it is missing or unreliable.
+        depths_m: ``(n,)``, depth along the optical axis, measured at each pixel, 0 where it is missing or
+            unreliable.
     """
 
     points_world: Array
@@ -271,7 +278,7 @@ class Correspondences:
 
 
 def extract(frame: Frame, options: FrontEndOptions, plugin: FeaturesPlugin | None = None) -> Features:
-    """Extract the features of a frame with their 3-D points; deterministic with ORB.
+    """Extract the features of a frame with their 3-D points; the same frame gives the same features with ORB.
 
     Args:
         frame: Image with depth, or a stereo pair.
@@ -326,7 +333,7 @@ def describe(
 
 
 def round_for_wire(points_world: Array, pixels: Array) -> tuple[Array, Array]:
-    """Round points to 0.1 mm and pixels to 0.01 px, so that server and robot solve the same numbers.
+    """Round points to 0.0001 (0.1 mm) and pixels to 0.01 px: server and robot then solve the same numbers.
 
     The rounding moves a pose by about 0.02 mm and shrinks the message to a third.
     """
@@ -335,18 +342,21 @@ def round_for_wire(points_world: Array, pixels: Array) -> tuple[Array, Array]:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PoseQuery:
-    """A query for the PnP service: the pose of a camera in the frame of the query's reference camera.
+    """A query for the PnP service: the pose of a camera in the world of the query.
 
-    The pose ``T_camera_reference`` is solved from all fields, and passed to the tracker's ``accept``.
+    That world is the frame of a reference camera; of a camera without depth, it is the frame of the segment's
+    map.  The solved pose maps it to the camera, and is passed to the tracker's ``accept`` as
+    ``T_camera_world``.
 
     Attributes:
         timestamp_s: Time of the frame, in seconds.
         correspondences: Points, pixels and depths.
         camera: Intrinsics of the pixels.
-        inlier_px: Largest reprojection error of an inlier.
+        inlier_px: Largest reprojection error of an inlier, in pixels.
         max_iterations: Largest number of RANSAC iterations.
-        against: The source of the points: the ``map`` near the predicted pose, the last ``frame``, a
-            ``keyframe`` by which the place is recognised, or a keyframe of another ``segment``.
+        against: The source of the points: the ``map`` around the predicted or last pose, the last ``frame``,
+            a ``keyframe`` by which the place is recognised, or, as ``segment``, a keyframe by which a tracked
+            frame is found in another segment or in a loop.
         depth_noise: Noise model of the depths; None for a Kinect's.
     """
 
@@ -368,14 +378,17 @@ class TrackedFrame:
         T_world_camera: ``(4, 4)``, metres unless *scale* is ``up to scale``; None for a lost frame, which
             must not be drawn.
         keyframe: Whether the frame became a keyframe.
-        inliers: Number of landmarks that agree with the pose.
-        matches: Number of matches of the frame.
+        inliers: Number of landmarks that agree with the pose; 0 for the first pose of a segment with depth.
+        matches: Number of matches with landmarks; without a pose, the largest number of an attempt (0 without
+            depth).
         status: ``lost`` without a pose, ``starting`` without a pose before a camera without depth has moved
-            enough, ``tracked`` with a pose; `Mapper` reports the first pose as ``first``.
-        reason: Why there is no pose, or why it is weak; empty otherwise.
+            enough, ``tracked`` with a pose.  `Mapper` reports the first pose as ``first``; a `Tracker` itself
+            leaves ``tracked`` also without a pose.
+        reason: Why there is no pose, why the pose is weak, or that its segment is not joined to the first
+            one; empty otherwise.
         scale: Whether lengths are metres, or of an arbitrary unit.
-        covariance: ``(6, 6)`` of the twist (metres, radians) on the left of the pose of the last query;
-            filled by `Mapper.track`.
+        covariance: ``(6, 6)`` of the twist (metres, radians) on the left of the pose that answered the last
+            query, which maps the query's world to the camera; filled by `Mapper.track`.
         source: Who solved the last query: a server (``cloud``), the Lambda (``burst``), or the ``robot``;
             filled by `Mapper.track`.
         round_trip_ms: Duration of the last query in milliseconds; filled by `Mapper.track`.
@@ -385,7 +398,7 @@ class TrackedFrame:
             was returned before is ``T_new_old @ T_world_camera`` now; None if it was not.
         T_map_camera: ``(4, 4)``, the pose in the live map; None until the segment is aligned.
         segment: Number of the present segment, that is, of the odometry frame.
-        features: Features of the image before any correction, None where none were extracted; their points
+        features: Features of the image with its rolling shutter, None where none were extracted; their points
             are NaN where depth is not used.
     """
 
@@ -430,8 +443,8 @@ def points_at(frame: Frame, pixels: Array, options: FrontEndOptions) -> Array:
         options: Range of depths, and how much the readings of a patch may differ.
 
     Returns:
-        ``(n, 3)`` metres in the camera's frame; NaN where a patch has too few readings, or readings that
-        differ too much or are out of range.
+        ``(n, 3)`` metres in the camera's frame; NaN where a patch has fewer than five readings, or readings
+        that differ too much, or where their median is out of range.
 
     Raises:
         MissingExtra: The native core is not installed.

@@ -63,8 +63,8 @@ _MIN_PLACE_SIZE = 8
 _MAX_PLACE_SIZE = 4096
 """Largest length of a place vector of a user: bounds the memory of a keyframe."""
 _CLIP_RMS = 4.0
-"""Numbers of a float descriptor are clipped at this many times their root mean square when they become
-int8."""
+"""When a float descriptor becomes int8, its numbers are clipped at this many times the root mean square of
+that descriptor."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -75,10 +75,12 @@ class FoundFeatures:
         pixels: ``(n, 2)``, column and row; the centre of the first pixel is (0, 0).
         scores: ``(n,)``, strength; features with the highest scores are used.
         descriptors: ``(n, d)``: uint8 for binary descriptors (Hamming distance), int8 or floats for vectors
-            (Euclidean distance).  Float vectors are scaled to one length and sent as int8.
+            (Euclidean distance).  Float vectors are scaled to one length and sent as int8.  None is allowed
+            only without features.
         orientations_deg: ``(n,)``, angle of each feature in the image, clockwise from the x axis; None if the
             detector measures none: then a match may be rotated by any angle.
-        sizes: ``(n,)``, scale of each feature, 1 for the finest; None if the detector measures none.
+        sizes: ``(n,)``, scale of each feature, above 0, 1 for the finest; None if the detector measures none:
+            then a match may have any change of scale.
     """
 
     pixels: npt.ArrayLike
@@ -100,7 +102,8 @@ LoopsFunction = Callable[[npt.NDArray[np.uint8]], npt.ArrayLike]
 numbers; the smaller the angle between the vectors of two images, the likelier both show the same place."""
 OptimiserFunction = Callable[[Bundle, Camera, int], tuple[npt.ArrayLike, npt.ArrayLike]]
 """A bundle adjustment: takes a bundle of a camera without depth, the camera's intrinsics and the number of
-iterations; returns the adjusted ``(c, 4, 4)`` poses ``T_camera_world`` and ``(p, 3)`` points."""
+iterations; returns the adjusted ``(c, 4, 4)`` poses ``T_camera_world`` and ``(p, 3)`` points.  Poses of fixed
+cameras must be returned as they are, which is not checked."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -125,9 +128,9 @@ class CheckedFeatures:
 class FeaturesPlugin:
     """A user's feature extractor with its checks.
 
-    ``name`` is the name of its features.  ``kind``, ``is_oriented`` and ``is_scaled`` (the kind of its
-    descriptors, and whether it measures orientations and sizes) are known after the first image with
-    features; before it, ``kind`` is ORB.
+    ``name`` is the name of its features, in lower case.  ``kind``, ``is_oriented`` and ``is_scaled`` (the
+    kind of its descriptors, and whether it measures orientations and sizes) are those of the first image with
+    features, and every later image must have the same; before that image they are ORB, False and False.
     """
 
     def __init__(self, function: FeaturesFunction) -> None:
@@ -157,7 +160,7 @@ class FeaturesPlugin:
             raise UsageError("features named orb are the built-in ones", hint="give yours another name")
 
     def __call__(self, rgb: npt.NDArray[np.uint8]) -> CheckedFeatures:
-        """Extract the features of an ``(h, w, 3)`` image.
+        """Return all features of an ``(h, w, 3)`` uint8 image, highest score first.
 
         Raises:
             UsageError: The function failed, or the returned values cannot be features.
@@ -212,7 +215,10 @@ class FeaturesPlugin:
         )
 
     def _check_numbers(self, field: str, given: npt.ArrayLike, shape: tuple[int, ...]) -> Array:
-        """Return finite numbers of *shape*, whose first length may be -1 for any."""
+        """Return *given* as finite float64 numbers of *shape*, whose first length may be -1 for any.
+
+        *field* is their name in an error.  Empty numbers of any shape fit a length of -1.
+        """
         try:
             array = np.asarray(given, dtype=np.float64)
         except (TypeError, ValueError) as error:
@@ -264,7 +270,7 @@ class MotionPlugin:
         self._recent: deque[tuple[float, Array]] = deque(maxlen=_MOTION_HISTORY_POSES)
 
     def add(self, timestamp_s: float, T_world_camera: Array) -> None:
-        """Add the pose of a tracked frame."""
+        """Add the pose of a tracked frame; only the ten newest poses are kept."""
         self._recent.append((timestamp_s, T_world_camera))
 
     def clear(self) -> None:
@@ -292,7 +298,7 @@ class MotionPlugin:
 
 
 class LoopsPlugin:
-    """A user's place recogniser with its checks; all of its vectors have one length."""
+    """A user's place recogniser with its checks; all of its vectors must be as long as the first one."""
 
     def __init__(self, function: LoopsFunction) -> None:
         """Wrap a function; raises UsageError if it cannot be called."""
@@ -329,6 +335,8 @@ class OptimiserPlugin:
     def __call__(self, bundle: Bundle, camera: Camera, *, iterations: int = 8) -> tuple[Array, Array]:
         """Return adjusted poses ``T_camera_world`` ``(c, 4, 4)`` and points ``(p, 3)`` of a bundle.
 
+        Whether they fit the pixels better than before is not checked.
+
         Raises:
             UsageError: The function failed, or returned poses or points of other shapes, or no rigid poses.
         """
@@ -357,7 +365,10 @@ def _check_callable(argument: str, function: Any) -> Any:
 
 
 def _call_user(name: str, function: Callable[..., Any], *arguments: Any) -> Any:
-    """Call a user's function; turn any exception into a UsageError that names the line which raised it."""
+    """Call a user's function; turn its exception into a UsageError that names the line which raised it.
+
+    KeyboardInterrupt passes as it is.
+    """
     try:
         return function(*arguments)
     except (Exception, asyncio.CancelledError, SystemExit) as error:  # also what would end a thread or a task
@@ -435,7 +446,9 @@ class Plugins:
         )
 
     def predict_pose(self, timestamp_s: float) -> Array | None:
-        """Predict ``T_world_camera`` ``(4, 4)`` by the user's motion model; None without one, or a pose.
+        """Predict ``T_world_camera`` ``(4, 4)`` by the user's motion model.
+
+        None without a motion model, and while it has been given no pose since the last `forget_poses`.
 
         Raises:
             UsageError: The user's function failed, or returned no rigid pose.
@@ -445,9 +458,10 @@ class Plugins:
     def predict_motion(self, T_last_next: Array, last_s: float, next_s: float) -> Array:
         """Replace the rotation of a predicted motion by the gyroscope's measurement, where there is one.
 
+        *T_last_next* is changed in place, and returned.
+
         Args:
-            T_last_next: ``(4, 4)``, motion from the last to the next camera pose at a constant velocity;
-                changed in place.
+            T_last_next: ``(4, 4)``, predicted pose of the next camera in the frame of the last one.
             last_s: Time of the last pose, in seconds.
             next_s: Time of the next frame, in seconds.
         """
@@ -468,7 +482,7 @@ class Plugins:
 
 
 def load_features(name: str | None) -> FeaturesFunction | None:
-    """Load the feature extractor that ``module:function`` names; None for None.
+    """Load the feature extractor that ``module:function`` names, without calling it; None for None.
 
     Raises:
         UsageError: There is no such function, or it has no name that features can have.
@@ -484,7 +498,9 @@ _FUNCTION_NAME = re.compile(r"([A-Za-z_][\w.]*):([A-Za-z_]\w*)")
 
 
 def load_function(name: str) -> Any:
-    """Import the object that ``module:function`` names; the working directory is searched, too.
+    """Import and return the object that ``module:function`` names; whether it can be called is not checked.
+
+    The working directory is put first on ``sys.path``, where it stays.
 
     Raises:
         UsageError: The name is malformed, its module cannot be imported, or has no such attribute.
@@ -514,7 +530,10 @@ def load_function(name: str) -> Any:
 
 
 def _describe_error(error: BaseException) -> str:
-    """Return an error's message in one line, with the last line of a user's file in its traceback."""
+    """Return an error's message in one line of at most 200 characters, then the file and line that raised it.
+
+    File and line are the last ones of the traceback that are not in this module or in the import system.
+    """
     own_files = (__file__, importlib.__file__)
     trace = traceback.extract_tb(error.__traceback__)
     frames = [f for f in trace if f.filename not in own_files and not f.filename.startswith("<")]

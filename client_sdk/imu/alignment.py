@@ -46,10 +46,11 @@ _MAX_ITERATIONS = 12  # largest number of accepted Levenberg-Marquardt steps of 
 _CONVERGED_FRACTION = 1e-4
 """Levenberg-Marquardt ends with a step that lowers the cost by less than this fraction."""
 _FIRST_DAMPING = 1e-5
-"""Levenberg-Marquardt damping of the first step; bad steps multiply it by 10, good ones by 0.1."""
+"""Levenberg-Marquardt damping of the first step, as a share of the diagonal; bad steps multiply it by 10,
+good ones by 0.1."""
 _MIN_DAMPING = 1e-9  # smallest Levenberg-Marquardt damping of a step
 _MAX_DAMPING = 1e8  # Levenberg-Marquardt damping above which the search for a better step is given up
-_COVARIANCE_FLOOR = 1e-14  # added to variances of preintegrated motions, so that they have a Cholesky factor
+_COVARIANCE_FLOOR = 1e-14  # added to variances of preintegrated motions, so that a Cholesky factor exists
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -59,14 +60,15 @@ class ImuAlignment:
     Attributes:
         scale: Metres per unit of the camera's poses.
         scale_deviation: Standard deviation of the logarithm of the scale, thus relative; 0 for metric poses.
-        gravity_m_s2: ``(3,)`` in the world of the poses; it points down.
+        gravity_m_s2: ``(3,)`` in the world of the poses; it points down, and its length is 9.81.
         gravity_deviation_rad: Standard deviation of the direction of gravity about its less certain axis.
         R_world_imu: ``(n, 3, 3)`` smoothed rotations of the IMU.
-        positions_m: ``(n, 3)`` smoothed positions of the IMU in the world.
+        positions_m: ``(n, 3)`` smoothed positions of the IMU in the world, whose lengths are multiplied by
+            *scale*.
         velocities_m_s: ``(n, 3)`` velocities of the IMU in the world.
         gyro_bias_rad_s: ``(n, 3)`` biases of the gyroscope.
         accel_bias_m_s2: ``(n, 3)`` biases of the accelerometer.
-        bias_covariance: ``(6, 6)`` of the last pose's biases of gyroscope and accelerometer.
+        bias_covariance: ``(6, 6)`` of the biases of gyroscope, then accelerometer, at the last pose.
         misfit: Square root of the chi-square per degree of freedom: about 1 if the noise is as stated.  All
             deviations and covariances above were multiplied by it, or its square, if it is above 1.
     """
@@ -87,7 +89,9 @@ class ImuAlignment:
 def estimate_gyro_bias(R_world_imu: Array, motions: Sequence[Preintegration]) -> Array:
     """Return the ``(3,)`` gyroscope bias in rad/s with which motions fit the rotations ``(n, 3, 3)`` best.
 
-    The n - 1 motions lie between neighbouring rotations.
+    The n - 1 motions lie between neighbouring rotations.  The result is the bias with which the first motion
+    was preintegrated, plus one linear correction; the others should have been preintegrated with nearly that
+    bias.
 
     Source:
         VINS-Mono, eq. 15.
@@ -110,7 +114,10 @@ def align_imu(
     *,
     is_metric: bool = False,
 ) -> ImuAlignment | None:
-    """Align an IMU with the poses of a camera; return None if the poses do not determine the scale.
+    """Align an IMU with the poses of a camera.
+
+    The result is None if the linear solution has a scale that is not above 0, or if the final equations have
+    no valid covariance: then the poses do not determine scale and gravity.
 
     Args:
         T_world_camera: ``(n, 4, 4)`` poses, n >= 5, with translations in any one unit.
@@ -141,10 +148,11 @@ def _align_linearly(
     *,
     is_metric: bool,
 ) -> tuple[float, Array, Array] | None:
-    """Return scale, gravity and velocities ``(n, 3)`` by linear least squares; None for a scale below 0.
+    """Return scale, gravity ``(3,)`` and velocities ``(n, 3)`` of the IMU by linear least squares.
 
-    The magnitude of gravity is free in the problem and set to 9.81 m/s^2 afterwards; the accelerometer has no
-    bias in it.  Raises UsageError as `align_imu` does.
+    Both vectors are in the world of the poses, in m/s^2 and m/s.  The magnitude of gravity is free in the
+    problem and set to 9.81 m/s^2 afterwards; the accelerometer has no bias in it.  None if the scale is not
+    above 0; UsageError if the scale is certainly below 0 or gravity certainly wrong, see `align_imu`.
     """
     # 1. Correct the motions for the change of the gyroscope bias.
     R, camera_in_imu = _imu_rotations(T_world_camera, model)
@@ -198,7 +206,10 @@ def _align_linearly(
 
 
 def _deviations_of_last(matrix: Array, residuals: Array, count: int) -> Array:
-    """Return the ``(count,)`` standard deviations of the last unknowns of a linear least-squares problem."""
+    """Return the ``(count,)`` standard deviations of the last unknowns of a linear least-squares problem.
+
+    The noise is estimated from the residuals.  All are infinite if the problem does not determine them.
+    """
     variance = np.square(residuals).sum() / max(1, len(residuals) - matrix.shape[1])
     # In the QR decomposition the last rows of R contain the last unknowns alone.
     R = np.asarray(np.linalg.qr(matrix, mode="r"))[-count:, -count:]
@@ -209,7 +220,7 @@ def _deviations_of_last(matrix: Array, residuals: Array, count: int) -> Array:
 
 
 def _velocity_and_position_deltas(motions: Sequence[Preintegration]) -> Array:
-    """Return the preintegrated changes of velocity and position ``(n, 6)``."""
+    """Return the preintegrated changes of velocity, then position, of *n* motions, ``(n, 6)``."""
     return np.stack(
         [np.concatenate([motion.delta_velocity_m_s, motion.delta_position_m]) for motion in motions]
     )
@@ -257,7 +268,11 @@ class _AlignmentProblem:
             self._sqrt_information[row, 9:, 9:] = np.diag(1.0 / np.sqrt(walk * motion.duration_s))
 
     def solve(self, scale: float, gravity: Array, velocities: Array, gyro_bias: Array) -> ImuAlignment | None:
-        """Refine a first solution by Levenberg-Marquardt; return None if its covariance is not positive."""
+        """Refine a first solution by Levenberg-Marquardt.
+
+        The arguments are those that `_align_linearly` returns, and the ``(3,)`` gyroscope bias.  The result
+        is None if it has no covariance with positive variances.
+        """
         n = len(self._observed_p)
         state = _State(
             R=self._observed_R.copy(),
@@ -281,7 +296,7 @@ class _AlignmentProblem:
                 damping *= 10.0
             if not is_better:
                 break
-            # 2. Take the step; stop if it changed little.
+            # 2. Take the step; stop if it lowered the cost by little.
             is_converged = cost - candidate_cost < _CONVERGED_FRACTION * cost
             state, cost, damping = candidate, candidate_cost, max(0.1 * damping, _MIN_DAMPING)
             equations = self._linearise(state)
@@ -290,7 +305,10 @@ class _AlignmentProblem:
         return self._make_alignment(state, equations)
 
     def _make_alignment(self, state: _State, equations: _NormalEquations) -> ImuAlignment | None:
-        """Return the alignment with deviations from the inverse of the normal equations; None if singular."""
+        """Return the alignment with its deviations, which come from the inverse of the normal equations.
+
+        None if these are singular, or have a variance that is not positive.
+        """
         covariance = equations.last_covariance()
         if covariance is None or not np.isfinite(covariance).all():
             return None
@@ -331,8 +349,11 @@ class _AlignmentProblem:
         return motion_residuals, np.concatenate([rotations, positions], axis=1)
 
     def _motion_residuals(self, state: _State) -> tuple[Array, Array]:
-        """Return the residuals of motions ``(n - 1, 15)``, and the rotation vectors ``(n - 1, 3)`` by which
-        the changes of the gyroscope biases correct the preintegrated rotations.
+        """Return the residuals of motions ``(n - 1, 15)`` in their own units, and corrections.
+
+        The residuals are those of rotation (rad), velocity (m/s), position (m) and the change of both biases.
+        The corrections ``(n - 1, 3)`` are rotation vectors, rad, by which the changes of the gyroscope biases
+        since the preintegration correct the preintegrated rotations, on the right.
         """
         RT = np.swapaxes(state.R[:-1], 1, 2)
         bias_changes = state.biases[:-1] - self._motion_biases
@@ -347,18 +368,21 @@ class _AlignmentProblem:
         return raw, corrections[:, :3]
 
     def _velocity_changes(self, state: _State) -> Array:
-        """Return the changes of velocity ``(n - 1, 3)`` in the world, without gravity."""
+        """Return the changes of velocity ``(n - 1, 3)`` in the world, m/s, without what gravity changed."""
         changes: Array = state.v[1:] - state.v[:-1] - self._dt[:, None] * state.gravity
         return changes
 
     def _position_changes(self, state: _State) -> Array:
-        """Return the changes of position ``(n - 1, 3)`` in the world, without velocity and gravity."""
+        """Return the changes of position ``(n - 1, 3)`` in the world, m.
+
+        What the velocity at the begin and gravity changed is subtracted.
+        """
         dt = self._dt[:, None]
         changes: Array = state.p[1:] - state.p[:-1] - dt * state.v[:-1] - 0.5 * dt**2 * state.gravity
         return changes
 
     def _linearise(self, state: _State) -> _NormalEquations:
-        """Return the weighted normal equations at a state.
+        """Return the normal equations at a state, with the weights of the Huber loss.
 
         The border holds the logarithm of the scale (unless the poses are metric) and two angles of gravity.
 
@@ -366,7 +390,8 @@ class _AlignmentProblem:
             Jacobians of preintegrated motions: Forster et al. 2017, appendix C.
         """
         n, border_size = len(self._observed_p), 2 if self._is_metric else 3
-        # 1. Differentiate the residuals of motions by the states before and behind, and by the border.
+        # 1. Differentiate the residuals of motions by the states at their begin (before) and at their end
+        # (behind), and by the border.
         raw, rotation_corrections = self._motion_residuals(state)
         RT = np.swapaxes(state.R[:-1], 1, 2)
         dt = self._dt[:, None, None]
@@ -396,7 +421,7 @@ class _AlignmentProblem:
         gravity_by_angles = -skew(state.gravity) @ _tangents(state.gravity)
         border[:, 3:6, border_size - 2 :] = -dt * RT @ gravity_by_angles
         border[:, 6:9, border_size - 2 :] = -0.5 * dt**2 * RT @ gravity_by_angles
-        # 2. Whiten and weight them.
+        # 2. Whiten these derivatives and the residuals of motions, and weight them.
         motion_residuals, pose_residuals = self._residuals(state)
         weights = np.sqrt(_huber_weights(motion_residuals))[:, :, None]
         before, behind, border = (
@@ -415,7 +440,7 @@ class _AlignmentProblem:
         weights = np.sqrt(_huber_weights(pose_residuals))[:, :, None]
         own, own_border = weights * own, weights * own_border
         pose_residuals = weights[:, :, 0] * pose_residuals
-        # 4. Add both to the normal equations, and the prior of the first biases.
+        # 4. Add poses and motions to the normal equations, and the prior of the first biases.
         equations = _NormalEquations(n, border_size)
         equations.add(own, own_border, pose_residuals)
         equations.add_pairs(before, behind, border, motion_residuals)
@@ -427,7 +452,16 @@ class _AlignmentProblem:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _State:
-    """Unknowns: for n poses rotation, position, velocity and biases of the IMU; scale and gravity."""
+    """The unknowns: the states of n poses of the IMU, the scale, and gravity.
+
+    Attributes:
+        R: ``(n, 3, 3)``, rotations ``R_world_imu``.
+        p: ``(n, 3)``, positions in the world, m.
+        v: ``(n, 3)``, velocities in the world, m/s.
+        biases: ``(n, 6)`` of the gyroscope (rad/s), then of the accelerometer (m/s^2).
+        scale: Metres per unit of the camera's poses.
+        gravity: ``(3,)`` in the world, m/s^2.
+    """
 
     R: Array
     p: Array
@@ -437,7 +471,11 @@ class _State:
     gravity: Array
 
     def moved_by(self, steps: Array, border_step: Array) -> _State:
-        """Return the state after steps ``(n, 15)`` of the poses and ``(2,)`` or ``(3,)`` of the border."""
+        """Return the state after steps ``(n, 15)`` of the poses and ``(2,)`` or ``(3,)`` of the border.
+
+        Rotations are multiplied on the right.  The border has the change of the scale's logarithm, if it has
+        three numbers, and the angles, rad, by which gravity rotates about its two `_tangents`.
+        """
         scale = self.scale * float(np.exp(border_step[0])) if len(border_step) == 3 else self.scale
         turn = exp_so3(_tangents(self.gravity) @ border_step[-2:])
         return _State(
@@ -455,7 +493,8 @@ class _NormalEquations:
 
     For n states of 15 unknowns and a border of m unknowns: ``diagonal`` ``(n, 15, 15)``, ``coupling``
     ``(n - 1, 15, 15)`` of each state with the next, ``border`` ``(n, 15, m)`` of each state with the border,
-    ``corner`` ``(m, m)`` of the border with itself, and the gradients ``(n, 15)`` and ``(m,)``.
+    ``corner`` ``(m, m)`` of the border with itself, and the gradients (Jacobian transposed times residuals)
+    ``(n, 15)`` and ``(m,)``.
     """
 
     def __init__(self, n: int, m: int) -> None:
@@ -487,7 +526,10 @@ class _NormalEquations:
         self.border_gradient += np.einsum("nij,nj->i", borderT, residuals)
 
     def solve(self, damping: float) -> tuple[Array, Array]:
-        """Return the steps of the states ``(n, 15)`` and of the border ``(m,)`` for a damping."""
+        """Return the steps of the states ``(n, 15)`` and of the border ``(m,)`` against the gradient.
+
+        *damping* is the share of each diagonal element that is added to it; the equations stay as they are.
+        """
         # 1. Eliminate all states.
         eliminated: list[Array] = []
         D, C, G, b, c = self._eliminate_all_but_last(damping, eliminated)
@@ -508,7 +550,10 @@ class _NormalEquations:
         return steps, border_step
 
     def last_covariance(self) -> Array | None:
-        """Return the covariance ``(15 + m, 15 + m)`` of the last state and the border; None if singular."""
+        """Return the covariance ``(15 + m, 15 + m)`` of the last state and the border.
+
+        None if the equations are singular, or a variance is not positive.
+        """
         D, C, G, _, _ = self._eliminate_all_but_last(0.0)
         try:
             covariance: Array = np.linalg.inv(np.block([[D, C], [C.T, G]]))
@@ -545,7 +590,7 @@ class _NormalEquations:
 
 
 def _bias_prior() -> Array:
-    """Return the standard deviations ``(6,)`` of the biases of gyroscope and accelerometer."""
+    """Return the standard deviations ``(6,)`` of the first biases of gyroscope and accelerometer."""
     return np.repeat([_GYRO_BIAS_PRIOR_RAD_S, _ACCEL_BIAS_PRIOR_M_S2], 3)
 
 

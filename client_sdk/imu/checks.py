@@ -74,8 +74,9 @@ class RateCheck:
     Attributes:
         trouble: Why the IMU must not be used, in one line; empty if it may be used.
         fault: Kind of the trouble, if wrong axes or a wrong clock cause it; empty otherwise.
-        offset_s: Time by which the clock of the IMU is ahead of that of the camera.
-        gyro_bias_rad_s: ``(3,)`` bias of the gyroscope.
+        offset_s: Time by which the clock of the IMU is ahead of that of the camera; the offset in use, if the
+            measured one differs from it by at most 3 ms.
+        gyro_bias_rad_s: ``(3,)`` bias of the gyroscope, in the IMU's frame.
     """
 
     trouble: str
@@ -135,7 +136,7 @@ def describe_gravity_error(measured_m_s2: float, circumstance: str) -> str:
 
 
 def _stationary_accel(samples: Array, model: ImuModel) -> float | None:
-    """Return the median magnitude of the specific force in windows in which the IMU is stationary.
+    """Return the median magnitude of the specific force, m/s^2, in windows in which the IMU is stationary.
 
     Stationary means that neither rates nor forces scatter beyond the noise.  None with fewer than 3 such
     windows of 0.5 s.
@@ -163,10 +164,10 @@ def check_rates(
         history: Samples of the time of the poses.
         timestamps_s: ``(n,)`` of the poses, ascending.
         R_world_camera: ``(n, 3, 3)`` rotations of the poses.
-        offset_s: Time offset in use; a difference below 3 ms leaves it as it is.
+        offset_s: Time offset in use, by which the IMU's clock is ahead; see `RateCheck.offset_s`.
 
     Returns:
-        The result; None while the camera rotates too little to compare anything.
+        The result; None while there are too few poses, or the camera rotates too little to compare anything.
 
     Source:
         Rotation between two sets of vectors: Kabsch, Acta Cryst. A32, 1976.
@@ -202,7 +203,7 @@ def check_rates(
     Q = U @ Vt
     is_mirrored = float(np.linalg.det(Q)) < 0.0
     if is_mirrored and not variances[0] > _MIN_RATE_SPREAD_RAD_S**2:
-        # Rotations about two axes leave the sign of the third one open: take the proper rotation.
+        # Rotations about two axes leave the sign of the third axis open: take the matrix that is a rotation.
         U[:, 2] *= -1.0
         Q, is_mirrored = U @ Vt, False
     residuals = gyro_centred @ Q.T / ratio - camera_centred
@@ -220,8 +221,9 @@ def check_rates(
 def _find_offset_s(history: ImuHistory, begins_s: Array, ends_s: Array, camera_rates: Array) -> float:
     """Return the time offset within 0.1 s at which the rates ``(n, 3)`` of camera and gyroscope fit best.
 
-    The rotation between both is free, so that swapped axes do not hide an offset.  The maximum of the fit is
-    interpolated by a parabola.
+    It is the time by which the clock of the IMU is ahead.  Begins and ends of the intervals are on the
+    camera's.  The rotation between both is free, so that swapped axes do not hide an offset.  The maximum of
+    the fit is interpolated by a parabola.
     """
     camera_centred = camera_rates - camera_rates.mean(axis=0)
     offsets_s = np.arange(-_MAX_OFFSET_S, _MAX_OFFSET_S + 1e-9, _OFFSET_STEP_S)
@@ -249,7 +251,7 @@ def _find_rate_trouble(
         Q: ``(3, 3)`` orthogonal matrix that maps the gyroscope's rates to the camera's; the identity if the
             axes are as stated.
         unexplained: Part of the camera's rates that the gyroscope does not explain with this matrix, 0 to 1.
-        offset_s: Time by which the clock of the IMU is ahead.
+        offset_s: Time by which the clock of the IMU is ahead of that of the camera.
         is_mirrored: Whether *Q* is a reflection.
     """
     if unexplained > _MAX_UNEXPLAINED:

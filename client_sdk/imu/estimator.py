@@ -31,14 +31,14 @@ _MAX_MISFIT = 12.0  # misfit of an alignment (1: the noise is as stated) from wh
 _MAX_MISFITS_IN_A_ROW = 3
 """Alignments in a row above the largest misfit after which the IMU is not used any more: a single one may be
 the fault of a wrong pose."""
-_MAX_BIAS_CHANGE_RAD_S = 0.005  # change of the gyroscope's bias from which on a motion is preintegrated again
-_MAX_CACHED_MOTIONS = 4 * _MAX_POSES  # preintegrated motions that are kept for later IMU alignments
+_MAX_BIAS_CHANGE_RAD_S = 0.005  # change of an axis of the gyroscope's bias above which a motion is redone
+_MAX_CACHED_MOTIONS = 4 * _MAX_POSES  # preintegrated motions beyond which the cache of motions is emptied
 _RATE_CHECK_S = 20.0  # seconds of newest poses whose rotations are compared with the gyroscope
 _MAX_MOTION_S = 10.0  # longest preintegrated motion that a keyframe contains: longer ones are too uncertain
-_MIN_GRAVITY_DEVIATION_RAD = 1e-3  # smallest standard deviation of gravity that a keyframe states
+_MIN_GRAVITY_DEVIATION_RAD = 1e-3  # smallest standard deviation of gravity's direction that a keyframe states
 _MAX_STATIONARY_ERROR = 0.25
-"""Largest relative difference between the mean of the first specific forces and 9.81 m/s^2, for which they
-count as gravity of a stationary camera."""
+"""Largest relative difference between 9.81 m/s^2 and the magnitude of the mean specific force, for which this
+mean counts as gravity of a stationary camera."""
 _R_WORLD_LEVEL_CAMERA: Array = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 """Rotation of a level camera (z ahead, y down) in a world with x ahead, y left, z up (ROS REP 103)."""
 
@@ -47,9 +47,10 @@ class ImuEstimator:
     """Estimate time offset, biases, gravity and scale of one IMU, as far as the drive has shown them.
 
     Attributes:
-        trouble: Why the IMU is not used, in one line; empty while it may be used.
-        offset_s: Time by which the clock of the IMU is ahead of that of the camera, as measured.
-        alignment: Result of the newest `align`; None if that failed.
+        trouble: Why the IMU is not used, in one line; empty while it may be used.  Once it is set, it stays.
+        offset_s: Time by which the clock of the IMU is ahead of that of the camera; 0 until a difference was
+            measured.
+        alignment: Result of the newest `align`; None before it, if it failed, and after `forget_gravity`.
     """
 
     def __init__(self, model: ImuModel, camera: Camera) -> None:
@@ -89,11 +90,14 @@ class ImuEstimator:
         return camera_rotation
 
     def forget_gravity(self) -> None:
-        """Forget the alignment, because the poses are in another world from now on; biases are kept."""
+        """Forget the alignment, because the poses are in another world from now on; `align` is due then.
+
+        The gyroscope's bias and the time offset are kept.
+        """
         self.alignment, self._due_s = None, float("-inf")
 
     def is_due(self, timestamp_s: float) -> bool:
-        """Return whether `align` should run again at the time of a frame."""
+        """Return whether `align` should run at the time of a frame; never once ``trouble`` is set."""
         return not self.trouble and timestamp_s >= self._due_s
 
     def align(
@@ -102,7 +106,7 @@ class ImuEstimator:
         """Align the IMU with the newest tracked poses.
 
         Args:
-            timestamps_s: ``(n,)`` of all poses, ascending.
+            timestamps_s: ``(n,)`` of all poses of one world, ascending; without poses the result is None.
             T_world_camera: ``(n, 4, 4)``.
             depth: Median depth of what the camera sees, in the unit of the poses; scales their noise.
             is_metric: Whether the unit of the poses is the metre.
@@ -122,7 +126,7 @@ class ImuEstimator:
         rows, motions = self._covered_by_samples(timestamps_s, _spaced_rows(timestamps_s)[-_MAX_POSES:])
         if len(rows) < _MIN_POSES:
             return None
-        # 3. Align.
+        # 3. Align the IMU with these poses, whose noise is a third of a pixel.
         noise_rad = _POSE_NOISE_PX / self._camera.fx
         pose_noise = noise_rad, noise_rad * depth
         try:
@@ -143,7 +147,7 @@ class ImuEstimator:
             )
         if self._misfits_in_a_row:
             return None
-        # 5. Store the result; wait longer for the next alignment once gravity and scale are known.
+        # 5. Store the alignment and its gyroscope bias; wait longer once gravity and scale are known.
         self._gyro_bias = alignment.gyro_bias_rad_s[-1]
         self.alignment = alignment
         is_gravity_known = alignment.gravity_deviation_rad <= _MAX_GRAVITY_DEVIATION_RAD
@@ -153,7 +157,10 @@ class ImuEstimator:
 
     @property
     def gravity_m_s2(self) -> Array | None:
-        """Gravity ``(3,)`` in the world of the last aligned poses; None unless known within 0.5 degrees."""
+        """Gravity ``(3,)``, m/s^2, in the world of the last aligned poses.
+
+        None unless the standard deviation of its direction is at most 0.5 degrees.
+        """
         alignment = self.alignment
         if alignment is None or alignment.gravity_deviation_rad > _MAX_GRAVITY_DEVIATION_RAD:
             return None
@@ -174,7 +181,7 @@ class ImuEstimator:
     def keyframe_imu(
         self, T_world_camera: Array, previous_s: float | None, timestamp_s: float
     ) -> KeyframeImu | None:
-        """Return gravity at a keyframe, and the preintegrated motion since the previous keyframe.
+        """Return the direction of gravity at a keyframe, and the preintegrated motion since the previous one.
 
         Args:
             T_world_camera: ``(4, 4)`` pose of the keyframe in the world of the last alignment.
@@ -212,9 +219,10 @@ class ImuEstimator:
         )
 
     def _check(self, timestamps_s: Array, T_world_camera: Array) -> bool:
-        """Return whether the IMU may be used; update time offset and first gyroscope bias.
+        """Return whether the IMU may be used; set ``trouble``, the time offset and the first gyroscope bias.
 
-        While the camera rotates too little to compare rates, the last result holds.
+        A changed time offset empties the cache of motions.  While the camera rotates too little to compare
+        rates, the answer is whether they have agreed once.
         """
         self.trouble = find_sample_trouble(self._history)
         if self.trouble:
@@ -238,7 +246,11 @@ class ImuEstimator:
     def _covered_by_samples(
         self, timestamps_s: Array, rows: list[int]
     ) -> tuple[list[int], list[Preintegration]]:
-        """Return the newest of *rows* without a gap in the samples between them, and the motions between."""
+        """Return the newest of *rows* without a gap in the samples between them, and the motions.
+
+        The motions are those between neighbouring rows.  *rows* are ascending and not empty; the last one is
+        returned in any case.
+        """
         covered = rows[-1:]
         motions: list[Preintegration] = []
         for first, second in reversed(list(pairwise(rows))):
@@ -250,7 +262,11 @@ class ImuEstimator:
         return covered, motions
 
     def _motion_between(self, begin_s: float, end_s: float) -> Preintegration | None:
-        """Return the preintegrated motion between two poses, from the cache if the bias changed little."""
+        """Return the preintegrated motion between two times of the camera; None where samples are missing.
+
+        It comes from the cache, if the gyroscope's bias changed little since.  The accelerometer has no bias
+        in it.
+        """
         motion = self._motions.get((begin_s, end_s))
         if motion is None or np.abs(motion.gyro_bias_rad_s - self._gyro_bias).max() > _MAX_BIAS_CHANGE_RAD_S:
             samples = self._history.between(begin_s, end_s, self.offset_s)
@@ -281,7 +297,7 @@ class ImuScale:
     def metres_per_unit(
         self, timestamps_s: Array, T_world_camera: Array, camera: Camera, depth: float
     ) -> float | None:
-        """Return the scale of ``(n, 4, 4)`` poses; None while its standard deviation is above 1.5 %.
+        """Return metres per unit of ``(n, 4, 4)`` poses; None while the standard deviation is above 1.5 %.
 
         The other arguments are those of `ImuEstimator.align`; *camera* is not used.
         """
@@ -307,7 +323,7 @@ def level_start_pose(gravity_camera: Array) -> Array:
 
 
 def _spaced_rows(timestamps_s: Array) -> list[int]:
-    """Return the rows of poses that are at least 0.2 s apart, chosen from the first pose on.
+    """Return the ascending rows of poses that are at least 0.2 s apart, chosen from the first pose on.
 
     A longer drive gives the same rows and more, so that motions between them can be cached.
     """

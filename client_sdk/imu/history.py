@@ -19,7 +19,7 @@ arrives before the sample behind it."""
 
 
 class ImuHistory:
-    """Samples of the last five minutes; ``model`` is the IMU model of the newest samples."""
+    """Samples of the last five minutes; ``model`` is the IMU model that was added last."""
 
     def __init__(self, model: ImuModel) -> None:
         self.model = model
@@ -27,7 +27,7 @@ class ImuHistory:
         self._samples: Array = np.empty((0, 7))
 
     def add(self, samples: ImuSamples) -> None:
-        """Append the samples that are later than the newest known one."""
+        """Append the samples that are later than the newest known one; the others are ignored."""
         self.model = samples.model
         part = np.column_stack([samples.timestamps_s, samples.gyro, samples.accel])
         part = part[part[:, 0] > self.last_s]
@@ -50,7 +50,8 @@ class ImuHistory:
             shift_s: Added to both times to convert them to the clock of the IMU.
 
         Returns:
-            Samples on the clock of the IMU; None if samples are missing, or do not reach to both ends.
+            Samples on the clock of the IMU; None if samples are missing, or do not reach to both ends.  At
+            the end the newest sample may stand for up to 1.5 sampling intervals.
         """
         samples = self.to_array()
         begin_s, end_s = begin_s + shift_s, end_s + shift_s
@@ -74,7 +75,11 @@ class ImuHistory:
         return ImuSamples(interval[:, 0], interval[:, 1:4], interval[:, 4:7], self.model)
 
     def mean_gyro(self, begins_s: Array, ends_s: Array) -> Array:
-        """Return the mean angular rates ``(n, 3)`` of n intervals on the clock of the IMU, rad/s."""
+        """Return the mean angular rates ``(n, 3)`` of n intervals, rad/s, in the IMU's frame.
+
+        *begins_s* and *ends_s* ``(n,)`` are on the clock of the IMU.  Before the first and after the last
+        sample the rates count as 0.
+        """
         samples = self.to_array()
         dt = np.diff(samples[:, 0])[:, None]
         integral = np.concatenate(
@@ -93,7 +98,10 @@ class ImuHistory:
         return samples[:, 4:7].mean(axis=0) if len(samples) else None
 
     def to_array(self) -> Array:
-        """Return all samples ``(n, 7)``: time (s), angular rates (rad/s), specific forces (m/s^2)."""
+        """Return all samples ``(n, 7)``: time (s), angular rates (rad/s), specific forces (m/s^2).
+
+        Samples more than five minutes before the newest are dropped.  The array is not a copy.
+        """
         if self._new_parts:
             self._samples = np.concatenate([self._samples, *self._new_parts])
             self._new_parts = []

@@ -44,8 +44,9 @@ class Preintegration:
         duration_s: Time between the two frames, above 0.
         covariance: ``(9, 9)`` of the errors of rotation (rotation vector on the right, rad), velocity and
             position.
-        bias_jacobian: ``(9, 6)`` derivatives of rotation, velocity and position by the biases of gyroscope
-            and accelerometer, to correct the motion for small changes of the biases.
+        bias_jacobian: ``(9, 6)`` derivatives of rotation (rotation vector on the right), velocity and
+            position by the biases of gyroscope and accelerometer, to correct the motion for small changes of
+            the biases.
         gyro_bias_rad_s: ``(3,)`` bias that was subtracted from the angular rates.
         accel_bias_m_s2: ``(3,)`` bias that was subtracted from the specific forces.
     """

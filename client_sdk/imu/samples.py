@@ -79,6 +79,7 @@ class ImuModel:
 class ImuSamples:
     """Samples since the last frame, with time stamps on the clock of the camera.
 
+    The stamps of a recording may be off by a constant, which `ImuEstimator` measures.
     The first sample is at or before the last frame and the last sample at or after this frame, as far as such
     samples exist, so that samples can be interpolated at both frames.
 

@@ -23,8 +23,8 @@ _HUBER_SIGMAS = 2.45
 """Threshold of the Huber loss, in standard deviations: 95 % of the residuals of a 2-D Gaussian are below
 it."""
 _MIN_DEPTH = 1e-3
-"""Smallest depth of a point before a camera, in the unit of the map; an observation behind it has no
-weight."""
+"""Smallest depth of a point before its camera, in the unit of the map; an observation of a nearer point, or
+of one behind the camera, has no weight."""
 _BEHIND_COST = 1e4
 """Cost of an observation whose point lies behind its camera, in squared standard deviations: above that of
 usual outliers, so that a step that moves points behind cameras raises the cost."""
@@ -76,7 +76,7 @@ class Adjuster(Protocol):
 
 
 def adjust(bundle: Bundle, camera: Camera, *, iterations: int = 8) -> tuple[Array, Array]:
-    """Adjust the free cameras and all points of a bundle; the cost never grows.
+    """Return the adjusted free cameras and points of a bundle, which stays as it is; the cost never grows.
 
     Args:
         bundle: Cameras, points and observations.
@@ -84,7 +84,8 @@ def adjust(bundle: Bundle, camera: Camera, *, iterations: int = 8) -> tuple[Arra
         iterations: Largest number of steps that lower the cost.
 
     Returns:
-        Poses ``T_camera_world`` ``(c, 4, 4)`` and points ``(p, 3)``.
+        Poses ``T_camera_world`` ``(c, 4, 4)``, those of fixed cameras unchanged, and points ``(p, 3)``, those
+        without an observation unchanged.
 
     Source:
         Triggs et al., "Bundle Adjustment - A Modern Synthesis", 2000, Sect. 6.1 (Schur complement).
@@ -106,7 +107,7 @@ def adjust(bundle: Bundle, camera: Camera, *, iterations: int = 8) -> tuple[Arra
             damping *= _DAMPING_FACTOR
         if not new_cost < cost:
             break
-        # 2. Take the step; end when it gained little.
+        # 2. Take the step; end when it lowered the cost by little.
         has_converged = cost - new_cost < _CONVERGED_SHARE * cost
         poses, points, cost = new_poses, new_points, new_cost
         damping = max(damping * 0.1, _MIN_DAMPING)
@@ -138,7 +139,10 @@ class _System:
         )
 
     def cost(self, poses: Array, points: Array) -> float:
-        """Return the sum of the Huber loss over all observations."""
+        """Return the sum of the Huber loss over all observations, in squared standard deviations.
+
+        An observation whose point is not before its camera costs `_BEHIND_COST`.
+        """
         camera_points = _transform_each(poses[self._cameras], points[self._points])
         squared = np.square(_residuals(camera_points, self._pixels, self._camera)).sum(axis=1)
         squared /= np.square(self._sigma_px)
@@ -149,14 +153,14 @@ class _System:
 
     def linearise(self, poses: Array, points: Array) -> None:
         """Set the normal equations at these poses and points."""
-        # 1. Weighted residuals and Jacobians.
+        # 1. Compute residuals and Jacobians, divided by the noise and weighted.
         camera_points = _transform_each(poses[self._cameras], points[self._points])
         Jc, Jp = _jacobians(camera_points, poses[self._cameras, :3, :3], self._camera)
         residuals = _residuals(camera_points, self._pixels, self._camera) / self._sigma_px[:, None]
         weights = np.sqrt(_huber_weights(residuals) * (camera_points[:, 2] > _MIN_DEPTH))
         scale = (weights / self._sigma_px)[:, None, None]
         Jc, Jp, residuals = Jc * scale, Jp * scale, residuals * weights[:, None]
-        # 2. The blocks of the points, of the cameras, and of both.
+        # 2. Sum them to the blocks of the points, of the free cameras, and between both.
         equations, Jp_transposed = self._equations, Jp.transpose(0, 2, 1)
         equations.H_landmarks = np.add.reduceat(Jp_transposed @ Jp, self._starts, axis=0)
         equations.g_landmarks = np.add.reduceat(np.einsum("nij,ni->nj", Jp, residuals), self._starts, axis=0)
@@ -168,7 +172,10 @@ class _System:
             equations.E[self._rows_of_points[own], :, block] = Jp_transposed[own] @ Jc[own]
 
     def step(self, poses: Array, points: Array, damping: float) -> tuple[Array, Array]:
-        """Return the poses and points after one damped step."""
+        """Return new poses and points after one damped step from those at which `linearise` was called.
+
+        Twists are applied on the left of ``T_camera_world``.
+        """
         reduced = self._equations.reduce(damping, _ADDED_INFORMATION, _ADDED_INFORMATION)
         twists: Array = np.linalg.solve(reduced.S, reduced.right).astype(np.float64, copy=False)
         new_poses, new_points = poses.copy(), points.copy()
@@ -186,7 +193,7 @@ def _transform_each(T_camera_world: Array, points_world: Array) -> Array:
 
 
 def _residuals(points_camera: Array, pixels: Array, camera: Camera) -> Array:
-    """Return the ``(n, 2)`` projections minus the pixels."""
+    """Return the ``(n, 2)`` projections minus the pixels; points nearer than `_MIN_DEPTH` get that depth."""
     z = np.maximum(points_camera[:, 2], _MIN_DEPTH)
     residuals = np.empty((len(pixels), 2))
     residuals[:, 0] = camera.fx * points_camera[:, 0] / z + camera.cx - pixels[:, 0]

@@ -28,7 +28,8 @@ _MIN_ODOMETRY_FRAMES = 5
 _MIN_MARKER_VIEWS = 4
 """Fewest frames that must show a marker before it gives the scale."""
 _MIN_MARKER_PARALLAX_DEG = 5.0
-"""Smallest parallax of a marker's corners, in degrees, with which it gives the scale."""
+"""Smallest mean parallax of a marker's corners, in degrees, between its first view and the one farthest from
+it, with which it gives the scale."""
 _MAX_CORNER_ERROR_PX = 4.0
 """Largest reprojection error of a marker's corner that is triangulated, in pixels."""
 _CORNER_SIGMA_PX = 0.5
@@ -84,13 +85,13 @@ class OdometryScale:
         self._positions_m: dict[float, Array] = {}
 
     def observe(self, timestamp_s: float, rgb: npt.NDArray[np.uint8], position_m: Array | None) -> None:
-        """Note the position of one frame.
+        """Store the position of one frame; a frame without a position is ignored.
 
         Args:
             timestamp_s: Time of the frame, in seconds.
             rgb: The image, which is not used.
-            position_m: ``(3,)`` metres; for None the recorded position at that time is taken, if there is
-                one.
+            position_m: ``(3,)`` metres; for None the nearest recorded position within 0.05 s is taken, if
+                there is one.
         """
         if position_m is None and self._recorded_s is not None and self._recorded_m is not None:
             nearest = int(np.argmin(np.abs(self._recorded_s - timestamp_s)))
@@ -106,7 +107,10 @@ class OdometryScale:
     def metres_per_unit(
         self, timestamps_s: Array, T_world_camera: Array, camera: Camera, depth: float
     ) -> float | None:
-        """Return the scale; None before the odometry has measured *first_m* metres since the first pose.
+        """Return metres per unit of the map; None while the odometry does not determine it.
+
+        The odometry must have measured *first_m* metres since the first pose that has a position, and have a
+        position for five poses or more.
 
         Args:
             timestamps_s: ``(n,)`` seconds, times of the tracked poses, ascending.
@@ -132,7 +136,7 @@ class OdometryScale:
 
 
 class MarkerScale:
-    """Metric scale by a square ArUco marker (dictionary 4x4_50) that several frames show.
+    """Metric scale by square ArUco markers (dictionary 4x4_50) of one size that several frames show.
 
     ``name`` is how the scale is reported.
     """
@@ -154,7 +158,7 @@ class MarkerScale:
         """Corners ``(4, 2)`` in pixels, by the marker's identity and the time of the frame."""
 
     def observe(self, timestamp_s: float, rgb: npt.NDArray[np.uint8], position_m: Array | None) -> None:
-        """Detect the corners of markers in one image.
+        """Detect the markers in one image, and store their corners.
 
         Args:
             timestamp_s: Time of the frame, in seconds.
@@ -183,7 +187,7 @@ class MarkerScale:
     def metres_per_unit(
         self, timestamps_s: Array, T_world_camera: Array, camera: Camera, depth: float
     ) -> float | None:
-        """Return the scale by the marker with the largest parallax; None while no marker determines it.
+        """Return metres per unit of the map by the marker with the largest parallax; None without one.
 
         Args:
             timestamps_s: ``(n,)`` seconds, times of the tracked poses.

@@ -31,9 +31,10 @@ class TwoViewStart:
 
     Attributes:
         T_second_first: ``(4, 4)``, pose of the second view, with a translation of length 1.
-        rows: ``(k,)``, rows of the matches whose points are good.
-        points: ``(k, 3)``, in the frame of the first camera.
-        parallax_deg: Median parallax of the points, in degrees.
+        rows: ``(k,)``, rows of the matches whose points are good: before both cameras, with small
+            reprojection errors and enough parallax.
+        points: ``(k, 3)``, in the frame of the first camera; the unit is the distance of the cameras.
+        parallax_deg: Median parallax, in degrees, of the points before both cameras with small errors.
         reason: Why the two views do not suffice for a start; empty if they do.
     """
 
@@ -66,7 +67,8 @@ def start_from_two_views(
             are noise.
 
     Returns:
-        The start; its ``reason`` says whether the two views suffice.
+        The start; its ``reason`` says whether the two views suffice.  If they have too few matches or
+        inliers, its pose is the identity, and it has no points.
 
     Raises:
         MissingExtra: OpenCV is not installed.
@@ -75,7 +77,7 @@ def start_from_two_views(
         Nister, PAMI 2004 (five-point algorithm); MAGSAC++, Barath et al., CVPR 2020, as OpenCV implements
         them.
     """
-    # 1. The essential matrix of the matches, by robust estimation.
+    # 1. Estimate the essential matrix of the matches, and its inliers.
     cv2 = load_opencv()
     no_start = TwoViewStart(
         T_second_first=np.eye(4),
@@ -95,18 +97,18 @@ def start_from_two_views(
     rows = np.flatnonzero(mask.ravel())
     if len(rows) < min_points:
         return no_start
-    # 2. The one of its four poses with the points before both cameras.
+    # 2. Choose the one of its four poses with the most points before both cameras.
     _, rotation, translation, _ = cv2.recoverPose(essential, first[rows], second[rows], camera.matrix)
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = rotation, translation.ravel()
-    # 3. The points, and their parallax.
+    # 3. Triangulate the inliers, and compute their parallax.
     points, is_good = triangulate(
         np.eye(4), pose, first[rows], second[rows], camera, max_error_px=2 * inlier_px
     )
     angles_deg = parallax_deg(points, np.zeros(3), inverse(pose)[:3, 3])
     median_deg = float(np.median(angles_deg[is_good])) if is_good.any() else 0.0
     is_kept = is_good & (angles_deg > _MIN_POINT_PARALLAX_SHARE * min_parallax_deg)
-    # 4. Decide whether they suffice.
+    # 4. Decide whether the points suffice for a start.
     kept_count, reason = int(is_kept.sum()), ""
     if median_deg < min_parallax_deg:
         reason = f"the camera has moved too little sideways: {median_deg:.1f} of {min_parallax_deg:g} deg"

@@ -39,8 +39,8 @@ def stereo_points(rgb: npt.NDArray[np.uint8], stereo: StereoView, camera: Camera
         pixels: ``(n, 2)``, column and row in the left image.
 
     Returns:
-        ``(n, 3)`` metres in the left camera's frame; NaN where no disparity was found, or the depth is not
-        within 0.3 to 900 m or a disparity of 1 px to a fifth of the width.
+        ``(n, 3)`` metres in the left camera's frame; NaN where no disparity was found.  Disparities are
+        sought from 1 px to a fifth of the width, at most 512 px, and for depths of 0.3 to 900 m.
 
     Raises:
         MissingExtra: OpenCV or the native core is not installed.
@@ -62,7 +62,7 @@ def noise_of(stereo: StereoView, camera: Camera) -> DepthNoise:
 
 
 def with_offset(points_camera: Array, f_baseline: float, offset_px: float) -> Array:
-    """Return stereo points as they would be if all disparities were larger by an offset.
+    """Return new stereo points as they would be if all disparities were larger by an offset.
 
     Each point moves along its ray.
 
