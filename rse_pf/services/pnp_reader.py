@@ -62,10 +62,9 @@ class _Request(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
 
 
 class _TextRequest(_Request, kw_only=True, forbid_unknown_fields=True):
-    """A JSON request without its lists of numbers.
+    """A JSON request without its lists of numbers; a string holds one character, the number of its list.
 
-    In place of a list stands a string of one character, whose code is the index of the list among those that
-    `cut_lists` returns.
+    The code of the character is the index of the list among those that `cut_lists` returns.
     """
 
     points_world: str
