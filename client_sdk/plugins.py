@@ -171,7 +171,7 @@ class FeaturesPlugin:
     def _check(self, found: Any, shape: tuple[int, ...]) -> CheckedFeatures:
         if not isinstance(found, FoundFeatures):
             raise self._refusal(f"returned {type(found).__name__}, not FoundFeatures")
-        # 1. Pixels, scores and descriptors.
+        # 1. Check pixels, scores and descriptors.
         pixels = self._check_numbers("pixels", found.pixels, (-1, 2))
         n = len(pixels)
         if n > _MAX_FOUND_FEATURES:
@@ -187,21 +187,21 @@ class FeaturesPlugin:
             )
         scores = self._check_numbers("scores", found.scores, (n,))
         descriptors = self._check_descriptors(found.descriptors, n)
-        # 2. The kind of the features must be that of the first image.
+        # 2. Compare the kind of the features with that of the first image.
         has_fields = found.orientations_deg is not None, found.sizes is not None
         kind = DescriptorKind(self.name, str(descriptors.dtype), descriptors.shape[1])
         if self._is_kind_known and (kind != self.kind or has_fields != (self.is_oriented, self.is_scaled)):
             raise self._refusal(f"returned {kind} after {self.kind}, or other fields than before")
         self.kind, self._is_kind_known = kind, True
         self.is_oriented, self.is_scaled = has_fields
-        # 3. Orientations and sizes, which may be missing.
+        # 3. Check orientations and sizes; missing ones become 0 degrees and 1.
         angles = np.zeros(n)
         if found.orientations_deg is not None:
             angles = np.radians(self._check_numbers("orientations_deg", found.orientations_deg, (n,)))
         sizes = np.ones(n) if found.sizes is None else self._check_numbers("sizes", found.sizes, (n,))
         if not (sizes > 0.0).all():
             raise self._refusal("returned sizes that are not above 0")
-        # 4. Pixels must lie in the image; the highest scores come first.
+        # 4. Refuse pixels outside the image, and sort by score.
         is_inside = ((pixels >= -0.5) & (pixels <= np.array([shape[1], shape[0]]) - 0.5)).all(axis=1)
         if not is_inside.all():
             raise self._refusal(f"returned {int((~is_inside).sum())} pixels outside the image")

@@ -176,7 +176,7 @@ def _align_linearly(
     matrix, right = A.reshape(-1, 3 * n + 4), b.ravel()
     if is_metric:
         right, matrix = right - matrix[:, -1], matrix[:, :-1]
-    # 3. Solve them.
+    # 3. Solve the equations by least squares.
     solution = np.asarray(np.linalg.lstsq(matrix, right, rcond=None)[0], dtype=np.float64)
     scale = 1.0 if is_metric else float(solution[-1])
     gravity: Array = solution[3 * n : 3 * n + 3]
@@ -199,7 +199,7 @@ def _align_linearly(
                 describe_gravity_error(magnitude, "for gravity, compared with the motion of the camera"),
                 hint="calibrate the accelerometer: it must read 9.81 m/s^2 while it is stationary",
             )
-    # 5. Set the magnitude of gravity.
+    # 5. Set the magnitude of gravity to 9.81 m/s^2; its direction stays.
     gravity = gravity * (GRAVITY_M_S2 / magnitude)
     velocities: Array = solution[: 3 * n].reshape(n, 3)
     return scale, gravity, velocities
@@ -340,7 +340,10 @@ class _AlignmentProblem:
         return float(_huber_cost(motion_residuals).sum() + _huber_cost(pose_residuals).sum() + prior.sum())
 
     def _residuals(self, state: _State) -> tuple[Array, Array]:
-        """Return the whitened residuals of motions ``(n - 1, 15)`` and of poses ``(n, 6)``."""
+        """Return the whitened residuals of motions ``(n - 1, 15)`` and of poses ``(n, 6)``.
+
+        Those of a pose are three of its rotation, then three of the camera's position.
+        """
         raw, _ = self._motion_residuals(state)
         motion_residuals = np.einsum("nij,nj->ni", self._sqrt_information, raw)
         rotations = log_so3(np.swapaxes(self._observed_R, 1, 2) @ state.R) / self._rotation_noise
@@ -530,7 +533,7 @@ class _NormalEquations:
 
         *damping* is the share of each diagonal element that is added to it; the equations stay as they are.
         """
-        # 1. Eliminate all states.
+        # 1. Eliminate all states, so that equations of the border alone remain.
         eliminated: list[Array] = []
         D, C, G, b, c = self._eliminate_all_but_last(damping, eliminated)
         solved = np.asarray(np.linalg.solve(D, np.column_stack([b, C])), dtype=np.float64)

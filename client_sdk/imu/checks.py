@@ -33,8 +33,8 @@ _MIN_SAMPLES = 100  # IMU samples before faults are sought in them: half a secon
 _MAX_MISSING_FRACTION = 0.05  # fraction of an IMU's samples that may be missing
 _MAX_SATURATED_FRACTION = 0.01  # fraction of an IMU's samples that may be at the end of the sensor's range
 _SATURATION = 0.999  # fraction of the sensor's range from which on a sample counts as saturated
-_MIN_IN_G = 0.7  # mean magnitude from which on an accelerometer probably states its values in g
-_MAX_IN_G = 1.3  # mean magnitude up to which an accelerometer probably states its values in g
+_MIN_IN_G = 0.7  # mean magnitude of the forces above which they are probably stated in g
+_MAX_IN_G = 1.3  # mean magnitude of the forces below which they are probably stated in g
 _MIN_MEAN_ACCEL = 0.7  # smallest plausible mean magnitude of an accelerometer, as a multiple of gravity
 _MAX_MEAN_ACCEL = 1.5  # largest plausible mean magnitude of an accelerometer, as a multiple of gravity
 _REST_S = 0.5  # length of the time windows in which an IMU is tested for being stationary
@@ -94,12 +94,12 @@ def find_sample_trouble(history: ImuHistory) -> str:
     samples, model = history.to_array(), history.model
     if len(samples) < _MIN_SAMPLES:
         return ""
-    # 1. Missing samples.
+    # 1. Refuse a sensor with too many missing samples, by the times between samples.
     steps = np.diff(samples[:, 0]) * model.rate_hz
     missing = float(np.maximum(0.0, np.round(steps) - 1.0).sum() / (steps.sum() + 1e-9))
     if missing > _MAX_MISSING_FRACTION:
         return f"{100 * missing:.0f} % of the IMU's samples are missing at {model.rate_hz:g} Hz"
-    # 2. Saturated samples.
+    # 2. Refuse a sensor with too many samples at the end of its range.
     for name, unit, columns, limit in (
         ("gyroscope", "rad/s", slice(1, 4), model.max_gyro),
         ("accelerometer", "m/s^2", slice(4, 7), model.max_accel),
@@ -107,13 +107,13 @@ def find_sample_trouble(history: ImuHistory) -> str:
         saturated = float((np.abs(samples[:, columns]) >= _SATURATION * limit).any(axis=1).mean())
         if saturated > _MAX_SATURATED_FRACTION:
             return f"the {name} is saturated at {limit:g} {unit} in {100 * saturated:.0f} % of its samples"
-    # 3. Unit of the accelerometer.
+    # 3. Refuse an accelerometer whose mean magnitude shows another unit than m/s^2.
     mean_accel = float(np.linalg.norm(samples[:, 4:7], axis=1).mean())
     if _MIN_IN_G < mean_accel < _MAX_IN_G:
         return f"the accelerometer reads {mean_accel:.2f} on average: in g, where m/s^2 are needed"
     if not _MIN_MEAN_ACCEL * GRAVITY_M_S2 < mean_accel < _MAX_MEAN_ACCEL * GRAVITY_M_S2:
         return f"the accelerometer reads {mean_accel:.1f} m/s^2 on average, where gravity is 9.8"
-    # 4. Magnitude of gravity while the IMU is stationary.
+    # 4. Compare the mean force while the IMU is stationary with gravity.
     stationary_accel = _stationary_accel(samples, model)
     return "" if stationary_accel is None else describe_gravity_error(stationary_accel, "while stationary")
 

@@ -27,7 +27,7 @@ _REPEAT_S = 2.0  # time between two IMU alignments once gravity and scale are kn
 _POSE_NOISE_PX = 0.33  # standard deviation of a tracked pose, as the shift in pixels that it causes
 _MAX_SCALE_DEVIATION = 0.015  # largest relative standard deviation of a scale that is used
 _MAX_GRAVITY_DEVIATION_RAD = math.radians(0.5)  # largest standard deviation of gravity's direction in use
-_MAX_MISFIT = 12.0  # misfit of an alignment (1: the noise is as stated) from which on it is not used
+_MAX_MISFIT = 12.0  # misfit of an alignment (1: the noise is as stated) above which it is not used
 _MAX_MISFITS_IN_A_ROW = 3
 """Alignments in a row above the largest misfit after which the IMU is not used any more: a single one may be
 the fault of a wrong pose."""
@@ -138,7 +138,7 @@ class ImuEstimator:
             return None
         if alignment is None:
             return None
-        # 4. Refuse an IMU that contradicts the camera three times in a row.
+        # 4. Drop an alignment in which IMU and camera disagree; after three in a row give up the IMU.
         self._misfits_in_a_row = self._misfits_in_a_row + 1 if alignment.misfit > _MAX_MISFIT else 0
         if self._misfits_in_a_row >= _MAX_MISFITS_IN_A_ROW:
             self.trouble = (

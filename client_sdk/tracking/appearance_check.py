@@ -58,7 +58,7 @@ def has_predicted_appearance(
     described, descriptors = describe_at(
         frame.rgb, predicted.pixels[visible], predicted.orientations[visible], predicted.sizes[visible]
     )
-    # 3. Compare the descriptors.
+    # 3. Compare the descriptors of the image with those of the landmarks.
     if not len(described) or len(described) < min_landmarks:
         return False
     distances = distances_of_pairs(descriptors, predicted.descriptors[visible[described]])

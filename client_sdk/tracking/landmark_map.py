@@ -586,12 +586,12 @@ class LandmarkMap:
             pixels=pixels,
             sigma_px=sizes * self.limits.pixel_sigma,
         )
-        # 3. Adjust, and write the result back.
+        # 3. Adjust the bundle, and write its points and poses back into the map.
         bundle = self._solve(bundle, iterations)
         self.points[used] = bundle.points_world
         for camera, number in enumerate(numbers):
             self.keyframes[number].T_camera_world = bundle.T_camera_world[camera]
-        # 4. Remove outlier observations, and landmarks that fewer than two keyframes see.
+        # 4. Remove observations with large errors, then landmarks that fewer than two keyframes see.
         errors_px, _ = reprojection_errors(
             bundle.T_camera_world[bundle.cameras], bundle.points_world[bundle.points], pixels, self.camera
         )

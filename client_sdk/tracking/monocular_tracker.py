@@ -371,7 +371,7 @@ class MonocularTracker:
 
     def _track(self, view: MonocularView) -> FrameSteps:
         """Yield the queries of the present frame, and return its result."""
-        # 1. Predict, match, solve and verify around the last pose, then at all known places.
+        # 1. Track the frame from the last pose; if that fails, relocalise it at all known places.
         posed = None
         reason = "a place that was not seen before"
         if self._state.last is not None:
@@ -423,7 +423,7 @@ class MonocularTracker:
         guided = GuidedMatchLimits(radius_px=search_px)
         wide = GuidedMatchLimits(radius_px=_WIDE_SEARCH_FACTOR * search_px)
         T_predicted, guided_matches = self._predict_pose(), _GUIDED_MATCHES_FACTOR * min_inliers
-        # 2. Match: near the predicted pixels, in a wider radius, or with the last frame by appearance.
+        # 2. Match near the predicted pixels, then in a wider radius, then with the last frame by appearance.
         attempts: tuple[tuple[Callable[[], Matches], Literal["map", "frame"], int], ...] = (
             (lambda: self._present.match(view, T_predicted, guided), "map", guided_matches),
             (lambda: self._present.match(view, T_predicted, wide), "map", guided_matches),
@@ -685,7 +685,7 @@ class MonocularTracker:
         )
 
     def _is_clear(self, answer: QueryAnswer, match_count: int) -> bool:
-        """Return whether an answer alone proves a place."""
+        """Return whether an answer to a query of *match_count* matches, sent or not, alone proves a place."""
         return answer.is_clear(min(match_count, self.options.max_matches))
 
     def _verify(
@@ -798,7 +798,7 @@ class MonocularTracker:
         T_before = self._pose_waiting_frames(segment, second.T_camera_world)
         if not is_first:
             self.lost_frames -= len(segment.frames)
-        # 3. The present frame is the last one now.
+        # 3. Keep the present frame as the last one, from which the next frame is tracked.
         posed = PosedView(
             view=view,
             T_camera_world=second.T_camera_world,
@@ -841,7 +841,7 @@ class MonocularTracker:
         segment, last = self._present, self._state.last
         # 1. Update the motion model; after a loss the motion is not known.
         T_next_last = np.eye(4) if last is None else posed.T_camera_world @ inverse(last.T_camera_world)
-        # 2. Extend and adjust the map.
+        # 2. With a keyframe, extend the map, adjust it, and remove doubtful landmarks.
         is_keyframe = not posed.is_weak and self._is_keyframe(posed)
         if is_keyframe:
             number = segment.map.add_keyframe(posed.view, posed.T_camera_world, posed.landmarks)
@@ -851,7 +851,7 @@ class MonocularTracker:
             segment.set_reference(number)
             keyframe = segment.map.keyframes[number]
             posed = replace(posed, T_camera_world=keyframe.T_camera_world, landmarks=keyframe.landmarks)
-        # 3. The frame is the last one now.
+        # 3. Keep the frame as the last one, from which the next frame is tracked.
         if last is None or is_keyframe:  # the camera was lost before, or the map was adjusted
             self._plugins.forget_poses()
         self._plugins.add_pose(self._frame.timestamp_s, inverse(posed.T_camera_world))

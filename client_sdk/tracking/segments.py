@@ -183,7 +183,10 @@ class DriveRecords:
         return record
 
     def add_to_cloud(self, tracked: TrackedFrame, pose: Array, features: Features | None) -> None:
-        """Add the points that a frame measured to the cloud of its segment."""
+        """Add the points that a frame measured to the cloud of its segment, see `add_to_cloud`.
+
+        Those of a stereo keyframe are kept for an adjustment, too.
+        """
         record = self._segments[tracked.segment]
         add_to_cloud(record.cloud, tracked.frame, pose, features, tracked.keyframe)
         if tracked.frame.stereo is not None and features is not None and tracked.keyframe:

@@ -127,7 +127,7 @@ def adjust_stereo(segment_map: KeyframeMap, f_baseline: float) -> StereoAdjustme
     assert calibrated is not None
     # 2. Move the result so that the first keyframe stays.
     new = segment_map.pose(0) @ T_camera_world[0] @ inverse(T_camera_world)
-    # 3. Measure how the path changes with the offset.
+    # 3. Compute by how much the path bends and grows with an offset of one pixel.
     one_pixel = np.zeros(len(UNKNOWNS))
     one_pixel[_CURVE] = 1.0 / f_baseline
     positions = inverse(T_camera_world)[:, :3, 3]
@@ -155,12 +155,12 @@ def _collect_observations(segment_map: KeyframeMap) -> tuple[int, DriveObservati
     Landmarks that are seen most often are taken first, and of those the nearest: they determine the scale.
     The standard deviations of the depths are not set yet: they hold the depths themselves.
     """
-    # 1. Landmark, keyframe and depth of every feature of every keyframe.
+    # 1. Collect landmark, keyframe and depth of every feature of every keyframe.
     views = [segment_map.view(k) for k in range(segment_map.keyframe_count)]
     seen = np.concatenate([segment_map.landmarks_of_features(k) for k in range(len(views))])
     keyframes = np.repeat(np.arange(len(views)), [len(view.features) for view in views])
     depths_m = np.concatenate([view.points_camera[:, 2] for view in views])
-    # 2. Choose landmarks.
+    # 2. Choose the landmarks that two or more keyframes see: those seen most often, then the nearest.
     total = segment_map.landmark_count
     observation_counts = np.bincount(seen[seen != NO_LANDMARK], minlength=total)
     smallest_depths_m = np.full(total, np.inf)

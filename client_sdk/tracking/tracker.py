@@ -53,7 +53,8 @@ _LOCAL_KEYFRAMES = 6
 """Number of keyframes nearest to a predicted pose whose landmarks are matched with a frame."""
 _GUIDED_MATCHES_FACTOR = 3
 """Fewest matches near the predicted pose for which a pose is queried, as a multiple of ``min_inliers``: with
-fewer the prediction is most likely wrong, and the frame is matched with the last one instead."""
+fewer the prediction is most likely wrong, and the frame is matched with the last one instead.  Also the
+fewest features with depth of the first frame of a later segment, as such a multiple."""
 _GUIDED_RATIO = 0.35
 """Smallest share of inliers among the matches that a query sent, for a pose that was solved by matches near a
 predicted pose to be verified."""
@@ -359,7 +360,7 @@ class Tracker:
         view = self._correct_view(view, self._state.rotation_rate)
         if not self._segments:
             return self._begin_or_lose(view, match_count=0)
-        # 2. Predict, match, solve and verify around the last pose, then at all known places.
+        # 2. Track the frame from the last pose; if that fails, relocalise it at all known places.
         posed, match_count = None, 0
         if self._state.last is not None:
             posed, match_count = yield from self._track_from_last_pose(view)
@@ -516,7 +517,7 @@ class Tracker:
             count = len(candidate.matches)
             if count < self.options.min_inliers:
                 break
-            # 1. Solve the pose against the keyframe.
+            # 1. Solve the pose by a query with the landmarks of the keyframe.
             segment_map = self._segments[candidate.segment]
             T_world_reference = segment_map.pose(candidate.keyframe)
             answer = yield self._make_query(view, candidate.matches, T_world_reference, "keyframe")
@@ -614,7 +615,7 @@ class Tracker:
 
     @property
     def _max_matches(self) -> int:
-        """Largest number of matches in a query."""
+        """Largest number of matches that a query sends; fewer for a stereo pair."""
         most = self.options.max_matches
         return most if self._frame.stereo is None else min(most, _MAX_STEREO_MATCHES)
 
@@ -835,11 +836,11 @@ class Tracker:
             landmarks = self._map.add_keyframe(posed.view, T_world_camera, landmarks, self.noise.noise)
             self.keyframes += 1
             keyframe_inliers = posed.inliers
-        # 3. Move the maps by the change of the readout time, after this image was measured with the old one.
+        # 3. Move all landmarks by the change of the readout time; this image was fused with the old time.
         for segment_map in self._segments.values():
             segment_map.change_readout(self._pending_readout_s)
         self._pending_readout_s = 0.0
-        # 4. The frame is the last one now.
+        # 4. Keep the frame as the last one, from which the next frame is tracked.
         features = replace(
             self._raw, pixels=posed.view.features.pixels, points_camera=posed.view.points_camera
         )
