@@ -32,7 +32,7 @@ from rse_pf.wire.live_map import LiveRequest
 __all__ = ["LiveMapClient"]
 
 _STORE_THREADS = 4
-"""Number of threads of a worker that read leases of live maps and block on the object store."""
+"""Number of threads in which a worker waits for the object store while it reads leases of live maps."""
 _RELEASE_TIMEOUT_S = 5.0
 """Seconds for which a worker that ends waits until its map servers have released their maps."""
 _LISTED_STATES = {"serving": "live", "starting": "moving", "released": "idle", "stopped": "stopped"}
@@ -100,6 +100,8 @@ class LiveMapClient:
     ) -> dict[str, Any]:
         """Send a request to the map server of a live map and return its reply.
 
+        A map server is started if the map has none.
+
         Args:
             tenant: Tenant of the robot.
             map_name: Name of the live map.
@@ -110,14 +112,17 @@ class LiveMapClient:
 
         Raises:
             Busy: The map has no map server in time; ``retry_after_ms`` says when to ask again.
-            RsePfError: The map server refused the request: Conflict, BadRequest, NotFound, Forbidden.
+            BadRequest: *map_name* is not valid, or the object store is not shared between servers.
+            RsePfError: The map server refused the request, or the map does not exist or was stopped.
         """
         connection = self._connection(tenant, map_name)
         self._pool.set_used(is_used=True)
         return await connection.request(robot, operation, request, deadline_s)
 
     async def list_maps(self, tenant: str) -> list[dict[str, Any]]:
-        """Return name, state, owner and server of each live map of *tenant*, read from the store only.
+        """Return name, state, owner and server of each live map of *tenant*, as its lease in the store says.
+
+        A map whose server has died keeps its last state.
 
         Raises:
             StoreError: The store fails, or a lease is damaged.
@@ -128,10 +133,15 @@ class LiveMapClient:
     def watch(self, tenant: str, map_name: str, *, may_start: bool = True) -> None:
         """Begin the updates of a map; each map server of the map first sends the current state.
 
+        A further call for the same map only replaces *may_start*.
+
         Args:
             tenant: Tenant of the map.
             map_name: Name of the map.
             may_start: Whether a map server is started for the updates if the map has none.
+
+        Raises:
+            BadRequest: *map_name* is not valid, or the object store is not shared between servers.
         """
         self._connection(tenant, map_name).set_watched(True, may_start=may_start)
         self._update_spare()
@@ -144,7 +154,10 @@ class LiveMapClient:
             self._update_spare()
 
     def give_up(self) -> None:
-        """Order the map servers of this worker to release their maps, because the server drains."""
+        """Order the map servers of this worker to release their maps, because the server drains.
+
+        No map server is started any more.
+        """
         self._pool.release_all()
 
     def cpu_by_tenant(self) -> dict[str, float]:
@@ -167,7 +180,11 @@ class LiveMapClient:
         self._threads.shutdown(wait=False)
 
     def _connection(self, tenant: str, map_name: str) -> MapConnection:
-        """Return the connection of a map, which is started if there is none; raises BadRequest."""
+        """Return the connection of a map, which is started if there is none.
+
+        Raises:
+            BadRequest: *map_name* is not valid, or the object store is not shared between servers.
+        """
         if self._settings.data.store == "memory:":
             raise BadRequest(
                 "live maps need an object store that all servers share, but data.store is memory:",

@@ -37,7 +37,7 @@ __all__ = [
 
 INTERNAL_KEY = "live/key=internal"
 """Object name of the key that signs tokens between servers.  No tenant's folder is named ``key=internal``,
-because folders of tenants contain an equals sign only behind an ``x``."""
+because a folder of a tenant contains an equals sign only as the second character, after an ``x``."""
 MAX_MESSAGE_BYTES = 4 << 20
 """Largest message in bytes between a worker and a map server; longer ones are refused before decoding."""
 TOKEN_S = 30.0
@@ -91,7 +91,7 @@ def internal_key(store: ObjectStore) -> bytes:
 
 
 def make_token(key: bytes, claims: ConnectionClaims) -> bytes:
-    """Return *claims* as JSON, with their HMAC-SHA-256 under *key* (32 bytes) in front."""
+    """Return the token with *claims*: 32 bytes of HMAC-SHA-256 under *key*, then the claims as JSON."""
     body = _encode(claims)
     return hmac.digest(key, body, "sha256") + body
 
@@ -106,7 +106,8 @@ def check_token(
         token: Result of `make_token` on the worker's side.
         expected: Claims that the token must have; ``expires_s`` is ignored.
         now_s: Current Unix time in seconds.
-        leeway_s: Tolerated difference between the clocks of two servers, in seconds.
+        leeway_s: Tolerated difference between the clocks of two servers, in seconds.  A token that expires
+            later than ``TOKEN_S + leeway_s`` from now is refused too.
     """
     signature_bytes = hashlib.sha256().digest_size
     signature, body = token[:signature_bytes], token[signature_bytes:]

@@ -31,14 +31,15 @@ __all__ = [
 
 _MAP_NAME = re.compile(r"[a-z0-9][a-z0-9-]{0,63}")
 _RENEWALS_PER_LEASE = 3
-"""A map server renews its lease three times within ``live.lease_s``: two renewals may fail or be late before
-another server takes the map over."""
+"""Number of renewals of a lease within ``live.lease_s``: two renewals may fail or be late before another
+server takes the map over."""
 _FAILED_STARTS_BEFORE_BACKOFF = 2
-"""Number of map servers of one map that may fail in a row soon after their start; from the next failure on,
-the wait before another takeover doubles each time."""
+"""Value of `LeaseRecord.tries` up to which a dead map server is replaced after ``live.lease_s``; for each
+failure beyond, the wait before another takeover doubles."""
 _MAX_TAKEOVER_WAIT_S = 60.0
-"""Longest wait in seconds before the takeover of a map whose map servers fail again and again: a map that
-kills its map servers loads no server with restarts, and is retried once a minute."""
+"""Longest wait in seconds (at least ``live.lease_s``) before the takeover of a map whose map servers fail
+again and again: a map that kills its map servers loads no server with restarts, and is retried once a
+minute."""
 
 LeaseState = Literal["starting", "serving", "released", "stopped"]
 LeaseAction = Literal["claim", "connect", "wait"]
@@ -46,6 +47,8 @@ LeaseAction = Literal["claim", "connect", "wait"]
 
 class LeaseRecord(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     """Describe the map server of a live map, as stored in JSON in the object ``live/TENANT/MAP/lease``.
+
+    The record stays in the store when its map server has exited.
 
     Attributes:
         state: ``starting`` while the map server restores the map, ``serving`` while it accepts connections,
@@ -57,8 +60,10 @@ class LeaseRecord(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True)
         port: TCP port at which the map server listens; 0 before it serves.
         certificate: SHA-256 in hex of the map server's TLS certificate, which workers pin.
         beat: Number of renewals by this map server.
-        base: Position in the log at which the map was stopped last; earlier entries do not belong to the map.
-        tries: Number of map servers in a row that failed before they had served for a while.
+        base: Position in the log at which the map was stopped last; entries up to it do not belong to the
+            map.  0 if the map was never stopped.
+        tries: Number of times in a row that the map was taken over from a dead map server; 0 again when a map
+            server has served for a while or has given the map up.
     """
 
     state: LeaseState
@@ -116,7 +121,10 @@ def lease_name(tenant: str, map_name: str) -> str:
 
 
 def renewal_s(lease_s: float) -> float:
-    """Return the seconds between two renewals of a lease that expires *lease_s* seconds after a renewal."""
+    """Return the seconds between two renewals of a lease that expires *lease_s* seconds after a renewal.
+
+    It is a third of *lease_s*.
+    """
     return lease_s / _RENEWALS_PER_LEASE
 
 
@@ -129,9 +137,9 @@ def next_action(record: LeaseRecord | None, *, unchanged_s: float, lease_s: floa
         lease_s: Seconds without a renewal after which the map server counts as dead.
 
     Returns:
-        ``claim``: become the map server, since there is none, or it gave the map up, or it is dead.  After
-        more than two map servers in a row that failed soon after their start, a dead one is replaced only
-        after *lease_s* times 2, 4, 8, ..., at most 60 s (exponential back-off).
+        ``claim``: become the map server, since there is none, or it gave the map up, or it is dead.  If
+        ``record.tries`` is 3, 4, 5, ..., since map servers failed soon after their start, a dead one is
+        replaced only after *lease_s* times 2, 4, 8, ..., at most 60 s (exponential back-off).
         ``connect``: the map server accepts connections.
         ``wait``: a map server is starting, or is dead and may not be replaced yet.
     """
@@ -167,11 +175,16 @@ class MapLease:
 
     @property
     def age_s(self) -> float:
-        """Seconds since the last successful write of the lease began; this process held the lease then."""
+        """Seconds since the last successful write of the lease began; this process held the lease then.
+
+        Infinity before the first one.
+        """
         return self._lease.age_s
 
     def claim(self, known: bytes | None) -> bool:
         """Become the map server if the stored lease still has the content *known* (None: no lease).
+
+        The new lease has the state ``starting`` and the next epoch.
 
         Returns:
             False if another process changed the lease first.
@@ -189,7 +202,9 @@ class MapLease:
         )
 
     def serve(self, address: str, port: int, certificate: str) -> bool:
-        """Publish in the lease where the map server listens, and the SHA-256 in hex of its certificate.
+        """Write into the lease where the map server listens, and the SHA-256 in hex of its certificate.
+
+        The state of the lease is then ``serving``.
 
         Returns:
             False if another process has taken the map over.
@@ -247,7 +262,11 @@ class MapLease:
         return self._is_held and self._write(record)
 
     def _write(self, record: LeaseRecord) -> bool:
-        """Replace the known lease by *record*; return False if another process changed the lease first."""
+        """Replace the known lease by *record*; return False if another process changed the lease first.
+
+        Raises:
+            StoreError: The store fails, so that the outcome is unknown.
+        """
         while not self._lease.write(record):
             if not self._is_held:
                 return False

@@ -1,9 +1,9 @@
 """Connect one worker to the map server of one live map; start or replace the map server if necessary.
 
-A worker finds the map server of a map by the lease of the map in the object store.  If there is none, or it
-is dead, the worker lets a process of its own claim the map.  A connection is kept while requests or
-subscribers wait, and for 10 s longer.  Requests without a reply are sent again after a reconnection: every
-operation of a live map may be repeated without harm.
+A worker finds the map server of a map by the lease of the map in the object store.  If there is no map
+server, or it is dead, the worker lets a process of its own claim the map.  A connection is kept while
+requests or subscribers wait, and for 10 s longer.  Requests without a reply are sent again after a
+reconnection: every operation of a live map may be repeated without harm.
 """
 
 from __future__ import annotations
@@ -56,22 +56,24 @@ __all__ = ["ConnectionContext", "MapConnection", "can_begin_map"]
 
 _READ_BYTES = 1 << 18  # largest number of bytes that one read of a socket returns
 _CONNECT_TIMEOUT_S = 1.0
-"""Seconds within which a map server must accept a connection, and then answer the hello."""
+"""Seconds within which a map server must accept a connection, and then as many to answer the hello."""
 _POLL_S = 0.1
-"""Seconds between two reads of the lease while a map moves to another map server or the store fails."""
+"""Seconds between two reads of the lease while a map moves to another map server or the store fails, or while
+the map server is silent."""
 _RECONNECT_S = 0.02
-"""Seconds after the end of a connection until the lease is read again: the map server is releasing it."""
+"""Seconds after the end of a connection until the lease is read again: a map server that gave the map up is
+releasing the lease then."""
 _IDLE_POLL_S = 1.0
 """Seconds between two reads of the lease of a map that has no map server and needs none."""
 _LINGER_S = 10.0
 """Seconds for which a worker keeps its connection to a map server after the last request or subscriber."""
 _PREPARE_SHARE = 0.66
-"""Share of ``live.lease_s`` without a renewal after which a worker starts a process, so that the process has
-imported its modules when the lease expires."""
+"""Share of ``live.lease_s`` for which a worker has seen no renewal when it starts a process, so that the
+process has imported its modules when the lease expires."""
 _BUSY_RETRY_MS = 500.0
-"""Milliseconds after which a robot sends a request again that found no map server."""
+"""Milliseconds after which a robot sends a request again that no map server answered in time."""
 _EMPTY_MAP_UPDATE = {"kind": "map", "keyframes": 0, "version": 0, "owner": ""}
-"""Fields of the update ``map`` that a worker sends before the map server has sent one."""
+"""Fields of the update ``map``, without its state, that a worker sends before the map server has sent one."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -103,7 +105,7 @@ class ConnectionContext:
 
 @dataclass(slots=True, eq=False)
 class _PendingRequest:
-    """A request to the map server without a reply; the reply or the error is set on ``future``."""
+    """A request that waits for a reply of the map server; the reply or the error is set on ``future``."""
 
     robot: RobotId
     operation: str
@@ -133,8 +135,9 @@ class MapConnection:
             context: Values shared by all connections of the worker.
             tenant: Tenant of the map.
             map_name: Name of the map.
-            on_update: Called with each update while the map is watched.
-            on_end: Called with this object when it is closed, or when nobody has used the map for 10 s.
+            on_update: Called with the payload of each update while the map is watched.
+            on_end: Called with this object when it is closed, or when nobody has used the map for 10 s; the
+                object cannot be used afterwards.
 
         Raises:
             BadRequest: The name of the map is not valid.
@@ -143,7 +146,7 @@ class MapConnection:
         self.is_watched = False
         """Whether robots of this worker subscribe to the map."""
         self.may_start = False
-        """Whether a map server is started for these subscribers."""
+        """Whether a map server is started for these subscribers; requests start one in any case."""
         self._context = context
         self._on_update = on_update
         self._on_end = on_end
@@ -155,7 +158,7 @@ class MapConnection:
         self._dead_epoch: int | None = None
         # Name of the last map server that accepted the token of this worker.
         self._reached_owner = ""
-        self._newest_map_update: dict[str, Any] = {}
+        self._newest_map_update: dict[str, Any] = {}  # last payload of the kind map, received or made here
         self._last_use_s = context.clock()
         self._is_closed = False
         self._had_requests = False
@@ -172,6 +175,8 @@ class MapConnection:
     ) -> dict[str, Any]:
         """Send a request to the map server and return its reply.
 
+        Until the reply arrives, the request is sent again over each new connection.
+
         Args:
             robot: Robot that asks.
             operation: Name of the service, such as ``live-keyframe``.
@@ -179,7 +184,8 @@ class MapConnection:
             deadline_s: Seconds from now on within which the reply must arrive.
 
         Raises:
-            Busy: There was no reply within *deadline_s*.
+            Busy: There was no reply within *deadline_s*, or no map server can be started.
+            NotFound, Conflict: The map does not exist, or was stopped, and the request does not begin it.
             RsePfError: The map server refused the request.
         """
         number = next(self._request_numbers)
@@ -205,7 +211,8 @@ class MapConnection:
 
         Args:
             is_watched: Whether updates are wanted.
-            may_start: Whether a map server is started for the updates if the map has none.
+            may_start: Whether a map server is started for the updates if the map has none; not used if no
+                updates are wanted.
         """
         self.is_watched, self.may_start = is_watched, is_watched and may_start
         self._last_use_s = self._context.clock()
@@ -214,7 +221,7 @@ class MapConnection:
 
     @property
     def may_need_process(self) -> bool:
-        """Whether the map had requests, or has subscribers for whom a map server is started."""
+        """Whether this object ever had requests, or has subscribers for whom a map server is started."""
         return self._had_requests or self.may_start
 
     async def close(self) -> None:
@@ -242,9 +249,13 @@ class MapConnection:
             self._on_end(self)
 
     async def _advance(self) -> None:
-        """Do what the lease, which was just read, calls for: connect, claim the map, or wait."""
+        """Connect to the map server, claim the map, or wait, as the lease, which was just read, demands.
+
+        Returns after one such step; after a connection, when it has ended.
+        """
         record, lease_s = self._lease.record, self._context.settings.lease_s
-        # 1. A map that does not exist or was stopped waits for a request that begins it.
+        # 1. If the map does not exist or was stopped, answer all requests but those that begin it; without
+        # a request that begins it, wait.
         if record is None or record.state == "stopped":
             self._refuse_requests_without_map(is_stopped=record is not None)
             if not any(can_begin_map(pending.request) for pending in self._pending.values()):
@@ -252,41 +263,45 @@ class MapConnection:
                     self._prepare_spare()  # subscribers send the first keyframe within seconds
                 await self._pause(_IDLE_POLL_S)
                 return
-        # 2. A map server whose process has certainly ended counts as silent for the whole lease.
+        # 2. Decide the next step; a map server whose process has certainly exited counts as silent for at
+        # least ``live.lease_s``.
         unchanged_s = self._lease.unchanged_s
         if record is not None and record.epoch == self._dead_epoch:
             unchanged_s = max(lease_s, unchanged_s)
         action = next_action(record, unchanged_s=unchanged_s, lease_s=lease_s)
-        # 3. A map without a map server is claimed, unless its subscribers may start none.
+        # 3. Claim a map without a map server, unless there are only subscribers that may start none.
         if action == "claim" and not self._needs_map_server:
             self._send_state("idle")
             await self._pause(_IDLE_POLL_S)
         elif action == "claim":
             await self._claim_map()
-        # 4. A map server that accepts connections is used until its connection or its lease ends.
+        # 4. Use a map server that accepts connections until its connection or its lease ends.
         elif action == "connect" and record is not None:
             if await self._use_map_server(record):
                 await asyncio.sleep(_RECONNECT_S)
             elif record.epoch != self._dead_epoch:
                 self._prepare_spare()
                 await self._pause(_POLL_S)
-        # 5. A starting map server is waited for, and so is the time at which a dead one may be replaced.
+        # 5. Otherwise wait until a starting map server accepts connections, or a dead one may be replaced.
         else:
             self._send_state("moving")
             await self._pause(_POLL_S)
 
     async def _claim_map(self) -> None:
-        """Let a map-server process of this worker claim the map, unless another process claims it first."""
+        """Let a map-server process of this worker claim the map, unless another process claims it first.
+
+        If no process is ready or free, wait for a moment and return; the caller then reads the lease again.
+        """
         pool, is_watched_only = self._context.pool, not self._pending
-        # 1. The process must be ready.  While it imports, another process may claim the map, so the lease is
-        # read again before the next try.
+        # 1. Wait until the spare process is ready.  While it imports, another process may claim the map, so
+        # the lease is read again before the next try.
         spare = pool.prepare_spare()
         if spare is not None and not spare.is_ready:
             await spare.wait_ready(_POLL_S)
             return
         process = pool.take(self.tenant, self._on_process_exit, is_watched_only=is_watched_only)
-        # 2. Without a process, watchers wait until no other map needs one; requests wait only while one is
-        # being freed.
+        # 2. Take a process.  If there is none, subscribers wait until no other map needs one; requests wait
+        # while a process is being freed, and are refused otherwise.
         if process is None and is_watched_only:
             self._send_state("idle")
             await self._pause(_IDLE_POLL_S)
@@ -297,7 +312,7 @@ class MapConnection:
                 self._refuse_all("all map-server processes of this server are in use, or the server drains")
             await self._pause(_POLL_S)
             return
-        # 3. The process claims the lease in the form that this worker has read.
+        # 3. Let the process claim the lease, which fails if the lease has changed since this worker read it.
         order = ClaimOrder(
             tenant=self.tenant,
             map_name=self.map_name,
@@ -318,7 +333,7 @@ class MapConnection:
             process.kill()
 
     def _on_process_exit(self, process: MapServerProcess, exit_code: int) -> None:
-        """Note that a process of this worker has exited: if it served the map, the map has no map server."""
+        """Note that a process that was taken for this map has exited; if it served the map, nobody does."""
         if process.epoch is not None:
             self._dead_epoch = process.epoch
             self._context.log.info("live-owner-ended", map=self.map_name, epoch=process.epoch, code=exit_code)
@@ -329,8 +344,10 @@ class MapConnection:
     async def _use_map_server(self, record: LeaseRecord) -> bool:
         """Connect to the map server and pass requests on until the connection or its lease ends.
 
+        All requests without a reply are sent first.
+
         Returns:
-            False if no connection could be opened.
+            False if no connection could be opened; True after the end of the connection.
         """
         connection = await self._connect(record)
         if connection is None:
@@ -351,9 +368,12 @@ class MapConnection:
     async def _connect(
         self, record: LeaseRecord
     ) -> tuple[asyncio.StreamReader, asyncio.StreamWriter, FrameReader] | None:
-        """Open an authenticated connection to the map server; return None if that fails."""
-        # 1. TCP and TLS.  A refused connection proves the end of the process only if this worker has reached
-        # its port before: a firewall may refuse what other servers can reach.
+        """Open an authenticated connection to the map server; return None if that fails.
+
+        A failure after the handshake of TLS is logged.  Messages that come with the welcome are handled here.
+        """
+        # 1. Connect by TCP and TLS.  A refused connection proves that the process has exited only if this
+        # worker has reached its port before: a firewall may refuse what other servers can reach.
         try:
             reader, writer = await asyncio.wait_for(
                 asyncio.open_connection(record.address, record.port, ssl=client_context()),
@@ -365,9 +385,9 @@ class MapConnection:
             return None
         is_welcome = False
         try:
-            # 2. The certificate of the map server.
+            # 2. Check the certificate of the map server.
             check_certificate(writer.get_extra_info("ssl_object"), record.certificate)
-            # 3. The token of this worker.
+            # 3. Send a token of this worker.
             claims = ConnectionClaims(
                 tenant=self.tenant,
                 map_name=self.map_name,
@@ -377,7 +397,7 @@ class MapConnection:
             )
             key = await self._context.call(self._context.key)
             writer.write(encode_message(["hello", make_token(key, claims)]))
-            # 4. The answer of the map server, perhaps with further messages.
+            # 4. Receive the answer of the map server, and handle messages that came with it.
             frames = FrameReader(MAX_MESSAGE_BYTES)
             messages = await asyncio.wait_for(_read_messages(reader, frames), _CONNECT_TIMEOUT_S)
             is_welcome = messages[0] == ["welcome"]
@@ -395,7 +415,11 @@ class MapConnection:
         return None
 
     async def _receive(self, record: LeaseRecord, reader: asyncio.StreamReader, frames: FrameReader) -> None:
-        """Handle messages of the map server until it disconnects, gives the map up, or may be replaced."""
+        """Handle messages of the map server until it disconnects, gives the map up, or may be replaced.
+
+        Returns also when the connection is not needed any more.  While the map server is silent, a spare
+        process is started, and the lease is read again and again.
+        """
         prepare_after_s = _PREPARE_SHARE * self._context.settings.lease_s
         read: asyncio.Task[bytes] | None = None
         try:
@@ -422,7 +446,7 @@ class MapConnection:
                 read.cancel()
 
     async def _is_replaceable(self, record: LeaseRecord) -> bool:
-        """Return whether a silent map server has lost or released its lease, or its lease has expired.
+        """Read the lease; return whether a silent map server has lost or released it, or it has expired.
 
         While the store fails, the answer is False, because nobody can replace the map server.
         """
@@ -437,7 +461,10 @@ class MapConnection:
         return self._lease.unchanged_s >= self._context.settings.lease_s
 
     def _handle(self, message: list[Any]) -> bool:
-        """Handle a message of the map server; return False if it gives the map up."""
+        """Handle a message of the map server; return False if it gives the map up.
+
+        A request that it answers with ``again`` stays pending, and is sent over the next connection.
+        """
         match message:
             case ["answer", int(number), dict(reply)]:
                 pending = self._pending.get(number)
@@ -465,7 +492,10 @@ class MapConnection:
         self._send(["request", number, list(pending.robot), pending.operation, request])
 
     def _send(self, message: list[Any]) -> None:
-        """Send *message* if there is a connection to the map server; the next one gets all requests again."""
+        """Send *message* over the connection to the map server, if there is one; else drop it.
+
+        `_use_map_server` sends all pending requests when it has opened a connection.
+        """
         if self._writer is not None:
             self._writer.write(encode_message(message))
 
@@ -497,7 +527,7 @@ class MapConnection:
                 )
 
     def _refuse_all(self, reason: str) -> None:
-        """Let all requests to this map that have no reply fail with Busy; *reason* is part of the message."""
+        """Let all requests to this map that have no reply fail with Busy; *reason* ends the message."""
         for pending in self._pending.values():
             pending.refuse(
                 Busy(
@@ -508,7 +538,10 @@ class MapConnection:
             )
 
     def _send_state(self, state: str) -> None:
-        """Send the subscribers of this worker the *state* of the map, unless they received it last."""
+        """Send the subscribers of this worker the update ``map`` with *state*, unless they received it last.
+
+        Its other fields are those of the last such update.
+        """
         if self.is_watched and self._newest_map_update.get("state") != state:
             self._newest_map_update = {**(self._newest_map_update or _EMPTY_MAP_UPDATE), "state": state}
             self._on_update(self._newest_map_update)
@@ -533,7 +566,7 @@ class MapConnection:
         return read_record(self._context.store, self._lease.name)
 
     async def _pause(self, seconds: float) -> None:
-        """Wait for *seconds*, or until a request or subscriber arrives or a process of this worker exits."""
+        """Wait for *seconds*, or until a request or subscriber arrives or a process of this map exits."""
         self._wake.clear()
         with contextlib.suppress(asyncio.TimeoutError):
             await asyncio.wait_for(self._wake.wait(), seconds)
@@ -566,7 +599,11 @@ def _show_reply_without_map(robot: RobotId) -> dict[str, Any]:
 
 
 async def _read_messages(reader: asyncio.StreamReader, frames: FrameReader) -> list[Any]:
-    """Return the next messages of the map server, at least one; raises ConnectionResetError at the end."""
+    """Return the next messages of the map server, at least one.
+
+    Raises:
+        ConnectionResetError: The map server has disconnected.
+    """
     while True:
         data = await reader.read(_READ_BYTES)
         if not data:

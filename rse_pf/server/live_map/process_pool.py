@@ -1,13 +1,14 @@
 """Start the map-server processes of one worker, and share them between maps and tenants.
 
-A worker has at most ``live.max_owners`` map servers.  When all are in use and another map needs one, a map
-gives its process up, in this order:
+A worker has at most ``live.max_owners`` map servers.  When all are in use and another map gets commands, one
+map gives its process up, the first of these that exists:
 
 1. a map that is only watched, of a tenant that holds at least two processes more than the tenant in need;
 2. a map that is only watched, of the tenant in need or of a tenant that holds more;
 3. a map in use of the tenant that holds most, if that tenant holds at least two more than the tenant in need.
 
-Among maps that are only watched, the one that was not used for longest comes first.
+A map counts as only watched if it gets no commands.  Among such maps, the one that was not used for longest
+comes first.  If no map can give its process up, requests to the map in need fail with Busy.
 
 One started process may wait for its map (the spare), so that a takeover does not wait for imports.
 """
@@ -36,15 +37,17 @@ DEFAULT_IMPLEMENTATION = "rse_pf.server.live_map.map_server.environment:LIVE_MAP
 _PROCESS_ENTRY_POINT = "rse_pf.server.live_map.map_server.process:run"
 """Function that a map server's process runs, as ``module:name``; the worker does not import this module."""
 _MAX_MEMORY_BYTES = 2 << 30
-"""Memory limit of one map server's process; a process that needs more exits, and its map is taken over."""
+"""Memory limit in bytes of one map server's process; a process that needs more exits, and its map is taken
+over."""
 _SPARE_IMPORT_NICE = 10
 """Additional niceness of a spare process while it imports modules, because nobody waits for it."""
 _READ_BYTES = 1 << 16  # largest number of bytes that one read of a process's socket returns
 _SPARE_DELAY_S = 3.0
 """Seconds after a process was taken until the next spare is started: the takeover needs the processors."""
 _RESERVATION_S = 3.0
-"""Seconds for which a process that a map gave up is reserved for the tenant that needed it.  A map that gets
-no process asks again within this time."""
+"""Seconds for which a process that a map gave up is reserved for the tenant that needed it.  For as long
+after a map with commands got no process, maps that are only watched get none: that map asks again within this
+time."""
 
 
 class ClaimOrder(msgspec.Struct, frozen=True, kw_only=True):
@@ -54,8 +57,8 @@ class ClaimOrder(msgspec.Struct, frozen=True, kw_only=True):
         tenant: Tenant of the map.
         map_name: Name of the map.
         server: Id of the backend server.
-        known: Content of the lease as the worker read it, None if there was none.  The claim fails if the
-            lease has changed.
+        known: Content of the lease as the worker read it, None if there was no lease.  The claim fails if
+            the lease has changed since then.
     """
 
     tenant: str
@@ -67,14 +70,15 @@ class ClaimOrder(msgspec.Struct, frozen=True, kw_only=True):
 def start_map_server(
     settings: PlatformSettings, implementation: str = DEFAULT_IMPLEMENTATION, *, at_low_priority: bool = False
 ) -> Child:
-    """Start a map server's process, which then waits for a `ClaimOrder`.
+    """Start a map server's process, which then waits for a `ClaimOrder`; return before it is ready.
 
     Called only in the main thread of a worker: Linux kills the process when that thread ends.
 
     Args:
         settings: Settings of the platform.
         implementation: Location of a `MapImplementation`, as ``module:name``.
-        at_low_priority: Whether it imports its modules at low priority, because nobody waits for it yet.
+        at_low_priority: Whether the process imports its modules at low priority, because nobody waits for it
+            yet.
     """
     child = start_child(
         ChildPlan(
@@ -96,13 +100,13 @@ class MapServerProcess:
         self.tenant = ""
         """Tenant of the map that the process claims or serves; empty for a spare."""
         self.unused_since_s: float | None = None
-        """Time since which its map is only watched; None while commands arrive."""
+        """Monotonic time since which its map is only watched; None while commands arrive, and for a spare."""
         self.is_releasing = False
-        """Whether it was ordered to give its map up."""
+        """Whether the process was ordered to give its map up."""
         self.final_cpu_s = 0.0
-        """CPU time in seconds that it used for its map, set when it has exited."""
+        """CPU time in seconds that the process used for its map, set when it has exited."""
         self.epoch: int | None = None
-        """Epoch of its lease, once it serves its map."""
+        """Epoch of its lease from the time on at which it serves its map; before, None."""
         self.on_exit: Callable[[MapServerProcess, int], None] = lambda process, exit_code: None
         """Called with this object and the exit code when the process has exited."""
         self._clock = clock
@@ -111,8 +115,8 @@ class MapServerProcess:
         self._ready: asyncio.Future[bool] = loop.create_future()
         self._outcome: asyncio.Future[Literal["serving", "lost"]] = loop.create_future()
         self.exited: asyncio.Future[int] = loop.create_future()
-        """Gets the exit code."""
-        self._cpu_before_map_s = 0.0
+        """A future that gets the exit code when the process has exited; negative for a signal."""
+        self._cpu_before_map_s = 0.0  # CPU time of the process before it was assigned to a map
         self._reader: asyncio.Task[None]
 
     def start_reading(self) -> MapServerProcess:
@@ -126,18 +130,18 @@ class MapServerProcess:
         return self._process.pid
 
     def assign(self, tenant: str, *, is_watched_only: bool) -> None:
-        """Assign the process to a map of *tenant*, for which its CPU time counts from now on."""
+        """Count the process for a map of *tenant*, and its CPU time from now on; no order is sent yet."""
         self.tenant = tenant
         self.unused_since_s = self._clock() if is_watched_only else None
         self._cpu_before_map_s = cpu_seconds(self.pid)
 
     def cpu_s(self) -> float:
-        """Return the CPU seconds of the process and its exited children for its map; 0 after its exit."""
+        """Return the CPU seconds of the process and its exited children since `assign`; 0 after its exit."""
         return max(0.0, cpu_seconds(self.pid) - self._cpu_before_map_s)
 
     @property
     def is_ready(self) -> bool:
-        """Whether the process has imported its modules and waits for an order, or has exited."""
+        """Whether the process has imported its modules, so that it can take an order, or has exited."""
         return self._ready.done()
 
     async def wait_ready(self, timeout_s: float) -> None:
@@ -145,9 +149,10 @@ class MapServerProcess:
         await asyncio.wait({self._ready}, timeout=timeout_s)
 
     async def claim(self, order: ClaimOrder) -> bool:
-        """Send *order* when the process is ready; return whether it serves the map now.
+        """Send *order* when the process is ready; wait until it serves the map, and return whether it does.
 
-        False means that another process was first, or that this one has exited.
+        False means that another process has claimed the map, that the map could not be restored, or that this
+        process has exited.
         """
         if not await asyncio.shield(self._ready):
             return False
@@ -155,12 +160,12 @@ class MapServerProcess:
         return await asyncio.shield(self._outcome) == "serving"
 
     def release(self) -> None:
-        """Order the process to give its map up and exit."""
+        """Order the process to give its map up and exit; return at once."""
         self.is_releasing = True
         self._process.say({"do": "release"})
 
     def kill(self) -> None:
-        """Kill the process at once; called only for a process that serves no map."""
+        """Kill the process at once, reap it and call ``on_exit``; only for a process that serves no map."""
         self._reader.cancel()
         self._finish()
 
@@ -187,7 +192,7 @@ class MapServerProcess:
                 self._outcome.set_result("lost")
 
     def _finish(self) -> None:
-        """Kill the process if it still runs, reap it, and complete the futures that wait for it."""
+        """Kill the process if it still runs, reap it, complete its futures, and call ``on_exit``."""
         if self.exited.done():
             return
         self.final_cpu_s = self.cpu_s()
@@ -215,12 +220,13 @@ class MapServerPool:
 
         Args:
             start_process: Starts a process; called with whether it imports its modules at low priority.
-            max_processes: Largest number of processes that claim or serve a map at the same time.
+            max_processes: Largest number of processes that claim or serve a map at the same time, without the
+                spare.
             keeps_spare: Whether a spare is kept while live maps are used.
             clock: Returns monotonic time in seconds.
         """
         self.is_draining = False
-        """Whether the server drains, so that no further map is taken."""
+        """Whether the server drains, so that no further process is started or taken."""
         self._start_process = start_process
         self._max_processes = max_processes
         self._keeps_spare = keeps_spare
@@ -239,7 +245,10 @@ class MapServerPool:
         return list(self._in_use)
 
     def cpu_by_tenant(self) -> dict[str, float]:
-        """Return the CPU seconds of all map servers of this worker so far, also of exited ones, by tenant."""
+        """Return the CPU seconds of all map servers of this worker so far, also of exited ones, by tenant.
+
+        The time of a process counts from its assignment to a map on.
+        """
         cpu_s = self._cpu_s_of_exited.copy()
         for process in self._in_use:
             cpu_s[process.tenant] += process.cpu_s()
@@ -257,9 +266,9 @@ class MapServerPool:
         *,
         is_watched_only: bool = False,
     ) -> MapServerProcess | None:
-        """Return a process for a map, or None if the map must ask again later.
+        """Return a process for a map, which may not be ready yet, or None if the map must ask again later.
 
-        If all processes are in use, another map may be ordered to give its process up.
+        If all processes are in use, a map with commands lets another map be ordered to give its process up.
 
         Args:
             tenant: Tenant of the map.
@@ -269,21 +278,21 @@ class MapServerPool:
         """
         now = self._clock()
         in_use_by_tenant = Counter(process.tenant for process in self._in_use)
-        # 1. A map that is only watched gets none while a map that gets commands may ask again.
+        # 1. Give a map that is only watched none while a map that gets commands may ask again.
         if is_watched_only and now < self._wanted_until_s:
             return None
-        # 2. A reserved process is not for a tenant that holds more than the one for which it is reserved.
+        # 2. Keep one process back if it is reserved for a tenant that holds fewer than this one.
         is_reserved = (
             now < self._reserved_until_s and in_use_by_tenant[tenant] > in_use_by_tenant[self._reserved_for]
         )
-        # 3. If no process is left, one is freed for a later call.
+        # 3. If no process is left, let a map give one up for a later call.
         if len(self._in_use) + is_reserved >= self._max_processes:
             if not is_watched_only:
                 self._free_process(tenant, in_use_by_tenant, now)
             return None
         if tenant == self._reserved_for:
             self._reserved_until_s = float("-inf")
-        # 4. The spare is assigned to the map, and the next one is started a little later.
+        # 4. Assign the spare to the map, and start the next spare 3 s later.
         self.prepare_spare()
         process, self._spare = self._spare, None
         if process is not None:
@@ -294,7 +303,10 @@ class MapServerPool:
         return process
 
     def prepare_spare(self, *, at_low_priority: bool = False) -> MapServerProcess | None:
-        """Return the spare process, which is started if there is none; None if the pool is full or drains."""
+        """Return the spare process, which is started if there is none; None if the pool is full or drains.
+
+        *at_low_priority* has no effect on a spare that was started before.
+        """
         if self._spare is None and len(self._in_use) < self._max_processes and not self.is_draining:
             started = self._start_process(at_low_priority)
             self._spare = MapServerProcess(started, self._clock).start_reading()
@@ -302,14 +314,17 @@ class MapServerPool:
         return self._spare
 
     def set_used(self, *, is_used: bool) -> None:
-        """Keep a spare while live maps are used, if the pool keeps spares; kill the spare otherwise."""
+        """Set whether live maps are used: if so, a pool that keeps spares starts one in 3 s; else kill it."""
         if is_used:
             self._prepare_spare_later()
         else:
             self.kill_spare()
 
     def release_all(self) -> None:
-        """Start no further process, and order all map servers of the pool to give their maps up."""
+        """Order all map servers of the pool to give their maps up; start or take no process any more.
+
+        The spare is killed.
+        """
         self.is_draining = True
         self.kill_spare()
         for process in self.in_use:
@@ -324,10 +339,16 @@ class MapServerPool:
             self._spare.kill()
 
     def _free_process(self, tenant: str, in_use_by_tenant: Counter[str], now: float) -> None:
-        """Order a map server to give its map up, so that a map of *tenant* gets a process.
+        """Order a map server to give its map up, and reserve its process for *tenant*.
 
-        A map that is only watched is chosen first, of the same tenant or of one with more processes; then the
-        newest map of the tenant with most processes, if that tenant has at least two more; else none.
+        The choice is that of the module's docstring; of the maps in use of the tenant that holds most, the
+        newest is chosen.  Nothing is ordered while the pool drains or another map is being given up; in the
+        second case, a reservation for *tenant* is prolonged.
+
+        Args:
+            tenant: Tenant of the map that needs a process.
+            in_use_by_tenant: Number of processes of each tenant that claim or serve a map.
+            now: Monotonic time in seconds.
         """
         self._wanted_until_s = now + _RESERVATION_S
         if self.is_freeing_process and tenant == self._reserved_for:

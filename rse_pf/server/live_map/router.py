@@ -1,7 +1,8 @@
 """Pass commands of robots to the map servers of live maps, and updates back to the robots of one worker.
 
 The worker checks the scope of the robot's token, and the size and format of each request; the map server
-validates its content.  A robot that sends many invalid requests may not use live maps for a minute.
+validates its content.  A robot that sends ten invalid requests within a minute may send no commands to live
+maps for a minute.
 """
 
 from __future__ import annotations
@@ -66,12 +67,12 @@ _MAX_WAITING_BYTES = 64 << 20
 """Largest total size in bytes of the messages of one worker that wait for map servers.  Beyond it, commands
 are refused with Busy, and robots keep their keyframes."""
 _MAX_WAITING_BYTES_PER_TENANT = _MAX_WAITING_BYTES // 4
-"""Largest size in bytes of the messages of one tenant that wait for map servers in one worker: four tenants
-that fill their part do not stop each other."""
+"""Largest total size in bytes of the messages of one tenant that wait for map servers in one worker: four
+tenants that fill their part do not stop each other."""
 _BUSY_RETRY_MS = 500.0
 """Milliseconds after which a robot sends a command again that was refused because too many wait."""
 _INVALID_REQUEST_CODES = (BadRequest.code, BadMessage.code, LimitExceeded.code, InvalidCamera.code)
-"""Codes of errors that the sender of a request has caused."""
+"""Codes of errors that the sender of a request has caused, so that they count as an invalid request."""
 _SERVICES_WITH_BLAME = (KEYFRAME, RELOCALISE)
 """Services for which an invalid-request error of the map server counts against the robot.  Errors of other
 services may come from the state of the map, for example of one that cannot be published."""
@@ -79,9 +80,10 @@ _MAX_INVALID_REQUESTS = 10
 """Number of invalid requests in 60 s after which live maps are closed to a robot.  A robot with a matching
 SDK sends none."""
 _WINDOW_S = 60.0
-"""Length in seconds of the time window in which the invalid requests of a robot are counted."""
+"""Length in seconds of the time window in which the invalid requests of a robot are counted; it begins with
+an invalid request, and the first one after its end begins the next window."""
 _BLOCKED_S = 60.0
-"""Seconds for which live maps are closed to a robot that sent too many invalid requests."""
+"""Seconds for which commands to live maps of a robot that sent too many invalid requests are refused."""
 _MAX_COUNTED_ROBOTS = 4096
 """Largest number of robots whose invalid requests a worker counts, to bound memory; the count of the robot
 whose last invalid request is oldest is dropped first."""
@@ -101,7 +103,10 @@ class InvalidRequestCounter:
         self._by_robot: dict[RobotId, _InvalidRequests] = {}
 
     def count(self, robot: RobotId, now: float) -> None:
-        """Count one invalid request of *robot* at the monotonic time *now* in seconds."""
+        """Count one invalid request of *robot* at the monotonic time *now* in seconds.
+
+        The tenth one in a time window of 60 s, and each further one, blocks the robot for 60 s from *now* on.
+        """
         requests = self._by_robot.pop(robot, None)
         if requests is None or now - requests.window_start_s > _WINDOW_S:
             requests = _InvalidRequests(now)
@@ -137,7 +142,7 @@ class LiveMapRouter(CommandQueue):
             context: Context of the worker.
             make_client: Makes the client of the live maps; its argument is called with tenant, map name and
                 payload of each update.
-            answer: Called exactly once for each submitted command.
+            answer: Called once for each submitted command, except for those that `close` cancels.
         """
         self._context = context
         self._monotonic = context.clocks.monotonic
@@ -171,7 +176,10 @@ class LiveMapRouter(CommandQueue):
     # --- Commands of robots and operators ---
 
     def submit(self, queued: QueuedCommand, now: float) -> None:
-        """Pass a command to the map server of its map; a command that is refused is answered at once."""
+        """Pass a command to the map server of its map; a command that is refused is answered at once.
+
+        *now* is the monotonic time in seconds.
+        """
         tenant = queued.robot.tenant
         try:
             self._check_not_blocked(queued.robot, now)
@@ -198,7 +206,13 @@ class LiveMapRouter(CommandQueue):
         task.add_done_callback(self._on_answered)
 
     def _prepare_request(self, queued: QueuedCommand, now: float) -> Callable[[], Any]:
-        """Check a command and return a function that sends its request; raises RsePfError to refuse it."""
+        """Check a command and return a function that sends its request and returns the awaitable reply.
+
+        *now* is the monotonic time in seconds.
+
+        Raises:
+            RsePfError: The command is refused.
+        """
         command, claims = queued.command, queued.owner.claims
         robot, service = queued.robot, command.service
         deadline_s = queued.deadline_s - now
@@ -215,7 +229,7 @@ class LiveMapRouter(CommandQueue):
         return lambda: self._client.request(robot.tenant, request.map, robot, service, request, deadline_s)
 
     async def _list_maps(self, tenant: str, claims: Claims | None) -> dict[str, Any]:
-        """Return the reply of ``live-list``: the maps of *tenant* in which the token may drive."""
+        """Return the reply of ``live-list``: the maps of *tenant* for which the token has ``maps:live``."""
         maps = await self._client.list_maps(tenant)
         return {
             "maps": [
@@ -226,7 +240,10 @@ class LiveMapRouter(CommandQueue):
         }
 
     async def _answer_command(self, queued: QueuedCommand, request: Callable[[], Any]) -> None:
-        """Await *request*, which sends the request of a command, and answer the command by its deadline."""
+        """Call *request*, which sends the request of a command, and answer the command with its reply.
+
+        Without a reply by the deadline of the command, or after an exception, the answer is a failure.
+        """
         started_s = self._monotonic()
         command, server = queued.command, self._context.server_id
         queued.started_s = started_s
@@ -272,7 +289,7 @@ class LiveMapRouter(CommandQueue):
         self._answer(queued, failure_of(error, queued.command, server=self._context.server_id))
 
     def _check_not_blocked(self, robot: RobotId, now: float) -> None:
-        """Raise Forbidden if the robot has sent too many invalid requests."""
+        """Raise Forbidden, and count the refusal in the metrics, if the robot is blocked now."""
         blocked_s = self._invalid_requests.seconds_blocked(robot, now)
         if blocked_s > 0:
             self._context.metrics.shed["live-garbage"] += 1
@@ -286,6 +303,9 @@ class LiveMapRouter(CommandQueue):
 
     def subscribe(self, connection: Any, identity: int, topic: str) -> None:
         """Begin the updates of the live map in *topic* (``live/MAP``), or send the robot an error.
+
+        A token with ``maps:watch`` or ``maps:live`` may read the map; only ``maps:live`` may start a map
+        server for it.
 
         Args:
             connection: Connection of the robot.
@@ -304,7 +324,10 @@ class LiveMapRouter(CommandQueue):
         checked_claims = connection.claims
 
         def find_error() -> RsePfError | None:
-            """Return an error if the robot has a new token without the right to read the map, else None."""
+            """Return an error if the robot has a new token without the right to read the map, else None.
+
+            If the new token may only watch the map, no map server is started for the subscription any more.
+            """
             nonlocal checked_claims
             if connection.claims is checked_claims:
                 return None
@@ -327,10 +350,13 @@ class LiveMapRouter(CommandQueue):
         self._subscriptions.end(connection, identity)
 
     def withdraw(self, owner: Any, command_id: int) -> None:
-        """Ignore the cancellation of a command: the map server answers it before its deadline."""
+        """Do nothing: a command to a live map cannot be cancelled, and is answered by its deadline."""
 
     def leave(self, owner: Subscriber) -> list[QueuedCommand]:
-        """End the subscriptions of a closed connection; its keyframes are still passed to their map."""
+        """End the subscriptions of a closed connection, and return no withdrawn commands.
+
+        Commands of the connection, such as keyframes, are still passed to their map.
+        """
         self._subscriptions.end_all(owner)
         return []
 
@@ -365,12 +391,15 @@ class LiveMapRouter(CommandQueue):
         self._client.give_up()
 
     def close(self) -> None:
-        """Cancel all commands to live maps that have no answer yet; they stay unanswered."""
+        """Cancel all commands to live maps that have no answer yet; they stay without an answer."""
         for task in list(self._tasks):
             task.cancel()
 
     async def wait_closed(self) -> None:
-        """Cancel all commands, wait until they have ended, and close the connections to map servers."""
+        """Cancel all commands, and wait until they have ended and the client of the live maps is closed.
+
+        The maps that this worker's processes serve are released.
+        """
         self.close()
         await asyncio.gather(*self._tasks, return_exceptions=True)
         await self._client.close()
@@ -400,7 +429,7 @@ def _find_source_error(claims: Claims | None, request: LiveStart) -> RsePfError 
 
 
 def _find_reading_error(claims: Claims | None, map_name: str) -> RsePfError | None:
-    """Return an error if a token has neither of the scopes with which a robot may subscribe to a live map."""
+    """Return an error if a token has neither ``maps:watch`` nor ``maps:live`` for a map, else None."""
     if _find_scope_error(claims, "maps:watch", map_name) is None:
         return None
     return _find_scope_error(claims, "maps:live", map_name)
@@ -423,7 +452,10 @@ def _decode_request(service: str, payload: Any) -> LiveRequest:
 
 
 def _check_keyframe_size(keyframe: Any) -> None:
-    """Raise LimitExceeded if an encoded keyframe, as bytes or as base64 text, is too large to decode."""
+    """Raise LimitExceeded if an encoded keyframe, as bytes or as base64 text, is too large to decode.
+
+    A *keyframe* of another type, also None, passes.
+    """
     size_bytes = 0
     if isinstance(keyframe, str):  # base64: four characters for three bytes, at most two of them padding
         size_bytes = len(keyframe) // 4 * 3 - 2
@@ -436,7 +468,7 @@ def _check_keyframe_size(keyframe: Any) -> None:
 
 
 def _check_keyframe(request: LiveRequest) -> None:
-    """Raise RsePfError if the keyframe of a request is malformed or implausible.
+    """Raise RsePfError if the keyframe of a request is malformed or implausible; other requests pass.
 
     The worker decodes keyframes first, because a defect of the decoder in the map server would concern all
     robots of the map.
@@ -448,9 +480,10 @@ def _check_keyframe(request: LiveRequest) -> None:
 
 
 def _decode_matrices(fields: Mapping[str, Any]) -> dict[str, Any]:
-    """Return *fields* with poses and covariances as flat float64 arrays in place of bytes.
+    """Return a copy of *fields* with poses and covariances as flat float64 arrays in place of bytes.
 
-    Every codec of the protocol can encode arrays; bytes only the binary one.
+    Those are the fields ``covariance`` and ``T_...``.  Every codec of the protocol can encode arrays, but
+    only the binary one can encode bytes.
     """
     return {
         name: np.frombuffer(value, "<f8")

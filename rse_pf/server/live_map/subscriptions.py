@@ -1,8 +1,8 @@
 """Send the robots of one worker the newest update of each key of the live maps to which they subscribe.
 
-The newest updates of a map are stored once for all its subscribers.  For a slow subscriber only the keys are
-stored that it has not received, so its memory is bounded: an update that it misses is replaced by the newest
-one of the key.  Who may subscribe is decided by the caller.
+The newest updates of a map are stored once for all its subscribers.  For a slow subscriber, only the keys are
+stored whose newest update it has not received, so memory is bounded: the subscriber later receives the newest
+update of each of these keys, and none of those between.  Who may subscribe is decided by the caller.
 """
 
 from __future__ import annotations
@@ -24,17 +24,19 @@ from rse_pf.wire.server_session import ServerSession
 __all__ = ["Subscriptions"]
 
 _MIN_ROUND_INTERVAL_S = 0.01
-"""Seconds between two rounds of sending; updates that arrive in between replace older ones of their key."""
+"""Shortest time in seconds between two rounds of sending, unless a round could not send everything; updates
+that arrive in between replace older ones of their key."""
 _SLOW_RETRY_S = 0.05
 """Seconds after which a subscriber whose socket was full is tried again."""
 _MAX_UNSENT_BYTES = 16_384
 """Bytes that may wait in the socket of a subscriber.  Above this limit no updates are written until the
 subscriber has read some bytes; answers to commands are written in any case."""
 _MAX_SENT_PER_ROUND = 200
-"""Largest number of updates in one round of the event loop.  Each takes about 20 us, and commands of robots
-wait meanwhile."""
+"""Largest number of updates that are sent in one round of the event loop.  Each takes about 20 us, and
+commands of robots wait meanwhile."""
 _MAX_KEYS = 1024
-"""Largest number of keys of one map; the key whose update is oldest is dropped first."""
+"""Largest number of keys of one map whose newest update is stored; the key whose update is oldest is dropped
+first."""
 _MAX_UPDATE_BYTES = 65_536
 """Largest encoded payload of an update in bytes; a larger one is logged and not sent."""
 _UPDATE_WITHOUT_MAP_SERVER = {"kind": "map", "keyframes": 0, "version": 0, "owner": "", "state": "moving"}
@@ -43,7 +45,10 @@ _UPDATE_WITHOUT_MAP_SERVER = {"kind": "map", "keyframes": 0, "version": 0, "owne
 
 @dataclass(eq=False, slots=True)
 class _MapUpdate:
-    """The payload of an update, with its encodings for the binary codec (True) and for JSON (False)."""
+    """The payload of an update, with its encodings for the binary codec (True) and for JSON (False).
+
+    An encoding is made when a subscriber needs it first; it is None if the update cannot be sent.
+    """
 
     payload: dict[str, Any]
     encoded: dict[bool, msgspec.Raw | None] = field(default_factory=dict)
@@ -68,7 +73,7 @@ class _Subscription:
     id: int
     map: _WatchedMap
     find_error: Callable[[], RsePfError | None]
-    seq: int = 0
+    seq: int = 0  # sequence number of the last update that was sent; those that were replaced count too
     unsent: dict[str, int] = field(default_factory=dict)
     """For each key with an unsent update, the number of updates since the last one that was sent.  The key
     that has waited longest comes first."""
@@ -95,9 +100,10 @@ class Subscriptions:
             unwatch: Called with tenant and map name when a map has lost its last subscription.
         """
         self.sent = 0
-        """Number of updates that were sent."""
+        """Number of updates that were sent, once for each subscriber."""
         self.replaced = 0
-        """Number of updates that were not sent to a subscriber, because a newer one replaced them."""
+        """Number of updates that were not sent to a subscriber, because a newer one replaced them, once for
+        each subscriber."""
         self._loop = loop
         self._log = log
         self._watch = watch
@@ -124,7 +130,9 @@ class Subscriptions:
         find_error: Callable[[], RsePfError | None],
         may_start: bool = True,
     ) -> None:
-        """Send the newest update of each key of a map to a subscriber now, and each newer one later.
+        """Send a subscriber the newest update of each key of a map soon, and newer ones when they arrive.
+
+        A map without updates of its map server has one update of the key ``map`` with the state "moving".
 
         Args:
             subscriber: Connection of the robot.
@@ -152,7 +160,10 @@ class Subscriptions:
             self._set_starter(subscription, is_starter=True, notify=not is_new)
 
     def stop_starting(self, subscriber: Subscriber, identity: int) -> None:
-        """Start no map server for a subscription from now on, because the robot may only watch the map."""
+        """Start no map server for a subscription from now on, because the robot may only watch the map.
+
+        Nothing happens if the subscription has ended.
+        """
         subscription = self._by_subscriber.get(subscriber, {}).get(identity)
         if subscription is not None:
             self._set_starter(subscription, is_starter=False)
@@ -160,7 +171,8 @@ class Subscriptions:
     def _set_starter(self, subscription: _Subscription, *, is_starter: bool, notify: bool = True) -> None:
         """Set whether a map server may be started for a subscription.
 
-        If that changes whether one may be started for the map, ``watch`` is called again if *notify* is set.
+        If that changes whether a map server may be started for the map, and the map still has subscriptions,
+        ``watch`` is called again, unless *notify* is False.
         """
         watched_map = subscription.map
         had_starters = bool(watched_map.starters)
@@ -221,7 +233,7 @@ class Subscriptions:
             self._loop.call_later(max(0.0, delay_s), self._send_round)
 
     def _send_round(self) -> None:
-        """Send up to 200 due updates; the rest follows after the event loop has served robots' commands."""
+        """Send up to 200 due updates; the others follow after the event loop has done its other work."""
         self._last_round_s = self._loop.time()
         remaining = _MAX_SENT_PER_ROUND
         while self._due and remaining > 0:
@@ -233,7 +245,11 @@ class Subscriptions:
             self._loop.call_soon(self._send_round)
 
     def _send_to(self, subscription: _Subscription, remaining: int) -> int:
-        """Send up to *remaining* updates to one subscriber; return how many more the round may send."""
+        """Send up to *remaining* updates to one subscriber; return how many more the round may send.
+
+        A subscription whose robot may no longer read the map ends here.  If the socket is full, the rest is
+        tried again after 0.05 s; if the round may send no more, the next round sends the rest.
+        """
         subscriber, session = subscription.subscriber, subscription.subscriber.session
         if session is None or not subscriber.is_connected:
             return remaining
@@ -270,7 +286,10 @@ class Subscriptions:
         return remaining
 
     def _encode(self, watched_map: _WatchedMap, key: str, session: ServerSession) -> msgspec.Raw | None:
-        """Return the newest payload of *key* in the codec of the session, or None if it cannot be sent."""
+        """Return the newest payload of *key* in the codec of the session, or None if it cannot be sent.
+
+        The first failure of an update is logged.
+        """
         update = watched_map.updates[key]
         is_binary = session.codec.name == "bin"
         if is_binary in update.encoded:
