@@ -310,7 +310,7 @@ def _pack_body(camera: Camera, options: NativeOptions) -> bytes:
 
 
 class NativeSolver:
-    """The PnP solver of one loaded library; any thread may call it."""
+    """The PnP solver of one loaded library; any thread may call it, and each thread has its own buffers."""
 
     def __init__(
         self,

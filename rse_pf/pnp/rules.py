@@ -23,9 +23,10 @@ _MAX_LOG10_FALSE_ALARMS = (
     -5.0
 )  # largest log10 of the expected number of random poses that fit as well as an accepted one
 _WEAK_WIDTH_TO_LENGTH = 0.1  # width over length of the inliers in the image below which a pose is weak
-# Increase of squared errors to a plane's second pose, in pixel variances, below which a pose is refused.
+# Smallest increase of the sum of squared reprojection errors from a pose to the second pose of a planar
+# scene, in pixel variances, with which the pose is accepted: 3 standard deviations, squared.
 _EQUAL_FIT = 9.0
-# Increase of squared errors to a plane's second pose, in pixel variances, below which a pose is weak.
+# The same increase below which an accepted pose is weak.
 _SIMILAR_FIT = 40.0
 _MIN_VARIANCE_PX2 = (
     0.01  # smallest pixel variance (px^2): messages are rounded, and four points may fit by luck
@@ -56,7 +57,7 @@ class Rule(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def is_satisfied(self) -> bool:
-        """Whether the measured value is on the right side of the limit."""
+        """Whether the measured value is at the limit or on the right side of it."""
         return self.measured >= self.limit if self.at_least else self.measured <= self.limit
 
     @property

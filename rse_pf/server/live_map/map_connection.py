@@ -584,7 +584,10 @@ def can_begin_map(request: LiveRequest) -> bool:
 
 
 def _show_reply_without_map(robot: RobotId) -> dict[str, Any]:
-    """Return the reply of ``live-show`` to *robot* about a map that does not exist; its state is ``none``."""
+    """Return the reply of ``live-show`` to *robot* about a map that does not exist or was stopped.
+
+    Its field ``state`` is ``none``.
+    """
     return {
         "keyframes": 0,
         "robots": [],

@@ -314,7 +314,7 @@ class MapServerPool:
         return self._spare
 
     def set_used(self, *, is_used: bool) -> None:
-        """Set whether live maps are used: if so, a pool that keeps spares starts one in 3 s; else kill it."""
+        """Start a spare in 3 s if live maps are used and the pool keeps spares; kill it if they are not."""
         if is_used:
             self._prepare_spare_later()
         else:

@@ -505,7 +505,10 @@ class LogWriter:
                 return position
 
     async def _is_entry_missing(self) -> bool:
-        """Return whether the log certainly has no next entry, so that other events may be written there."""
+        """Return whether the log certainly has no next entry, so that other events may be written there.
+
+        The answer is False if the store fails.
+        """
         try:
             return not await self._environment.threads.store(self._log.has_next_entry)
         except StoreError:

@@ -264,6 +264,11 @@ class MapServer:
         return await self._stop_map()
 
     async def _take_keyframe(self, robot: RobotId, request: KeyframeRequest) -> dict[str, Any]:
+        """Add a keyframe to the map; the reply names the number of the robot's next keyframe.
+
+        If the robot sends a keyframe again while it is being added, both requests wait for the same addition,
+        which goes on if a request is cancelled.
+        """
         event = KeyframeAdded(
             robot=robot.folder, segment=request.segment, number=request.number, data=request.keyframe
         )
@@ -348,6 +353,10 @@ class MapServer:
         return relocalise_reply(await threads.match(relocalise), position)
 
     async def _leave(self, robot: RobotId) -> dict[str, Any]:
+        """Log that a robot has left, if it had not; when no robot is present any more, publish the map.
+
+        The reply does not wait for the publication.
+        """
         if robot.folder in await self._environment.threads.compute(
             Urgency.ANSWER, lambda: self._state.live_map.robots
         ):
@@ -385,7 +394,7 @@ class MapServer:
         return {"forgotten": len(folders), "version": self._state.position}
 
     async def _delete_objects_of_forgotten(self) -> None:
-        """Delete points and images of all robots that were forgotten from the store; raises StoreError."""
+        """Delete from the store the points and images of all forgotten robots; raises StoreError."""
         threads, objects = self._environment.threads, self._environment.objects
         forgotten = await threads.compute(Urgency.ANSWER, lambda: self._state.live_map.deletable_objects)
         if forgotten:

@@ -92,7 +92,7 @@ class Publisher:
         self.has_failed = False
         """Whether the last try to publish the due version failed; the version stays due."""
         self._retry_s = _FIRST_RETRY_S
-        self._retry_at_s = float("-inf")
+        self._retry_at_s = float("-inf")  # until then, publish_due does nothing
 
     @property
     def is_due(self) -> bool:
