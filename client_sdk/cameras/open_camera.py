@@ -57,18 +57,18 @@ def open_camera(
             side by side (with a rig), a folder with ``left/`` and ``right/``, or ``realsense-stereo``.
         intrinsics: Intrinsics or rig of the cameras, or a file of them (``intrinsics.json``, ``rig.json``).
             None for folders, recordings and RealSense cameras that state their own.  A recording takes a file
-            only; ``realsense`` uses intrinsics and no rig, folders of a stereo pair and ``realsense-stereo``
-            use a rig and no intrinsics: otherwise their own are used.
+            only, ``realsense`` takes intrinsics and no rig of two cameras, folders of a stereo pair and
+            ``realsense-stereo`` take a rig of two cameras.
         rate_hz: Frames a second to deliver on average, see `client_sdk.datasets.thinning`; None for all.
         depth: Whether depth is read, where there is some.
         camera: ``left`` for the left camera of a rig alone, ``stereo`` for both; None for both where there
-            are two.  ``realsense`` ignores it.
+            are two.
         imu: Whether frames carry samples of an IMU; None for yes where there is one, which only recordings
-            have.  RealSense cameras and stereo sources that are no recordings ignore it.
+            have.
 
     Raises:
-        UsageError: There is no such source, its intrinsics are missing, or facts about it contradict each
-            other.
+        UsageError: There is no such source, its intrinsics are missing or of another kind, it lacks what
+            *camera* or *imu* asks for, or facts about it contradict each other.
         MissingExtra: A package for this kind of source is not installed.
     """
     # 1. Check that the source exists, and read the intrinsics that the user names.
@@ -79,7 +79,15 @@ def open_camera(
             check_exists(name, _SOURCE_HINT)
     own = read_calibration(intrinsics) if isinstance(intrinsics, Path | str) else intrinsics
     stated_by = str(intrinsics) if isinstance(intrinsics, Path | str) else f"the intrinsics of {word}"
+    if imu and not is_recording(path):
+        raise UsageError(f"{word} has no IMU", hint="leave out --imu")
     # 2. Open a stereo source with a rig of its own, or a RealSense camera.
+    is_stereo = word == "realsense-stereo" or pair_folders(path) is not None
+    if is_stereo and own is not None and not (isinstance(own, Rig) and own.right is not None):
+        raise UsageError(
+            f"{word} is a stereo pair, and {stated_by} is of one camera",
+            hint="name a rig.json of both cameras, or leave it out to use the rig of the source",
+        )
     if word == "realsense-stereo":
         pairs, rig, close = open_realsense_stereo()
         facts = SourceFacts(name=word)
@@ -90,7 +98,13 @@ def open_camera(
         images = list_pairs(path, rig.left.lens.rate_hz)
         facts = images.facts(rig.left.lens, str(intrinsics or path / "rig.json"), has_depth=False)
         return _open_pair(facts, images.pairs, rig, rate_hz, camera)
+    if isinstance(own, Rig) and own.right is None:
+        own = own.left.lens
     if word == "realsense" or path.suffix == ".bag":
+        if camera == "stereo" or isinstance(own, Rig):
+            raise UsageError(
+                f"{word} is one camera with depth", hint="name realsense-stereo for its two infrared cameras"
+            )
         raw, factory, close = open_realsense(None if word == "realsense" else path)
         lens = own if isinstance(own, Intrinsics) else factory
         facts = _facts_of_lens(word, lens, stated_by)
@@ -117,9 +131,7 @@ def open_camera(
             log=dataset.log,
             span_s=dataset.span_s,
         )
-    # 4. Take a rig of one camera as the lens of that camera, and open the devices or videos of a stereo rig.
-    if isinstance(own, Rig) and own.right is None:
-        own = own.left.lens
+    # 4. Open the devices or videos of a stereo rig.
     if isinstance(own, Rig) and path.is_dir():
         raise UsageError(
             f"{word} has no two folders of images, such as left/ and right/ or image_left/ and image_right/",
@@ -130,8 +142,6 @@ def open_camera(
     # 5. Open one camera: a folder, a video or a device.
     if camera == "stereo":
         raise UsageError(f"{word} is one camera", hint="name a rig: --intrinsics rig.json")
-    if imu:
-        raise UsageError(f"{word} has no IMU", hint="leave out --imu")
     if path.is_dir():
         if own is None:
             file = path / "intrinsics.json"
@@ -181,7 +191,7 @@ def _open_single(
     Raises:
         UsageError: Two facts contradict each other; nothing was read then.
     """
-    log = DoubtLog(check_source(facts))
+    log = _check(facts, close)
     info = SourceInfo(
         name=facts.name,
         camera=lens.camera,
@@ -191,6 +201,20 @@ def _open_single(
         span_s=span_s or facts.span_s,
     )
     return RawSource(info, frames(log), lens, rate_hz=rate_hz, close=close)
+
+
+def _check(facts: SourceFacts, close: Callable[[], None] | None) -> DoubtLog:
+    """Return the doubts about a source; *close* it where its facts contradict each other.
+
+    Raises:
+        UsageError: Two facts contradict each other.
+    """
+    try:
+        return DoubtLog(check_source(facts))
+    except UsageError:
+        if close is not None:
+            close()
+        raise
 
 
 def _facts_of_lens(name: str, lens: Intrinsics, stated_by: str) -> SourceFacts:
@@ -286,7 +310,7 @@ def _open_pair(
         )
     right = rig.left if rig.right is None else rig.right
     right_facts = _facts_of_lens(facts.name, right.lens, f"the right camera of {facts.name}").cameras
-    log = DoubtLog(check_source(replace(facts, cameras=(*facts.cameras, *right_facts))))
+    log = _check(replace(facts, cameras=(*facts.cameras, *right_facts)), close)
     info = SourceInfo(
         name=facts.name,
         camera=rig.left.lens.camera,

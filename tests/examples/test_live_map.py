@@ -72,7 +72,7 @@ async def keyframes_of(platform: ExamplePlatform, robot: str, name: str) -> int:
     file = platform.folder / f"{robot}.enrolment"
     async with connect(enrolment=file) as connected, connected.live_map(name) as mapper:
         end = time.monotonic() + 20.0
-        while not mapper.owner:
+        while not mapper.map_server:
             assert time.monotonic() < end, mapper.trouble
             await asyncio.sleep(0.05)
         answer = await connected.call("live-show", {"map": name}, keep=True)

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import importlib
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -98,3 +101,44 @@ def test_images_of_another_size_are_one_line(tmp_path: Path) -> None:
     cv2.imwrite(str(folder / "left" / "0.png"), np.zeros((48, 48), np.uint8))
     with pytest.raises(UsageError, match=r"images of 48x48 px, .*rig.json is for 64x48 px"):
         open_camera(folder)
+
+
+@pytest.mark.parametrize(
+    ("source", "options", "says"),
+    [
+        ("pair", {"intrinsics": RIG.left.lens}, "is a stereo pair, and the intrinsics of"),
+        ("pair", {"imu": True}, "has no IMU"),
+        ("colours", {"imu": True}, "has no IMU"),
+        ("realsense", {"imu": True}, "realsense has no IMU"),
+        ("realsense", {"camera": "stereo"}, "realsense is one camera with depth"),
+        ("realsense", {"intrinsics": RIG}, "realsense is one camera with depth"),
+        ("realsense-stereo", {"intrinsics": RIG.left.lens}, "realsense-stereo is a stereo pair"),
+    ],
+)
+def test_what_a_source_cannot_give_or_use_is_refused(
+    tmp_path: Path, source: str, options: dict[str, Any], says: str
+) -> None:
+    (tmp_path / "pair").mkdir()
+    images(tmp_path / "pair")
+    place = source if source.startswith("realsense") else tmp_path / source.replace("colours", "pair/left")
+
+    with pytest.raises(UsageError, match=says) as refused:
+        open_camera(place, **options)
+
+    assert refused.value.hint
+
+
+def test_a_source_whose_facts_contradict_each_other_is_closed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    closed: list[str] = []
+    module = importlib.import_module("client_sdk.cameras.open_camera")
+    opened = module.open_video(str(video(tmp_path / "both.avi", [100, 200])))
+    monkeypatch.setattr(module, "open_video", lambda name: replace(opened, close=lambda: closed.append(name)))
+    narrow = Intrinsics(camera=Camera(fx=6000.0, fy=6000.0, cx=31.5, cy=23.5, width=64, height=48))
+    rig = Rig(cameras=tuple(replace(camera, lens=narrow) for camera in RIG.cameras))
+
+    with pytest.raises(UsageError, match="field of view"):
+        open_camera(tmp_path / "both.avi", intrinsics=rig)
+
+    assert closed == [str(tmp_path / "both.avi")]

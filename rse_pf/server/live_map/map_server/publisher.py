@@ -64,6 +64,11 @@ _MAX_COMMIT_TRIES = 5
 """Largest number of tries to commit a version; a try fails if another process moves the head of the map."""
 
 
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class _Request:
+    note: str
+
+
 class Publisher:
     """Publishes versions of one live map; all methods are called in the event loop."""
 
@@ -88,7 +93,7 @@ class Publisher:
         self._published_changes: int | None = None  # MapState.changes at the last publication
         self._last_record: MapRecord | None = None
         self._next_allowed_s: float | None = None  # None: the registry was not read yet
-        self._due_note = ""  # note of the last request
+        self._due_request: _Request | None = None  # the last request, until a version is published after it
         self.has_failed = False
         """Whether the last try to publish the due version failed; the version stays due."""
         self._retry_s = _FIRST_RETRY_S
@@ -96,8 +101,8 @@ class Publisher:
 
     @property
     def is_due(self) -> bool:
-        """Whether `request` was called at any time and the map has changed since this object published it."""
-        return bool(self._due_note) and self._is_changed
+        """Whether `request` was called since the last version, and the map has changed since then."""
+        return self._due_request is not None and self._is_changed
 
     async def publish(self, note: str, freed_bytes: int = 0) -> MapRecord:
         """Publish the map and return the record of the version.
@@ -136,14 +141,11 @@ class Publisher:
             return await self._publish(note, freed_bytes)
 
     def request(self, note: str) -> None:
-        """Let `publish_due` publish the map, with this *note*, if the map has changed.
-
-        A request holds until the next one replaces its note: each change after a version makes another one
-        due.
-        """
+        """Let `publish_due` publish the map once, with this *note*, if the map has changed."""
         if not self.is_due:
             self.has_failed = False
-        self._due_note = note
+        if self._is_changed:
+            self._due_request = _Request(note)
 
     async def publish_due(self) -> None:
         """Publish the due version if ``live.publish_pause_s`` has passed since the last version.
@@ -166,8 +168,8 @@ class Publisher:
             return
         try:
             async with self._lock:
-                if self._is_changed:
-                    await self._publish(self._due_note)
+                if self._due_request is not None and self._is_changed:
+                    await self._publish(self._due_request.note)
         except RsePfError as error:
             self._environment.log.warning("live-publish-failed", map=self._map_name, error=error.message)
             self.has_failed = True
@@ -180,7 +182,7 @@ class Publisher:
 
     async def _publish(self, note: str, freed_bytes: int = 0) -> MapRecord:
         environment, background = self._environment, self._threads.background
-        changes = self._state.changes
+        changes, due_request = self._state.changes, self._due_request
         # 1. Make the version: keyframes, point cloud, and the up direction.
         version = await self._make_version()
         version = await background(functools.partial(self._add_source_up, version))
@@ -191,6 +193,8 @@ class Publisher:
         record = await background(commit)
         self._next_allowed_s = self._clock() + self._min_interval_s
         self._published_changes, self._last_record = changes, record
+        if self._due_request is due_request:  # else the map was requested again after the version was made
+            self._due_request = None
         self.has_failed, self._retry_s = False, _FIRST_RETRY_S
         environment.log.info("live-map-published", map=self._map_name, id=record.id, number=record.number)
         # 3. Remove old automatic versions.

@@ -33,6 +33,19 @@ async def test_robots_that_leave_again_and_again_publish_one_version_in_an_inter
     assert len(maps.versions(MAP)) == 2, "nothing has changed"
 
 
+async def test_a_map_that_changes_all_the_time_is_published_each_ten_minutes():
+    bench = Bench(keep_versions=0)
+
+    server = await bench.start("a")
+    server.map_server.users = 1
+    maps = MapRegistry(bench.store, "default")
+    for number in range(60):
+        await server.keyframe(number)
+        await bench.clock.advance(30.0)
+
+    assert 2 <= len(maps.versions(MAP)) <= 4, "of half an hour"
+
+
 async def test_who_asks_for_a_version_waits_for_the_interval_and_all_who_ask_get_the_same_one():
     bench = Bench(publish_pause_s=5.0)
 
