@@ -47,7 +47,7 @@ echo "sanitize: Python tests"
   tests/pnp/test_depth_refinement.py \
   tests/pnp/test_depth_refinement_oracle.py tests/slam/test_descriptors.py tests/slam/test_orb.py \
   tests/slam/test_stereo.py tests/slam/test_tracking.py tests/client_sdk/test_frontend.py \
-  tests/client_sdk/test_mapping.py tests/client_sdk/check/test_figures.py tests/hostile/test_geometry.py
+  tests/client_sdk/test_point_map.py tests/client_sdk/check/test_figures.py tests/hostile/test_geometry.py
 for target in geometry match depth describe track stereo; do
   echo "sanitize: fuzz $target for $seconds s"
   "$python" -m fuzz "$target" --engine hypothesis --seconds "$seconds"
