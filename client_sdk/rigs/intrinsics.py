@@ -55,8 +55,9 @@ _DEFAULT_DEPTH_SCALE = 1000.0  # units in a metre where nobody stated them: most
 _PERSPECTIVE_NAMES = {"pinhole", "perspective", "simple_pinhole", "none", ""}
 """Values of a field for the lens model that name a perspective projection, in lower case: the distortion is
 then radial-tangential, as in files of COLMAP, Kalibr and EuRoC."""
-_PROJECTION_ONLY_NAMES = {"pinhole", "perspective", ""}
-"""Values of ``camera_model`` that say nothing of the distortion, which another field may state."""
+_UNSPECIFIC_NAMES = {"pinhole", "perspective", "none", ""}
+"""Values of ``camera_model`` that say nothing of the distortion, and of ``distortion_model`` that say nothing
+of the projection, in lower case: another field may state the lens model."""
 _FIELD_ALIASES = {
     **dict.fromkeys(("w", "image_width"), "width"),
     **dict.fromkeys(("h", "image_height"), "height"),
@@ -257,11 +258,11 @@ def parse_lens_model(stated: Any) -> str:
 def _replace_field_aliases(values: Any) -> dict[str, Any]:
     """Return the fields of a file by the names of ``intrinsics.json``.
 
-    Of several fields for the lens model, the last one counts that says more than that the projection is
-    perspective.
+    A field for the lens model that says only that the projection is perspective, or that there is no
+    distortion, is left out.
 
     Raises:
-        UsageError: A field is not known, or two names of another field state different values.
+        UsageError: A field is not known, or two names of one field state different values.
     """
     fields: dict[str, Any] = {}
     for alias, value in values.items():
@@ -271,12 +272,15 @@ def _replace_field_aliases(values: Any) -> dict[str, Any]:
                 f"the field {alias!r} is not known",
                 hint=did_you_mean(alias, sorted(_FIELDS), INTRINSICS_HINT),
             )
-        if name in fields and fields[name] != value and name != "model":
+        if name == "model":
+            if str(value).lower() in _UNSPECIFIC_NAMES:
+                continue
+            value = parse_lens_model(value)
+        if name in fields and fields[name] != value:
             raise UsageError(
                 f"{name} is {fields[name]} and, as {alias}, {value}", hint=f"give {name} once, as {name}"
             )
-        if name != "model" or str(value).lower() not in _PROJECTION_ONLY_NAMES:
-            fields[name] = value
+        fields[name] = value
     return fields
 
 

@@ -1,7 +1,7 @@
 """The lens model: a camera with the distortion of its lens, and the table of all models.
 
 This module alone calls the distortion functions of OpenCV, and alone knows which of them belong to a model.
-All other code holds a `Lens` and asks it.  To add a camera model, add an entry to `LENS_MODELS`.  OpenCV is
+All other code holds a `Lens` and asks it.  To add a camera model, add an entry to `_MODELS`.  OpenCV is
 imported when a function needs it, so that a robot without OpenCV can still hold a `Lens`.
 """
 
