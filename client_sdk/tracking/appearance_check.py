@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from client_sdk.frontend import Frame
-from client_sdk.tracking.landmarks import Landmarks
+from client_sdk.tracking.keyframe_map import KeyframeMap
 from rse_pf.geometry import Array, inverse, transform
 from rse_pf.slam.descriptors import distances_of_pairs
 from rse_pf.slam.orb import describe_at
@@ -32,25 +32,24 @@ _MIN_SIMILAR_SHARE = 0.25
 
 
 def has_predicted_appearance(
-    frame: Frame, landmarks: Landmarks, T_world_camera: Array, min_landmarks: int
+    frame: Frame, segment_map: KeyframeMap, T_world_camera: Array, min_landmarks: int
 ) -> bool:
     """Return whether enough of the landmarks that a pose predicts look as predicted in the frame's image.
 
     Args:
         frame: Image with its depth; landmarks that something nearer hides are left out.  Where the depth is
             0, as everywhere in a stereo pair, no landmark counts as hidden.
-        landmarks: Landmarks around the place, with ORB descriptors.
-        T_world_camera: ``(4, 4)``, the pose to check, in the world of the landmarks.
+        segment_map: Map of the place, whose landmarks have ORB descriptors.
+        T_world_camera: ``(4, 4)``, the pose to check, in the world of the map.
         min_landmarks: Fewest landmarks that must be compared; with fewer the answer is False.
     """
     # 1. Predict the landmarks, and leave out those that are hidden.
     T_camera_world = inverse(T_world_camera)
-    rows, predicted = predict_features(
-        landmarks.appearance, np.arange(len(landmarks)), T_camera_world, frame.camera, -_EDGE_PX
-    )
+    landmarks, numbers = segment_map.landmarks_around(T_world_camera)
+    rows, predicted = predict_features(landmarks, numbers, T_camera_world, frame.camera, -_EDGE_PX)
     columns, lines = np.rint(predicted.pixels).astype(np.int64).T
     measured_m = frame.depth_m[lines, columns]
-    depths_m = transform(T_camera_world, landmarks.points[rows])[:, 2]
+    depths_m = transform(T_camera_world, landmarks.points[numbers[rows]])[:, 2]
     visible = np.flatnonzero((measured_m <= 0.0) | (measured_m > _HIDDEN_DEPTH_SHARE * depths_m))
     if len(visible) > _MAX_LANDMARKS:
         visible = visible[np.linspace(0, len(visible) - 1, _MAX_LANDMARKS).astype(np.int64)]

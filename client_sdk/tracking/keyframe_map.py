@@ -7,24 +7,38 @@ are fused by their covariances.  A keyframe keeps its pose in the map: there is 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 import numpy.typing as npt
 
 from client_sdk.stereo.depth import with_offset
-from client_sdk.tracking.landmarks import NO_LANDMARK, Landmarks, Matches, shift_landmarks
-from client_sdk.tracking.place_recognition import LazyPlaceVector
+from client_sdk.tracking.landmark_matching import (
+    NO_LANDMARK,
+    Landmarks,
+    LazyPlaceVector,
+    Matches,
+    shift_landmarks,
+)
 from rse_pf.geometry import Array, Camera, inverse, transform
 from rse_pf.maps.descriptors import Descriptors
 from rse_pf.pnp import DepthNoise
-from rse_pf.slam.tracking import GuidedMatchLimits, ImageFeatures, match_landmarks
+from rse_pf.slam.descriptors import match_all
+from rse_pf.slam.tracking import (
+    GuidedMatchLimits,
+    ImageFeatures,
+    LandmarkAppearance,
+    Observations,
+    match_landmarks,
+)
 
-__all__ = ["PIXEL_SIGMA_PX", "KeyframeMap", "View", "depths_for_noise", "measure_points"]
+__all__ = ["KeyframeMap", "PosedView", "View", "depths_for_noise", "measure_points", "observe_landmarks"]
 
 Rows = npt.NDArray[np.int64]
 
-PIXEL_SIGMA_PX = 1.0
+_LOCAL_KEYFRAMES = 6
+"""Number of keyframes nearest to a pose whose landmarks are matched with an image there."""
+_PIXEL_SIGMA_PX = 1.0
 """Standard deviation, in pixels, of a feature's position on the finest pyramid level; it grows with the size
 of the feature."""
 _INITIAL_CAPACITY = 4096
@@ -59,6 +73,33 @@ class View:
     place_vector: LazyPlaceVector
     is_stereo: bool = False
     timestamp_s: float = 0.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PosedView:
+    """An image with its verified pose.
+
+    Attributes:
+        view: The image.
+        T_world_camera: ``(4, 4)``.
+        landmarks: ``(n,)``, number of the landmark that each feature shows, or NO_LANDMARK; only features
+            that agree with the pose have one.
+        inliers: Number of features that agree with the pose; 0 for the first frame of a segment.
+        matches: Number of matches of the query or of the verification, whichever is larger; 0 for the first
+            frame of a segment.
+        is_weak: Whether the solver calls the pose weak; the image then changes no landmark, and never becomes
+            a keyframe.
+        rotation_rate: ``(3,)`` rad/s in the camera's frame, mean rate since the camera's last pose; zeros
+            unless the camera moved there from its last pose.
+    """
+
+    view: View
+    T_world_camera: Array
+    landmarks: Rows
+    inliers: int
+    matches: int
+    is_weak: bool
+    rotation_rate: Array = field(default_factory=lambda: np.zeros(3))
 
 
 def depths_for_noise(measured_m: Array, expected_m: Array) -> Array:
@@ -99,11 +140,38 @@ def measure_points(
     rays = points / z[:, None]
     depth_variance = noise.variance_m2(z if expected_m is None else depths_for_noise(z, expected_m))
     covariances = rays[:, :, None] * rays[:, None, :] * depth_variance[:, None, None]
-    pixel_variance = (PIXEL_SIGMA_PX * view.features.sizes[rows]) ** 2
+    pixel_variance = (_PIXEL_SIGMA_PX * view.features.sizes[rows]) ** 2
     covariances[:, 0, 0] += pixel_variance * (z / camera.fx) ** 2
     covariances[:, 1, 1] += pixel_variance * (z / camera.fy) ** 2
     rotation = T_world_camera[:3, :3]
     return transform(T_world_camera, points), rotation @ covariances @ rotation.T
+
+
+def observe_landmarks(view: View, matches: Matches, T_world_camera: Array, noise: DepthNoise) -> Observations:
+    """Return what an image measured of matched landmarks, with the noise of each measurement.
+
+    The depth is 0 where there is none.
+
+    Args:
+        view: The image.
+        matches: Landmarks that it shows.
+        T_world_camera: ``(4, 4)``, its approximate pose; used for stereo pairs only, whose noise is evaluated
+            between the measured depth and the one that this pose predicts.
+        noise: Noise model of the depths.
+    """
+    depths_m = np.nan_to_num(view.points_camera[matches.features, 2], posinf=0.0, neginf=0.0)
+    noise_depths_m = depths_m
+    if view.is_stereo:
+        expected_m = transform(inverse(T_world_camera), matches.points)[:, 2]
+        noise_depths_m = depths_for_noise(depths_m, expected_m)
+    return Observations(
+        points=matches.points,
+        covariances=matches.covariances,
+        pixels=view.features.pixels[matches.features],
+        pixel_sigmas_px=_PIXEL_SIGMA_PX * view.features.sizes[matches.features],
+        depths_m=depths_m,
+        depth_sigmas_m=np.sqrt(noise.variance_m2(noise_depths_m)),
+    )
 
 
 class KeyframeMap:
@@ -192,74 +260,92 @@ class KeyframeMap:
         cosines = (np.einsum("nij,ij->n", self._poses[:, :3, :3], T_world_camera[:3, :3]) - 1.0) / 2.0
         return metres, np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0)))
 
-    def nearest(self, T_world_camera: Array, count: int) -> list[int]:
-        """Return the *count* keyframes with the nearest poses, nearest first, and the newest one.
-
-        The newest keyframe comes last, if it is not among the nearest.  The distance of a pose is that in
-        metres plus that in degrees divided by 30.
-        """
-        metres, degrees = self.distances(T_world_camera)
-        nearest: list[int] = np.argsort(metres + degrees / _DEG_PER_M, kind="stable")[:count].tolist()
-        newest = len(self._views) - 1
-        return nearest if newest in nearest else [*nearest, newest]
-
     def rank_by_similarity(self, place: LazyPlaceVector, count: int) -> list[int]:
         """Return the *count* keyframes whose place vectors are most similar to an image's, best first."""
         ranked: list[int] = np.argsort(-(self._place_vectors @ place.get()), kind="stable").tolist()
         return ranked[:count]
 
-    def landmarks(self, numbers: Rows) -> Landmarks:
-        """Return landmarks by their numbers."""
-        return self._table.select(numbers)
+    def matched(self, numbers: Rows, features: Rows) -> Matches:
+        """Return landmarks by their numbers as those that *features*, rows of an image's features, show."""
+        return self._table.matched(numbers, features)
 
-    def landmarks_seen_by(self, keyframes: list[int]) -> Landmarks:
-        """Return the landmarks that at least one of the keyframes sees."""
-        return self.landmarks(self._numbers_seen_by(keyframes))
+    def landmarks_in(self, keyframe: int) -> tuple[Rows, Descriptors]:
+        """Return the numbers of the landmarks that a keyframe sees, and their descriptors in it."""
+        seen = self._seen[keyframe]
+        rows = np.flatnonzero(seen != NO_LANDMARK)
+        return seen[rows], self._views[keyframe].features.descriptors[rows]
+
+    def landmarks_around(self, T_world_camera: Array) -> tuple[LandmarkAppearance, Rows]:
+        """Return the appearance of all landmarks, and the ascending numbers of those around a pose.
+
+        These are the landmarks that at least one of the six keyframes with the nearest poses, or the newest
+        keyframe, sees.  The distance of a pose is that in metres plus that in degrees divided by 30.
+        """
+        metres, degrees = self.distances(T_world_camera)
+        nearest = np.argsort(metres + degrees / _DEG_PER_M, kind="stable")[:_LOCAL_KEYFRAMES]
+        is_seen = np.zeros(self._count + 1, dtype=bool)  # the last row is that of NO_LANDMARK
+        for keyframe in (*nearest, -1):
+            is_seen[self._seen[keyframe]] = True
+        return self._table.first(self._count).appearance, np.flatnonzero(is_seen[:-1])
 
     def match(
         self,
-        keyframes: list[int],
-        T_camera_world: Array,
         view: View,
+        T_world_camera: Array,
         limits: GuidedMatchLimits,
-        margin_px: float,
+        last: PosedView | None,
+        noise: DepthNoise,
+        enough: float = np.inf,
     ) -> Matches:
-        """Match the landmarks of keyframes with an image near the pixels at which a pose predicts them.
+        """Match the landmarks around a pose, and those of the last frame, with an image near their pixels.
+
+        Where a feature or a landmark has a match of both kinds, that with the last frame is taken.
+        Landmarks are also predicted in a border around the image as wide as the radius of the limits.
 
         Args:
-            keyframes: Numbers of keyframes; landmarks that at least one of them sees are matched.
-            T_camera_world: ``(4, 4)``, the predicted pose of the image.
             view: The image.
+            T_world_camera: ``(4, 4)``, its predicted pose.
             limits: Conditions of a match.
-            margin_px: Width of the border around the image in which landmarks are predicted, too.
+            last: The last frame; None to match with the landmarks around the pose only.
+            noise: Noise model of the depths, for points of the last frame that are in no map.
+            enough: If the landmarks around the pose give this many matches, the last frame is left out.
         """
-        numbers = self._numbers_seen_by(keyframes)
-        appearance = self._table.select(slice(self._count)).appearance
+        # 1. Match the landmarks that the nearest keyframes see.
+        T_camera_world, radius_px = inverse(T_world_camera), limits.radius_px
+        appearance, numbers = self.landmarks_around(T_world_camera)
         rows, features = match_landmarks(
-            appearance, numbers, T_camera_world, view.camera, view.features, limits, margin_px
+            appearance, numbers, T_camera_world, view.camera, view.features, limits, radius_px
         )
-        return Matches(landmarks=self.landmarks(numbers[rows]), features=features)
+        if last is None or len(rows) >= enough:
+            return self.matched(numbers[rows], features)
+        # 2. Match the landmarks and other points that the last frame shows.
+        recent = self.landmarks_of_view(last, noise).match(
+            T_camera_world, view.camera, view.features, limits, radius_px
+        )
+        # 3. Add those of the first matches that share no feature and no landmark with the second ones.
+        is_free_feature = np.ones(len(view.features), bool)
+        is_free_landmark = np.ones(self._count + 1, bool)  # the last row is that of NO_LANDMARK
+        is_free_feature[recent.features] = False
+        is_free_landmark[recent.numbers] = False
+        free = np.flatnonzero(is_free_feature[features] & is_free_landmark[numbers[rows]])
+        return self.matched(numbers[rows[free]], features[free]).followed_by(recent)
 
-    def landmarks_in(self, keyframe: int) -> tuple[Landmarks, Descriptors]:
-        """Return the landmarks that a keyframe sees, and their descriptors in that keyframe."""
-        seen = self._seen[keyframe]
-        rows = np.flatnonzero(seen != NO_LANDMARK)
-        return self.landmarks(seen[rows]), self._views[keyframe].features.descriptors[rows]
+    def match_last_frame(self, view: View, last: PosedView, noise: DepthNoise) -> Matches:
+        """Match all landmarks and other points of the last frame with an image by their descriptors alone."""
+        recent = self.landmarks_of_view(last, noise)
+        return recent.matched(*match_all(recent.descriptors, view.features.descriptors))
 
-    def landmarks_of_view(
-        self, view: View, T_world_camera: Array, landmarks: Rows, noise: DepthNoise
-    ) -> Landmarks:
+    def landmarks_of_view(self, posed: PosedView, noise: DepthNoise) -> Landmarks:
         """Return the landmarks of an image, and its other features with depth as landmarks of no map.
 
         Landmarks of the map have their fused points, the others the points that this image measured, and the
         number NO_LANDMARK.  The appearance of all is that in this image.  The map is not changed.
 
         Args:
-            view: The image, which need not be a keyframe.
-            T_world_camera: ``(4, 4)``, its pose.
-            landmarks: ``(n,)``, landmark of each feature, or NO_LANDMARK.
+            posed: The image with its pose, which need not be a keyframe.
             noise: Noise model of the depths.
         """
+        view, T_world_camera, landmarks = posed.view, posed.T_world_camera, posed.landmarks
         rows = np.flatnonzero((landmarks != NO_LANDMARK) | np.isfinite(view.points_camera[:, 2]))
         numbers = landmarks[rows]
         new = np.flatnonzero(numbers == NO_LANDMARK)
@@ -311,7 +397,7 @@ class KeyframeMap:
 
     def move(self, T_new_old: Array) -> None:
         """Express the whole map in another world frame, by the ``(4, 4)`` rigid motion *T_new_old*."""
-        rotation, table = T_new_old[:3, :3], self._table.select(slice(self._count))
+        rotation, table = T_new_old[:3, :3], self._table.first(self._count)
         self._poses = T_new_old @ self._poses
         table.points[:] = transform(T_new_old, table.points)
         table.covariances[:] = rotation @ table.covariances @ rotation.T
@@ -332,7 +418,7 @@ class KeyframeMap:
         for keyframe, seen in enumerate(self._seen):
             newest_keyframe[seen[seen != NO_LANDMARK]] = keyframe
         old, new = self._poses[newest_keyframe, :3], T_world_camera[newest_keyframe, :3]
-        table = self._table.select(slice(self._count))
+        table = self._table.first(self._count)
         # 1. Express each landmark in the old frame of its keyframe, and move it along its ray by the offset.
         local = np.einsum("nji,nj->ni", old[:, :, :3], table.points - old[:, :, 3])
         moved = with_offset(local, f_baseline, offset_px)
@@ -366,13 +452,6 @@ class KeyframeMap:
         for own, others in zip(_columns(self._table), _columns(other._table), strict=True):
             own[first : self._count] = others[: other._count]
         return first
-
-    def _numbers_seen_by(self, keyframes: list[int]) -> Rows:
-        """Return the ascending numbers of the landmarks that at least one of the keyframes sees."""
-        is_seen = np.zeros(self._count + 1, dtype=bool)  # the last row is that of NO_LANDMARK
-        for keyframe in keyframes:
-            is_seen[self._seen[keyframe]] = True
-        return np.flatnonzero(is_seen[:-1])
 
     def _update_appearance(self, numbers: Rows, view: View, T_world_camera: Array, rows: Rows) -> None:
         """Set descriptor, ray, orientation and size of landmarks to those in an image.

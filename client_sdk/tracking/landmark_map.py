@@ -12,8 +12,13 @@ import numpy as np
 import numpy.typing as npt
 
 from client_sdk.monocular.bundle import Adjuster, Bundle, adjust
-from client_sdk.tracking.landmarks import NO_LANDMARK, Landmarks, Matches, shift_landmarks
-from client_sdk.tracking.place_recognition import LazyPlaceVector
+from client_sdk.tracking.landmark_matching import (
+    NO_LANDMARK,
+    Landmarks,
+    LazyPlaceVector,
+    Matches,
+    shift_landmarks,
+)
 from rse_pf.geometry import Array, Camera, exp_se3, inverse, log_se3, scaled, transform
 from rse_pf.maps.descriptors import Descriptors
 from rse_pf.slam.tracking import GuidedMatchLimits, ImageFeatures
@@ -265,11 +270,24 @@ class LandmarkMap:
             numbers=numbers,
         )
 
-    def landmarks_in(self, keyframe: int) -> tuple[Landmarks, Descriptors]:
-        """Return the landmarks that a keyframe sees, and their descriptors in that keyframe."""
+    def matched(self, numbers: Rows, features: Rows) -> Matches:
+        """Return landmarks by their numbers as those that *features*, rows of an image's features, show.
+
+        Their covariances are 0.
+        """
+        return Matches(
+            features=features,
+            numbers=numbers,
+            points=self.points[numbers],
+            covariances=np.zeros((len(numbers), 3, 3)),
+            shutter_displacements=np.zeros((len(numbers), 3)),
+        )
+
+    def landmarks_in(self, keyframe: int) -> tuple[Rows, Descriptors]:
+        """Return the numbers of the landmarks that a keyframe sees, and their descriptors in it."""
         record = self.keyframes[keyframe]
         rows = np.flatnonzero(record.landmarks != NO_LANDMARK)
-        return self.landmarks(record.landmarks[rows]), record.view.features.descriptors[rows]
+        return record.landmarks[rows], record.view.features.descriptors[rows]
 
     def local_keyframes(self, number: int) -> list[int]:
         """Return a keyframe, and its neighbours in the order of how many landmarks they share with it."""
@@ -403,7 +421,7 @@ class LandmarkMap:
         """
         keyframe = self.keyframes[number]
         matches = self._match_projected(keyframe, landmarks, radius_px)
-        matched, existing = matches.landmarks.numbers, keyframe.landmarks[matches.features]
+        matched, existing = matches.numbers, keyframe.landmarks[matches.features]
         is_free = existing == NO_LANDMARK
         keyframe.landmarks[matches.features[is_free]] = matched[is_free]
         # 1. Replace each duplicate by the matched landmark in all keyframes.
@@ -434,7 +452,7 @@ class LandmarkMap:
         keyframe = self.keyframes[number]
         matches = self._match_projected(keyframe, landmarks, _OBSERVE_RADIUS_PX)
         is_free = keyframe.landmarks[matches.features] == NO_LANDMARK
-        keyframe.landmarks[matches.features[is_free]] = matches.landmarks.numbers[is_free]
+        keyframe.landmarks[matches.features[is_free]] = matches.numbers[is_free]
 
     def _triangulate(self, number: int, neighbour: int, depths: Array) -> None:
         """Match the features without a landmark of a keyframe and its neighbour, and add their points.
@@ -507,7 +525,7 @@ class LandmarkMap:
             one.T_camera_world, self.camera, one.view.features, limits, self.limits.search_px
         )
         is_free = one.landmarks[matches.features] == NO_LANDMARK
-        return matches.features[is_free], matches.landmarks.numbers[is_free]
+        return matches.features[is_free], matches.numbers[is_free]
 
     def _neighbours(self, number: int) -> list[int]:
         """Return the keyframes that share at least `MIN_SHARED_LANDMARKS` with one, most first.

@@ -8,13 +8,14 @@ import numpy as np
 import numpy.typing as npt
 
 from client_sdk.tracking.landmark_map import LandmarkMap, MonocularView
-from client_sdk.tracking.landmarks import NO_LANDMARK, Matches
+from client_sdk.tracking.landmark_matching import NO_LANDMARK, Matches
 from client_sdk.trajectory import Trajectory
 from rse_pf.geometry import Array, inverse, pose_difference, rigid, scaled, transform
 from rse_pf.maps.descriptors import DescriptorKind
+from rse_pf.slam.descriptors import match_all
 from rse_pf.slam.tracking import GuidedMatchLimits, ImageFeatures, Observations, fit_pose
 
-__all__ = ["AdjustedKeyframe", "MonocularSegment", "PosedView", "Similarity"]
+__all__ = ["AdjustedKeyframe", "MonocularSegment", "PosedView", "Similarity", "measure_scale"]
 
 Rows = npt.NDArray[np.int64]
 
@@ -30,6 +31,9 @@ _AGREEMENT_DEG = 4.0
 """Largest rotation, in degrees, between two measurements of one similarity that confirm each other."""
 _AGREEMENT_SCALE_RATIO = 1.1
 """Largest ratio of the scales of two measurements of one similarity that confirm each other."""
+_MAX_SCALE_SPREAD = 0.15
+"""Largest median deviation of the ratios of depths from their median, as a share of it, with which they give
+the scale between two segments."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -134,6 +138,30 @@ class Similarity:
         )
 
 
+def measure_scale(
+    here: PosedView, map_here: LandmarkMap, there: PosedView, map_there: LandmarkMap, min_landmarks: int
+) -> float | None:
+    """Return the factor that turns lengths of one map into lengths of another one.
+
+    The factor is the median ratio of the depths of features that have a landmark in both maps.
+
+    Args:
+        here: An image with its pose in the first map.
+        map_here: The first map.
+        there: The same image with its pose in the other map.
+        map_there: The other map.
+        min_landmarks: Fewest such features; None is returned with fewer, and if their ratios differ too much.
+    """
+    both = np.flatnonzero((here.landmarks != NO_LANDMARK) & (there.landmarks != NO_LANDMARK))
+    depths_here = transform(here.T_camera_world, map_here.points[here.landmarks[both]])[:, 2]
+    depths_there = transform(there.T_camera_world, map_there.points[there.landmarks[both]])[:, 2]
+    ratios = depths_there / depths_here
+    if len(both) < min_landmarks:
+        return None
+    scale = float(np.median(ratios))
+    return scale if np.median(np.abs(ratios - scale)) <= _MAX_SCALE_SPREAD * scale else None
+
+
 @dataclass(slots=True, kw_only=True, eq=False)
 class MonocularSegment:
     """One segment of a drive.
@@ -198,6 +226,13 @@ class MonocularSegment:
             T_camera_world, self.map.camera, view.features, limits, limits.radius_px
         )
 
+    def match_last_frame(self, view: MonocularView, last: PosedView) -> Matches:
+        """Match the landmarks of the last frame that still exist with an image by their descriptors alone."""
+        rows = np.flatnonzero(last.landmarks != NO_LANDMARK)
+        rows = rows[self.map.is_alive[last.landmarks[rows]]]
+        seen_again, features = match_all(last.view.features.descriptors[rows], view.features.descriptors)
+        return self.map.matched(last.landmarks[rows[seen_again]], features)
+
     def fit(
         self,
         view: MonocularView,
@@ -225,8 +260,8 @@ class MonocularSegment:
             if count < min_inliers:
                 return None
             observed = Observations(
-                points=matches.landmarks.points,
-                covariances=matches.landmarks.covariances,
+                points=matches.points,
+                covariances=matches.covariances,
                 pixels=view.features.pixels[matches.features],
                 pixel_sigmas_px=limits.pixel_sigma * view.features.sizes[matches.features],
                 depths_m=np.zeros(count),
@@ -241,7 +276,7 @@ class MonocularSegment:
             T_camera_world, is_inlier = pose, fitted.is_inlier
         inliers = np.flatnonzero(is_inlier)
         landmarks = np.full(len(view.features), NO_LANDMARK)
-        landmarks[matches.features[inliers]] = matches.landmarks.numbers[inliers]
+        landmarks[matches.features[inliers]] = matches.numbers[inliers]
         return PosedView(
             view=view, T_camera_world=T_camera_world, landmarks=landmarks, matches=count, is_weak=False
         )

@@ -25,19 +25,22 @@ from client_sdk.tracking.landmark_map import (
     LandmarkMap,
     MonocularView,
 )
-from client_sdk.tracking.landmarks import NO_LANDMARK, Matches, match_by_appearance, shift_landmarks
+from client_sdk.tracking.landmark_matching import (
+    LATEST_KEYFRAMES,
+    NO_LANDMARK,
+    Matches,
+    list_other_segments,
+    list_relocalisation_candidates,
+    make_place_vector,
+    match_candidates,
+    shift_landmarks,
+)
 from client_sdk.tracking.monocular_segment import (
     AdjustedKeyframe,
     MonocularSegment,
     PosedView,
     Similarity,
-)
-from client_sdk.tracking.place_recognition import (
-    LATEST_KEYFRAMES,
-    list_other_segments,
-    list_relocalisation_candidates,
-    make_place_vector,
-    match_candidates,
+    measure_scale,
 )
 from client_sdk.tracking.pose_queries import CLEAR_INLIERS, FrameSteps, OpenQuery, QueryAnswer, make_query
 from client_sdk.tracking.segment_join import NOT_JOINED, Join
@@ -87,9 +90,6 @@ time of a keyframe."""
 _LOOP_AGE_KEYFRAMES = 15
 """Fewest keyframes between the two keyframes of a loop closure, and between two loop closures: nearer
 keyframes are connected by common landmarks anyway."""
-_MAX_SCALE_SPREAD = 0.15
-"""Largest median deviation of the ratios of depths from their median, as a share of it, with which they give
-the scale between two segments."""
 _MERGE_ITERATIONS = 6
 """Iterations of the bundle adjustment of all keyframes after a join, after a loop closure, and at the end of
 a
@@ -419,6 +419,8 @@ class MonocularTracker:
         failed.
         """
         # 1. Predict the pose.
+        last = self._state.last
+        assert last is not None
         reason, search_px, min_inliers = "", self.options.search_px, self.options.min_inliers
         guided = GuidedMatchLimits(radius_px=search_px)
         wide = GuidedMatchLimits(radius_px=_WIDE_SEARCH_FACTOR * search_px)
@@ -427,7 +429,7 @@ class MonocularTracker:
         attempts: tuple[tuple[Callable[[], Matches], Literal["map", "frame"], int], ...] = (
             (lambda: self._present.match(view, T_predicted, guided), "map", guided_matches),
             (lambda: self._present.match(view, T_predicted, wide), "map", guided_matches),
-            (lambda: self._match_last_frame(view), "frame", min_inliers),
+            (lambda: self._present.match_last_frame(view, last), "frame", min_inliers),
         )
         for match, against, min_matches in attempts:
             matches = match()
@@ -455,15 +457,6 @@ class MonocularTracker:
         T_last_next = self._plugins.predict_motion(inverse(state.T_next_last), state.timestamp_s, now_s)
         predicted: Array = inverse(T_last_next) @ state.last.T_camera_world
         return predicted
-
-    def _match_last_frame(self, view: MonocularView) -> Matches:
-        """Match an image by appearance alone with the landmarks of the last frame that still exist."""
-        last, own = self._state.last, self._present.map
-        assert last is not None
-        rows = np.flatnonzero(last.landmarks != NO_LANDMARK)
-        rows = rows[own.is_alive[last.landmarks[rows]]]
-        landmarks = own.landmarks(last.landmarks[rows])
-        return match_by_appearance(landmarks, last.view.features.descriptors[rows], view.features)
 
     # --- Recognise known places ---
 
@@ -575,7 +568,7 @@ class MonocularTracker:
         if there is None:
             return None
         # 2. Measure the scale by the depths of landmarks in both maps.
-        scale = self._measure_scale(posed, there, segment.map)
+        scale = measure_scale(posed, self._present.map, there, segment.map, self.options.min_inliers)
         if scale is None:
             return None
         # 3. Keep the measurement as the candidate, and compare it with the candidate before it.
@@ -591,23 +584,6 @@ class MonocularTracker:
             return None
         centre, depth = inverse(posed.T_camera_world)[:3, 3], segment.map.median_depth(best.keyframe)
         return measured if previous.agrees_with(measured, centre, depth) else None
-
-    def _measure_scale(self, posed: PosedView, there: PosedView, other_map: LandmarkMap) -> float | None:
-        """Return the factor that turns lengths of the present segment into lengths of another map.
-
-        *posed* and *there* are the same image with its poses in the present segment and in the other map.
-        The factor is the median ratio of the depths of features that have a landmark in both maps; None if
-        these are too few, or their ratios differ too much.
-        """
-        both = np.flatnonzero((posed.landmarks != NO_LANDMARK) & (there.landmarks != NO_LANDMARK))
-        points_here = self._present.map.points[posed.landmarks[both]]
-        points_there = other_map.points[there.landmarks[both]]
-        depths_here = transform(posed.T_camera_world, points_here)[:, 2]
-        ratios = transform(there.T_camera_world, points_there)[:, 2] / depths_here
-        if len(both) < self.options.min_inliers:
-            return None
-        scale = float(np.median(ratios))
-        return scale if np.median(np.abs(ratios - scale)) <= _MAX_SCALE_SPREAD * scale else None
 
     def _join(self, segment: int, similarity: Similarity, keyframe: int) -> None:
         """Move all of *segment*, the newer one, into an older one, which keeps its frame and its unit.

@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 
 from client_sdk.frontend import Correspondences, Frame, PoseQuery, TrackedFrame, round_for_wire
-from client_sdk.tracking.landmarks import Matches
+from client_sdk.tracking.landmark_matching import Matches
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Array, inverse, rigid, transform
 from rse_pf.pnp import DepthNoise
@@ -94,7 +94,7 @@ def make_query(
         rows = np.linspace(0, len(rows) - 1, max_matches).astype(np.int64)
     # From left to right: neighbours share digits, so that the message compresses better.
     rows = rows[np.argsort(image.pixels[matches.features[rows], 0], kind="stable")]
-    features, points = matches.features[rows], matches.landmarks.points[rows]
+    features, points = matches.features[rows], matches.points[rows]
     if T_world_reference is not None:
         points = transform(inverse(T_world_reference), points)
     points, pixels = round_for_wire(points, image.pixels[features])

@@ -15,7 +15,7 @@ import numpy as np
 
 from client_sdk.frontend import Features
 from client_sdk.tracking.keyframe_map import View
-from client_sdk.tracking.landmarks import Matches
+from client_sdk.tracking.landmark_matching import Matches
 from rse_pf.geometry import Array, Camera, log_se3, skew
 from rse_pf.slam.tracking import FittedPose, Observations, fit_readout_change
 
@@ -141,7 +141,7 @@ def measure_readout_change(
     rows = np.flatnonzero(fitted.is_inlier & (observed.depths_m > 0.0))
     if len(rows) < _MIN_LANDMARKS:
         return 0.0, 0.0
-    of_landmarks = matches.landmarks.shutter_displacements[rows] @ fitted.T_camera_world[:3, :3].T
+    of_landmarks = matches.shutter_displacements[rows] @ fitted.T_camera_world[:3, :3].T
     of_image = view.shutter_displacements[matches.features[rows]]
     return fit_readout_change(
         observed.select(rows), of_landmarks - of_image, view.camera, fitted.T_camera_world

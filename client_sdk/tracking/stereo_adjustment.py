@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from client_sdk.tracking.keyframe_map import KeyframeMap, depths_for_noise
-from client_sdk.tracking.landmarks import NO_LANDMARK
+from client_sdk.tracking.landmark_matching import NO_LANDMARK
 from client_sdk.trajectory import Trajectory
 from rse_pf.errors import DegenerateGeometry
 from rse_pf.geometry import Array, inverse

@@ -19,19 +19,15 @@ from client_sdk.plugins import Plugins
 from client_sdk.stereo.depth import with_offset
 from client_sdk.tracking.appearance_check import has_predicted_appearance
 from client_sdk.tracking.depth_noise import NoiseEstimate
-from client_sdk.tracking.keyframe_map import PIXEL_SIGMA_PX, KeyframeMap, View, depths_for_noise
-from client_sdk.tracking.landmarks import (
+from client_sdk.tracking.keyframe_map import KeyframeMap, PosedView, View, observe_landmarks
+from client_sdk.tracking.landmark_matching import (
     NO_LANDMARK,
-    Landmarks,
     Matches,
-    match_by_appearance,
-    shift_landmarks,
-)
-from client_sdk.tracking.place_recognition import (
     list_other_segments,
     list_relocalisation_candidates,
     make_place_vector,
     match_candidates,
+    shift_landmarks,
 )
 from client_sdk.tracking.pose_queries import CLEAR_INLIERS, FrameSteps, OpenQuery, QueryAnswer, make_query
 from client_sdk.tracking.rolling_shutter import (
@@ -42,15 +38,13 @@ from client_sdk.tracking.rolling_shutter import (
 )
 from client_sdk.tracking.segment_join import NOT_JOINED, Join
 from client_sdk.tracking.stereo_adjustment import StereoAdjustment, adjust_stereo
-from rse_pf.geometry import Array, inverse, pose_difference, rigid, transform
-from rse_pf.slam.tracking import GuidedMatchLimits, Observations, fit_pose
+from rse_pf.geometry import Array, inverse, pose_difference, rigid
+from rse_pf.slam.tracking import GuidedMatchLimits, fit_pose
 
 __all__ = ["Tracker"]
 
 Rows = npt.NDArray[np.int64]
 
-_LOCAL_KEYFRAMES = 6
-"""Number of keyframes nearest to a predicted pose whose landmarks are matched with a frame."""
 _GUIDED_MATCHES_FACTOR = 3
 """Fewest matches near the predicted pose for which a pose is queried, as a multiple of ``min_inliers``: with
 fewer the prediction is most likely wrong, and the frame is matched with the last one instead.  Also the
@@ -107,32 +101,6 @@ two to confirm each other."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _PosedView:
-    """An image with its verified pose.
-
-    Attributes:
-        view: The image.
-        T_world_camera: ``(4, 4)``.
-        landmarks: ``(n,)``, number of the landmark that each feature shows, or NO_LANDMARK; only features
-            that agree with the pose have one.
-        inliers: Number of features that agree with the pose; 0 for the first frame of a segment.
-        matches: Number of matches of the query or of the verification, whichever is larger; 0 for the first
-            frame of a segment.
-        is_weak: Whether the solver calls the pose weak; the image then changes no landmark, and never becomes
-            a keyframe.
-        is_continuous: Whether the camera moved there from its last pose, so that its motion is known.
-    """
-
-    view: View
-    T_world_camera: Array
-    landmarks: Rows
-    inliers: int
-    matches: int
-    is_weak: bool
-    is_continuous: bool = False
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _TrackState:
     """What a tracker knows of the camera between two frames.
 
@@ -161,7 +129,7 @@ class _TrackState:
     timestamp_s: float = 0.0
     T_last_next: Array = field(default_factory=lambda: np.eye(4))
     rotation_rate: Array = field(default_factory=lambda: np.zeros(3))
-    last: _PosedView | None = None
+    last: PosedView | None = None
     features: Features | None = None
     first: tuple[Features, View] | None = None
     keyframe_inliers: int = 0
@@ -229,6 +197,8 @@ class Tracker:
         self._pending_readout_s = 0.0
         self._frame: Frame  # the frame that is tracked, set by `prepare`
         self._raw: Features  # its features, with rolling shutter
+        self._interval_s: float  # seconds since the last accepted pose
+        self._raw_view: View  # the frame as it is matched, with rolling shutter
         self._open = OpenQuery()
 
     @property
@@ -326,13 +296,15 @@ class Tracker:
         """
         self._open.refuse_open()
         self.frames += 1
+        self._interval_s = max(_MIN_INTERVAL_S, frame.timestamp_s - self._state.timestamp_s)
         self._frame, self._raw = frame, extract(frame, self.options, self._plugins.features)
         if self.disparity_offset_px and frame.stereo is not None:
             f_baseline = frame.camera.fx * frame.stereo.baseline_m
             points_camera = with_offset(self._raw.points_camera, f_baseline, self.disparity_offset_px)
             self._raw = replace(self._raw, points_camera=points_camera)
         self.noise.model = frame.depth_noise
-        return self._open.begin(self._track(self._make_view(frame, self._raw)))
+        self._raw_view = self._make_view(frame, self._raw)
+        return self._open.begin(self._track())
 
     def accept(
         self, query: PoseQuery, T_camera_world: Array | None, inliers: int = 0, *, is_weak: bool = False
@@ -354,10 +326,10 @@ class Tracker:
 
     # --- The steps of one frame ---
 
-    def _track(self, view: View) -> FrameSteps:
+    def _track(self) -> FrameSteps:
         """Yield the queries of the present frame, and return its result."""
         # 1. Undo the rolling shutter of the extracted features at the last rotation rate.
-        view = self._correct_view(view, self._state.rotation_rate)
+        view = correct_view(self._raw_view, self._raw, self.readout.readout_s, self._state.rotation_rate)
         if not self._segments:
             return self._begin_or_lose(view, match_count=0)
         # 2. Track the frame from the last pose; if that fails, relocalise it at all known places.
@@ -392,32 +364,41 @@ class Tracker:
 
     def _track_from_last_pose(
         self, view: View
-    ) -> Generator[PoseQuery, QueryAnswer, tuple[_PosedView | None, int]]:
+    ) -> Generator[PoseQuery, QueryAnswer, tuple[PosedView | None, int]]:
         """Ask for the pose of a frame around the camera's last pose.
 
         Returned are the image with its verified pose, None if no attempt gives one, and the largest number of
         matches of an attempt.
         """
         # 1. Predict the pose.
-        min_inliers, max_count = self.options.min_inliers, 0
+        last, noise, min_inliers, max_count = self._state.last, self.noise.noise, self.options.min_inliers, 0
         T_predicted, T_last = self._predict_pose(), self._state.T_world_camera
         # 2. Match near the predicted pixels, then with the last frame by appearance, then widely around the
         #    last pose.  An attempt holds the matching function, the reference pose, the source of the
         #    landmarks, the fewest matches of a query, and the smallest inlier ratio of its answer.
+        assert last is not None
+        guided = GuidedMatchLimits(radius_px=self.options.search_px, lowe_ratio=_GUIDED_LOWE_RATIO)
+        wide = GuidedMatchLimits(radius_px=_WIDE_RADIUS_PX, lowe_ratio=_GUIDED_LOWE_RATIO)
         attempts: list[tuple[Callable[[], Matches], Array, Literal["map", "frame"], int, float]] = [
             (
-                lambda: self._match_guided(view, T_predicted, self.options.search_px, _GUIDED_LOWE_RATIO),
+                lambda: self._map.match(view, T_predicted, guided, last, noise),
                 T_predicted,
                 "map",
                 _GUIDED_MATCHES_FACTOR * min_inliers,
                 _GUIDED_RATIO,
             ),
-            (lambda: self._match_last_frame(view), T_last, "frame", min_inliers, _LAST_FRAME_RATIO),
+            (
+                lambda: self._map.match_last_frame(view, last, noise),
+                T_last,
+                "frame",
+                min_inliers,
+                _LAST_FRAME_RATIO,
+            ),
         ]
         if view.is_stereo:
             attempts.append(
                 (
-                    lambda: self._match_guided(view, T_last, _WIDE_RADIUS_PX, _GUIDED_LOWE_RATIO),
+                    lambda: self._map.match(view, T_last, wide, last, noise),
                     T_last,
                     "map",
                     min_inliers,
@@ -431,21 +412,18 @@ class Tracker:
             if count < min_matches:
                 continue
             # 3. Solve the pose by a query; go on only if enough matches agree and the motion is plausible.
-            answer = yield self._make_query(view, matches, T_world_reference, against)
-            T_world_camera = self._read_pose(answer, T_world_reference, count, min_ratio)
+            T_world_camera, answer = yield from self._solve(
+                view, matches, T_world_reference, against, min_ratio
+            )
             if T_world_camera is None or not self._is_plausible(T_world_camera):
                 continue
             # 4. Verify the pose by the landmarks around it.
-            image, is_continuous = self._correct_view_at(view, T_world_camera, is_near=True)
+            is_continuous = self._is_continuous(T_world_camera)
+            image = view if is_continuous else self._raw_view
             posed = self._verify(image, T_world_camera, answer, count, self._map, is_continuous=is_continuous)
             if posed is not None:
                 return posed, max_count
         return None, max_count
-
-    def _match_last_frame(self, view: View) -> Matches:
-        """Match an image by appearance alone with the landmarks and other points of the last frame."""
-        landmarks = self._landmarks_of_last_frame()
-        return match_by_appearance(landmarks, landmarks.descriptors, view.features)
 
     def _predict_pose(self) -> Array:
         """Predict ``T_world_camera`` ``(4, 4)`` of the frame by a user's motion model, if it returns a pose.
@@ -460,49 +438,9 @@ class Tracker:
         T_last_next = self._plugins.predict_motion(state.T_last_next.copy(), state.timestamp_s, now_s)
         return _orthonormalise(state.T_world_camera @ T_last_next)
 
-    def _match_guided(
-        self,
-        view: View,
-        T_world_camera: Array,
-        radius_px: float,
-        lowe_ratio: float,
-        segment_map: KeyframeMap | None = None,
-        enough: float = np.inf,
-    ) -> Matches:
-        """Match landmarks of the nearest keyframes and of the last frame near the pixels of a pose.
-
-        Where a feature or a landmark has a match of both kinds, that with the last frame is taken.  The last
-        frame is left out in the map of another segment, and after a loss.
-
-        Args:
-            view: The image.
-            T_world_camera: ``(4, 4)``, its predicted pose.
-            radius_px: Radius around predicted pixels.
-            lowe_ratio: Lowe's ratio.
-            segment_map: The map; None for that of the present segment.
-            enough: If the keyframes give this many matches, the last frame is left out, too.
-        """
-        state, segment_map = self._state, segment_map or self._map
-        T_camera_world = inverse(T_world_camera)
-        limits = GuidedMatchLimits(radius_px=radius_px, lowe_ratio=lowe_ratio)
-        nearest = segment_map.nearest(T_world_camera, _LOCAL_KEYFRAMES)
-        matches = segment_map.match(nearest, T_camera_world, view, limits, radius_px)
-        is_elsewhere = segment_map is not self._map or state.last is None or state.lost_in_a_row > 0
-        if is_elsewhere or len(matches) >= enough:
-            return matches
-        recent = self._landmarks_of_last_frame().match(
-            T_camera_world, view.camera, view.features, limits, radius_px
-        )
-        return matches.replace_by(recent, len(view.features), segment_map.landmark_count)
-
-    def _landmarks_of_last_frame(self) -> Landmarks:
-        last = self._state.last
-        assert last is not None
-        return self._map.landmarks_of_view(last.view, last.T_world_camera, last.landmarks, self.noise.noise)
-
     # --- Recognise known places ---
 
-    def _relocalise(self, view: View) -> Generator[PoseQuery, QueryAnswer, tuple[_PosedView | None, int]]:
+    def _relocalise(self, view: View) -> Generator[PoseQuery, QueryAnswer, tuple[PosedView | None, int]]:
         """Ask for the pose of a frame at the keyframes of all segments that may show its place.
 
         If the pose is found in another segment, that one becomes the present segment.  Returned are the image
@@ -520,8 +458,9 @@ class Tracker:
             # 1. Solve the pose by a query with the landmarks of the keyframe.
             segment_map = self._segments[candidate.segment]
             T_world_reference = segment_map.pose(candidate.keyframe)
-            answer = yield self._make_query(view, candidate.matches, T_world_reference, "keyframe")
-            T_world_camera = self._read_pose(answer, T_world_reference, count, 0.0)
+            T_world_camera, answer = yield from self._solve(
+                view, candidate.matches, T_world_reference, "keyframe"
+            )
             if T_world_camera is None:
                 continue
             # 2. Far from the last pose, only a clear answer is accepted: perceptual aliases exist.
@@ -529,7 +468,8 @@ class Tracker:
             if not (answer.is_clear(count) or (is_near and answer.inliers >= _NEARBY_RATIO * count)):
                 continue
             # 3. Verify the pose by the landmarks around it, and by the appearance of the image.
-            image, is_continuous = self._correct_view_at(view, T_world_camera, is_near=is_near)
+            is_continuous = is_near and self._is_continuous(T_world_camera)
+            image = view if is_continuous else self._raw_view
             posed = self._verify(
                 image, T_world_camera, answer, count, segment_map, is_continuous=is_continuous
             )
@@ -541,7 +481,7 @@ class Tracker:
                 return posed, max_count
         return None, max_count
 
-    def _find_join(self, posed: _PosedView) -> Generator[PoseQuery, QueryAnswer, None]:
+    def _find_join(self, posed: PosedView) -> Generator[PoseQuery, QueryAnswer, None]:
         """Ask for the place of a tracked frame in other segments; join two once two measurements agree.
 
         Two measurements are compared if they are of the same other segment and no measurement lies between
@@ -554,8 +494,9 @@ class Tracker:
         if count < CLEAR_INLIERS:
             return
         T_other_reference = segment_map.pose(best.keyframe)
-        answer = yield self._make_query(posed.view, best.matches, T_other_reference, "segment")
-        T_other_camera = self._read_pose(answer, T_other_reference, count, 0.0)
+        T_other_camera, answer = yield from self._solve(
+            posed.view, best.matches, T_other_reference, "segment"
+        )
         if T_other_camera is None or not answer.is_clear(min(count, self._max_matches)):
             return
         there = self._verify(posed.view, T_other_camera, answer, count, segment_map)
@@ -619,14 +560,27 @@ class Tracker:
         most = self.options.max_matches
         return most if self._frame.stereo is None else min(most, _MAX_STEREO_MATCHES)
 
-    def _make_query(
+    def _solve(
         self,
         view: View,
         matches: Matches,
         T_world_reference: Array,
         against: Literal["map", "frame", "keyframe", "segment"],
-    ) -> PoseQuery:
-        return make_query(
+        min_ratio: float = 0.0,
+    ) -> Generator[PoseQuery, QueryAnswer, tuple[Array | None, QueryAnswer]]:
+        """Ask for the pose of an image by its matches.
+
+        Returned are ``T_world_camera`` ``(4, 4)``, None without a rigid pose and enough inliers, and the
+        answer.
+
+        Args:
+            view: The image.
+            matches: Its matches, of which the query may send only a part.
+            T_world_reference: ``(4, 4)``, pose of the query's reference camera.
+            against: The source of the landmarks, see `PoseQuery`.
+            min_ratio: Smallest share of inliers among the sent matches; ``min_inliers`` are needed, too.
+        """
+        answer = yield make_query(
             self._frame,
             matches,
             view.features,
@@ -638,21 +592,9 @@ class Tracker:
             depths_m=view.points_camera[:, 2],
             depth_noise=None if self._frame.stereo is None else self.noise.noise,
         )
-
-    def _read_pose(
-        self, answer: QueryAnswer, T_world_reference: Array, match_count: int, min_ratio: float
-    ) -> Array | None:
-        """Return ``T_world_camera`` ``(4, 4)`` of an answer; None without a rigid pose and enough inliers.
-
-        Args:
-            answer: The answer.
-            T_world_reference: ``(4, 4)``, pose of the query's reference camera.
-            match_count: Number of matches, of which the query may have sent only a part.
-            min_ratio: Smallest share of inliers among the sent matches; ``min_inliers`` are needed, too.
-        """
-        sent = min(match_count, self._max_matches)
+        sent = min(len(matches), self._max_matches)
         T_camera_reference = answer.accepted_pose(max(self.options.min_inliers, min_ratio * sent))
-        return None if T_camera_reference is None else T_world_reference @ inverse(T_camera_reference)
+        return None if T_camera_reference is None else T_world_reference @ inverse(T_camera_reference), answer
 
     # --- Verify ---
 
@@ -670,36 +612,15 @@ class Tracker:
         moved_m = float(np.linalg.norm(T_world_camera[:3, 3] - self._state.T_world_camera[:3, 3]))
         return moved_m <= limit_m
 
-    def _correct_view_at(self, view: View, T_world_camera: Array, *, is_near: bool) -> tuple[View, bool]:
-        """Return a frame's image to verify at a solved pose, and whether its motion to there is known.
+    def _is_continuous(self, T_world_camera: Array) -> bool:
+        """Return whether the camera moved from the pose of the frame before to this plausible one.
 
-        If the camera moved there from the pose of the frame before, the image stays as it is.  After a loss,
-        or a cut in a video (a pose that is not near, or a rotation that is too fast), the rotation rate is
-        unknown, and the image is returned with its rolling shutter.
-        """
-        rate = self._rate_at(T_world_camera, np.zeros(3))
-        is_slow = float(np.linalg.norm(rate)) <= _MAX_RATE_RAD_S
-        if is_near and self._state.last is not None and is_slow:
-            return view, True
-        return self._correct_view(view, np.zeros(3)), False
-
-    def _rate_at(self, T_world_camera: Array, previous_rate: Array) -> Array:
-        """Return the ``(3,)`` rotation rate, rad/s, of a camera that moved from the last pose to this one.
-
-        *previous_rate* is the mean rate before the last pose; for zeros the mean rate since then is returned,
-        see `rotation_rate`.
+        After a loss, or a cut in a video (a rotation that is too fast), it did not, and its rotation rate is
+        unknown.
         """
         state = self._state
-        interval_s = max(_MIN_INTERVAL_S, self._frame.timestamp_s - state.timestamp_s)
-        return rotation_rate(state.T_world_camera, T_world_camera, interval_s, previous_rate)
-
-    def _correct_view(self, view: View, rate: Array) -> View:
-        """Return an image without the rolling shutter of a camera that rotates at *rate* ``(3,)`` rad/s.
-
-        Pixels and points are computed anew from the extracted features of the present frame; for zeros they
-        keep their rolling shutter.
-        """
-        return correct_view(view, self._raw, self.readout.readout_s, rate)
+        rate = rotation_rate(state.T_world_camera, T_world_camera, self._interval_s, np.zeros(3))
+        return state.last is not None and float(np.linalg.norm(rate)) <= _MAX_RATE_RAD_S
 
     def _verify(
         self,
@@ -710,7 +631,7 @@ class Tracker:
         segment_map: KeyframeMap,
         *,
         is_continuous: bool = False,
-    ) -> _PosedView | None:
+    ) -> PosedView | None:
         """Fit a solved pose to all landmarks of the map around it; None if too few agree.
 
         An accepted pose updates the estimate of the depth noise.  With *is_continuous* the image of a depth
@@ -726,69 +647,58 @@ class Tracker:
             is_continuous: Whether the camera moved there from its last pose; then its rolling shutter is
                 undone by that motion.
         """
-        # 1. Match the landmarks around the pose, and fit the pose to them.
-        matches = self._match_guided(
-            view, T_world_camera, _VERIFY_RADIUS_PX, _VERIFY_LOWE_RATIO, segment_map, _ENOUGH_MAP_MATCHES
-        )
-        min_inliers = self.options.min_inliers
+        # 1. Match the landmarks around the pose; the last frame is left out in the map of another segment.
+        state, min_inliers, T_camera_world = self._state, self.options.min_inliers, inverse(T_world_camera)
+        limits = GuidedMatchLimits(radius_px=_VERIFY_RADIUS_PX, lowe_ratio=_VERIFY_LOWE_RATIO)
+        last = state.last if segment_map is self._map else None
+        noise, rate, fitted = self.noise.noise, np.zeros(3), None
+        matches = segment_map.match(view, T_world_camera, limits, last, noise, _ENOUGH_MAP_MATCHES)
         if len(matches) < min_inliers:
             return None
-        observed = self._observe(view, matches, T_world_camera)
-        fitted = fit_pose(observed, view.camera, inverse(T_world_camera))
-        # 2. Undo the rolling shutter at the rate of the fitted pose, and fit again.
-        if fitted is not None and is_continuous:
-            T_fitted = inverse(fitted.T_camera_world)
-            rate = self._rate_at(T_fitted, self._state.rotation_rate)
-            if self._state.first is not None and int(fitted.is_inlier.sum()) >= CLEAR_INLIERS:
-                self._correct_first_keyframe(*self._state.first, rate)
-                return self._verify(view, T_fitted, answer, match_count, self._map, is_continuous=True)
-            view = self._correct_view(view, rate)
-            observed = self._observe(view, matches, T_fitted)
-            fitted = fit_pose(observed, view.camera, fitted.T_camera_world)
-            if fitted is not None and not view.is_stereo:
-                # Not for stereo: its shutters are global, and an unsynchronised pair looks like a readout.
-                change = measure_readout_change(view, matches, observed, fitted)
-                self._pending_readout_s += self.readout.update(*change, rate)
-        # 3. Accept the pose if enough landmarks agree.
-        inlier_count = 0 if fitted is None else int(fitted.is_inlier.sum())
-        if fitted is None or inlier_count < max(min_inliers, _VERIFIED_RATIO * len(matches)):
+        for _ in range(2 if is_continuous else 1):
+            # 3. Undo the rolling shutter at the rate of the fitted pose, and fit again.
+            if fitted is not None:
+                T_camera_world, T_world_camera = fitted.T_camera_world, inverse(fitted.T_camera_world)
+                rate = rotation_rate(
+                    state.T_world_camera, T_world_camera, self._interval_s, state.rotation_rate
+                )
+                if state.first is not None and int(fitted.is_inlier.sum()) >= CLEAR_INLIERS:
+                    self._correct_first_keyframe(*state.first, rate)
+                    return self._verify(
+                        view, T_world_camera, answer, match_count, self._map, is_continuous=True
+                    )
+                view = correct_view(view, self._raw, self.readout.readout_s, rate)
+            # 2. Fit the pose to the matched landmarks.
+            observed = observe_landmarks(view, matches, T_world_camera, noise)
+            fitted = fit_pose(observed, view.camera, T_camera_world)
+            if fitted is None:
+                return None
+        assert fitted is not None
+        if is_continuous and not view.is_stereo:
+            # Not for stereo: its shutters are global, and an unsynchronised pair looks like a readout.
+            change = measure_readout_change(view, matches, observed, fitted)
+            self._pending_readout_s += self.readout.update(*change, rate)
+        # 4. Accept the pose if enough landmarks agree.
+        inlier_count = int(fitted.is_inlier.sum())
+        accepted = rigid(fitted.T_camera_world)
+        if accepted is None or inlier_count < max(min_inliers, _VERIFIED_RATIO * len(matches)):
             return None
-        T_camera_world = rigid(fitted.T_camera_world)
-        if T_camera_world is None:
-            return None
-        # 4. Update the noise estimate, and note which features show which landmarks.
+        # 5. Update the noise estimate, and note which features show which landmarks.
         inliers = np.flatnonzero(fitted.is_inlier)
-        self.noise.add(observed, inliers, T_camera_world)
+        self.noise.add(observed, inliers, accepted)
         landmarks = np.full(len(view.features), NO_LANDMARK)
-        landmarks[matches.features[inliers]] = matches.landmarks.numbers[inliers]
-        return _PosedView(
+        landmarks[matches.features[inliers]] = matches.numbers[inliers]
+        T_world_camera = inverse(accepted)
+        if is_continuous:
+            rate = rotation_rate(state.T_world_camera, T_world_camera, self._interval_s, np.zeros(3))
+        return PosedView(
             view=view,
-            T_world_camera=inverse(T_camera_world),
+            T_world_camera=T_world_camera,
             landmarks=landmarks,
             inliers=inlier_count,
             matches=max(match_count, len(matches)),
             is_weak=answer.is_weak,
-            is_continuous=is_continuous,
-        )
-
-    def _observe(self, view: View, matches: Matches, T_world_camera: Array) -> Observations:
-        """Return what an image measured of matched landmarks, with the noise of each measurement.
-
-        The depth is 0 where there is none.  The noise of a stereo depth is that between the measured depth
-        and the one that the pose *T_world_camera* predicts; otherwise the pose is not used.
-        """
-        depths_m = np.nan_to_num(view.points_camera[matches.features, 2], posinf=0.0, neginf=0.0)
-        noise_depths_m = depths_m
-        if view.is_stereo:
-            expected_m = transform(inverse(T_world_camera), matches.landmarks.points)[:, 2]
-            noise_depths_m = depths_for_noise(depths_m, expected_m)
-        return Observations(
-            points=matches.landmarks.points,
-            covariances=matches.landmarks.covariances,
-            pixels=view.features.pixels[matches.features],
-            pixel_sigmas_px=PIXEL_SIGMA_PX * view.features.sizes[matches.features],
-            depths_m=depths_m,
-            depth_sigmas_m=np.sqrt(self.noise.noise.variance_m2(noise_depths_m)),
+            rotation_rate=rate,
         )
 
     def _correct_first_keyframe(self, raw: Features, view: View, rate: Array) -> None:
@@ -809,14 +719,13 @@ class Tracker:
 
         A user's features cannot be computed at given pixels, so that they pass without a check.
         """
-        if self._plugins.features is not None:
-            return True
-        landmarks = segment_map.landmarks_seen_by(segment_map.nearest(T_world_camera, _LOCAL_KEYFRAMES))
-        return has_predicted_appearance(self._frame, landmarks, T_world_camera, self.options.min_inliers)
+        return self._plugins.features is not None or has_predicted_appearance(
+            self._frame, segment_map, T_world_camera, self.options.min_inliers
+        )
 
     # --- Decide and keep ---
 
-    def _keep(self, posed: _PosedView) -> bool:
+    def _keep(self, posed: PosedView) -> bool:
         """Take a frame with a verified pose as the last one, and into the map; return if it is a keyframe."""
         state, T_world_camera, timestamp_s = self._state, posed.T_world_camera, self._frame.timestamp_s
         # 1. Update the motion model; after a loss the motion is not known.
@@ -825,7 +734,7 @@ class Tracker:
             self._plugins.forget_poses()
         else:
             T_last_next = _orthonormalise(inverse(state.T_world_camera) @ T_world_camera)
-            rate = self._rate_at(T_world_camera, np.zeros(3)) if posed.is_continuous else np.zeros(3)
+            rate = posed.rotation_rate
         self._plugins.add_pose(timestamp_s, T_world_camera)
         # 2. Fuse the measurements into the landmarks, and add a keyframe; a weak pose does neither.
         is_keyframe, keyframe_inliers = self._is_keyframe(posed), state.keyframe_inliers
@@ -859,7 +768,7 @@ class Tracker:
         )
         return is_keyframe
 
-    def _is_keyframe(self, posed: _PosedView) -> bool:
+    def _is_keyframe(self, posed: PosedView) -> bool:
         """Return whether a frame is far from all keyframes, or sees much fewer landmarks than the newest.
 
         A frame with a weak pose, or with fewer than twice ``min_inliers``, is never a keyframe.
@@ -899,7 +808,7 @@ class Tracker:
         self._next_segment += 1
         self._segments[segment] = KeyframeMap(self.options.max_keyframes)
         self._state = _TrackState(T_world_camera=T_world_camera, timestamp_s=timestamp_s, segment=segment)
-        posed = _PosedView(
+        posed = PosedView(
             view=view,
             T_world_camera=T_world_camera,
             landmarks=self._add_first_keyframe(view, T_world_camera),
@@ -942,7 +851,7 @@ class Tracker:
             features=self._raw,
         )
 
-    def _make_result(self, posed: _PosedView, *, is_keyframe: bool) -> TrackedFrame:
+    def _make_result(self, posed: PosedView, *, is_keyframe: bool) -> TrackedFrame:
         is_joined = self._state.segment == min(self._segments)
         return TrackedFrame(
             frame=self._frame,

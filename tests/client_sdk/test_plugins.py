@@ -25,7 +25,7 @@ from client_sdk.plugins import (
     load_features,
     load_function,
 )
-from client_sdk.tracking.place_recognition import make_place_vector
+from client_sdk.tracking.landmark_matching import make_place_vector
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Camera, exp_se3
 from rse_pf.maps.descriptors import ORB, DescriptorKind

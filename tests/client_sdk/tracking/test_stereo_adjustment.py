@@ -7,8 +7,7 @@ import pytest
 
 from client_sdk.stereo.depth import with_offset
 from client_sdk.tracking.keyframe_map import KeyframeMap, View
-from client_sdk.tracking.landmarks import NO_LANDMARK
-from client_sdk.tracking.place_recognition import LazyPlaceVector
+from client_sdk.tracking.landmark_matching import NO_LANDMARK, LazyPlaceVector
 from client_sdk.tracking.stereo_adjustment import adjust_stereo
 from rse_pf.geometry import Array, Camera, exp_se3, inverse, transform
 from rse_pf.slam.stereo import stereo_noise
@@ -63,8 +62,8 @@ def test_the_offset_of_disparities_and_the_metres_are_found(offset_px: float) ->
     assert found.deviation_px < 0.05
     poses = np.array([known.pose(row) for row in range(known.keyframe_count)])
     assert np.abs(poses[:, :3, 3] - truth[:, :3, 3]).max() < 0.01  # 4 cm before
-    landmarks = known.landmarks_seen_by(list(range(known.keyframe_count))).points
-    assert np.median(np.linalg.norm(landmarks - points, axis=1) / points[:, 2]) < 0.03
+    landmarks, _ = known.landmarks_around(truth[0])
+    assert np.median(np.linalg.norm(landmarks.points - points, axis=1) / points[:, 2]) < 0.03
     measured = known.view(3).points_camera[:, 2]
     expected = transform(inverse(truth[3]), points)[:, 2]
     assert abs(np.median(F_BASELINE / measured - F_BASELINE / expected)) < 0.06  # 0.3 before

@@ -1,0 +1,259 @@
+"""Match landmarks of a map with the features of an image, also at places that are to be recognised.
+
+Guided matching compares features near predicted pixels; matching by appearance compares all of them.  Places
+are recognised in two stages: keyframes are ranked by the cosine similarity of place vectors, and the best
+ones by their number of matches.  The trackers decide which matches and which keyframes are accepted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, fields
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from client_sdk.plugins import LoopsPlugin
+from rse_pf.geometry import Array, Camera
+from rse_pf.maps.descriptors import Descriptors
+from rse_pf.slam.descriptors import match_all
+from rse_pf.slam.place_recognition import PlaceVector, place_vector
+from rse_pf.slam.tracking import GuidedMatchLimits, ImageFeatures, LandmarkAppearance, match_landmarks
+
+__all__ = [
+    "LATEST_KEYFRAMES",
+    "NO_LANDMARK",
+    "Candidate",
+    "Landmarks",
+    "LazyPlaceVector",
+    "Matches",
+    "list_other_segments",
+    "list_relocalisation_candidates",
+    "make_place_vector",
+    "match_candidates",
+    "shift_landmarks",
+]
+
+Rows = npt.NDArray[np.int64]
+
+NO_LANDMARK = -1
+"""Stands in arrays of landmark numbers for a feature that shows no landmark of the map."""
+LATEST_KEYFRAMES = 3
+"""Number of newest keyframes of the present segment that are compared with a frame after the camera was lost:
+most losses end near the place where they began."""
+_SIMILAR_KEYFRAMES = 5
+"""Number of keyframes of each segment that place recognition proposes for a frame."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Landmarks:
+    """Points of the world with their uncertainty, and how each looked in the last image that showed it.
+
+    The last image is a keyframe, except for landmarks that were made of a single frame.
+
+    Attributes:
+        points: ``(n, 3)``, world, in metres or in the unit of the segment.
+        covariances: ``(n, 3, 3)`` of the points, in the squared unit of the points, world axes; 0 of a camera
+            without depth.
+        shutter_displacements: ``(n, 3)``: how far each point moves in the world for each second that the
+            camera's rolling-shutter readout takes longer.
+        descriptors: ``(n, d)``.
+        rays: ``(n, 3)``, from the centre of the camera of that image to the point, world axes.
+        orientations: ``(n, 3)``, orientation of the feature in that image as a direction in the world.
+        sizes: ``(n,)``, scale of the feature in that image, 1 for the finest pyramid level.
+        numbers: ``(n,)``, number of each landmark in its map; NO_LANDMARK for a point that is in no map.
+    """
+
+    points: Array
+    covariances: Array
+    shutter_displacements: Array
+    descriptors: Descriptors
+    rays: Array
+    orientations: Array
+    sizes: Array
+    numbers: Rows
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    @property
+    def appearance(self) -> LandmarkAppearance:
+        """The part of the landmarks that guided matching needs."""
+        return LandmarkAppearance(
+            points=self.points,
+            rays=self.rays,
+            orientations=self.orientations,
+            sizes=self.sizes,
+            descriptors=self.descriptors,
+        )
+
+    def first(self, count: int) -> Landmarks:
+        """Return the first *count* landmarks, as views of the same memory."""
+        return Landmarks(**{column.name: getattr(self, column.name)[:count] for column in fields(self)})
+
+    def matched(self, rows: Rows, features: Rows) -> Matches:
+        """Return the landmarks of *rows* as those that *features*, rows of an image's features, show."""
+        return Matches(
+            features=features,
+            numbers=self.numbers[rows],
+            points=self.points[rows],
+            covariances=self.covariances[rows],
+            shutter_displacements=self.shutter_displacements[rows],
+        )
+
+    def match(
+        self,
+        T_camera_world: Array,
+        camera: Camera,
+        image: ImageFeatures,
+        limits: GuidedMatchLimits,
+        margin_px: float,
+    ) -> Matches:
+        """Match the landmarks with features near the pixels at which a pose predicts them.
+
+        Args:
+            T_camera_world: ``(4, 4)``, the predicted pose of the image.
+            camera: Intrinsics of the image.
+            image: Features of the image.
+            limits: Conditions of a match.
+            margin_px: Width of the border around the image in which landmarks are predicted, too.
+        """
+        rows, features = match_landmarks(
+            self.appearance, np.arange(len(self)), T_camera_world, camera, image, limits, margin_px
+        )
+        return self.matched(rows, features)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Matches:
+    """Landmarks and the features of an image that show them: what a pose is solved and fitted by.
+
+    Attributes:
+        features: ``(n,)``, row of the feature that shows each landmark.
+        numbers: ``(n,)``, ``points`` ``(n, 3)``, ``covariances`` ``(n, 3, 3)`` and ``shutter_displacements``
+            ``(n, 3)`` of the landmarks, as in `Landmarks`.
+    """
+
+    features: Rows
+    numbers: Rows
+    points: Array
+    covariances: Array
+    shutter_displacements: Array
+
+    def __len__(self) -> int:
+        return len(self.features)
+
+    def followed_by(self, other: Matches) -> Matches:
+        """Return these matches and then *other*, as one."""
+        return Matches(
+            features=np.concatenate([self.features, other.features]),
+            numbers=np.concatenate([self.numbers, other.numbers]),
+            points=np.concatenate([self.points, other.points]),
+            covariances=np.concatenate([self.covariances, other.covariances]),
+            shutter_displacements=np.concatenate([self.shutter_displacements, other.shutter_displacements]),
+        )
+
+
+def shift_landmarks(numbers: Rows, first: int) -> Rows:
+    """Return landmark numbers after their map was appended to another one, where they begin at *first*."""
+    return np.where(numbers == NO_LANDMARK, NO_LANDMARK, numbers + first)
+
+
+class LazyPlaceVector:
+    """The place vector of one image, computed when it is first needed; the image is released then."""
+
+    def __init__(self, compute: Callable[[], PlaceVector]) -> None:
+        self._compute: Callable[[], PlaceVector] | None = compute
+        self._vector: PlaceVector
+
+    def get(self) -> PlaceVector:
+        """Return the ``(d,)`` unit vector, or zeros for an image without features."""
+        if self._compute is not None:
+            self._vector, self._compute = self._compute(), None
+        return self._vector
+
+
+class RecognisableMap(Protocol):
+    """A map of one segment whose keyframes can be recognised."""
+
+    @property
+    def keyframe_count(self) -> int:
+        """The number of keyframes."""
+
+    def rank_by_similarity(self, place: LazyPlaceVector, count: int) -> list[int]:
+        """Return the *count* keyframes whose place vectors are most similar to an image's, best first."""
+
+    def landmarks_in(self, keyframe: int) -> tuple[Rows, Descriptors]:
+        """Return the numbers of the landmarks that a keyframe sees, and their descriptors in it."""
+
+    def matched(self, numbers: Rows, features: Rows) -> Matches:
+        """Return landmarks by their numbers as those that *features*, rows of an image's features, show."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Candidate:
+    """A keyframe that may show the place of an image, and the matches of its landmarks with that image."""
+
+    segment: int
+    keyframe: int
+    matches: Matches
+
+
+def make_place_vector(
+    descriptors: Descriptors, rgb: npt.NDArray[np.uint8], plugin: LoopsPlugin | None
+) -> LazyPlaceVector:
+    """Make the place vector of an image from its descriptors, or by a user's place recogniser.
+
+    Args:
+        descriptors: ``(n, d)``, of the image's features.
+        rgb: ``(h, w, 3)``, the image.
+        plugin: A user's place recogniser; None for the vector of the descriptors (VLAD).
+    """
+    if plugin is None:
+        return LazyPlaceVector(lambda: place_vector(descriptors))
+    return LazyPlaceVector(lambda: plugin(rgb))
+
+
+def list_relocalisation_candidates(
+    maps: Mapping[int, RecognisableMap], place: LazyPlaceVector, current_segment: int
+) -> Iterator[tuple[int, int]]:
+    """Yield (segment, keyframe) of all keyframes that may show the place of an untracked frame.
+
+    These are the five most similar keyframes of every segment, and the three newest ones of the current
+    segment; each keyframe is yielded once.
+    """
+    for segment, segment_map in maps.items():
+        keyframes = segment_map.rank_by_similarity(place, _SIMILAR_KEYFRAMES)
+        if segment == current_segment:
+            newest = segment_map.keyframe_count - 1
+            keyframes = [*range(newest, max(-1, newest - LATEST_KEYFRAMES), -1), *keyframes]
+        yield from ((segment, keyframe) for keyframe in dict.fromkeys(keyframes))
+
+
+def list_other_segments(
+    maps: Mapping[int, RecognisableMap], place: LazyPlaceVector, current_segment: int
+) -> Iterator[tuple[int, int]]:
+    """Yield (segment, keyframe) of the five most similar keyframes of each segment but the current one."""
+    for segment, segment_map in maps.items():
+        if segment != current_segment:
+            yield from ((segment, k) for k in segment_map.rank_by_similarity(place, _SIMILAR_KEYFRAMES))
+
+
+def match_candidates(
+    maps: Mapping[int, RecognisableMap], keyframes: Iterable[tuple[int, int]], image: ImageFeatures
+) -> list[Candidate]:
+    """Match the landmarks of each keyframe with an image by appearance; return all, most matches first.
+
+    Args:
+        maps: Map of each segment by its number.
+        keyframes: (segment, keyframe) of each candidate.
+        image: Features of the image.
+    """
+    candidates = []
+    for segment, keyframe in keyframes:
+        numbers, descriptors = maps[segment].landmarks_in(keyframe)
+        rows, features = match_all(descriptors, image.descriptors)
+        matches = maps[segment].matched(numbers[rows], features)
+        candidates.append(Candidate(segment=segment, keyframe=keyframe, matches=matches))
+    return sorted(candidates, key=lambda candidate: -len(candidate.matches))
