@@ -22,10 +22,11 @@ from rse_pf.errors import UsageError
 from rse_pf.geometry import Array, Camera, body_poses
 from rse_pf.images import load_opencv
 from rse_pf.maps.descriptors import ORB, DescriptorKind, Descriptors
-from rse_pf.native import address_of, aligned, core_function
+from rse_pf.native import core_function
 from rse_pf.pnp import DepthNoise
+from rse_pf.slam.descriptors import measure_distinctiveness
 from rse_pf.slam.orb import DescribedKeypoints, describe_orb, select_spread_rows
-from rse_pf.slam.tracking import ImageFeatures, measure_distinctiveness
+from rse_pf.slam.tracking import ImageFeatures
 
 __all__ = [
     "Correspondences",
@@ -39,7 +40,6 @@ __all__ = [
     "extract",
     "load_opencv",
     "points_at",
-    "round_for_wire",
 ]
 
 _MAX_STAMP_S = 1e10
@@ -332,14 +332,6 @@ def describe(
     )
 
 
-def round_for_wire(points_world: Array, pixels: Array) -> tuple[Array, Array]:
-    """Round points to 0.0001 (0.1 mm) and pixels to 0.01 px: server and robot then solve the same numbers.
-
-    The rounding moves a pose by about 0.02 mm and shrinks the message to a third.
-    """
-    return np.round(points_world, 4), np.round(pixels, 2)
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PoseQuery:
     """A query for the PnP service: the pose of a camera in the world of the query.
@@ -451,13 +443,13 @@ def points_at(frame: Frame, pixels: Array, options: FrontEndOptions) -> Array:
     """
     if frame.stereo is not None:
         return stereo_points(frame.rgb, frame.stereo, frame.camera, pixels)
-    depth_m, pixels = aligned(frame.depth_m, np.float32), aligned(pixels, np.float64)
-    height, width = depth_m.shape
+    height, width = frame.depth_m.shape
     camera, points_camera = frame.camera, np.full((len(pixels), 3), np.nan)
     _core_points_at()(
-        address_of(depth_m), width, height, address_of(pixels), len(pixels),
+        frame.depth_m.astype(np.float32, copy=False), width, height,
+        pixels.astype(np.float64, copy=False), len(pixels),
         camera.fx, camera.fy, camera.cx, camera.cy, options.min_depth_m, options.max_depth_m,
-        options.depth_spread_percent / 100.0, address_of(points_camera),
+        options.depth_spread_percent / 100.0, points_camera,
     )  # fmt: skip
     return points_camera
 

@@ -21,7 +21,7 @@ from rse_pf.geometry import Array, Camera
 from rse_pf.native import PART_ABIS, address_of, core_function
 from rse_pf.pnp import DepthNoise, PnpSolution, refine_with_depth
 from rse_pf.pnp.problems import KINECT
-from rse_pf.slam.descriptors import match_orb
+from rse_pf.slam.descriptors import match_orb, measure_distinctiveness
 from rse_pf.slam.orb import Keypoints, describe_keypoints, detect_keypoints
 from rse_pf.slam.tracking import (
     GuidedMatchLimits,
@@ -30,7 +30,6 @@ from rse_pf.slam.tracking import (
     PredictedFeatures,
     fit_pose,
     match_predictions,
-    measure_distinctiveness,
 )
 from tests.oracles import depths, matching
 

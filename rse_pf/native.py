@@ -144,7 +144,8 @@ def load_core(open_part: Callable[[Path], Part]) -> Part:
 def core_function(part: str, name: str, arguments: Sequence[Any], result: Any) -> Any:
     """Return one function of the native core with its ctypes signature.
 
-    Each call finds and opens the library again, so callers keep the result.
+    Each call finds and opens the library again, so callers keep the result.  The function takes numpy arrays
+    where C has pointers; an array that is not C-contiguous and aligned is passed as such a copy.
 
     Args:
         part: Part of the core, a key of `PART_ABIS`.
@@ -158,4 +159,9 @@ def core_function(part: str, name: str, arguments: Sequence[Any], result: Any) -
     """
     (function,) = load_core(lambda path: load_part(path, part, PART_ABIS[part], name))
     function.argtypes, function.restype = arguments, result
-    return function
+
+    def call(*values: Any) -> Any:
+        values = tuple([aligned(value) if isinstance(value, np.ndarray) else value for value in values])
+        return function(*[address_of(value) if isinstance(value, np.ndarray) else value for value in values])
+
+    return call

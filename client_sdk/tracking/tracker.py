@@ -7,6 +7,7 @@ pose (elsewhere, by a query), verify it, decide what becomes of the frame, and k
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Generator
 from dataclasses import dataclass, field, replace
 from typing import Literal
@@ -38,7 +39,7 @@ from client_sdk.tracking.rolling_shutter import (
 )
 from client_sdk.tracking.segment_join import NOT_JOINED, Join
 from client_sdk.tracking.stereo_adjustment import StereoAdjustment, adjust_stereo
-from rse_pf.geometry import Array, inverse, pose_difference, rigid
+from rse_pf.geometry import Array, inverse, orthonormalise, pose_difference, rigid
 from rse_pf.slam.tracking import GuidedMatchLimits, fit_pose
 
 __all__ = ["Tracker"]
@@ -246,7 +247,7 @@ class Tracker:
             UsageError: A query is open.
         """
         self._open.refuse_open()
-        self._T_world_start = _orthonormalise(T_new_old @ self._T_world_start)
+        self._T_world_start = orthonormalise(T_new_old @ self._T_world_start)
         for segment_map in self._segments.values():
             segment_map.move(T_new_old)
         self._move_state(T_new_old)
@@ -280,7 +281,7 @@ class Tracker:
         if own is not None:
             self.disparity_offset_px += own.offset_px
             moved = own.moved(np.array([state.timestamp_s]), state.T_world_camera[None])[0]
-            state = replace(state, T_world_camera=_orthonormalise(moved))
+            state = replace(state, T_world_camera=orthonormalise(moved))
         self._state = state
         self._plugins.forget_poses()
         return clear
@@ -303,8 +304,18 @@ class Tracker:
             points_camera = with_offset(self._raw.points_camera, f_baseline, self.disparity_offset_px)
             self._raw = replace(self._raw, points_camera=points_camera)
         self.noise.model = frame.depth_noise
-        self._raw_view = self._make_view(frame, self._raw)
-        return self._open.begin(self._track())
+        self._raw_view = View(
+            features=self._raw.for_matching(),
+            points_camera=self._raw.points_camera,
+            shutter_displacements=np.zeros_like(self._raw.points_camera),
+            camera=frame.camera,
+            place_vector=make_place_vector(self._raw.descriptors, frame.rgb, self._plugins.loops),
+            is_stereo=frame.stereo is not None,
+            timestamp_s=frame.timestamp_s,
+        )
+        # The rolling shutter is undone at the last rotation rate, until the pose of this frame is known.
+        view = correct_view(self._raw_view, self._raw, self.readout.readout_s, self._state.rotation_rate)
+        return self._open.begin(self._track(view))
 
     def accept(
         self, query: PoseQuery, T_camera_world: Array | None, inliers: int = 0, *, is_weak: bool = False
@@ -326,39 +337,25 @@ class Tracker:
 
     # --- The steps of one frame ---
 
-    def _track(self) -> FrameSteps:
-        """Yield the queries of the present frame, and return its result."""
-        # 1. Undo the rolling shutter of the extracted features at the last rotation rate.
-        view = correct_view(self._raw_view, self._raw, self.readout.readout_s, self._state.rotation_rate)
+    def _track(self, view: View) -> FrameSteps:
+        """Yield the queries of the present frame, whose image is *view*, and return its result."""
         if not self._segments:
             return self._begin_or_lose(view, match_count=0)
-        # 2. Track the frame from the last pose; if that fails, relocalise it at all known places.
+        # 1. Track the frame from the last pose; if that fails, relocalise it at all known places.
         posed, match_count = None, 0
         if self._state.last is not None:
             posed, match_count = yield from self._track_from_last_pose(view)
         if posed is None:
             posed, candidate_matches = yield from self._relocalise(view)
             match_count = max(match_count, candidate_matches)
-        # 3. Decide: without a pose, the frame is lost or begins a segment.
+        # 2. Decide: without a pose, the frame is lost or begins a segment.
         if posed is None:
             return self._begin_or_lose(view, match_count)
-        # 4. Keep the frame in the map, and look for its place in other segments.
+        # 3. Keep the frame in the map, and look for its place in other segments.
         is_keyframe = self._keep(posed)
         if len(self._segments) > 1 and self.frames % _JOIN_INTERVAL_FRAMES == 0:
             yield from self._find_join(posed)
         return self._make_result(posed, is_keyframe=is_keyframe)
-
-    def _make_view(self, frame: Frame, features: Features) -> View:
-        """Return a frame and its extracted features as a view, whose rolling shutter is not undone yet."""
-        return View(
-            features=features.for_matching(),
-            points_camera=features.points_camera,
-            shutter_displacements=np.zeros_like(features.points_camera),
-            camera=frame.camera,
-            place_vector=make_place_vector(features.descriptors, frame.rgb, self._plugins.loops),
-            is_stereo=frame.stereo is not None,
-            timestamp_s=frame.timestamp_s,
-        )
 
     # --- Predict and match ---
 
@@ -371,24 +368,23 @@ class Tracker:
         matches of an attempt.
         """
         # 1. Predict the pose.
-        last, noise, min_inliers, max_count = self._state.last, self.noise.noise, self.options.min_inliers, 0
+        noise, min_inliers, max_count = self.noise.noise, self.options.min_inliers, 0
         T_predicted, T_last = self._predict_pose(), self._state.T_world_camera
         # 2. Match near the predicted pixels, then with the last frame by appearance, then widely around the
         #    last pose.  An attempt holds the matching function, the reference pose, the source of the
         #    landmarks, the fewest matches of a query, and the smallest inlier ratio of its answer.
-        assert last is not None
         guided = GuidedMatchLimits(radius_px=self.options.search_px, lowe_ratio=_GUIDED_LOWE_RATIO)
         wide = GuidedMatchLimits(radius_px=_WIDE_RADIUS_PX, lowe_ratio=_GUIDED_LOWE_RATIO)
         attempts: list[tuple[Callable[[], Matches], Array, Literal["map", "frame"], int, float]] = [
             (
-                lambda: self._map.match(view, T_predicted, guided, last, noise),
+                lambda: self._map.match(view, T_predicted, guided, self._last, noise),
                 T_predicted,
                 "map",
                 _GUIDED_MATCHES_FACTOR * min_inliers,
                 _GUIDED_RATIO,
             ),
             (
-                lambda: self._map.match_last_frame(view, last, noise),
+                lambda: self._map.match_last_frame(view, self._last, noise),
                 T_last,
                 "frame",
                 min_inliers,
@@ -398,7 +394,7 @@ class Tracker:
         if view.is_stereo:
             attempts.append(
                 (
-                    lambda: self._map.match(view, T_last, wide, last, noise),
+                    lambda: self._map.match(view, T_last, wide, self._last, noise),
                     T_last,
                     "map",
                     min_inliers,
@@ -425,6 +421,12 @@ class Tracker:
                 return posed, max_count
         return None, max_count
 
+    @property
+    def _last(self) -> PosedView:
+        """The last frame with its pose, of which there must be one."""
+        assert self._state.last is not None
+        return self._state.last
+
     def _predict_pose(self) -> Array:
         """Predict ``T_world_camera`` ``(4, 4)`` of the frame by a user's motion model, if it returns a pose.
 
@@ -436,7 +438,7 @@ class Tracker:
         if T_world_camera is not None:
             return T_world_camera
         T_last_next = self._plugins.predict_motion(state.T_last_next.copy(), state.timestamp_s, now_s)
-        return _orthonormalise(state.T_world_camera @ T_last_next)
+        return orthonormalise(state.T_world_camera @ T_last_next)
 
     # --- Recognise known places ---
 
@@ -471,9 +473,15 @@ class Tracker:
             is_continuous = is_near and self._is_continuous(T_world_camera)
             image = view if is_continuous else self._raw_view
             posed = self._verify(
-                image, T_world_camera, answer, count, segment_map, is_continuous=is_continuous
+                image,
+                T_world_camera,
+                answer,
+                count,
+                segment_map,
+                is_continuous=is_continuous,
+                is_recognised=True,
             )
-            if posed is not None and self._has_predicted_appearance(posed.T_world_camera, segment_map):
+            if posed is not None:
                 if candidate.segment != segment:
                     self._state = replace(
                         self._state, segment=candidate.segment, last=None, join_candidate=None
@@ -499,11 +507,11 @@ class Tracker:
         )
         if T_other_camera is None or not answer.is_clear(min(count, self._max_matches)):
             return
-        there = self._verify(posed.view, T_other_camera, answer, count, segment_map)
-        if there is None or not self._has_predicted_appearance(there.T_world_camera, segment_map):
+        there = self._verify(posed.view, T_other_camera, answer, count, segment_map, is_recognised=True)
+        if there is None:
             return
         # 2. Keep the measurement as the candidate; go on only if the candidate before it agrees.
-        T_other_present = _orthonormalise(there.T_world_camera @ inverse(posed.T_world_camera))
+        T_other_present = orthonormalise(there.T_world_camera @ inverse(posed.T_world_camera))
         previous = self._state.join_candidate
         self._state = replace(self._state, join_candidate=(best.segment, T_other_present))
         if previous is None or previous[0] != best.segment:
@@ -539,7 +547,7 @@ class Tracker:
             T_new_old: ``(4, 4)``.
             first_landmark: Number of the segment's first landmark in the map that it was appended to.
         """
-        T_world_camera = _orthonormalise(T_new_old @ self._state.T_world_camera)
+        T_world_camera = orthonormalise(T_new_old @ self._state.T_world_camera)
         last = self._state.last
         if last is not None:
             landmarks = shift_landmarks(last.landmarks, first_landmark)
@@ -619,8 +627,8 @@ class Tracker:
         unknown.
         """
         state = self._state
-        rate = rotation_rate(state.T_world_camera, T_world_camera, self._interval_s, np.zeros(3))
-        return state.last is not None and float(np.linalg.norm(rate)) <= _MAX_RATE_RAD_S
+        _, rotated_deg = pose_difference(state.T_world_camera, T_world_camera)
+        return state.last is not None and math.radians(rotated_deg) <= _MAX_RATE_RAD_S * self._interval_s
 
     def _verify(
         self,
@@ -631,6 +639,7 @@ class Tracker:
         segment_map: KeyframeMap,
         *,
         is_continuous: bool = False,
+        is_recognised: bool = False,
     ) -> PosedView | None:
         """Fit a solved pose to all landmarks of the map around it; None if too few agree.
 
@@ -646,6 +655,8 @@ class Tracker:
             segment_map: The map in which the pose was solved.
             is_continuous: Whether the camera moved there from its last pose; then its rolling shutter is
                 undone by that motion.
+            is_recognised: Whether the place was recognised; then the image must also look as the landmarks
+                predict.  A user's features cannot be computed at given pixels: they are not compared.
         """
         # 1. Match the landmarks around the pose; the last frame is left out in the map of another segment.
         state, min_inliers, T_camera_world = self._state, self.options.min_inliers, inverse(T_world_camera)
@@ -662,66 +673,70 @@ class Tracker:
                 rate = rotation_rate(
                     state.T_world_camera, T_world_camera, self._interval_s, state.rotation_rate
                 )
-                if state.first is not None and int(fitted.is_inlier.sum()) >= CLEAR_INLIERS:
-                    self._correct_first_keyframe(*state.first, rate)
+                first = state.first if int(fitted.is_inlier.sum()) >= CLEAR_INLIERS else None
+                raw, image = (self._raw, view) if first is None else first
+                image = correct_view(image, raw, self.readout.readout_s, rate)
+                if first is not None:
+                    self._replace_first_keyframe(image)
                     return self._verify(
-                        view, T_world_camera, answer, match_count, self._map, is_continuous=True
+                        view,
+                        T_world_camera,
+                        answer,
+                        match_count,
+                        self._map,
+                        is_continuous=True,
+                        is_recognised=is_recognised,
                     )
-                view = correct_view(view, self._raw, self.readout.readout_s, rate)
+                view = image
             # 2. Fit the pose to the matched landmarks.
             observed = observe_landmarks(view, matches, T_world_camera, noise)
             fitted = fit_pose(observed, view.camera, T_camera_world)
             if fitted is None:
                 return None
-        assert fitted is not None
+        accepted = None if fitted is None else rigid(fitted.T_camera_world)
+        if fitted is None or accepted is None:
+            return None
+        # 4. Measure the mean rotation rate and, of a depth camera, the readout time.  Not of a stereo pair:
+        #    its shutters are global, and an unsynchronised pair looks like a readout.
+        T_world_camera, mean_rate = inverse(accepted), np.zeros(3)
+        if is_continuous:
+            mean_rate = rotation_rate(state.T_world_camera, T_world_camera, self._interval_s, mean_rate)
         if is_continuous and not view.is_stereo:
-            # Not for stereo: its shutters are global, and an unsynchronised pair looks like a readout.
             change = measure_readout_change(view, matches, observed, fitted)
             self._pending_readout_s += self.readout.update(*change, rate)
-        # 4. Accept the pose if enough landmarks agree.
-        inlier_count = int(fitted.is_inlier.sum())
-        accepted = rigid(fitted.T_camera_world)
-        if accepted is None or inlier_count < max(min_inliers, _VERIFIED_RATIO * len(matches)):
-            return None
-        # 5. Update the noise estimate, and note which features show which landmarks.
+        # 5. Accept the pose if enough landmarks agree.
         inliers = np.flatnonzero(fitted.is_inlier)
+        if len(inliers) < max(min_inliers, _VERIFIED_RATIO * len(matches)):
+            return None
+        # 6. Update the noise estimate, compare the appearance, and note which features show which landmarks.
         self.noise.add(observed, inliers, accepted)
+        can_compare = is_recognised and self._plugins.features is None
+        if can_compare and not has_predicted_appearance(
+            self._frame, segment_map, T_world_camera, min_inliers
+        ):
+            return None
         landmarks = np.full(len(view.features), NO_LANDMARK)
         landmarks[matches.features[inliers]] = matches.numbers[inliers]
-        T_world_camera = inverse(accepted)
-        if is_continuous:
-            rate = rotation_rate(state.T_world_camera, T_world_camera, self._interval_s, np.zeros(3))
         return PosedView(
             view=view,
             T_world_camera=T_world_camera,
             landmarks=landmarks,
-            inliers=inlier_count,
+            inliers=len(inliers),
             matches=max(match_count, len(matches)),
             is_weak=answer.is_weak,
-            rotation_rate=rate,
+            rotation_rate=mean_rate,
         )
 
-    def _correct_first_keyframe(self, raw: Features, view: View, rate: Array) -> None:
+    def _replace_first_keyframe(self, view: View) -> None:
         """Replace the map of the present segment by one with its first keyframe without rolling shutter.
 
-        The rotation rate *rate* ``(3,)`` (rad/s) is known only after the second frame.  *raw* are the
-        features with rolling shutter, *view* is their image.
+        *view* is the first image, corrected with the rotation rate that is known only after the second frame.
         """
         state = self._state
         assert state.last is not None
-        view = correct_view(view, raw, self.readout.readout_s, rate)
         self._segments[state.segment] = KeyframeMap(self.options.max_keyframes)
         landmarks = self._add_first_keyframe(view, state.T_world_camera)
         self._state = replace(state, last=replace(state.last, view=view, landmarks=landmarks), first=None)
-
-    def _has_predicted_appearance(self, T_world_camera: Array, segment_map: KeyframeMap) -> bool:
-        """Return whether the frame looks as the landmarks around a recognised place predict.
-
-        A user's features cannot be computed at given pixels, so that they pass without a check.
-        """
-        return self._plugins.features is not None or has_predicted_appearance(
-            self._frame, segment_map, T_world_camera, self.options.min_inliers
-        )
 
     # --- Decide and keep ---
 
@@ -733,7 +748,7 @@ class Tracker:
         if state.lost_in_a_row or state.last is None:
             self._plugins.forget_poses()
         else:
-            T_last_next = _orthonormalise(inverse(state.T_world_camera) @ T_world_camera)
+            T_last_next = orthonormalise(inverse(state.T_world_camera) @ T_world_camera)
             rate = posed.rotation_rate
         self._plugins.add_pose(timestamp_s, T_world_camera)
         # 2. Fuse the measurements into the landmarks, and add a keyframe; a weak pose does neither.
@@ -863,11 +878,3 @@ class Tracker:
             features=self._raw,
             reason="" if is_joined else NOT_JOINED,
         )
-
-
-def _orthonormalise(T: Array) -> Array:
-    """Return a pose with the nearest true rotation; a product of poses drifts away from one."""
-    U, _, Vt = np.linalg.svd(T[:3, :3])
-    orthonormal: Array = T.copy()
-    orthonormal[:3, :3] = U @ Vt
-    return orthonormal

@@ -24,6 +24,7 @@ __all__ = [
     "log_se3",
     "log_so3",
     "median_pose",
+    "orthonormalise",
     "pose_difference",
     "right_jacobian_so3",
     "rigid",
@@ -116,6 +117,14 @@ def rigid(T: Array, max_m: float = MAX_TRANSLATION_M) -> Array | None:
             return T
     poses = rigid_many(T[None], max_m)
     return None if poses is None else poses[0]
+
+
+def orthonormalise(T: Array) -> Array:
+    """Return a ``(4, 4)`` pose with the nearest true rotation; a product of poses drifts away from one."""
+    U, _, Vt = np.linalg.svd(T[:3, :3])
+    orthonormal: Array = T.copy()
+    orthonormal[:3, :3] = U @ Vt
+    return orthonormal
 
 
 def rigid_many(T: Array, max_m: float = MAX_TRANSLATION_M) -> Array | None:

@@ -16,8 +16,9 @@ import numpy as np
 import numpy.typing as npt
 
 from rse_pf.errors import BadRequest
+from rse_pf.geometry import Array
 from rse_pf.maps.descriptors import ORB, Descriptors
-from rse_pf.native import Workspace, address_of, aligned, core_function
+from rse_pf.native import Workspace, core_function
 
 __all__ = [
     "as_vectors",
@@ -26,11 +27,13 @@ __all__ = [
     "distances_of_pairs",
     "match_all",
     "match_orb",
+    "measure_distinctiveness",
     "no_distance",
 ]
 
 Rows = npt.NDArray[np.int64]
 
+_DESCRIPTOR_DTYPES = (np.uint8, np.int8)
 _INSTRUCTION_FLAGS = {"portable": 1, "avx2": 2, "avx512": 0}
 """Flags of the native core's ``rse_pf_match`` by the widest instructions that it may use."""
 _BLOCK_DISTANCES = 4_000_000
@@ -162,12 +165,11 @@ def match_orb(
     Raises:
         MissingExtra: The native core is not installed.
     """
-    reference, view = aligned(reference), aligned(view)
     n, m = len(reference), len(view)
     rows, view_rows = np.empty((2, min(n, m)), dtype=np.int64)
     count = _core_match()(
-        address_of(reference), n, address_of(view), m, ratio, _INSTRUCTION_FLAGS[lanes],
-        address_of(_WORKSPACE.words(n + 5 * m + 64)), address_of(rows), address_of(view_rows),
+        reference, n, view, m, ratio, _INSTRUCTION_FLAGS[lanes],
+        _WORKSPACE.words(n + 5 * m + 64), rows, view_rows,
     )  # fmt: skip
     return rows[:count], view_rows[:count]
 
@@ -206,3 +208,53 @@ def match_all(
         rows, second_rows = rows[is_near], second_rows[is_near]
     order = np.argsort(rows, kind="stable")
     return rows[order], second_rows[order]
+
+
+def measure_distinctiveness(
+    descriptors: Descriptors, pixels: Array, min_separation_px: float = 6.0
+) -> npt.NDArray[np.int32]:
+    """Return the distance of each descriptor to the most similar other one of the same image.
+
+    Two features that are closer than *min_separation_px* both in columns and in rows count as the same point,
+    and are not compared.
+
+    Args:
+        descriptors: ``(n, d)``, uint8 (Hamming distance) or int8 (squared Euclidean distance).
+        pixels: ``(n, 2)``.
+        min_separation_px: Pixels.
+
+    Returns:
+        ``(n,)`` distances; where a feature is compared with no other one, a number above all distances (256
+        for ORB).
+
+    Raises:
+        BadRequest: Shapes do not fit, or descriptors are neither uint8 nor int8.
+        MissingExtra: The descriptors are ORB, and the native core is not installed.
+    """
+    is_fit = descriptors.ndim == 2 and len(descriptors) == len(pixels) and pixels.shape[1:] == (2,)
+    if not is_fit or descriptors.dtype not in _DESCRIPTOR_DTYPES:
+        raise BadRequest(
+            f"{len(pixels)} features cannot have descriptors of shape {descriptors.shape} and type "
+            f"{descriptors.dtype}",
+            hint="give one descriptor of uint8 or int8 and two pixel coordinates for each feature",
+        )
+    if ORB.is_kind_of(descriptors):
+        nearest = np.full(len(pixels), no_distance(descriptors), dtype=np.int32)
+        _core_distinct()(
+            descriptors, pixels.astype(np.float64, copy=False), len(pixels), float(min_separation_px), nearest
+        )
+        return nearest
+    pixels = np.asarray(pixels, dtype=np.float64)
+    distances, none = distance_matrix(descriptors, descriptors), no_distance(descriptors)
+    with np.errstate(invalid="ignore", over="ignore"):
+        is_apart = (np.abs(pixels[:, None] - pixels[None]) >= min_separation_px).any(axis=2)
+    distances[~is_apart | np.eye(len(pixels), dtype=bool)] = none
+    most_similar: npt.NDArray[np.int32] = distances.min(axis=1, initial=none).astype(np.int32)
+    return most_similar
+
+
+@cache
+def _core_distinct() -> Any:
+    pointer, size = ctypes.c_void_p, ctypes.c_int64
+    arguments = (pointer, pointer, size, ctypes.c_double, pointer)
+    return core_function("track", "rse_pf_distinct", arguments, ctypes.c_int32)

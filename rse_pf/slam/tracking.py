@@ -20,7 +20,7 @@ from rse_pf.errors import BadRequest
 from rse_pf.geometry import Array, Camera, transform
 from rse_pf.maps.descriptors import ORB, Descriptors
 from rse_pf.native import PART_ABIS, Workspace, address_of, aligned, core_function
-from rse_pf.slam.descriptors import distance_matrix, distances_of_pairs, no_distance
+from rse_pf.slam.descriptors import distances_of_pairs, no_distance
 
 __all__ = [
     "FittedPose",
@@ -33,7 +33,6 @@ __all__ = [
     "fit_readout_change",
     "match_landmarks",
     "match_predictions",
-    "measure_distinctiveness",
     "predict_features",
 ]
 
@@ -74,7 +73,7 @@ class ImageFeatures:
         sizes: ``(n,)``, the scale of each feature, 1 for the finest pyramid level; meaningless unless
             *is_scaled*.
         distinctiveness: ``(n,)``, distance of each descriptor to the most similar other one of the same
-            image, see `measure_distinctiveness`.
+            image, see `rse_pf.slam.descriptors.measure_distinctiveness`.
         is_oriented: Whether the feature extractor measures orientations.
         is_scaled: Whether the feature extractor measures sizes.
     """
@@ -245,7 +244,6 @@ class _FitResult(ctypes.Structure):
 
 
 _CORE_SIGNATURES = {
-    "distinct": ((_P, _P, _I, _D, _P), ctypes.c_int32),
     "match_near": ((_P,) * 4, _I),
     "seek": ((_P,) * 5, _I),
     "fit_pose": ((_P,) * 3, ctypes.c_int32),
@@ -256,54 +254,6 @@ _CORE_SIGNATURES = {
 @cache
 def _core(name: str) -> Any:
     return core_function("track", f"rse_pf_{name}", *_CORE_SIGNATURES[name])
-
-
-def measure_distinctiveness(
-    descriptors: Descriptors, pixels: Array, min_separation_px: float = 6.0
-) -> npt.NDArray[np.int32]:
-    """Return the distance of each descriptor to the most similar other one of the same image.
-
-    Two features that are closer than *min_separation_px* both in columns and in rows count as the same point,
-    and are not compared.
-
-    Args:
-        descriptors: ``(n, d)``, uint8 (Hamming distance) or int8 (squared Euclidean distance).
-        pixels: ``(n, 2)``.
-        min_separation_px: Pixels.
-
-    Returns:
-        ``(n,)`` distances; where a feature is compared with no other one, a number above all distances (256
-        for ORB).
-
-    Raises:
-        BadRequest: Shapes do not fit, or descriptors are neither uint8 nor int8.
-        MissingExtra: The descriptors are ORB, and the native core is not installed.
-    """
-    is_fit = descriptors.ndim == 2 and len(descriptors) == len(pixels) and pixels.shape[1:] == (2,)
-    if not is_fit or descriptors.dtype not in _DESCRIPTOR_DTYPES:
-        raise BadRequest(
-            f"{len(pixels)} features cannot have descriptors of shape {descriptors.shape} and type "
-            f"{descriptors.dtype}",
-            hint="give one descriptor of uint8 or int8 and two pixel coordinates for each feature",
-        )
-    if ORB.is_kind_of(descriptors):
-        descriptors, pixels = aligned(descriptors), aligned(pixels, np.float64)
-        nearest = np.full(len(pixels), _ORB_DISTANCE_LIMIT, dtype=np.int32)
-        _core("distinct")(
-            address_of(descriptors),
-            address_of(pixels),
-            len(pixels),
-            float(min_separation_px),
-            address_of(nearest),
-        )
-        return nearest
-    pixels = np.asarray(pixels, dtype=np.float64)
-    distances, none = distance_matrix(descriptors, descriptors), no_distance(descriptors)
-    with np.errstate(invalid="ignore", over="ignore"):
-        is_apart = (np.abs(pixels[:, None] - pixels[None]) >= min_separation_px).any(axis=2)
-    distances[~is_apart | np.eye(len(pixels), dtype=bool)] = none
-    most_similar: npt.NDArray[np.int32] = distances.min(axis=1, initial=none).astype(np.int32)
-    return most_similar
 
 
 def predict_features(
@@ -504,7 +454,7 @@ def _call_matcher(
     """
     rows, features = np.empty((2, min(predicted_count, feature_count)), dtype=np.int64)
     workspace = _WORKSPACE.words(11 * predicted_count + 12 * feature_count + _GRID_WORDS)
-    count = function(*map(ctypes.byref, requests), *map(address_of, (workspace, rows, features)))
+    count = function(*map(ctypes.byref, requests), workspace, rows, features)
     return rows[: max(0, count)], features[: max(0, count)]
 
 
@@ -660,7 +610,7 @@ def fit_pose(
     is_inlier = np.zeros(n, dtype=np.uint8)
     result = _FitResult()
     request, _referenced = _make_fit_request(observed, camera, T_camera_world, cauchy, gate2)
-    if _core("fit_pose")(ctypes.byref(request), address_of(is_inlier), ctypes.byref(result)):
+    if _core("fit_pose")(ctypes.byref(request), is_inlier, ctypes.byref(result)):
         return None
     return FittedPose(
         T_camera_world=np.array(result.T_camera_world).reshape(4, 4),
@@ -712,8 +662,8 @@ def fit_readout_change(
         MissingExtra: The native core is not installed.
     """
     request, _referenced = _make_fit_request(observed, camera, T_camera_world, cauchy, 0.0)
-    displacements = aligned(displacements, np.float64)
     fitted = np.zeros(2)
-    address = address_of(fitted)
-    _core("fit_sway")(ctypes.byref(request), address_of(displacements), address, address + fitted.itemsize)
+    _core("fit_sway")(
+        ctypes.byref(request), displacements.astype(np.float64, copy=False), fitted[:1], fitted[1:]
+    )
     return float(fitted[0]), float(fitted[1])

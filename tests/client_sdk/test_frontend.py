@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from client_sdk.frontend import Frame, FrontEndOptions, describe, extract, points_at, round_for_wire
+from client_sdk.frontend import Frame, FrontEndOptions, describe, extract, points_at
+from client_sdk.tracking.pose_queries import round_for_wire
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Camera
 from rse_pf.pnp import PnpOptions

@@ -24,7 +24,13 @@ from rse_pf.maps.descriptors import ORB, DescriptorKind, common_kind
 from rse_pf.maps.format import Keyframe, MapVersion, decode_map, encode_map
 from rse_pf.service import dispatch
 from rse_pf.services.builtin import builtin_services
-from rse_pf.slam.descriptors import best_matches, distance_matrix, distances_of_pairs, no_distance
+from rse_pf.slam.descriptors import (
+    best_matches,
+    distance_matrix,
+    distances_of_pairs,
+    measure_distinctiveness,
+    no_distance,
+)
 from rse_pf.slam.keyframe import (
     MAX_KEYFRAME_BYTES,
     SentKeyframe,
@@ -40,7 +46,6 @@ from rse_pf.slam.tracking import (
     ImageFeatures,
     PredictedFeatures,
     match_predictions,
-    measure_distinctiveness,
 )
 from rse_pf.wire import Command, Failure, Result
 from tests.live_map.generated_drives import GeneratedWorld, circle

@@ -12,6 +12,7 @@ import pytest
 
 from rse_pf.errors import BadRequest
 from rse_pf.geometry import Array, Camera, exp_se3, inverse, log_se3, transform
+from rse_pf.slam.descriptors import measure_distinctiveness
 from rse_pf.slam.tracking import (
     FittedPose,
     GuidedMatchLimits,
@@ -23,7 +24,6 @@ from rse_pf.slam.tracking import (
     fit_readout_change,
     match_landmarks,
     match_predictions,
-    measure_distinctiveness,
     predict_features,
 )
 from tests.oracles import matching, pose_fit

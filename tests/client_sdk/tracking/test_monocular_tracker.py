@@ -18,7 +18,8 @@ from client_sdk.trajectory import Trajectory
 from rse_pf.errors import UsageError
 from rse_pf.experiments.results.trajectory_error import accuracy
 from rse_pf.geometry import Array, Camera, exp_se3, inverse, pose_difference, transform
-from rse_pf.slam.tracking import ImageFeatures, measure_distinctiveness
+from rse_pf.slam.descriptors import measure_distinctiveness
+from rse_pf.slam.tracking import ImageFeatures
 from tests.client_sdk.mapper.flat_world import CAMERA, covered, foreign, frame_at
 from tests.client_sdk.tracking.driving import run, run_all, solve
 
