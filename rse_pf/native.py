@@ -145,7 +145,8 @@ def core_function(part: str, name: str, arguments: Sequence[Any], result: Any) -
     """Return one function of the native core with its ctypes signature.
 
     Each call finds and opens the library again, so callers keep the result.  The function takes numpy arrays
-    where C has pointers; an array that is not C-contiguous and aligned is passed as such a copy.
+    where C has pointers to data of their type; an array that is not C-contiguous and aligned is passed as
+    such a copy, so that C must only read it.
 
     Args:
         part: Part of the core, a key of `PART_ABIS`.
@@ -161,7 +162,8 @@ def core_function(part: str, name: str, arguments: Sequence[Any], result: Any) -
     function.argtypes, function.restype = arguments, result
 
     def call(*values: Any) -> Any:
-        values = tuple([aligned(value) if isinstance(value, np.ndarray) else value for value in values])
-        return function(*[address_of(value) if isinstance(value, np.ndarray) else value for value in values])
+        # The list keeps copies alive until C returns.
+        kept = [aligned(value) if isinstance(value, np.ndarray) else value for value in values]
+        return function(*[address_of(value) if isinstance(value, np.ndarray) else value for value in kept])
 
     return call
