@@ -52,4 +52,5 @@ async def merge_maps(
 
 
 def _ignore_progress(done: float, step: str) -> None:
-    """Ignore the progress; a call with such a function has no default deadline."""
+    """Ignore the progress: it stands in for the caller's function, since a call with any function has no
+    default deadline."""

@@ -530,7 +530,7 @@ class Mapper:
             for number in tracker.segments[1:]
         ]
 
-    # --- First frame ---
+    # --- Check of each frame, and choice of the tracker by the first one ---
 
     def _check(self, frame: Frame) -> None:
         """Raise UsageError for a frame that cannot follow the one before, else note its camera and time.

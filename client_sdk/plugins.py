@@ -476,7 +476,10 @@ class Plugins:
             self.motion.add(timestamp_s, T_world_camera)
 
     def forget_poses(self) -> None:
-        """Let the user's motion model begin anew: the camera was lost, or the world frame was moved."""
+        """Drop the poses kept for the user's motion model: the camera was lost, or the world frame was moved.
+
+        The model predicts again after the next `add_pose`.
+        """
         if self.motion is not None:
             self.motion.clear()
 

@@ -240,7 +240,11 @@ class BackgroundUploader:
         await self._is_empty.wait()
 
     async def run(self) -> None:
-        """Upload objects until cancelled; a failed upload is repeated after a pause, unless it is refused."""
+        """Upload objects, the oldest first, until cancelled.
+
+        A failed upload is repeated after a pause, while later objects wait.  A refused object is dropped; if
+        the server would refuse every object of the robot, all objects that wait are dropped.
+        """
         pause_s = _FIRST_PAUSE_S
         while True:
             # 1. Wait for an object, for the rate limit, and for pose queries and keyframes.

@@ -112,10 +112,10 @@ class BurstClient:
         self._tasks: set[asyncio.Task[Result | Failure]] = set()
 
     def read_welcome(self, welcome: Welcome) -> None:
-        """Take over the address of the function and the robot's daily budget from *welcome*.
+        """Take over from *welcome* the address of the function, and how many commands it may get in a day.
 
-        An address that the user gave stays in use.  A *welcome* without an address leaves the budget as it
-        is.
+        A *welcome* without an address ends the use of the address of an earlier one, and leaves the budget as
+        it is.  An address that the user gave stays in use in any case.
         """
         self._welcome_url = welcome.burst_url
         if welcome.burst_url:

@@ -266,7 +266,10 @@ def _points_of_pair(frame: Frame, features: Features) -> tuple[Array, npt.NDArra
 
 
 def select_certain_rows(frame: Frame, features: Features) -> npt.NDArray[np.int64]:
-    """Return the rows of the features of a stereo pair whose depth is known to 5 %."""
+    """Return the rows of the features of a stereo pair whose depth is certain.
+
+    Two standard deviations of such a depth are at most 5 % of it.  Rows without a depth are left out.
+    """
     depths_m = features.points_camera[:, 2]
     with np.errstate(invalid="ignore"):
         deviation_m = _DISPARITY_SIGMAS * np.sqrt(frame.depth_noise.variance_m2(depths_m))

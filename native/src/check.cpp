@@ -11,7 +11,8 @@ constexpr int64_t kMaxRows = int64_t{1} << 24;
 constexpr int64_t kContrastPx = 16;
 // Distance (px) over which the steepest part of an edge is measured.
 constexpr int64_t kSlopePx = 2;
-// Shortest line (px) whose edges are measured: three times the distance over which contrast is measured.
+// Shortest row of an image (px) along which edge sharpness is measured: three times kContrastPx.  An image with shorter
+// rows is refused.
 constexpr int64_t kMinLength = 48;
 // Number of grey levels of a pixel, and so of contrasts.
 constexpr int64_t kLevels = 256;

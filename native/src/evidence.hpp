@@ -40,9 +40,10 @@ static double log10_false_alarms(int64_t n, int64_t inliers, double largest_erro
     return log * kLog10E;
 }
 
-// Count the independent inliers: inliers in the same cell or in adjacent cells of the image count once.  Where at least
-// kManyCells cells are occupied, return the number of all inliers (`count`).  u, v: pixels relative to the principal
-// point (cx, cy); width: of the image, pixels.
+// Count the independent inliers: of the occupied cells of a grid over the image, in the order of columns and rows, count
+// each cell that touches no counted cell, also not diagonally (a row of five cells counts 3).  Where at least kManyCells
+// cells are occupied, return the number of all inliers (`count`).  u, v: pixels relative to the principal point (cx, cy);
+// width: of the image, pixels.
 static int64_t count_independent_inliers(const double* u, const double* v, int64_t count, double cx, double cy,
                                          double width) {
     // 1. List the occupied cells.

@@ -20,8 +20,12 @@ __all__ = ["UP_TO_SCALE", "alignment_of", "report_alignments"]
 
 UP_TO_SCALE = "up to scale: no robot with metres has seen what it sees"
 
-MIN_REPORTED_SHIFT_M = 0.001  # metres that an alignment must move before the robot is sent a correction
-MIN_REPORTED_ROTATION_DEG = 0.05  # degrees that an alignment must turn before the robot is sent a correction
+MIN_REPORTED_SHIFT_M = 0.001
+"""Metres by which a segment has shifted since its last correction above which its robot is sent another one,
+even if the segment has not turned."""
+MIN_REPORTED_ROTATION_DEG = 0.05
+"""Degrees by which a segment has turned since its last correction above which its robot is sent another one,
+even if the segment has not shifted."""
 MIN_REPORTED_LOG_SCALE = 0.002
 """Change of the logarithm of a segment's scale above which its robot is sent a correction."""
 

@@ -511,7 +511,7 @@ class _LazyProvenance(Mapping[str, Any]):
 
 
 def _reject_extension(code: int, _: memoryview) -> Any:
-    raise ValueError(f"it holds a MessagePack extension of type {code}")
+    raise ValueError(f"the provenance holds a MessagePack extension of type {code}")
 
 
 def _decode_keyframe(encoded: _EncodedKeyframe, kind: DescriptorKind) -> Keyframe:

@@ -50,7 +50,9 @@ __all__ = [
 RejectionCounts = Counter[tuple[int, int, str]]
 """Number of rejected keyframe pairs by (lower map, higher map, reason)."""
 
-MAX_PAIRS = 700_000  # keyframe pairs that one merge may compare, because each needs some milliseconds
+MAX_PAIRS = 700_000
+"""Largest product of the numbers of keyframes, maps and candidates of a merge, which bounds the pairs of
+keyframes that it compares: a pair needs some milliseconds."""
 WEAK_POSE_VARIANCE = 4.0
 """Factor by which the covariance of a weakly determined relative pose is multiplied.  In rendered worlds the
 errors of such poses are 1.2 to 1.7 times, at most 2.7 times, their standard deviations; a third of the loop

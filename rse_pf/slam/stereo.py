@@ -67,7 +67,8 @@ class StereoOptions:
 def stereo_noise(f_baseline: float, disparity_px: float) -> DepthNoise:
     """Return the noise model of depths ``f_baseline / d`` by the noise of their disparities ``d``.
 
-    The standard deviation of a depth z is that of the disparity times ``z^2 / f_baseline``, at most ``z^2``.
+    The standard deviation of a depth z is ``1e-5 m + growth * z^2``.  The growth (1/m) is *disparity_px* over
+    *f_baseline*, but at most 1, the largest that `DepthNoise` accepts.
 
     Args:
         f_baseline: Focal length in pixels times the baseline in metres.

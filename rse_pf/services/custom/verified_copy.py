@@ -133,7 +133,9 @@ class VerifiedCopy:
         self._file_statuses = file_statuses
 
     def problem(self) -> ConfigurationError | None:
-        """Return an error that names the files of the original that were changed, None if none was.
+        """Return an error that names the files of the original that have not the hashes of its installation.
+
+        Return None if there is no such file.
 
         A newer installation of the service is not an error: the server runs this copy until it is replaced.
         """

@@ -96,7 +96,8 @@ def merge_maps(request: MergeRequest, *, report: Report = ignore_progress) -> Me
     Raises:
         BadRequest: There are no or too many maps, the bytes are not maps, a map has no keyframes, the maps
             have descriptors of different kinds, or the information of an edge is not positive definite.
-        LimitExceeded: The maps are too large, or have too many similar keyframes to compare.
+        LimitExceeded: The maps are too large, or the product of the numbers of keyframes, maps and candidates
+            is above `MAX_PAIRS`.
         MissingExtra: GTSAM or the native core is not installed.
         Cancelled: *report* raised it.
     """
