@@ -113,8 +113,8 @@ class LandmarkAppearance:
 
     Attributes:
         points: ``(n, 3)`` positions in the world, in metres or in the map's unit.
-        rays: ``(n, 3)``, from the centre of the camera of that last image to the landmark, in the axes and the
-            unit of the world; not normalised, so that their length is the distance.
+        rays: ``(n, 3)``, from the centre of the camera of that last image to the landmark, in the axes and
+            the unit of the world; not normalised, so that their length is the distance.
         orientations: ``(n, 3)``, the feature's orientation in that image as a direction in the world.
         sizes: ``(n,)``, the feature's scale in that image, 1 for the finest pyramid level.
         descriptors: ``(n, d)``.
