@@ -52,7 +52,7 @@ def report_alignments(
         # 1. Report a segment whose connection with the map was lost.
         if not graph.is_aligned(row):
             if is_reported:
-                is_metric = graph.is_metric(segment.component)
+                is_metric = segment.component in graph.metric_components
                 default = "the links that aligned it were removed" if is_metric else UP_TO_SCALE
                 graph.report_unaligned(row, segment.reason or default)
                 outcomes.append(Unaligned(robot=segment.robot, segment=segment.number, reason=segment.reason))
@@ -66,7 +66,7 @@ def report_alignments(
             continue
         # 3. Report the new alignment.
         newest = segment.keyframes[-1]
-        covariance = windows.covariance(graph, newest) if windows is not None else None
+        covariance = windows.covariances.get(newest) if windows is not None else None
         graph.report_alignment(row, T_map_odom, covariance)
         outcomes.append(
             Corrected(

@@ -49,8 +49,7 @@ def choose_candidates(
     is_close = rows == rows[keyframe]
     is_close &= np.abs(graph.odometry_steps - graph.odometry_steps[keyframe]) < min_steps
     # 2. Ask place recognition, separately for other components and for the keyframe's own one.
-    component = np.array([segment.component for segment in graph.segments])[rows]
-    is_own = component == graph.component_of(keyframe)
+    is_own = graph.components == graph.components[keyframe]
     from_others = places.nearest(vector, limit // 2, np.flatnonzero(is_allowed & ~is_own))
     own_limit = limit - len(from_others)
     from_own = places.nearest(vector, own_limit, np.flatnonzero(is_allowed & is_own & ~is_close))

@@ -11,8 +11,7 @@ All numbers depend on the order of the events only, so that a replay gives equal
 
 from __future__ import annotations
 
-import heapq
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import pairwise
 
 import numpy as np
@@ -26,10 +25,6 @@ __all__ = ["MapGraph", "count_odometry_steps"]
 STEP_LENGTH_M = 0.25  # metres of motion that are one step of odometry, for which its drift is stated
 STEP_ROTATION_DEG = 15.0  # degrees of rotation that are one step of odometry, for which its drift is stated
 MIN_STEP = 0.05  # steps of odometry that a motion counts as, at least: a stationary robot has some variance
-MAX_PATH_STEPS = 200.0
-"""Steps of odometry that stand for a path which the search does not find: the upper limit along one segment,
-the lower limit elsewhere.  After so many steps odometry says nothing about the relative pose."""
-MAX_VISITED_KEYFRAMES = 250  # keyframes that one search for shortest paths visits, to bound its CPU time
 MAX_REJECTED_EDGES = 2000
 """Newest rejected loop closures that are kept, since a map decides about them again after a robot was
 forgotten or excluded."""
@@ -90,6 +85,7 @@ class MapGraph:
         self._T_odom_camera = np.empty((64, 4, 4))
         self._odometry_steps = np.empty(64)
         self._segment_rows = np.empty(64, dtype=np.int64)
+        self._components = np.empty(64, dtype=np.int64)
         self._positions = np.empty(64, dtype=np.int64)
         self._has_features = np.empty(64, dtype=np.bool_)
 
@@ -119,6 +115,11 @@ class MapGraph:
         return self._segment_rows[: self._size]
 
     @property
+    def components(self) -> npt.NDArray[np.int64]:
+        """``(n,)``: component of each keyframe, the row of its first segment; -1 for forgotten robots."""
+        return self._components[: self._size]
+
+    @property
     def positions(self) -> npt.NDArray[np.int64]:
         """``(n,)``: position of each keyframe within its segment, from 0."""
         return self._positions[: self._size]
@@ -137,13 +138,6 @@ class MapGraph:
     def segment_of(self, i: int) -> Segment:
         """Return the segment of keyframe *i*, whose robot was not forgotten."""
         return self.segments[int(self._segment_rows[i])]
-
-    def component_of(self, i: int) -> int:
-        """Return the component of keyframe *i*: the row of the first segment in it.
-
-        The robot of the keyframe must not have been forgotten.
-        """
-        return self.segments[int(self._segment_rows[i])].component
 
     def find_segment(self, robot: str, number: int) -> Segment | None:
         """Return segment *number* of a robot, None if there is none or it has no keyframes left."""
@@ -166,27 +160,15 @@ class MapGraph:
         """Return whether segment *row* is in the component that the map consists of, if there is one."""
         return self.root >= 0 and self.segments[row].component == self.segments[self.root].component
 
-    def is_metric(self, component: int) -> bool:
-        """Return whether the unit of a component is a metre: one of its segments is metric."""
-        return any(
-            segment.component == component and segment.is_metric and segment.keyframes
-            for segment in self.segments
-        )
+    @property
+    def metric_components(self) -> set[int]:
+        """The components whose unit is a metre: one of their segments is metric and has keyframes."""
+        return {each.component for each in self.segments if each.is_metric and each.keyframes}
 
     @property
     def has_scales(self) -> bool:
         """Whether a segment has no metric scale of its own, so that scales must be estimated."""
         return not all(segment.is_metric for segment in self.segments)
-
-    def unit_segment_of(self, edge: LoopEdge) -> int:
-        """Return the row of the segment in whose unit a loop closure is, -1 if it is in metres."""
-        is_metric = self.segment_of(edge.a).is_metric or self.segment_of(edge.b).is_metric
-        return -1 if is_metric else int(self._segment_rows[edge.a])
-
-    def relative_pose_of(self, edge: LoopEdge) -> Array:
-        """Return ``T_a_b`` of a loop closure within one component, in the unit of the component."""
-        row = self.unit_segment_of(edge)
-        return edge.T_a_b if row < 0 else scaled(edge.T_a_b, self.segments[row].scale)
 
     def odometry_poses(self, ids: Sequence[int]) -> Array:
         """Return ``(n, 4, 4)`` poses of keyframes in their odometry frames, in the unit of the component."""
@@ -224,22 +206,6 @@ class MapGraph:
                 by_segments.setdefault(self.segment_pair_of(edge), []).append(number)
         return by_segments
 
-    def neighbours(self, i: int) -> Iterator[tuple[int, float]]:
-        """Yield (keyframe, steps) of each keyframe that odometry or an accepted edge connects with *i*.
-
-        A loop closure counts as one step.  Keyframes of a stored version have no odometry.
-        """
-        segment = self.segments[self._segment_rows[i]]
-        if not segment.is_from_version:
-            position = int(self._positions[i])
-            for near in (position - 1, position + 1):
-                if 0 <= near < len(segment.keyframes):
-                    other = segment.keyframes[near]
-                    yield other, abs(float(self._odometry_steps[other] - self._odometry_steps[i]))
-        for number in self._accepted_of.get(i, []):
-            edge = self.edges[number]
-            yield (edge.b if edge.a == i else edge.a), 1.0
-
     def odometry_edges_of(self, i: int) -> list[tuple[int, int]]:
         """Return the pairs (before, *i*) and (*i*, after) of consecutive keyframes of the segment of *i*.
 
@@ -257,36 +223,6 @@ class MapGraph:
         """Return the keyframe after *i* in its segment, -1 if *i* is the last one."""
         ids, position = self.segments[self._segment_rows[i]].keyframes, int(self._positions[i])
         return int(ids[position + 1]) if position + 1 < len(ids) else -1
-
-    def shortest_paths(self, start: int, targets: Iterable[int]) -> dict[int, float]:
-        """Return the steps of odometry from keyframe *start* to each target along the shortest path.
-
-        A loop closure counts as one step.  The search (Dijkstra) visits 250 keyframes at most.  A target that
-        it does not reach gets the steps along the segment, at most 200, if it is in the segment of *start*;
-        else the steps to the farthest visited keyframe, at least 200.
-        """
-        wanted = set(targets)
-        steps: dict[int, float] = {}
-        visited: set[int] = set()
-        heap = [(0.0, start)]
-        farthest = 0.0
-        while heap and len(steps) < len(wanted) and len(visited) < MAX_VISITED_KEYFRAMES:
-            farthest, i = heapq.heappop(heap)
-            if i in visited:
-                continue
-            visited.add(i)
-            if i in wanted:
-                steps[i] = farthest
-            for neighbour, length in self.neighbours(i):
-                if neighbour not in visited:
-                    heapq.heappush(heap, (farthest + length, neighbour))
-        for i in wanted - steps.keys():
-            along_segment = abs(float(self._odometry_steps[i] - self._odometry_steps[start]))
-            is_same_segment = self._segment_rows[i] == self._segment_rows[start]
-            steps[i] = (
-                min(along_segment, MAX_PATH_STEPS) if is_same_segment else max(farthest, MAX_PATH_STEPS)
-            )
-        return steps
 
     # --- Changes of keyframes and segments ---
 
@@ -357,6 +293,7 @@ class MapGraph:
         self.keyframes.append(keyframe)
         self._T_component_camera[i], self._T_odom_camera[i] = T_component, T_odom
         self._odometry_steps[i], self._segment_rows[i] = odometry_steps, row
+        self._components[i] = segment.component
         self._positions[i], self._has_features[i] = len(segment.keyframes), True
         segment.keyframes.append(i)
         if not segment.is_from_version:
@@ -371,8 +308,8 @@ class MapGraph:
         if self._size < len(self._odometry_steps):
             return
         names = (
-            "_T_component_camera", "_T_odom_camera", "_odometry_steps", "_segment_rows", "_positions",
-            "_has_features",
+            "_T_component_camera", "_T_odom_camera", "_odometry_steps", "_segment_rows", "_components",
+            "_positions", "_has_features",
         )  # fmt: skip
         for name in names:
             old = getattr(self, name)
@@ -431,7 +368,7 @@ class MapGraph:
             self.drop_features(i)
             self.orphaned_objects += [(robot, digest) for digest in self.keyframes[i].objects]
             self.keyframes[i].objects = ()
-            self._segment_rows[i] = -1
+            self._segment_rows[i] = self._components[i] = -1
         self.orphaned_objects = self.orphaned_objects[-MAX_ORPHANED_OBJECTS:]
         # 4. Choose another segment to define the frame of the map if necessary, and update the components.
         self.newest_segments.pop(robot, None)
@@ -654,6 +591,7 @@ class MapGraph:
                 parent[max(row_a, row_b)] = min(row_a, row_b)
         for row, segment in enumerate(self.segments):
             segment.component = find_root(row)
+            self._components[segment.keyframes] = segment.component
 
     def _drop_pair_consistency(self) -> None:
         """Drop the known consistency of pairs that are not both pending any more."""
@@ -696,11 +634,14 @@ class MapGraph:
             table = np.empty((capacity, *values.shape[1:]), dtype=values.dtype)
             table[:n] = values
             setattr(graph, name, table)
+        graph._components = np.full(capacity, -1, dtype=np.int64)
         graph._has_features = np.zeros(capacity, dtype=np.bool_)
         graph._has_features[:n] = [keyframe.data is not None for keyframe in keyframes]
         graph.keyframes, graph._accepted_of = keyframes, accepted_by_keyframe
         for name, value in tables.items():
             setattr(graph, name, value)
+        for segment in graph.segments:
+            graph._components[segment.keyframes] = segment.component
         return graph
 
 

@@ -55,8 +55,14 @@ from rse_pf.live_map.outcomes import (
     OptimiseWanted,
     Outcome,
 )
-from rse_pf.live_map.outlier_rejection import GraphChanges, decide_again, process_new_edges
-from rse_pf.live_map.robot_checks import exclude_if_contradicting, has_odometry_jump, has_wrong_scale
+from rse_pf.live_map.outlier_rejection import (
+    GraphChanges,
+    decide_again,
+    exclude_if_contradicting,
+    has_odometry_jump,
+    has_wrong_scale,
+    process_new_edges,
+)
 from rse_pf.live_map.smoothing import CAUCHY_WIDTH, SmoothedWindows, smooth_changes, smooth_everything
 from rse_pf.live_map.snapshots import (
     SnapshotParts,
@@ -507,12 +513,8 @@ class LiveMap:
         reports = report_alignments(graph, (robot, number), windows)
         # 6. Drop redundant features, and those of a keyframe whose odometry jumped, since they would
         #    contradict every later keyframe.
-        culled = (
-            self._drop_features((keyframe,))
-            if has_jumped
-            else self._drop_features(find_redundant_keyframes(graph, keyframe))
-        )
-        return [*changes.outcomes, *decided_again, *reports, *culled]
+        surplus = (keyframe,) if has_jumped else find_redundant_keyframes(graph, keyframe)
+        return [*changes.outcomes, *decided_again, *reports, *self._drop_features(surplus)]
 
     def _take_optimised_poses(self, event: Optimised) -> list[Outcome]:
         """Take the poses of an optimisation; keyframes that arrived later move with those before them."""

@@ -2,13 +2,16 @@
 
 A new loop closure is *pending*.  Within one component it is compared with the poses of the graph, between two
 components with other loop closures (see `pairwise_consistency`).  Loop closures that contradict the graph,
-but agree with each other, are evidence against loop closures that were accepted earlier.
+but agree with each other, are evidence against loop closures that were accepted earlier.  A robot whose
+odometry or metric scale keeps contradicting the other robots is excluded: its keyframes stay, but its loop
+closures are ignored.
 
 To add a rule that rejects loop closures, see CONTRIBUTING.md.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import groupby
@@ -16,8 +19,9 @@ from typing import Literal
 
 import numpy as np
 
-from rse_pf.geometry import Array, inverse
-from rse_pf.live_map.graph import STEP_LENGTH_M, MapGraph
+from rse_pf.geometry import inverse
+from rse_pf.live_map.events import MeasuredLoopClosure, matrix_of
+from rse_pf.live_map.graph import MapGraph
 from rse_pf.live_map.outcomes import Ambiguous, LoopClosureAccepted, LoopClosureRejected, Outcome
 from rse_pf.live_map.pairwise_consistency import (
     ALIAS_DISTANCE_M,
@@ -26,16 +30,19 @@ from rse_pf.live_map.pairwise_consistency import (
     Fit,
     classify_by_graph,
     decide_join,
-    find_consistent_by_odometry,
+    find_contradiction,
     find_supporting_edges,
-    is_at_alias,
     total_weight,
 )
+from rse_pf.slam.consistency import evidence_weight
 
 __all__ = [
     "GraphChanges",
     "decide_again",
+    "exclude_if_contradicting",
     "find_weakest_connection",
+    "has_odometry_jump",
+    "has_wrong_scale",
     "process_new_edges",
     "reject_misfitting_edges",
 ]
@@ -51,9 +58,16 @@ most."""
 MIN_ALIAS_SUPPORT = 12
 """Summed weight of contrary loop closures between two segments, at least, that proves perceptual aliases
 where no connection weighs less, so that none can be rejected."""
-MAX_DRIFT_RATIO = 0.15
-"""Error of odometry, in metres per metre of path, that is possible; a larger disagreement with loop closures
-means that two places look the same."""
+JUMP_NEIGHBOURS = 4
+"""Keyframes before a new one that may prove a jump of its odometry: they saw the same place a moment before,
+so they cannot be at another place that looks the same."""
+MAX_JUMP_RATIO = 0.5  # error of odometry per length of motion above which the odometry has jumped
+MAX_CONTRADICTIONS = 16
+"""Contradictions among the last 32 records of a segment from which on it is excluded; honest robots stay far
+below, also with 10 % of wheel slip."""
+WRONG_SCALE_COUNT = 2
+"""Records of a contradiction that a keyframe with a wrong metric scale counts as, because two other robots
+measured the scale."""
 FIXED_WEIGHT = 1e9  # weight of a connection that is never rejected, above any sum of loop closures' weights
 
 _AT_SEVERAL_PLACES = "ambiguous: what it saw is in the map at several places"
@@ -86,16 +100,14 @@ def process_new_edges(graph: MapGraph, keyframe: int, numbers: list[int]) -> Gra
     """
     changes = GraphChanges()
     # 1. Decide about the loop closures within the component of the keyframe by the poses of the graph.
-    component = graph.component_of(keyframe)
-    others = {
-        number: graph.edges[number].b if graph.edges[number].a == keyframe else graph.edges[number].a
-        for number in numbers
-    }
-    within = [number for number in numbers if graph.component_of(others[number]) == component]
+    component = int(graph.components[keyframe])
+    edges = {number: graph.edges[number] for number in numbers}
+    others = {number: edge.b if edge.a == keyframe else edge.a for number, edge in edges.items()}
+    within = [number for number in numbers if graph.components[others[number]] == component]
     _decide_within(graph, _drop_redundant_weak(graph, within), changes)
     # 2. Try to join the component with those that its loop closures lead to.
-    for other in sorted({graph.component_of(i) for i in others.values()} - {component}):
-        _join_if_consistent(graph, graph.component_of(keyframe), other, changes)
+    for other in sorted({int(graph.components[i]) for i in others.values()} - {component}):
+        _join_if_consistent(graph, int(graph.components[keyframe]), other, changes)
     return changes
 
 
@@ -148,7 +160,7 @@ def _decide_within(graph: MapGraph, numbers: list[int], changes: GraphChanges) -
     # 1. Compare the loop closures with the poses of the graph.
     fits = classify_by_graph(graph, numbers)
     changes.fits |= {
-        "alias" if is_at_alias(graph, number) else fit
+        "alias" if _is_at_alias(graph, number) else fit
         for number, fit in fits.items()
         if graph.edges[number].weight == 1.0
     }
@@ -166,7 +178,7 @@ def _decide_within(graph: MapGraph, numbers: list[int], changes: GraphChanges) -
             continue
         edge = graph.edges[number]
         # A rejection for an earlier loop closure of this loop may have separated the components of both ends.
-        if graph.component_of(edge.a) != graph.component_of(edge.b):
+        if graph.components[edge.a] != graph.components[edge.b]:
             continue
         supporting = find_supporting_edges(graph, number)
         if supporting and fit == "vague":
@@ -216,14 +228,23 @@ def _reject_contradicted(graph: MapGraph, number: int, consistent: list[int], ch
     reason = f"{len(consistent)} later links agree with each other and contradict it"
     edge = graph.edges[number]
     row_a, row_b = int(graph.segment_rows[edge.a]), int(graph.segment_rows[edge.b])
-    if row_a == row_b:
-        _reject_contradicted_loops(graph, number, consistent, reason, changes)
+    if row_a != row_b and _is_at_alias(graph, number):
         return
-    if is_at_alias(graph, number):
-        return
-    # 1. Reject the weakest connection between both segments, as long as it weighs less than the contrary loop
-    #    closures, until both segments are in two components.
+    contradiction = find_contradiction(graph, number)
+    distance_m = contradiction.alias_distance_m
     weight = total_weight(graph, consistent)
+    # 1. Within one segment, reject the loops that the contrary loop closures outweigh, and accept these.
+    #    Where odometry cannot be so wrong, the contrary ones prove perceptual aliases instead.
+    if row_a == row_b:
+        contradicted = contradiction.edges
+        if distance_m is not None:
+            _mark_aliases(graph, consistent, distance_m, changes)
+        elif contradicted and total_weight(graph, contradicted) < weight:
+            _reject(graph, contradicted, reason, changes)
+            _accept(graph, consistent, changes)
+        return
+    # 2. Between two segments, reject the weakest connection, as long as it weighs less than the contrary
+    #    loop closures, until both segments are in two components.
     has_rejected = False
     while graph.segments[row_a].component == graph.segments[row_b].component:
         weakest = find_weakest_connection(graph, row_a, row_b)
@@ -232,53 +253,13 @@ def _reject_contradicted(graph: MapGraph, number: int, consistent: list[int], ch
         _reject(graph, weakest, reason, changes)
         has_rejected = True
     component_a, component_b = graph.segments[row_a].component, graph.segments[row_b].component
-    # 2. Join the two components again where the contrary loop closures say.
-    if has_rejected and component_a != component_b:
-        _join_if_consistent(graph, component_a, component_b, changes)
     # 3. If no connection was rejected, and the contrary loop closures weigh at least 12, an error of the
     #    graph that drift cannot explain proves perceptual aliases.
-    elif not has_rejected and weight >= MIN_ALIAS_SUPPORT:
-        error_m = _translation_error_m(graph, number, *graph.T_component_camera[[edge.a, edge.b]])
-        steps = graph.shortest_paths(edge.a, [edge.b])[edge.b]
-        if error_m > max(ALIAS_DISTANCE_M, steps * STEP_LENGTH_M * MAX_DRIFT_RATIO):
-            _mark_aliases(graph, consistent, error_m, changes)
-
-
-def _reject_contradicted_loops(
-    graph: MapGraph, number: int, consistent: list[int], reason: str, changes: GraphChanges
-) -> None:
-    """Reject accepted loops within one segment that *consistent* contrary ones outweigh, and accept these.
-
-    Where odometry cannot be so wrong, the contrary loop closures prove perceptual aliases instead.
-    """
-    edge = graph.edges[number]
-    row = int(graph.segment_rows[edge.a])
-    error_m = _translation_error_m(graph, number, *graph.odometry_poses([edge.a, edge.b]))
-    steps = abs(float(graph.odometry_steps[edge.a] - graph.odometry_steps[edge.b]))
-    if error_m > max(ALIAS_DISTANCE_M, steps * STEP_LENGTH_M * MAX_DRIFT_RATIO):
-        _mark_aliases(graph, consistent, error_m, changes)
-        return
-    contradicted = [
-        each
-        for each, accepted in graph.edges.items()
-        if accepted.state == "accepted"
-        and not accepted.is_fixed
-        and graph.segment_rows[accepted.a] == graph.segment_rows[accepted.b] == row
-        and each not in find_consistent_by_odometry(graph, number, [each])
-    ]
-    if contradicted and total_weight(graph, contradicted) < total_weight(graph, consistent):
-        _reject(graph, contradicted, reason, changes)
-        _accept(graph, consistent, changes)
-
-
-def _translation_error_m(graph: MapGraph, number: int, T_a: Array, T_b: Array) -> float:
-    """Return the distance of the relative pose of two poses from the loop closure between them.
-
-    *T_a* and *T_b* ``(4, 4)`` are the poses of both ends in one frame.  They and the result are in the unit
-    of the component, which is a metre if one of its segments is metric.
-    """
-    error = inverse(graph.relative_pose_of(graph.edges[number])) @ inverse(T_a) @ T_b
-    return float(np.sqrt((error[:3, 3] ** 2).sum()))
+    if not has_rejected and weight >= MIN_ALIAS_SUPPORT and distance_m is not None:
+        _mark_aliases(graph, consistent, distance_m, changes)
+    # 4. Join the two components again where the contrary loop closures say.
+    if has_rejected and component_a != component_b:
+        _join_if_consistent(graph, component_a, component_b, changes)
 
 
 def find_weakest_connection(graph: MapGraph, row_a: int, row_b: int) -> list[int]:
@@ -362,12 +343,9 @@ def _join_if_consistent(graph: MapGraph, first: int, second: int, changes: Graph
         changes.outcomes.append(LoopClosureAccepted(a=edge.a, b=edge.b))
         changes.mark_moved(edge.a, edge.b)
     # 2. Decide about the newest pending loop closures that are now within the joined component.
-    joined = graph.component_of(accepted[0].a)
-    within = [
-        number
-        for number in graph.pending
-        if graph.component_of(graph.edges[number].a) == graph.component_of(graph.edges[number].b) == joined
-    ]
+    components, joined = graph.components, graph.components[accepted[0].a]
+    pending = [(number, graph.edges[number]) for number in graph.pending]
+    within = [number for number, edge in pending if components[edge.a] == components[edge.b] == joined]
     _decide_within(graph, within[-MAX_EDGES_AFTER_JOIN:], changes)
 
 
@@ -393,8 +371,7 @@ def _mark_aliases(graph: MapGraph, numbers: list[int], distance_m: float, change
     # 1. Mark the keyframes around both ends of the loop closures.
     radius_m = min(0.5 * distance_m, MAX_ALIAS_RADIUS_M)
     ends = {end for number in numbers for end in (graph.edges[number].a, graph.edges[number].b)}
-    components = np.array([graph.component_of(i) if graph.exists(i) else -1 for i in range(len(graph))])
-    positions = graph.T_component_camera[:, :3, 3]
+    components, positions = graph.components, graph.T_component_camera[:, :3, 3]
     for i in sorted(ends):
         distances_m = np.sqrt(((positions - positions[i]) ** 2).sum(axis=1))
         near = np.flatnonzero((distances_m < radius_m) & (components == components[i]))
@@ -402,11 +379,17 @@ def _mark_aliases(graph: MapGraph, numbers: list[int], distance_m: float, change
     # 2. Reject connections between segments that have too little weight without the marked keyframes.
     for pair, connection in sorted(graph.accepted_edges_by_segments().items()):
         is_fixed = any(graph.edges[number].is_fixed for number in connection)
-        distinct = [number for number in connection if not is_at_alias(graph, number)]
+        distinct = [number for number in connection if not _is_at_alias(graph, number)]
         if pair[0] != pair[1] and not is_fixed and total_weight(graph, distinct) < MIN_SUPPORT:
             _reject(graph, connection, "ambiguous: both ends look like another place", changes)
             for row in pair:
                 graph.set_reason(row, _AT_SEVERAL_PLACES)
+
+
+def _is_at_alias(graph: MapGraph, number: int) -> bool:
+    """Return whether an end of a loop closure is at a place that looks like another place of the map."""
+    edge = graph.edges[number]
+    return edge.a in graph.aliased_keyframes or edge.b in graph.aliased_keyframes
 
 
 # --- Applying decisions ---
@@ -426,3 +409,82 @@ def _reject(graph: MapGraph, numbers: list[int], reason: str, changes: GraphChan
     for edge in graph.reject_edges(numbers):
         changes.outcomes.append(LoopClosureRejected(a=edge.a, b=edge.b, reason=reason))
         changes.mark_moved(edge.a, edge.b)
+
+
+# --- Checks of a robot: its odometry, its metric scale, and how often it contradicts the map ---
+
+
+def has_wrong_scale(graph: MapGraph, keyframe: int, measured: Iterable[MeasuredLoopClosure]) -> bool:
+    """Return whether the metric scale of *keyframe* differs from that of all robots it was compared with.
+
+    Only loop closures of full weight with metric segments of other robots count.  They must be with at least
+    two robots, or with one and the stored version: where only two robots differ, nobody knows which one is
+    wrong.  All of them must find the scale of *keyframe* too large, or all of them too small.
+    """
+    own = graph.keyframes[keyframe].robot
+    signs: dict[tuple[str, bool], set[float]] = {}
+    for closure in measured:
+        segment, robot = graph.segment_of(closure.other), graph.keyframes[closure.other].robot
+        is_full = evidence_weight(closure.inliers, closure.matches) == 1.0
+        if segment.is_metric and robot != own and is_full:
+            sign = math.copysign(1.0, closure.off_scale) if closure.off_scale else 0.0
+            signs.setdefault((robot, segment.is_from_version), set()).add(sign)
+    return len(signs) > 1 and len(set().union(*signs.values())) == 1 and {0.0} not in signs.values()
+
+
+def has_odometry_jump(graph: MapGraph, keyframe: int, measured: Iterable[MeasuredLoopClosure]) -> bool:
+    """Return whether the odometry of *keyframe* contradicts all loop closures with the keyframes before it.
+
+    A jump is an error above 1 m and above half of the motion that odometry states.  Only loop closures of
+    full weight with the last four keyframes of the same metric segment count; without them the result is
+    false.
+    """
+    segment = graph.segment_of(keyframe)
+    if segment.is_from_version or not segment.is_metric:
+        return False
+    position = int(graph.positions[keyframe])
+    neighbours = set(segment.keyframes[max(0, position - JUMP_NEIGHBOURS) : position])
+    jumps = []
+    for closure in measured:
+        if closure.other in neighbours and evidence_weight(closure.inliers, closure.matches) == 1.0:
+            motion = inverse(graph.T_odom_camera[keyframe]) @ graph.T_odom_camera[closure.other]
+            error = inverse(np.array(matrix_of(closure.T_keyframe_other, 4, 4))) @ motion
+            motion_m, error_m = (math.sqrt(float(T[:3, 3] @ T[:3, 3])) for T in (motion, error))
+            jumps.append(error_m > max(ALIAS_DISTANCE_M, MAX_JUMP_RATIO * motion_m))
+    return bool(jumps) and all(jumps)
+
+
+def exclude_if_contradicting(
+    graph: MapGraph, keyframe: int, changes: GraphChanges, *, is_scale_wrong: bool
+) -> bool:
+    """Record whether *keyframe* contradicts the map, and exclude its segment at 16 of 32 contradictions.
+
+    A keyframe contradicts the map if all its loop closures of full weight within its component do and none
+    was accepted, or if its metric scale is wrong, which counts twice.  Loop closures at perceptual aliases
+    are no contradiction.  Without such loop closures and with a right scale, nothing is recorded.
+
+    Args:
+        graph: The graph; the exclusion takes the loop closures of the segment out of it.
+        keyframe: The keyframe whose loop closures were just processed.
+        changes: How its loop closures fitted the graph; receives the outcome of an exclusion.
+        is_scale_wrong: Whether its metric scale differs from that of other robots.
+
+    Returns:
+        Whether the segment was excluded now.
+    """
+    row, segment = int(graph.segment_rows[keyframe]), graph.segment_of(keyframe)
+    if not (changes.fits or is_scale_wrong) or segment.is_excluded or segment.is_from_version:
+        return False
+    has_accepted = any(isinstance(outcome, LoopClosureAccepted) for outcome in changes.outcomes)
+    is_contrary = is_scale_wrong or (changes.fits == {"contrary"} and not has_accepted)
+    contradictions = graph.note_contradiction(
+        row, is_contradiction=is_contrary, count=WRONG_SCALE_COUNT if is_scale_wrong else 1
+    )
+    if contradictions < MAX_CONTRADICTIONS or not is_contrary:
+        return False
+    reason = f"contradicting: {contradictions} of the last 32 keyframes contradict their own odometry"
+    if is_scale_wrong:
+        reason = "contradicting: its metres are not those of two other robots"
+    graph.exclude_segment(row, reason)
+    changes.outcomes.append(Ambiguous(robot=segment.robot, segment=segment.number, reason=reason))
+    return True

@@ -5,8 +5,8 @@
 2. Loop closures *between two components* are compared pairwise; the largest set that agrees joins both
    components (`decide_join`), unless perceptual aliases may explain it.
 
-All functions only read the graph, except that it remembers which pairs were tested.  They take loop closures
-out of it as values in one direction and one unit of length, and call the tests of `rse_pf.slam.consistency`.
+All functions only read the tables of the graph, which remembers the pairs that were tested.  They take loop
+closures as values in one direction and one unit of length, and call the tests of `rse_pf.slam.consistency`.
 
 Source:
     Mangelson et al., Pairwise consistent measurement set maximization for robust multi-robot map merging,
@@ -15,10 +15,11 @@ Source:
 
 from __future__ import annotations
 
+import heapq
 import math
 from collections import Counter
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -28,10 +29,10 @@ from rse_pf.geometry import Array, inverse, median_pose, scaled
 from rse_pf.live_map.graph import STEP_LENGTH_M, MapGraph
 from rse_pf.live_map.graph_rows import LoopEdge
 from rse_pf.slam.consistency import (
+    CHI2_99_PERCENT_1,
     EdgeArrays,
     OdometryNoise,
     are_pairwise_consistent,
-    are_scales_consistent,
     find_maximum_clique,
     fits_prediction,
 )
@@ -40,16 +41,20 @@ __all__ = [
     "ALIAS_DISTANCE_M",
     "MIN_SUPPORT",
     "AmbiguousJoin",
+    "Contradiction",
     "Fit",
     "Join",
     "classify_by_graph",
     "decide_join",
     "find_consistent_by_odometry",
+    "find_contradiction",
+    "find_neighbours",
     "find_supporting_edges",
-    "is_at_alias",
     "relative_pose_between_components",
+    "relative_pose_of",
     "relative_scale",
     "total_weight",
+    "unit_segment_of",
 ]
 
 Fit = Literal["agrees", "vague", "contrary"]
@@ -68,6 +73,13 @@ MAX_CONTRARY_EDGES = 24  # newest loop closures that are tested against one by o
 MAX_CONFIRMED_STEPS = 12.0
 """Steps of odometry between both ends of a loop closure beyond which drift makes the graph too vague to
 confirm a single loop closure."""
+MAX_PATH_STEPS = 200.0
+"""Steps of odometry that stand for a path which the search does not find: the upper limit along one segment,
+the lower limit elsewhere.  After so many steps odometry says nothing about the relative pose."""
+MAX_VISITED_KEYFRAMES = 250  # keyframes that one search for shortest paths visits, to bound its CPU time
+MAX_DRIFT_RATIO = 0.15
+"""Error of odometry, in metres per metre of path, that is possible; a larger disagreement with loop closures
+means that two places look the same."""
 KNOWN_SCALE_DEVIATION = 0.03
 """Standard deviation of the logarithm of a scale that the graph has estimated; the first loop closures leave
 an error of 1 to 3 %."""
@@ -121,6 +133,18 @@ class AmbiguousJoin:
     reason: str
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Contradiction:
+    """What a loop closure that is contrary to the graph says.
+
+    ``alias_distance_m`` is the distance of two places that look the same, None if drift explains the error.
+    ``edges`` are the numbers of the accepted loop closures within the same segment that contradict it.
+    """
+
+    alias_distance_m: float | None = None
+    edges: list[int] = field(default_factory=list)
+
+
 # --- Evidence of a set of loop closures ---
 
 
@@ -138,13 +162,15 @@ def has_enough_support(graph: MapGraph, numbers: Sequence[int]) -> bool:
     if total_weight(graph, numbers) < MIN_SUPPORT:
         return False
     first = graph.edges[numbers[0]]
-    row, component = int(graph.segment_rows[first.a]), graph.component_of(first.a)
-    is_within_component = component == graph.component_of(first.b)
+    # 1. Choose the table whose entry tells the sides apart: that of segments within a component.
+    is_within_component = graph.components[first.a] == graph.components[first.b]
+    side_of = graph.segment_rows if is_within_component else graph.components
+    # 2. Collect the different keyframes of each side.
     near_side: set[int] = set()
     far_side: set[int] = set()
     for number in numbers:
         a, b = graph.edges[number].a, graph.edges[number].b
-        is_near = graph.segment_rows[a] == row if is_within_component else graph.component_of(a) == component
+        is_near = side_of[a] == side_of[first.a]
         near_side.add(a if is_near else b)
         far_side.add(b if is_near else a)
     return min(len(near_side), len(far_side)) >= MIN_SUPPORTING_KEYFRAMES
@@ -182,17 +208,17 @@ def classify_by_graph(graph: MapGraph, numbers: Sequence[int]) -> dict[int, Fit]
     targets: dict[int, list[int]] = {}
     for edge in edges:
         targets.setdefault(edge.a, []).append(edge.b)
-    paths = {a: graph.shortest_paths(a, ends) for a, ends in targets.items()}
+    paths = {a: shortest_paths(graph, a, ends) for a, ends in targets.items()}
     steps = [paths[edge.a][edge.b] for edge in edges]
     # 3. Compute the lever of rotation noise; on a round trip no pose is farther away than the diameter of
     #    the circle.
     steps_between = np.maximum(np.array(steps), 1.0)
     distance_m = np.sqrt((predicted[:, :3, 3] ** 2).sum(axis=1))
     lever_m = np.maximum(distance_m, STEP_LENGTH_M * steps_between / math.pi)
-    # 4. Test whether noise explains the errors of pose and scale.
+    # 4. Test whether noise explains the errors of scale and pose.
+    has_scale = [has_consistent_scale(graph, edge, along) for edge, along in zip(edges, steps, strict=True)]
     measured = _stack_edges([_edge_within_component(graph, edge) for edge in edges])
     agrees = fits_prediction(predicted, measured, steps_between, lever_m, TEST_NOISE)
-    has_scale = [has_consistent_scale(graph, edge, along) for edge, along in zip(edges, steps, strict=True)]
     agrees &= np.array(has_scale, dtype=np.bool_)
     return {
         number: "contrary" if not is_consistent else "vague" if is_far else "agrees"
@@ -208,12 +234,10 @@ def find_supporting_edges(graph: MapGraph, number: int) -> list[int]:
     They are between the same two segments as *number*, which is among them.  The list is empty if their
     weight or the number of their keyframes is too small, see `has_enough_support`.
     """
-    pair = graph.segment_pair_of(graph.edges[number])
-    parallels = [
-        other
-        for other in graph.pending
-        if other != number and graph.segment_pair_of(graph.edges[other]) == pair
-    ]
+    rows, edge = graph.segment_rows, graph.edges[number]
+    pair = {rows[edge.a], rows[edge.b]}
+    others = [(other, graph.edges[other]) for other in graph.pending if other != number]
+    parallels = [other for other, each in others if {rows[each.a], rows[each.b]} == pair]
     consistent = find_consistent_by_odometry(graph, number, parallels)
     return consistent if has_enough_support(graph, consistent) else []
 
@@ -226,11 +250,11 @@ def has_consistent_scale(graph: MapGraph, edge: LoopEdge, steps: float = 0.0) ->
     if edge.scale is None:
         return True
     a, b = graph.segment_of(edge.a), graph.segment_of(edge.b)
-    if a.component != b.component and not all(graph.is_metric(each.component) for each in (a, b)):
+    if a.component != b.component and not {a.component, b.component} <= graph.metric_components:
         return True
     variance = edge.scale[1] + KNOWN_SCALE_DEVIATION**2 + steps * TEST_NOISE.step_scale**2
     difference = edge.scale[0] + math.log(a.scale / b.scale)
-    return bool(are_scales_consistent(np.array(difference**2), np.array(variance)))
+    return difference**2 <= CHI2_99_PERCENT_1 * variance
 
 
 def find_consistent_by_odometry(graph: MapGraph, number: int, others: Iterable[int]) -> list[int]:
@@ -276,13 +300,89 @@ def _agree_by_odometry(
     )
 
 
+def find_contradiction(graph: MapGraph, number: int) -> Contradiction:
+    """Return whether loop closure *number*, contrary to the graph, proves aliases or contradicts others.
+
+    The error of the relative pose of both ends is computed by odometry within one segment, and by the poses
+    of the graph between two segments of one component.  An error above 1 m and above 15 % of the path along
+    odometry proves perceptual aliases; a smaller one within a segment may be that of accepted loop closures.
+    """
+    # 1. Compute the error of the relative pose, and the steps of odometry between both ends.
+    rows, edge = graph.segment_rows, graph.edges[number]
+    ends, row = [edge.a, edge.b], int(rows[edge.a])
+    if row == rows[edge.b]:
+        T_a, T_b = scaled(graph.T_odom_camera[ends], graph.segments[row].scale)
+        steps = abs(float(graph.odometry_steps[edge.a] - graph.odometry_steps[edge.b]))
+    else:
+        T_a, T_b = graph.T_component_camera[ends]
+        steps = shortest_paths(graph, edge.a, [edge.b])[edge.b]
+    error = inverse(relative_pose_of(graph, edge)) @ inverse(T_a) @ T_b
+    error_m = float(np.sqrt((error[:3, 3] ** 2).sum()))
+    # 2. An error that drift cannot explain is the distance of two places that look the same.
+    if error_m > max(ALIAS_DISTANCE_M, steps * STEP_LENGTH_M * MAX_DRIFT_RATIO):
+        return Contradiction(alias_distance_m=error_m)
+    # 3. Else find the accepted loop closures within the segment that do not agree by odometry.
+    loops = [
+        other
+        for other, accepted in graph.edges.items()
+        if accepted.state == "accepted"
+        and not accepted.is_fixed
+        and rows[accepted.a] == rows[accepted.b] == row == rows[edge.b]
+    ]
+    return Contradiction(
+        edges=[loop for loop in loops if loop not in find_consistent_by_odometry(graph, number, [loop])]
+    )
+
+
+def shortest_paths(graph: MapGraph, start: int, targets: Iterable[int]) -> dict[int, float]:
+    """Return the steps of odometry from keyframe *start* to each target along the shortest path.
+
+    A loop closure counts as one step.  The search (Dijkstra) visits 250 keyframes at most.  A target that it
+    does not reach gets the steps along the segment, at most 200, if it is in the segment of *start*; else the
+    steps to the farthest visited keyframe, at least 200.
+    """
+    wanted = set(targets)
+    steps: dict[int, float] = {}
+    visited: set[int] = set()
+    heap = [(0.0, start)]
+    farthest = 0.0
+    while heap and len(steps) < len(wanted) and len(visited) < MAX_VISITED_KEYFRAMES:
+        farthest, i = heapq.heappop(heap)
+        if i in visited:
+            continue
+        visited.add(i)
+        if i in wanted:
+            steps[i] = farthest
+        for neighbour, length in find_neighbours(graph, i):
+            if neighbour not in visited:
+                heapq.heappush(heap, (farthest + length, neighbour))
+    for i in wanted - steps.keys():
+        along_segment = abs(float(graph.odometry_steps[i] - graph.odometry_steps[start]))
+        is_same_segment = graph.segment_rows[i] == graph.segment_rows[start]
+        steps[i] = min(along_segment, MAX_PATH_STEPS) if is_same_segment else max(farthest, MAX_PATH_STEPS)
+    return steps
+
+
+def find_neighbours(graph: MapGraph, i: int) -> Iterator[tuple[int, float]]:
+    """Yield (keyframe, steps) of each keyframe that odometry or an accepted edge connects with *i*.
+
+    A loop closure counts as one step.  Keyframes of a stored version have no odometry.
+    """
+    for pair in graph.odometry_edges_of(i):
+        other = pair[0] if pair[1] == i else pair[1]
+        yield other, abs(float(graph.odometry_steps[other] - graph.odometry_steps[i]))
+    for number in graph.accepted_edges_of(i):
+        edge = graph.edges[number]
+        yield (edge.b if edge.a == i else edge.a), 1.0
+
+
 # --- Loop closures between two components ---
 
 
 def choose_metric_component(graph: MapGraph, first: int, second: int) -> int:
     """Return in whose unit two components are compared: the first one's, unless only the second is metric."""
-    is_second = graph.has_scales and graph.is_metric(second) and not graph.is_metric(first)
-    return second if is_second else first
+    metric = graph.metric_components
+    return second if second in metric and first not in metric else first
 
 
 def relative_scale(graph: MapGraph, number: int, base: int) -> tuple[float, float]:
@@ -293,7 +393,7 @@ def relative_scale(graph: MapGraph, number: int, base: int) -> tuple[float, floa
     """
     edge = graph.edges[number]
     a, b = graph.segment_of(edge.a), graph.segment_of(edge.b)
-    if edge.scale is None or (graph.is_metric(a.component) and graph.is_metric(b.component)):
+    if edge.scale is None or {a.component, b.component} <= graph.metric_components:
         return 0.0, 0.0
     log_ratio = edge.scale[0] + math.log(a.scale / b.scale)
     return (log_ratio if a.component == base else -log_ratio), edge.scale[1]
@@ -307,7 +407,7 @@ def relative_pose_between_components(
     *log_scale* is the logarithm of the length of the other component's unit in the unit of *base*.
     """
     edge = graph.edges[number]
-    row, is_forward = graph.unit_segment_of(edge), graph.component_of(edge.a) == base
+    row, is_forward = unit_segment_of(graph, edge), bool(graph.components[edge.a] == base)
     unit = 1.0 if row < 0 else graph.segments[row].scale * (1.0 if is_forward else math.exp(log_scale))
     return _directed(edge, is_forward, unit)
 
@@ -332,8 +432,8 @@ def are_consistent_between_components(
     """
     reference = edge_between_components(graph, number, base)
     directed = [edge_between_components(graph, other, base) for other in others]
-    steps_a = graph.shortest_paths(reference.a, [edge.a for edge in directed])
-    steps_b = graph.shortest_paths(reference.b, [edge.b for edge in directed])
+    steps_a = shortest_paths(graph, reference.a, [edge.a for edge in directed])
+    steps_b = shortest_paths(graph, reference.b, [edge.b for edge in directed])
     steps = np.array([steps_a[edge.a] + steps_b[edge.b] for edge in directed])
     return are_pairwise_consistent(
         graph.T_component_camera, _stack_edges(directed), _stack_edges([reference]), steps, TEST_NOISE
@@ -369,12 +469,6 @@ def decide_join(graph: MapGraph, first: int, second: int) -> Join | AmbiguousJoi
     return Join(moving=moving, T_stay_moving=T_stay_moving, scale=math.exp(log_scale), edges=consistent)
 
 
-def is_at_alias(graph: MapGraph, number: int) -> bool:
-    """Return whether an end of a loop closure is at a place that looks like another place of the map."""
-    edge = graph.edges[number]
-    return edge.a in graph.aliased_keyframes or edge.b in graph.aliased_keyframes
-
-
 def _find_consistent_edges(
     graph: MapGraph, first: int, second: int, excluded: frozenset[int] = frozenset()
 ) -> list[int]:
@@ -383,15 +477,11 @@ def _find_consistent_edges(
     The set is empty if the tested ones together have too little weight.  *excluded* ones are left out.
     """
     # 1. Choose the pending loop closures between both components whose scale the graph does not contradict.
-    pair = {first, second}
-    numbers = [
-        number
-        for number in graph.pending
-        if number not in excluded
-        and {graph.component_of(graph.edges[number].a), graph.component_of(graph.edges[number].b)} == pair
-    ]
+    components, pair = graph.components, {first, second}
+    edges = [(number, graph.edges[number]) for number in graph.pending if number not in excluded]
+    between = [(number, each) for number, each in edges if {components[each.a], components[each.b]} == pair]
+    numbers = [number for number, each in between if has_consistent_scale(graph, each)]
     base = choose_metric_component(graph, first, second)
-    numbers = [number for number in numbers if has_consistent_scale(graph, graph.edges[number])]
     # 2. Limit the number of loop closures. Where rooms look the same, take them at a distance from each
     #    other, so that the limited number extends over more than one room.
     if graph.equal_rooms_m:
@@ -449,13 +539,14 @@ def _thin_out(graph: MapGraph, numbers: list[int], component: int, min_distance_
 def _find_ambiguity(graph: MapGraph, first: int, second: int, consistent: list[int]) -> str:
     """Return why a consistent set may see one of several equal places, empty if there is no sign of that."""
     # 1. Loop closures at known perceptual aliases prove nothing.
-    distinct = [number for number in consistent if not is_at_alias(graph, number)]
+    ends = {number: {graph.edges[number].a, graph.edges[number].b} for number in consistent}
+    distinct = [number for number in consistent if ends[number].isdisjoint(graph.aliased_keyframes)]
     if not has_enough_support(graph, distinct):
         return "ambiguous: what it sees is in the map at several places"
     # 2. Where rooms look the same, the loop closures must extend over more than one room in each metric
     #    component; without a metric component no extent is known, and the set is ambiguous.
     size_m = graph.equal_rooms_m
-    metric = [side for side in (first, second) if not graph.has_scales or graph.is_metric(side)]
+    metric = {first, second} & graph.metric_components
     if size_m and min((_extent_m(graph, distinct, side) for side in metric), default=0.0) <= size_m:
         return f"ambiguous: what it shares with others lies within {size_m:g} m, the size of equal rooms"
     # 3. A second consistent set without the loop closures of the first one must give the same pose within
@@ -476,7 +567,7 @@ def _find_ambiguity(graph: MapGraph, first: int, second: int, consistent: list[i
 def _extent_m(graph: MapGraph, numbers: list[int], component: int) -> float:
     """Return the largest distance between the ends of loop closures in *component*, in its unit."""
     edges = [graph.edges[number] for number in numbers]
-    ends = [edge.a if graph.component_of(edge.a) == component else edge.b for edge in edges]
+    ends = [edge.a if graph.components[edge.a] == component else edge.b for edge in edges]
     positions = graph.T_component_camera[ends, :3, 3]
     return float(np.sqrt(((positions[:, None] - positions[None]) ** 2).sum(axis=2).max()))
 
@@ -504,6 +595,18 @@ def _median_frame(graph: MapGraph, numbers: list[int], stay: int, log_scale: flo
 # --- Loop closures as values ---
 
 
+def unit_segment_of(graph: MapGraph, edge: LoopEdge) -> int:
+    """Return the row of the segment in whose unit a loop closure is, -1 if it is in metres."""
+    is_metric = graph.segment_of(edge.a).is_metric or graph.segment_of(edge.b).is_metric
+    return -1 if is_metric else int(graph.segment_rows[edge.a])
+
+
+def relative_pose_of(graph: MapGraph, edge: LoopEdge) -> Array:
+    """Return ``T_a_b`` of a loop closure within one component, in the unit of the component."""
+    row = unit_segment_of(graph, edge)
+    return edge.T_a_b if row < 0 else scaled(edge.T_a_b, graph.segments[row].scale)
+
+
 def _stack_edges(edges: Sequence[DirectedEdge]) -> EdgeArrays:
     """Return loop closures as arrays; either all of them have a scale, or none has."""
     scales = [edge.scale for edge in edges if edge.scale is not None]
@@ -523,14 +626,14 @@ def _edge_between_segments(graph: MapGraph, edge: LoopEdge, base: int) -> Direct
         return _directed(edge, is_forward, 1.0)
     log_ratio, variance = edge.scale
     log_scale = log_ratio if is_forward else -log_ratio
-    is_in_other_unit = graph.unit_segment_of(edge) >= 0 and not is_forward
+    is_in_other_unit = unit_segment_of(graph, edge) >= 0 and not is_forward
     directed = _directed(edge, is_forward, math.exp(log_scale) if is_in_other_unit else 1.0)
     return directed._replace(scale=(log_scale, variance))
 
 
 def _edge_within_component(graph: MapGraph, edge: LoopEdge) -> DirectedEdge:
     """Return a loop closure within one component, in the unit of the component."""
-    row = -1 if edge.scale is None else graph.unit_segment_of(edge)
+    row = -1 if edge.scale is None else unit_segment_of(graph, edge)
     return _directed(edge, True, 1.0 if row < 0 else graph.segments[row].scale)
 
 

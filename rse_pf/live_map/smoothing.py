@@ -19,6 +19,7 @@ from rse_pf.live_map.graph import MapGraph
 from rse_pf.live_map.graph_rows import LoopEdge
 from rse_pf.live_map.options import LiveMapOptions
 from rse_pf.live_map.outlier_rejection import GraphChanges, reject_misfitting_edges
+from rse_pf.live_map.pairwise_consistency import find_neighbours, relative_pose_of, unit_segment_of
 from rse_pf.slam.consistency import OdometryNoise
 from rse_pf.slam.smoother import ScaleTerms, SmoothedPoses, smooth
 
@@ -70,27 +71,17 @@ class SmoothedWindows:
     ``is_strained`` says that the border of a window of the largest size moved too far, so that the whole
     graph should be optimised.  ``squared_misfits`` holds the squared Mahalanobis norm of the residual of each
     smoothed loop closure by number, and ``mean_misfit`` is their mean.  ``keyframe_count`` sums the keyframes
-    of all windows that were tried, also of those that were replaced by a larger one.
+    of all windows that were tried, also of those that were replaced by a larger one.  ``covariances`` has by
+    keyframe the ``(6, 6)`` covariance of the pose of each smoothed keyframe that is the newest one of a robot
+    that has not left.  It is that of a left twist (metres, radians) in the frame of the component, given the
+    poses that were held.
     """
 
     is_strained: bool = False
     mean_misfit: float = 0.0
     squared_misfits: dict[int, float] = field(default_factory=dict)
     keyframe_count: int = 0
-    _covariances: dict[int, Array] = field(default_factory=dict)
-
-    def covariance(self, graph: MapGraph, keyframe: int) -> Array | None:
-        """Return the ``(6, 6)`` covariance of the pose of *keyframe*, None if it is not known.
-
-        It is known if *keyframe* was smoothed and is the newest one of a robot that has not left.  It is that
-        of a left twist (metres, radians) in the frame of the map, given the poses that were held.
-        """
-        right = self._covariances.get(keyframe)
-        if right is None:
-            return None
-        Ad = adjoint(graph.T_component_camera[keyframe])
-        left: Array = Ad @ (0.5 * (right + right.T)) @ Ad.T
-        return left
+    covariances: dict[int, Array] = field(default_factory=dict)
 
 
 def smooth_changes(
@@ -141,7 +132,7 @@ def smooth_around(
     seeds_of: dict[int, list[int]] = {}
     for i in moved:
         if graph.exists(i):
-            seeds_of.setdefault(graph.component_of(i), []).append(i)
+            seeds_of.setdefault(int(graph.components[i]), []).append(i)
     newest_segments = [graph.segments[row] for row in graph.newest_segments.values()]
     newest = [segment.keyframes[-1] for segment in newest_segments if segment.keyframes]
     total = 0.0
@@ -175,7 +166,9 @@ def smooth_around(
             }
             result.squared_misfits |= squared_misfits
             total += sum(squared_misfits.values())
-            result._covariances |= dict(zip(wanted, smoothed.covariances, strict=True))
+            for i, right in zip(wanted, smoothed.covariances, strict=True):
+                Ad = adjoint(graph.T_component_camera[i])
+                result.covariances[i] = Ad @ (0.5 * (right + right.T)) @ Ad.T
             break
     result.mean_misfit = total / max(1, len(result.squared_misfits))
     return result
@@ -224,7 +217,7 @@ def select_edges(graph: MapGraph, ids: Iterable[int]) -> GraphEdges:
     # 3. Take the relative poses of loop closures, and their information reduced by their weight.
     T_loops, information = np.empty((0, 4, 4)), np.empty((0, 6, 6))
     if loops:
-        T_loops = np.array([graph.relative_pose_of(edge) for edge in loops])
+        T_loops = np.array([relative_pose_of(graph, edge) for edge in loops])
         weights = np.array([edge.weight for edge in loops])
         information = weights[:, None, None] ** 2 * np.array([information_of(graph, edge) for edge in loops])
     # 4. Note the segment in whose unit each edge was measured, since its scale may be estimated.
@@ -232,7 +225,7 @@ def select_edges(graph: MapGraph, ids: Iterable[int]) -> GraphEdges:
     if graph.has_scales:
         rows = graph.segment_rows[a]
         is_metric = np.array([segment.is_metric for segment in graph.segments])
-        loop_units = np.array([graph.unit_segment_of(edge) for edge in loops], dtype=np.int64)
+        loop_units = np.array([unit_segment_of(graph, edge) for edge in loops], dtype=np.int64)
         unit_segments = np.concatenate([np.where(is_metric[rows], -1, rows), loop_units])
     return GraphEdges(
         a=np.concatenate([a, np.array([edge.a for edge in loops], dtype=np.int64)]),
@@ -252,7 +245,7 @@ def odometry_information() -> Array:
 
 def information_of(graph: MapGraph, edge: LoopEdge) -> Array:
     """Return the ``(6, 6)`` information of a loop closure in the unit of its component, without weight."""
-    row = graph.unit_segment_of(edge)
+    row = unit_segment_of(graph, edge)
     if row < 0:
         return edge.information
     per_length = np.array([1.0 / graph.segments[row].scale] * 3 + [1.0] * 3)
@@ -277,7 +270,7 @@ def _choose_window(
     while frontier:
         next_frontier: list[int] = []
         for i in frontier:
-            for neighbour, _ in graph.neighbours(i):
+            for neighbour, _ in find_neighbours(graph, i):
                 if neighbour not in seen and neighbour not in held:
                     if len(ids) == size:
                         return ids, False
@@ -345,7 +338,7 @@ def _find_free_scales(graph: MapGraph, ids: Sequence[int]) -> list[int]:
         return []
     used_rows = {int(row) for row in graph.segment_rows[list(ids)]}
     rows = sorted(row for row in used_rows if not graph.segments[row].is_metric)
-    if rows and not graph.is_metric(graph.component_of(ids[0])):
+    if rows and int(graph.components[ids[0]]) not in graph.metric_components:
         held = int(graph.segment_rows[graph.anchor(rows[0])])
         rows = [row for row in rows if row != held]
     return rows

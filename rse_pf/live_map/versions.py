@@ -15,6 +15,7 @@ from rse_pf.geometry import Array, Camera, inverse
 from rse_pf.live_map.events import MapStarted, StartEdge, StartKeyframe, matrix_bytes
 from rse_pf.live_map.graph import MapGraph
 from rse_pf.live_map.graph_rows import LoopEdge, Segment
+from rse_pf.live_map.pairwise_consistency import relative_pose_of
 from rse_pf.live_map.smoothing import information_of, odometry_information, select_edges
 from rse_pf.maps.format import UP, UP_FIELD, Edge, EdgeKind, Keyframe, MapVersion
 from rse_pf.slam.inertial import agreed_gravity, upright_rotation
@@ -152,7 +153,7 @@ def _version_of(graph: MapGraph) -> MapVersion:
                 Edge(
                     a=edge.a,
                     b=edge.b,
-                    T_a_b=graph.relative_pose_of(edge),
+                    T_a_b=relative_pose_of(graph, edge),
                     information=information_of(graph, edge),
                     kind=_kind_of(graph, edge),
                 )

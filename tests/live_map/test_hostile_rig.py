@@ -11,8 +11,7 @@ from rse_pf.live_map.graph import MapGraph
 from rse_pf.live_map.graph_rows import LiveKeyframe, LoopEdge
 from rse_pf.live_map.live_map import LiveMap
 from rse_pf.live_map.outcomes import Culled
-from rse_pf.live_map.outlier_rejection import find_weakest_connection
-from rse_pf.live_map.robot_checks import has_odometry_jump
+from rse_pf.live_map.outlier_rejection import find_weakest_connection, has_odometry_jump
 from rse_pf.slam.keyframe import decode_keyframe
 from tests.live_map.hostile_rig import (
     ACCEPTED,

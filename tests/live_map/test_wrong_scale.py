@@ -14,8 +14,7 @@ from rse_pf.live_map.graph_rows import LiveKeyframe
 from rse_pf.live_map.live_map import LiveMap
 from rse_pf.live_map.measure import measure_loop_closures
 from rse_pf.live_map.outcomes import Outcome, Unaligned
-from rse_pf.live_map.outlier_rejection import GraphChanges
-from rse_pf.live_map.robot_checks import exclude_if_contradicting, has_wrong_scale
+from rse_pf.live_map.outlier_rejection import GraphChanges, exclude_if_contradicting, has_wrong_scale
 from rse_pf.slam.keyframe import decode_keyframe, make_features
 from tests.live_map.generated_drives import GeneratedWorld, circle
 from tests.live_map.hostile_rig import generated_drives
