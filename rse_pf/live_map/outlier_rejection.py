@@ -27,6 +27,7 @@ from rse_pf.live_map.pairwise_consistency import (
     ALIAS_DISTANCE_M,
     MIN_SUPPORT,
     AmbiguousJoin,
+    Contradiction,
     Fit,
     classify_by_graph,
     decide_join,
@@ -181,10 +182,11 @@ def _decide_within(graph: MapGraph, numbers: list[int], changes: GraphChanges) -
         if graph.components[edge.a] != graph.components[edge.b]:
             continue
         supporting = find_supporting_edges(graph, number)
-        if supporting and fit == "vague":
+        contradiction = find_contradiction(graph, number) if supporting and fit == "contrary" else None
+        if fit == "vague":
             _accept(graph, supporting, changes)
-        elif supporting:
-            _reject_contradicted(graph, number, supporting, changes)
+        elif contradiction is not None:
+            _reject_contradicted(graph, number, supporting, contradiction, changes)
 
 
 def _drop_redundant_weak(graph: MapGraph, numbers: list[int]) -> list[int]:
@@ -218,25 +220,26 @@ def _has_full_weight_parallel(graph: MapGraph, number: int) -> bool:
 # --- Evidence against accepted loop closures ---
 
 
-def _reject_contradicted(graph: MapGraph, number: int, consistent: list[int], changes: GraphChanges) -> None:
+def _reject_contradicted(
+    graph: MapGraph,
+    number: int,
+    consistent: list[int],
+    contradiction: Contradiction,
+    changes: GraphChanges,
+) -> None:
     """Reject accepted loop closures that *consistent* ones, among them the contrary *number*, outweigh.
 
     Where accepted and contrary loop closures both have much weight, both are right: the robots saw two places
-    that look the same (perceptual aliases).  Between two segments, nothing changes if *number* is at a known
-    perceptual alias.
+    that look the same (perceptual aliases).
     """
     reason = f"{len(consistent)} later links agree with each other and contradict it"
     edge = graph.edges[number]
     row_a, row_b = int(graph.segment_rows[edge.a]), int(graph.segment_rows[edge.b])
-    if row_a != row_b and _is_at_alias(graph, number):
-        return
-    contradiction = find_contradiction(graph, number)
-    distance_m = contradiction.alias_distance_m
+    contradicted, distance_m = contradiction.edges, contradiction.alias_distance_m
     weight = total_weight(graph, consistent)
     # 1. Within one segment, reject the loops that the contrary loop closures outweigh, and accept these.
     #    Where odometry cannot be so wrong, the contrary ones prove perceptual aliases instead.
     if row_a == row_b:
-        contradicted = contradiction.edges
         if distance_m is not None:
             _mark_aliases(graph, consistent, distance_m, changes)
         elif contradicted and total_weight(graph, contradicted) < weight:
@@ -335,7 +338,10 @@ def _join_if_consistent(graph: MapGraph, first: int, second: int, changes: Graph
     if decision is None:
         return
     if isinstance(decision, AmbiguousJoin):
-        _note_ambiguity(graph, decision, changes)
+        for row in decision.segment_rows:
+            graph.set_reason(row, decision.reason)
+            robot, segment = graph.segments[row].robot, graph.segments[row].number
+            changes.outcomes.append(Ambiguous(robot=robot, segment=segment, reason=decision.reason))
         return
     # 1. Move one component into the frame of the other one.
     accepted = graph.join_components(decision.moving, decision.T_stay_moving, decision.scale, decision.edges)
@@ -347,19 +353,6 @@ def _join_if_consistent(graph: MapGraph, first: int, second: int, changes: Graph
     pending = [(number, graph.edges[number]) for number in graph.pending]
     within = [number for number, edge in pending if components[edge.a] == components[edge.b] == joined]
     _decide_within(graph, within[-MAX_EDGES_AFTER_JOIN:], changes)
-
-
-def _note_ambiguity(graph: MapGraph, decision: AmbiguousJoin, changes: GraphChanges) -> None:
-    """Set and report the reason of all segments outside the map that the ambiguous loop closures touch."""
-    root = graph.root_component()
-    edges = [graph.edges[number] for number in decision.edges]
-    for i in sorted({end for edge in edges for end in (edge.a, edge.b)}, reverse=True):
-        segment = graph.segment_of(i)
-        if segment.component != root and segment.reason != decision.reason:
-            graph.set_reason(int(graph.segment_rows[i]), decision.reason)
-            changes.outcomes.append(
-                Ambiguous(robot=segment.robot, segment=segment.number, reason=decision.reason)
-            )
 
 
 def _mark_aliases(graph: MapGraph, numbers: list[int], distance_m: float, changes: GraphChanges) -> None:

@@ -127,9 +127,12 @@ class Join:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AmbiguousJoin:
-    """The loop closures ``edges`` agree, but may see one of several equal places; ``reason`` says why."""
+    """Loop closures agree, but may see one of several equal places; ``reason`` says why.
 
-    edges: list[int]
+    ``segment_rows`` are the segments outside the map that they touch, and that have another reason until now.
+    """
+
+    segment_rows: list[int]
     reason: str
 
 
@@ -300,16 +303,19 @@ def _agree_by_odometry(
     )
 
 
-def find_contradiction(graph: MapGraph, number: int) -> Contradiction:
+def find_contradiction(graph: MapGraph, number: int) -> Contradiction | None:
     """Return whether loop closure *number*, contrary to the graph, proves aliases or contradicts others.
 
     The error of the relative pose of both ends is computed by odometry within one segment, and by the poses
     of the graph between two segments of one component.  An error above 1 m and above 15 % of the path along
     odometry proves perceptual aliases; a smaller one within a segment may be that of accepted loop closures.
+    Return None if *number* says nothing: between two segments, at a known perceptual alias.
     """
     # 1. Compute the error of the relative pose, and the steps of odometry between both ends.
     rows, edge = graph.segment_rows, graph.edges[number]
     ends, row = [edge.a, edge.b], int(rows[edge.a])
+    if row != rows[edge.b] and not graph.aliased_keyframes.isdisjoint(ends):
+        return None
     if row == rows[edge.b]:
         T_a, T_b = scaled(graph.T_odom_camera[ends], graph.segments[row].scale)
         steps = abs(float(graph.odometry_steps[edge.a] - graph.odometry_steps[edge.b]))
@@ -368,9 +374,12 @@ def find_neighbours(graph: MapGraph, i: int) -> Iterator[tuple[int, float]]:
 
     A loop closure counts as one step.  Keyframes of a stored version have no odometry.
     """
-    for pair in graph.odometry_edges_of(i):
-        other = pair[0] if pair[1] == i else pair[1]
-        yield other, abs(float(graph.odometry_steps[other] - graph.odometry_steps[i]))
+    segment, position = graph.segments[graph.segment_rows[i]], int(graph.positions[i])
+    if not segment.is_from_version:
+        for near in (position - 1, position + 1):
+            if 0 <= near < len(segment.keyframes):
+                other = segment.keyframes[near]
+                yield other, abs(float(graph.odometry_steps[other] - graph.odometry_steps[i]))
     for number in graph.accepted_edges_of(i):
         edge = graph.edges[number]
         yield (edge.b if edge.a == i else edge.a), 1.0
@@ -453,12 +462,16 @@ def decide_join(graph: MapGraph, first: int, second: int) -> Join | AmbiguousJoi
     if not has_enough_support(graph, consistent):
         return None
     # 2. Refuse a set that perceptual aliases may explain.
+    root = graph.root_component()
     reason = _find_ambiguity(graph, first, second, consistent)
     if reason:
-        return AmbiguousJoin(edges=consistent, reason=reason)
+        edges = [graph.edges[number] for number in consistent]
+        ends = sorted({end for edge in edges for end in (edge.a, edge.b)}, reverse=True)
+        rows = dict.fromkeys(int(graph.segment_rows[i]) for i in ends if graph.components[i] != root)
+        changed = [row for row in rows if graph.segments[row].reason != reason]
+        return AmbiguousJoin(segment_rows=changed, reason=reason)
     # 3. Choose the component that stays: that of the map, else the older one; but if only one is metric, that
     #    one.
-    root = graph.root_component()
     is_second = second == root or (first != root and second < first)
     stay, moving = (second, first) if is_second else (first, second)
     if choose_metric_component(graph, stay, moving) != stay:
