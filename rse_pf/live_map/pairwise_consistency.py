@@ -129,7 +129,8 @@ class Join:
 class AmbiguousJoin:
     """Loop closures agree, but may see one of several equal places; ``reason`` says why.
 
-    ``segment_rows`` are the segments outside the map that they touch, and that have another reason until now.
+    ``segment_rows`` are the rows of the segments that they touch, outside the map, whose noted reason differs
+    from ``reason``.
     """
 
     segment_rows: list[int]
