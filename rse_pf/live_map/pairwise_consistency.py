@@ -1,7 +1,8 @@
 """Test which loop closures of a live map agree, and decide whether they join two components.
 
 1. A loop closure *within one component* is compared with the poses of the graph (`classify_by_graph`), and
-   with other loop closures by odometry alone (`find_consistent_by_odometry`).
+   with other loop closures by odometry alone (`find_consistent_by_odometry`).  What a loop closure that is
+   contrary to the graph proves, `find_contradiction` returns as a value.
 2. Loop closures *between two components* are compared pairwise; the largest set that agrees joins both
    components (`decide_join`), unless perceptual aliases may explain it.
 

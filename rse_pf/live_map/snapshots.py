@@ -183,38 +183,38 @@ def decode_graph(data: bytes) -> tuple[MapGraph, dict[str, bytes]]:
             orphaned_objects = objects.gone
             for i, digests in objects.keyframes:
                 keyframes[i].objects = digests
+        # 2. Put the tables into a graph.
+        n = len(keyframes)
+        layout = (("<f8", (4, 4)), ("<f8", (4, 4)), ("<f8", ()), ("<i8", ()), ("<i8", ()))
+        next_edge, root, events, optimised_at = packed.numbers
+        graph = MapGraph.restore(
+            keyframes=keyframes,
+            arrays=[
+                np.frombuffer(raw, dtype=np.dtype(kind)).reshape(n, *shape)
+                for (kind, shape), raw in zip(layout, packed.arrays, strict=True)
+            ],
+            accepted_by_keyframe={int(i): numbers for i, numbers in packed.links_of},
+            tables={
+                "segments": segments,
+                "edges": edges,
+                "rejected": rejected,
+                "pending": packed.open,
+                "pair_consistency": {(i, j): is_consistent for i, j, is_consistent in packed.agreements},
+                "next_edge": next_edge,
+                "root": root,
+                "events": events,
+                "optimised_at": optimised_at,
+                "next_numbers": dict(packed.next_numbers),
+                "newest_segments": dict(packed.newest),
+                "smoothing_debt": dict(packed.smoothing),
+                "source": packed.source,
+                "equal_rooms_m": packed.equal_rooms_m,
+                "aliased_keyframes": set(packed.lookalikes),
+                "orphaned_objects": orphaned_objects,
+            },
+        )
     except (msgspec.MsgspecError, LookupError) as error:
         raise _damaged(message_of(error)) from error
-    # 2. Put the tables into a graph.
-    n = len(keyframes)
-    layout = (("<f8", (4, 4)), ("<f8", (4, 4)), ("<f8", ()), ("<i8", ()), ("<i8", ()))
-    next_edge, root, events, optimised_at = packed.numbers
-    graph = MapGraph.restore(
-        keyframes=keyframes,
-        arrays=[
-            np.frombuffer(raw, dtype=np.dtype(kind)).reshape(n, *shape)
-            for (kind, shape), raw in zip(layout, packed.arrays, strict=True)
-        ],
-        accepted_by_keyframe={int(i): numbers for i, numbers in packed.links_of},
-        tables={
-            "segments": segments,
-            "edges": edges,
-            "rejected": rejected,
-            "pending": packed.open,
-            "pair_consistency": {(i, j): is_consistent for i, j, is_consistent in packed.agreements},
-            "next_edge": next_edge,
-            "root": root,
-            "events": events,
-            "optimised_at": optimised_at,
-            "next_numbers": dict(packed.next_numbers),
-            "newest_segments": dict(packed.newest),
-            "smoothing_debt": dict(packed.smoothing),
-            "source": packed.source,
-            "equal_rooms_m": packed.equal_rooms_m,
-            "aliased_keyframes": set(packed.lookalikes),
-            "orphaned_objects": orphaned_objects,
-        },
-    )
     return graph, extra
 
 

@@ -20,11 +20,11 @@ import numpy.typing as npt
 from rse_pf.geometry import Array, inverse, log_se3, scaled
 
 __all__ = [
+    "CHI2_99_PERCENT_1",
     "EdgeArrays",
     "LoopClosure",
     "OdometryNoise",
     "are_pairwise_consistent",
-    "are_scales_consistent",
     "evidence_weight",
     "find_consistent_set",
     "find_maximum_clique",
