@@ -24,7 +24,7 @@ _MAX_FOCAL_DEVIATION_PERCENT = 2.0
 similar."""
 _MIN_TILT_DEG = 20.0
 """Smallest value of the largest angle between the boards of any two views: without such an angle, focal
-length and distance of the board cannot be told apart, and the standard deviation of the focal length says
+length and distance of the board cannot be separated, and the standard deviation of the focal length says
 nothing."""
 _MIN_MOTION_SHARE = 0.05
 """Motion of the corner that moved most, as a share of the image width, which a new view must reach against

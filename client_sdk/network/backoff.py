@@ -7,7 +7,7 @@ Two rules bound the attempts:
     2. A token bucket bounds the attempts that are answered: `DIAL_BURST` at once, then `DIALS_PER_MINUTE`.
        Pauses alone would not bound them while a server accepts connections and closes them.  The web firewall
        counts attempts by IP address, and its limit is computed from these two numbers
-       (`rse_pf.config.front_door`), so many robots may share one address.
+       (`rse_pf.config.front_door`), and from the number of robots that may share one address.
 """
 
 from __future__ import annotations

@@ -154,7 +154,7 @@ def parse_answer(data: bytes) -> HttpAnswer | None:
 def explain_answer(address: str, answer: HttpAnswer) -> ConnectError:
     """Return the error for an HTTP *answer* of *address* that no RSE-PF server sends.
 
-    The cause is told by the status first, then by headers and body.
+    The cause is sought in the status first, then in headers and body.
     """
     status, statement = answer.status, f"{address} answers {answer.shown_status}"
     # 1. Recognise a wrong scheme in the URL, and a 400 of RSE-PF for headers that a proxy on the way removed.

@@ -431,7 +431,7 @@ class MapGraph:
             segment.covariance = covariance
 
     def report_unaligned(self, row: int, reason: str) -> None:
-        """Note that the robot of segment *row* is told that it has no alignment any more, and why."""
+        """Note that the robot of segment *row* is sent a report without an alignment, with this *reason*."""
         self.segments[row].reported_T_map_odom, self.segments[row].reason = None, reason
 
     def note_optimisation(self) -> None:

@@ -76,7 +76,7 @@ MAX_CONFIRMED_STEPS = 12.0
 confirm a single loop closure."""
 MAX_PATH_STEPS = 200.0
 """Steps of odometry that stand for a path which the search does not find: the upper limit along one segment,
-the lower limit elsewhere.  After so many steps odometry says nothing about the relative pose."""
+the lower limit elsewhere.  Along a path of that length, drift leaves no information on the relative pose."""
 MAX_VISITED_KEYFRAMES = 250  # keyframes that one search for shortest paths visits, to bound its CPU time
 MAX_DRIFT_RATIO = 0.15
 """Error of odometry, in metres per metre of path, that is possible; a larger disagreement with loop closures

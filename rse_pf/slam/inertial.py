@@ -198,7 +198,7 @@ def _median_direction(directions: Array) -> Array:
     """Return the medoid of unit vectors ``(n, 3)``: the one with the smallest sum of angles to the others.
 
     The medoid is robust: fewer than half of the vectors cannot move it far.  Of more than `_MAX_DIRECTIONS`
-    vectors an even selection of so many is used.
+    vectors, this number is chosen at equal intervals.
     """
     if len(directions) > _MAX_DIRECTIONS:
         rows = np.linspace(0, len(directions) - 1, _MAX_DIRECTIONS).astype(np.int64)

@@ -32,8 +32,8 @@ __all__ = ["WorkerConnections", "listen"]
 
 _READ_BYTES = 1 << 18  # largest number of bytes that one read of a worker's socket returns
 _MAX_CONCURRENT_REQUESTS = 256
-"""Largest number of unanswered requests of one worker; while there are so many, nothing more is read from its
-socket, so that memory is bounded."""
+"""Largest number of unanswered requests of one worker; at this number, nothing more is read from the socket
+of the worker, so that memory is bounded."""
 _FLUSH_S = 2.0
 """Seconds for which a map server waits until its last messages are written to the sockets of workers: when
 the map is given up, and before a refused connection is closed."""
