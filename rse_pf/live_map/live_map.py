@@ -69,6 +69,7 @@ from rse_pf.live_map.snapshots import (
     SnapshotWriter,
     decode_graph,
     decode_parts,
+    decode_places,
     encode_graph,
 )
 from rse_pf.live_map.versions import (
@@ -125,7 +126,7 @@ class LiveMap:
         """
         restored = cls(options)
         restored._graph, extra = decode_graph(snapshot)
-        restored._places = PlaceIndex.from_bytes(extra["places"])
+        restored._places = decode_places(extra)
         return restored
 
     def snapshot(self) -> bytes:

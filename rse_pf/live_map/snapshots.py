@@ -24,7 +24,14 @@ from rse_pf.live_map.graph import MapGraph
 from rse_pf.live_map.graph_rows import EdgeState, LiveKeyframe, LoopEdge, Segment, variances_of
 from rse_pf.slam.place_recognition import PLACE_VECTOR_SIZE, PlaceIndex
 
-__all__ = ["SnapshotParts", "SnapshotWriter", "decode_graph", "decode_parts", "encode_graph"]
+__all__ = [
+    "SnapshotParts",
+    "SnapshotWriter",
+    "decode_graph",
+    "decode_parts",
+    "decode_places",
+    "encode_graph",
+]
 
 FORMAT_VERSION = 2  # version of the snapshot format; a snapshot of another version is refused
 SCALES_FIELD = "scales"  # name of the extra bytes that hold estimated scales; maps in metres have none
@@ -170,12 +177,12 @@ def decode_graph(data: bytes) -> tuple[MapGraph, dict[str, bytes]]:
         packed = msgspec.msgpack.decode(data, type=_Packed)
     except (msgspec.MsgspecError, ValueError) as error:
         raise _damaged(message_of(error)) from error
-    # 1. Unpack the rows of the tables, with the scales and objects that some maps have.
-    keyframes = [LiveKeyframe(*row) for row in packed.keyframes]
-    segments = _unpack_segments(packed)
-    edges, rejected = _unpack_edges(packed.links), _unpack_edges(packed.removed)
     extra, orphaned_objects = dict(packed.extra), list[tuple[str, str]]()
     try:
+        # 1. Unpack the rows of the tables, with the scales and objects that some maps have.
+        keyframes = [LiveKeyframe(*row) for row in packed.keyframes]
+        segments = _unpack_segments(packed)
+        edges, rejected = _unpack_edges(packed.links), _unpack_edges(packed.removed)
         if SCALES_FIELD in extra:
             _restore_scales(extra.pop(SCALES_FIELD), segments, {**edges, **rejected})
         if OBJECTS_FIELD in extra:
@@ -213,7 +220,7 @@ def decode_graph(data: bytes) -> tuple[MapGraph, dict[str, bytes]]:
                 "orphaned_objects": orphaned_objects,
             },
         )
-    except (msgspec.MsgspecError, LookupError) as error:
+    except (msgspec.MsgspecError, LookupError, ValueError, ArithmeticError) as error:
         raise _damaged(message_of(error)) from error
     return graph, extra
 
@@ -397,6 +404,18 @@ def _pack_features(graph: MapGraph, places: PlaceIndex, i: int) -> _PartRow:
     data = graph.keyframes[i].data
     assert data is not None
     return i, data, places.vector_of(i).astype("<f4").tobytes()
+
+
+def decode_places(extra: dict[str, bytes]) -> PlaceIndex:
+    """Return the index of places that a snapshot holds beside its graph.
+
+    Raises:
+        BadRequest: There is none, or it is damaged.
+    """
+    try:
+        return PlaceIndex.from_bytes(extra["places"])
+    except (BadRequest, LookupError, ValueError) as error:
+        raise _damaged(message_of(error)) from error
 
 
 def _damaged(reason: str) -> BadRequest:

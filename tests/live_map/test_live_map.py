@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy as copy_module
 import dataclasses
+from collections.abc import Callable
 from typing import Any
 
 import msgspec
@@ -209,6 +210,29 @@ def test_a_snapshot_of_another_version_is_refused_with_how_to_publish_first(
 def test_a_damaged_snapshot_is_refused(joined: Run) -> None:
     with pytest.raises(BadRequest):
         LiveMap.restore(joined.map.snapshot()[:-100])
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda packed: packed["segments"][0][2].append(10**6),
+        lambda packed: packed["arrays"].pop(),
+        lambda packed: packed.update(arrays=[packed["arrays"][0][:-8], *packed["arrays"][1:]]),
+        lambda packed: packed["links"][0].__setitem__(3, b"short"),
+        lambda packed: packed["extra"].clear(),
+        lambda packed: packed.update(extra=[["places", 2 * dict(packed["extra"])["places"]]]),
+    ],
+)
+def test_a_snapshot_whose_tables_contradict_each_other_is_refused(
+    joined: Run, damage: Callable[[dict[str, Any]], None]
+) -> None:
+    packed = msgspec.msgpack.decode(joined.map.snapshot())
+    damage(packed)
+
+    with pytest.raises(BadRequest, match="the snapshot is damaged") as refused:
+        LiveMap.restore(msgspec.msgpack.encode(packed))
+
+    assert refused.value.hint
 
 
 def test_inconsistent_loop_closures_join_nothing() -> None:
