@@ -76,6 +76,22 @@ def test_a_robot_that_records_has_its_commands_and_answers_in_a_file(tmp_path: P
     assert "frames" not in found
 
 
+def test_the_recorder_learns_of_the_beginning_and_the_end_of_each_connection(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    ended: list[int] = []
+    close_connection = RobotRecorder.close_connection
+
+    def close(recorder: RobotRecorder, connection: int) -> None:
+        ended.append(connection)
+        close_connection(recorder, connection)
+
+    monkeypatch.setattr(RobotRecorder, "close_connection", close)
+    drive(tmp_path)
+
+    assert ended == [1]
+
+
 def test_pictures_are_small_and_only_there_if_the_robot_allows_them(tmp_path: Path):
     drive(tmp_path, thumbnails=True)
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from client_sdk.cameras import open_camera
+from client_sdk.cameras import open_camera, read_intrinsics
 from client_sdk.cameras.source import FrameStream
 from rse_pf.errors import UsageError
 
@@ -461,3 +461,9 @@ def test_calibrations_of_other_programs_name_the_way_to_intrinsics(
     with pytest.raises(UsageError) as refused:
         open_camera(tmp_path, intrinsics=tmp_path / name)
     assert "intrinsics.json" in refused.value.hint
+
+
+def test_a_projection_without_a_distortion_model_keeps_its_projection(tmp_path: Path) -> None:
+    folder = folder_of(tmp_path, ["0.png"], camera_model="equidistant", distortion_model="none")
+
+    assert read_intrinsics(folder / "intrinsics.json").model == "fisheye"
