@@ -114,8 +114,9 @@ class Parser(argparse.ArgumentParser):
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one verb and return the exit code."""
-    # Before a verb imports numpy.  A robot's matrices are small: a second thread of BLAS only spins.
-    os.environ.update({**ONE_THREAD, **os.environ})
+    # Before a verb imports numpy.  A second thread of BLAS would change the last bits of a map, so that the
+    # replay of a log would differ from the map server; and a robot's matrices are small: it would only spin.
+    os.environ.update(ONE_THREAD)
     words = list(sys.argv[1:] if argv is None else argv)
     try:
         code = _run(words)

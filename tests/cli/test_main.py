@@ -212,8 +212,8 @@ def test_the_page_of_settings_is_the_one_in_the_documentation(
     assert capsys.readouterr().out == page, "run make docs"
 
 
-def test_a_verb_computes_with_one_thread_of_blas() -> None:
-    """A robot's matrices are small: OpenBLAS would spin on all cores."""
+def test_a_verb_computes_with_one_thread_of_blas_whatever_the_environment_says() -> None:
+    """With two threads, the last bits of a map differ from those of its map server."""
     script = """
 import sys
 from pathlib import Path
@@ -224,10 +224,15 @@ import numpy as np
 np.ones((500, 500)) @ np.ones((500, 500))
 print(len(list(Path("/proc/self/task").iterdir())))
 """
-    free = {name: value for name, value in os.environ.items() if not name.endswith("_NUM_THREADS")}
+    environment = {**os.environ, "OPENBLAS_NUM_THREADS": "2"}
 
     done = subprocess.run(
-        [sys.executable, "-c", script], env=free, capture_output=True, text=True, check=True, timeout=60
+        [sys.executable, "-c", script],
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=60,
     )
 
     assert done.stdout.split()[-1] == "1"

@@ -173,9 +173,13 @@ class MapServer:
     def current_updates(self) -> list[dict[str, Any]]:
         """Return the newest update of each key for a new subscriber.
 
-        The list is empty while another process may hold the lease.
+        The list is empty while another process may hold the lease; after its next renewal, all updates are
+        sent to every subscriber.
         """
-        return self._updates.all() if self._holds_lease() else []
+        if self._holds_lease():
+            return self._updates.all()
+        self._has_unsent_updates = True
+        return []
 
     async def run(self) -> ServiceEnd:
         """Serve until the map is lost, released or stopped, or a task of this object fails; return which.

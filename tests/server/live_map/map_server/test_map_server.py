@@ -321,10 +321,24 @@ async def test_nothing_is_sent_while_the_lease_is_not_renewed():
     asked = asyncio.ensure_future(server.ask("live-show"))
     await settle()
     assert not asked.done()  # another process might own the map
-    assert server.map_server.current_updates() == []
     store.is_down = False
     await bench.clock.advance(1.0)
     assert (await asked)["keyframes"] == 1
+
+
+async def test_a_subscriber_that_comes_while_the_lease_is_too_old_gets_the_updates_after_its_renewal():
+    bench = Bench(store := Store())
+
+    server = await bench.start("a")
+    await server.keyframe(0)
+    await settle()
+    store.is_down = True
+    await bench.clock.advance(2.0)
+    assert server.map_server.current_updates() == []
+    server.sent_updates.clear()
+    store.is_down = False
+    await bench.clock.advance(1.0)
+    assert {payload["kind"] for payload in server.sent_updates} == {"map", "alignment", "pose"}
 
 
 async def test_a_map_server_that_has_measured_a_keyframe_counts_as_stable():

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import json
 import os
 import shutil
 import signal
 import subprocess
+import sys
 import time
 from collections import Counter
 from collections.abc import AsyncIterator, Iterator
@@ -21,15 +23,22 @@ import pytest
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import Conflict, NotFound, RsePfError
 from rse_pf.identity import RobotId
-from rse_pf.live_map.events import KeyframeAdded, decode_events
+from rse_pf.live_map.events import KeyframeAdded, decode_events, encode_events
+from rse_pf.live_map.live_map import LiveMap
 from rse_pf.object_store import DirectoryStore
 from rse_pf.server.live_map.client import LiveMapClient
-from rse_pf.server.live_map.lease import decode_lease, lease_name, map_folder
+from rse_pf.server.live_map.lease import MapLease, decode_lease, lease_name, map_folder
 from rse_pf.server.live_map.map_server.log import LiveLog
 from rse_pf.server.live_map.map_server.state import MapState
-from rse_pf.server.live_map.process_pool import ClaimOrder, MapServerProcess, start_map_server
+from rse_pf.server.live_map.process_pool import (
+    DEFAULT_IMPLEMENTATION,
+    ClaimOrder,
+    MapServerProcess,
+    start_map_server,
+)
 from rse_pf.server.log import JsonLog
 from rse_pf.wire.live_map import LiveMapRequest, LiveRequest
+from tests.live_map.generated_drives import GeneratedWorld, circle
 from tests.server.live_map.fake_map import FAKE_MAP, keyframe_request
 
 MAP, ROBOT = "warehouse", RobotId("default", "robot-1")
@@ -78,7 +87,7 @@ class Servers:
 
 
 @asynccontextmanager
-async def servers(folder: Path, **live: Any) -> AsyncIterator[Servers]:
+async def servers(folder: Path, *, implementation: str = KIND, **live: Any) -> AsyncIterator[Servers]:
     settings = PlatformSettings.from_dict(
         {
             "data": {"store": f"dir:{folder}"},
@@ -95,7 +104,7 @@ async def servers(folder: Path, **live: Any) -> AsyncIterator[Servers]:
             server_id=name,
             log=log,
             on_update=lambda tenant, name, payload: updates.append(payload),
-            implementation=KIND,
+            implementation=implementation,
         )
         for name in ("a", "b")
     ]
@@ -299,3 +308,38 @@ async def test_a_stopped_map_refuses_later_keyframes_and_another_tenant_sees_not
         with pytest.raises(Conflict, match="was stopped"):
             await both.send(both.b, 1)
         assert (await both.send(both.b, 0))["number"] == 1
+
+
+async def test_a_map_server_and_a_replay_make_the_same_map_with_any_number_of_blas_threads(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The tests compute with one thread of BLAS; with two, the last bits of the poses would differ."""
+    # 1. Store the log of two robots in one room, whose map server has released the map.
+    world, live_map = GeneratedWorld(seed=1), LiveMap()
+    drives = [world.drive("a", circle(0.5, 1.2)), world.drive("b", circle(0.5, 1.2, phase=3.0))]
+    store = DirectoryStore(tmp_path)
+    lease = MapLease(store, lease_name("default", MAP), owner="a-1", server="a", clock=time.monotonic)
+    assert lease.claim(None)
+    log = LiveLog(store, map_folder("default", MAP), owner="a-1", epoch=1)
+    for event in world.play(drives):
+        live_map.apply(event)
+        log.write_entry(encode_events([event]))
+    assert lease.release()
+    # 2. Replay the log by the command line and in a map server, with two threads in the environment.
+    monkeypatch.setenv("OPENBLAS_NUM_THREADS", "2")
+    words = ["map", "live", "show", MAP, "--json", "--store", f"dir:{tmp_path}"]
+    shown = subprocess.run(
+        [sys.executable, "-c", f"from rse_pf.cli.main import main; main({words})"],
+        capture_output=True,
+        check=True,
+        timeout=PATIENT_S,
+    )
+    async with servers(tmp_path, implementation=DEFAULT_IMPLEMENTATION) as both:
+        served = await both.show(both.a)
+
+    assert json.loads(shown.stdout)["digest"] == live_map.digest()
+    for entry in log.read_entries():  # what the map server has logged before its reply
+        if log.position <= served["version"]:
+            for event in decode_events(entry.events):
+                live_map.apply(event)
+    assert served["digest"] == live_map.digest()
