@@ -12,6 +12,7 @@ import ssl
 import time
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import replace
+from importlib import metadata
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
@@ -31,7 +32,6 @@ from client_sdk.offloading.burst_policy import check_burst_url
 from client_sdk.offloading.command_router import CallArguments, CommandRouter, OnProgress
 from client_sdk.offloading.local_services import LocalServices
 from client_sdk.offloading.offload_policy import CloudFirst
-from client_sdk.recording import make_recorder, sdk_version
 from client_sdk.transfer.small_objects import SmallObjectStore
 from rse_pf.config import SessionSettings
 from rse_pf.errors import Disconnected, RsePfError, UsageError, error_from_code
@@ -54,6 +54,7 @@ if TYPE_CHECKING:
     from client_sdk.tracking.monocular_tracker import MonocularOptions
     from rse_pf.geometry import Camera
     from rse_pf.pnp import DepthNoise, PnpOptions
+    from rse_pf.recording.robot_recorder import RobotRecorder
 
 __all__ = ["MAX_DEADLINE_S", "OnProgress", "Robot", "connect"]
 
@@ -124,9 +125,9 @@ class Robot:
             raise UsageError(f"no codec named {codec!r}", hint=f"choose one of {', '.join(CODECS)}")
         settings, random = settings or SessionSettings(), random or random_module.Random()
         self._session = ClientSession(
-            codec=make_codec(codec, settings), settings=settings, sdk=f"rse-pf-python/{sdk_version()}"
+            codec=make_codec(codec, settings), settings=settings, sdk=f"rse-pf-python/{_sdk_version()}"
         )
-        self._recorder = make_recorder(record, thumbnails, settings)
+        self._recorder = None if record is None else _make_recorder(record, thumbnails, settings)
         self.callbacks = UserCallbacks(settings.ping_timeout_s)
         self._connection = Connection(
             urls,
@@ -139,7 +140,7 @@ class Robot:
             wall_clock=wall_clock,
             on_change=on_change,
             callbacks=self.callbacks,
-            tap=self._recorder,
+            recorder=self._recorder,
         )
         self._urls, self._enrolment = urls, enrolment
         self._offload = offload
@@ -601,6 +602,20 @@ class Robot:
             self._subscriptions.handle_event(event)
             return
         self._router.handle_event(event)
+
+
+def _make_recorder(folder: str | Path, thumbnails: bool, settings: SessionSettings) -> RobotRecorder:
+    from rse_pf.recording.robot_recorder import RobotRecorder  # robots that do not record need no mcap
+
+    return RobotRecorder(folder, thumbnails=thumbnails, session=settings, version=_sdk_version())
+
+
+def _sdk_version() -> str:
+    """Return the version of this SDK, "0" where it runs from its sources without an installation."""
+    try:
+        return metadata.version("rse-pf")
+    except metadata.PackageNotFoundError:
+        return "0"
 
 
 connect = Robot

@@ -12,14 +12,14 @@ Two rules bound the attempts:
 
 from __future__ import annotations
 
-from enum import Enum
 from random import Random
 
 from client_sdk.network.connect_timings import ConnectTimings
+from client_sdk.network.dial_errors import DialError
 from rse_pf.config.front_door import DIAL_BURST, DIALS_PER_MINUTE
 from rse_pf.token_bucket import TokenBucket
 
-__all__ = ["AttemptResult", "Backoff"]
+__all__ = ["Backoff"]
 
 RECONNECT_BASE_S = 0.1
 """Upper bound of the first pause before a reconnect, in seconds; it doubles with each attempt ("full jitter",
@@ -42,19 +42,6 @@ RETRY_AFTER_SPREAD = 1.25
 number do not come back at the same moment."""
 MAX_DOUBLINGS = 16
 """The exponential pause stops doubling after this many attempts, so that the number stays finite."""
-
-
-class AttemptResult(Enum):
-    """How the last attempt to connect ended."""
-
-    NONE = "none"
-    """There was no attempt since the connection was lost."""
-    UNANSWERED = "unanswered"
-    """Nobody accepted the TCP connection, or no packet left the robot."""
-    ANSWERED = "answered"
-    """A machine accepted the TCP connection or refused it, and the robot may connect a little later."""
-    REFUSED = "refused"
-    """An RSE-PF server refused this robot, perhaps for a long time."""
 
 
 class Backoff:
@@ -83,13 +70,13 @@ class Backoff:
     def pause_s(
         self,
         now_s: float,
-        retry_after_s: float = 0.0,
+        failure: DialError | None = None,
         *,
-        last: AttemptResult = AttemptResult.ANSWERED,
         valid_in_s: float | None = None,
+        spent_s: float = 0.0,
         is_move: bool = False,
     ) -> float:
-        """Return the seconds between the start of the last attempt and the next one.
+        """Return how many seconds to wait from now before the next attempt.
 
         Call it once for each attempt: each call makes later pauses longer, unless the last attempt was
         refused or not answered.
@@ -100,33 +87,39 @@ class Backoff:
         After a refusal it is between half of ``reconnect_long_max_s`` and all of it, but at most half a
         second longer than *valid_in_s*; after an attempt that nobody answered it is 1 to 1.25 s.  The time
         that the server asked for, up to 1.25 times as long, is added, and the pause is never shorter than the
-        token bucket demands.
+        token bucket demands.  Except after a refusal, the duration of the last attempt is a part of the
+        pause, so that an attempt that timed out is repeated at once; the result is still at least the time
+        that the server asked for.
 
         Args:
             now_s: Seconds of the robot's clock.
-            retry_after_s: How long the server asked the robot to wait; 0 if it asked for nothing.
-            last: How the last attempt ended.
+            failure: Failure of the last attempt; None if none has failed since the connection was lost.
             valid_in_s: Seconds until tokens signed at that moment are accepted again, None if unknown.
+            spent_s: Duration of the last attempt, in seconds.
             is_move: Whether the robot is connected and only changes the server; half of the token bucket then
                 stays in reserve.
         """
+        retry_after_s = 0.0 if failure is None else failure.retry_after_s
         asked_s = retry_after_s * self._random.uniform(1.0, RETRY_AFTER_SPREAD)
         bucket_s = self._bucket.wait_s(now_s)
         if is_move:
             missing_tokens = MOVE_RESERVE * self._bucket.burst + 1.0 - self._bucket.tokens
             bucket_s = max(bucket_s, missing_tokens / self._bucket.rate)
-        return max(asked_s + self._backoff_s(now_s, last, valid_in_s), bucket_s)
+        pause_s = max(asked_s + self._backoff_s(now_s, failure, valid_in_s), bucket_s)
+        if failure is not None and failure.is_refusal:
+            return pause_s
+        return max(retry_after_s, pause_s - spent_s)
 
-    def _backoff_s(self, now_s: float, last: AttemptResult, valid_in_s: float | None) -> float:
+    def _backoff_s(self, now_s: float, failure: DialError | None, valid_in_s: float | None) -> float:
         timings, uniform = self._timings, self._random.uniform
-        if last is AttemptResult.UNANSWERED:
-            return uniform(UNANSWERED_MIN_S, UNANSWERED_MAX_S)
-        if last is AttemptResult.REFUSED:
+        if failure is not None and failure.is_refusal:
             pause_s = uniform(0.5 * timings.reconnect_long_max_s, timings.reconnect_long_max_s)
             if valid_in_s is None:
                 return pause_s
             return min(pause_s, max(0.0, valid_in_s) + uniform(0.0, REVOCATION_JITTER_S))
-        if self._failing_since_s is None and last is AttemptResult.ANSWERED:
+        if failure is not None and failure.is_unanswered:
+            return uniform(UNANSWERED_MIN_S, UNANSWERED_MAX_S)
+        if self._failing_since_s is None and failure is not None:
             self._failing_since_s = now_s
         failing_s = 0.0 if self._failing_since_s is None else now_s - self._failing_since_s
         longest_s = min(timings.reconnect_long_max_s, MAX_PAUSE_RATIO * failing_s)

@@ -23,7 +23,7 @@ Transitions:
     4. Lose: a close, an error, silence or a missing pong makes a socket ENDED (`_discard_socket`).  If it was
        CURRENT, the nearest STANDBY socket of another region is adopted at once (`_switch_to_standby`).
     5. Reconnect: the task of each region (`_maintain_region`) dials again whenever its region has no socket,
-       after the pauses of `client_sdk.network.reconnect_wait`; `_adopt_if_disconnected` then adopts the
+       after the pauses of `client_sdk.network.backoff`; `_adopt_if_disconnected` then adopts the
        socket.
     6. Move: when a server asks for it, `_move_to_other_server` opens a socket to another server of the same
        region first, adopts it, and leaves the old one to drain (make before break).
@@ -49,7 +49,7 @@ import random as random_module
 import ssl
 import time
 from collections.abc import Callable, Coroutine, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from websockets.exceptions import ConnectionClosed
 
@@ -65,8 +65,6 @@ from client_sdk.network.dial_errors import (
     revoked_token_error,
 )
 from client_sdk.network.handshake import Dialler, Token
-from client_sdk.network.message_tap import MessageTap, NullMessageTap
-from client_sdk.network.reconnect_wait import ReconnectWait
 from client_sdk.network.region_choice import MAX_REGIONS, RegionChoice
 from client_sdk.network.region_sockets import Region, RegionSocket
 from rse_pf.errors import ConnectError, ProtocolError, RsePfError, UnsupportedProtocol, UsageError
@@ -83,6 +81,9 @@ from rse_pf.wire.client_session import (
 )
 from rse_pf.wire.client_subscriptions import SubscriptionEnded, Updated
 from rse_pf.wire.server_session import CLOSE_RATE, CLOSE_REPLACED, CLOSE_REVOKED, MAX_BAD_MESSAGES
+
+if TYPE_CHECKING:  # only robots that record import the recorder
+    from rse_pf.recording.robot_recorder import RobotRecorder
 
 __all__ = [
     "Connection",
@@ -115,6 +116,9 @@ region, both addresses lead to the same platform, and the robot itself is the ca
 LATE_WELCOME_S = 60.0
 """A stalled server may accept a connection attempt this long after the robot gave it up, which replaces the
 robot's newer connection; a replacement within this time is therefore not blamed on another program."""
+SHORT_REFUSAL_S = 2.0
+"""A refusal that ends within this many seconds is not reported: commands and a first connect wait for its
+end."""
 TOKEN_CLOCK_STEP_S = 1.0
 """After a revocation the robot waits this many seconds before it signs a new token, so that the new one,
 whose time is in whole seconds, is certainly later than the revocation."""
@@ -140,7 +144,7 @@ class Connection:
         wall_clock: Callable[[], float] = time.time,
         on_change: OnChange = None,
         callbacks: UserCallbacks,
-        tap: MessageTap | None = None,
+        recorder: RobotRecorder | None = None,
     ) -> None:
         """Prepare the connections of one robot; `open` makes them.
 
@@ -155,7 +159,7 @@ class Connection:
             wall_clock: Unix seconds; the clock by which *token* signs.
             on_change: Function of the program that is notified when the connection changes.
             callbacks: Calls *on_change* and *token*, and survives their exceptions.
-            tap: Observes every message, for a recording; None observes nothing.
+            recorder: Records every message; None records nothing.
 
         Raises:
             UsageError: An address is no WebSocket address or appears twice, or there are too many.
@@ -168,7 +172,7 @@ class Connection:
         self.last_error = ""
         self.refusal: RsePfError | None = None
         """Why all regions refuse this robot now; None while it is connected or may be accepted."""
-        self._tap = tap or NullMessageTap()
+        self._recorder = recorder
         self._session = session
         self._settings = session.settings
         self._timings = timings
@@ -179,7 +183,7 @@ class Connection:
         self._on_change = on_change
         self._callbacks = callbacks
         self._clock = clock
-        self._reconnect_wait = ReconnectWait(clock, wall_clock)
+        self._wall_clock = wall_clock
         self._sockets: list[RegionSocket] = []
         self._tasks: set[asyncio.Task[Any]] = set()
         self._timer_changed = asyncio.Event()
@@ -233,8 +237,7 @@ class Connection:
                 break
             if attempt == FIRST_CONNECT_ATTEMPTS:
                 raise failure.error from None
-            await asyncio.sleep(self._reconnect_wait.pause_s(self._regions[0].backoff, failure))
-        self._reconnect_wait.start_watching_network()
+            await asyncio.sleep(self._pause_s(self._regions[0], failure))
         region_tasks = [self._start_task(self._maintain_region(region)) for region in self._regions]
         self._main_tasks = [self._start_task(self._run_timers()), *region_tasks]
         for socket in self._usable_sockets().values():
@@ -244,7 +247,6 @@ class Connection:
     async def close(self) -> None:
         """End all tasks and close all sockets; unanswered commands stay in the session."""
         self._is_closed = True
-        self._reconnect_wait.stop_watching_network()
         await cancel_tasks(self._main_tasks)
         await asyncio.gather(*(self._close_socket(socket) for socket in list(self._sockets)))
         await cancel_tasks(self._tasks)
@@ -281,7 +283,7 @@ class Connection:
 
     def _is_hopeless(self, failure: DialError) -> bool:
         """Return whether another attempt of a first connect would fail in the same way."""
-        return failure.is_wrong_address or self._reconnect_wait.is_lasting_refusal(failure)
+        return failure.is_wrong_address or self._is_lasting_refusal(failure)
 
     def _usable_sockets(self) -> dict[int, RegionSocket]:
         """Return the STANDBY and CURRENT sockets by the number of their region."""
@@ -404,16 +406,11 @@ class Connection:
         if self._clock() - region.connected_since_s > self._timings.reconnect_max_s:
             region.backoff.reset()
         began_s = self._clock()
-        clock_offset_s = self._reconnect_wait.clock_offset_s()
         while True:
             # 1. Pause for as long as the last failure demands.
-            failure = region.last_failure
-            spent_s = self._clock() - began_s
-            pause_s = self._reconnect_wait.pause_s(region.backoff, failure, spent_s=spent_s)
-            await self._reconnect_wait.wait(pause_s, failure, clock_offset_s)
+            await asyncio.sleep(self._pause_s(region, region.last_failure, self._clock() - began_s))
             # 2. Dial the region, and wait for the Welcome.
             began_s = self._clock()
-            clock_offset_s = self._reconnect_wait.clock_offset_s()
             region.last_failure = await self._join_region(region)
             # 3. Continue the commands on the new socket, or end them if every region refuses the robot.
             if region.last_failure is None:
@@ -421,9 +418,33 @@ class Connection:
                 return
             self._fail_refused_commands()
 
+    def _pause_s(
+        self, region: Region, failure: DialError | None, spent_s: float = 0.0, *, is_move: bool = False
+    ) -> float:
+        """Return how many seconds to wait from now before the next attempt; see `Backoff.pause_s`."""
+        return region.backoff.pause_s(
+            self._clock(),
+            failure,
+            valid_in_s=self._valid_in_s(failure),
+            spent_s=spent_s,
+            is_move=is_move,
+        )
+
+    def _is_lasting_refusal(self, failure: DialError | None) -> bool:
+        """Return whether a server refused this robot and does not accept it again within two seconds."""
+        valid_in_s = self._valid_in_s(failure)
+        is_short = valid_in_s is not None and valid_in_s <= SHORT_REFUSAL_S
+        return failure is not None and failure.is_refusal and not is_short
+
+    def _valid_in_s(self, failure: DialError | None) -> float | None:
+        """Return in how many seconds tokens that are signed then are accepted again, None if unknown."""
+        if failure is None or failure.valid_from_s is None:
+            return None
+        return failure.valid_from_s - self._wall_clock()
+
     def _fail_refused_commands(self) -> None:
         """End all commands with the reason if every region refuses this robot; dialling goes on."""
-        if not all(self._reconnect_wait.is_lasting_refusal(region.last_failure) for region in self._regions):
+        if not all(self._is_lasting_refusal(region.last_failure) for region in self._regions):
             return
         failure = self._regions[0].last_failure
         assert failure is not None
@@ -470,7 +491,7 @@ class Connection:
                     self._notify_change("moved", fresh.state.server)
                     return
                 self._start_task(self._close_socket(fresh))
-            pause_s = self._reconnect_wait.pause_s(region.backoff, failure, is_move=True)
+            pause_s = self._pause_s(region, failure, is_move=True)
             await wait_for_event(old.has_ended, min(pause_s, max(0.0, until_s - self._clock())))
 
     # --- One WebSocket, from its handshake to its end -------------------------------------------
@@ -490,7 +511,8 @@ class Connection:
         # 2. Start the tasks that read and write the socket; the first message is Hello.
         socket = RegionSocket(region, websocket, self._session.open_connection(self._clock()))
         self._sockets.append(socket)
-        socket.tap_number = self._tap.open_connection(self._session.codec, token)
+        if self._recorder is not None:
+            socket.recorder_number = self._recorder.open_connection(self._session.codec, token)
         socket.tasks = [
             self._start_task(self._read_messages(socket)),
             self._start_task(self._write_messages(socket)),
@@ -525,7 +547,8 @@ class Connection:
             while True:
                 data = await socket.websocket.recv(decode=False)
                 self.bytes_in += len(data)
-                self._tap.observe_message(socket.tap_number, "down", data)
+                if self._recorder is not None:
+                    self._recorder.observe_message(socket.recorder_number, "down", data)
                 self._receive(socket, data)
         except (ConnectionClosed, OSError):
             code = socket.websocket.close_code
@@ -534,7 +557,7 @@ class Connection:
                 self.last_error = "the server closed the connection: this robot exceeds its rate limit"
             elif is_held and code == CLOSE_REVOKED:
                 is_fresh = callable(self.dialler.token)
-                valid_from_s = self._reconnect_wait.wall_clock() + TOKEN_CLOCK_STEP_S if is_fresh else None
+                valid_from_s = self._wall_clock() + TOKEN_CLOCK_STEP_S if is_fresh else None
                 socket.region.last_failure = revoked_token_error(valid_from_s)
             elif is_held and code == CLOSE_REPLACED and self._is_replaced_by_another_program(socket):
                 socket.region.last_failure = replaced_connection_error()
@@ -586,7 +609,8 @@ class Connection:
                 while socket.state.outgoing:
                     data = socket.state.outgoing.pop(0)
                     self.bytes_out += len(data)
-                    self._tap.observe_message(socket.tap_number, "up", data)
+                    if self._recorder is not None:
+                        self._recorder.observe_message(socket.recorder_number, "up", data)
                     await socket.websocket.send(data, text=is_text)
         except (ConnectionClosed, OSError):
             return  # the reading task handles the end, after the messages that still arrived
@@ -653,7 +677,8 @@ class Connection:
         # 1. Forget the socket; the session keeps its unanswered commands.
         socket.has_ended.set()
         self._sockets.remove(socket)
-        self._tap.close_connection(socket.tap_number)
+        if self._recorder is not None:
+            self._recorder.close_connection(socket.recorder_number)
         if self._session.current is socket.state and not self._is_closed:
             self._notify_change("link-lost", "closed")
         self._session.close_connection(socket.state)

@@ -102,7 +102,7 @@ class _Connection:
 
 
 class RobotRecorder:
-    """Record one robot between `start` and `stop`; implements `client_sdk.network.message_tap.MessageTap`."""
+    """Record the messages, frames and maps of one robot between `start` and `stop`."""
 
     def __init__(
         self, folder: str | Path, *, thumbnails: bool, session: SessionSettings, version: str = ""

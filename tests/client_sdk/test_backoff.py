@@ -8,14 +8,19 @@ from random import Random
 
 import pytest
 
-from client_sdk.network.backoff import AttemptResult, Backoff
+from client_sdk.network.backoff import Backoff
 from client_sdk.network.connect_timings import ConnectTimings
+from client_sdk.network.dial_errors import DialError
 from rse_pf.config import PlatformSettings
 from rse_pf.config.front_door import DIAL_BURST, DIALS_PER_MINUTE
+from rse_pf.errors import ConnectError
 from tests.played_firewall import PlayedFirewall, rules_of_settings
 
 SITE = "203.0.113.7"
 BEGAN_S = 1000.0
+ANSWERED = DialError(ConnectError("closed"))
+UNANSWERED = DialError(ConnectError("no route"), is_unanswered=True)
+REFUSED = DialError(ConnectError("refused"), is_refusal=True)
 
 
 @dataclass
@@ -31,7 +36,7 @@ def play(settings: PlatformSettings, *, robots: int, outage_s: float, seed: int 
     """Disconnect all robots at once; the load balancer answers 503, and the firewall applies its rules."""
     firewall = PlayedFirewall(rules_of_settings(settings))
     backoffs = [Backoff(ConnectTimings(), Random(f"{seed}/{robot}")) for robot in range(robots)]
-    due = [(BEGAN_S + each.pause_s(BEGAN_S), robot) for robot, each in enumerate(backoffs)]
+    due = [(BEGAN_S + each.pause_s(BEGAN_S, ANSWERED), robot) for robot, each in enumerate(backoffs)]
     heapq.heapify(due)
     connected_s: list[float] = []
     dials: list[list[float]] = [[] for _ in range(robots)]
@@ -44,7 +49,8 @@ def play(settings: PlatformSettings, *, robots: int, outage_s: float, seed: int 
             connected_s.append(now - BEGAN_S)
             continue
         asked_s = 0.0 if reply is None else float(reply.headers["Retry-After"])
-        heapq.heappush(due, (now + backoffs[robot].pause_s(now, asked_s), robot))
+        failure = DialError(ConnectError("full"), retry_after_s=asked_s)
+        heapq.heappush(due, (now + backoffs[robot].pause_s(now, failure), robot))
     most = max(_most_within_a_minute(each) for each in dials)
     return Outage(sorted(connected_s), firewall.blocked, most)
 
@@ -77,7 +83,7 @@ def test_a_server_that_accepts_and_dies_again_and_again_does_not_empty_the_allow
     timings = ConnectTimings()
     backoff, now, dials = Backoff(timings, Random(1)), 0.0, 0
     while now < 600.0:
-        now += backoff.pause_s(now)
+        now += backoff.pause_s(now, ANSWERED)
         backoff.count_attempt(now)
         dials += 1
         now += 1.5  # longer than reconnect_max_s: counts as a connection that lasted
@@ -94,25 +100,25 @@ def test_a_move_that_does_not_succeed_leaves_half_of_the_allowance():
     while now < 30.0:
         backoff.count_attempt(now)
         dials_until_s.append(now)
-        now += backoff.pause_s(now, is_move=True)
+        now += backoff.pause_s(now, ANSWERED, is_move=True)
 
     assert len(dials_until_s) <= 0.5 * DIAL_BURST + 0.5 * DIALS_PER_MINUTE + 1
     backoff.reset()
     for _ in range(DIAL_BURST // 2):
-        assert backoff.pause_s(now) <= timings.reconnect_max_s
+        assert backoff.pause_s(now, ANSWERED) <= timings.reconnect_max_s
         backoff.count_attempt(now)
 
 
 def test_a_server_that_dies_is_dialled_again_within_a_second():
     for seed in range(50):
-        assert Backoff(ConnectTimings(), Random(seed)).pause_s(50.0) <= 0.1
+        assert Backoff(ConnectTimings(), Random(seed)).pause_s(50.0, ANSWERED) <= 0.1
 
 
 def test_the_pauses_grow_to_a_bound_and_not_beyond():
     timings = ConnectTimings()
     backoff, now, pauses = Backoff(timings, Random(5)), 0.0, []
     while now < 3600.0:
-        pauses.append(backoff.pause_s(now))
+        pauses.append(backoff.pause_s(now, ANSWERED))
         now += pauses[-1]
 
     assert max(pauses[-10:]) <= timings.reconnect_long_max_s
@@ -120,7 +126,8 @@ def test_the_pauses_grow_to_a_bound_and_not_beyond():
 
 
 def test_robots_that_are_told_the_same_time_do_not_come_back_together():
-    pauses = [Backoff(ConnectTimings(), Random(seed)).pause_s(0.0, 60.0) for seed in range(100)]
+    full = DialError(ConnectError("full"), retry_after_s=60.0)
+    pauses = [Backoff(ConnectTimings(), Random(seed)).pause_s(0.0, full) for seed in range(100)]
 
     assert min(pauses) >= 60.0
     assert max(pauses) - min(pauses) >= 10.0
@@ -130,7 +137,7 @@ def test_attempts_that_nobody_answers_go_on_once_a_second_and_cost_no_allowance(
     backoff, now = Backoff(ConnectTimings(), Random(3)), 0.0
     pauses = []
     for _ in range(200):
-        pauses.append(backoff.pause_s(now, last=AttemptResult.UNANSWERED))
+        pauses.append(backoff.pause_s(now, UNANSWERED))
         now += pauses[-1]
 
     assert min(pauses) >= 1.0
@@ -141,18 +148,18 @@ def test_pauses_grow_with_the_time_of_answers_and_not_with_that_of_silence():
     timings = ConnectTimings()
     for seed in range(20):
         backoff, now = Backoff(timings, Random(seed)), 0.0
-        backoff.pause_s(now, last=AttemptResult.NONE)
+        backoff.pause_s(now)
         while now < 120.0:
-            now += backoff.pause_s(now, last=AttemptResult.UNANSWERED)
+            now += backoff.pause_s(now, UNANSWERED)
 
-        assert backoff.pause_s(now) <= timings.reconnect_max_s
+        assert backoff.pause_s(now, ANSWERED) <= timings.reconnect_max_s
 
 
 def test_a_robot_that_is_refused_tries_again_every_20_to_40_s_for_ever():
     backoff, now, pauses = Backoff(ConnectTimings(), Random(4)), 0.0, []
     while now < 7200.0:
         backoff.count_attempt(now)
-        pauses.append(backoff.pause_s(now, last=AttemptResult.REFUSED))
+        pauses.append(backoff.pause_s(now, REFUSED))
         now += pauses[-1]
 
     assert min(pauses) >= 20.0
@@ -163,17 +170,13 @@ def test_a_robot_that_is_refused_tries_again_every_20_to_40_s_for_ever():
 @pytest.mark.parametrize(("valid_in_s", "least_s"), [(-120.0, 0.0), (0.0, 0.0), (0.7, 0.7), (9.0, 9.0)])
 def test_after_a_cut_off_a_robot_is_back_half_a_second_after_its_tokens_are_late_enough(valid_in_s, least_s):
     for seed in range(50):
-        pause_s = Backoff(ConnectTimings(), Random(seed)).pause_s(
-            5.0, last=AttemptResult.REFUSED, valid_in_s=valid_in_s
-        )
+        pause_s = Backoff(ConnectTimings(), Random(seed)).pause_s(5.0, REFUSED, valid_in_s=valid_in_s)
 
         assert least_s <= pause_s <= least_s + 0.5
 
 
 def test_a_cut_off_far_away_by_a_wrong_clock_does_not_keep_a_robot_from_trying():
-    assert (
-        Backoff(ConnectTimings(), Random(1)).pause_s(0.0, last=AttemptResult.REFUSED, valid_in_s=1e6) <= 40.0
-    )
+    assert Backoff(ConnectTimings(), Random(1)).pause_s(0.0, REFUSED, valid_in_s=1e6) <= 40.0
 
 
 def test_refusals_cost_the_allowance_of_the_firewall_like_every_other_answer():
@@ -182,4 +185,4 @@ def test_refusals_cost_the_allowance_of_the_firewall_like_every_other_answer():
     for _ in range(DIAL_BURST):
         backoff.count_attempt(0.0)
 
-    assert backoff.pause_s(0.0, last=AttemptResult.REFUSED, valid_in_s=0.0) >= 60.0 / DIALS_PER_MINUTE
+    assert backoff.pause_s(0.0, REFUSED, valid_in_s=0.0) >= 60.0 / DIALS_PER_MINUTE
