@@ -169,8 +169,9 @@ static bool refine(const rse_pf::Columns<double>& rows, int64_t count, const Foc
 }
 
 // Copy the inliers, which are the rows whose squared error (as `project` wrote it) is at most limit2 (px^2), to
-// data.inliers, and pad the last vector.  Write their ascending row numbers unless `numbers`, memory for n numbers, is
-// null.  Return the number of inliers.
+// data.inliers, and pad the last vector.  The padding repeats the point of the last inlier, so that it lies behind the
+// camera only where an inlier does.  Write the ascending row numbers of the inliers unless `numbers`, memory for n
+// numbers, is null.  Return the number of inliers.
 static int64_t gather_inliers(const rse_pf::Workspace& data, int64_t n, double limit2, uint32_t* numbers) {
     const rse_pf::Columns<double>&from = data.all, &to = data.inliers;
     int64_t count = 0;
@@ -184,7 +185,9 @@ static int64_t gather_inliers(const rse_pf::Workspace& data, int64_t n, double l
         count += data.error2[i] <= limit2 ? 1 : 0;
     }
     for (int64_t i = count; i < padded(count); ++i) {
-        to.x[i] = to.y[i] = to.z[i] = 0.0;
+        to.x[i] = to.x[count - 1];
+        to.y[i] = to.y[count - 1];
+        to.z[i] = to.z[count - 1];
         to.u[i] = to.v[i] = kPaddingPixel;
     }
     return count;

@@ -26,8 +26,9 @@ Descriptors = npt.NDArray[Any]
 """Descriptors of n features, ``(n, d)``: uint8 if they are binary (d bytes), int8 if they are vectors."""
 
 MAX_DESCRIPTOR_SIZE = 512
-"""Largest size of a descriptor, in bytes if it is binary, else in dimensions: squared distances of int8
-vectors of this length stay below 2**24, where float32 is exact."""
+"""Largest size of a descriptor, in bytes if it is binary, else in dimensions.  Of two int8 vectors with this
+number of dimensions, twice the scalar product and the sum of the squared lengths are at most 2**24, up to
+which float32 holds whole numbers exactly, so that a distance does not depend on the order of summation."""
 _MIN_DESCRIPTOR_SIZE = 4
 """Smallest size of a descriptor, in bytes if it is binary, else in dimensions: smaller ones do not
 distinguish features."""

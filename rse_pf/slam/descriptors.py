@@ -64,8 +64,8 @@ def distances_of_pairs(first: Descriptors, second: Descriptors) -> npt.NDArray[n
 def distance_matrix(first: Descriptors, second: Descriptors) -> npt.NDArray[np.float32]:
     """Return the ``(n, m)`` distances between all rows of ``(n, d)`` and all rows of ``(m, d)`` descriptors.
 
-    They are Hamming distances of uint8, and squared Euclidean distances of int8: whole numbers, which float32
-    holds exactly up to 2**24, whatever the order of summation.
+    They are Hamming distances of uint8, and squared Euclidean distances of int8.  Both are whole numbers;
+    float32 holds them exactly up to 2**24, and larger ones, up to 2**25, as the nearest even number.
     """
     a, b = as_vectors(first), as_vectors(second)
     distances: npt.NDArray[np.float32]
@@ -167,10 +167,8 @@ def match_orb(
     """
     n, m = len(reference), len(view)
     rows, view_rows = np.empty((2, min(n, m)), dtype=np.int64)
-    count = _core_match()(
-        reference, n, view, m, ratio, _INSTRUCTION_FLAGS[lanes],
-        _WORKSPACE.words(n + 5 * m + 64), rows, view_rows,
-    )  # fmt: skip
+    workspace, flags = _WORKSPACE.words(n + 5 * m + 64), _INSTRUCTION_FLAGS[lanes]
+    count = _core_match()(reference, n, view, m, ratio, flags, workspace, rows, view_rows)
     return rows[:count], view_rows[:count]
 
 

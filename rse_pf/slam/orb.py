@@ -201,10 +201,16 @@ class _DetectRequest(ctypes.Structure):
     """``rse_pf_detect_request`` of ``rse_pf_match.h``."""
 
     _fields_ = (
-        ("gray", ctypes.c_void_p), ("width", ctypes.c_int64), ("height", ctypes.c_int64),
-        ("scales", ctypes.c_void_p), ("wanted", ctypes.c_void_p), ("levels", ctypes.c_int32),
-        ("threshold", ctypes.c_int32), ("room", ctypes.c_int64), ("workspace", ctypes.c_void_p),
-    )  # fmt: skip
+        ("gray", ctypes.c_void_p),
+        ("width", ctypes.c_int64),
+        ("height", ctypes.c_int64),
+        ("scales", ctypes.c_void_p),
+        ("wanted", ctypes.c_void_p),
+        ("levels", ctypes.c_int32),
+        ("threshold", ctypes.c_int32),
+        ("room", ctypes.c_int64),
+        ("workspace", ctypes.c_void_p),
+    )
 
 
 def detect_keypoints(gray: npt.NDArray[np.uint8], count: int, threshold: int) -> Keypoints | None:
@@ -234,9 +240,16 @@ def detect_keypoints(gray: npt.NDArray[np.uint8], count: int, threshold: int) ->
         np.empty(capacity, dtype=np.int32),
     )
     request = _DetectRequest(
-        address_of(gray), width, height, address_of(_CORE_LEVEL_SIZES), address_of(wanted), _PYRAMID_LEVELS,
-        threshold, capacity, address_of(_WORKSPACE.words(width * height // 2 + 8 * width + height + 64)),
-    )  # fmt: skip
+        gray=address_of(gray),
+        width=width,
+        height=height,
+        scales=address_of(_CORE_LEVEL_SIZES),
+        wanted=address_of(wanted),
+        levels=_PYRAMID_LEVELS,
+        threshold=threshold,
+        room=capacity,
+        workspace=address_of(_WORKSPACE.words(width * height // 2 + 8 * width + height + 64)),
+    )
     detected = _core_detect()(ctypes.byref(request), *map(address_of, keypoints))
     return None if detected < 0 else keypoints.select(slice(detected))
 
@@ -259,10 +272,16 @@ def describe_keypoints(gray: npt.NDArray[np.uint8], keypoints: Keypoints) -> npt
     descriptors = np.empty((len(pixels), ORB.size), dtype=np.uint8)
     workspace = _WORKSPACE.words(3 * width * height // 8 + 7 * width + 64)
     refused = _core_describe()(
-        address_of(gray), width, height, address_of(_CORE_LEVEL_SIZES), _PYRAMID_LEVELS, address_of(pixels),
-        address_of(cosines), address_of(sines), address_of(octaves), len(pixels), address_of(workspace),
+        address_of(gray),
+        width,
+        height,
+        address_of(_CORE_LEVEL_SIZES),
+        _PYRAMID_LEVELS,
+        *map(address_of, (pixels, cosines, sines, octaves)),
+        len(pixels),
+        address_of(workspace),
         address_of(descriptors),
-    )  # fmt: skip
+    )
     return None if refused else descriptors
 
 

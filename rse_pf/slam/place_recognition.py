@@ -69,7 +69,7 @@ def place_vector(descriptors: Descriptors) -> PlaceVector:
     # 1. Centre descriptors other than ORB: vectors without negative elements all lie in one direction.
     if not is_orb and len(vectors):
         vectors -= np.rint(vectors.sum(axis=0, dtype=np.float64) / len(vectors)).astype(np.float32)
-    # 2. Assign each descriptor to its nearest word.  All numbers are integers below 2**24, so that float32
+    # 2. Assign each descriptor to its nearest word.  All products are integers below 2**24, so that float32
     # holds their sums exactly in whatever order a machine adds them.
     products = _multiply_in_one_thread(vectors, words.T)
     nearest = np.argmin(squared_lengths - (2.0 * _WORD_SCALE) * products, axis=1)

@@ -7,7 +7,7 @@ matched. The caller computes depths from disparities, and decides which of them 
 from __future__ import annotations
 
 import ctypes
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cache
 from typing import Any
 
@@ -83,12 +83,20 @@ class StereoRequest(ctypes.Structure):
     """``rse_pf_stereo_request`` of ``rse_pf_stereo.h``."""
 
     _fields_ = (
-        ("abi", ctypes.c_uint32), ("flags", ctypes.c_uint32), ("width", ctypes.c_int64),
-        ("height", ctypes.c_int64), ("left", ctypes.c_void_p), ("right", ctypes.c_void_p),
-        ("rows", ctypes.c_int64), ("pixels", ctypes.c_void_p), ("min_disparity_px", ctypes.c_double),
-        ("min_likeness", ctypes.c_double), ("uniqueness", ctypes.c_double),
-        ("max_disparity_px", ctypes.c_int64), ("left_right_px", ctypes.c_int64),
-    )  # fmt: skip
+        ("abi", ctypes.c_uint32),
+        ("flags", ctypes.c_uint32),
+        ("width", ctypes.c_int64),
+        ("height", ctypes.c_int64),
+        ("left", ctypes.c_void_p),
+        ("right", ctypes.c_void_p),
+        ("rows", ctypes.c_int64),
+        ("pixels", ctypes.c_void_p),
+        ("min_disparity_px", ctypes.c_double),
+        ("min_likeness", ctypes.c_double),
+        ("uniqueness", ctypes.c_double),
+        ("max_disparity_px", ctypes.c_int64),
+        ("left_right_px", ctypes.c_int64),
+    )
 
 
 def disparities(
@@ -131,10 +139,16 @@ def disparities(
     disparities_px = np.empty(len(pixels))
     height, width = left.shape
     request = StereoRequest(
-        PART_ABIS["stereo"], _PORTABLE_FLAG if portable else 0, width, height, address_of(left),
-        address_of(right), len(pixels), address_of(pixels), options.min_disparity_px, options.min_likeness,
-        options.uniqueness, options.max_disparity_px, options.left_right_px,
-    )  # fmt: skip
+        abi=PART_ABIS["stereo"],
+        flags=_PORTABLE_FLAG if portable else 0,
+        width=width,
+        height=height,
+        left=address_of(left),
+        right=address_of(right),
+        rows=len(pixels),
+        pixels=address_of(pixels),
+        **asdict(options),
+    )
     if _core_disparities()(ctypes.byref(request), address_of(disparities_px)):
         raise BadRequest(
             f"a stereo pair of {width}x{height} px cannot be matched: a side is above 65536 px",

@@ -52,6 +52,30 @@ def test_the_order_of_the_rows_changes_the_inliers_numbers_only():
     np.testing.assert_allclose(one.T_camera_world, other.T_camera_world, atol=1e-3)
 
 
+@pytest.mark.parametrize("inliers", range(41, 48))
+def test_the_pose_is_as_accurate_where_most_points_lie_behind_the_camera(inliers):
+    """A pose is refined over its inliers alone, also where they do not fill the last vector of eight rows."""
+    rng = np.random.default_rng(1)
+    T = exp_se3([0.3, -0.2, 0.4, 0.1, 0.2, -0.1])
+    exact_pixels = rng.uniform(20.0, 460.0, (inliers, 2))
+    right = KINECT.back_project(exact_pixels, rng.uniform(1.0, 4.0, inliers))
+    pixels = np.concatenate(
+        [exact_pixels + rng.normal(size=(inliers, 2)) * 0.5, rng.uniform(0, 480, (100, 2))]
+    )
+    order = rng.permutation(len(pixels))
+    solutions = []
+    for depth_m in (3.0, -3.0):
+        wrong = rng.uniform([-2.0, -2.0, depth_m], [2.0, 2.0, depth_m + 1.0], (100, 3))
+        points_world = transform(inverse(T), np.concatenate([right, wrong]))
+        solutions.append(solve_pnp(points_world[order], pixels[order], KINECT))
+
+    in_front, behind = solutions
+
+    assert np.array_equal(in_front.inliers, behind.inliers)
+    # The refinement stops after a step below 1e-6.
+    np.testing.assert_allclose(in_front.T_camera_world, behind.T_camera_world, rtol=0, atol=2e-6)
+
+
 @pytest.mark.parametrize("n", [60, 80])
 def test_thirteen_right_matches_among_many_wrong_ones_are_a_weak_pose(n):
     """As in the wide-baseline pairs of real recordings, which have 13 inliers at 3 px."""

@@ -20,7 +20,7 @@ from rse_pf.geometry import Camera, exp_se3
 from rse_pf.live_map.events import KeyframeAdded, RobotForgotten
 from rse_pf.live_map.live_map import LiveMap
 from rse_pf.live_map.versions import started_from
-from rse_pf.maps.descriptors import ORB, DescriptorKind, common_kind
+from rse_pf.maps.descriptors import MAX_DESCRIPTOR_SIZE, ORB, DescriptorKind, common_kind
 from rse_pf.maps.format import Keyframe, MapVersion, decode_map, encode_map
 from rse_pf.service import dispatch
 from rse_pf.services.builtin import builtin_services
@@ -112,6 +112,19 @@ def test_distances_are_exact_whole_numbers(kind: DescriptorKind) -> None:
     assert np.array_equal(distance_matrix(first, second), oracle)
     assert np.array_equal(distances_of_pairs(first, second), np.diag(oracle))
     assert oracle.max() <= no_distance(first)
+
+
+def test_distances_of_the_longest_vectors_do_not_depend_on_the_order_of_their_dimensions() -> None:
+    rng = np.random.default_rng(7)
+    vectors = rng.choice(np.array([-128, -127, 126, 127], dtype=np.int8), (40, MAX_DESCRIPTOR_SIZE))
+    order = rng.permutation(MAX_DESCRIPTOR_SIZE)
+    exact = ((vectors[:, None].astype(np.int64) - vectors[None]) ** 2).sum(axis=2)
+
+    distances = distance_matrix(vectors, vectors)
+
+    assert exact.max() > 2**24
+    assert np.array_equal(distances, exact.astype(np.float32))
+    assert np.array_equal(distances, distance_matrix(vectors[:, order], vectors[:, order]))
 
 
 @pytest.mark.parametrize("kind", KINDS, ids=str)
