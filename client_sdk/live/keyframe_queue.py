@@ -84,27 +84,19 @@ class KeyframeQueue:
         self._max_bytes = max_bytes or (_MAX_MEMORY_BYTES if folder is None else _MAX_FOLDER_BYTES)
         self._entries: deque[_Entry] = deque()
         self._queued_bytes = 0
-        self._next_index = 0
-        self._offset: NumberOffset | None = None
+        self.next_index = 0
+        """The robot's number of the next keyframe that is added."""
+        self.offset: NumberOffset | None = None
+        """Offset from the robot's numbers to those of the map; None until the map was asked for it."""
         self._lock_descriptor = -1
 
     def __len__(self) -> int:
         return len(self._entries)
 
     @property
-    def offset(self) -> NumberOffset | None:
-        """Offset from the robot's numbers to those of the map; None until the map was asked for it."""
-        return self._offset
-
-    @property
     def first_index(self) -> int:
         """The robot's number of the oldest queued keyframe; `next_index` if the queue is empty."""
-        return self._entries[0].index if self._entries else self._next_index
-
-    @property
-    def next_index(self) -> int:
-        """The robot's number of the next keyframe that is added."""
-        return self._next_index
+        return self._entries[0].index if self._entries else self.next_index
 
     def open(self) -> int:
         """Lock the folder and read the queue of an earlier run; return the first segment of this run.
@@ -131,9 +123,9 @@ class KeyframeQueue:
                 (folder / _STATE_FILE).unlink(missing_ok=True)
                 return 0
             self._queued_bytes = sum(entry.size_bytes for entry in self._entries)
-            self._next_index = self._entries[-1].index + 1
+            self.next_index = self._entries[-1].index + 1
             if (folder / _STATE_FILE).exists():
-                self._offset = NumberOffset(**json.loads((folder / _STATE_FILE).read_text(encoding="utf-8")))
+                self.offset = NumberOffset(**json.loads((folder / _STATE_FILE).read_text(encoding="utf-8")))
         except (OSError, ValueError, TypeError) as error:
             self.close()
             raise UsageError(
@@ -167,7 +159,7 @@ class KeyframeQueue:
         data = keyframe.data if self._folder is None else None
         self._entries.append(_Entry(keyframe.index, keyframe.segment, size_bytes, data))
         self._queued_bytes += size_bytes
-        self._next_index = keyframe.index + 1
+        self.next_index = keyframe.index + 1
         return True
 
     def first(self) -> QueuedKeyframe:
@@ -204,7 +196,7 @@ class KeyframeQueue:
         Raises:
             UsageError: The state file cannot be written.
         """
-        self._offset = offset
+        self.offset = offset
         if self._folder is not None:
             text = json.dumps({"number": offset.number, "segment": offset.segment})
             try:

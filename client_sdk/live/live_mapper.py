@@ -51,7 +51,7 @@ from client_sdk.tracking.segments import add_to_cloud
 from client_sdk.trajectory import Trajectory
 from rse_pf.errors import BadMessage, BadRequest, RsePfError, UnsupportedProtocol, UsageError
 from rse_pf.geometry import Array, Camera, pose_difference
-from rse_pf.wire.live_map import RelocaliseReply, live_topic
+from rse_pf.wire.live_map import live_topic
 
 __all__ = ["LiveMapper"]
 
@@ -128,11 +128,26 @@ class LiveMapper:
         self.options = live or LiveOptions()
         self.sent_keyframes: deque[KeyframeSent] = deque(maxlen=_MAX_SENT_RECORDS)
         """Times of the newest 100,000 keyframes that the map has acknowledged in this run."""
-        self._robot, self._clock, self._ask = robot, clock, ask
+        self._robot, self._ask = robot, ask
         self._queue = KeyframeQueue(None if spool is None else spool / name)
-        self._sender: KeyframeSender  # made when the map is joined
+        self._sender = KeyframeSender(
+            robot,
+            name,
+            self._queue,
+            deadline_s=self.options.deadline_s,
+            bytes_per_s=self.options.bytes_per_s,
+            clock=clock,
+            on_introduced=self._apply_introduction,
+            on_acknowledged=self.sent_keyframes.append,
+        )
         self._attachments = Attachments(store, self.options, clock, self._wait_quiet)
-        self._relocaliser = Relocaliser(robot, name, self.options, clock, self._apply_relocalisation)
+        self._relocaliser = Relocaliser(
+            robot,
+            name,
+            self.options,
+            clock,
+            on_reply=lambda *reply: self._publish(self._alignments.apply_relocalisation(*reply)),
+        )
         self._mapper = Mapper(
             ask=self._ask_with_priority,
             camera=camera,
@@ -151,7 +166,7 @@ class LiveMapper:
         self._alignments = Alignments()
         self._correction_stream = CorrectionStream()
         self._is_corrected = False  # whether the present segment was corrected since the last frame
-        self._segment = 0
+        self._segment = self._first_segment = 0
         self._last_keyframe: Array | None = None
         self._last_keyframe_s: float | None = None
         self._poses: list[
@@ -164,7 +179,6 @@ class LiveMapper:
         self._frame_lock = asyncio.Lock()
         self._is_introduced = False
         self._is_joined = False
-        self._was_left = False
 
     async def __aenter__(self) -> LiveMapper:
         """Join the map; a robot without a connection joins it as soon as it is connected.
@@ -177,7 +191,7 @@ class LiveMapper:
             BadRequest: The name of the map is invalid.
             UsageError: The spool folder cannot be used, or another program uses it.
         """
-        self._segment = await asyncio.to_thread(self._queue.open)
+        self._segment = self._first_segment = await asyncio.to_thread(self._queue.open)
         try:
             await self._join()
         except BaseException:
@@ -186,16 +200,6 @@ class LiveMapper:
         return self
 
     async def _join(self) -> None:
-        self._sender = KeyframeSender(
-            self._robot,
-            self.name,
-            self._queue,
-            deadline_s=self.options.deadline_s,
-            bytes_per_s=self.options.bytes_per_s,
-            clock=self._clock,
-            on_introduced=self._apply_introduction,
-            on_acknowledged=self.sent_keyframes.append,
-        )
         self._sender.current_segment = self._segment
         if self._robot.connected:
             try:
@@ -236,7 +240,6 @@ class LiveMapper:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
             self._queue.close()
-            self._was_left = True
             self._correction_stream.close()
 
     async def track(self, frame: Frame) -> TrackedFrame:
@@ -361,7 +364,7 @@ class LiveMapper:
         reports it; ``offline`` without a connection; ``refused: ...`` if the platform refuses all keyframes
         of this robot.
         """
-        if self._is_joined and self._sender.is_refused:
+        if self._sender.is_refused:
             return f"refused: {self._sender.trouble}"
         if not self._robot.connected:
             return "offline"
@@ -374,8 +377,7 @@ class LiveMapper:
         Empty if all of them succeed.  A failed relocalisation counts only while the segment is not aligned.
         """
         relocalisation_trouble = "" if self.aligned else self._relocaliser.trouble
-        sender_trouble = self._sender.trouble if self._is_joined else ""
-        return sender_trouble or self._update_trouble or relocalisation_trouble
+        return self._sender.trouble or self._update_trouble or relocalisation_trouble
 
     @property
     def keyframes_waiting(self) -> int:
@@ -466,14 +468,17 @@ class LiveMapper:
         return self._mapper.T_body_camera
 
     def report(self) -> dict[str, Any]:
-        """Return the figures of the drive: those of `Mapper.report`, and under ``live`` those of the map."""
-        has_sender = self._is_joined or self._was_left
+        """Return the figures of the drive: those of `Mapper.report`, and under ``live`` those of the map.
+
+        All of them are figures of this run of the program: ``segments`` does not count the segments of
+        keyframes that an earlier run left in the spool folder.
+        """
         return {
             **self._mapper.report(),
             "live": {
                 "map": self.name,
                 "state": self.state,
-                "segments": self._segment + 1,
+                "segments": self._segment - self._first_segment + 1,
                 "aligned": self.aligned,
                 "aligned_by": self.aligned_by,
                 "reason": self.reason,
@@ -483,7 +488,7 @@ class LiveMapper:
                 "keyframes_kept": len(self.sent_keyframes),
                 "keyframes_waiting": len(self._queue),
                 "keyframes_dropped": self._dropped_keyframes,
-                "keyframes_refused": self._sender.refused_keyframes if has_sender else 0,
+                "keyframes_refused": self._sender.refused_keyframes,
                 "relocalisations": dict(self._relocaliser.verdicts),
                 "others": sorted(self._alignments.others),
                 **self._attachments.report(),
@@ -645,9 +650,6 @@ class LiveMapper:
             for correction in self._alignments.identify_robot(robot_in_map.name, offset.segment):
                 self._publish(correction)
         self._alignments.map_keyframes = max(self._alignments.map_keyframes, robot_in_map.map_keyframes)
-
-    def _apply_relocalisation(self, segment: int, T_odom_camera: Array, reply: RelocaliseReply) -> None:
-        self._publish(self._alignments.apply_relocalisation(segment, T_odom_camera, reply))
 
     def _publish(self, correction: Correction | None) -> None:
         """Publish a correction, if there is one; it marks the next frame if it is of the present segment."""

@@ -217,6 +217,8 @@ async def test_a_program_that_starts_again_sends_what_waited_and_begins_a_new_se
         await robot.until(lambda: mapper.keyframes_waiting == 0)
 
         assert [(each.number, each.segment) for each in robot.kept] == [(0, 0), (1, 0), (2, 1)]
+        assert mapper.segment == 1
+        assert mapper.report()["live"]["segments"] == 1
 
 
 async def test_a_spool_in_use_is_refused_in_one_line_and_free_again_when_its_program_ends(
