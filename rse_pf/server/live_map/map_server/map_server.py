@@ -16,18 +16,9 @@ import functools
 from collections.abc import Callable, Coroutine, Iterable
 from typing import Any, Literal
 
-import msgspec
-
-from rse_pf.errors import (
-    Busy,
-    Conflict,
-    InternalError,
-    NotFound,
-    StoreError,
-    StoreFull,
-)
-from rse_pf.identity import RobotId, folders_of, shown_name
-from rse_pf.live_map.events import Event, KeyframeAdded, MapStarted, RobotForgotten, RobotLeft
+from rse_pf.errors import Busy, InternalError, StoreError, StoreFull
+from rse_pf.identity import RobotId
+from rse_pf.live_map.events import Event, KeyframeAdded, RobotForgotten
 from rse_pf.live_map.outcomes import (
     Added,
     Ambiguous,
@@ -46,43 +37,13 @@ from rse_pf.server.live_map.map_server.environment import (
     Urgency,
     next_retry_s,
 )
-from rse_pf.server.live_map.map_server.log import (
-    BUSY_RETRY_MS,
-    SLOW_STORE_S,
-    LiveLog,
-    LogWriter,
-    MapSnapshot,
-    SubmittedEvent,
-)
+from rse_pf.server.live_map.map_server.log import BUSY_RETRY_MS, LiveLog, LogWriter, SubmittedEvent
 from rse_pf.server.live_map.map_server.measurement import KeyframeMeasurer
-from rse_pf.server.live_map.map_server.messages import (
-    MapUpdates,
-    decode_request,
-    paths_reply,
-    relocalise_reply,
-    show_reply,
-    version_reply,
-)
-from rse_pf.server.live_map.map_server.publisher import (
-    NOTE_ALL_LEFT,
-    NOTE_CHANGED,
-    NOTE_UNUSED,
-    Publisher,
-    read_start_version,
-)
+from rse_pf.server.live_map.map_server.messages import MapUpdates, version_reply
+from rse_pf.server.live_map.map_server.publisher import NOTE_CHANGED, NOTE_UNUSED, Publisher
+from rse_pf.server.live_map.map_server.requests import RequestHandler
 from rse_pf.server.live_map.map_server.state import AppliedEntry, MapState
-from rse_pf.slam.keyframe import decode_keyframe
-from rse_pf.wire.live_map import (
-    LEAVE,
-    PUBLISH,
-    STOP,
-    KeyframeRequest,
-    LiveForget,
-    LiveMapRequest,
-    LiveRelocalise,
-    LiveShow,
-    LiveStart,
-)
+from rse_pf.wire.live_map import STOP
 
 __all__ = ["MapMoving", "MapServer", "ServiceEnd"]
 
@@ -98,8 +59,6 @@ the next map server publishes the version."""
 _UNUSED_SHARE = 1.0 / 6.0
 """A map without any command for this share of ``live.idle_s`` counts as watched only, and not used: its
 process may be taken for another map."""
-_EVENT_OVERHEAD_BYTES = 512
-"""Bytes that are charged to the tenant's quota for each keyframe in the log, in addition to its own bytes."""
 _WAITING_FOR_STORE = "waiting for the store"  # state of the map that subscribers are sent
 _ALIGNMENT_OUTCOMES = (Joined, Corrected, Unaligned, Ambiguous, LoopClosureRejected)
 """Classes of outcomes after which the alignments of robots are compared with those that were sent last."""
@@ -119,7 +78,7 @@ class MapMoving(Busy):
 
 
 class MapServer:
-    """Answers requests to one live map, writes its log, and keeps its lease.
+    """Serves one live map: keeps its lease, applies its log, and sends updates; ends with the lease.
 
     All methods are called in the event loop, except those whose docstrings name the thread of the map, the
     only thread that uses the map itself.
@@ -143,8 +102,6 @@ class MapServer:
         self._state = state
         self._log = log
         self._lease = lease
-        self._robot_names: dict[str, str] = {}  # displayed names, keyed by RobotId.folder
-        self._updates = MapUpdates(self._name_of)
         self._writer = LogWriter(
             log,
             environment,
@@ -154,9 +111,17 @@ class MapServer:
         )
         self._measurer = KeyframeMeasurer(state, environment, self._writer.submit)
         self._publisher = Publisher(state, environment, server=lease.record.server)
-        # Keyframes that are being added, keyed by RobotId.folder and keyframe number.
-        self._additions: dict[tuple[str, int], asyncio.Task[None]] = {}
-        self._present_robots: dict[str, None] = {}  # robots that sent keyframes and have not left, by folder
+        self._requests = RequestHandler(
+            environment,
+            state,
+            lease,
+            self._writer,
+            self._publisher,
+            charge=self.charge,
+            service_state=self.service_state,
+            start_task=self.start_task,
+        )
+        self._updates = MapUpdates(self._requests.name_of)
         self._renewed = asyncio.Event()
         self._snapshot_position = 0  # entry of the log at the last snapshot of this process; 0: none
         self._bytes_since_snapshot = 0  # bytes that were charged for entries since then
@@ -193,9 +158,9 @@ class MapServer:
             self._writer.run(),
             self._measurer.run(),
             self._keep_lease(),
-            self._delete_objects_of_forgotten_at_start(),
+            self._delete_objects_of_forgotten(),
         ):
-            self._start_task(work)
+            self.start_task(work)
         try:
             return await asyncio.shield(self._ended)
         finally:
@@ -207,8 +172,8 @@ class MapServer:
     async def answer(self, robot: RobotId, operation: str, request: bytes) -> dict[str, Any]:
         """Do what a robot or an operator requests, and return the reply.
 
-        While the lease is too old, the finished reply is held back until the lease is renewed or lost; only
-        that of ``live-stop``, which gives the lease up, is not.
+        While the lease is too old, the finished reply is held back until the lease is renewed or lost.  Only
+        the reply of ``live-stop``, which gives the lease up, is not held back.
 
         Args:
             robot: Robot that asks.
@@ -221,11 +186,12 @@ class MapServer:
         """
         if self._is_closing or self._ended.done():
             raise self._moving_error()
-        self._robot_names[robot.folder] = robot.name
         self._set_used(is_used=True)
-        reply = await self._reply_to(robot, operation, request)
+        if operation == STOP:
+            return await self._stop_map()
+        reply = await self._requests.answer(robot, operation, request)
         # While the lease is too old, another process may serve the map: the reply waits for a renewal.
-        while operation != STOP and not self._holds_lease():
+        while not self._holds_lease():
             if self._ended.done():
                 raise self._moving_error()
             self._renewed.clear()
@@ -240,240 +206,6 @@ class MapServer:
         """
         await self._close(self._lease.release, "released")
 
-    # --- Requests of robots and operators to the live map ---
-
-    async def _reply_to(self, robot: RobotId, operation: str, data: bytes) -> dict[str, Any]:
-        match decode_request(operation, data):
-            case KeyframeRequest() as request:
-                return await self._take_keyframe(robot, request)
-            case LiveRelocalise() as request:
-                return await self._relocalise(request)
-            case LiveForget() as request:
-                return await self._forget_robot(request)
-            case LiveStart() as request:
-                return await self._start_map(request)
-            case LiveShow() as request:
-                show = functools.partial(self._show, robot, request.paths)
-                return await self._environment.threads.compute(Urgency.ANSWER, show)
-            case LiveMapRequest():
-                return await self._reply_to_map_request(robot, operation)
-
-    async def _reply_to_map_request(self, robot: RobotId, operation: str) -> dict[str, Any]:
-        """Do ``live-leave``, ``live-publish`` or ``live-stop``, whose requests have the same fields."""
-        if operation == LEAVE:
-            return await self._leave(robot)
-        if operation == PUBLISH:
-            record = await self._publisher.publish(f"published by {robot}")
-            return version_reply(self._environment.map_name, record)
-        return await self._stop_map()
-
-    async def _take_keyframe(self, robot: RobotId, request: KeyframeRequest) -> dict[str, Any]:
-        """Add a keyframe to the map; the reply names the number of the robot's next keyframe.
-
-        If the robot sends a keyframe again while it is being added, both requests wait for the same addition,
-        which goes on if a request is cancelled.
-        """
-        event = KeyframeAdded(
-            robot=robot.folder, segment=request.segment, number=request.number, data=request.keyframe
-        )
-        key = event.robot, event.number
-        addition = self._additions.get(key)  # not None if the robot sends the keyframe again
-        if addition is None:
-            self._present_robots[event.robot] = None
-            addition = self._additions[key] = asyncio.ensure_future(self._add_keyframe(event))
-            addition.add_done_callback(lambda _: self._additions.pop(key))
-        await asyncio.shield(addition)
-        return {"number": event.number + 1, "version": self._state.position}
-
-    async def _add_keyframe(self, event: KeyframeAdded) -> None:
-        """Write a keyframe to the log and wait until it is applied to the map.
-
-        A keyframe that the map has already is not written again.
-
-        Raises:
-            RsePfError: The keyframe is refused, for example because it is not valid, or above the quota.
-        """
-        compute, live_map = self._environment.threads.compute, self._state.live_map
-        while True:
-            # 1. Validate the keyframe against the map; the robot may have sent it before.
-            verdict = await compute(Urgency.VALIDATE, functools.partial(live_map.check_keyframe, event))
-            if verdict == "known":
-                return
-            # 2. Charge, log and apply the keyframe if it is the robot's next one.
-            if verdict == "new":
-                await self._charge(len(event.data) + _EVENT_OVERHEAD_BYTES)
-                await asyncio.shield(self._writer.submit(event, len(event.data)))
-                return
-            # 3. Otherwise its number is too high: wait for the keyframe before it, if that is being added,
-            # and validate this one again.
-            previous = self._additions.get((event.robot, event.number - 1))
-            if previous is not None:
-                await asyncio.wait({previous})
-                continue
-            # 4. Refuse the keyframe if the one before it was not sent.
-            expected = await compute(Urgency.VALIDATE, functools.partial(live_map.next_number, event.robot))
-            if event.number > expected:
-                raise Conflict(
-                    f"keyframe {event.number} arrived, but {expected} is the next one",
-                    hint=f"send keyframe {expected} first",
-                )
-
-    async def _charge(self, size_bytes: int) -> None:
-        """Charge the tenant's quota with *size_bytes* that are written to the log next.
-
-        A snapshot stores the features of keyframes a second time before the log is shortened, so the bytes
-        that were logged since the last snapshot must be free as well.  If the store fails in
-        another way than by StoreFull, nothing is charged: the entry waits for the store and is counted later.
-
-        Raises:
-            QuotaExceeded: The tenant would store more than its quota.
-            StoreFull: The disk is nearly full, and the tenant holds more than its share.
-            Busy: Other processes changed the account at each try.
-        """
-        account = self._environment.account
-        if not account.try_charge(size_bytes):
-            reserve = functools.partial(
-                account.reserve, size_bytes, margin=self._bytes_since_snapshot + size_bytes
-            )
-            reservation = asyncio.ensure_future(self._environment.threads.store(reserve))
-            await asyncio.wait({reservation}, timeout=SLOW_STORE_S)
-            if not reservation.done():
-                self.set_waiting_for_store(True)
-            try:
-                await reservation
-            except StoreFull:
-                raise
-            except StoreError:  # the log entry waits until the store works, and is counted later
-                pass
-        self._bytes_since_snapshot += size_bytes
-
-    async def _relocalise(self, request: LiveRelocalise) -> dict[str, Any]:
-        view = decode_keyframe(request.keyframe)
-        threads, live_map = self._environment.threads, self._state.live_map
-        relocalise = await threads.compute(
-            Urgency.ANSWER, functools.partial(live_map.prepare_relocalisation, view)
-        )
-        position = self._state.position
-        return relocalise_reply(await threads.match(relocalise), position)
-
-    async def _leave(self, robot: RobotId) -> dict[str, Any]:
-        """Log that a robot has left, if it had not; when no robot is present any more, publish the map.
-
-        The reply does not wait for the publication.
-        """
-        if robot.folder in await self._environment.threads.compute(
-            Urgency.ANSWER, lambda: self._state.live_map.robots
-        ):
-            await asyncio.shield(self._writer.submit(RobotLeft(robot=robot.folder)))
-        self._present_robots.pop(robot.folder, None)
-        if not self._present_robots:
-            self._publisher.request(NOTE_ALL_LEFT)
-            self._start_task(self._publisher.publish_due())
-        return {}
-
-    async def _forget_robot(self, request: LiveForget) -> dict[str, Any]:
-        """Remove all that a robot contributed to the map, and delete its stored points and images.
-
-        A robot that was enrolled several times under one name is removed completely; the reply counts these
-        enrolments.
-
-        Raises:
-            NotFound: The robot contributed nothing.
-            StoreError: The objects could not be deleted; the robot is removed from the map all the same, and
-                the next publication deletes them.
-        """
-        contributors = await self._environment.threads.compute(
-            Urgency.ANSWER, lambda: list(self._state.live_map.contributors)
-        )
-        folders = [folder for folder in contributors if self._robot_names.get(folder) == request.robot]
-        folders += [folder for folder in folders_of(request.robot, contributors) if folder not in folders]
-        if not folders:
-            raise NotFound(
-                f"robot {request.robot[:80]!r} contributed nothing to the live map",
-                hint="name a robot that rse-pf map live show MAP lists",
-            )
-        for folder in folders:
-            await asyncio.shield(self._writer.submit(RobotForgotten(robot=folder)))
-        await self._delete_objects_of_forgotten()
-        return {"forgotten": len(folders), "version": self._state.position}
-
-    async def _delete_objects_of_forgotten(self) -> None:
-        """Delete from the store the points and images of all forgotten robots; raises StoreError."""
-        threads, objects = self._environment.threads, self._environment.objects
-        forgotten = await threads.compute(Urgency.ANSWER, lambda: self._state.live_map.deletable_objects)
-        if forgotten:
-            await threads.background(functools.partial(objects.delete_of_forgotten, forgotten))
-
-    async def _delete_objects_of_culled(self, culled: list[tuple[str, str]]) -> None:
-        """Delete stored points and images of culled keyframes; an error of the store is ignored."""
-        with contextlib.suppress(StoreError):
-            await self._environment.threads.background(
-                functools.partial(self._environment.objects.delete_of_culled, culled)
-            )
-
-    async def _delete_objects_of_forgotten_at_start(self) -> None:
-        """Delete objects of forgotten robots that the previous map server did not delete.
-
-        An error of the store is ignored, because each publication tries again.
-        """
-        with contextlib.suppress(StoreError):
-            await self._delete_objects_of_forgotten()
-
-    async def _start_map(self, request: LiveStart) -> dict[str, Any]:
-        """Begin an empty map, or a map with the keyframes of a version; raises Conflict if it has begun.
-
-        An empty map without ``equal_rooms_m`` is not written to the log, and may be begun again.
-        """
-        map_name, background = self._environment.map_name, self._environment.threads.background
-        if self._state.changes or self._state.keyframes:
-            raise Conflict(
-                f"the live map {map_name!r} has begun already",
-                hint=f"stop it first: rse-pf map live stop {map_name}",
-            )
-        if request.source:
-            version, source = await background(lambda: read_start_version(self._environment.maps, request))
-            event = await background(lambda: self._environment.implementation.started_from(version, source))
-        else:
-            event = MapStarted(source="", keyframes=())
-        if request.source or request.equal_rooms_m:
-            event = msgspec.structs.replace(event, equal_rooms_m=request.equal_rooms_m)
-            await self._charge(
-                sum(len(keyframe.data) + _EVENT_OVERHEAD_BYTES for keyframe in event.keyframes)
-            )
-            await asyncio.shield(self._writer.submit(event))
-        return {"keyframes": self._state.keyframes, "version": self._state.position}
-
-    async def _stop_map(self) -> dict[str, Any]:
-        """Publish the map, give its lease up as stopped, and delete its log.
-
-        The reply names the version; it is empty if the map has no keyframes.  If the publication fails, the
-        map goes on, and the error is raised.
-        """
-        background, record = self._environment.threads.background, None
-        # 1. Publish the map as a version; the bytes of its log, which is deleted afterwards, count as free.
-        if self._state.keyframes:
-            freed_bytes = await background(self._log.charged_bytes)
-            record = await self._publisher.publish("the live map was stopped", freed_bytes)
-        # 2. Give the lease up, and write into it the position of the log at which the map was stopped.
-        await self._close(lambda: self._lease.stop(self._log.position), "stopped")
-        # 3. Delete the log; entries that stay after an error are ignored by the next map server.
-        with contextlib.suppress(StoreError):
-            await background(functools.partial(self._log.delete_until, self._lease.record.base))
-        return {} if record is None else version_reply(self._environment.map_name, record)
-
-    def _show(self, robot: RobotId, with_paths: bool) -> dict[str, Any]:
-        """Return the reply of ``live-show`` for *robot*; called in the thread of the map."""
-        reply = show_reply(
-            robot,
-            self._state,
-            self._lease.record,
-            service_state=self._service_state(),
-            name_of=self._name_of,
-            is_present=self._present_robots.__contains__,
-        )
-        paths = {"paths": paths_reply(self._state, self._name_of)} if with_paths else {}
-        return {**reply, "images": self._environment.settings.images, **paths}
-
     # --- Entries of the log and snapshots ---
 
     async def apply_entry(self, position: int, batch: list[SubmittedEvent]) -> None:
@@ -487,13 +219,13 @@ class MapServer:
         self._complete_events(batch, applied)
         # 3. Delete the stored points and images of keyframes whose features the map dropped.
         if culled:
-            self._start_task(self._delete_objects_of_culled(culled))
+            self.start_task(self._delete_objects_of_culled(culled))
         # 4. Send subscribers the alignments and poses that changed.
         for update in updates:
             self._send_update(update)
         # 5. Begin to write a snapshot if enough entries were applied since the last one.
         if self._state.is_snapshot_due:
-            self._start_task(self._write_snapshot(await self._make_snapshot()))
+            self.start_task(self._write_snapshot())
 
     def _apply_events(
         self, position: int, events: list[Event]
@@ -523,17 +255,34 @@ class MapServer:
         culled = [id_ for outcome in outcomes if isinstance(outcome, Culled) for id_ in outcome.ids]
         return applied, updates, self._state.live_map.objects_of(culled) if culled else []
 
+    async def _delete_objects_of_culled(self, culled: list[tuple[str, str]]) -> None:
+        """Delete stored points and images of culled keyframes; an error of the store is ignored."""
+        with contextlib.suppress(StoreError):
+            await self._environment.threads.background(
+                functools.partial(self._environment.objects.delete_of_culled, culled)
+            )
+
+    async def _delete_objects_of_forgotten(self) -> None:
+        """Delete objects of forgotten robots that the previous map server did not delete.
+
+        An error of the store is ignored, because each publication tries again.
+        """
+        with contextlib.suppress(StoreError):
+            await self._requests.delete_objects_of_forgotten()
+
     def _log_alignments(self, outcomes: Iterable[Outcome]) -> None:
         for outcome in outcomes:
             if isinstance(outcome, Joined):
                 self._environment.log.info(
-                    "live-aligned", map=self._environment.map_name, robot=self._name_of(outcome.robot)
+                    "live-aligned",
+                    map=self._environment.map_name,
+                    robot=self._requests.name_of(outcome.robot),
                 )
             elif isinstance(outcome, Unaligned):
                 self._environment.log.warning(
                     "live-alignment-lost",
                     map=self._environment.map_name,
-                    robot=self._name_of(outcome.robot),
+                    robot=self._requests.name_of(outcome.robot),
                     reason=outcome.reason,
                 )
 
@@ -561,16 +310,40 @@ class MapServer:
             if isinstance(submitted.event, KeyframeAdded):
                 self._measurer.add_keyframes(outcome.id for outcome in outcomes if isinstance(outcome, Added))
 
-    async def _make_snapshot(self) -> MapSnapshot:
-        return await self._environment.threads.compute(
+    async def charge(self, size_bytes: int) -> None:
+        """Charge the tenant's quota with *size_bytes* that are written to the log next.
+
+        A snapshot stores the features of keyframes a second time before the log is shortened, so the bytes
+        that were logged since the last snapshot must be free as well.  If the store fails in
+        another way than by StoreFull, nothing is charged: the entry waits for the store and is counted later.
+
+        Raises:
+            QuotaExceeded: The tenant would store more than its quota.
+            StoreFull: The disk is nearly full, and the tenant holds more than its share.
+            Busy: Other processes changed the account at each try.
+        """
+        account = self._environment.account
+        if not account.try_charge(size_bytes):
+            reserve = functools.partial(
+                account.reserve, size_bytes, margin=self._bytes_since_snapshot + size_bytes
+            )
+            try:
+                await self._environment.threads.store(reserve)
+            except StoreFull:
+                raise
+            except StoreError:  # the log entry waits until the store works, and is counted later
+                pass
+        self._bytes_since_snapshot += size_bytes
+
+    async def _write_snapshot(self) -> None:
+        """Write a snapshot; if the store fails, log that: a restart reads more entries until the next one."""
+        threads = self._environment.threads
+        saved_bytes = self._bytes_since_snapshot
+        snapshot = await threads.compute(
             Urgency.APPLY, functools.partial(self._state.make_snapshot, self._log.stored_parts)
         )
-
-    async def _write_snapshot(self, snapshot: MapSnapshot) -> None:
-        """Write a snapshot; if the store fails, log that: a restart reads more entries until the next one."""
-        saved_bytes = self._bytes_since_snapshot
         try:
-            await self._environment.threads.background(lambda: self._log.write_snapshot(snapshot))
+            await threads.background(functools.partial(self._log.write_snapshot, snapshot))
         except StoreError as error:
             self._environment.log.warning(
                 "live-snapshot-failed", map=self._environment.map_name, error=error.message
@@ -634,9 +407,9 @@ class MapServer:
             self._idle_since_s = now
         elif now - self._idle_since_s >= environment.settings.idle_s:
             self._idle_since_s = now
-            self._start_task(self._give_up_idle_map())
+            self.start_task(self._give_up_idle_map())
         # 4. Publish the requested version if the map has changed and ``live.publish_pause_s`` has passed.
-        self._start_task(self._publisher.publish_due())
+        self.start_task(self._publisher.publish_due())
 
     def _set_used(self, *, is_used: bool) -> None:
         """Note that a command has arrived, or that none has for a while; notify the worker of a change."""
@@ -647,14 +420,12 @@ class MapServer:
             self._environment.on_use(is_used)
 
     async def _give_up_idle_map(self) -> None:
-        """Wait until the map may be published, publish and release it, unless a worker connects meanwhile.
+        """Publish the map if it has changed, and release it unless a worker has connected meanwhile.
 
         If the publication fails, the map is released, and the next map server publishes it.
         """
         self._publisher.request(NOTE_UNUSED)
-        while self._publisher.is_due and not self._publisher.has_failed and not self.users:
-            await self._publisher.publish_due()
-            await self._environment.sleep(renewal_s(self._environment.settings.lease_s))
+        await self._publisher.publish_now()
         if not self.users:
             await self.release()
 
@@ -675,12 +446,11 @@ class MapServer:
         self._send_map_state()
         # 1. Wait until submitted events are written and applied.
         await self._writer.wait_empty()
-        snapshot = await self._make_snapshot()
         if end == "released":
             # 2. Write a snapshot unless this process wrote one after the last entry, so that the next map
             # server starts fast.
-            if snapshot.position > self._snapshot_position:
-                await self._write_snapshot(snapshot)
+            if self._state.position > self._snapshot_position:
+                await self._write_snapshot()
             # 3. Publish a requested version without a pause, because the next map server may start late.
             await asyncio.wait(
                 {asyncio.ensure_future(self._publisher.publish_now())}, timeout=_MAX_FINAL_PUBLICATION_S
@@ -695,6 +465,24 @@ class MapServer:
                 wait_s = next_retry_s(wait_s)
             else:
                 self._end(end if was_held else "lost")
+
+    async def _stop_map(self) -> dict[str, Any]:
+        """Publish the map, give its lease up as stopped, and delete its log.
+
+        The reply names the version; it is empty if the map has no keyframes.  If the publication fails, the
+        map goes on, and the error is raised.
+        """
+        background, record = self._environment.threads.background, None
+        # 1. Publish the map as a version; the bytes of its log, which is deleted afterwards, count as free.
+        if self._state.keyframes:
+            freed_bytes = await background(self._log.charged_bytes)
+            record = await self._publisher.publish("the live map was stopped", freed_bytes)
+        # 2. Give the lease up, and write into it the position of the log at which the map was stopped.
+        await self._close(lambda: self._lease.stop(self._log.position), "stopped")
+        # 3. Delete the log; entries that stay after an error are ignored by the next map server.
+        with contextlib.suppress(StoreError):
+            await background(functools.partial(self._log.delete_until, self._lease.record.base))
+        return {} if record is None else version_reply(self._environment.map_name, record)
 
     def lose(self, reason: str) -> None:
         """End the service, because another process serves the map; *reason* is logged."""
@@ -717,7 +505,7 @@ class MapServer:
 
     def _send_map_state(self) -> None:
         """Send the update ``map`` (size, position in the log, server and state) if it has changed."""
-        service_state = self._service_state()
+        service_state = self.service_state()
         for payload in self._updates.set_map(
             keyframes=self._state.keyframes,
             version=self._state.position,
@@ -729,7 +517,7 @@ class MapServer:
             else:
                 self._send_update(payload)
 
-    def _service_state(self) -> str:
+    def service_state(self) -> str:
         if self._is_closing:
             return "moving"
         return _WAITING_FOR_STORE if self._is_waiting_for_store else "live"
@@ -740,10 +528,6 @@ class MapServer:
             self._is_waiting_for_store = is_waiting
             self._send_map_state()
 
-    def _name_of(self, folder: str) -> str:
-        """Return the name that is displayed for the robot with the `RobotId.folder` *folder*."""
-        return self._robot_names.get(folder) or shown_name(folder)
-
     def _moving_error(self) -> MapMoving:
         return MapMoving(
             "the live map is moving to another server",
@@ -751,7 +535,7 @@ class MapServer:
             retry_after_ms=BUSY_RETRY_MS,
         )
 
-    def _start_task(self, work: Coroutine[Any, Any, None]) -> None:
+    def start_task(self, work: Coroutine[Any, Any, None]) -> None:
         """Run *work* as a task until the service ends; an exception of it ends the service as a defect."""
         task = asyncio.get_running_loop().create_task(work)
         self._tasks.add(task)

@@ -94,8 +94,6 @@ class Publisher:
         self._last_record: MapRecord | None = None
         self._next_allowed_s: float | None = None  # None: the registry was not read yet
         self._due_request: _Request | None = None  # the last request, until a version is published after it
-        self.has_failed = False
-        """Whether the last try to publish the due version failed; the version stays due."""
         self._retry_s = _FIRST_RETRY_S
         self._retry_at_s = float("-inf")  # until then, publish_due does nothing
 
@@ -142,8 +140,6 @@ class Publisher:
 
     def request(self, note: str) -> None:
         """Let `publish_due` publish the map once, with this *note*, if the map has changed."""
-        if not self.is_due:
-            self.has_failed = False
         if self._is_changed:
             self._due_request = _Request(note)
 
@@ -172,7 +168,6 @@ class Publisher:
                     await self._publish(self._due_request.note)
         except RsePfError as error:
             self._environment.log.warning("live-publish-failed", map=self._map_name, error=error.message)
-            self.has_failed = True
             self._retry_at_s = self._clock() + self._retry_s
             self._retry_s = min(_MAX_RETRY_S, 2 * self._retry_s)
 
@@ -195,7 +190,7 @@ class Publisher:
         self._published_changes, self._last_record = changes, record
         if self._due_request is due_request:  # else the map was requested again after the version was made
             self._due_request = None
-        self.has_failed, self._retry_s = False, _FIRST_RETRY_S
+        self._retry_s = _FIRST_RETRY_S
         environment.log.info("live-map-published", map=self._map_name, id=record.id, number=record.number)
         # 3. Remove old automatic versions.
         try:
