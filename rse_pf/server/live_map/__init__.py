@@ -11,8 +11,8 @@ these steps:
 4. `map_server.worker_connections` (map server) receives the request.
 5. `map_server.requests.RequestHandler` validates the keyframe against the map and charges the quota.
 6. `map_server.log.LogWriter` writes the keyframe durably into the next entry of the log.
-7. `map_server.map_server.MapServer` applies the entry to the map (`map_server.state`), and the reply goes back
-   the same way.
+7. `map_server.map_server.MapServer` applies the entry to the map (`map_server.state`), and the reply goes
+   back the same way.
 8. `map_server.measurement` measures the loop closures of the keyframe, which enter the log as in step 6.
 9. `MapServer` applies them and sends the alignments that changed (`map_server.messages`) to all workers.
 10. `subscriptions.Subscriptions` (worker) sends the newest update of each key to every subscribed robot.
