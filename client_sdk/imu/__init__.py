@@ -5,7 +5,7 @@
 2. `checks` refuses an IMU whose samples are faulty, or whose gyroscope contradicts the camera's rotations.
 3. `preintegration` integrates the samples between two frames on the manifold (Forster et al. 2017).
 4. `alignment` estimates metric scale, gravity, velocities and biases from tracked poses and preintegrated
-   motions (as the initialisation of VINS-Mono, then a batch optimisation).
+   motions: the linear initialisation of VINS-Mono, then nonlinear least squares over all these poses.
 5. `estimator` runs these steps over a drive, predicts the rotation between frames, and gives keyframes their
    gravity.
 

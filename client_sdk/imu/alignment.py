@@ -5,8 +5,9 @@ The camera's poses, which may be up to scale, are measurements with noise (a loo
 1. The bias of the gyroscope follows from the rotations of the poses (VINS-Mono, eq. 15).
 2. A linear problem gives velocities, gravity and scale (VINS-Mono, Sect. V-B), and refuses a sensor with the
    wrong sign or scale.  Gravity is then set to 9.81 m/s^2.
-3. A nonlinear least-squares problem refines these, and also rotations, positions and biases of all poses:
+3. A nonlinear least-squares problem refines these, and the rotations, positions and biases of all poses:
    residuals of preintegrated motions (Forster et al. 2017) and of poses, Huber loss, Levenberg-Marquardt.
+   Each pose has biases of its own.
 
 Source:
     Qin et al., "VINS-Mono", T-RO 2018, for steps 1 and 2; Campos et al., "Inertial-Only Optimization for
@@ -39,15 +40,18 @@ _BIASES = slice(9, 15)
 
 _GYRO_BIAS_PRIOR_RAD_S = 0.1  # standard deviation of the gyroscope's bias before anything is measured
 _ACCEL_BIAS_PRIOR_M_S2 = 0.2  # standard deviation of the accelerometer's bias before anything is measured
-_HUBER_WIDTH = 3.0  # root mean square of a residual's three whitened axes from which on the loss is linear
+_HUBER_WIDTH = 3.0
+"""Width of the Huber loss: the loss of a residual is linear where the root mean square of the residual's
+three whitened components is above this."""
 _CERTAIN_DEVIATIONS = 10.0
-"""Standard deviations by which the linear solution must contradict a sensor to refuse it."""
+"""Standard deviations by which scale or gravity of the linear solution must be wrong to refuse the
+accelerometer."""
 _MAX_ITERATIONS = 12  # largest number of accepted Levenberg-Marquardt steps of one alignment
 _CONVERGED_FRACTION = 1e-4
 """Levenberg-Marquardt ends with a step that lowers the cost by less than this fraction."""
 _FIRST_DAMPING = 1e-5
-"""Levenberg-Marquardt damping of the first step, as a share of the diagonal; bad steps multiply it by 10,
-good ones by 0.1."""
+"""Levenberg-Marquardt damping of the first step, as a share of the diagonal.  A step that does not lower the
+cost multiplies the damping by 10; a step that does multiplies it by 0.1."""
 _MIN_DAMPING = 1e-9  # smallest Levenberg-Marquardt damping of a step
 _MAX_DAMPING = 1e8  # Levenberg-Marquardt damping above which the search for a better step is given up
 _COVARIANCE_FLOOR = 1e-14  # added to variances of preintegrated motions, so that a Cholesky factor exists
@@ -55,43 +59,34 @@ _COVARIANCE_FLOOR = 1e-14  # added to variances of preintegrated motions, so tha
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ImuAlignment:
-    """Metric scale, gravity, velocities and biases, and the smoothed poses that agree with them.
+    """Metric scale, gravity and biases that agree with the poses of a camera and the samples of its IMU.
 
     Attributes:
         scale: Metres per unit of the camera's poses.
-        scale_deviation: Standard deviation of the logarithm of the scale, thus relative; 0 for metric poses.
+        scale_deviation: Relative standard deviation of the scale; 0 for metric poses.
         gravity_m_s2: ``(3,)`` in the world of the poses; it points down, and its length is 9.81.
         gravity_deviation_rad: Standard deviation of the direction of gravity about its less certain axis.
-        R_world_imu: ``(n, 3, 3)`` smoothed rotations of the IMU.
-        positions_m: ``(n, 3)`` smoothed positions of the IMU in the world, whose lengths are multiplied by
-            *scale*.
-        velocities_m_s: ``(n, 3)`` velocities of the IMU in the world.
-        gyro_bias_rad_s: ``(n, 3)`` biases of the gyroscope.
-        accel_bias_m_s2: ``(n, 3)`` biases of the accelerometer.
-        bias_covariance: ``(6, 6)`` of the biases of gyroscope, then accelerometer, at the last pose.
-        misfit: Square root of the chi-square per degree of freedom: about 1 if the noise is as stated.  All
-            deviations and covariances above were multiplied by it, or its square, if it is above 1.
+        gyro_bias_rad_s: ``(3,)`` bias of the gyroscope at the last pose.
+        accel_bias_m_s2: ``(3,)`` bias of the accelerometer at the last pose.
+        misfit: Square root of the chi-square per degree of freedom: about 1 if the noise is as stated.  A
+            misfit above 1 was multiplied into both deviations above.
     """
 
     scale: float
     scale_deviation: float
     gravity_m_s2: Array
     gravity_deviation_rad: float
-    R_world_imu: Array
-    positions_m: Array
-    velocities_m_s: Array
     gyro_bias_rad_s: Array
     accel_bias_m_s2: Array
-    bias_covariance: Array
     misfit: float
 
 
 def estimate_gyro_bias(R_world_imu: Array, motions: Sequence[Preintegration]) -> Array:
     """Return the ``(3,)`` gyroscope bias in rad/s with which motions fit the rotations ``(n, 3, 3)`` best.
 
-    The n - 1 motions lie between neighbouring rotations.  The result is the bias with which the first motion
-    was preintegrated, plus one linear correction; the others should have been preintegrated with nearly that
-    bias.
+    The n - 1 motions lie between neighbouring rotations.  One linear step is taken from the bias with which
+    the first motion was preintegrated.  The step is exact only if all motions were preintegrated with nearly
+    the same bias.
 
     Source:
         VINS-Mono, eq. 15.
@@ -127,82 +122,14 @@ def align_imu(
         is_metric: Whether the unit of the poses is the metre, so that the scale is 1.
 
     Raises:
-        UsageError: Scale or magnitude of gravity are wrong by more than ten standard deviations, so that the
-            accelerometer has the wrong sign, scale or bias.
+        UsageError: The scale is negative by more than ten standard deviations, or the magnitude of gravity is
+            wrong by 0.6 m/s^2 and more than ten standard deviations: the accelerometer has the wrong sign,
+            scale or bias.
     """
-    gyro_bias = estimate_gyro_bias(T_world_camera[:, :3, :3] @ model.T_imu_camera[:3, :3].T, motions)
-    linear = _align_linearly(T_world_camera, motions, model, gyro_bias, is_metric=is_metric)
-    if linear is None:
-        return None
-    scale, gravity, velocities = linear
-    return _AlignmentProblem(T_world_camera, motions, model, pose_noise, is_metric=is_metric).solve(
-        scale, gravity, velocities, gyro_bias
-    )
-
-
-def _align_linearly(
-    T_world_camera: Array,
-    motions: Sequence[Preintegration],
-    model: ImuModel,
-    gyro_bias: Array,
-    *,
-    is_metric: bool,
-) -> tuple[float, Array, Array] | None:
-    """Return scale, gravity ``(3,)`` and velocities ``(n, 3)`` of the IMU by linear least squares.
-
-    Both vectors are in the world of the poses, in m/s^2 and m/s.  The magnitude of gravity is free in the
-    problem and set to 9.81 m/s^2 afterwards; the accelerometer has no bias in it.  None if the scale is not
-    above 0; UsageError if the scale is certainly below 0 or gravity certainly wrong, see `align_imu`.
-    """
-    # 1. Correct the motions for the change of the gyroscope bias.
-    R, camera_in_imu = _imu_rotations(T_world_camera, model)
-    p = T_world_camera[:, :3, 3]
-    n = len(R)
-    dt = np.array([motion.duration_s for motion in motions])
-    bias_change = gyro_bias - np.stack([motion.gyro_bias_rad_s for motion in motions])
-    J = np.stack([motion.bias_jacobian[3:, :3] for motion in motions])
-    deltas = _velocity_and_position_deltas(motions) + np.einsum("nij,nj->ni", J, bias_change)
-    # 2. Set up 6 equations for each motion; the unknowns are n velocities, gravity and scale.
-    A, b = np.zeros((n - 1, 6, 3 * n + 4)), np.zeros((n - 1, 6))
-    for row in range(n - 1):
-        velocity, next_velocity = slice(3 * row, 3 * row + 3), slice(3 * row + 3, 3 * row + 6)
-        A[row, :3, velocity], A[row, :3, next_velocity] = -np.eye(3), np.eye(3)
-        A[row, :3, 3 * n : 3 * n + 3] = -dt[row] * np.eye(3)
-        A[row, 3:, velocity] = -dt[row] * np.eye(3)
-        A[row, 3:, 3 * n : 3 * n + 3] = -0.5 * dt[row] ** 2 * np.eye(3)
-        A[row, 3:, -1] = p[row + 1] - p[row]
-        b[row, :3] = R[row] @ deltas[row, :3]
-        b[row, 3:] = R[row] @ deltas[row, 3:] + (R[row + 1] - R[row]) @ camera_in_imu
-    matrix, right = A.reshape(-1, 3 * n + 4), b.ravel()
-    if is_metric:
-        right, matrix = right - matrix[:, -1], matrix[:, :-1]
-    # 3. Solve the equations by least squares.
-    solution = np.asarray(np.linalg.lstsq(matrix, right, rcond=None)[0], dtype=np.float64)
-    scale = 1.0 if is_metric else float(solution[-1])
-    gravity: Array = solution[3 * n : 3 * n + 3]
-    magnitude = float(np.linalg.norm(gravity))
-    # 4. Refuse an accelerometer whose sign or scale is certainly wrong.
-    if not is_metric and scale < 0.0:
-        deviations = _deviations_of_last(matrix, right - matrix @ solution, 1)
-        if -scale > _CERTAIN_DEVIATIONS * deviations[0]:
-            raise UsageError(
-                "the accelerometer measures the opposite of how the camera moves: an axis has the wrong sign",
-                hint="a stationary accelerometer reads 9.81 upwards; correct its axes, or T_imu_camera",
-            )
-    if not scale > 0.0 or not magnitude > 0.0:
-        return None
-    if abs(magnitude - GRAVITY_M_S2) > MAX_GRAVITY_ERROR_M_S2:
-        deviations = _deviations_of_last(matrix, right - matrix @ solution, 3 if is_metric else 4)
-        excess = abs(magnitude - GRAVITY_M_S2) - MAX_GRAVITY_ERROR_M_S2
-        if excess > _CERTAIN_DEVIATIONS * deviations[:3].max():
-            raise UsageError(
-                describe_gravity_error(magnitude, "for gravity, compared with the motion of the camera"),
-                hint="calibrate the accelerometer: it must read 9.81 m/s^2 while it is stationary",
-            )
-    # 5. Set the magnitude of gravity to 9.81 m/s^2; its direction stays.
-    gravity = gravity * (GRAVITY_M_S2 / magnitude)
-    velocities: Array = solution[: 3 * n].reshape(n, 3)
-    return scale, gravity, velocities
+    problem = _AlignmentProblem(T_world_camera, motions, model, pose_noise, is_metric=is_metric)
+    gyro_bias = estimate_gyro_bias(problem.observed_R, motions)
+    linear_solution = problem.solve_linearly(gyro_bias)
+    return None if linear_solution is None else problem.refine(*linear_solution, gyro_bias)
 
 
 def _deviations_of_last(matrix: Array, residuals: Array, count: int) -> Array:
@@ -217,19 +144,6 @@ def _deviations_of_last(matrix: Array, residuals: Array, count: int) -> Array:
         return np.full(count, np.inf)
     deviations: Array = np.sqrt(variance * np.square(np.linalg.inv(R)).sum(axis=1))
     return deviations
-
-
-def _velocity_and_position_deltas(motions: Sequence[Preintegration]) -> Array:
-    """Return the preintegrated changes of velocity, then position, of *n* motions, ``(n, 6)``."""
-    return np.stack(
-        [np.concatenate([motion.delta_velocity_m_s, motion.delta_position_m]) for motion in motions]
-    )
-
-
-def _imu_rotations(T_world_camera: Array, model: ImuModel) -> tuple[Array, Array]:
-    """Return ``R_world_imu`` ``(n, 3, 3)`` and the position ``(3,)`` of the camera in the IMU's frame."""
-    R: Array = T_world_camera[:, :3, :3] @ model.T_imu_camera[:3, :3].T
-    return R, model.T_imu_camera[:3, 3]
 
 
 class _AlignmentProblem:
@@ -248,13 +162,17 @@ class _AlignmentProblem:
         *,
         is_metric: bool,
     ) -> None:
-        self._observed_R, self._camera_in_imu = _imu_rotations(T_world_camera, model)
+        self.observed_R: Array = T_world_camera[:, :3, :3] @ model.T_imu_camera[:3, :3].T
+        """Rotations ``R_world_imu`` ``(n, 3, 3)`` of the poses."""
+        self._camera_in_imu = model.T_imu_camera[:3, 3]
         self._observed_p = T_world_camera[:, :3, 3]
         self._rotation_noise, self._position_noise = pose_noise
         self._is_metric = is_metric
         self._dt = np.array([motion.duration_s for motion in motions])
         self._delta_rotations = np.stack([motion.delta_rotation for motion in motions])
-        self._deltas = _velocity_and_position_deltas(motions)
+        self._deltas = np.stack(
+            [np.concatenate([motion.delta_velocity_m_s, motion.delta_position_m]) for motion in motions]
+        )
         self._J = np.stack([motion.bias_jacobian for motion in motions])
         self._motion_biases = np.stack(
             [np.concatenate([motion.gyro_bias_rad_s, motion.accel_bias_m_s2]) for motion in motions]
@@ -267,16 +185,76 @@ class _AlignmentProblem:
             self._sqrt_information[row, :9, :9] = np.linalg.inv(np.linalg.cholesky(covariance))
             self._sqrt_information[row, 9:, 9:] = np.diag(1.0 / np.sqrt(walk * motion.duration_s))
 
-    def solve(self, scale: float, gravity: Array, velocities: Array, gyro_bias: Array) -> ImuAlignment | None:
+    def solve_linearly(self, gyro_bias: Array) -> tuple[float, Array, Array] | None:
+        """Return scale, gravity ``(3,)`` and velocities ``(n, 3)`` of the IMU by linear least squares.
+
+        Gravity (m/s^2) and velocities (m/s) are in the world of the poses.  The accelerometer's bias is taken
+        as 0.  All three components of gravity are estimated; then gravity is scaled to 9.81 m/s^2.  The
+        result is None if the scale is not above 0.
+
+        Raises:
+            UsageError: See `align_imu`.
+        """
+        # 1. Correct the motions for the change of the gyroscope bias.
+        R, p, dt = self.observed_R, self._observed_p, self._dt
+        n = len(R)
+        bias_change = gyro_bias - self._motion_biases[:, :3]
+        deltas = self._deltas + np.einsum("nij,nj->ni", self._J[:, 3:, :3], bias_change)
+        # 2. Set up 6 equations for each motion; the unknowns are n velocities, gravity and scale.
+        A, b = np.zeros((n - 1, 6, 3 * n + 4)), np.zeros((n - 1, 6))
+        for row in range(n - 1):
+            velocity, next_velocity = slice(3 * row, 3 * row + 3), slice(3 * row + 3, 3 * row + 6)
+            A[row, :3, velocity], A[row, :3, next_velocity] = -np.eye(3), np.eye(3)
+            A[row, :3, 3 * n : 3 * n + 3] = -dt[row] * np.eye(3)
+            A[row, 3:, velocity] = -dt[row] * np.eye(3)
+            A[row, 3:, 3 * n : 3 * n + 3] = -0.5 * dt[row] ** 2 * np.eye(3)
+            A[row, 3:, -1] = p[row + 1] - p[row]
+            b[row, :3] = R[row] @ deltas[row, :3]
+            b[row, 3:] = R[row] @ deltas[row, 3:] + (R[row + 1] - R[row]) @ self._camera_in_imu
+        matrix, right = A.reshape(-1, 3 * n + 4), b.ravel()
+        if self._is_metric:
+            right, matrix = right - matrix[:, -1], matrix[:, :-1]
+        # 3. Solve the equations by least squares.
+        solution = np.asarray(np.linalg.lstsq(matrix, right, rcond=None)[0], dtype=np.float64)
+        scale = 1.0 if self._is_metric else float(solution[-1])
+        gravity: Array = solution[3 * n : 3 * n + 3]
+        magnitude = float(np.linalg.norm(gravity))
+        # 4. Refuse an accelerometer whose sign or scale is certainly wrong.
+        if not self._is_metric and scale < 0.0:
+            deviations = _deviations_of_last(matrix, right - matrix @ solution, 1)
+            if -scale > _CERTAIN_DEVIATIONS * deviations[0]:
+                raise UsageError(
+                    "the accelerometer measures the opposite of how the camera moves: an axis has the wrong "
+                    "sign",
+                    hint="a stationary accelerometer reads 9.81 upwards; correct its axes, or T_imu_camera",
+                )
+        if not scale > 0.0 or not magnitude > 0.0:
+            return None
+        if abs(magnitude - GRAVITY_M_S2) > MAX_GRAVITY_ERROR_M_S2:
+            deviations = _deviations_of_last(matrix, right - matrix @ solution, 3 if self._is_metric else 4)
+            excess = abs(magnitude - GRAVITY_M_S2) - MAX_GRAVITY_ERROR_M_S2
+            if excess > _CERTAIN_DEVIATIONS * deviations[:3].max():
+                raise UsageError(
+                    describe_gravity_error(magnitude, "for gravity, compared with the motion of the camera"),
+                    hint="calibrate the accelerometer: it must read 9.81 m/s^2 while it is stationary",
+                )
+        # 5. Set the magnitude of gravity to 9.81 m/s^2; its direction stays.
+        gravity = gravity * (GRAVITY_M_S2 / magnitude)
+        velocities: Array = solution[: 3 * n].reshape(n, 3)
+        return scale, gravity, velocities
+
+    def refine(
+        self, scale: float, gravity: Array, velocities: Array, gyro_bias: Array
+    ) -> ImuAlignment | None:
         """Refine a first solution by Levenberg-Marquardt.
 
-        The arguments are those that `_align_linearly` returns, and the ``(3,)`` gyroscope bias.  The result
+        The arguments are those that `solve_linearly` returns, and the ``(3,)`` gyroscope bias.  The result
         is None if it has no covariance with positive variances.
         """
         n = len(self._observed_p)
         state = _State(
-            R=self._observed_R.copy(),
-            p=scale * self._observed_p - self._observed_R @ self._camera_in_imu,
+            R=self.observed_R.copy(),
+            p=scale * self._observed_p - self.observed_R @ self._camera_in_imu,
             v=velocities.copy(),
             biases=np.tile(np.concatenate([gyro_bias, np.zeros(3)]), (n, 1)),
             scale=scale,
@@ -284,24 +262,17 @@ class _AlignmentProblem:
         )
         cost, damping = self._cost(state), _FIRST_DAMPING
         equations = self._linearise(state)
-        for _ in range(_MAX_ITERATIONS):
-            # 1. Increase the damping until a step lowers the cost.
-            is_better = False
-            while damping < _MAX_DAMPING:
-                candidate = state.moved_by(*equations.solve(damping))
-                candidate_cost = self._cost(candidate)
-                if candidate_cost < cost:
-                    is_better = True
-                    break
+        accepted_steps, is_converged = 0, False
+        while accepted_steps < _MAX_ITERATIONS and damping < _MAX_DAMPING and not is_converged:
+            candidate = state.moved_by(*equations.solve(damping))
+            candidate_cost = self._cost(candidate)
+            if candidate_cost < cost:
+                is_converged = cost - candidate_cost < _CONVERGED_FRACTION * cost
+                state, cost, damping = candidate, candidate_cost, max(0.1 * damping, _MIN_DAMPING)
+                equations = self._linearise(state)
+                accepted_steps += 1
+            else:
                 damping *= 10.0
-            if not is_better:
-                break
-            # 2. Take the step; stop if it lowered the cost by little.
-            is_converged = cost - candidate_cost < _CONVERGED_FRACTION * cost
-            state, cost, damping = candidate, candidate_cost, max(0.1 * damping, _MIN_DAMPING)
-            equations = self._linearise(state)
-            if is_converged:
-                break
         return self._make_alignment(state, equations)
 
     def _make_alignment(self, state: _State, equations: _NormalEquations) -> ImuAlignment | None:
@@ -325,12 +296,8 @@ class _AlignmentProblem:
             scale_deviation=0.0 if self._is_metric else float(np.sqrt(covariance[_STATE_SIZE, _STATE_SIZE])),
             gravity_m_s2=state.gravity,
             gravity_deviation_rad=float(np.sqrt(np.linalg.eigvalsh(tilt_covariance)[-1])),
-            R_world_imu=state.R,
-            positions_m=state.p,
-            velocities_m_s=state.v,
-            gyro_bias_rad_s=state.biases[:, :3],
-            accel_bias_m_s2=state.biases[:, 3:],
-            bias_covariance=covariance[_BIASES, _BIASES],
+            gyro_bias_rad_s=state.biases[-1, :3],
+            accel_bias_m_s2=state.biases[-1, 3:],
             misfit=misfit,
         )
 
@@ -346,17 +313,18 @@ class _AlignmentProblem:
         """
         raw, _ = self._motion_residuals(state)
         motion_residuals = np.einsum("nij,nj->ni", self._sqrt_information, raw)
-        rotations = log_so3(np.swapaxes(self._observed_R, 1, 2) @ state.R) / self._rotation_noise
+        rotations = log_so3(np.swapaxes(self.observed_R, 1, 2) @ state.R) / self._rotation_noise
         camera_positions = state.p + state.R @ self._camera_in_imu
         positions = (camera_positions - state.scale * self._observed_p) / (self._position_noise * state.scale)
         return motion_residuals, np.concatenate([rotations, positions], axis=1)
 
     def _motion_residuals(self, state: _State) -> tuple[Array, Array]:
-        """Return the residuals of motions ``(n - 1, 15)`` in their own units, and corrections.
+        """Return the residuals of motions ``(n - 1, 15)`` in their own units, and rotation corrections.
 
         The residuals are those of rotation (rad), velocity (m/s), position (m) and the change of both biases.
-        The corrections ``(n - 1, 3)`` are rotation vectors, rad, by which the changes of the gyroscope biases
-        since the preintegration correct the preintegrated rotations, on the right.
+        A motion was preintegrated with another gyroscope bias than that of *state*; its correction, a row of
+        ``(n - 1, 3)``, is the rotation vector (rad) of the rotation that is multiplied on the right of the
+        preintegrated rotation for this difference.
         """
         RT = np.swapaxes(state.R[:-1], 1, 2)
         bias_changes = state.biases[:-1] - self._motion_biases
@@ -371,15 +339,12 @@ class _AlignmentProblem:
         return raw, corrections[:, :3]
 
     def _velocity_changes(self, state: _State) -> Array:
-        """Return the changes of velocity ``(n - 1, 3)`` in the world, m/s, without what gravity changed."""
+        """Return the changes of velocity ``(n - 1, 3)`` in the world minus gravity times duration, m/s."""
         changes: Array = state.v[1:] - state.v[:-1] - self._dt[:, None] * state.gravity
         return changes
 
     def _position_changes(self, state: _State) -> Array:
-        """Return the changes of position ``(n - 1, 3)`` in the world, m.
-
-        What the velocity at the begin and gravity changed is subtracted.
-        """
+        """Return ``p_j - p_i - v_i dt - g dt^2 / 2`` of each motion ``(n - 1, 3)`` in the world, m."""
         dt = self._dt[:, None]
         changes: Array = state.p[1:] - state.p[:-1] - dt * state.v[:-1] - 0.5 * dt**2 * state.gravity
         return changes
@@ -394,18 +359,19 @@ class _AlignmentProblem:
         """
         n, border_size = len(self._observed_p), 2 if self._is_metric else 3
         # 1. Differentiate the residuals of motions by the states at their begin (before) and at their end
-        # (behind), and by the border.
+        # (after), and by the border.
         raw, rotation_corrections = self._motion_residuals(state)
         RT = np.swapaxes(state.R[:-1], 1, 2)
         dt = self._dt[:, None, None]
         inverse_right_jacobian = np.asarray(np.linalg.inv(right_jacobian_so3(raw[:, :3])), dtype=np.float64)
-        before, behind = np.zeros((n - 1, 15, 15)), np.zeros((n - 1, 15, 15))
+        before, after = np.zeros((n - 1, 15, 15)), np.zeros((n - 1, 15, 15))
         border = np.zeros((n - 1, 15, border_size))
         before[:, _ROTATION, _ROTATION] = (
             -inverse_right_jacobian @ np.swapaxes(state.R[1:], 1, 2) @ state.R[:-1]
         )
-        behind[:, _ROTATION, _ROTATION] = inverse_right_jacobian
-        # Log(Exp(-J d) Exp(r)): a change d of the bias acts on the left, by the inverse left Jacobian.
+        after[:, _ROTATION, _ROTATION] = inverse_right_jacobian
+        # A change d of the bias turns a rotation residual r into Log(Exp(-J d) Exp(r)): it acts on the left,
+        # so that the inverse left Jacobian is needed.
         before[:, _ROTATION, _GYRO_BIAS] = (
             -np.linalg.inv(left_jacobian_so3(raw[:, :3]))
             @ right_jacobian_so3(rotation_corrections)
@@ -414,21 +380,21 @@ class _AlignmentProblem:
         before[:, 3:6, _ROTATION] = skew(np.einsum("nij,nj->ni", RT, self._velocity_changes(state)))
         before[:, 6:9, _ROTATION] = skew(np.einsum("nij,nj->ni", RT, self._position_changes(state)))
         before[:, 3:6, _VELOCITY] = -RT
-        behind[:, 3:6, _VELOCITY] = RT
+        after[:, 3:6, _VELOCITY] = RT
         before[:, 6:9, _POSITION] = -RT
-        behind[:, 6:9, _POSITION] = RT
+        after[:, 6:9, _POSITION] = RT
         before[:, 6:9, _VELOCITY] = -dt * RT
         before[:, 3:9, _BIASES] = -self._J[:, 3:]
         before[:, 9:, _BIASES] = -np.eye(6)
-        behind[:, 9:, _BIASES] = np.eye(6)
+        after[:, 9:, _BIASES] = np.eye(6)
         gravity_by_angles = -skew(state.gravity) @ _tangents(state.gravity)
         border[:, 3:6, border_size - 2 :] = -dt * RT @ gravity_by_angles
         border[:, 6:9, border_size - 2 :] = -0.5 * dt**2 * RT @ gravity_by_angles
         # 2. Whiten these derivatives and the residuals of motions, and weight them.
         motion_residuals, pose_residuals = self._residuals(state)
         weights = np.sqrt(_huber_weights(motion_residuals))[:, :, None]
-        before, behind, border = (
-            weights * (self._sqrt_information @ jacobian) for jacobian in (before, behind, border)
+        before, after, border = (
+            weights * (self._sqrt_information @ jacobian) for jacobian in (before, after, border)
         )
         motion_residuals = weights[:, :, 0] * motion_residuals
         # 3. Differentiate the residuals of poses, and weight them.
@@ -445,8 +411,12 @@ class _AlignmentProblem:
         pose_residuals = weights[:, :, 0] * pose_residuals
         # 4. Add poses and motions to the normal equations, and the prior of the first biases.
         equations = _NormalEquations(n, border_size)
-        equations.add(own, own_border, pose_residuals)
-        equations.add_pairs(before, behind, border, motion_residuals)
+        equations.add(slice(None), own, own_border, pose_residuals)
+        equations.add_border(own_border, pose_residuals)
+        equations.add(slice(None, -1), before, border, motion_residuals)
+        equations.add(slice(1, None), after, border, motion_residuals)
+        equations.add_border(border, motion_residuals)
+        equations.coupling += np.swapaxes(before, 1, 2) @ after
         information = 1.0 / _bias_prior() ** 2
         equations.diagonal[0, 9:, 9:] += np.diag(information)
         equations.gradient[0, 9:] += information * state.biases[0]
@@ -506,25 +476,19 @@ class _NormalEquations:
         self.border, self.corner = np.zeros((n, _STATE_SIZE, m)), np.zeros((m, m))
         self.gradient, self.border_gradient = np.zeros((n, _STATE_SIZE)), np.zeros(m)
 
-    def add(self, J: Array, border: Array, residuals: Array) -> None:
-        """Add residuals ``(n, k)`` of single states, with Jacobians by the state and by the border."""
-        JT, borderT = np.swapaxes(J, 1, 2), np.swapaxes(border, 1, 2)
-        self.diagonal += JT @ J
-        self.border += JT @ border
-        self.gradient += np.einsum("nij,nj->ni", JT, residuals)
-        self.corner += (borderT @ border).sum(axis=0)
-        self.border_gradient += np.einsum("nij,nj->i", borderT, residuals)
+    def add(self, rows: slice, J: Array, border: Array, residuals: Array) -> None:
+        """Add what ``(m, k)`` residuals say of the states *rows* alone, and of these and the border.
 
-    def add_pairs(self, before: Array, behind: Array, border: Array, residuals: Array) -> None:
-        """Add residuals ``(n - 1, k)`` of neighbours, with Jacobians by both states and by the border."""
-        beforeT, behindT, borderT = (np.swapaxes(jacobian, 1, 2) for jacobian in (before, behind, border))
-        self.diagonal[:-1] += beforeT @ before
-        self.diagonal[1:] += behindT @ behind
-        self.coupling += beforeT @ behind
-        self.border[:-1] += beforeT @ border
-        self.border[1:] += behindT @ border
-        self.gradient[:-1] += np.einsum("nij,nj->ni", beforeT, residuals)
-        self.gradient[1:] += np.einsum("nij,nj->ni", behindT, residuals)
+        *J* ``(m, k, 15)`` and *border* are the Jacobians of the residuals by these states and by the border.
+        """
+        JT = np.swapaxes(J, 1, 2)
+        self.diagonal[rows] += JT @ J
+        self.border[rows] += JT @ border
+        self.gradient[rows] += np.einsum("nij,nj->ni", JT, residuals)
+
+    def add_border(self, border: Array, residuals: Array) -> None:
+        """Add what ``(m, k)`` residuals say of the border alone; *border* is their Jacobian by the border."""
+        borderT = np.swapaxes(border, 1, 2)
         self.corner += (borderT @ border).sum(axis=0)
         self.border_gradient += np.einsum("nij,nj->i", borderT, residuals)
 
@@ -569,8 +533,10 @@ class _NormalEquations:
     ) -> tuple[Array, Array, Array, Array, Array]:
         """Eliminate the states from the first to the last but one.
 
-        Returns diagonal and border of the last state, the corner, and the gradients of the last state and of
-        the border.  *eliminated* collects for each state what gradient, border and next state became.
+        Return diagonal and border of the last state, the corner, and the gradients of the last state and of
+        the border.  For each eliminated state, the matrix ``inverse(D) [b, C, E]`` is appended to
+        *eliminated*: D, b, C and E are the state's diagonal, gradient, border and coupling after the states
+        before were eliminated.
         """
         n, m = len(self.diagonal), len(self.border_gradient)
         G, c = self.corner + damping * np.diag(np.diag(self.corner)), self.border_gradient.copy()
@@ -593,7 +559,7 @@ class _NormalEquations:
 
 
 def _bias_prior() -> Array:
-    """Return the standard deviations ``(6,)`` of the first biases of gyroscope and accelerometer."""
+    """Return the prior standard deviations ``(6,)`` of the biases at the first pose, gyroscope first."""
     return np.repeat([_GYRO_BIAS_PRIOR_RAD_S, _ACCEL_BIAS_PRIOR_M_S2], 3)
 
 
@@ -607,7 +573,10 @@ def _tangents(gravity: Array) -> Array:
 
 
 def _huber_weights(residuals: Array) -> Array:
-    """Return the Huber weights ``(n, k)`` of whitened residuals ``(n, k)``; three axes share one weight."""
+    """Return the Huber weights ``(n, k)`` of whitened residuals ``(n, k)``, equal for the axes of a vector.
+
+    Each three successive columns are the components of one vector.
+    """
     norms = np.linalg.norm(residuals.reshape(len(residuals), -1, 3), axis=2) / np.sqrt(3.0)
     weights: Array = np.repeat(np.minimum(1.0, _HUBER_WIDTH / np.maximum(norms, 1e-12)), 3, axis=1)
     return weights

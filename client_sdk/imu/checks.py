@@ -33,8 +33,8 @@ _MIN_SAMPLES = 100  # IMU samples before faults are sought in them: half a secon
 _MAX_MISSING_FRACTION = 0.05  # fraction of an IMU's samples that may be missing
 _MAX_SATURATED_FRACTION = 0.01  # fraction of an IMU's samples that may be at the end of the sensor's range
 _SATURATION = 0.999  # fraction of the sensor's range from which on a sample counts as saturated
-_MIN_IN_G = 0.7  # mean magnitude of the forces above which they are probably stated in g
-_MAX_IN_G = 1.3  # mean magnitude of the forces below which they are probably stated in g
+_MIN_IN_G = 0.7  # mean magnitude of the stated forces: between this and _MAX_IN_G their unit is probably g
+_MAX_IN_G = 1.3  # mean magnitude of the stated forces: between _MIN_IN_G and this their unit is probably g
 _MIN_MEAN_ACCEL = 0.7  # smallest plausible mean magnitude of an accelerometer, as a multiple of gravity
 _MAX_MEAN_ACCEL = 1.5  # largest plausible mean magnitude of an accelerometer, as a multiple of gravity
 _REST_S = 0.5  # length of the time windows in which an IMU is tested for being stationary
@@ -47,22 +47,27 @@ _REST_ACCEL_M_S2 = 0.1  # standard deviation that a stationary accelerometer may
 _MIN_INTERVALS = 30  # intervals between poses that are needed to compare the rates of gyroscope and camera
 _MAX_INTERVAL_S = 0.5  # longest interval between two poses whose mean rate is compared with the gyroscope
 _MIN_RATE_SPREAD_RAD_S = 0.04
-"""Smallest standard deviation of the camera's rates about its second most turned axis, in rad/s: slower
-rotations, or rotations about one axis, do not distinguish the axes of the gyroscope."""
+"""Smallest standard deviation of the camera's rates about the second of their principal axes, in rad/s:
+slower rotations, or rotations about one axis, do not distinguish the axes of the gyroscope."""
 _MAX_OFFSET_S = 0.1
-"""Largest time offset between the clocks of IMU and camera that is sought, in either direction."""
+"""Largest time offset between the clocks of IMU and camera that is sought, in either direction.  It is above
+`_MAX_USABLE_OFFSET_S`, so that the fault can be reported with its size."""
 _OFFSET_STEP_S = 0.002
 """Step of the search for the time offset between IMU and camera; the best is interpolated."""
-_MIN_OFFSET_S = 0.003
-"""Smallest change of the time offset that is applied: the estimate is no better than that."""
+_MIN_OFFSET_CHANGE_S = 0.003
+"""Smallest difference between the measured time offset and the offset in use that replaces the offset in use:
+the measurement is no better than that."""
 _MAX_USABLE_OFFSET_S = 0.06
 """A larger offset between the clocks of IMU and camera is a fault, and not corrected."""
 _OUTLIER_FACTOR = 4.0
-"""Multiple of the median difference of the two rates from which on an interval is left out."""
+"""Multiple of the median distance between the rates of gyroscope and camera, above which an interval is left
+out."""
 _MAX_UNEXPLAINED = 0.5
-"""Largest part of the camera's rates (root mean square) that the gyroscope does not explain."""
+"""Largest part of the camera's rates (root mean square) that may remain after subtraction of the gyroscope's
+rates; above it the two sensors do not measure the same motion, and the IMU is refused."""
 _MIN_DEGREES_RATIO = 40.0
-"""Gyroscope rates divided by camera rates from which on the gyroscope states degrees."""
+"""Gyroscope rates divided by camera rates, above which the IMU is refused because its unit is degrees per
+second: a degree per second read as rad/s is 57 times too large."""
 _MAX_RATE_RATIO = 1.25  # largest ratio of the rates of gyroscope and camera, either way, of a sound gyroscope
 _MAX_AXES_ERROR_DEG = 8.0  # largest angle between the gyroscope's axes and those that T_imu_camera states
 
@@ -73,9 +78,10 @@ class RateCheck:
 
     Attributes:
         trouble: Why the IMU must not be used, in one line; empty if it may be used.
-        fault: Kind of the trouble, if wrong axes or a wrong clock cause it; empty otherwise.
-        offset_s: Time by which the clock of the IMU is ahead of that of the camera; the offset in use, if the
-            measured one differs from it by at most 3 ms.
+        fault: ``axes`` if wrong axes and ``offset`` if a wrong clock cause *trouble*; empty for other causes,
+            and without trouble.
+        offset_s: Time by which the clock of the IMU is ahead of that of the camera.  It is the offset that
+            was already in use, unless the measured offset differs from that by more than 3 ms.
         gyro_bias_rad_s: ``(3,)`` bias of the gyroscope, in the IMU's frame.
     """
 
@@ -88,8 +94,9 @@ class RateCheck:
 def find_sample_trouble(history: ImuHistory) -> str:
     """Return in one line why the samples of an IMU cannot be used; empty if they can.
 
-    Faults are missing samples, saturated samples, values in g, and an accelerometer that does not measure
-    9.81 m/s^2 while the IMU is stationary.  Before 100 samples the result is empty.
+    Faults are more than 5 % missing samples, more than 1 % saturated samples, an accelerometer that states g,
+    and one that does not measure 9.81 m/s^2 while the IMU is stationary.  Before 100 samples the result is
+    empty.
     """
     samples, model = history.to_array(), history.model
     if len(samples) < _MIN_SAMPLES:
@@ -122,8 +129,8 @@ def describe_gravity_error(measured_m_s2: float, circumstance: str) -> str:
     """Return in one line how wrong an accelerometer is that measures gravity as *measured_m_s2*.
 
     Empty up to an error of 0.6 m/s^2, which the usual bias explains.  One direction of gravity does not
-    distinguish a wrong scale from a bias, so the line names both.  *circumstance* follows the measured value
-    in the line.
+    distinguish a wrong scale from a bias, so the line names both.  *circumstance* are words for the line that
+    say when it was measured, such as ``while stationary``.
     """
     error = measured_m_s2 - GRAVITY_M_S2
     if abs(error) <= MAX_GRAVITY_ERROR_M_S2:
@@ -203,7 +210,8 @@ def check_rates(
     Q = U @ Vt
     is_mirrored = float(np.linalg.det(Q)) < 0.0
     if is_mirrored and not variances[0] > _MIN_RATE_SPREAD_RAD_S**2:
-        # Rotations about two axes leave the sign of the third axis open: take the matrix that is a rotation.
+        # Rotations about two axes only do not determine the sign of the third axis: choose the sign that
+        # makes Q a rotation.
         U[:, 2] *= -1.0
         Q, is_mirrored = U @ Vt, False
     residuals = gyro_centred @ Q.T / ratio - camera_centred
@@ -213,7 +221,7 @@ def check_rates(
     return RateCheck(
         trouble=trouble,
         fault=fault,
-        offset_s=best_offset_s if abs(best_offset_s - offset_s) > _MIN_OFFSET_S else offset_s,
+        offset_s=best_offset_s if abs(best_offset_s - offset_s) > _MIN_OFFSET_CHANGE_S else offset_s,
         gyro_bias_rad_s=bias,
     )
 
@@ -221,9 +229,9 @@ def check_rates(
 def _find_offset_s(history: ImuHistory, begins_s: Array, ends_s: Array, camera_rates: Array) -> float:
     """Return the time offset within 0.1 s at which the rates ``(n, 3)`` of camera and gyroscope fit best.
 
-    It is the time by which the clock of the IMU is ahead.  Begins and ends of the intervals are on the
-    camera's.  The rotation between both is free, so that swapped axes do not hide an offset.  The maximum of
-    the fit is interpolated by a parabola.
+    It is the time by which the clock of the IMU is ahead.  Begins and ends of the intervals are on the clock
+    of the camera.  Each offset is tried with the orthogonal matrix between the two sensors that fits best, so
+    that swapped axes do not hide an offset.  The maximum of the fit is interpolated by a parabola.
     """
     camera_centred = camera_rates - camera_rates.mean(axis=0)
     offsets_s = np.arange(-_MAX_OFFSET_S, _MAX_OFFSET_S + 1e-9, _OFFSET_STEP_S)
@@ -252,7 +260,8 @@ def _find_rate_trouble(
             axes are as stated.
         unexplained: Part of the camera's rates that the gyroscope does not explain with this matrix, 0 to 1.
         offset_s: Time by which the clock of the IMU is ahead of that of the camera.
-        is_mirrored: Whether *Q* is a reflection.
+        is_mirrored: Whether *Q* has the determinant -1, so that one axis has the wrong sign or two are
+            swapped.
     """
     if unexplained > _MAX_UNEXPLAINED:
         return "", "the rates of the gyroscope do not follow the camera's, at any time offset within 100 ms"

@@ -24,15 +24,17 @@ _MAX_POSES = 150  # newest poses that are aligned with the IMU, those of the las
 _MIN_POSES = 8  # poses that an alignment with the IMU needs
 _RETRY_S = 0.5  # time between two IMU alignments while gravity or scale are not known well enough
 _REPEAT_S = 2.0  # time between two IMU alignments once gravity and scale are known; biases still change
-_POSE_NOISE_PX = 0.33  # standard deviation of a tracked pose, as the shift in pixels that it causes
+_POSE_NOISE_PX = 0.33  # standard deviation of a tracked pose, as the shift of the image that it causes, px
 _MAX_SCALE_DEVIATION = 0.015  # largest relative standard deviation of a scale that is used
 _MAX_GRAVITY_DEVIATION_RAD = math.radians(0.5)  # largest standard deviation of gravity's direction in use
 _MAX_MISFIT = 12.0  # misfit of an alignment (1: the noise is as stated) above which it is not used
 _MAX_MISFITS_IN_A_ROW = 3
-"""Alignments in a row above the largest misfit after which the IMU is not used any more: a single one may be
-the fault of a wrong pose."""
+"""Successive alignments with a misfit above `_MAX_MISFIT`, after which the IMU is not used any more.  A
+single such alignment may be the fault of a wrong pose."""
 _MAX_BIAS_CHANGE_RAD_S = 0.005  # change of an axis of the gyroscope's bias above which a motion is redone
-_MAX_CACHED_MOTIONS = 4 * _MAX_POSES  # preintegrated motions beyond which the cache of motions is emptied
+_MAX_CACHED_MOTIONS = 4 * _MAX_POSES
+"""Preintegrated motions in the cache, above which it is emptied.  One alignment uses fewer than `_MAX_POSES`,
+so that this rarely happens."""
 _RATE_CHECK_S = 20.0  # seconds of newest poses whose rotations are compared with the gyroscope
 _MAX_MOTION_S = 10.0  # longest preintegrated motion that a keyframe contains: longer ones are too uncertain
 _MIN_GRAVITY_DEVIATION_RAD = 1e-3  # smallest standard deviation of gravity's direction that a keyframe states
@@ -48,8 +50,8 @@ class ImuEstimator:
 
     Attributes:
         trouble: Why the IMU is not used, in one line; empty while it may be used.  Once it is set, it stays.
-        offset_s: Time by which the clock of the IMU is ahead of that of the camera; 0 until a difference was
-            measured.
+        offset_s: Time by which the clock of the IMU is ahead of that of the camera; 0 until `align` has
+            measured an offset of more than 3 ms.
         alignment: Result of the newest `align`; None before it, if it failed, and after `forget_gravity`.
     """
 
@@ -73,8 +75,9 @@ class ImuEstimator:
         """Integrate the gyroscope between two times of the camera's clock.
 
         Returns:
-            ``R_begin_end`` ``(3, 3)`` of the camera; None if samples are missing, before the gyroscope has
-            agreed with the camera, and while ``trouble`` is not empty.
+            ``R_begin_end`` ``(3, 3)``, which maps vectors from the camera's frame at the end to its frame at
+            the begin.  None if samples are missing, until the gyroscope has agreed with the camera's
+            rotations in an `align`, and once ``trouble`` is set.
         """
         if not self._has_agreed or self.trouble:
             return None
@@ -90,7 +93,7 @@ class ImuEstimator:
         return camera_rotation
 
     def forget_gravity(self) -> None:
-        """Forget the alignment, because the poses are in another world from now on; `align` is due then.
+        """Forget the alignment, because the poses are in another world from now on; `align` is due at once.
 
         The gyroscope's bias and the time offset are kept.
         """
@@ -148,7 +151,7 @@ class ImuEstimator:
         if self._misfits_in_a_row:
             return None
         # 5. Store the alignment and its gyroscope bias; wait longer once gravity and scale are known.
-        self._gyro_bias = alignment.gyro_bias_rad_s[-1]
+        self._gyro_bias = alignment.gyro_bias_rad_s
         self.alignment = alignment
         is_gravity_known = alignment.gravity_deviation_rad <= _MAX_GRAVITY_DEVIATION_RAD
         if is_gravity_known and alignment.scale_deviation <= _MAX_SCALE_DEVIATION:
@@ -167,10 +170,10 @@ class ImuEstimator:
         return alignment.gravity_m_s2
 
     def stationary_gravity(self) -> Array | None:
-        """Return gravity ``(3,)`` in the frame of the camera, m/s^2, as if the camera had been stationary.
+        """Return gravity ``(3,)`` in the frame of the camera, m/s^2: minus the mean specific force so far.
 
-        None if the mean specific force of the samples so far is not within 25 % of 9.81 m/s^2: the camera
-        moves, or the unit is another one.
+        This is right if the camera was stationary.  None if the mean specific force is not within 25 % of
+        9.81 m/s^2: the camera moves, or the unit is another one.
         """
         accel = self._history.mean_accel()
         if accel is None or abs(float(np.linalg.norm(accel)) / GRAVITY_M_S2 - 1.0) > _MAX_STATIONARY_ERROR:
@@ -189,8 +192,8 @@ class ImuEstimator:
             timestamp_s: Time stamp of the keyframe.
 
         Returns:
-            Both, without a motion where samples are missing or the motion took longer than 10 s; None while
-            gravity is not known.
+            The direction of gravity, with the motion unless samples are missing, the motion took longer than
+            10 s, or there is no previous keyframe.  None while gravity is not known.
         """
         gravity = self.gravity_m_s2
         if gravity is None or self.alignment is None or self.trouble:
@@ -201,7 +204,7 @@ class ImuEstimator:
         )
         motion = None
         if samples is not None and samples.timestamps_s[-1] - samples.timestamps_s[0] <= _MAX_MOTION_S:
-            preintegrated = preintegrate(samples, self._gyro_bias, self.alignment.accel_bias_m_s2[-1])
+            preintegrated = preintegrate(samples, self._gyro_bias, self.alignment.accel_bias_m_s2)
             motion = InertialMotion(
                 duration_s=preintegrated.duration_s,
                 rotation=log_so3(preintegrated.delta_rotation[None])[0],
@@ -264,8 +267,8 @@ class ImuEstimator:
     def _motion_between(self, begin_s: float, end_s: float) -> Preintegration | None:
         """Return the preintegrated motion between two times of the camera; None where samples are missing.
 
-        It comes from the cache, if the gyroscope's bias changed little since.  The accelerometer has no bias
-        in it.
+        It comes from the cache, if the gyroscope's bias changed by at most 0.005 rad/s since.  The
+        accelerometer's bias is taken as 0.
         """
         motion = self._motions.get((begin_s, end_s))
         if motion is None or np.abs(motion.gyro_bias_rad_s - self._gyro_bias).max() > _MAX_BIAS_CHANGE_RAD_S:

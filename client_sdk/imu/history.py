@@ -14,12 +14,12 @@ _MAX_GAP_INTERVALS = 5.0
 """Longest distance between two samples, in sampling intervals, over which they are interpolated: beyond it
 samples were lost, and the motion between them is unknown."""
 _MAX_HOLD_INTERVALS = 1.5
-"""Longest time, in sampling intervals, for which the newest sample stands for what follows it: a frame often
-arrives before the sample behind it."""
+"""Longest time after the newest sample, in sampling intervals, for which the values of this sample are
+assumed: a frame often arrives before the first sample that is later than it."""
 
 
 class ImuHistory:
-    """Samples of the last five minutes; ``model`` is the IMU model that was added last."""
+    """Samples of the last five minutes; ``model`` is the model of the samples that were added last."""
 
     def __init__(self, model: ImuModel) -> None:
         self.model = model
@@ -50,8 +50,8 @@ class ImuHistory:
             shift_s: Added to both times to convert them to the clock of the IMU.
 
         Returns:
-            Samples on the clock of the IMU; None if samples are missing, or do not reach to both ends.  At
-            the end the newest sample may stand for up to 1.5 sampling intervals.
+            Samples with time stamps on the clock of the IMU.  None if samples are missing, or if they begin
+            after *begin_s* or end more than 1.5 sampling intervals before *end_s*.
         """
         samples = self.to_array()
         begin_s, end_s = begin_s + shift_s, end_s + shift_s

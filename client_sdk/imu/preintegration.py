@@ -108,7 +108,8 @@ def preintegrate(samples: ImuSamples, gyro_bias_rad_s: Array, accel_bias_m_s2: A
         A[_VELOCITY, _ACCEL_BIAS] = -step_s * middle_rotation
         A[_POSITION] += 0.5 * step_s * A[_VELOCITY]
         A[_POSITION, _VELOCITY] = step_s * np.eye(3)
-        # 3. Propagate derivatives and covariance; white noise enters as a bias of this step does.
+        # 3. Propagate derivatives and covariance.  White noise acts on a step as a bias of this step alone
+        # would, so that the derivatives by the biases propagate it.
         transition = A @ transition
         covariance = A @ covariance @ A.T
         by_gyro, by_accel = A[:, _GYRO_BIAS].copy(), A[:, _ACCEL_BIAS].copy()

@@ -24,7 +24,7 @@ _MAX_LEVER_ARM_M = 10.0  # longest distance between IMU and camera: a longer one
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ImuModel:
-    """Mounting, noise and range of an IMU; the noise is that of Kalibr's and EuRoC's files.
+    """Mounting, noise and range of an IMU; the noise is defined as in the files of Kalibr and EuRoC.
 
     Attributes:
         T_imu_camera: ``(4, 4)`` pose of the camera (of a pair: the rectified left one) in the IMU's frame.
@@ -77,11 +77,12 @@ class ImuModel:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImuSamples:
-    """Samples since the last frame, with time stamps on the clock of the camera.
+    """Samples since the last frame.
 
-    The stamps of a recording may be off by a constant, which `ImuEstimator` measures.
-    The first sample is at or before the last frame and the last sample at or after this frame, as far as such
-    samples exist, so that samples can be interpolated at both frames.
+    The time stamps should be on the clock of the camera.  `ImuEstimator` measures and corrects a constant
+    offset of up to 60 ms between the clock of the IMU and that of the camera.  The first sample is at or
+    before the last frame and the last sample at or after this frame, as far as such samples exist, so that
+    samples can be interpolated at both frames.
 
     Attributes:
         timestamps_s: ``(n,)``, strictly ascending.
