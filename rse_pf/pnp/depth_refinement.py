@@ -1,9 +1,10 @@
 """Refine the pose of `solve_pnp` with the depths that both cameras measured.
 
-PnP takes its points as exact, and minimises the errors of the pixels of one image.  If depth cameras took
-both images, each correspondence is two noisy measurements of one point.  The refinement weights each residual
-by the noise of both measurements; the set of inliers stays that of PnP.  The native core computes the refined
-pose (``native/src/depth.cpp``).
+PnP takes the 3-D points as exact, and minimises the reprojection errors in the second image only.  If depth
+cameras took both images, a correspondence is two noisy measurements of one point: pixel and depth in the
+reference image, from which the 3-D point was computed, and pixel and depth in the second image.  The
+refinement weights each residual by the noise of both measurements; the set of inliers stays that of PnP.  The
+native core computes the refined pose (``native/src/depth.cpp``).
 """
 
 from __future__ import annotations
@@ -26,20 +27,22 @@ __all__ = ["DepthNoise", "refine_with_depth"]
 _PORTABLE = 1  # flag RSE_PF_DEPTH_PORTABLE of a request: compute without AVX2
 _REFINED = 0  # status RSE_PF_DEPTH_REFINED of a result: it holds the refined pose
 _KEPT = 1  # status RSE_PF_DEPTH_KEPT of a result: the pose of PnP stays
-_COLUMNS = 11  # numbers (8 bytes each) of the core's workspace for each inlier
+_COLUMNS = 11  # columns of the core's workspace, each with one 8-byte number for each inlier
 _SPARE_ROWS = 4  # rows of the core's workspace that pad the inliers to a multiple of four
 _MAX_DEPTH_M = 1e3  # largest depth (metres) that the core accepts; here it only appears in an error message
 
 
 class DepthNoise(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """Noise model of a depth camera: depth z has the standard deviation base + growth * max(0, z - from)^2.
+    """Noise model of a depth camera: the standard deviation of a measured depth, which grows with the depth.
+
+    At depth z (metres) it is ``base_m + growth_per_m * max(0, z - from_m)**2`` metres.
 
     Attributes:
         base_m: Standard deviation up to the depth *from_m*, metres.
         growth_per_m: Growth of the standard deviation with the square of the depth beyond *from_m*, 1/metre.
         from_m: Depth from which on the standard deviation grows, metres.
 
-    The defaults are those of a Kinect.
+    The default values, 1.2 mm + 1.9 mm/m^2 beyond 0.4 m, are those of a Kinect.
 
     Raises:
         BadRequest: A number is out of its range.
@@ -82,7 +85,8 @@ def refine_with_depth(
     Minimise the residuals of pixel and depth of the inliers in the second image by Gauss-Newton with Cauchy
     weights; an inlier without a depth there has the residual of its pixel only.  The covariance of a residual
     sums the noise of pixel and depth in both images.  The standard deviation of a pixel coordinate is taken
-    as half of ``solution.rmse_px`` in each image.
+    as half of ``solution.rmse_px`` in each image, at least 0.05 px: the square of a reprojection error sums
+    the variances of four coordinates, two in each image.
 
     Args:
         solution: Result of `solve_pnp` for the same rows, where the world frame is that of the reference
@@ -97,10 +101,11 @@ def refine_with_depth(
         portable: Compute without AVX2, which changes no byte of the result; for tests.
 
     Returns:
-        A copy of *solution* with the refined pose, its covariance and its ``rmse_px`` over all inliers;
-        inliers, verdict and reason stay those of PnP.  *solution* itself if no inlier has a depth, if the
-        reprojection error would rise above 1.5 times the earlier one (above 0.3 px if that was below 0.2 px),
-        or if the refined pose is not constrained.
+        A copy of *solution* with the refined pose, its covariance, and the root mean square reprojection
+        error of all inliers at the refined pose as ``rmse_px``; inliers, verdict and reason stay those of
+        PnP.  *solution* itself if no inlier has a depth in the second image, if the ``rmse_px`` of the
+        refined pose would be above 1.5 times the larger one of ``solution.rmse_px`` and 0.2 px, or if the
+        normal equations are singular or leave a variance that is not positive and finite.
 
     Raises:
         BadRequest: Shapes do not fit, a number is not finite or too large, a depth is negative, or a point is
@@ -166,7 +171,8 @@ _REFUSALS = {
         "leave such rows out",
     ),
 }
-"""Message and hint by the status of ``rse_pf_depth.h``: bad depths (3), points (4) or pixels (5)."""
+"""Message and hint of the error for each status of ``rse_pf_depth.h`` that names a malformed array: 3 is
+RSE_PF_DEPTH_BAD_DEPTHS, 4 RSE_PF_DEPTH_BAD_POINTS, and 5 RSE_PF_DEPTH_BAD_PIXELS."""
 _BAD_REQUEST = (
     "depths_m came with a pose, a camera or row numbers that do not fit",
     "pass the solution of solve_pnp for the same rows",

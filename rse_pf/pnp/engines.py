@@ -1,7 +1,8 @@
-"""Offer two robust PnP engines: the native core, and OpenCV's ``solvePnPRansac``, which the paper used.
+"""Offer two robust PnP engines: the native core, and OpenCV's ``solvePnPRansac``, as in the RSE-PF paper.
 
-The native core measures the evidence of the poses of both.  Engines are deterministic (fixed seeds, one
-thread), and raise errors of this package only.
+Both engines need the native core: it measures the `Evidence` (inliers, covariance and the values of the
+rules) of its own poses and of OpenCV's.  Engines are deterministic (fixed seeds, one thread), and raise
+errors of this package only.
 """
 
 from __future__ import annotations
@@ -24,8 +25,8 @@ __all__ = [
     "native_options",
 ]
 
-# Most refinements of a pose by OpenCV, each over the inliers of the pose before it; they end earlier if the
-# inliers stay the same or are fewer than four.
+# Most refinements of a pose by OpenCV, each over the inliers of the previous pose.  The refinements stop
+# earlier if a refined pose has the same inliers as the previous one, or fewer than four.
 _MAX_REFINEMENTS = 4
 # Largest absolute coordinate (metres or pixels) that OpenCV receives; a request with a larger or non-finite
 # number goes to the native core at once, which refuses it.
@@ -35,7 +36,8 @@ Engine = Callable[[Array, Array, Camera, PnpOptions, WeakLimits], Evidence]
 """A function of ``(points_world, pixels, camera, options, weak)`` that returns a pose with its evidence.
 
 The points are ``(n, 3)`` metres in the world frame, the pixels ``(n, 2)`` and undistorted, both float64;
-``n >= 4``.  A pose that a rule refuses is returned too, with the error in its ``refusal``.
+``n >= 4``.  An engine does not raise NoConsensus or DegenerateGeometry: it returns also a pose that a rule
+refuses, with that error in ``Evidence.refusal``, and the caller raises the error.
 
 Raises:
     BadRequest: A number is not finite or beyond 1e6.
@@ -100,8 +102,9 @@ def _opencv_engine() -> Engine:
             if not has_pose or inliers is None or len(inliers) < MIN_CORRESPONDENCES:
                 return None
             rows = inliers[:, 0]
-            # 2. Estimate the pose again from the inliers by SQPnP: EPnP, the last step of solvePnPRansac, may
-            # converge to the wrong one of the two minima of a planar scene.
+            # 2. Estimate the pose again from the inliers by SQPnP, which finds the global minimum.
+            # solvePnPRansac ends with EPnP, which for a planar scene may return the pose at the wrong one of
+            # the two local minima of the reprojection error.
             has_global, global_rotation, global_translation = cv2.solvePnP(
                 points_world[rows], pixels[rows], matrix, None, flags=cv2.SOLVEPNP_SQPNP
             )

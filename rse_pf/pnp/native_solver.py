@@ -34,9 +34,12 @@ __all__ = [
 ]
 
 MIN_WIDTH_TO_LENGTH = 0.02
-"""Smallest width over length, in the image, of the inliers of an accepted pose; 0 is a line.  The native core
-applies this limit (``kCollinear`` in ``native/src/solve.hpp``); here the value only appears in error messages
-and in `rse_pf.pnp.rules`."""
+"""Smallest width over length of the inlier pixels of an accepted pose; 0 is a line.
+
+Length and width are 80 % quantiles: length of the distances from the centroid along the main axis of the
+pixels, width of the distances from this axis.  The native core applies this limit (``kCollinear`` in
+``native/src/solve.hpp``); here the value only appears in error messages and in `rse_pf.pnp.rules`.
+"""
 
 _FLAGS = {"avx512": 0, "avx2": 4, "portable": 1}
 """Flag of a request by the widest vector instructions that the core may use for it; a processor without them
@@ -63,12 +66,11 @@ _LIST_ENDS = struct.Struct("=qqqq")  # number of lists, then for each of three l
 _REST_AT = _LISTS_HEAD.size + _LIST_ENDS.size  # byte offset of rest
 _MAX_REST_BYTES = 1024  # size of the JSON text without its lists: RSE_PF_MAX_REST of the C header
 
-_FIRST_ROWS = (
-    512  # correspondences for which the first arrays of a thread have room; longer requests enlarge them
-)
-_MAX_NUMBERS = (
-    30_000  # most numbers in the lists of one JSON text: 5,000 matches of 3 + 2 + 1 numbers, with depth
-)
+# Correspondences for which the arrays of a thread have room at first; a longer request enlarges the arrays.
+_FIRST_ROWS = 512
+# Most numbers in all lists of one JSON text: 5,000 correspondences of a point (3 numbers), a pixel (2) and a
+# depth (1).
+_MAX_NUMBERS = 30_000
 
 _REASONS = (
     "",
@@ -142,7 +144,12 @@ _REFUSALS: dict[int, tuple[type[RsePfError], str, str]] = {
 status 1, whose error is `_BAD_REQUEST`.
 
 The messages are part of the replies to robots.  A changed message would make recordings of earlier releases
-differ from their replay, which is compared byte by byte.
+differ from their replay, which is compared byte by byte.  Therefore the terms that they leave open are
+explained here: to agree means to be an inlier.  Status 4: at least 1e-5 random poses are expected to fit as
+well (`Evidence.log10_false_alarms`).  Status 6: this holds only if inliers close together count once
+(`Evidence.independent_inliers`).  Status 9: for the second pose of a planar scene, the sum of squared errors
+is less than 9 pixel variances larger.  Status 10: a pose of the reflected points has at least twice as many
+inliers.
 """
 _BAD_REQUEST = (BadRequest, "the options or sizes of the request do not fit", "leave the options out")
 _STATUSES_WITHOUT_EVIDENCE = (1, 2, 3, 11)
@@ -186,14 +193,21 @@ class Evidence(msgspec.Struct, frozen=True, kw_only=True, eq=False):
             or without a positive diagonal if the inliers do not constrain the pose.
         reason: Why the pose is weak, such as ``few-inliers``; empty for a pose that is not.  A refused pose
             may have a reason too.
-        independent_inliers: Number of inliers of which those in the same cell or in adjacent cells of the
-            image count once (40 cells across its width); all inliers if they lie in 24 cells or more.
-        log10_false_alarms: log10 of the expected number of random poses that have as many independent
-            inliers, none with a larger error than the largest of this pose.
-        width_to_length: Width over length that the rule about collinear matches compares with its limit:
-            that of all matches, in space or in the image, if the pose has fewer than four inliers or a random
-            pose would have as many; 0 if the inliers may be copies of each other; else that of the inliers.
-        inlier_width_to_length: Width over length of the inliers in the image; 0 is a line.
+        independent_inliers: Number of inliers of which those close together in the image count once, because
+            they may be copies of one wrong match.  The image is divided into square cells, 40 across its
+            width; an occupied cell counts unless it touches, also diagonally, a cell that was counted before
+            it.  If 24 cells or more are occupied, the number of all inliers: copies of a few matches occupy
+            fewer cells.
+        log10_false_alarms: log10 of the expected number of wrong poses, computed by P3P from three random
+            correspondences, that have at least as many independent inliers within the largest reprojection
+            error of an inlier of this pose (number of false alarms of a-contrario RANSAC).
+        width_to_length: Width over length, defined at `MIN_WIDTH_TO_LENGTH`, on which the rule about
+            collinear matches decided.  If the pose has fewer than four inliers, or a random pose would have
+            as many: that of all 3-D points, or of all pixels where the points are not collinear and the
+            pixels are narrower.  0 if the inliers may be copies of each other.  Else that of the inlier
+            pixels.
+        inlier_width_to_length: Width over length of the inlier pixels; 0 is a line.  Above 0.15 it may be a
+            lower bound.
         radius_px: Root mean square distance of the inlier pixels from their centroid.
         second_pose_rmse_px: Root mean square reprojection error of the same inliers by the second pose of a
             planar scene; 0 without a second pose.
@@ -250,10 +264,10 @@ class _ResultHead(NamedTuple):
 
 
 class _Buffers(threading.local):
-    """Request, result and arrays of one thread, at addresses that are looked up once.
+    """Request, result and arrays of one thread, whose memory addresses are computed once.
 
-    A call copies its points and pixels into these arrays: to look up the addresses of the caller's arrays
-    would take longer.
+    A call copies its points and pixels into these arrays: to ask numpy for the memory addresses of the
+    caller's arrays would take longer than the copies.
     """
 
     def __init__(self) -> None:
@@ -428,11 +442,12 @@ class NativeSolver:
         """Move the lists of numbers out of a JSON text, so that a JSON parser makes no object of each number.
 
         Returns:
-            The text in which the string ``"\\u000K"`` stands in the place of list K (from 0), valid until
-            the next call of this thread, and the lists as float64 arrays of their own.  None if the text must
-            be parsed as usual: it has more than three lists, more than 30,000 numbers in them, or a list that
-            is empty or holds anything but numbers; a number has more than 15 digits or an exponent; the text
-            has a backslash, or more than 1,024 bytes besides the lists.
+            A view of the text in which the JSON string ``"\\u000K"`` replaces the list with the number K (0,
+            1 or 2, by position in the text), and the lists as new float64 arrays.  The next call of this
+            thread overwrites the view, but not the arrays.  None if the text must be parsed as usual: it has
+            more than three lists, more than 30,000 numbers in them, or a list that is empty or holds anything
+            but numbers; a number is ``-0``, or has more than 15 digits or an exponent; the text has a
+            backslash, or more than 1,024 bytes besides the lists.
         """
         buffers = self._lists
         size = self._cut_function(text, len(text), buffers.lists_address)

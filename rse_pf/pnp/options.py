@@ -33,7 +33,8 @@ class PnpOptions(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
         inlier_px: Largest reprojection error of an inlier, pixels.
         max_iterations: Most samples that RANSAC draws.
         min_iterations: Fewest samples that RANSAC draws.
-        confidence: RANSAC stops when it has drawn a sample of inliers only with this probability.
+        confidence: RANSAC stops before ``max_iterations`` when the probability that at least one of the drawn
+            samples had no outlier reaches this value.
 
     Raises:
         BadRequest: A number is out of its range.
@@ -44,7 +45,6 @@ class PnpOptions(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     max_iterations: int = 1000
     # Above max_iterations, min_iterations counts as max_iterations; OpenCV's estimate does not use it.
     min_iterations: int = 10
-    # Probability that at least one sample had no outlier.
     confidence: float = 0.999
 
     def __post_init__(self) -> None:
@@ -59,14 +59,16 @@ class WeakLimits:
     """Limits beyond which a pose is weak instead of ok.
 
     Attributes:
-        inliers: Fewest inliers of a pose that is ok.  At least half as many must be independent, which means
-            that inliers that are neighbours in the image count once.
+        inliers: Fewest inliers of a pose that is ok.  The number of its independent inliers, of which those
+            close together in the image count once (`rse_pf.pnp.native_solver.Evidence`), must be at least
+            half of this limit.
         inlier_ratio: Smallest share of the correspondences that are inliers, 0 to 1.
         translation_m: Largest root of the summed variances of the translation along the three axes, metres.
         rotation_rad: Largest root of the summed variances of the rotation about the three axes, radians.
 
-    The benchmarks call a pose correct within 0.1 m and 2 degrees.  The default limits of both deviations are
-    a third of that: three standard deviations of a pose that is ok stay within both.
+    The benchmarks call a pose correct if its errors are at most 0.1 m and 2 degrees.  The default limits of
+    the standard deviations are a third of these errors, 0.033 m and 0.67 degrees, so that three standard
+    deviations of a pose that is ok are at most 0.1 m and 2 degrees.
     """
 
     inliers: int = 12

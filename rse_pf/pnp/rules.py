@@ -1,9 +1,10 @@
 """List the rules by which the native core refuses a pose or calls it weak, with measured values and limits.
 
 ``native/src/solve.hpp`` applies the rules; this module only lists them, for the replay of a recorded pose.
-Of the violated rules that refuse poses, the first determines the error.  Of the other violated rules, the
-first gives the reason of a weak pose, except that ``ambiguous`` comes before all.  The test for mirrored
-points is not among the rules.
+A violated rule either refuses the pose or makes it weak.  The first violated rule that refuses determines the
+error.  Without such a rule, the reason of a weak pose is ``ambiguous`` if that rule is violated, else the
+first violated rule.  The core's test for mirrored points is not listed, because `Evidence` does not hold the
+number of inliers of the mirrored points.
 """
 
 from __future__ import annotations
@@ -18,19 +19,22 @@ from rse_pf.pnp.options import MIN_CORRESPONDENCES, WeakLimits
 
 __all__ = ["Rule", "evaluate_rules"]
 
-# The five limits repeat constants of native/src/evidence.hpp and native/src/solve.hpp: change both together.
-_MAX_LOG10_FALSE_ALARMS = (
-    -5.0
-)  # largest log10 of the expected number of random poses that fit as well as an accepted one
-_WEAK_WIDTH_TO_LENGTH = 0.1  # width over length of the inliers in the image below which a pose is weak
+# The constants of this block repeat constants of native/src/evidence.hpp and native/src/solve.hpp: change
+# them together.
+
+# Largest log10 of the expected number of random poses that fit as well as an accepted pose.
+_MAX_LOG10_FALSE_ALARMS = -5.0
+# Width over length of the inlier pixels below which a pose is weak.
+_WEAK_WIDTH_TO_LENGTH = 0.1
 # Smallest increase of the sum of squared reprojection errors from a pose to the second pose of a planar
-# scene, in pixel variances, with which the pose is accepted: 3 standard deviations, squared.
+# scene, in units of the pixel variance, with which the pose is accepted: 3 standard deviations, squared.
 _EQUAL_FIT = 9.0
-# The same increase below which an accepted pose is weak.
+# Smallest increase of the sum of squared reprojection errors from a pose to the second pose of a planar
+# scene, in units of the pixel variance, with which the pose is ok instead of weak.
 _SIMILAR_FIT = 40.0
-_MIN_VARIANCE_PX2 = (
-    0.01  # smallest pixel variance (px^2): messages are rounded, and four points may fit by luck
-)
+# Smallest pixel variance (px^2) that is derived from the reprojection errors: pixels in messages are rounded
+# to 0.01 px, and four points may fit by luck.
+_MIN_VARIANCE_PX2 = 0.01
 
 
 class Rule(msgspec.Struct, frozen=True, kw_only=True):
@@ -62,10 +66,12 @@ class Rule(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def margin(self) -> float:
-        """How many times better than its limit the measured value is.
+        """By which factor the measured value is on the right side of its limit, from 0 to infinity.
 
-        The ratio of both, from 0 to infinity: 1 at the limit, above 1 if the rule is satisfied with a margin,
-        below 1 if the rule is violated.
+        The margin is 1 at the limit, above 1 if the rule is satisfied, and below 1 if the rule is violated.
+        It is ``measured / limit`` if the limit is a smallest value (``at_least``), and ``limit / measured``
+        if it is a largest one.  If the limit is negative, such as that of a logarithm, the margin is the
+        reciprocal of this ratio.  A negative ratio counts as 0.
         """
         if self.measured == self.limit:
             return 1.0
@@ -80,9 +86,10 @@ def evaluate_rules(
 ) -> tuple[Rule, ...]:
     """Return the rules about a pose, satisfied or not, with the values that *evidence* holds.
 
-    With fewer than four correspondences only the rule ``too-few`` is returned; with fewer than four inliers,
-    the rules about the numbers of both and about the shape of all matches.  The rules about the second pose
-    of a planar scene are left out if there is no second pose.
+    With fewer than four correspondences only the rule ``too-few`` is returned.  With fewer than four inliers,
+    three rules are returned: those about the number of correspondences, about the number of inliers, and
+    about width over length of all correspondences.  The rules about the second pose of a planar scene are
+    left out if there is no second pose.
 
     Args:
         correspondences: Number of correspondences of the request.
@@ -139,9 +146,10 @@ def evaluate_rules(
 def _constraint_rules(evidence: Evidence, weak: WeakLimits) -> tuple[Rule, ...]:
     """Return the rules about the covariance of the pose.
 
-    A covariance that is not finite or has a variance that is not positive violates the one rule that is
-    returned: of six motions, at most five are constrained.  Otherwise, two rules limit the standard
-    deviations of position and rotation, each the root of the summed variances of its three axes.
+    If the covariance is not finite or has a variance that is not positive, some motion of the camera is not
+    constrained.  Then only one rule is returned, which is violated: the measured value 5 stands for any
+    number below the required 6 motions.  Otherwise, two rules limit the standard deviations of position and
+    rotation, each the root of the summed variances of its three axes.
     """
     variances = evidence.covariance.diagonal()
     if not (np.isfinite(evidence.covariance).all() and (variances > 0.0).all()):
@@ -169,8 +177,8 @@ def _constraint_rules(evidence: Evidence, weak: WeakLimits) -> tuple[Rule, ...]:
 def _ambiguity_rules(evidence: Evidence) -> tuple[Rule, ...]:
     """Return the rules that compare the pose with the second pose of a planar scene by a likelihood ratio.
 
-    They limit by how many pixel variances the sum of squared reprojection errors of the inliers is larger for
-    the second pose.  Without a second pose there is no rule.
+    The measured value is the increase of the sum of squared reprojection errors of the inliers from the pose
+    to the second pose, divided by the pixel variance.  Without a second pose there is no rule.
     """
     if not evidence.second_pose_rmse_px:
         return ()
