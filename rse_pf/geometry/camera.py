@@ -14,8 +14,11 @@ from rse_pf.geometry.transforms import Array
 __all__ = ["Camera"]
 
 MAX_IMAGE_SIDE_PX = 16384  # width or height: no sensor of a robot is larger, and a larger one is a wrong unit
-MIN_FOCAL_LENGTH = 0.05  # focal length over the longer side of the image: a shorter one is in another unit
-MAX_FOCAL_LENGTH = 100.0  # focal length over the longer side of the image: no robot carries such a telescope
+# Smallest focal length, as a multiple of the longer side of the image: a smaller one is in another unit, such
+# as millimetres.
+MIN_FOCAL_LENGTH = 0.05
+# Largest focal length, as a multiple of the longer side of the image: no robot carries such a telescope.
+MAX_FOCAL_LENGTH = 100.0
 
 
 class Camera(msgspec.Struct, frozen=True, kw_only=True):
@@ -25,8 +28,10 @@ class Camera(msgspec.Struct, frozen=True, kw_only=True):
     the size of the image.
 
     Raises:
-        InvalidCamera: A number is not finite, a focal length is not plausible for the size of the image, or
-            the principal point lies more than half an image outside of it.
+        InvalidCamera: A number is not finite, a side of the image is not within 1 to 16384 px, a focal length
+            is not within 0.05 to 100 times the longer side of the image, or the principal point lies more
+            than the width of the image to the left or right of its centre, or more than its height above or
+            below.
     """
 
     fx: float

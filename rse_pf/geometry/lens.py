@@ -22,8 +22,11 @@ from rse_pf.images import load_opencv
 __all__ = ["LENS_MODELS", "Lens", "LensModel", "find_lens_model", "rectify_stereo_pair"]
 
 MAX_STATED_COEFFICIENT = 1e3
-"""Largest absolute value of a distortion coefficient in a file or a request: those of real lenses are far
-below, so that a larger one is another number in the place of a coefficient."""
+"""Largest absolute value of a distortion coefficient in a file or a request.
+
+The coefficients of real lenses are far below.  A larger number is refused: it is probably another intrinsic,
+such as a focal length, at the position of a coefficient.
+"""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -34,15 +37,16 @@ class LensModel:
     ``coefficients`` ``(m,)`` are in OpenCV's order.
 
     Attributes:
-        name: As files and requests of this platform state the model.
+        name: Identifier of the model in files and requests of this platform.
         aliases: Names that ROS, Kalibr, EuRoC, COLMAP, ORB-SLAM3 and nerfstudio give to the same model, in
             lower case with ``_`` for spaces.
         coefficient_names: Coefficients that files and requests can state, in OpenCV's order.
-        coefficient_counts: Numbers of coefficients that OpenCV takes; 0 is valid for every model.
+        coefficient_counts: Numbers of coefficients that OpenCV's functions for this model take.  A `Lens` may
+            also have none, in which case OpenCV receives four zeros.
         is_perspective: Whether the model without coefficients is a pinhole camera.
         plausible_field_of_view_deg: Smallest and largest field of view of a lens that SLAM can use.
-        field_of_view_rad: Image side divided by focal length, both in pixels, to the field of view along this
-            side in radians, without distortion.
+        field_of_view_rad: Maps the quotient of an image side and the focal length, both in pixels, to the
+            field of view along this side in radians, without distortion.
         undistort_points: ``(cv2, pixels (n, 1, 2), K, coefficients, K_new or None)`` to ``(n, 1, 2)``: pixels
             of a pinhole camera with the matrix K_new, or coordinates in the plane z = 1 for None.
         distort_points: ``(cv2, rays (n, 2), K, coefficients)`` to ``(n, 1, 2)``: the distorted pixels of
@@ -145,8 +149,9 @@ class Lens:
     def undistort_pixels(self, pixels: Array) -> Array:
         """Return ``(n, 2)`` distorted pixels as pixels of the pinhole camera with the same intrinsics.
 
-        The inverse of the distortion is iterative and may fail far from the centre without an error:
-        `distort_pixels` of the result must give *pixels* again.
+        The distortion is inverted iteratively.  Far from the centre of the image this may not converge, and
+        no error is raised.  A caller that needs to know applies `distort_pixels` to the result, and compares
+        it with *pixels*.
 
         Raises:
             MissingExtra: OpenCV is not installed.
@@ -179,13 +184,15 @@ class Lens:
         return directions
 
     def undistortion_maps(self, camera: Camera, rotation: Array | None = None) -> tuple[Any, Any]:
-        """Return the two maps with which ``cv2.remap`` makes images of a pinhole *camera* from those of this.
+        """Return the two maps with which ``cv2.remap`` converts images of this lens to images of *camera*.
 
-        Each is ``(height, width)`` float32 of the new image: the x and the y pixel in the distorted image.
+        Each map is float32 with the shape ``(height, width)`` of the new image, and holds for each of its
+        pixels the x coordinate (first map) or the y coordinate (second map) in the distorted image.
 
         Args:
             camera: The pinhole camera of the new images.
-            rotation: ``(3, 3)``, from this camera's frame to that of the new camera; None if both agree.
+            rotation: ``(3, 3)``, maps directions in the frame of this lens's camera to the frame of *camera*;
+                None for the identity.
 
         Raises:
             MissingExtra: OpenCV is not installed.
@@ -268,7 +275,7 @@ def _radial_tangential_maps(cv2: Any, *arguments: Any) -> Any:
 
 
 def _rectify_radial_tangential(cv2: Any, *pair: Any) -> Any:
-    # alpha 0: every pixel of the rectified images is seen by the camera.
+    # alpha 0 crops the rectified images so that no pixel lies outside the original images.
     return cv2.stereoRectify(*pair, flags=cv2.CALIB_ZERO_DISPARITY, alpha=0.0)[:4]
 
 
@@ -288,7 +295,7 @@ def _fisheye_maps(cv2: Any, *arguments: Any) -> Any:
 
 
 def _rectify_fisheye(cv2: Any, *pair: Any) -> Any:
-    # balance 0: every pixel of the rectified images is seen by the camera.
+    # balance 0 crops the rectified images so that no pixel lies outside the original images.
     return cv2.fisheye.stereoRectify(*pair, flags=cv2.CALIB_ZERO_DISPARITY, balance=0.0)[:4]
 
 
@@ -308,8 +315,8 @@ _MODELS = (
         coefficient_names=("k1", "k2", "p1", "p2", "k3"),
         coefficient_counts=(4, 5, 8, 12, 14),
         is_perspective=True,
-        # Below 20 degrees is a mistake in the unit of fx, or a lens too long for SLAM; above 140 degrees is
-        # no pinhole camera.
+        # A field of view below 20 degrees results from a wrong unit of fx, or from a lens too long for SLAM.
+        # No lens that this model describes has a field of view above 140 degrees.
         plausible_field_of_view_deg=(20.0, 140.0),
         field_of_view_rad=lambda side_per_focal_length: 2.0 * math.atan(side_per_focal_length / 2.0),
         undistort_points=_undistort_radial_tangential,
@@ -323,7 +330,8 @@ _MODELS = (
         coefficient_names=("k1", "k2", "k3", "k4"),
         coefficient_counts=(4,),
         is_perspective=False,
-        plausible_field_of_view_deg=(0.0, math.inf),  # a fisheye's image circle may be cropped, or all around
+        # No limits: an image may show a small crop of the image circle of a fisheye lens, or all of it.
+        plausible_field_of_view_deg=(0.0, math.inf),
         field_of_view_rad=lambda side_per_focal_length: side_per_focal_length,
         undistort_points=_undistort_fisheye,
         distort_points=_distort_fisheye,

@@ -40,16 +40,18 @@ Array = npt.NDArray[np.float64]
 """A numpy array of float64; the docstring of each function states its shape."""
 
 ROTATION_TOLERANCE = 2e-3
-"""Largest deviation of a number of R^T R from the identity in a matrix that is accepted as a rotation: a
-rotation whose numbers are rounded to three decimals deviates by up to 1.8e-3."""
+"""Largest absolute element of R^T R - I for which a matrix R is accepted as a rotation: for a rotation whose
+elements are rounded to three decimals, it is up to 1.8e-3."""
 EXACT_TOLERANCE = 1e-9
-"""Deviation of R^T R from the identity below which a rotation is kept as it is, so that a pose that was
-written by this platform is read back to the bit."""
+"""Largest absolute element of R^T R - I for which a pose keeps its rotation R; `rigid` replaces a rotation
+that deviates more by the nearest rotation.  Rotations that this platform writes deviate less, so that a pose
+is read back with every bit unchanged."""
 LAST_ROW_TOLERANCE = 1e-5  # largest deviation of a pose's last row from 0 0 0 1: float32 rounds by less
 MAX_TRANSLATION_M = 1e9  # metres along each axis of a pose: beyond any map, far from the limits of float64
 NEAR_HALF_TURN_COSINE = -0.999
-"""Cosine of the rotation angle (177.4 degrees) beyond which the logarithm goes by way of the quaternion,
-because the antisymmetric part of the matrix vanishes at half a turn."""
+"""Cosine of the rotation angle below which `log_se3` computes the rotation vector from the quaternion, which
+is for angles above 177.4 degrees: the antisymmetric part of the matrix, which it uses for smaller angles,
+vanishes at 180 degrees."""
 SMALL_ANGLE_RAD = 1e-4  # below this angle, series replace quotients whose denominators vanish
 
 
@@ -72,7 +74,7 @@ def inverse(T_a_b: Array) -> Array:
 def body_poses(T_world_camera: Array, T_body_camera: Array) -> Array:
     """Return the poses ``(..., 4, 4)`` of the body from the poses *T_world_camera* of its camera.
 
-    *T_body_camera* ``(4, 4)`` is where the camera is mounted on the body.
+    *T_body_camera* ``(4, 4)`` is the pose of the camera in the frame of the body.
     """
     T_world_body: Array = T_world_camera @ inverse(T_body_camera)
     return T_world_body
@@ -88,15 +90,19 @@ def scaled(T: Array, scale: float | Array) -> Array:
 def rigid(T: Array, max_m: float = MAX_TRANSLATION_M) -> Array | None:
     """Return a ``(4, 4)`` matrix as a rigid motion, or None if the matrix is no rigid motion.
 
-    This is the one rule of the platform for poses, applied where a pose arrives.  A rigid motion has ``det R
-    > 0``, the last row 0 0 0 1 within `LAST_ROW_TOLERANCE`, and no number of ``R^T R - I`` beyond
-    `ROTATION_TOLERANCE`.  If the last row is not exact, or the rotation is beyond `EXACT_TOLERANCE`, a new
-    matrix has the exact last row and the nearest rotation (singular value decomposition), so that poses
-    computed from accepted poses are accepted, too.  Otherwise *T* itself is returned.
+    This is the one rule of the platform for poses, applied where a pose arrives.  A matrix with the upper
+    left 3x3 block R is a rigid motion if ``det R > 0``, no element of ``R^T R - I`` is beyond
+    `ROTATION_TOLERANCE`, no element of the last row differs from 0 0 0 1 by more than `LAST_ROW_TOLERANCE`,
+    and no coordinate of the translation is beyond *max_m*.
+
+    If the last row is exactly 0 0 0 1 and no element of ``R^T R - I`` is beyond `EXACT_TOLERANCE`, *T* itself
+    is returned.  Otherwise a new matrix is returned, with the last row 0 0 0 1 and the rotation nearest to R
+    (by singular value decomposition).  Without this correction, a product of several accepted poses could
+    deviate more than the rule accepts.
 
     Args:
         T: Any ``(4, 4)`` numbers, NaN and infinity included.
-        max_m: Largest absolute value of each number of the translation, metres.
+        max_m: Largest absolute value of a coordinate of the translation, metres.
     """
     if T.shape != (4, 4):
         return None
@@ -120,7 +126,7 @@ def rigid(T: Array, max_m: float = MAX_TRANSLATION_M) -> Array | None:
 
 
 def orthonormalise(T: Array) -> Array:
-    """Return a ``(4, 4)`` pose with the nearest true rotation; a product of poses drifts away from one."""
+    """Return a copy of a ``(4, 4)`` pose with the nearest rotation, from which a product of poses drifts."""
     U, _, Vt = np.linalg.svd(T[:3, :3])
     orthonormal: Array = T.copy()
     orthonormal[:3, :3] = U @ Vt
@@ -130,7 +136,8 @@ def orthonormalise(T: Array) -> Array:
 def rigid_many(T: Array, max_m: float = MAX_TRANSLATION_M) -> Array | None:
     """Return ``(n, 4, 4)`` matrices as rigid motions by the rule of `rigid`; None if one matrix is none.
 
-    If all are exact, *T* itself is returned; otherwise a copy, in which the others are replaced.
+    If `rigid` would return each matrix itself, *T* itself is returned.  Otherwise a copy of *T* is returned,
+    in which the matrices that `rigid` would replace are replaced.
     """
     # 1. Check that all matrices are rigid motions; a NaN makes each comparison false.
     rotations = T[:, :3, :3]
@@ -229,12 +236,11 @@ def adjoint(T_a_b: Array) -> Array:
 
 
 def median_pose(T_a_b: Array) -> Array:
-    """Return the medoid ``(4, 4)`` of n >= 1 poses: that with the smallest sum of differences to the others.
+    """Return the medoid of ``(n, 4, 4)`` poses, n >= 1: the one with the smallest summed differences to all.
 
-    Of equal sums, the first pose is returned.
-
-    A difference is the distance of the positions in metres plus the Frobenius norm of the difference of the
-    rotations, so that a metre weighs as much as about 41 degrees.
+    If several poses have the same sum, the first of them is returned.  The difference of two poses is the
+    distance of their positions in metres plus the Frobenius norm of the difference of their rotation
+    matrices: a distance of 1 m counts as much as a rotation by about 41 degrees.
     """
     distances_m = np.sqrt(((T_a_b[:, None, :3, 3] - T_a_b[None, :, :3, 3]) ** 2).sum(axis=2))
     rotation_distances = np.sqrt(((T_a_b[:, None, :3, :3] - T_a_b[None, :, :3, :3]) ** 2).sum(axis=(2, 3)))
