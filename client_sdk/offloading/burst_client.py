@@ -1,8 +1,8 @@
 """Send a command to the burst function (AWS Lambda) by HTTP/1.1.
 
-The body has the bytes that the WebSocket would carry, and the token is the same.  `BurstPolicy` decides
-whether a command may be sent.  A call ends with exactly one answer or failure, and never later than its
-deadline.  This is the only module of the robot that speaks HTTP in its event loop.
+The body of a request has the bytes that the WebSocket would carry, and the token is the same.  `BurstPolicy`
+decides whether a command may be sent.  A call of `BurstClient.ask` returns exactly one answer or failure, and
+never later than its deadline.  This is the only module of the robot that speaks HTTP in its event loop.
 """
 
 from __future__ import annotations
@@ -27,13 +27,14 @@ __all__ = ["BURST_SERVICES", "BurstClient"]
 BURST_SERVICES = frozenset({"pnp"})
 """Services that the burst function offers."""
 SERVER_NAME = "lambda"
-"""Name of the burst function as a server, in failures that its client makes itself."""
+"""Field ``server`` of the failures that this module makes: the name that the burst function has in its own
+answers, too."""
 COLD_START_HEADER = "x-rse-pf-cold"
 """Header of the burst function's answer that is ``true`` after a cold start (AWS Lambda had to start an
 environment)."""
 TOKEN_REUSE_S = 60.0
-"""How long the client of the burst function reuses a signed token, in seconds; tokens are valid for
-minutes."""
+"""How long the client of the burst function reuses a signed token, in seconds: signing costs time, and tokens
+are valid for minutes."""
 IDLE_TIMEOUT_S = 20.0
 """How long an unused HTTP connection to the burst function is kept for the next command, in seconds."""
 MAX_IDLE_CONNECTIONS = 4
@@ -41,20 +42,24 @@ MAX_IDLE_CONNECTIONS = 4
 MAX_HEAD_BYTES = 16384
 """Longest status line and headers of an answer of the burst function, in bytes."""
 MAX_RETRY_AFTER_S = 86400.0
-"""Longest time in seconds for which an answer of the burst function can ask the robot to send nothing."""
+"""Longest time for which an answer of the burst function can make the robot send it no command, in seconds; a
+longer ``Retry-After`` is cut to this."""
 EXCHANGE_TIMEOUT_S = 5.0
-"""A command that the burst function has not answered for this long, in seconds, counts as a failure of it."""
+"""Longest time of one HTTP exchange with the burst function, in seconds; after it, the exchange ends and
+counts as a failure of the function.  The caller gets ``expired`` at the deadline of its command, which may be
+earlier; the exchange then goes on, so that the policy learns how long a late answer takes."""
 FUNCTION_FAILURES = frozenset({"busy", "quota", "unauthorized", "forbidden", "connect", "bad-message"})
-"""Error codes that are failures of the burst function and not of the command; they count for its circuit
-breaker."""
+"""Error codes that count as failures of the burst function in its circuit breaker: the next command would
+probably fail in the same way, because the function is overloaded or unreachable, does not accept this robot,
+or sends messages that the robot cannot decode.  Other codes concern the one command."""
 
 
 class _BrokenHttp(Exception):
-    """The peer sent malformed HTTP, or a token or host name cannot be sent by HTTP."""
+    """The peer sent malformed HTTP, or the token or the host name has letters that HTTP cannot carry."""
 
 
 class _StaleConnection(Exception):
-    """An idle connection was closed by the peer before it received the request, so it can be sent again."""
+    """The peer closed an idle connection without an answer, so the request can be sent on another one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +77,7 @@ class _IdleConnection:
 
 
 class BurstClient:
-    """Ask the burst function as one robot."""
+    """Send commands of one robot to the burst function."""
 
     def __init__(
         self,
@@ -85,17 +90,18 @@ class BurstClient:
         max_answer_bytes: int,
         url: str | None = None,
     ) -> None:
-        """Prepare a client of the burst function; nothing is sent yet.
+        """Store the arguments; nothing is sent yet.
 
         Args:
-            codec: Codec of the robot's connection.
+            codec: Codec of the robot's connection, which encodes the bodies of requests and decodes answers.
             read_token: Returns the robot's token, None without one; raises RsePfError.
-            read_access: Returns the WebSocket address of the servers, and what the robot trusts there.
+            read_access: Returns the WebSocket address of the backend servers, and the TLS context for them.
             clock: Monotonic seconds.
             random: Source of the jitter of the circuit breaker.
-            max_answer_bytes: Longest answer that is read.
-            url: Address of the function that the user gave; None means the one in the last Welcome, and an
-                empty text means no function.
+            max_answer_bytes: Longest body of an answer, in bytes; a longer one counts as malformed HTTP.
+            url: Address of the burst function that the user gave, absolute or a path at the host of the
+                servers.  None means the address in the last Welcome of a server, and an empty text means that
+                the function is never asked.
         """
         self._codec = codec
         self._read_token = read_token
@@ -112,10 +118,10 @@ class BurstClient:
         self._tasks: set[asyncio.Task[Result | Failure]] = set()
 
     def read_welcome(self, welcome: Welcome) -> None:
-        """Take over from *welcome* the address of the function, and how many commands it may get in a day.
+        """Use the address of the burst function and the daily budget of commands that *welcome* states.
 
-        A *welcome* without an address ends the use of the address of an earlier one, and leaves the budget as
-        it is.  An address that the user gave stays in use in any case.
+        If *welcome* states no address, the address of an earlier Welcome is not used any more, and the budget
+        does not change.  An address that the user gave is used in place of any address in a Welcome.
         """
         self._welcome_url = welcome.burst_url
         if welcome.burst_url:
@@ -123,12 +129,12 @@ class BurstClient:
 
     @property
     def address(self) -> str | None:
-        """HTTP address of the function, None if there is none."""
+        """HTTP address of the burst function; None if there is none, or if `burst_address` refuses it."""
         url = self._welcome_url if self._user_url is None else self._user_url
         return burst_address(url, self._read_access()[0]) if url else None
 
     def expected_s(self, service: str) -> float | None:
-        """Return the expected seconds of an answer to *service*, None if the function cannot be asked now."""
+        """Return the expected time of an answer in seconds; None if *service* cannot be sent now."""
         if service not in BURST_SERVICES or self.address is None:
             return None
         now_s = self._clock()
@@ -137,8 +143,8 @@ class BurstClient:
     async def ask(self, command: Command, *, deadline_s: float, why: str) -> Answer | Failure:
         """Send *command* to the burst function; return an answer or failure within *deadline_s* seconds.
 
-        *why* says why no server was asked or answered; the answer carries this text.  Without an address, and
-        while `BurstPolicy.may_send` forbids it, nothing is sent.
+        *why* says why no server was asked or answered; the answer carries this text.  If there is no address,
+        or `BurstPolicy.may_send` forbids it, nothing is sent, and the failure ``quota`` is returned.
         """
         address, began_s = self.address, self._clock()
         if address is None or not self.policy.may_send(began_s):
@@ -196,7 +202,7 @@ class BurstClient:
         self._idle.clear()
 
     async def _post(self, address: str, body: bytes) -> tuple[Result | Failure, bool]:
-        """Post an encoded command; return the answer, and whether it was a cold start of the function."""
+        """Post an encoded command; return the answer, and whether it is one after a cold start."""
         try:
             token = await self._reuse_token()
             if token is None:
@@ -281,9 +287,11 @@ class BurstClient:
     ) -> _Response:
         """Send *data* and return the answer; then append the connection to *idle*, or abort it.
 
+        It is aborted after an error, if the peer wants to close it, and if *idle* is full.
+
         Raises:
-            _StaleConnection: *is_reused*, and the peer closed the connection before it sent anything.
-            _BrokenHttp: The answer is no HTTP/1 with a length, or is too long.
+            _StaleConnection: *is_reused*, and the peer closed the connection without a byte of an answer.
+            _BrokenHttp: The answer is not HTTP/1 with a ``Content-Length``, or its body is too long.
         """
         is_kept = False
         try:
@@ -310,7 +318,10 @@ class BurstClient:
                 writer.transport.abort()
 
     def _tls_context(self, host: str) -> ssl.SSLContext:
-        """Return the TLS context of the robot's servers if *host* is theirs, else the default context."""
+        """Return the TLS context of the backend servers if *host* (``HOST`` or ``HOST:PORT``) is theirs.
+
+        Any other host gets a context that trusts the certificate authorities of the machine.
+        """
         own_url, own_context = self._read_access()
         if own_context is not None and host == urlsplit(own_url).netloc.rpartition("@")[2]:
             return own_context
@@ -322,7 +333,7 @@ class BurstClient:
 async def _open_connection(
     parts: SplitResult, context: ssl.SSLContext | None
 ) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
-    """Open a TCP or TLS connection to the host of *parts*, perhaps through a proxy of the environment."""
+    """Open a TCP or TLS connection to the host of *parts*, through the HTTP proxy that is set, if any."""
     host, port = parts.hostname or "", port_of(parts)
     if find_proxy(parts.scheme, host, port) is None:
         return await asyncio.open_connection(host, port, limit=MAX_HEAD_BYTES, ssl=context)
@@ -334,7 +345,7 @@ async def _open_connection(
 
 
 def _parse_head(head: bytes) -> tuple[int, dict[str, str]]:
-    """Return status and headers of an HTTP response; names of headers are in lower case."""
+    """Return HTTP status and headers of a response; the names of the headers are in lower case."""
     first, *lines = head.decode("latin-1").split("\r\n")
     version, _, rest = first.partition(" ")
     if not version.startswith("HTTP/1.") or not rest[:3].isdecimal() or len(rest[:3]) != 3:

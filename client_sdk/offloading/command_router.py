@@ -1,7 +1,8 @@
 """Send a command to a backend server, the burst function or the robot itself, as a plan of `CloudFirst` says.
 
-A call ends with the first good answer.  A place is not asked if it cannot answer in time.  A failure that
-another place may not share is returned only if no other place is left.
+These three are called places.  A call returns the first answer that is not a failure.  After a failure that
+another place may not have (`CloudFirst.can_recover`), the call waits for the other places, and asks those of
+its plan that were not asked yet; only if all of them fail does it return a failure.
 """
 
 from __future__ import annotations
@@ -26,19 +27,18 @@ from rse_pf.wire.client_session import Answered, ClientSession, Progressed
 __all__ = ["CallArguments", "CommandRouter", "OnProgress"]
 
 OnProgress = Callable[[float, str], None]
-"""Called with the share of a long command that is done (0..1), and the name of the step that was done
-last."""
+"""Called with the share (0..1) of a long command that is computed, and the name of the last finished step."""
 
 PLACE_NAMES = {"server": "the cloud", "burst": "the burst function", "robot": "the robot"}
-"""How the reason in an answer names the place that failed before."""
+"""For each place, its name in the ``why`` of the answer of a place that was asked after its failure."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CallArguments:
     """The arguments of one call of `Robot.call`, which explains them.
 
-    ``deadline_s`` is always a number; ``is_open_ended`` says that the caller gave none, so that a long
-    service may take longer.
+    ``deadline_s`` is always a number.  ``is_open_ended`` says that the caller gave no deadline: the servers
+    then get the command without one, and a service that takes long may take longer than ``deadline_s``.
     """
 
     service: str
@@ -52,14 +52,14 @@ class CallArguments:
 
 @dataclass(frozen=True, slots=True)
 class _PlannedRequest:
-    """A place, and after how many seconds it is asked if there is no answer by then."""
+    """A place, and how many seconds after the call began it is asked, unless there is an answer."""
 
     place: Literal["server", "burst", "robot"]
     after_s: float
 
 
 class CommandRouter:
-    """Send commands of one robot to servers, burst function or robot, and wait for their answers."""
+    """Send commands of one robot to the backend servers, the burst function or the robot itself."""
 
     def __init__(
         self,
@@ -73,20 +73,21 @@ class CommandRouter:
         burst: BurstClient,
         callbacks: UserCallbacks,
     ) -> None:
-        """Keep the three places to ask; no command is sent yet.
+        """Store the arguments; no command is sent yet.
 
         Args:
-            session: Sends commands to the servers.
-            flush: Sends the messages that the session has written.
-            counter: Learns round trips, and predicts the next one.
+            session: Encodes commands for the servers, and holds those without an answer.
+            flush: Sends the messages that *session* has encoded.
+            counter: Is told the round trips to servers, and predicts the next one.
             clock: Monotonic seconds.
-            policy: Plans the commands; None means the defaults.
-            local: Services of the robot itself, None without them.
+            policy: Plans the commands; None means `CloudFirst` with its defaults.
+            local: Services of the robot itself; None if the robot never computes commands.
             burst: Client of the burst function.
-            callbacks: Calls the *on_progress* of a call.
+            callbacks: Calls the *on_progress* of a call, and survives its exceptions.
         """
         self.waiting: dict[int, asyncio.Future[Answered] | Callable[[Answered], None]] = {}
-        """For each command at the servers its future, or the function that receives its end."""
+        """For the id of each command at the servers, the future of its answer, or a function that is called
+        with its answer."""
         self._session = session
         self._flush = flush
         self._counter = counter
@@ -99,7 +100,7 @@ class CommandRouter:
         self._tasks: set[asyncio.Task[Answer | Failure]] = set()
 
     async def ask(self, call: CallArguments) -> Answer | Failure:
-        """Return the first good answer to *call*, or a failure; see `_race`."""
+        """Plan *call*, ask the places of the plan, and return the first answer or a failure (see `_race`)."""
         local, current = self._local, self._session.current
         self.read_welcome()
         plan = self._policy.plan(
@@ -116,7 +117,10 @@ class CommandRouter:
         return await self._race(requests, call, plan.why)
 
     def read_welcome(self) -> None:
-        """Keep what the connected server says of the burst function, for the time without a server."""
+        """Pass the Welcome of the connected server, if any, to the client of the burst function.
+
+        The Welcome states the address of the burst function, which is needed when no server is connected.
+        """
         current = self._session.current
         if current is not None and current.welcome is not None:
             self._burst.read_welcome(current.welcome)
@@ -147,10 +151,11 @@ class CommandRouter:
     async def _race(
         self, requests: deque[_PlannedRequest], call: CallArguments, why: str
     ) -> Answer | Failure:
-        """Ask each place at its time, or as soon as no other place is asked; return the first good answer.
+        """Ask each place at its planned time, or earlier if no other is working; return the first answer.
 
-        A failure of the command itself, and any answer of the robot, ends the race at once.  If all places
-        fail, the first failure is returned, and at the deadline the failure ``expired``.
+        A failure that other places would have, too (not `CloudFirst.can_recover`), and any failure of the
+        robot itself are returned at once.  If all places fail, the failure that arrived first is returned.
+        At the deadline the failure ``expired`` is returned.
         """
         began_s = self._clock()
         running: dict[asyncio.Task[Answer | Failure], _PlannedRequest] = {}
@@ -176,7 +181,8 @@ class CommandRouter:
                 done, _ = await asyncio.wait(
                     running, timeout=max(0.0, until_s - elapsed_s), return_when=asyncio.FIRST_COMPLETED
                 )
-                # 4. Return a good answer or a final failure; a server's answer is preferred.
+                # 4. Return an answer or a final failure; if several have arrived, that of a server is
+                #    preferred.
                 for task in sorted(done, key=lambda task: running[task].place != "server"):
                     request, answer = running.pop(task), task.result()
                     if request.place == "robot" or isinstance(answer, Answer):
@@ -191,8 +197,8 @@ class CommandRouter:
                 task.cancel()
             raise
         finally:
-            # Requests that still run go on, because their times are measured; but a command that waits for a
-            # connection is cancelled, so that it is not sent later.
+            # The requests that have no answer yet are not cancelled, because their times are measured.  Only
+            # a command that waits for a connection to a server is cancelled, so that it is not sent later.
             for task, request in running.items():
                 if request.place == "server" and self._session.current is None:
                     task.cancel()
@@ -277,7 +283,7 @@ class CommandRouter:
 
 
 def _planned_requests(plan: Plan) -> deque[_PlannedRequest]:
-    """Return the places to ask in the order of their times; the burst function comes before the robot."""
+    """Return the places of *plan* in the order of their times; the burst function before the robot."""
     requests = [] if plan.where == "robot" else [_PlannedRequest("server", 0.0)]
     if plan.burst_after_s is not None:
         requests.append(_PlannedRequest("burst", plan.burst_after_s))

@@ -1,6 +1,6 @@
-"""Answer commands on the robot itself, in one thread, by the same `dispatch` as on a server.
+"""Answer commands on the robot itself, in one thread, with the `dispatch` that a server uses.
 
-Solvers are imported only by `LocalServices.prepare`, so that a robot without them starts quickly.
+Only `LocalServices.prepare` imports the solvers, so that a robot that computes nothing itself starts quickly.
 """
 
 from __future__ import annotations
@@ -17,14 +17,15 @@ from rse_pf.wire import Command, Failure, Result, make_codec
 __all__ = ["LocalServices"]
 
 RECENT_ANSWERS = 8
-"""The robot expects that its next answer takes as long as the slowest of this many last ones."""
+"""The robot expects that its next answer takes as long as the slowest of its last answers, of which this many
+count."""
 
 
 class LocalServices:
-    """Hold the services that a robot offers itself, and answer one command at a time."""
+    """Hold the services that a robot computes itself, and answer one command at a time."""
 
     def __init__(self, registry: Registry | None, clock: Callable[[], float]) -> None:
-        """Keep the registry of services; `prepare` loads them.
+        """Store the arguments; `prepare` loads the built-in services.
 
         Args:
             registry: The services; None means the built-in ones.
@@ -37,9 +38,9 @@ class LocalServices:
         self._executor = ThreadPoolExecutor(1, "rse-pf-local-services")
 
     async def prepare(self) -> None:
-        """Load the services and measure how long a typical pose takes.
+        """Load the services, and measure how long the robot takes for a typical pose command.
 
-        The first pose is not counted, because it pays for imports.
+        The command is computed twice, and only the second time counts, because the first includes imports.
 
         Raises:
             MissingExtra: No solver is installed.
@@ -52,11 +53,11 @@ class LocalServices:
             await self.ask(command)
 
     def offers(self, service: str) -> bool:
-        """Return whether the robot offers *service*; the built-in ones are not known before `prepare`."""
+        """Return whether the robot can compute *service*; False for a built-in one before `prepare`."""
         return self._registry is not None and any(registered.name == service for registered in self._registry)
 
     async def ask(self, command: Command) -> Result | Failure:
-        """Compute *command* on the robot, after the commands that came before."""
+        """Compute *command* on the robot, after all commands of earlier calls."""
         began_s = self._clock()
         loop = asyncio.get_running_loop()
         answer = await loop.run_in_executor(self._executor, self._answer, command)
@@ -65,15 +66,18 @@ class LocalServices:
 
     @property
     def solve_s(self) -> float | None:
-        """The longest of the last eight answers in seconds, waiting included; None before the first."""
+        """The longest time in seconds from `ask` to its answer among the last eight; None before the first.
+
+        It includes the time that a command waited for the commands before it.
+        """
         return max(self._recent_s, default=None)
 
     def close(self) -> None:
-        """End the thread after its present command, whose answer is dropped."""
+        """End the thread after its present command, without waiting for it; cancel the commands that wait."""
         self._executor.shutdown(wait=False, cancel_futures=True)
 
     def _answer(self, command: Command) -> Result | Failure:
-        """Encode and decode *command*, so that it is exactly what a server receives, and compute it."""
+        """Compute *command*; encode and decode it and its answer, so that both are as with a server."""
         assert self._registry is not None
         try:
             received = self._codec.decode_from_robot(self._codec.encode(command))

@@ -1,8 +1,8 @@
-"""Plan who computes a command, and when each of them is asked; `CommandRouter` carries the plan out.
+"""Plan where a command is computed, and when each place is asked; `CommandRouter` carries the plan out.
 
-The candidates are the backend servers, the burst function (AWS Lambda) and the robot itself.  The rule of the
-paper (Sect. 6.2) is: "the saved time should be more than transmission delay so that real-time performance
-gains from cloud computing".
+The places are the backend servers, the burst function (AWS Lambda) and the robot itself.  The rule of the
+paper that this platform implements (Sect. 6.2) is: "the saved time should be more than transmission delay so
+that real-time performance gains from cloud computing".
 """
 
 from __future__ import annotations
@@ -15,8 +15,9 @@ from rse_pf.service import Registry
 __all__ = ["CloudFirst", "Plan"]
 
 FALLBACK_MARGIN = 2.0
-"""A fallback is asked while there is time for this many of its own expected answers, so that it is not
-late."""
+"""A fallback is asked this many times its expected answer time before its answer is needed, so that an answer
+that is slower than expected is still in time.  Only slow servers delay the burst function
+(`_burst_after_s`)."""
 
 RECOVERABLE_CODES = frozenset(
     {
@@ -34,21 +35,23 @@ RECOVERABLE_CODES = frozenset(
         "conflict",
     }
 )
-"""Codes of failures that are no fault of the command itself, so that another place may succeed."""
+"""Error codes of failures after which another place may succeed with the same command, because its arguments
+are not the cause; `rse_pf.errors` explains each code."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Plan:
-    """Who computes one command, and from when on.
+    """Where one command is computed, and when each place is asked.
 
     Attributes:
-        where: ``cloud`` asks the servers and never the robot, ``robot`` never the servers, ``both`` asks the
-            servers at once and the robot later.
-        robot_after_s: Seconds after which the robot itself is asked if there is no answer by then, or earlier
-            if all others have failed; not used if *where* is ``cloud``.
-        burst_after_s: Seconds after which the burst function is asked if there is no answer by then, or
-            earlier if the servers have failed; None never asks it.
-        why: The reason that is given in an answer of the burst function or of the robot.
+        where: ``cloud`` asks the backend servers and never the robot itself; ``robot`` asks the robot and
+            never the servers; ``both`` asks the servers at once, and the robot after *robot_after_s*.  The
+            burst function does not depend on *where*, only on *burst_after_s*.
+        robot_after_s: Seconds from the call after which the robot itself is asked if there is no answer yet;
+            it is asked earlier if the other places have failed.  Not used if *where* is ``cloud``.
+        burst_after_s: Seconds from the call after which the burst function is asked if there is no answer
+            yet; it is asked earlier if the servers have failed.  None means that it is never asked.
+        why: The field ``why`` of an answer of the burst function or the robot: why no server answered.
     """
 
     where: Literal["cloud", "robot", "both"]
@@ -59,16 +62,18 @@ class Plan:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CloudFirst:
-    """Ask the servers first, then the burst function if there is one, and the robot itself at last.
+    """Ask the servers first, then the burst function if there is one, and the robot itself last.
 
-    Each of them is asked early enough to meet the deadline.  The robot is the last because it needs no
-    network.
+    A place that has not answered stays asked while the next one works, and the first answer counts.  Each
+    place is asked early enough to meet the deadline.  The robot is the last because it needs no network.
 
     Attributes:
-        registry: Services that the robot offers itself; None means the built-in ones.
-        robot_solve_s: Expected time of the robot's own solver in seconds, until it was measured.
+        registry: Services that the robot computes itself; None means the built-in ones.
+        robot_solve_s: Expected time in seconds of an answer of the robot itself, until it is measured.
         slack_s: Time in seconds by which the robot starts earlier, because its processor has other work.
-        take_faster: Whether the rule of the paper applies: do not ask a cloud that is slower than the robot.
+        take_faster: Whether to apply the rule of the paper, too: if the expected time of the robot is at most
+            the expected round trip to a server, ask the robot alone.  Without it, the servers are asked
+            first even if they are slower.
     """
 
     registry: Registry | None = None
@@ -90,21 +95,23 @@ class CloudFirst:
 
         Args:
             deadline_s: Seconds from now within which the answer is needed.
-            connected: Whether a server is connected.
-            expected_round_trip_s: 95th percentile of recent round trips to a server, None if unknown.
-            robot_solve_s: Recent time of the robot for such a command in seconds, None if unknown.
-            robot_can: Whether the robot offers the service.
-            burst_s: Expected time of an answer of the burst function, None if it cannot be asked.
+            connected: Whether the robot is connected to a server.
+            expected_round_trip_s: 95th percentile of recent round trips to a server in seconds; None if
+                unknown.
+            robot_solve_s: Expected time in seconds of an answer of the robot itself by its recent answers;
+                None if it has not answered yet, so that the attribute *robot_solve_s* counts.
+            robot_can: Whether the robot can compute the service.
+            burst_s: Expected time in seconds of an answer of the burst function; None if it cannot be asked.
         """
-        # 1. Compute the latest moment at which the robot can start and still meet the deadline; leave out a
-        #    burst function that needs more time than that.
+        # 1. Compute the latest time at which the robot can start and still meet the deadline.  Leave out the
+        #    burst function if it would probably answer after this time.
         local_s = self.robot_solve_s if robot_solve_s is None else robot_solve_s
         robot_needs_s = FALLBACK_MARGIN * local_s if robot_can else 0.0
         latest_s = max(0.0, deadline_s - robot_needs_s - self.slack_s)
         if burst_s is not None and burst_s > latest_s:
             burst_s = None
-        # 2. Without a server that can be in time, ask the burst function at once, and the robot as late as is
-        #    safe; without a burst function, ask the robot at once.
+        # 2. If no server can be in time, ask the burst function at once, and the robot at its latest time;
+        #    without a burst function, ask the robot at once.
         where: Literal["cloud", "both"] = "both" if robot_can else "cloud"
         is_slow = expected_round_trip_s is not None and expected_round_trip_s >= deadline_s
         if not connected or is_slow:
@@ -117,12 +124,12 @@ class CloudFirst:
                 burst_after_s=None if burst_s is None else 0.0,
                 why=why,
             )
-        # 3. By the rule of the paper, ask the robot alone if it is not slower than the cloud.
+        # 3. By the rule of the paper, ask the robot alone if it is not slower than a server.
         if self.take_faster and robot_can and expected_round_trip_s is not None:
             why = f"the robot takes {local_s * 1e3:.1f} ms, the cloud {expected_round_trip_s * 1e3:.1f} ms"
             if local_s <= expected_round_trip_s:
                 return Plan(where="robot", why=why)
-        # 4. Ask the servers now, and the others as late as is safe.
+        # 4. Ask the servers at once, and the other places at their latest times.
         burst_after_s = None
         if burst_s is not None:
             burst_after_s = _burst_after_s(latest_s, burst_s, expected_round_trip_s)
@@ -135,18 +142,20 @@ class CloudFirst:
 
     @staticmethod
     def can_recover(code: str) -> bool:
-        """Return whether another place may succeed where one failed with the error *code*.
+        """Return whether another place may succeed after one has failed with the error *code*.
 
-        An error of the command itself (too few points, no consensus) would occur everywhere.
+        A failure that the arguments of the command cause (too few points, no consensus) would occur
+        everywhere.
         """
         return code in RECOVERABLE_CODES
 
 
 def _burst_after_s(latest_s: float, burst_s: float, expected_round_trip_s: float | None) -> float:
-    """Return after how many seconds the burst function is asked while a server has not answered yet.
+    """Return how many seconds after the servers the burst function is asked if none has answered yet.
 
-    That is as late as is safe, and after the 95th percentile of the servers' round trips: a command that both
-    answer is paid for twice.
+    A command that both compute is paid for twice, so the function is asked late: twice its expected time
+    *burst_s* before *latest_s*, at which the robot starts.  If the 95th percentile of the servers' round
+    trips is later, it waits for that, too, but no longer than until *burst_s* before *latest_s*.
 
     Source:
         Dean and Barroso 2013, "The tail at scale": a second request after the 95th percentile of the first.

@@ -1,4 +1,6 @@
-"""Transfer of large data over HTTP: objects and maps, resumed and background uploads, presigned addresses.
+"""Transfer objects and maps between a robot and the platform's data service over HTTP.
 
-Commands travel on the WebSocket of `client_sdk.network.connection` instead.
+A transfer that was interrupted is resumed.  Large objects may go directly to or from the bucket, by a
+presigned URL: it carries a signature for one transfer in place of the robot's token.  Commands travel on the
+WebSocket of `client_sdk.network.connection` instead.
 """

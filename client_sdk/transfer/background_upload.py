@@ -1,7 +1,9 @@
-"""Upload keyframes in the background: in order, at a limited rate, from a spool folder of bounded size.
+"""Upload encoded keyframes as objects of the data service: in order, at a limited rate, from a spool folder.
 
-The rate limit allows no burst: keyframes of hours without a network are uploaded at a steady rate, so that
-they do not delay live poses.  The spool survives a restart of the robot.
+This serves a robot that has no live map; a live map has its own queue in `client_sdk.live.keyframe_queue`.
+The spool folder holds the keyframes that are not uploaded yet, has a bounded size, and survives a restart of
+the robot.  The rate limit allows no burst: keyframes of hours without a network are uploaded at a steady
+rate, so that they do not delay the robot's pose queries.
 """
 
 from __future__ import annotations
@@ -22,17 +24,18 @@ from rse_pf.token_bucket import TokenBucket
 __all__ = ["BYTES_PER_S", "MAX_SPOOL_BYTES", "BackgroundUploader"]
 
 BYTES_PER_S = 262_144.0
-"""Default rate of uploads, in bytes per second: a small part of a wireless link, so that poses are not
+"""Default rate of uploads, in bytes per second: a small part of a wireless link, so that pose queries are not
 delayed."""
 MAX_SPOOL_BYTES = 1 << 30
 """Default limit of the spool folder, in bytes: space for the keyframes of some hours without a network."""
 THREAD_JOIN_S = 5.0
-"""How long `BackgroundUploader.close` waits for the upload that its thread works on, in seconds."""
+"""How long `BackgroundUploader.close` waits for its thread to end, in seconds: the thread may be in the
+middle of an upload, which ends soon because `close` has closed the connection."""
 RETRY_PAUSE_S = 5.0
-"""Pause in seconds before a failed upload is tried again; the data client has repeated each request
-before."""
+"""Pause before a failed upload is tried again, in seconds: an upload fails only after the data client has
+repeated one request for `DataOptions.deadline_s`, so a short pause more makes no difference."""
 BUSY_POLL_S = 0.05
-"""Pause between two calls of *is_busy* while live poses are waiting, in seconds."""
+"""Pause between two calls of *is_busy* while it returns True, in seconds."""
 
 
 class BackgroundUploader:
@@ -48,24 +51,26 @@ class BackgroundUploader:
         clock: Callable[[], float] = time.monotonic,
         is_busy: Callable[[], bool] = lambda: False,
     ) -> None:
-        """Describe the uploads; `start` begins them.
+        """Store the arguments; `start` begins the uploads.
 
         Args:
-            uploads: Client of the data service.
+            uploads: Client of the data service; `close` closes its connection.
             folder: The spool folder, which `start` creates; keyframes of an earlier run in it are uploaded,
                 too.
             bytes_per_s: Highest rate of the uploads, in bytes per second.
             max_spool_bytes: Largest size of the spool folder; keyframes that do not fit are dropped.
             clock: Monotonic seconds.
-            is_busy: Returns whether live poses are waiting; no keyframe and no part of one is sent meanwhile.
-                If it raises, the exception is logged and the uploads go on.
+            is_busy: Returns whether pose queries of the robot are waiting for answers; while it returns True,
+                no keyframe and no part of a keyframe is sent.  If it raises, the exception is logged and the
+                uploads go on.
         """
         self.sent = 0
-        """Keyframes that were uploaded."""
+        """Number of keyframes that this object has uploaded."""
         self.dropped = 0
-        """Keyframes that did not fit into the spool, or that the data service refused for good."""
+        """Number of keyframes that are lost: the spool or the disk was full, or the data service refused the
+        keyframe in a way that a second attempt would not change."""
         self.last_error = ""
-        """Message of the last failure, empty without one."""
+        """Message of the last failed upload or write to the spool; empty before the first failure."""
         self._uploads = uploads
         self._folder = folder
         self._bytes_per_s = bytes_per_s
@@ -90,7 +95,7 @@ class BackgroundUploader:
 
     @property
     def waiting(self) -> int:
-        """Number of keyframes that are not uploaded yet."""
+        """Number of keyframes in the spool: those not uploaded yet."""
         with self._condition:
             return len(self._spooled)
 
@@ -98,7 +103,8 @@ class BackgroundUploader:
         """Write an encoded keyframe to the spool without waiting for its upload.
 
         Returns:
-            The sha256 of the keyframe; None if it was dropped because the spool or the disk is full.
+            The sha256 of *data*, which is the name of the object at the data service; None if the keyframe
+            was dropped because the spool or the disk is full.
         """
         digest = hashlib.sha256(data).hexdigest()
         with self._condition:
@@ -118,17 +124,18 @@ class BackgroundUploader:
         return digest
 
     def wait_sent(self, timeout_s: float) -> bool:
-        """Wait until each keyframe is uploaded or refused for good, at most *timeout_s* seconds.
+        """Wait until the spool is empty, at most *timeout_s* seconds; return whether it is empty.
 
-        Return whether none is left.
+        The spool becomes empty when each keyframe in it is uploaded or dropped (see `dropped`).
         """
         with self._condition:
             return self._condition.wait_for(lambda: not self._spooled, timeout_s)
 
     def close(self) -> None:
-        """End the thread and close the connection of *uploads*; an upload that runs has at most 5 s to end.
+        """Close the connection of *uploads* and wait at most 5 s for the thread to end.
 
-        Keyframes that are not uploaded stay in the spool for the next run.
+        An upload that runs fails because of the closed connection.  Keyframes that are not uploaded stay in
+        the spool for the next run.
         """
         with self._condition:
             self._is_closed = True
@@ -152,9 +159,9 @@ class BackgroundUploader:
                 return
 
     def _upload(self, name: str) -> bool:
-        """Upload a file of the spool and remove it; return False if it has to be tried again.
+        """Upload the file *name* of the spool and remove it; return False if the upload has to be repeated.
 
-        A file that is refused for good is removed, and counts as dropped.
+        If a second attempt would fail in the same way, the file is removed and counts as dropped.
         """
         path = self._folder / name
         try:
@@ -183,7 +190,7 @@ class BackgroundUploader:
             self._wait_not_busy()
 
     def _wait_not_busy(self) -> bool:
-        """Wait until no live pose is waiting; return False if the uploader was closed."""
+        """Wait until *is_busy* returns False; return False if the uploader was closed meanwhile."""
         while self._callbacks.call("is_busy", self._is_busy, default=False):
             if self._wait_closed(BUSY_POLL_S):
                 return False

@@ -1,9 +1,11 @@
-"""Store and fetch large data by HTTP (paper, Sect. 5.2): images, keyframes, point clouds, maps.
+"""Store and fetch large data over HTTP: images, keyframes, point clouds, maps.
 
-`DataClient` blocks; an asyncio program runs it in a thread.  Objects are named by their sha256, so a repeated
-or resumed transfer can neither store an object twice nor mix two versions.  An upload returns when the data
-server has reported the object durable.  The service may offer a presigned address of its bucket (S3), which
-takes the bytes directly; when that fails, the bytes go through the service.
+The data service is the HTTP interface of the platform's data servers, which keep the objects in a bucket (S3)
+or on a disk.  `DataClient` blocks; an asyncio program runs it in a thread.  Objects are named by their
+sha256, so a repeated or resumed transfer can neither store an object twice nor mix two versions.  An upload
+returns when the data service has reported the object durable.  For a large object, the data service may offer
+a presigned URL of its bucket, so that the bytes do not pass through a data server; if the transfer with that
+URL fails, they do.
 """
 
 from __future__ import annotations
@@ -59,14 +61,17 @@ OnBytes = Callable[[int, int], None]
 PIECE_BYTES = 1 << 20
 """Size of the ranges of a download, and of the pieces in which a file is read, in bytes."""
 PRESIGNED_ATTEMPTS = 3
-"""How often a transfer by presigned addresses is tried before the bytes go through the data service."""
+"""Failed requests with presigned URLs in one upload or download after which the rest of its bytes goes
+through the data service: a bucket that the robot cannot reach must not stop the transfer."""
 TEMPORARY_REDIRECT = 307
-"""Status by which the data service offers a presigned address."""
+"""HTTP status by which the data service offers a presigned URL for a download."""
 NO_SERVICE_TIMEOUT_S = 5.0
-"""How long a request is repeated while the load balancer says that the platform has no data server: a
-platform that starts needs seconds, and one without a data service never has one."""
+"""How long a request is repeated while the load balancer answers that the platform has no data server, in
+seconds, if `DataOptions.deadline_s` is not shorter: a platform that starts needs seconds, and a platform
+without a data service never gets one."""
 RETRIED_STATUSES = {408, 429, 500, 502, 503, 504}
-"""HTTP statuses of failures that may pass, so that the request is repeated."""
+"""HTTP statuses after which a request is repeated, because the cause may pass; a refusal to store an object
+(`StoreRefused`) is not repeated, whatever its status."""
 T = TypeVar("T")
 
 
@@ -105,16 +110,20 @@ class DataOptions:
     """Timeouts and repeats of a data client.
 
     Attributes:
-        timeout_s: How long one attempt of a request may wait for data.
-        deadline_s: How long a request is repeated; since each part of a transfer is a request, this is the
-            longest time without progress.
-        first_pause_s: Longest pause before the first repeat; it doubles with each repeat.
-        max_pause_s: Longest pause between repeats, unless the service asks for a longer one.
-        part_bytes: Largest part of an upload.
+        timeout_s: How long one attempt of a request may wait for the next bytes of its answer, in seconds.
+        deadline_s: How long a failed request is repeated, in seconds; 5 s at most while the platform has no
+            data server.  Each part of a transfer is a request of its own, so a large transfer may last
+            longer, and fails after this time without progress.
+        first_pause_s: Longest pause before the first repeat of a request, in seconds; it doubles with each
+            repeat.  A pause is a random time from half of the longest pause to all of it.
+        max_pause_s: The longest pause does not double beyond this, in seconds; a longer ``Retry-After`` of
+            the data service is obeyed.
+        part_bytes: Size of the parts of an upload, in bytes, unless the data service asks for smaller ones.
         clock: Monotonic seconds.
         sleep: Waits for a number of seconds.
-        random: Source of the jitter of pauses.
-        ssl_context: What ``https:`` trusts; None means the authorities of the machine.
+        random: Source of the random pauses.
+        ssl_context: TLS context for ``https:``, which holds the trusted certificate authorities; None trusts
+            those of the machine.
     """
 
     timeout_s: float = 10.0
@@ -132,12 +141,14 @@ class DataClient:
     """Store and fetch objects and maps of one robot over one connection, which threads use in turn."""
 
     def __init__(self, url: str, token: str | Callable[[], str], options: DataOptions | None = None) -> None:
-        """Store the address; nothing is sent yet.
+        """Store the arguments; nothing is sent yet.
 
         Args:
-            url: ``http://HOST:PORT`` or ``https://...``, or the ``ws:`` or ``wss:`` address of the servers.
-            token: The robot's token, or a callable that returns a valid one.
-            options: Timeouts, retries and part sizes; None means the defaults.
+            url: Address of the data service, ``http://HOST:PORT`` or ``https://...``; or the ``ws:`` or
+                ``wss:`` address of the backend servers, at whose host and port the data service is, too.
+            token: The robot's token, or a callable that returns a valid one; it is called for each attempt of
+                a request.
+            options: Timeouts, repeats and part sizes; None means the defaults.
 
         Raises:
             UsageError: *url* has another scheme, or no usable host or port.
@@ -152,7 +163,7 @@ class DataClient:
 
     @classmethod
     def enrolled(cls, enrolment: str | Path) -> DataClient:
-        """Return a client with the address and the key in an enrolment file.
+        """Return a client with the address, the key and the certificate authorities of an enrolment file.
 
         Args:
             enrolment: File of ``rse-pf robot enrol --out``.
@@ -170,8 +181,8 @@ class DataClient:
     def upload(self, source: bytes | Path, progress: OnBytes | None = None) -> str:
         """Store bytes or a file as an object, and return its sha256 once it is durable.
 
-        An earlier upload of the same bytes is resumed, also one by another process.  *progress* is called
-        after each part.
+        If an earlier upload of the same bytes was interrupted, also by the end of its process, it is resumed.
+        *progress* is called after each part.
 
         Raises:
             ConnectError: There was no progress for ``deadline_s``, or no data service for 5 s.
@@ -192,12 +203,13 @@ class DataClient:
     def download(self, digest: str, to: Path | None = None, progress: OnBytes | None = None) -> bytes:
         """Return the bytes of an object, or write them to the file *to* and return empty bytes.
 
-        The bytes are verified by *digest*, the sha256 of the object.  The file appears only when it is
-        complete; a download to a file that was interrupted is kept in the same folder and resumed.
+        The bytes are verified by *digest*, the sha256 of the object.  The file *to* appears only when it is
+        complete; until then the received bytes are in a hidden file in the same folder, from which the next
+        call resumes an interrupted download.
 
         Raises:
             NotFound: This robot has no such object.
-            StoreError: The bytes do not match the digest; they are removed.
+            StoreError: The received bytes do not match the digest; the hidden file is removed.
             ConnectError: There was no progress for ``deadline_s``, or no data service for 5 s.
         """
         with self._lock:
@@ -209,7 +221,7 @@ class DataClient:
             self._request("DELETE", f"/data/v1/objects/{digest}", bytes)
 
     def objects(self) -> Iterator[tuple[str, int]]:
-        """Yield sha256 and size in bytes of each object of this robot."""
+        """Yield the sha256 and the size in bytes of each object of this robot, in the order of the sha256."""
         after = ""
         while True:
             with self._lock:
@@ -238,14 +250,18 @@ class DataClient:
         return description
 
     def download_map(self, name: str, version: str = "head", progress: OnBytes | None = None) -> bytes:
-        """Return the encoded map of a version, for `rse_pf.maps.format.decode_map`; see `map_version`."""
+        """Return the encoded map of a version, for `rse_pf.maps.format.decode_map`.
+
+        *name* and *version* are those of `map_version`, and so are the errors; *progress* is called after
+        each part.
+        """
         description = self.map_version(name, version)
         with self._lock:
             path = f"{_versions_path(name)}/{description['id']}/content"
             return self._download(path, description["record"]["digest"], None, progress)
 
     def commit_map(self, name: str, data: bytes, *, parent: str | None, note: str = "") -> str:
-        """Upload an encoded map as the new head of the map *name*; return the id of the version.
+        """Upload an encoded map as the new head of the map *name*; return the id of this new version.
 
         Args:
             name: Name of the map.
@@ -254,17 +270,21 @@ class DataClient:
             note: Text for people who read the history.
 
         Raises:
-            Conflict: *parent* is no longer the head: another robot committed first.
+            Conflict: *parent* is not the head: another robot committed first, or this commit was stored, but
+                its answer was lost, and the repeated request found it as the head.
         """
         body = {"digest": self.upload(data), "parent": parent, "note": note}
         with self._lock:
             return self._reply("POST", _versions_path(name), _MapVersion, json.dumps(body).encode()).id
 
     def update_map(self, name: str, data: bytes, *, note: str = "") -> str:
-        """Upload an encoded map as the new head of the map *name*, whatever its head is; return the id.
+        """Upload an encoded map as the new head of the map *name*; return the id of this new version.
+
+        The parent is the head at the time of the call, which is not merged with *data*: it stays in the
+        history of the map.  If there is no such map yet, it is created.
 
         Raises:
-            Conflict: Another robot committed at the same moment.
+            Conflict: As `commit_map`, if another robot commits during the call.
         """
         try:
             parent: str | None = self.map_version(name)["id"]
@@ -294,7 +314,12 @@ class DataClient:
             return self._reply("POST", path, PhotoLocation, photo)
 
     def map_outline(self, name: str) -> MapOutline:
-        """Return the outline of the head of the map *name* from above; raise the errors of `localise`."""
+        """Return the head of the map *name* as seen from above: 2D positions of keyframes and points, metres.
+
+        Raises:
+            NotFound: The tenant has no such map.
+            Forbidden: The token lacks the scope ``maps:localise/MAP``.
+        """
         with self._lock:
             path = f"{LOCALISE_PATH}{quote(name, safe='')}"
             return self._reply("GET", path, MapOutline)
@@ -321,9 +346,10 @@ class DataClient:
     def _open_upload(
         self, path: str, request: bytes, reader: _Source, digest: str, progress: OnBytes | None
     ) -> _Upload:
-        """Open an upload; send the object to a presigned address if the service offers one.
+        """Open an upload, and send the object to a presigned URL if the data service offers one.
 
-        The returned state says how many bytes the service has; all of them after a presigned upload.
+        The ``offset`` of the returned state is the number of bytes that the data service has: all of the
+        object if it was sent to a presigned URL, else the part of it that an interrupted upload has stored.
         """
         attempts, pause_s = PRESIGNED_ATTEMPTS, self._options.first_pause_s
         while True:
@@ -341,7 +367,11 @@ class DataClient:
         return is_allowed(presigned_url, secure=self._connection.uses_tls)
 
     def _fetch_piece(self, path: str, headers: dict[str, str], route: _DownloadRoute) -> Response:
-        """Fetch a range of an object from a presigned address, or from the service if it offers none."""
+        """Fetch the range in *headers* from the presigned URL of *route*, else through the data service.
+
+        If *route* has no URL, the data service is asked for one, and may answer with the bytes instead.  Each
+        request that a presigned URL does not answer well costs *route* an attempt.
+        """
         options = self._options
         while route.attempts_left:
             if not route.url:
@@ -355,13 +385,13 @@ class DataClient:
                 response = _request_bucket("GET", route.url, headers, None, options.timeout_s)
                 if response is not None:
                     return response
-            # The presigned address has expired, or the bucket cannot be reached.
+            # The presigned URL is not safe or has expired, or the bucket cannot be reached.
             route.url, route.attempts_left = "", route.attempts_left - 1
             options.sleep(options.first_pause_s)
         return self._request("GET", path, bytes, None, headers, expected=(416,))
 
     def _download(self, path: str, digest: str, to: Path | None, progress: OnBytes | None) -> bytes:
-        # 1. Begin with what an interrupted download has left.
+        # 1. Begin with the bytes that an interrupted download has left in the hidden file.
         partial = None if to is None else to.with_name(f".{to.name}.{digest[:16]}.part")
         received = bytearray(partial.read_bytes() if partial is not None and partial.exists() else b"")
         # 2. Fetch one range after the other until nothing is missing.
@@ -381,7 +411,7 @@ class DataClient:
                 received.clear()
                 _remove(partial)
             self._report(progress, len(received), size)
-        # 3. Verify the bytes, and let the file appear.
+        # 3. Verify the bytes, and rename the hidden file to *to*.
         if hashlib.sha256(received).hexdigest() != digest:
             _remove(partial)
             raise StoreError("the downloaded bytes do not match the digest", hint="download the object again")
@@ -432,9 +462,10 @@ class DataClient:
         expected: tuple[int, ...] = (),
         digest: str = "",
     ) -> tuple[int, http.client.HTTPMessage, T]:
-        """Repeat a request until it succeeds, is refused, or ``deadline_s`` has passed.
+        """Send a request, and repeat it while it fails in a way that may pass, for at most ``deadline_s``.
 
-        All requests of this class are idempotent.
+        No request of this class takes effect twice, so a repeat is safe when an answer was lost.  Only a
+        commit is refused with `Conflict` when it is repeated after it took effect.
 
         Args:
             method: HTTP method.
@@ -442,11 +473,14 @@ class DataClient:
             kind: Type of the reply; `bytes` returns the body as it is.
             body: Body of the request; None without one.
             headers: Further headers of the request.
-            expected: Statuses of 300 and above that are no errors.
-            digest: The object that the reply must be about, empty for any.
+            expected: HTTP statuses of 300 and above that are returned and not raised as errors.
+            digest: The sha256 that a `StoredReply` must name; empty for any.
 
         Returns:
-            Status, headers and decoded reply.
+            HTTP status, headers and decoded reply.
+
+        Raises:
+            RsePfError: The error of the last attempt, or of the first one that a repeat cannot help.
         """
         options = self._options
         began_s, pause_s = options.clock(), options.first_pause_s
@@ -481,7 +515,11 @@ class DataClient:
 
 @dataclass(slots=True)
 class _DownloadRoute:
-    """Where a download comes from: the presigned *url*, or the service when no attempts are left."""
+    """The presigned URL that a download uses, and how many requests with such URLs may still fail.
+
+    An empty ``url`` means that the data service is asked for a new one; without ``attempts_left`` it is not
+    asked again, and the bytes come through the data service.
+    """
 
     url: str = ""
     attempts_left: int = PRESIGNED_ATTEMPTS
@@ -529,9 +567,9 @@ class _Source:
 
 
 def is_allowed(url: str, *, secure: bool) -> bool:
-    """Return whether a presigned *url* may carry data: without TLS only if *secure* is False.
+    """Return whether a presigned *url* may carry data: ``https:``, and ``http:`` only if *secure* is False.
 
-    *secure* says whether the data service itself is reached by TLS.
+    *secure* says whether the robot reaches the data service itself by TLS.
     """
     parts = urlsplit(url)
     return bool(parts.hostname) and parts.scheme in (("https",) if secure else ("http", "https"))
@@ -540,7 +578,10 @@ def is_allowed(url: str, *, secure: bool) -> bool:
 def _request_bucket(
     method: str, url: str, headers: Mapping[str, str], body: Iterable[bytes] | None, timeout_s: float
 ) -> Response | None:
-    """Return the answer of a presigned address, None unless it succeeds; never send the token."""
+    """Send one request to a presigned *url*, without the robot's token; return None if it fails in any way.
+
+    Status 416 counts as an answer to a GET: the range begins behind the end of the object.
+    """
     parts = urlsplit(url)
     connection = None
     try:

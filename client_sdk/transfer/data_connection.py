@@ -47,16 +47,18 @@ resumed."""
 NO_UPSTREAM = b"no healthy upstream"
 """Body of the 503 that the load balancer (Envoy) sends while it knows no data server at all."""
 PROBE_TIMEOUT_S = 1.0
-"""Time limit of each step of the probe of a peer that gave no usable answer; a live peer needs less."""
+"""Time limit of each step of `probe_peer`, in seconds: it runs after a peer gave no usable answer, and a peer
+that is alive needs less."""
 HTTP_SCHEMES = {"ws": "http", "wss": "https"}
-"""The scheme of the data service at the address of the WebSocket servers."""
+"""For each scheme of the backend servers' WebSocket address, the scheme of the data service at the same host
+and port."""
 Response = tuple[int, http.client.HTTPMessage, bytes]
-"""Status, headers and body of an HTTP answer."""
+"""HTTP status, headers and body of an answer."""
 T = TypeVar("T")
 
 
 class StoredReply(msgspec.Struct, frozen=True, kw_only=True):
-    """The fields that every reply about an object has: its sha256 in hexadecimal, and its size in bytes."""
+    """Fields of every reply about one object: its sha256 in hexadecimal, and its size in bytes."""
 
     digest: str
     size: int
@@ -66,11 +68,12 @@ class DataConnection:
     """Keep one HTTP connection to the data service; one thread may use it at a time."""
 
     def __init__(self, url: str, *, timeout_s: float, ssl_context: ssl.SSLContext | None) -> None:
-        """Store the address; nothing is sent yet.
+        """Store the arguments; nothing is sent yet.
 
         Args:
-            url: ``http://HOST:PORT`` or ``https://...``, or the ``ws:`` or ``wss:`` address of the servers.
-            timeout_s: How long one request may wait for data.
+            url: Address of the data service, ``http://HOST:PORT`` or ``https://...``; or the ``ws:`` or
+                ``wss:`` address of the backend servers, at whose host and port the data service is, too.
+            timeout_s: How long one request may wait for the next bytes of its answer, in seconds.
             ssl_context: TLS context for ``https:``; None trusts the authorities of the machine.
 
         Raises:
@@ -86,7 +89,9 @@ class DataConnection:
         self.uses_tls = scheme == "https"
         self.host = self._parts.hostname or ""
         self.is_wrong_address = False
-        """Whether the last request failed by its address or settings, so that a repeat cannot help."""
+        """Whether the last request failed in a way that a repeat cannot help: the scheme of the address is
+        wrong for the peer (TLS or not), its certificate is not trusted, or the HTTP proxy refuses the
+        request."""
         self._has_answered = False
         self._timeout_s, self._ssl_context = timeout_s, ssl_context
         self._connection: http.client.HTTPConnection | None = None
@@ -105,7 +110,7 @@ class DataConnection:
         Raises:
             ConnectError: There is no answer.
             Unauthorized: *token* is no text of a token.
-            UsageError: The environment variable names no HTTP proxy.
+            UsageError: The environment variable for the proxy does not hold the address of an HTTP proxy.
         """
         authorization = {"Authorization": f"Bearer {strip_token(token)}"}
         self.is_wrong_address = False
@@ -133,9 +138,10 @@ class DataConnection:
         content: bytes,
         expected: tuple[int, ...] = (),
     ) -> RsePfError | None:
-        """Return the typed error of an answer; None for a success or an *expected* status.
+        """Return the typed error of an answer; None for a status below 300 or an *expected* status.
 
-        Login pages and proxies answer with 200 and redirects, too; such an answer is always an error.
+        The answer of a login page or a proxy is an error whatever its status; `HttpAnswer.is_foreign`
+        recognises it by a status or a content type that the data service never sends.
         """
         answer = _answer_of(status, headers, content)
         if not answer.is_foreign and (status < 300 or status in expected):
@@ -151,10 +157,10 @@ class DataConnection:
         Args:
             response: The answer.
             kind: Type of the reply; `bytes` returns the body as it is.
-            digest: The object that a `StoredReply` must be about; empty for any.
+            digest: The sha256 that a `StoredReply` must name; empty for any.
 
         Raises:
-            ConnectError: The body is no such reply, so another program answered.
+            ConnectError: The body is not a reply of this type about this object, so another program answered.
         """
         if kind is bytes:
             return response[2]  # type: ignore[return-value]
@@ -174,7 +180,10 @@ class DataConnection:
         )
 
     def _explain_no_answer(self, error: OSError | http.client.HTTPException) -> ConnectError:
-        """Return the typed error of a request without an answer; probe a peer that has never answered."""
+        """Return the typed error of a request that got no answer because of *error*.
+
+        A peer that has never answered, or whose certificate is not trusted, is probed for the cause.
+        """
         address = self._parts.geturl()
         if isinstance(error, ssl.SSLCertVerificationError):
             self.is_wrong_address = True
@@ -200,13 +209,13 @@ class DataConnection:
 def open_connection(
     parts: SplitResult, timeout_s: float, ssl_context: ssl.SSLContext | None = None
 ) -> http.client.HTTPConnection:
-    """Return a connection to the host of *parts*, through the proxy of the environment if it has one.
+    """Open a connection to the host of *parts*, through the HTTP proxy that the environment names, if any.
 
     Raises:
         ConnectError: There is no TCP connection.
         OSError: The TLS handshake failed.
         TunnelRefused: The proxy opens no tunnel, or cannot be reached.
-        UsageError: The environment variable names no HTTP proxy.
+        UsageError: The environment variable for the proxy does not hold the address of an HTTP proxy.
     """
     host, port = parts.hostname or "", port_of(parts)
     connection = http.client.HTTPConnection(host, port, timeout=timeout_s)
@@ -234,7 +243,7 @@ def _answer_of(status: int, headers: http.client.HTTPMessage, content: bytes) ->
 
 
 def _error_of(content: bytes) -> RsePfError | None:
-    """Return the typed error in the body of an answer, None if the data service did not write the body."""
+    """Return the typed error in the body of an answer; None if the data service did not write it."""
     try:
         error = json.loads(content)
         return error_from_code(str(error["code"]), str(error["message"]), hint=str(error.get("hint", "")))

@@ -13,23 +13,23 @@ from rse_pf.errors import LimitExceeded, Unauthorized
 __all__ = ["SmallObjectStore"]
 
 REQUEST_TIMEOUT_S = 5.0
-"""How long one request to the data service may wait for data, in seconds; the caller repeats what failed."""
+"""How long one request may wait for the next bytes of its answer, in seconds."""
 
 
 class SmallObjectStore:
-    """Store objects of one robot, one at a time."""
+    """Store objects of one robot at the data service, one at a time."""
 
     def __init__(
         self,
         read_token: Callable[[], Awaitable[str | None]],
         read_access: Callable[[], tuple[str, ssl.SSLContext | None]],
     ) -> None:
-        """Keep how to find and enter the data service; nothing is sent yet.
+        """Store the two functions; nothing is sent yet.
 
         Args:
-            read_token: Returns a valid token, None where the platform needs none.
-            read_access: Returns the WebSocket address of the robot's servers, and what the robot trusts
-                there.
+            read_token: Returns the robot's token, None if the robot has none; `store` needs one.
+            read_access: Returns the present WebSocket address of the robot's servers, at which the data
+                service is, too, and the TLS context for it (None trusts the authorities of the machine).
         """
         self._read_token = read_token
         self._read_access = read_access
@@ -38,12 +38,13 @@ class SmallObjectStore:
         self._lock = asyncio.Lock()
 
     async def store(self, data: bytes) -> str:
-        """Store *data* as an object and return its sha256 once it is durable; a failure is not repeated.
+        """Store *data* as an object and return its sha256 once it is durable; do not repeat a failed request.
 
         Raises:
             ConnectError: There is no answer, or the platform has no data service.
             LimitExceeded: *data* is larger than 256 KiB.
-            StoreFull, QuotaExceeded, Unauthorized, Forbidden: The server refuses the object.
+            Unauthorized: The robot has no token, or the data service refuses it.
+            StoreFull, QuotaExceeded, Forbidden: The data service refuses the object.
         """
         if len(data) > MAX_SINGLE_PUT_BYTES:
             raise LimitExceeded(
