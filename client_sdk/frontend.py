@@ -21,12 +21,11 @@ from client_sdk.stereo.view import StereoView
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Array, Camera, body_poses
 from rse_pf.images import load_opencv
-from rse_pf.maps.descriptors import ORB, DescriptorKind, Descriptors
 from rse_pf.native import core_function
 from rse_pf.pnp import DepthNoise
 from rse_pf.slam.descriptors import measure_distinctiveness
 from rse_pf.slam.orb import DescribedKeypoints, describe_orb, select_spread_rows
-from rse_pf.slam.tracking import ImageFeatures
+from rse_pf.slam.tracking import Features
 
 __all__ = [
     "Correspondences",
@@ -39,6 +38,7 @@ __all__ = [
     "describe",
     "extract",
     "load_opencv",
+    "make_features",
     "points_at",
 ]
 
@@ -207,57 +207,6 @@ class FrontEndOptions:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Features:
-    """Features of one frame with their 3-D points, by ORB or by a user's feature extractor.
-
-    Attributes:
-        pixels: ``(n, 2)``, column and row.
-        descriptors: ``(n, d)`` of one *kind*.
-        points_camera: ``(n, 3)`` metres in the camera's frame, NaN where the depth is missing or unreliable.
-        orientations: ``(n, 2)``, cosine and sine of each feature's angle in the image.
-        sizes: ``(n,)``, scale of each feature, 1 for the finest pyramid level.
-        kind: Name, type and length of the descriptors.
-        is_oriented: Whether *orientations* were measured; otherwise they are meaningless.
-        is_scaled: Whether *sizes* were measured; otherwise they are meaningless.
-    """
-
-    pixels: Array
-    descriptors: Descriptors
-    points_camera: Array
-    orientations: Array
-    sizes: Array
-    kind: DescriptorKind = ORB
-    is_oriented: bool = True
-    is_scaled: bool = True
-
-    @classmethod
-    def from_keypoints(cls, described: DescribedKeypoints, points_camera: Array) -> Features:
-        """Return described keypoints as features with the ``(n, 3)`` points *points_camera*."""
-        return cls(
-            pixels=described.pixels,
-            descriptors=described.descriptors,
-            points_camera=points_camera,
-            orientations=described.orientations,
-            sizes=described.sizes,
-            kind=described.kind,
-            is_oriented=described.is_oriented,
-            is_scaled=described.is_scaled,
-        )
-
-    def for_matching(self) -> ImageFeatures:
-        """Return the features as the matchers need them, with the distinctiveness of each descriptor."""
-        return ImageFeatures(
-            pixels=self.pixels,
-            descriptors=self.descriptors,
-            orientations=self.orientations,
-            sizes=self.sizes,
-            distinctiveness=measure_distinctiveness(self.descriptors, self.pixels),
-            is_oriented=self.is_oriented,
-            is_scaled=self.is_scaled,
-        )
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Correspondences:
     """Correspondences between 3-D points and pixels of one view, as they are sent.
 
@@ -290,7 +239,22 @@ def extract(frame: Frame, options: FrontEndOptions, plugin: FeaturesPlugin | Non
         UsageError: The user's function failed, or returned values that cannot be features.
     """
     described = describe(frame.rgb, options.features, is_spread=options.is_spread, plugin=plugin)
-    return Features.from_keypoints(described, points_at(frame, described.pixels, options))
+    return make_features(described, points_at(frame, described.pixels, options))
+
+
+def make_features(described: DescribedKeypoints, points_camera: Array) -> Features:
+    """Return described keypoints as features with the ``(n, 3)`` points *points_camera*, metres or NaN."""
+    return Features(
+        pixels=described.pixels,
+        descriptors=described.descriptors,
+        points_camera=points_camera,
+        orientations=described.orientations,
+        sizes=described.sizes,
+        distinctiveness=measure_distinctiveness(described.descriptors, described.pixels),
+        kind=described.kind,
+        is_oriented=described.is_oriented,
+        is_scaled=described.is_scaled,
+    )
 
 
 def describe(

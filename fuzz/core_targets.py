@@ -24,8 +24,8 @@ from rse_pf.pnp.problems import KINECT
 from rse_pf.slam.descriptors import match_orb, measure_distinctiveness
 from rse_pf.slam.orb import Keypoints, describe_keypoints, detect_keypoints
 from rse_pf.slam.tracking import (
+    Features,
     GuidedMatchLimits,
-    ImageFeatures,
     Observations,
     PredictedFeatures,
     fit_pose,
@@ -333,7 +333,11 @@ def track(data: bytes, meter: Meter) -> None:
     )
     names = ("pixels", "orientations", "sizes", "descriptors")
     sought_features = PredictedFeatures(**dict(zip(names, sought, strict=True)))
-    image_features = ImageFeatures(**dict(zip(names, image, strict=True)), distinctiveness=distinct)
+    image_features = Features(
+        **dict(zip(names, image, strict=True)),
+        points_camera=np.full((len(image[0]), 3), np.nan),
+        distinctiveness=distinct,
+    )
     found = meter.call(
         lambda _: match_predictions(sought_features, image_features, limits), data, ProtocolError
     )

@@ -44,7 +44,7 @@ CORRECTION_P99_MS, POSES_RATIO = 1000.0, 1.3
 _FEATURES = "RSE_PF_BENCHMARK_FEATURES"
 _ABOUT = "about.json"
 _OPTIONS = FrontEndOptions().sent_with("zlib")
-_ARRAYS = ("pixels", "descriptors", "points_camera", "orientations", "sizes")
+_ARRAYS = ("pixels", "descriptors", "points_camera", "orientations", "sizes", "distinctiveness")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

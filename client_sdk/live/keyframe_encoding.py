@@ -84,7 +84,7 @@ def encode_monocular_keyframe(
         max_orb_features: Limit of the number of ORB features; descriptors of more bytes have a lower limit.
         imu: Gravity, and motion since the previous keyframe; None where they are not known.
     """
-    limit = _feature_limit(max_orb_features, adjusted.kind)
+    limit = _feature_limit(max_orb_features, adjusted.features.kind)
     rows = np.argsort(np.isnan(adjusted.depths), kind="stable")[:limit]
     keyframe = SentKeyframe(
         timestamp_s=adjusted.timestamp_s,
@@ -94,7 +94,7 @@ def encode_monocular_keyframe(
             adjusted.features.pixels[rows],
             adjusted.depths[rows],
             adjusted.features.descriptors[rows],
-            adjusted.kind,
+            adjusted.features.kind,
         ),
         imu=imu,
     )

@@ -25,8 +25,8 @@ from rse_pf.maps.descriptors import Descriptors
 from rse_pf.pnp import DepthNoise
 from rse_pf.slam.descriptors import match_all
 from rse_pf.slam.tracking import (
+    Features,
     GuidedMatchLimits,
-    ImageFeatures,
     LandmarkAppearance,
     Observations,
     match_landmarks,
@@ -56,8 +56,7 @@ class View:
     """One image with depth, as it is matched and kept in a map.
 
     Attributes:
-        features: Features of the image, ``n`` of them.
-        points_camera: ``(n, 3)`` metres in the camera's frame, NaN without depth.
+        features: Features of the image with their points, ``n`` of them.
         shutter_displacements: ``(n, 3)``, how far each point moves in the camera's frame for each second that
             the camera's rolling-shutter readout takes longer.
         camera: Intrinsics.
@@ -66,8 +65,7 @@ class View:
         timestamp_s: Time of the frame, in seconds.
     """
 
-    features: ImageFeatures
-    points_camera: Array
+    features: Features
     shutter_displacements: Array
     camera: Camera
     place_vector: LazyPlaceVector
@@ -135,7 +133,7 @@ def measure_points(
     Returns:
         ``(n, 3)`` metres in the world, and ``(n, 3, 3)`` square metres, world axes.
     """
-    points, camera = view.points_camera[rows], view.camera
+    points, camera = view.features.points_camera[rows], view.camera
     z = points[:, 2]
     rays = points / z[:, None]
     depth_variance = noise.variance_m2(z if expected_m is None else depths_for_noise(z, expected_m))
@@ -159,7 +157,7 @@ def observe_landmarks(view: View, matches: Matches, T_world_camera: Array, noise
             between the measured depth and the one that this pose predicts.
         noise: Noise model of the depths.
     """
-    depths_m = np.nan_to_num(view.points_camera[matches.features, 2], posinf=0.0, neginf=0.0)
+    depths_m = np.nan_to_num(view.features.points_camera[matches.features, 2], posinf=0.0, neginf=0.0)
     noise_depths_m = depths_m
     if view.is_stereo:
         expected_m = transform(inverse(T_world_camera), matches.points)[:, 2]
@@ -235,7 +233,7 @@ class KeyframeMap:
             landmarks = self._thin_out(landmarks)
         landmarks = landmarks.copy()
         known = np.flatnonzero(landmarks != NO_LANDMARK)
-        new = np.flatnonzero((landmarks == NO_LANDMARK) & np.isfinite(view.points_camera[:, 2]))
+        new = np.flatnonzero((landmarks == NO_LANDMARK) & np.isfinite(view.features.points_camera[:, 2]))
         numbers = self._count + np.arange(len(new))
         landmarks[new] = numbers
         self._reserve(self._count + len(new))
@@ -346,7 +344,7 @@ class KeyframeMap:
             noise: Noise model of the depths.
         """
         view, T_world_camera, landmarks = posed.view, posed.T_world_camera, posed.landmarks
-        rows = np.flatnonzero((landmarks != NO_LANDMARK) | np.isfinite(view.points_camera[:, 2]))
+        rows = np.flatnonzero((landmarks != NO_LANDMARK) | np.isfinite(view.features.points_camera[:, 2]))
         numbers = landmarks[rows]
         new = np.flatnonzero(numbers == NO_LANDMARK)
         points, covariances = self._table.points[numbers], self._table.covariances[numbers]
@@ -375,7 +373,7 @@ class KeyframeMap:
             landmarks: ``(n,)``, landmark of each feature, or NO_LANDMARK.
             noise: Noise model of the depths.
         """
-        rows = np.flatnonzero((landmarks != NO_LANDMARK) & np.isfinite(view.points_camera[:, 2]))
+        rows = np.flatnonzero((landmarks != NO_LANDMARK) & np.isfinite(view.features.points_camera[:, 2]))
         if not len(rows):
             return
         numbers, table = landmarks[rows], self._table
@@ -432,9 +430,12 @@ class KeyframeMap:
         table.shutter_displacements[:] = np.einsum("nij,nj->ni", rotation, table.shutter_displacements)
         self._poses = T_world_camera.copy()
         # 3. Add the offset to the disparities of the points that the keyframes measured.
+        points_cameras = [
+            with_offset(view.features.points_camera, f_baseline, offset_px) for view in self._views
+        ]
         self._views = [
-            replace(view, points_camera=with_offset(view.points_camera, f_baseline, offset_px))
-            for view in self._views
+            replace(view, features=replace(view.features, points_camera=points_camera))
+            for view, points_camera in zip(self._views, points_cameras, strict=True)
         ]
 
     def append(self, other: KeyframeMap) -> int:

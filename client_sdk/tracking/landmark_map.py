@@ -21,7 +21,7 @@ from client_sdk.tracking.landmark_matching import (
 )
 from rse_pf.geometry import Array, Camera, exp_se3, inverse, log_se3, scaled, transform
 from rse_pf.maps.descriptors import Descriptors
-from rse_pf.slam.tracking import GuidedMatchLimits, ImageFeatures
+from rse_pf.slam.tracking import Features, GuidedMatchLimits
 from rse_pf.slam.triangulation import parallax_deg, reprojection_errors, triangulate
 
 __all__ = ["MIN_SHARED_LANDMARKS", "LandmarkLimits", "LandmarkMap", "MonocularKeyframe", "MonocularView"]
@@ -97,7 +97,7 @@ class MonocularView:
         place_vector: Vector by which the place of the image is recognised.
     """
 
-    features: ImageFeatures
+    features: Features
     colours: npt.NDArray[np.uint8]
     place_vector: LazyPlaceVector
 

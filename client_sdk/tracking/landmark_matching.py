@@ -19,7 +19,7 @@ from rse_pf.geometry import Array, Camera
 from rse_pf.maps.descriptors import Descriptors
 from rse_pf.slam.descriptors import match_all
 from rse_pf.slam.place_recognition import PlaceVector, place_vector
-from rse_pf.slam.tracking import GuidedMatchLimits, ImageFeatures, LandmarkAppearance, match_landmarks
+from rse_pf.slam.tracking import Features, GuidedMatchLimits, LandmarkAppearance, match_landmarks
 
 __all__ = [
     "LATEST_KEYFRAMES",
@@ -106,7 +106,7 @@ class Landmarks:
         self,
         T_camera_world: Array,
         camera: Camera,
-        image: ImageFeatures,
+        image: Features,
         limits: GuidedMatchLimits,
         margin_px: float,
     ) -> Matches:
@@ -241,7 +241,7 @@ def list_other_segments(
 
 
 def match_candidates(
-    maps: Mapping[int, RecognisableMap], keyframes: Iterable[tuple[int, int]], image: ImageFeatures
+    maps: Mapping[int, RecognisableMap], keyframes: Iterable[tuple[int, int]], image: Features
 ) -> list[Candidate]:
     """Match the landmarks of each keyframe with an image by appearance; return all, most matches first.
 

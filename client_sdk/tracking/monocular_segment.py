@@ -11,9 +11,8 @@ from client_sdk.tracking.landmark_map import LandmarkMap, MonocularView
 from client_sdk.tracking.landmark_matching import NO_LANDMARK, Matches
 from client_sdk.trajectory import Trajectory
 from rse_pf.geometry import Array, inverse, pose_difference, rigid, scaled, transform
-from rse_pf.maps.descriptors import DescriptorKind
 from rse_pf.slam.descriptors import match_all
-from rse_pf.slam.tracking import GuidedMatchLimits, ImageFeatures, Observations, fit_pose
+from rse_pf.slam.tracking import Features, GuidedMatchLimits, Observations, fit_pose
 
 __all__ = ["AdjustedKeyframe", "MonocularSegment", "PosedView", "Similarity", "measure_scale"]
 
@@ -44,15 +43,13 @@ class AdjustedKeyframe:
         timestamp_s: Time of the frame, in seconds.
         T_world_camera: ``(4, 4)``, in the unit of the segment.
         features: Features of the image, ``n`` of them.
-        kind: Kind of their descriptors.
         depths: ``(n,)``, depth of each feature along the optical axis in the unit of the segment, NaN for
             features without a landmark.
     """
 
     timestamp_s: float
     T_world_camera: Array
-    features: ImageFeatures
-    kind: DescriptorKind
+    features: Features
     depths: Array
 
 

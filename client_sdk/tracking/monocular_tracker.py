@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from client_sdk.frontend import Features, Frame, PoseQuery, TrackedFrame, describe
+from client_sdk.frontend import Features, Frame, PoseQuery, TrackedFrame, describe, make_features
 from client_sdk.monocular.bundle import adjust
 from client_sdk.monocular.two_view import TwoViewStart, start_from_two_views
 from client_sdk.plugins import Plugins
@@ -47,7 +47,6 @@ from client_sdk.tracking.segment_join import NOT_JOINED, Join
 from client_sdk.trajectory import Trajectory
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Array, inverse, pose_difference, scaled, transform
-from rse_pf.maps.descriptors import ORB
 from rse_pf.slam.descriptors import match_all
 from rse_pf.slam.tracking import GuidedMatchLimits
 
@@ -256,7 +255,6 @@ class MonocularTracker:
             timestamp_s=next(frame.timestamp_s for frame in own.frames if frame.keyframe == number),
             T_world_camera=self._T_world_start @ inverse(keyframe.T_camera_world),
             features=keyframe.view.features,
-            kind=ORB if self._plugins.features is None else self._plugins.features.kind,
             depths=own.map.depths(number),
         )
 
@@ -395,7 +393,7 @@ class MonocularTracker:
         wider = max(1.0, frame.camera.width / _FEATURES_WIDTH_PX)
         count = int(min(max(self.options.features, _MAX_FEATURES), self.options.features * wider))
         described = describe(frame.rgb, count, plugin=self._plugins.features)
-        return Features.from_keypoints(described, np.full((len(described.pixels), 3), np.nan))
+        return make_features(described, np.full((len(described.pixels), 3), np.nan))
 
     def _make_view(self) -> MonocularView:
         """Return the image of the present frame."""
@@ -403,7 +401,7 @@ class MonocularTracker:
         last_pixel = np.array([frame.camera.width - 1, frame.camera.height - 1])
         columns, lines = np.clip(np.rint(features.pixels).astype(np.int64), 0, last_pixel).T
         return MonocularView(
-            features=features.for_matching(),
+            features=features,
             colours=frame.rgb[lines, columns],
             place_vector=make_place_vector(features.descriptors, frame.rgb, self._plugins.loops),
         )

@@ -17,7 +17,7 @@ from client_sdk.tracking.landmark_matching import Matches
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Array, inverse, rigid, transform
 from rse_pf.pnp import DepthNoise
-from rse_pf.slam.tracking import ImageFeatures
+from rse_pf.slam.tracking import Features
 
 __all__ = ["CLEAR_INLIERS", "FrameSteps", "OpenQuery", "QueryAnswer", "make_query", "round_for_wire"]
 
@@ -62,14 +62,13 @@ FrameSteps = Generator[PoseQuery, QueryAnswer, TrackedFrame]
 def make_query(
     frame: Frame,
     matches: Matches,
-    image: ImageFeatures,
+    image: Features,
     *,
     inlier_px: float,
     max_iterations: int,
     max_matches: int,
     against: Literal["map", "frame", "keyframe", "segment"],
     T_world_reference: Array | None = None,
-    depths_m: Array | None = None,
     depth_noise: DepthNoise | None = None,
 ) -> PoseQuery:
     """Make the query for the pose of a frame from its matches.
@@ -77,16 +76,14 @@ def make_query(
     Args:
         frame: The frame whose pose is asked for.
         matches: Landmarks that the frame shows.
-        image: Features of the frame.
+        image: Features of the frame.  A depth that is missing is sent as 0, and so are all depths if a point
+            does not lie before the reference camera.
         inlier_px: Largest reprojection error of an inlier, in pixels.
         max_iterations: Largest number of RANSAC iterations.
         max_matches: Largest number of matches that are sent; an even sample is taken of more.
         against: The source of the landmarks, see `PoseQuery`.
         T_world_reference: ``(4, 4)``, pose of the reference camera, in whose frame points are sent; None
             sends them in the frame of the map.
-        depths_m: ``(n,)``, depths of the features of *image*, NaN where there is none; None for no depths.  A
-            depth that is missing is sent as 0, and so are all depths if a point does not lie before the
-            reference camera.
         depth_noise: Noise model of the depths; None for a Kinect's.
     """
     rows = np.arange(len(matches))
@@ -100,8 +97,9 @@ def make_query(
     points, pixels = round_for_wire(points, image.pixels[features])
     sent_depths_m = np.zeros(len(points))
     # The solver compares depths with those of the reference camera: all points must lie before it.
-    if depths_m is not None and not (len(points) and points[:, 2].min() <= _MIN_REFERENCE_DEPTH_M):
-        sent_depths_m = np.nan_to_num(depths_m[features], posinf=0.0, neginf=0.0).round(3)
+    if not (len(points) and points[:, 2].min() <= _MIN_REFERENCE_DEPTH_M):
+        depths_m = image.points_camera[features, 2]
+        sent_depths_m = np.nan_to_num(depths_m, posinf=0.0, neginf=0.0).round(3)
     return PoseQuery(
         timestamp_s=frame.timestamp_s,
         correspondences=Correspondences(points_world=points, pixels=pixels, depths_m=sent_depths_m),

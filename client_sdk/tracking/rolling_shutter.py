@@ -13,11 +13,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from client_sdk.frontend import Features
 from client_sdk.tracking.keyframe_map import View
 from client_sdk.tracking.landmark_matching import Matches
 from rse_pf.geometry import Array, Camera, log_se3, skew
-from rse_pf.slam.tracking import FittedPose, Observations, fit_readout_change
+from rse_pf.slam.tracking import Features, FittedPose, Observations, fit_readout_change
 
 __all__ = [
     "ReadoutEstimate",
@@ -85,22 +84,17 @@ def shutter_displacements(features: Features, points_camera: Array, camera: Came
     return displacements
 
 
-def correct_view(view: View, features: Features, readout_s: float, rate: Array) -> View:
+def correct_view(view: View, readout_s: float, rate: Array) -> View:
     """Return an image with pixels, points and displacements of its features computed without rolling shutter.
 
     Args:
-        view: The image; if its features were corrected before, that correction is replaced.
-        features: Features as the image shows them.
+        view: The image, whose features have not been corrected yet.
         readout_s: Readout time of the camera, in seconds.
         rate: ``(3,)`` rad/s, rotation rate of the camera in its own frame.
     """
-    corrected = undo_rolling_shutter(features, view.camera, readout_s * rate)
-    return replace(
-        view,
-        features=replace(view.features, pixels=corrected.pixels),
-        points_camera=corrected.points_camera,
-        shutter_displacements=shutter_displacements(features, corrected.points_camera, view.camera, rate),
-    )
+    corrected = undo_rolling_shutter(view.features, view.camera, readout_s * rate)
+    displacements = shutter_displacements(view.features, corrected.points_camera, view.camera, rate)
+    return replace(view, features=corrected, shutter_displacements=displacements)
 
 
 def rotation_rate(

@@ -318,7 +318,7 @@ def landmark_keyframes(tracker: MonocularTracker, camera: Camera, robot: str) ->
             pixels=adjusted.features.pixels.astype(np.float32),
             descriptors=adjusted.features.descriptors,
             points_camera=camera.back_project(adjusted.features.pixels, adjusted.depths).astype(np.float32),
-            kind=adjusted.kind,
+            kind=adjusted.features.kind,
         )
         for adjusted in tracker.keyframes_of(min(tracker.segments, default=0))
     ]

@@ -159,7 +159,7 @@ def _collect_observations(segment_map: KeyframeMap) -> tuple[int, DriveObservati
     views = [segment_map.view(k) for k in range(segment_map.keyframe_count)]
     seen = np.concatenate([segment_map.landmarks_of_features(k) for k in range(len(views))])
     keyframes = np.repeat(np.arange(len(views)), [len(view.features) for view in views])
-    depths_m = np.concatenate([view.points_camera[:, 2] for view in views])
+    depths_m = np.concatenate([view.features.points_camera[:, 2] for view in views])
     # 2. Choose the landmarks that two or more keyframes see: those seen most often, then the nearest.
     total = segment_map.landmark_count
     observation_counts = np.bincount(seen[seen != NO_LANDMARK], minlength=total)

@@ -8,8 +8,9 @@ pose (elsewhere, by a query), verify it, decide what becomes of the frame, and k
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Generator
+from collections.abc import Generator, Iterator
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from typing import Literal
 
 import numpy as np
@@ -113,9 +114,8 @@ class _TrackState:
         rotation_rate: ``(3,)`` rad/s in the camera's frame, mean rate between the last two frames; zeros if
             it is not known.
         last: The last frame with its pose; None after a loss and after `Tracker.adjust_pairs`.
-        features: Features of the frame *last*, without rolling shutter; not to be used while *last* is None.
-        first: Features (with rolling shutter) and image of a segment's first frame, until the second frame
-            tells at which rate the camera rotated; None afterwards.
+        first: A segment's first image (with rolling shutter), until the second frame tells at which rate the
+            camera rotated; None afterwards.
         keyframe_inliers: Number of landmarks that agreed with the pose of the newest keyframe; for the first
             keyframe of a segment, half the number of its features with depth.
         lost_in_a_row: Number of frames without a pose since the last accepted one.
@@ -131,13 +131,33 @@ class _TrackState:
     T_last_next: Array = field(default_factory=lambda: np.eye(4))
     rotation_rate: Array = field(default_factory=lambda: np.zeros(3))
     last: PosedView | None = None
-    features: Features | None = None
-    first: tuple[Features, View] | None = None
+    first: View | None = None
     keyframe_inliers: int = 0
     lost_in_a_row: int = 0
     unrecognised: int = 0
     segment: int = -1
     join_candidate: tuple[int, Array] | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Attempt:
+    """Matches of a frame by which its pose is to be solved.
+
+    Attributes:
+        matches: The matches.
+        segment: Number of the segment whose landmarks are matched.
+        T_world_reference: ``(4, 4)``, pose of the query's reference camera in the world of that segment.
+        against: The source of the landmarks, see `PoseQuery`.
+        min_matches: Fewest matches for which the pose is queried.
+        min_ratio: Smallest share of inliers among the sent matches; ``min_inliers`` are needed, too.
+    """
+
+    matches: Matches
+    segment: int
+    T_world_reference: Array
+    against: Literal["map", "frame", "keyframe", "segment"]
+    min_matches: int
+    min_ratio: float
 
 
 class Tracker:
@@ -197,9 +217,8 @@ class Tracker:
         self._adjusted_frames = 0
         self._pending_readout_s = 0.0
         self._frame: Frame  # the frame that is tracked, set by `prepare`
-        self._raw: Features  # its features, with rolling shutter
+        self._raw: View  # its image with rolling shutter
         self._interval_s: float  # seconds since the last accepted pose
-        self._raw_view: View  # the frame as it is matched, with rolling shutter
         self._open = OpenQuery()
 
     @property
@@ -208,7 +227,7 @@ class Tracker:
 
         None if that frame has no pose, and after `adjust_pairs`.
         """
-        return self._state.features if self._state.last is not None else None
+        return None if self._state.last is None else self._state.last.view.features
 
     @property
     def segment(self) -> int:
@@ -298,23 +317,11 @@ class Tracker:
         self._open.refuse_open()
         self.frames += 1
         self._interval_s = max(_MIN_INTERVAL_S, frame.timestamp_s - self._state.timestamp_s)
-        self._frame, self._raw = frame, extract(frame, self.options, self._plugins.features)
-        if self.disparity_offset_px and frame.stereo is not None:
-            f_baseline = frame.camera.fx * frame.stereo.baseline_m
-            points_camera = with_offset(self._raw.points_camera, f_baseline, self.disparity_offset_px)
-            self._raw = replace(self._raw, points_camera=points_camera)
+        self._frame = frame
+        self._raw = self._extract(frame)
         self.noise.model = frame.depth_noise
-        self._raw_view = View(
-            features=self._raw.for_matching(),
-            points_camera=self._raw.points_camera,
-            shutter_displacements=np.zeros_like(self._raw.points_camera),
-            camera=frame.camera,
-            place_vector=make_place_vector(self._raw.descriptors, frame.rgb, self._plugins.loops),
-            is_stereo=frame.stereo is not None,
-            timestamp_s=frame.timestamp_s,
-        )
         # The rolling shutter is undone at the last rotation rate, until the pose of this frame is known.
-        view = correct_view(self._raw_view, self._raw, self.readout.readout_s, self._state.rotation_rate)
+        view = correct_view(self._raw, self.readout.readout_s, self._state.rotation_rate)
         return self._open.begin(self._track(view))
 
     def accept(
@@ -341,13 +348,8 @@ class Tracker:
         """Yield the queries of the present frame, whose image is *view*, and return its result."""
         if not self._segments:
             return self._begin_or_lose(view, match_count=0)
-        # 1. Track the frame from the last pose; if that fails, relocalise it at all known places.
-        posed, match_count = None, 0
-        if self._state.last is not None:
-            posed, match_count = yield from self._track_from_last_pose(view)
-        if posed is None:
-            posed, candidate_matches = yield from self._relocalise(view)
-            match_count = max(match_count, candidate_matches)
+        # 1. Predict, match, solve and verify: around the last pose, then at all known places.
+        posed, match_count = yield from self._pose(view)
         # 2. Decide: without a pose, the frame is lost or begins a segment.
         if posed is None:
             return self._begin_or_lose(view, match_count)
@@ -357,75 +359,25 @@ class Tracker:
             yield from self._find_join(posed)
         return self._make_result(posed, is_keyframe=is_keyframe)
 
+    # --- Extract ---
+
+    def _extract(self, frame: Frame) -> View:
+        """Return the image of a frame with its rolling shutter."""
+        features = extract(frame, self.options, self._plugins.features)
+        if self.disparity_offset_px and frame.stereo is not None:
+            f_baseline = frame.camera.fx * frame.stereo.baseline_m
+            points_camera = with_offset(features.points_camera, f_baseline, self.disparity_offset_px)
+            features = replace(features, points_camera=points_camera)
+        return View(
+            features=features,
+            shutter_displacements=np.zeros_like(features.points_camera),
+            camera=frame.camera,
+            place_vector=make_place_vector(features.descriptors, frame.rgb, self._plugins.loops),
+            is_stereo=frame.stereo is not None,
+            timestamp_s=frame.timestamp_s,
+        )
+
     # --- Predict and match ---
-
-    def _track_from_last_pose(
-        self, view: View
-    ) -> Generator[PoseQuery, QueryAnswer, tuple[PosedView | None, int]]:
-        """Ask for the pose of a frame around the camera's last pose.
-
-        Returned are the image with its verified pose, None if no attempt gives one, and the largest number of
-        matches of an attempt.
-        """
-        # 1. Predict the pose.
-        noise, min_inliers, max_count = self.noise.noise, self.options.min_inliers, 0
-        T_predicted, T_last = self._predict_pose(), self._state.T_world_camera
-        # 2. Match near the predicted pixels, then with the last frame by appearance, then widely around the
-        #    last pose.  An attempt holds the matching function, the reference pose, the source of the
-        #    landmarks, the fewest matches of a query, and the smallest inlier ratio of its answer.
-        guided = GuidedMatchLimits(radius_px=self.options.search_px, lowe_ratio=_GUIDED_LOWE_RATIO)
-        wide = GuidedMatchLimits(radius_px=_WIDE_RADIUS_PX, lowe_ratio=_GUIDED_LOWE_RATIO)
-        attempts: list[tuple[Callable[[], Matches], Array, Literal["map", "frame"], int, float]] = [
-            (
-                lambda: self._map.match(view, T_predicted, guided, self._last, noise),
-                T_predicted,
-                "map",
-                _GUIDED_MATCHES_FACTOR * min_inliers,
-                _GUIDED_RATIO,
-            ),
-            (
-                lambda: self._map.match_last_frame(view, self._last, noise),
-                T_last,
-                "frame",
-                min_inliers,
-                _LAST_FRAME_RATIO,
-            ),
-        ]
-        if view.is_stereo:
-            attempts.append(
-                (
-                    lambda: self._map.match(view, T_last, wide, self._last, noise),
-                    T_last,
-                    "map",
-                    min_inliers,
-                    _GUIDED_RATIO,
-                )
-            )
-        for match, T_world_reference, against, min_matches, min_ratio in attempts:
-            matches = match()
-            count = len(matches)
-            max_count = max(max_count, count)
-            if count < min_matches:
-                continue
-            # 3. Solve the pose by a query; go on only if enough matches agree and the motion is plausible.
-            T_world_camera, answer = yield from self._solve(
-                view, matches, T_world_reference, against, min_ratio
-            )
-            if T_world_camera is None or not self._is_plausible(T_world_camera):
-                continue
-            # 4. Verify the pose by the landmarks around it.
-            is_continuous = self._is_continuous(T_world_camera)
-            image = view if is_continuous else self._raw_view
-            posed = self._verify(image, T_world_camera, answer, count, self._map, is_continuous=is_continuous)
-            if posed is not None:
-                return posed, max_count
-        return None, max_count
-
-    @property
-    def _last(self) -> PosedView:
-        """The last frame with its pose, of which there must be one."""
-        assert self._state.last is not None
-        return self._state.last
 
     def _predict_pose(self) -> Array:
         """Predict ``T_world_camera`` ``(4, 4)`` of the frame by a user's motion model, if it returns a pose.
@@ -440,54 +392,142 @@ class Tracker:
         T_last_next = self._plugins.predict_motion(state.T_last_next.copy(), state.timestamp_s, now_s)
         return orthonormalise(state.T_world_camera @ T_last_next)
 
-    # --- Recognise known places ---
+    def _match_around_last_pose(self, view: View) -> Iterator[_Attempt]:
+        """Match a frame near the pixels that the motion predicts, with the last frame, and widely.
 
-    def _relocalise(self, view: View) -> Generator[PoseQuery, QueryAnswer, tuple[PosedView | None, int]]:
-        """Ask for the pose of a frame at the keyframes of all segments that may show its place.
+        The wide search around the last pose is for stereo pairs only.  There is no attempt after a loss.
+        """
+        state, noise, min_inliers = self._state, self.noise.noise, self.options.min_inliers
+        if state.last is None:
+            return
+        T_predicted, T_last = self._predict_pose(), state.T_world_camera
+        guided = GuidedMatchLimits(radius_px=self.options.search_px, lowe_ratio=_GUIDED_LOWE_RATIO)
+        yield _Attempt(
+            matches=self._map.match(view, T_predicted, guided, self._state.last, noise),
+            segment=state.segment,
+            T_world_reference=T_predicted,
+            against="map",
+            min_matches=_GUIDED_MATCHES_FACTOR * min_inliers,
+            min_ratio=_GUIDED_RATIO,
+        )
+        # Verifying the attempt before may have replaced the last frame, see `_replace_first_keyframe`.
+        assert self._state.last is not None
+        yield _Attempt(
+            matches=self._map.match_last_frame(view, self._state.last, noise),
+            segment=state.segment,
+            T_world_reference=T_last,
+            against="frame",
+            min_matches=min_inliers,
+            min_ratio=_LAST_FRAME_RATIO,
+        )
+        if view.is_stereo:
+            wide = GuidedMatchLimits(radius_px=_WIDE_RADIUS_PX, lowe_ratio=_GUIDED_LOWE_RATIO)
+            yield _Attempt(
+                matches=self._map.match(view, T_last, wide, self._state.last, noise),
+                segment=state.segment,
+                T_world_reference=T_last,
+                against="map",
+                min_matches=min_inliers,
+                min_ratio=_GUIDED_RATIO,
+            )
+
+    def _match_known_places(self, view: View) -> Iterator[_Attempt]:
+        """Match a frame with the three keyframes of all segments that have the most matches."""
+        keyframes = list_relocalisation_candidates(self._segments, view.place_vector, self._state.segment)
+        candidates = match_candidates(self._segments, keyframes, view.features)
+        for candidate in candidates[:_MAX_RELOCALISATION_QUERIES]:
+            yield _Attempt(
+                matches=candidate.matches,
+                segment=candidate.segment,
+                T_world_reference=self._segments[candidate.segment].pose(candidate.keyframe),
+                against="keyframe",
+                min_matches=self.options.min_inliers,
+                min_ratio=0.0,
+            )
+
+    # --- Solve ---
+
+    def _pose(self, view: View) -> Generator[PoseQuery, QueryAnswer, tuple[PosedView | None, int]]:
+        """Ask for the pose of a frame by one attempt after the other, until one gives a verified pose.
 
         If the pose is found in another segment, that one becomes the present segment.  Returned are the image
-        with its verified pose, None if no keyframe gives one, and the number of matches with the best
-        keyframe.
+        with its verified pose, None if no attempt gives one, and the largest number of matches of an attempt.
         """
-        segment = self._state.segment
-        keyframes = list_relocalisation_candidates(self._segments, view.place_vector, segment)
-        candidates = match_candidates(self._segments, keyframes, view.features)
-        max_count = len(candidates[0].matches) if candidates else 0
-        for candidate in candidates[:_MAX_RELOCALISATION_QUERIES]:
-            count = len(candidate.matches)
-            if count < self.options.min_inliers:
-                break
-            # 1. Solve the pose by a query with the landmarks of the keyframe.
-            segment_map = self._segments[candidate.segment]
-            T_world_reference = segment_map.pose(candidate.keyframe)
-            T_world_camera, answer = yield from self._solve(
-                view, candidate.matches, T_world_reference, "keyframe"
-            )
+        max_count = 0
+        for attempt in chain(self._match_around_last_pose(view), self._match_known_places(view)):
+            count = len(attempt.matches)
+            max_count = max(max_count, count)
+            if count < attempt.min_matches:
+                continue
+            # 1. Solve the pose by a query.
+            T_world_camera, answer = yield from self._solve(view, attempt)
             if T_world_camera is None:
                 continue
-            # 2. Far from the last pose, only a clear answer is accepted: perceptual aliases exist.
-            is_near = candidate.segment == segment and self._is_plausible(T_world_camera)
-            if not (answer.is_clear(count) or (is_near and answer.inliers >= _NEARBY_RATIO * count)):
+            # 2. Far from the last pose, only a clear answer by a known place is accepted: perceptual aliases,
+            #    places that look alike, exist.
+            is_recognised = attempt.against == "keyframe"
+            is_near = attempt.segment == self._state.segment and self._is_plausible(T_world_camera)
+            is_accepted = is_near
+            if is_recognised:
+                has_support = is_near and answer.inliers >= _NEARBY_RATIO * count
+                is_accepted = has_support or answer.is_clear(count)
+            if not is_accepted:
                 continue
-            # 3. Verify the pose by the landmarks around it, and by the appearance of the image.
+            # 3. Verify the pose by the landmarks around it, and at a known place by the appearance.
             is_continuous = is_near and self._is_continuous(T_world_camera)
-            image = view if is_continuous else self._raw_view
             posed = self._verify(
-                image,
+                view if is_continuous else self._raw,
                 T_world_camera,
                 answer,
                 count,
-                segment_map,
+                self._segments[attempt.segment],
                 is_continuous=is_continuous,
-                is_recognised=True,
+                is_recognised=is_recognised,
             )
-            if posed is not None:
-                if candidate.segment != segment:
-                    self._state = replace(
-                        self._state, segment=candidate.segment, last=None, join_candidate=None
-                    )
-                return posed, max_count
+            if posed is None:
+                continue
+            if attempt.segment != self._state.segment:
+                self._state = replace(self._state, segment=attempt.segment, last=None, join_candidate=None)
+            return posed, max_count
         return None, max_count
+
+    def _solve(
+        self, view: View, attempt: _Attempt
+    ) -> Generator[PoseQuery, QueryAnswer, tuple[Array | None, QueryAnswer]]:
+        """Ask for the pose of an image by the matches of an attempt, of which the query may send only a part.
+
+        Returned are ``T_world_camera`` ``(4, 4)`` in the world of the attempt's segment, None without a rigid
+        pose and enough inliers, and the answer.
+        """
+        answer = yield make_query(
+            self._frame,
+            attempt.matches,
+            view.features,
+            inlier_px=self.options.inlier_px,
+            max_iterations=self.options.max_iterations,
+            max_matches=self._max_matches,
+            against=attempt.against,
+            T_world_reference=attempt.T_world_reference,
+            depth_noise=None if self._frame.stereo is None else self.noise.noise,
+        )
+        sent = min(len(attempt.matches), self._max_matches)
+        T_camera_reference = answer.accepted_pose(max(self.options.min_inliers, attempt.min_ratio * sent))
+        if T_camera_reference is None:
+            return None, answer
+        return attempt.T_world_reference @ inverse(T_camera_reference), answer
+
+    @property
+    def _map(self) -> KeyframeMap:
+        """The map of the present segment."""
+        return self._segments[self._state.segment]
+
+    @property
+    def _max_matches(self) -> int:
+        """Largest number of matches that a query sends; fewer for a stereo pair."""
+        most = self.options.max_matches
+        return most if self._frame.stereo is None else min(most, _MAX_STEREO_MATCHES)
+
+    # --- Join segments ---
 
     def _find_join(self, posed: PosedView) -> Generator[PoseQuery, QueryAnswer, None]:
         """Ask for the place of a tracked frame in other segments; join two once two measurements agree.
@@ -501,10 +541,15 @@ class Tracker:
         count, segment_map = len(best.matches), self._segments[best.segment]
         if count < CLEAR_INLIERS:
             return
-        T_other_reference = segment_map.pose(best.keyframe)
-        T_other_camera, answer = yield from self._solve(
-            posed.view, best.matches, T_other_reference, "segment"
+        attempt = _Attempt(
+            matches=best.matches,
+            segment=best.segment,
+            T_world_reference=segment_map.pose(best.keyframe),
+            against="segment",
+            min_matches=CLEAR_INLIERS,
+            min_ratio=0.0,
         )
+        T_other_camera, answer = yield from self._solve(posed.view, attempt)
         if T_other_camera is None or not answer.is_clear(min(count, self._max_matches)):
             return
         there = self._verify(posed.view, T_other_camera, answer, count, segment_map, is_recognised=True)
@@ -555,55 +600,6 @@ class Tracker:
         self._state = replace(self._state, T_world_camera=T_world_camera, last=last, join_candidate=None)
         self._plugins.forget_poses()
 
-    # --- Solve ---
-
-    @property
-    def _map(self) -> KeyframeMap:
-        """The map of the present segment."""
-        return self._segments[self._state.segment]
-
-    @property
-    def _max_matches(self) -> int:
-        """Largest number of matches that a query sends; fewer for a stereo pair."""
-        most = self.options.max_matches
-        return most if self._frame.stereo is None else min(most, _MAX_STEREO_MATCHES)
-
-    def _solve(
-        self,
-        view: View,
-        matches: Matches,
-        T_world_reference: Array,
-        against: Literal["map", "frame", "keyframe", "segment"],
-        min_ratio: float = 0.0,
-    ) -> Generator[PoseQuery, QueryAnswer, tuple[Array | None, QueryAnswer]]:
-        """Ask for the pose of an image by its matches.
-
-        Returned are ``T_world_camera`` ``(4, 4)``, None without a rigid pose and enough inliers, and the
-        answer.
-
-        Args:
-            view: The image.
-            matches: Its matches, of which the query may send only a part.
-            T_world_reference: ``(4, 4)``, pose of the query's reference camera.
-            against: The source of the landmarks, see `PoseQuery`.
-            min_ratio: Smallest share of inliers among the sent matches; ``min_inliers`` are needed, too.
-        """
-        answer = yield make_query(
-            self._frame,
-            matches,
-            view.features,
-            inlier_px=self.options.inlier_px,
-            max_iterations=self.options.max_iterations,
-            max_matches=self._max_matches,
-            against=against,
-            T_world_reference=T_world_reference,
-            depths_m=view.points_camera[:, 2],
-            depth_noise=None if self._frame.stereo is None else self.noise.noise,
-        )
-        sent = min(len(matches), self._max_matches)
-        T_camera_reference = answer.accepted_pose(max(self.options.min_inliers, min_ratio * sent))
-        return None if T_camera_reference is None else T_world_reference @ inverse(T_camera_reference), answer
-
     # --- Verify ---
 
     def _is_plausible(self, T_world_camera: Array) -> bool:
@@ -612,7 +608,7 @@ class Tracker:
         The limit grows with the number of frames that were lost in a row.
         """
         jump_m = self.options.max_jump_m
-        depths_m = self._raw.points_camera[:, 2]
+        depths_m = self._raw.features.points_camera[:, 2]
         if self._frame.stereo is not None and np.isfinite(depths_m).any():
             median_m = float(np.median(depths_m[np.isfinite(depths_m)]))
             jump_m = max(jump_m, _STEREO_JUMP_SHARE * median_m)
@@ -658,41 +654,36 @@ class Tracker:
             is_recognised: Whether the place was recognised; then the image must also look as the landmarks
                 predict.  A user's features cannot be computed at given pixels: they are not compared.
         """
+        state, min_inliers, noise = self._state, self.options.min_inliers, self.noise.noise
         # 1. Match the landmarks around the pose; the last frame is left out in the map of another segment.
-        state, min_inliers, T_camera_world = self._state, self.options.min_inliers, inverse(T_world_camera)
         limits = GuidedMatchLimits(radius_px=_VERIFY_RADIUS_PX, lowe_ratio=_VERIFY_LOWE_RATIO)
         last = state.last if segment_map is self._map else None
-        noise, rate, fitted = self.noise.noise, np.zeros(3), None
         matches = segment_map.match(view, T_world_camera, limits, last, noise, _ENOUGH_MAP_MATCHES)
         if len(matches) < min_inliers:
             return None
-        for _ in range(2 if is_continuous else 1):
-            # 3. Undo the rolling shutter at the rate of the fitted pose, and fit again.
-            if fitted is not None:
-                T_camera_world, T_world_camera = fitted.T_camera_world, inverse(fitted.T_camera_world)
-                rate = rotation_rate(
-                    state.T_world_camera, T_world_camera, self._interval_s, state.rotation_rate
+        # 2. Fit the pose to the matched landmarks.
+        observed = observe_landmarks(view, matches, T_world_camera, noise)
+        fitted = fit_pose(observed, view.camera, inverse(T_world_camera))
+        # 3. Undo the rolling shutter at the rotation rate of the fitted pose, first in the segment's first
+        #    image, which has no rate of its own; then fit again.
+        rate = np.zeros(3)
+        if fitted is not None and is_continuous:
+            T_world_camera = inverse(fitted.T_camera_world)
+            rate = rotation_rate(state.T_world_camera, T_world_camera, self._interval_s, state.rotation_rate)
+            if state.first is not None and int(fitted.is_inlier.sum()) >= CLEAR_INLIERS:
+                self._replace_first_keyframe(correct_view(state.first, self.readout.readout_s, rate))
+                return self._verify(
+                    view,
+                    T_world_camera,
+                    answer,
+                    match_count,
+                    self._map,
+                    is_continuous=True,
+                    is_recognised=is_recognised,
                 )
-                first = state.first if int(fitted.is_inlier.sum()) >= CLEAR_INLIERS else None
-                raw, image = (self._raw, view) if first is None else first
-                image = correct_view(image, raw, self.readout.readout_s, rate)
-                if first is not None:
-                    self._replace_first_keyframe(image)
-                    return self._verify(
-                        view,
-                        T_world_camera,
-                        answer,
-                        match_count,
-                        self._map,
-                        is_continuous=True,
-                        is_recognised=is_recognised,
-                    )
-                view = image
-            # 2. Fit the pose to the matched landmarks.
+            view = correct_view(self._raw, self.readout.readout_s, rate)
             observed = observe_landmarks(view, matches, T_world_camera, noise)
-            fitted = fit_pose(observed, view.camera, T_camera_world)
-            if fitted is None:
-                return None
+            fitted = fit_pose(observed, view.camera, fitted.T_camera_world)
         accepted = None if fitted is None else rigid(fitted.T_camera_world)
         if fitted is None or accepted is None:
             return None
@@ -765,9 +756,6 @@ class Tracker:
             segment_map.change_readout(self._pending_readout_s)
         self._pending_readout_s = 0.0
         # 4. Keep the frame as the last one, from which the next frame is tracked.
-        features = replace(
-            self._raw, pixels=posed.view.features.pixels, points_camera=posed.view.points_camera
-        )
         self._state = replace(
             state,
             T_world_camera=T_world_camera,
@@ -775,7 +763,6 @@ class Tracker:
             T_last_next=T_last_next,
             rotation_rate=rate,
             last=replace(posed, landmarks=landmarks),
-            features=features,
             first=None,
             keyframe_inliers=keyframe_inliers,
             lost_in_a_row=0,
@@ -803,7 +790,7 @@ class Tracker:
         begin at the last accepted pose, with three times as many, after more than ``segment_after`` such
         frames.
         """
-        feature_count = int(np.isfinite(view.points_camera[:, 2]).sum())
+        feature_count = int(np.isfinite(view.features.points_camera[:, 2]).sum())
         factor = _GUIDED_MATCHES_FACTOR if self._segments else 1
         if feature_count < factor * self.options.min_inliers:
             return self._lose(match_count)
@@ -835,8 +822,7 @@ class Tracker:
         self._state = replace(
             self._state,
             last=posed,
-            features=self._raw,
-            first=(self._raw, view),
+            first=self._raw,
             keyframe_inliers=feature_count // 2,
         )
         self._plugins.forget_poses()
@@ -863,7 +849,7 @@ class Tracker:
             inliers=0,
             matches=match_count,
             segment=self.segment,
-            features=self._raw,
+            features=self._raw.features,
         )
 
     def _make_result(self, posed: PosedView, *, is_keyframe: bool) -> TrackedFrame:
@@ -875,6 +861,6 @@ class Tracker:
             inliers=posed.inliers,
             matches=posed.matches,
             segment=self.segment,
-            features=self._raw,
+            features=self._raw.features,
             reason="" if is_joined else NOT_JOINED,
         )

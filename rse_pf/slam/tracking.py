@@ -18,14 +18,14 @@ import numpy.typing as npt
 
 from rse_pf.errors import BadRequest
 from rse_pf.geometry import Array, Camera, transform
-from rse_pf.maps.descriptors import ORB, Descriptors
+from rse_pf.maps.descriptors import ORB, DescriptorKind, Descriptors
 from rse_pf.native import PART_ABIS, Workspace, address_of, aligned, core_function
 from rse_pf.slam.descriptors import distances_of_pairs, no_distance
 
 __all__ = [
+    "Features",
     "FittedPose",
     "GuidedMatchLimits",
-    "ImageFeatures",
     "LandmarkAppearance",
     "Observations",
     "PredictedFeatures",
@@ -62,27 +62,32 @@ that showed it, times this ratio."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class ImageFeatures:
-    """Features of one image, ready to be matched.
+class Features:
+    """Features of one image with their 3-D points, by ORB or by a user's feature extractor.
 
     Attributes:
         pixels: ``(n, 2)``, undistorted, column and row.
-        descriptors: ``(n, d)``.
+        descriptors: ``(n, d)`` of one *kind*.
+        points_camera: ``(n, 3)`` metres in the camera's frame, NaN where the depth is missing, unreliable, or
+            not measured by this kind of camera.
         orientations: ``(n, 2)``, cosine and sine of each feature's angle in the image; meaningless unless
             *is_oriented*.
-        sizes: ``(n,)``, the scale of each feature, 1 for the finest pyramid level; meaningless unless
+        sizes: ``(n,)``, scale of each feature, 1 for the finest pyramid level; meaningless unless
             *is_scaled*.
         distinctiveness: ``(n,)``, distance of each descriptor to the most similar other one of the same
             image, see `rse_pf.slam.descriptors.measure_distinctiveness`.
+        kind: Name, type and length of the descriptors.
         is_oriented: Whether the feature extractor measures orientations.
         is_scaled: Whether the feature extractor measures sizes.
     """
 
     pixels: Array
     descriptors: Descriptors
+    points_camera: Array
     orientations: Array
     sizes: Array
     distinctiveness: npt.NDArray[np.int32]
+    kind: DescriptorKind = ORB
     is_oriented: bool = True
     is_scaled: bool = True
 
@@ -312,7 +317,7 @@ def match_landmarks(
     numbers: Rows,
     T_camera_world: Array,
     camera: Camera,
-    image: ImageFeatures,
+    image: Features,
     limits: GuidedMatchLimits,
     margin_px: float,
 ) -> tuple[Rows, Rows]:
@@ -361,7 +366,7 @@ def match_landmarks(
 
 
 def match_predictions(
-    predicted: PredictedFeatures, image: ImageFeatures, limits: GuidedMatchLimits
+    predicted: PredictedFeatures, image: Features, limits: GuidedMatchLimits
 ) -> tuple[Rows, Rows]:
     """Match predicted features with features of an image; deterministic, one to one.
 
@@ -419,7 +424,7 @@ def _align_arrays(*arrays: Array, descriptors: npt.NDArray[np.uint8]) -> list[np
 
 
 def _make_near_request(
-    image: ImageFeatures,
+    image: Features,
     limits: GuidedMatchLimits,
     predicted: Sequence[npt.NDArray[Any]] = (),
     predicted_count: int = 0,
@@ -459,9 +464,7 @@ def _call_matcher(
     return rows[: max(0, count)], features[: max(0, count)]
 
 
-def _thresholds(
-    limits: GuidedMatchLimits, image: ImageFeatures
-) -> tuple[float, float, float, float, float, int]:
+def _thresholds(limits: GuidedMatchLimits, image: Features) -> tuple[float, float, float, float, float, int]:
     """Return the six *limits* in the order in which the native core's request has them.
 
     If the features of *image* have no orientations, or no sizes, the limit of these is one that all meet.
@@ -477,7 +480,7 @@ def _thresholds(
 
 
 def _match_by_numpy(
-    predicted: PredictedFeatures, image: ImageFeatures, limits: GuidedMatchLimits
+    predicted: PredictedFeatures, image: Features, limits: GuidedMatchLimits
 ) -> tuple[Rows, Rows]:
     """Match predicted features with descriptors of any kind, as `match_predictions` describes."""
     radius_px, lowe_ratio, distinctiveness_ratio, min_cosine, max_size_ratio, max_bits = _thresholds(

@@ -42,8 +42,8 @@ from rse_pf.slam.keyframe import (
 from rse_pf.slam.loop_closures import Atlas
 from rse_pf.slam.place_recognition import place_vector
 from rse_pf.slam.tracking import (
+    Features,
     GuidedMatchLimits,
-    ImageFeatures,
     PredictedFeatures,
     match_predictions,
 )
@@ -165,11 +165,12 @@ def test_features_near_a_pixel_are_matched_by_their_own_metric(kind: DescriptorK
     n = 12
     descriptors = random_descriptors(kind, n, 5)
     pixels = np.stack([40.0 * np.arange(n), np.full(n, 50.0)], axis=1)
-    image = ImageFeatures(
+    image = Features(
         pixels=pixels,
         descriptors=descriptors,
         orientations=np.zeros((n, 2)),
         sizes=np.full(n, 9.0),
+        points_camera=np.full((n, 3), np.nan),
         distinctiveness=measure_distinctiveness(descriptors, pixels),
         is_oriented=False,
         is_scaled=False,

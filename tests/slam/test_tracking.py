@@ -14,9 +14,9 @@ from rse_pf.errors import BadRequest
 from rse_pf.geometry import Array, Camera, exp_se3, inverse, log_se3, transform
 from rse_pf.slam.descriptors import measure_distinctiveness
 from rse_pf.slam.tracking import (
+    Features,
     FittedPose,
     GuidedMatchLimits,
-    ImageFeatures,
     LandmarkAppearance,
     Observations,
     PredictedFeatures,
@@ -53,10 +53,11 @@ def test_landmarks_are_matched_where_a_pose_predicts_them(seed: int) -> None:
     T = exp_se3(rng.normal(0.0, 0.1, 6))
     _, seen = predict_features(landmarks, np.arange(400), T, CAMERA, 10.0)
     shown = rng.permutation(len(seen.pixels))[:100]
-    image = ImageFeatures(
+    image = Features(
         pixels=seen.pixels[shown] + rng.normal(0.0, 3.0, (len(shown), 2)),
         descriptors=seen.descriptors[shown], orientations=seen.orientations[shown],
-        sizes=seen.sizes[shown], distinctiveness=np.full(len(shown), 256, dtype=np.int32),
+        sizes=seen.sizes[shown], points_camera=np.full((len(shown), 3), np.nan),
+        distinctiveness=np.full(len(shown), 256, dtype=np.int32),
         is_oriented=seed % 2 == 0, is_scaled=seed % 3 == 0,
     )  # fmt: skip
     numbers = np.sort(rng.choice(400, 300, replace=False))
@@ -103,7 +104,7 @@ def angles(rng: np.random.Generator, n: int) -> Array:
     return np.column_stack([np.cos(turn), np.sin(turn)])
 
 
-def request_of(seed: int) -> tuple[PredictedFeatures, ImageFeatures, GuidedMatchLimits]:
+def request_of(seed: int) -> tuple[PredictedFeatures, Features, GuidedMatchLimits]:
     rng = np.random.default_rng(seed)
     m, n = (int(rng.choice([0, 1, 2, 40, 300])) for _ in range(2))
     kind = ("lattice", "anywhere", "cells", "outside", "strange")[seed % 5]
@@ -121,8 +122,9 @@ def request_of(seed: int) -> tuple[PredictedFeatures, ImageFeatures, GuidedMatch
         pixels=predicted, descriptors=expected_bits, orientations=angles(rng, m),
         sizes=1.2 ** rng.integers(0, 4, m),
     )  # fmt: skip
-    image = ImageFeatures(
+    image = Features(
         pixels=pixels, descriptors=bits, orientations=angles(rng, n), sizes=1.2 ** rng.integers(0, 4, n),
+        points_camera=np.full((n, 3), np.nan),
         distinctiveness=matching.measure_distinctiveness(bits, pixels, 6.0).astype(np.int32),
     )  # fmt: skip
     limits = GuidedMatchLimits(
@@ -168,11 +170,15 @@ def flat(pixels: list[tuple[float, float]], bits: list[int]) -> dict[str, Any]:
     }
 
 
-def image_of(pixels: list[tuple[float, float]], bits: list[int], distinct: int = 256) -> ImageFeatures:
-    return ImageFeatures(**flat(pixels, bits), distinctiveness=np.full(len(bits), distinct, dtype=np.int32))
+def image_of(pixels: list[tuple[float, float]], bits: list[int], distinct: int = 256) -> Features:
+    return Features(
+        **flat(pixels, bits),
+        points_camera=np.full((len(bits), 3), np.nan),
+        distinctiveness=np.full(len(bits), distinct, dtype=np.int32),
+    )
 
 
-def matched(sought: dict[str, Any], image: ImageFeatures, **limits: float) -> list[tuple[int, int]]:
+def matched(sought: dict[str, Any], image: Features, **limits: float) -> list[tuple[int, int]]:
     rows, columns = match_predictions(
         PredictedFeatures(**sought),
         image,

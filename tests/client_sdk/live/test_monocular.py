@@ -16,9 +16,8 @@ from client_sdk.simulator.renderer import add_image_noise
 from client_sdk.tracking.monocular_segment import AdjustedKeyframe
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Array, exp_se3, inverse, pose_difference, scaled
-from rse_pf.maps.descriptors import ORB
 from rse_pf.slam.keyframe import decode_keyframe
-from rse_pf.slam.tracking import ImageFeatures
+from rse_pf.slam.tracking import Features
 from tests.client_sdk.live.fake_live_map import FakeLiveRobot, alignment, solve
 from tests.client_sdk.live.shared_map import SharedMap
 from tests.client_sdk.mapper.flat_world import DEPTHS_M, STEP_M, foreign, frame_at
@@ -186,12 +185,12 @@ class MovingTracker:
 
     def keyframe(self, number: int) -> AdjustedKeyframe:
         none = np.empty((0, 2))
-        image = ImageFeatures(
+        image = Features(
             pixels=none, descriptors=np.empty((0, 32), np.uint8), orientations=none, sizes=none[:, 0],
-            distinctiveness=none[:, 0],
+            points_camera=np.empty((0, 3)), distinctiveness=none[:, 0],
         )  # fmt: skip
         return AdjustedKeyframe(
-            timestamp_s=float(number), T_world_camera=self.poses[number], features=image, kind=ORB,
+            timestamp_s=float(number), T_world_camera=self.poses[number], features=image,
             depths=np.array([2.0 * self.length_factor, np.nan]),
         )  # fmt: skip
 

@@ -19,7 +19,7 @@ from rse_pf.errors import UsageError
 from rse_pf.experiments.results.trajectory_error import accuracy
 from rse_pf.geometry import Array, Camera, exp_se3, inverse, pose_difference, transform
 from rse_pf.slam.descriptors import measure_distinctiveness
-from rse_pf.slam.tracking import ImageFeatures
+from rse_pf.slam.tracking import Features
 from tests.client_sdk.mapper.flat_world import CAMERA, covered, foreign, frame_at
 from tests.client_sdk.tracking.driving import run, run_all, solve
 
@@ -203,9 +203,10 @@ def map_of(poses: Array, world: Array) -> LandmarkMap:
     descriptors = np.random.default_rng(3).integers(0, 256, (len(world), 32), dtype=np.uint8)
     for pose in poses:
         pixels = CAMERA.project(transform(pose, world))
-        image = ImageFeatures(
+        image = Features(
             pixels=pixels, descriptors=descriptors, orientations=np.tile([1.0, 0.0], (len(world), 1)),
-            sizes=np.ones(len(world)), distinctiveness=measure_distinctiveness(descriptors, pixels),
+            sizes=np.ones(len(world)), points_camera=np.full((len(world), 3), np.nan),
+            distinctiveness=measure_distinctiveness(descriptors, pixels),
         )  # fmt: skip
         colours = np.zeros((len(world), 3), dtype=np.uint8)
         place = make_place_vector(image.descriptors, np.empty((0, 0, 3), dtype=np.uint8), None)

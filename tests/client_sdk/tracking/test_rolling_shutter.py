@@ -16,6 +16,7 @@ from client_sdk.tracking.rolling_shutter import (
 from client_sdk.tracking.tracker import Tracker
 from rse_pf.geometry import Array, exp_se3, inverse, pose_difference, transform
 from rse_pf.pnp.problems import KINECT
+from rse_pf.slam.descriptors import measure_distinctiveness
 from rse_pf.slam.tracking import Observations, fit_readout_change
 from tests.client_sdk.tracking.driving import run
 
@@ -58,6 +59,7 @@ class Room:
             sizes=np.ones(len(rows)),
             points_camera=KINECT.back_project(pixels, depth_m),
             orientations=np.tile([1.0, 0.0], (len(rows), 1)),
+            distinctiveness=measure_distinctiveness(self.descriptors[rows], pixels),
         )
 
 
@@ -95,7 +97,7 @@ def test_features_of_a_turning_camera_are_where_a_global_shutter_shows_them() ->
     true = np.einsum("nij,nj->ni", rotations[:, :3, :3], read)
     raw = Features(
         pixels=pixels, descriptors=np.zeros((200, 32), np.uint8), points_camera=read,
-        orientations=np.ones((200, 2)), sizes=np.ones(200),
+        orientations=np.ones((200, 2)), sizes=np.ones(200), distinctiveness=np.full(200, 256, np.int32),
     )  # fmt: skip
 
     corrected = undo_rolling_shutter(raw, KINECT, READOUT_S * RATE)
@@ -173,7 +175,9 @@ def test_a_camera_that_looks_around_is_tracked_whatever_its_shutter(
     assert max(metres for metres, _ in errors) < most_m
     assert max(degrees for _, degrees in errors) < most_deg
     assert tracker.last_features is not None
-    assert (tracker.last_features.pixels == tracker._raw.pixels).all() == (tracker.readout.readout_s == 0.0)
+    assert (tracker.last_features.pixels == tracker._raw.features.pixels).all() == (
+        tracker.readout.readout_s == 0.0
+    )
 
 
 def test_a_cut_in_a_video_is_no_rotation(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,7 +11,7 @@ from client_sdk.tracking.landmark_matching import NO_LANDMARK, LazyPlaceVector
 from client_sdk.tracking.stereo_adjustment import adjust_stereo
 from rse_pf.geometry import Array, Camera, exp_se3, inverse, transform
 from rse_pf.slam.stereo import stereo_noise
-from rse_pf.slam.tracking import ImageFeatures
+from rse_pf.slam.tracking import Features
 
 pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
 
@@ -31,14 +31,14 @@ def drive(offset_px: float, keyframes: int = 8, noise_px: float = 0.05) -> tuple
         seen = transform(inverse(T), points)
         pixels = CAMERA.project(seen) + rng.normal(0.0, 0.3, (len(points), 2))
         disparities = F_BASELINE / seen[:, 2] - offset_px + rng.normal(0.0, noise_px, len(points))
-        features = ImageFeatures(
+        features = Features(
             pixels=pixels, descriptors=np.zeros((len(points), 32), dtype=np.uint8),
             orientations=np.tile([1.0, 0.0], (len(points), 1)), sizes=np.ones(len(points)),
+            points_camera=CAMERA.back_project(pixels, F_BASELINE / disparities),
             distinctiveness=np.zeros(len(points), dtype=np.int32),
         )  # fmt: skip
         view = View(
             features=features,
-            points_camera=CAMERA.back_project(pixels, F_BASELINE / disparities),
             shutter_displacements=np.zeros((len(points), 3)),
             camera=CAMERA,
             place_vector=LazyPlaceVector(lambda: np.ones(4, np.float32)),
@@ -64,7 +64,7 @@ def test_the_offset_of_disparities_and_the_metres_are_found(offset_px: float) ->
     assert np.abs(poses[:, :3, 3] - truth[:, :3, 3]).max() < 0.01  # 4 cm before
     landmarks, _ = known.landmarks_around(truth[0])
     assert np.median(np.linalg.norm(landmarks.points - points, axis=1) / points[:, 2]) < 0.03
-    measured = known.view(3).points_camera[:, 2]
+    measured = known.view(3).features.points_camera[:, 2]
     expected = transform(inverse(truth[3]), points)[:, 2]
     assert abs(np.median(F_BASELINE / measured - F_BASELINE / expected)) < 0.06  # 0.3 before
 
