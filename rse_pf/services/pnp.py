@@ -1,6 +1,7 @@
 """The service ``pnp``: compute the camera pose of one image from 3-D to 2-D correspondences.
 
-The service is stateless in the sense of the paper (Sect. 3.3): a request holds all data of its computation.
+The service is stateless in the sense of the RSE-PF paper (Sect. 3.3): a request holds all data of its
+computation.
 """
 
 from __future__ import annotations
@@ -41,9 +42,10 @@ class PnpRequest(msgspec.Struct, frozen=True, kw_only=True):
         pixels: ``2n`` undistorted pixel coordinates in the same order.
         options: Options of RANSAC; None for the server's defaults.
         depths_m: Optional ``n`` depths that a depth camera measured at the pixels, metres; 0 where there is
-            none. The pose is then refined with them, and the world frame is that of the camera that measured
-            the points.
-        depth_noise: Noise of both depth cameras; used with *depths_m* only.
+            none. With depths, the points must be in the frame of the camera that measured them, which is the
+            world frame of the reply, and the server refines the pose with the depths.
+        depth_noise: Noise of the depth camera that measured *depths_m* and of that which measured the points;
+            used with *depths_m* only.
     """
 
     camera: Camera
@@ -93,7 +95,7 @@ class PnpReply(msgspec.Struct, frozen=True, kw_only=True):
     def solution(self) -> PnpSolution:
         """Return the pose of the reply as a `PnpSolution`, with ``(4, 4)`` pose and ``(6, 6)`` covariance.
 
-        A verdict other than ``ok`` becomes ``weak``.
+        A verdict other than ``ok``, such as one that only a newer server knows, becomes ``weak``.
         """
         covariance = np.zeros((6, 6))
         covariance[_UPPER] = self.covariance
@@ -121,8 +123,8 @@ def make_request(
 ) -> PnpRequest:
     """Return a request whose numbers are rounded, so that its JSON text is short.
 
-    Points are rounded to 0.1 mm and pixels to 0.01 px, which leaves a third of the bytes and moves a pose by
-    about 0.02 mm.
+    Points are rounded to 0.1 mm and pixels to 0.01 px.  This reduces the JSON text to a third of its bytes,
+    and changes the position of the estimated pose by about 0.02 mm.
 
     Args:
         points_world: ``(n, 3)``, metres, world frame; with *depths_m* the frame of the camera that measured
@@ -166,8 +168,8 @@ def register(registry: Registry, settings: PnpSettings) -> None:
         _check_sizes(points_world, pixels)
         options = request.options or defaults
         if options is not defaults and options.max_iterations == unset_iterations:
-            # A robot that leaves max_iterations out sends the default value: the limit of the server replaces
-            # it.
+            # A request without max_iterations decodes to the default value, as does one that states this
+            # value.  The limit of the server replaces it in both cases.
             options = msgspec.structs.replace(options, max_iterations=defaults.max_iterations)
         if options.max_iterations > settings.max_iterations:
             raise LimitExceeded(

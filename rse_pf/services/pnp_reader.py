@@ -62,9 +62,9 @@ class _Request(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
 
 
 class _TextRequest(_Request, kw_only=True, forbid_unknown_fields=True):
-    """A JSON request without its lists of numbers; a string holds one character, the number of its list.
+    """A JSON request in which `NativeSolver.cut_lists` replaced each list of numbers by a string.
 
-    The code of the character is the index of the list among those that `cut_lists` returns.
+    The string has one character, whose code is the index of the list among those that `cut_lists` returned.
     """
 
     points_world: str
@@ -99,8 +99,9 @@ def pnp_reader(registry: Registry, codec: str) -> Callable[[bytes | bytearray], 
         codec: ``bin``, or a codec whose messages are JSON.
 
     Returns:
-        The function.  None if *registry* has no service ``pnp``, or one of a user or of another process,
-        which receives its payload as the robot sent it.
+        The function.  None if *registry* has no service ``pnp``, or if its ``pnp`` is not the built-in one:
+        the service of a user and a service that runs in another process receive the payload as the robot
+        sent it, not as a `PnpRequest`.
 
     Raises:
         MissingExtra: The native core is not installed.

@@ -2,8 +2,9 @@
 
 The life of such a service:
 
-1. Write: a folder holds ``service.json`` (name, language, entry file, kind) and the code; ``rse-pf service
-   new NAME`` makes one.
+1. Write: a folder holds the code and ``service.json``, which states name, language, entry file and kind.  The
+   kind says whether the service keeps state between the commands of a robot (``per_robot_state``) or not
+   (``stateless``).  ``rse-pf service new NAME`` makes such a folder.
 2. Build: the Python packages of ``requirements.txt`` are installed from wheels with known hashes
    (`dependencies`).
 3. Install: the regular files are copied to the services folder of a server, with a SHA-256 for each
@@ -15,8 +16,11 @@ The life of such a service:
    `lua`).
 7. Run: the sandbox calls the service for each command; what the service prints is limited and logged
    (`output`).
-8. Stop: the sandbox exits with the robot's connection, or is killed at a deadline; a service with snapshots
-   continues on another server.
+8. Stop: the sandbox exits some time after the last connection of the robot, or is killed if a command takes
+   much longer than its deadline.  If the service has ``snapshot`` and ``restore``, the server stores a
+   snapshot of its state after each command, and the next sandbox of the robot, on the same or another server,
+   restores it.
 
-`rse_pf.server.sandbox` isolates the processes; this package executes nothing of a service before step 6.
+`rse_pf.server.sandbox` isolates the processes.  Nothing of a service is executed before step 6, neither code
+of its packages nor a script nor a library.
 """

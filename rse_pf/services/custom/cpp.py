@@ -36,7 +36,9 @@ _ABI = 1  # RSE_PF_SERVICE_ABI, the version of the C interface
 _FLOAT64 = 1  # RSE_PF_FLOAT64, the type of a field that holds an array of doubles
 _TEXT = 2  # RSE_PF_TEXT, the type of a field that holds UTF-8
 _MAX_RANK = 4  # most axes of an array, the size of ``shape`` in the C struct
-_MAX_FIELDS = 1024  # most fields of a reply: more are a defect of the library, whose memory must not be read
+# Most fields of a reply: a larger count is a defect of the library, and to read so many fields could access
+# memory that the library did not allocate.
+_MAX_FIELDS = 1024
 _MAX_BYTES = 1 << 28  # largest reply, snapshot or field in bytes: more is a defect of the library
 _ERRORS: dict[int, type[RsePfError]] = {1: BadRequest, 2: CommandFailed, 3: DegenerateGeometry}
 """Error of each code of ``enum rse_pf_status`` but success; any other code becomes CommandFailed."""
@@ -56,7 +58,9 @@ class _Field(ctypes.Structure):
 
 
 class CppRuntime:
-    """A loaded library with the state that its ``rse_pf_service_open`` returned, which is never closed.
+    """A loaded library, and the state that its ``rse_pf_service_open`` passed out.
+
+    ``rse_pf_service_close`` is never called: the state is released when the process of the sandbox exits.
 
     Attributes:
         has_snapshots: Whether the library exports ``rse_pf_service_snapshot`` and ``rse_pf_service_restore``.
@@ -92,13 +96,16 @@ class CppRuntime:
         self._state = ctypes.c_void_p()
         code = self._require("rse_pf_service_open")(str(scratch).encode(), ctypes.byref(self._state))
         if code != 0:
-            raise ConfigurationError(f"{service.name}: rse_pf_service_open returned {code}")
+            raise ConfigurationError(
+                f"{service.name}: rse_pf_service_open returned {code}, not RSE_PF_OK (0)",
+                hint="see enum rse_pf_status in rse_pf_service.h, and why this function of the service fails",
+            )
 
     def call(self, payload: Any) -> Any:
         """Return the library's reply to *payload*.
 
-        If the library exports ``rse_pf_service_call_arrays``, both are fields of numbers, arrays and text;
-        otherwise both are any JSON value.
+        If the library exports ``rse_pf_service_call_arrays``, payload and reply are maps from names to
+        numbers, arrays and texts; otherwise each is any JSON value.
         """
         return (
             self._call_with_bytes(payload) if self._call_arrays is None else self._call_with_arrays(payload)
@@ -137,10 +144,9 @@ class CppRuntime:
         self._check(code)
         try:
             if count.value > _MAX_FIELDS or (count.value and not reply):
-                where = "at most" if reply else "at an address, not NULL, and at most"
                 raise InternalError(
                     f"service {self._name!r} replied with {count.value} fields{'' if reply else ' at NULL'}",
-                    hint=f"pass them out {where} {_MAX_FIELDS}",
+                    hint=f"pass out the address of the fields, not NULL, and at most {_MAX_FIELDS} fields",
                 )
             return dict(_decode_field(reply[i], self._name) for i in range(count.value))
         finally:
@@ -174,7 +180,7 @@ class CppRuntime:
         text = self._error(self._state) if self._error is not None else None
         reason = (text or b"").decode("utf-8", "replace")[:500]
         kind = _ERRORS.get(code, CommandFailed)
-        raise kind(f"{self._name}: {reason or f'returned {code}'}")
+        raise kind(f"{self._name}: {reason or f'returned the code {code} without a text'}")
 
     def _check_abi(self) -> None:
         function = self._require("rse_pf_service_abi", result=ctypes.c_uint32)
@@ -236,15 +242,18 @@ def _as_array(name: str, value: Any) -> Any:
         ) from error
     array = array.reshape(np.shape(value))  # ascontiguousarray turns a scalar into an array of one element.
     if array.ndim > _MAX_RANK or not np.isfinite(array).all():
-        raise BadRequest(f"field {name!r} has more than {_MAX_RANK} axes, or a number that is not finite")
+        raise BadRequest(
+            f"field {name!r} has more than {_MAX_RANK} axes, or a number that is not finite",
+            hint=f"send finite numbers in lists that are nested at most {_MAX_RANK} levels deep",
+        )
     return array
 
 
 def _decode_field(field: Any, service: str) -> tuple[str, Any]:
     """Return name and value of a field of a reply: a text, a float, or a flat float64 array.
 
-    One number of rank 0 becomes a float.  All other numbers become an array ``(count,)``, whose shape in the
-    C field is checked but not returned, since arrays are flat in messages.
+    One number of rank 0 becomes a float.  All other numbers become an array ``(count,)``: the shape in the C
+    field must hold ``count`` numbers, but the robot does not receive it, since arrays are flat in messages.
 
     Raises:
         InternalError: The description of the field is invalid.

@@ -2,8 +2,9 @@
 
 An author writes the wanted packages to ``requirements.in``; `lock_dependencies` resolves them to
 ``requirements.txt``, the lock, with one version and its hashes for each package; `build_dependencies`
-installs the lock.  Only wheels are installed, so that no code of a package runs outside of a sandbox.  Lines
-of authors are parsed before pip sees them, since pip would build a folder, and download from an address.
+installs the lock.  Only wheels are installed, so that no code of a package runs outside of a sandbox.  A line
+that an author wrote is parsed, and a line that names a folder or an address is refused, before pip gets the
+lines: pip would execute the build code of that folder, or download from that address.
 """
 
 from __future__ import annotations
@@ -47,7 +48,8 @@ LOCK_FILE = "requirements.txt"
 _WANTED_FILE = "requirements.in"
 """Name of the file in the folder of a service that lists the wanted packages."""
 PROVIDED = ("msgspec", "numpy")
-"""Packages that a sandbox loads before the service, so that another version in the lock would not be used."""
+"""Packages that every sandbox has loaded before it loads the service.  A lock must not name them, because the
+service would not get the version of the lock."""
 
 _LOCKED_LINE = re.compile(
     r"(?P<name>[A-Za-z0-9](?:[\w.-]*[A-Za-z0-9])?)(?:\[[\w.,\s-]*\])?\s*==\s*(?P<version>[\w.!+-]+)"
@@ -86,8 +88,8 @@ class Dependencies:
     """The installed packages of a service.
 
     Attributes:
-        folder: Folder of the packages, whose name is *digest*.
-        digest: `tree_digest` of the folder.
+        folder: Folder of the packages; the last part of its path is *digest*.
+        digest: `tree_digest` of *folder*.
         packages: Versions of the packages by name.
         platform: `platform_tag` of the interpreter for which they were installed.
     """
@@ -138,12 +140,14 @@ def read_lock(folder: Path) -> list[LockedRequirement]:
 def build_dependencies(folder: Path, store: Path) -> Dependencies | None:
     """Install the packages that the service in *folder* locks; return None if it locks none.
 
-    Packages of the same lock that are already installed below *store*, and unchanged, are returned without a
-    call of pip.  A file below *store*, named by the digest of the lock, records them.
+    A file below *store*, named by the SHA-256 of the platform tag and the lines of the lock, records the
+    result.  If this file exists and the packages that it describes are unchanged, they are returned without a
+    call of pip.
 
     Args:
         folder: The service.
-        store: Folder below which packages are installed, each set in a folder named by its digest.
+        store: Folder below which the packages of each lock are installed in a folder of their own, which is
+            named by its `tree_digest`.
 
     Raises:
         UsageError: The lock is invalid, or pip is not installed.
@@ -204,9 +208,10 @@ def require_same_versions(packages: Mapping[str, Mapping[str, str]]) -> None:
 
 
 def copy_dependencies(dependencies: Dependencies, store: Path) -> None:
-    """Copy packages to the folder below *store* named by their digest, unless an unchanged copy is there.
+    """Copy packages to the folder below *store* that is named by their digest.
 
-    A changed copy is replaced.  The copy is not compared with the digest.
+    A folder of this name stays if its content has the digest, and is replaced otherwise.  The content of the
+    new copy is not compared with the digest; a caller that needs this calls `verify_dependencies`.
     """
     target = store / dependencies.digest
     if target.is_dir() and tree_digest(target) == dependencies.digest:
@@ -236,8 +241,9 @@ def tree_digest(folder: Path) -> str:
 def lock_dependencies(folder: Path) -> list[LockedRequirement]:
     """Resolve ``requirements.in`` in *folder* with pip, write ``requirements.txt``, and return its packages.
 
-    Without ``requirements.in``, the wanted packages are the lines of ``requirements.txt``, whose text becomes
-    ``requirements.in`` after pip has resolved it.  Only wheels for this interpreter and machine are chosen.
+    Without ``requirements.in``, the wanted packages are the lines of ``requirements.txt``.  After pip has
+    resolved them, the former text of ``requirements.txt`` is saved as ``requirements.in``, and the lock
+    replaces ``requirements.txt``.  Only wheels for this interpreter and machine are chosen.
     Packages that every sandbox provides are left out of the lock.  The lock stays as it is if an error is
     raised.
 
@@ -416,7 +422,8 @@ def _read_report_entry(entry: Mapping[str, Any]) -> LockedRequirement | None:
     sha256 = entry["download_info"].get("archive_info", {}).get("hashes", {}).get("sha256", "")
     if not _SHA256.fullmatch(sha256):
         raise CommandFailed(
-            f"{name} {version} is not a file with a hash", hint="name a version that an index has"
+            f"pip found {name} {version} at a place that states no SHA-256 of a file",
+            hint="name a version of which a package index has a wheel",
         )
     return LockedRequirement(name=name, version=version, line=f"{name}=={version} --hash=sha256:{sha256}")
 

@@ -91,12 +91,15 @@ class InstalledService:
         language: ``python``, ``cpp`` or ``lua``; ``package`` for a service of an installed Python package.
         entry: File that is loaded, relative to *folder*: a Python or Lua source, or a shared library.  For
             the language ``package`` the dotted name of the module.
-        kind: ``stateless``: a command may be retried in another sandbox.  ``per_robot_state``: the service
-            keeps state as long as the robot is connected.
+        kind: ``stateless``: the service keeps no state between commands, so that a command whose sandbox
+            crashed is retried in another one.  ``per_robot_state``: the service keeps state of the robot in
+            its sandbox; the state outlives the sandbox, and a command is retried, only if the service has
+            snapshots.
         folder: Folder of the service.
         dependencies: Folder of the service's own Python packages; None without any.
-        identity: SHA-256 of ``pins.json``, and so of all that was installed, packages included; empty for a
-            folder that is not installed.
+        identity: SHA-256 of ``pins.json``, which holds the SHA-256 of every file of the service, also that of
+            ``dependencies.json`` with the digest of its packages; so it differs if any installed file
+            differs.  Empty for a folder that is not installed.
     """
 
     name: str
@@ -142,8 +145,9 @@ def read_service(folder: Path) -> InstalledService:
 def install(folder: Path, into: Path, dependencies: Dependencies | None = None) -> InstalledService:
     """Copy the service in *folder* to the services folder *into*, and write the hash of every file.
 
-    An installed service of the same name is replaced when the copy is complete: it is renamed, and then the
-    copy gets its name.  Its Python packages stay in the services folder.
+    An installed service of the same name is replaced after the copy is complete: its folder is renamed, the
+    copy gets its name, and the renamed folder is deleted.  The Python packages of the replaced service are
+    not deleted from the services folder.
 
     Args:
         folder: The service.
@@ -233,14 +237,16 @@ def packaged_services() -> list[InstalledService]:
     verified.
 
     Raises:
-        ConfigurationError: A name is invalid, or used by two entry points.
+        ConfigurationError: The name of an entry point is not a valid name of a service, or two entry points
+            have the same name.
     """
     services: dict[str, InstalledService] = {}
     for point in metadata.entry_points(group=ENTRY_POINTS):
         if not _NAME.fullmatch(point.name) or point.name in services:
             raise ConfigurationError(
                 f"the service {point.name!r} of {point.value} has an invalid name, or one that is in use",
-                hint="uninstall the package, or set services.published to false",
+                hint="uninstall the package, or set services.published to false, which runs no service of an "
+                "installed Python package",
             )
         spec = importlib.util.find_spec(point.value.partition(".")[0])
         folder = Path(spec.origin).parent if spec is not None and spec.origin else Path()

@@ -1,4 +1,4 @@
-"""The runtime of services in Lua: a LuaJIT virtual machine per robot, as in the paper (Sect. 5.2, Fig. 3).
+"""The runtime of services in Lua: one LuaJIT virtual machine per robot (RSE-PF paper, Sect. 5.2 and Fig. 3).
 
 A script returns a function of one table, or a table with ``serve`` and optionally ``snapshot`` and
 ``restore``.  A script may require ``json``, ``zlib`` and ``ffi``, and load shared libraries of its own
@@ -31,8 +31,8 @@ __all__ = ["LuaRuntime", "warm_up"]
 # output is cut off there without an error.
 _MAX_INFLATED = 1 << 24
 _MAX_LEVELS = 64
-"""Most levels of nested tables in a reply or snapshot, so that a table that holds itself causes an error
-instead of an endless recursion; a message has fewer levels."""
+"""Most levels of nested tables in a reply or snapshot, so that a table that contains itself causes an error
+instead of an endless recursion."""
 _SETUP = """
 local json_decode, json_encode, inflate, deflate, folder = ...
 package.preload.json = function() return {decode = json_decode, encode = json_encode} end
@@ -105,8 +105,8 @@ class LuaRuntime:
     def call(self, payload: Any) -> Any:
         """Return the reply of the script to *payload*.
 
-        If the table that the script returned has ``takes_text = true``, its ``serve`` receives and returns
-        JSON text instead of tables.
+        The function ``serve`` receives *payload* as a Lua table and returns a table.  If the table that the
+        script returned has ``takes_text = true``, ``serve`` receives and returns JSON text instead.
 
         Raises:
             RsePfError: The script raised an error, see `_convert_error`.
@@ -243,7 +243,7 @@ def _inflate(data: bytes) -> bytes:
 
 
 def _no_attributes(thing: object, name: object, setting: bool) -> object:
-    raise AttributeError(f"{name!r} is not available to scripts")
+    raise AttributeError(f"the attribute {name!r} of a Python object is not available to scripts")
 
 
 def _first_line(error: BaseException) -> str:

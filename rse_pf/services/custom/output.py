@@ -15,7 +15,7 @@ from rse_pf.token_bucket import TokenBucket
 __all__ = ["MAX_LINE", "OutputLines", "format_output_line"]
 
 MAX_LINE = 256  # longest line of output in characters: the length that a line of the log holds
-_MARK_CHARACTERS = 40  # characters of a cut line that are reserved for the mark "[N letters more]"
+_MARK_CHARACTERS = 40  # characters of a cut line that are reserved for the mark "[N characters more]"
 _LINES_PER_S = 50.0  # lines per second that pass in the long run, so that one service cannot fill the log
 _BURST_LINES = 200.0  # lines that pass at once, such as a traceback, after a time without output
 
@@ -23,10 +23,10 @@ _BURST_LINES = 200.0  # lines that pass at once, such as a traceback, after a ti
 class OutputLines:
     """Splits the output of one sandbox into lines.
 
-    A token bucket lets 200 lines pass at once and 50 per second; the next line that passes is preceded by one
-    with the number of dropped lines.  A line of more than `MAX_LINE` characters is cut, and ends with the
-    number of characters that are missing.  `feed` and `end` are generators, which the caller must exhaust:
-    they change the state while they yield.
+    A token bucket lets 200 lines pass at once and 50 per second in the long run; other lines are dropped.
+    After lines were dropped, a line with their number precedes the next line that passes.  A line of more
+    than `MAX_LINE` characters is cut, and ends with the number of characters that are missing.  `feed` and
+    `end` are generators, which the caller must exhaust: they change the state while they yield.
     """
 
     def __init__(self) -> None:
@@ -80,4 +80,4 @@ def format_output_line(time_s: float, robot: str, text: str) -> str:
 
 def _cut(line: str, characters: int) -> str:
     shown = MAX_LINE - _MARK_CHARACTERS
-    return f"{line[:shown]} [{characters - shown} letters more]"
+    return f"{line[:shown]} [{characters - shown} characters more]"

@@ -1,9 +1,9 @@
 """Publish services to all servers of a platform on AWS, and follow what was published.
 
 An operator uploads an archive of each service, and a list of the services that run, to the artifact bucket.
-The list names each archive by its SHA-256, so a server runs only what the list names.  Operators may write
-both, servers only read. A server unpacks the archives into a `PublishedFolder`, which it uses as its services
-folder.
+The list names each archive by its SHA-256, so a server runs only what the list names.  By the permissions on
+the bucket, operators may write archives and list, and servers may only read them.  A server unpacks the
+archives into a `PublishedFolder`, which it uses as its services folder.
 """
 
 from __future__ import annotations
@@ -87,8 +87,9 @@ _ARCHIVE_ERRORS = (
     NotADirectoryError,
     ValueError,
 )
-"""Errors that a damaged archive causes, which become a ConfigurationError.  Others, such as that of a full
-disk, pass, and the server tries the list again."""
+"""Errors that a damaged archive causes, which become a ConfigurationError: a server does not try to install
+this list again.  Other errors, such as that of a full disk, are raised as they are, and the server tries to
+install the list again at its next poll."""
 
 _NAME = re.compile(r"[a-z][a-z0-9_-]{0,39}")  # pattern of a service's name
 _DIGEST = re.compile(r"[0-9a-f]{64}")  # pattern of a SHA-256 in hexadecimal digits
@@ -101,7 +102,8 @@ _ELF_X86_64 = 62  # the machine x86-64 in an ELF header
 _SYMBOL_VERSION = re.compile(rb"\b(GLIBC|GLIBCXX)_(\d+)\.(\d+)(?:\.(\d+))?\b")
 """The name of a symbol version in a shared library, such as ``GLIBC_2.34``."""
 _NEWEST_VERSIONS = {b"GLIBC": (2, 36, 0), b"GLIBCXX": (3, 4, 30)}
-"""Newest symbol versions (major, minor, patch) of the C and C++ libraries of Debian 12."""
+"""Newest symbol versions (major, minor, patch) of the C and C++ libraries of Debian 12.  A service whose
+library needs a newer one is not published, since no server could load it."""
 _BUILD_HINT = "build it on Debian 12 (x86-64), for example in a container, and publish from there"
 
 
@@ -167,7 +169,7 @@ def publish(service: InstalledService, root: Path, store: ObjectStore, *, now_s:
 
     Args:
         service: The service.
-        root: Services folder in which it is the only service.
+        root: A services folder that holds only *service* and its packages.
         store: The artifact bucket.
         now_s: Unix time, seconds.
 
@@ -175,7 +177,8 @@ def publish(service: InstalledService, root: Path, store: ObjectStore, *, now_s:
         ConfigurationError: Servers cannot run the service, the archive is too large, the published list is
             damaged, or another published service needs another version of a package.
         UsageError: An entry below *root* is neither a regular file nor a folder.
-        StoreError: The store fails, or other operators change the list all the time; the list stays.
+        StoreError: The store fails, or other operators change the list during each attempt to replace it;
+            the list stays.
     """
     dependencies = require_server_platform(service, root)
     archive = pack_archive(root)
@@ -200,7 +203,7 @@ def publish(service: InstalledService, root: Path, store: ObjectStore, *, now_s:
 
 
 def unpublish(name: str, store: ObjectStore) -> None:
-    """Remove the service *name* from the list; its archive stays until a lifecycle rule deletes it.
+    """Remove the service *name* from the list; its archive stays until a rule of the bucket deletes it.
 
     Raises:
         UsageError: The list has no service of this name.
@@ -282,7 +285,10 @@ def _change_list(store: ObjectStore, changes: Mapping[str, PublishedService | No
         except Conflict:
             continue
         return
-    raise StoreError("the list of services changes all the time", hint="publish again")
+    raise StoreError(
+        f"other operators changed the list of services during each of {_MAX_TRIES} attempts to replace it",
+        hint="publish again",
+    )
 
 
 def _require_compatible_packages(entries: Sequence[PublishedService]) -> None:
@@ -339,9 +345,9 @@ class PublishedFolder:
     """The services folder of a server that follows the published list.
 
     Below one root lie the unpacked archives, a services folder for each list, and the link ``current`` to the
-    services folder that runs.  A new list gets a new folder, and the link moves when all of it is verified: a
-    server that still reads the old folder is not disturbed, and a server that fails in between keeps the old
-    services.
+    services folder that runs.  A new list gets a new services folder, and the link moves after all files of
+    that folder are verified.  So a process of the server that still reads the old services folder is not
+    disturbed, and if an installation fails, the link leads to the old services.
     """
 
     def __init__(self, root: Path) -> None:
@@ -378,7 +384,9 @@ class PublishedFolder:
         for entry in entries:
             if not (archives / entry.archive).is_dir():
                 if entry.size > MAX_ARCHIVE_BYTES:
-                    raise damaged_error(f"the archive of {entry.name} is {entry.size} bytes")
+                    raise damaged_error(
+                        f"the archive of {entry.name} is {entry.size} bytes, above {MAX_ARCHIVE_BYTES}"
+                    )
                 fresh = Path(tempfile.mkdtemp(prefix=".new-", dir=archives))
                 try:
                     unpack_archive(entry, fetch(entry), fresh)
@@ -405,7 +413,8 @@ class PublishedFolder:
     def _remove_others(self, lists: set[str], archives: set[str]) -> None:
         """Remove all but the named services folders and archives.
 
-        Files of a removed archive stay in the services folders that hold hard links to them.
+        A services folder that is kept loses no file of a removed archive, because it has hard links to the
+        files.
         """
         for folder, keep in ((_LISTS, lists), (_ARCHIVES, archives)):
             for path in (self._root / folder).iterdir():
@@ -432,7 +441,10 @@ def unpack_archive(entry: PublishedService, archive: bytes, into: Path) -> None:
                 parts = PurePosixPath(member.name).parts
                 files, size = files + 1, size + member.size
                 if not member.isreg() or not parts or parts[0] not in (entry.name, DEPENDENCIES_FOLDER):
-                    raise damaged_error(f"the archive of {entry.name} holds {member.name[:80]!r}")
+                    raise damaged_error(
+                        f"the archive of {entry.name} holds {member.name[:80]!r}, which is no regular file "
+                        f"or lies outside of {entry.name} and {DEPENDENCIES_FOLDER}"
+                    )
                 if len(os.fsencode(member.name)) > _MAX_PATH or max(map(len, parts)) > _MAX_PART:
                     raise damaged_error(f"the archive of {entry.name} holds a name that is too long")
                 if ".." in parts or files > _MAX_FILES or size > _MAX_UNPACKED_BYTES:

@@ -1,7 +1,8 @@
 """Load an installed service into a sandbox: the interface of all runtimes, and the runtime of Python.
 
-Only the processes of sandboxes use this module.  Every language receives a payload as the robot sent it:
-names, numbers, text, lists and arrays.
+Only the processes of sandboxes use this module.  The runtime of every language receives the payload of a
+command as the robot sent it: a map from names of fields to numbers, texts, lists, maps and arrays.  The
+runtime of Python converts the payload to the request type of the service.
 """
 
 from __future__ import annotations
@@ -42,7 +43,8 @@ _KINDS: dict[Any, tuple[type, ...]] = {
     types.NoneType: (types.NoneType,),
     None: (types.NoneType,),
 }
-"""For each annotation of a field of a reply the classes of values that its message carries correctly."""
+"""For each annotation of a field of a reply, the classes of values that a message encodes as this annotation
+states: for ``float`` also integers and numpy's floats, for ``list`` also tuples and arrays."""
 
 
 class Runtime(Protocol):
@@ -197,7 +199,8 @@ def _load_file(service: InstalledService) -> Any:
         )
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module
-    # The last folder is searched first: the packages of the service before its own folder.
+    # Each folder is put in front of sys.path, so that the packages of the service are found before the files
+    # of its own folder.
     for folder in (service.folder, service.dependencies):
         if folder is not None and str(folder) not in sys.path:
             sys.path.insert(0, str(folder))

@@ -2,7 +2,8 @@
 
 A server compares the files of a service with their hashes when it starts, and a sandbox may load them hours
 later.  The zygote, which is the parent process of all sandboxes, therefore copies the files to a folder of
-its own, and compares the copy.
+its own.  It compares the copy with the hashes in ``pins.json``, and ``pins.json`` with the identity
+(`InstalledService.identity`) that the server read when it started.
 """
 
 from __future__ import annotations
@@ -112,7 +113,7 @@ class VerifiedCopy:
             if read_identity(target) != original.identity:
                 raise ConfigurationError(
                     f"{original.name} was installed again while its server started",
-                    hint="start the server again, or roll: rse-pf local roll",
+                    hint="start the server again; rse-pf local roll replaces the local servers one by one",
                 )
             dependencies = read_dependencies(original.folder)
             if dependencies is not None:
@@ -133,11 +134,11 @@ class VerifiedCopy:
         self._file_statuses = file_statuses
 
     def problem(self) -> ConfigurationError | None:
-        """Return an error that names the files of the original that have not the hashes of its installation.
+        """Return an error if files of *original* were changed after its installation, else None.
 
-        Return None if there is no such file.
-
-        A newer installation of the service is not an error: the server runs this copy until it is replaced.
+        The error names the changed files.  The zygote calls this method before each start of a sandbox, which
+        then refuses the service.  If the service was installed again, the result is None: sandboxes load this
+        copy until the server is replaced.
         """
         file_statuses = _file_statuses(self.original)
         if file_statuses == self._file_statuses:
@@ -153,7 +154,9 @@ class VerifiedCopy:
             return None  # The service is being removed or replaced.
         except ConfigurationError as error:
             return error
-        self._file_statuses = file_statuses  # The files have other times, but the same bytes.
+        # The files have other times, but the same bytes: remember the times, so that the next call does not
+        # hash the files again.
+        self._file_statuses = file_statuses
         return None
 
 

@@ -16,8 +16,9 @@ __all__ = ["IcpReply", "IcpRequest", "register"]
 MAX_POINTS = 1_000_000
 """Most points of one cloud of a request, which bounds the time and memory of an alignment."""
 _MAX_VOXELS = 500_000
-"""Largest distance of a point from the origin along an axis, in voxels: small_gicp numbers voxels by 21
-bits."""
+"""Largest distance of a point from the origin along an axis, in voxels.  The voxel indices of small_gicp have
+21 bits for each axis, and so reach 2^20 (1,048,576) voxels to either side; about half of them is a margin for
+the motion of the source cloud."""
 
 
 class IcpRequest(msgspec.Struct, frozen=True, kw_only=True):

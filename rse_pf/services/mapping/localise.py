@@ -26,15 +26,16 @@ from rse_pf.wire.arrays import Array
 __all__ = ["LocaliseOptions", "LocaliseReply", "LocaliseRequest", "locate", "register"]
 
 _RETRIEVAL_FACTOR = 6
-"""Keyframes that place recognition retrieves per candidate, so that the candidates, chosen from them, include
-other parts of the map that look alike (perceptual aliases)."""
+"""Quotient of the number of keyframes that place recognition retrieves and the number of candidates that are
+chosen from them, so that the candidates include other parts of the map that look alike (perceptual
+aliases)."""
 
 
 class LocaliseOptions(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     """Options of a localisation.
 
     Attributes:
-        candidates: Keyframes to which the view is matched, 1..100.
+        candidates: Number of keyframes to which the view is matched, 1..100.
         min_inliers: Fewest inliers of a pose that is ok, at least 12.
         min_inlier_ratio: Smallest share of the matches that are inliers of a pose that is ok.
         agree_m: A keyframe supports the best pose if its own pose of the view differs by at most this
@@ -96,15 +97,17 @@ class LocaliseReply(msgspec.Struct, frozen=True, kw_only=True):
     """The pose of the camera in the map with its evidence.
 
     Attributes:
-        verdict: ``ok``; ``weak`` for a pose that may be wrong; ``lost`` without a pose.
+        verdict: ``ok``; ``weak`` for a pose that may be wrong; ``lost`` without a pose, for which
+            `rse_pf.slam.localise` says ``none``.
         reason: Why the pose is weak or missing; empty for a pose that is ok.
         T_map_camera: 16 numbers, row-major, maps camera points (metres) to the map frame; None without a
             pose.
-        inliers: Inliers of the best keyframe.
+        inliers: Number of inliers of the best keyframe, which is the candidate with most inliers, also where
+            the pose was computed from several keyframes.
         rmse_px: Root mean square reprojection error of these inliers.
         keyframes: Ids of the keyframes that support the pose, best first.
-        covariance: 36 numbers, row-major, of the twist (metres, radians) that multiplies the pose on the
-            left.
+        covariance: 36 numbers, row-major, the covariance of the twist (metres, radians) that multiplies the
+            pose on the left; None without a pose.
     """
 
     verdict: str
@@ -137,8 +140,8 @@ def locate(
     # 1. Retrieve similar keyframes by place recognition.
     options = options or LocaliseOptions()
     similar = index.nearest(view.descriptors, _RETRIEVAL_FACTOR * options.candidates, within)
-    # 2. Choose the candidates among them, at most three quarters from one region of the map, so that another
-    # region that looks alike is compared as well.
+    # 2. Choose the candidates among them.  At most three quarters of the candidates come from one region of
+    # the map, so that the view is also matched to another region that looks alike.
     limits = LocalisationOptions(
         measured=RelativePoseOptions(
             min_inliers=options.min_inliers,

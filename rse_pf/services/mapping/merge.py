@@ -30,8 +30,8 @@ __all__ = [
 MAX_MAPS = 64
 """Most maps that one request merges; all maps together have at most 2,000 keyframes."""
 _MAX_PROJECTIONS = 20_000_000_000
-"""Largest product of the numbers of keyframes and of cloud points of all maps of a request: to project each
-point into each keyframe then takes an hour, the longest time of a job."""
+"""Largest product of the numbers of keyframes and of cloud points of all maps of a request: to project so
+many points takes an hour, the default time limit of a job (``max_job_s``)."""
 
 
 class MergeRequest(msgspec.Struct, frozen=True, kw_only=True):
@@ -45,7 +45,7 @@ class Refusal(msgspec.Struct, frozen=True, kw_only=True):
     """Rejected loop closures between two maps.
 
     Attributes:
-        maps: Numbers of the two maps in the request, which may be equal.
+        maps: Indices of the two maps in the request, from 0; equal for loop closures within one map.
         reason: Why the loop closures were rejected.
         count: Number of loop closures that were rejected for this reason.
     """
@@ -56,7 +56,12 @@ class Refusal(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class NotJoined(msgspec.Struct, frozen=True, kw_only=True):
-    """A map of the request that is not in the result, by its number, and why."""
+    """A map of the request that is not in the result.
+
+    Attributes:
+        map: Index of the map in the request, from 0.
+        reason: Why the map was not joined.
+    """
 
     map: int
     reason: str
@@ -67,11 +72,11 @@ class MergeReply(msgspec.Struct, frozen=True, kw_only=True):
 
     Attributes:
         map: Encoded map version.
-        joined: Numbers of the maps of the request that are in the result.
+        joined: Indices, from 0, of the maps of the request that are in the result.
         not_joined: The other maps.
         refused: Rejected loop closures.
-        loops: Accepted loop closures within one map.
-        merges: Accepted loop closures between two maps.
+        loops: Number of accepted loop closures within a map, summed over the joined maps.
+        merges: Number of accepted loop closures between two joined maps.
         cost_before: Cost of the pose graph before the optimisation.
         cost_after: Cost of the pose graph after the optimisation.
     """

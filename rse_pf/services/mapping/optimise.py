@@ -34,9 +34,10 @@ class OptimiseReply(msgspec.Struct, frozen=True, kw_only=True):
         chi2_after: The same sum after the optimisation.
         cost_before: Cost with the robust loss before the optimisation.
         cost_after: Cost with the robust loss after the optimisation.
-        components: Connected components of the graph.
-        doubted: Loop closures, as pairs of ids, whose residual exceeds three times the scale of the robust
-            loss.
+        components: Number of connected components of the graph.
+        doubted: Probable outliers: the loop closures, as pairs of ids of poses, whose residual (Mahalanobis
+            norm) after the optimisation is above three times the scale of the robust loss, or above 9 if the
+            scale is smaller than 3.  They stay in the graph.
     """
 
     g2o: str

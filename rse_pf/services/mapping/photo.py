@@ -26,17 +26,18 @@ from rse_pf.slam.relative_pose import View
 
 __all__ = ["localise_photo", "location_of", "outline_of"]
 
-_MAX_FEATURES = 1000  # ORB features of a photo: as many as a robot finds in one of its frames
+_MAX_FEATURES = 1000  # most ORB features of a photo: as many as a robot finds in one of its frames
 _MAX_FOCAL_RATIO = 1.2
-"""Largest focal length of a photo over the median of the map's images, both in pixels: a photo with a longer
-one is made smaller, because beyond one level of ORB's image pyramid (1.2) the same corners get other
-descriptors."""
+"""Largest quotient of the focal length of a photo and the median focal length of the map's images, both in
+pixels.  A photo with a larger quotient is resized so that its focal length is the median: if the scale
+differs by more than one level of ORB's image pyramid (1.2), the same corners get other descriptors."""
 _MAX_PIXEL_RATIO = 4
-"""Largest number of pixels of a photo over that of the map's largest image: a larger photo is made
-smaller."""
+"""Largest quotient of the number of pixels of a photo and that of the map's largest image; a photo with more
+pixels is resized to this number, which bounds the time of the detection."""
 _MAX_ASPECT_DIFFERENCE = 0.01
-"""Largest relative difference between the aspect ratios of a photo and of the image that its intrinsics
-describe: rounding of a resized photo stays below 1 %, and a cropped or rotated photo differs by more."""
+"""Largest relative difference between the aspect ratio of a photo and that of the image which its intrinsics
+describe.  If a photo was resized, the rounding of its width and height to whole pixels changes the ratio by
+less than 1 %; if it was cropped or rotated, the ratio usually differs by more."""
 _MAX_ROUND_TRIP_PX = 0.5
 """Largest difference, in each coordinate, between a pixel and the same pixel undistorted and distorted again:
 beyond it, the iterative inverse of the distortion has failed, and the feature at the pixel is not used."""
@@ -81,11 +82,12 @@ def localise_photo(data: bytes, photo_lens: PhotoLens, index: MapIndex) -> Local
 
 
 def location_of(reply: LocaliseReply, version: str) -> PhotoLocation:
-    """Return the result of `localise_photo` as the HTTP reply, with one number for each of two uncertainties.
+    """Return the result of `localise_photo` as the HTTP reply, which also states two standard deviations.
 
     ``position_sigma_m`` is the square root of the sum of the variances of the camera's position along the
-    three axes, and ``turn_sigma_deg`` the same of its rotation.  Both, the pose and the covariance are None
-    if *reply* has no pose.  *version* is the id of the map version that was searched.
+    three axes, and ``turn_sigma_deg`` the square root of the sum of the variances of its rotation about them.
+    Both, the pose and the covariance are None if *reply* has no pose.  *version* is the id of the map version
+    that was searched.
     """
     pose, covariance = reply.T_map_camera, reply.covariance
     location = PhotoLocation(
@@ -142,7 +144,7 @@ def _camera_of_photo(photo_lens: PhotoLens, width: int, height: int) -> Camera:
     if abs((width / stated[0]) / (height / stated[1]) - 1.0) > _MAX_ASPECT_DIFFERENCE:
         raise BadRequest(
             f"the intrinsics are for {stated[0]}x{stated[1]} px, the photo has {width}x{height}",
-            hint="send those of this camera, without cropping or turning the photo",
+            hint="send intrinsics of this camera, and a photo that was neither cropped nor rotated",
         )
     camera = Camera(
         fx=photo_lens.fx,
@@ -164,7 +166,8 @@ def _top_view_axes(up: Array) -> Array:
     """Return the x and y axes ``(2, 3)`` of the view from above, in the world of the map.
 
     Both are unit vectors orthogonal to each other and to the unit vector *up* ``(3,)``, and y is x turned
-    counter-clockwise as seen from above.  The x axis is the axis of the map that is most level, projected.
+    counter-clockwise as seen from above.  The x axis is the projection, onto the plane orthogonal to *up*, of
+    that axis of the map's frame which is closest to the plane.
     """
     right = np.eye(3)[int(np.argmin(np.abs(up)))]
     right = right - (right @ up) * up

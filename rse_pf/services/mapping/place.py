@@ -55,8 +55,9 @@ MAX_FEATURES = 2_000_000
 MAX_VIEW_FEATURES = 20_000
 """Most features of the view (the image to localise) of a request, which bounds the time of matching."""
 _MAX_COMPARISONS = 2_000_000_000
-"""Most comparisons of an ORB descriptor of the view with one of a candidate keyframe in one request; they
-take about five seconds.  Comparisons of longer descriptors count in proportion to their size."""
+"""Most comparisons of two ORB descriptors, one of the view and one of a candidate keyframe, in one request;
+so many take about five seconds.  A comparison of longer descriptors counts as several, in proportion to their
+size."""
 
 
 class FeatureKind(msgspec.Struct, frozen=True, kw_only=True):
@@ -91,7 +92,8 @@ class PlaceRequest(msgspec.Struct, frozen=True, kw_only=True):
         pixels: ``2n`` undistorted pixel coordinates of the features.
         descriptors: Raw bytes of the ``n`` descriptors; 32 bytes each for ORB.
         candidates: Most keyframes of the reply, 1..100.
-        check: Whether candidates are verified by PnP, and sorted by inliers.
+        check: Whether the relative pose of the view and each candidate is estimated by PnP, and the
+            candidates are sorted by the number of inliers.
         within: Prior of the camera's position; None to search the whole map.
         features: Kind of the descriptors; None for ORB.
     """

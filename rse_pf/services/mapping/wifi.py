@@ -53,7 +53,9 @@ _CALIBRATION_GRID_M = 0.5  # smallest distance of grid points in the calibration
 # --- Limits of a request ---
 MAX_FINGERPRINTS = 5000  # most fingerprints (surveyed positions) of a request, which bounds its time
 _MAX_FLOORS = 100  # most floors, which are surveyed heights rounded to 1 m; each floor has a grid of its own
-_MAX_ACCESS_POINTS = 300  # most access points of a survey with five or more readings, which bounds the time
+# Most access points with five or more readings in a survey, which bounds the time; access points with fewer
+# readings are ignored.
+_MAX_ACCESS_POINTS = 300
 # Largest product of the numbers of grid points and of surveyed positions: the calibration then takes five
 # seconds.
 _MAX_POSTERIORS = 5_000_000
@@ -90,8 +92,10 @@ class WifiOptions(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True)
 
     Attributes:
         grid_m: Distance of the points of the grid over which the position is estimated, metres, 0.1..5.
-        reach_m: Largest distance of a grid point from a surveyed position, metres, up to 50.
-        min_common: Fewest access points of the scan that the survey knows, 1..100.
+        reach_m: Largest horizontal distance of a grid point from the nearest surveyed position of its floor,
+            metres, up to 50.  The robot is assumed to be at a grid point.
+        min_common: Fewest access points of the scan that the survey must know, 1..100; with fewer of them, no
+            position is found.
 
     Raises:
         BadRequest: A number is out of its range.
@@ -126,7 +130,8 @@ class WifiReply(msgspec.Struct, frozen=True, kw_only=True):
         x: Mean of the posterior, metres, map frame.
         y: Mean of the posterior, metres, map frame.
         z: Mean of the posterior, metres, map frame.
-        sigma_m: Horizontal radius that holds the true position with a probability of 68 %.
+        sigma_m: Radius in metres of the horizontal circle around ``(x, y)`` that holds the true position with
+            a probability of 68 %; larger than the standard deviation along one axis.
         common: Access points of the scan that the survey knows.
     """
 
@@ -144,8 +149,9 @@ def fingerprint_of(
 ) -> Fingerprint:
     """Return a fingerprint of *readings* without hardware addresses; the robot calls this function.
 
-    Left out are networks whose name ends in ``_nomap``, locally administered addresses (those of phones that
-    share their connection, which change) and strengths outside -120..0 dBm.  Of several readings of an
+    Left out are networks whose name ends in ``_nomap``, access points with a locally administered address,
+    and strengths outside -120..0 dBm.  Locally administered addresses are mostly those of phones that share
+    their connection: they change at random, and the phones move.  Of several readings of an
     address the last one counts.  An address becomes a keyed BLAKE2b hash: robots with the same *key* give an
     access point the same name, and without the key the address cannot be found out.
 
@@ -178,8 +184,8 @@ class Locator:
     The posterior over a grid around the surveyed positions has a uniform prior, and for each received access
     point a Gaussian likelihood with the mean and variance of its signal field.  The errors of access points
     are correlated (walls, people), which the product of their likelihoods ignores.  The product is therefore
-    raised to a power of at most 1, chosen so that in a five-fold cross-validation of the survey 68 % of the
-    positions lie within their stated radius.
+    raised to a power of at most 1.  The power is chosen so that, in a five-fold cross-validation of the
+    survey, 68 % of the true positions lie within the radius ``sigma_m`` around the estimated ones.
 
     Attributes:
         temper: The power, 0.1..1; 0.4 if fewer than 30 positions of the survey could be located in the
@@ -298,7 +304,8 @@ def _calibrate_temper(survey: Sequence[Survey], model: SignalModel, options: Wif
     if count < _MIN_HELD_OUT:
         return _DEFAULT_TEMPER
     # 2. Interpolate the power between the candidates.  A larger power makes the radius smaller, so the share
-    # of positions inside falls; where it does not, the minimum of the shares so far is taken.
+    # of positions inside should fall from candidate to candidate.  Where it rises by chance, it is replaced
+    # by the smallest share of the smaller powers, so that the interpolation has one result.
     share = np.minimum.accumulate(inside / count)
     return float(np.interp(-_ONE_SIGMA, -share, _TEMPERS))
 

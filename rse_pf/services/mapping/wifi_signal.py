@@ -22,18 +22,18 @@ Rows = npt.NDArray[np.int64]
 __all__ = ["MAX_READINGS", "SignalField", "SignalModel", "fit_signals"]
 
 _MIN_READINGS = 5
-"""Fewest readings of an access point that is used: its horizontal position and its trend have four
-unknowns."""
+"""Fewest readings of an access point that is used, one more than the unknowns of its model without a process:
+two of its horizontal position, and two of its trend."""
 _LENGTHS_M = (2.0, 4.0, 8.0, 16.0)
 """Candidate correlation lengths of the Gaussian process, metres: from a room to a hall."""
 _SMOOTH_SHARES = (0.1, 0.3, 0.5, 0.7, 0.85)
-"""Candidate shares of the variance of the residuals that the Gaussian process explains, which is smooth in
-space; the rest is noise of the readings."""
+"""Candidates for the share of the variance of the residuals that is explained by the Gaussian process, a
+smooth function of the position.  The rest of the variance is independent noise of each reading."""
 _MIN_VARIANCE_DBM2 = 1.0
 """Smallest variance of the noise (dBm^2), so that no reading counts as exact."""
 _NEAR_M = 1.0
-"""Length in metres that is added in quadrature to each distance from an access point, since log10 of 0 is
-infinite."""
+"""Length n in metres with which each distance d from an access point becomes sqrt(d^2 + n^2), since log10 of
+0 is not finite."""
 _BATCH = 8192
 """Positions whose covariances with all readings are computed at once, which bounds the memory."""
 MAX_READINGS = 400
@@ -256,7 +256,7 @@ def _fit_line(x: Array, y: Array) -> tuple[float, float]:
 def _trend(positions: Array, source: Array) -> Array:
     """Return the ``(n, 2)`` design matrix of the trend: ones, and log10 of the distances to *source*.
 
-    Distances are in metres, with `_NEAR_M` added in quadrature.
+    A distance d (metres) counts as ``sqrt(d**2 + _NEAR_M**2)``.
     """
     distance = np.sqrt(((positions - source) ** 2).sum(axis=1) + _NEAR_M**2)
     return np.column_stack([np.ones(len(positions)), np.log10(distance)])

@@ -175,7 +175,7 @@ def test_printed_lines_are_passed_on_with_limits_of_length_and_number(peer):
     os.write(peer.output, b"x" * 1000 + b"\n" + b"line\n" * 500)
     peer.loop.run_until(lambda: peer.lines)
 
-    assert peer.lines[0].endswith("x [784 letters more]")
+    assert peer.lines[0].endswith("x [784 characters more]")
     assert len(peer.lines) == 200
 
 

@@ -37,7 +37,7 @@ def test_a_long_line_is_cut_and_says_how_much_is_missing() -> None:
     assert whole == "x" * MAX_LINE
     assert len(cut) <= MAX_LINE
     kept = cut.count("y")
-    assert cut.endswith(f"y [{100_000 - kept} letters more]")
+    assert cut.endswith(f"y [{100_000 - kept} characters more]")
 
 
 def test_a_line_that_never_ends_takes_no_memory() -> None:

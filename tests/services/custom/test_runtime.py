@@ -220,7 +220,7 @@ def test_plain_c_may_take_json_bytes(tmp_path):
 
     assert service.call({"a": [1, "é", None]}) == {"a": [1, "é", None]}
     assert not service.has_snapshots
-    with pytest.raises(CommandFailed, match="returned 2"):
+    with pytest.raises(CommandFailed, match="returned the code 2 without a text"):
         service.call({"a": "!"})
 
 
