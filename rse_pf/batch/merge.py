@@ -24,7 +24,7 @@ from rse_pf.geometry import Array, inverse
 from rse_pf.maps.format import MapLimits, MapVersion, decode_map
 from rse_pf.object_store import ObjectStore
 from rse_pf.service import Report
-from rse_pf.services.mapping.place import map_limits
+from rse_pf.services.mapping.place import MAP_LIMITS
 from rse_pf.slam.cloud_deform import merge_clouds
 from rse_pf.slam.consistency import LoopClosure
 from rse_pf.slam.loop_closures import Atlas, LoopProposals, MergeOptions, RejectionCounts, map_pair_of
@@ -148,12 +148,11 @@ class BatchMerge:
     def _versions(self) -> list[MapVersion]:
         if not 1 <= len(self._maps) <= MAX_MAPS:
             raise BadRequest(f"{len(self._maps)} maps are not within 1..{MAX_MAPS}", hint="name one or more")
-        limits = map_limits()
         most = MapLimits()
         versions: list[MapVersion] = []
         keyframes = features = 0
         for name in self._maps:
-            versions.append(decode_map(self._store.get(name), limits=limits))
+            versions.append(decode_map(self._store.get(name), limits=MAP_LIMITS))
             keyframes += len(versions[-1].keyframes)
             if keyframes > MAX_KEYFRAMES:
                 raise LimitExceeded(f"more than {MAX_KEYFRAMES} keyframes", hint="merge fewer maps at once")

@@ -19,7 +19,7 @@ from rse_pf.batch.parts import Part, PartResult, encode_result, is_done, read_re
 from rse_pf.errors import BadRequest
 from rse_pf.maps.format import MapVersion, decode_map
 from rse_pf.object_store import ObjectStore
-from rse_pf.services.mapping.place import map_limits
+from rse_pf.services.mapping.place import MAP_LIMITS
 from rse_pf.slam.cloud_deform import deform_cloud
 from rse_pf.slam.consistency import LoopClosure
 from rse_pf.slam.loop_closures import (
@@ -212,7 +212,7 @@ def _cached_map(store: Any, name: str) -> MapVersion:
 
 
 def _decoded(data: bytes) -> MapVersion:
-    return decode_map(data, limits=map_limits())
+    return decode_map(data, limits=MAP_LIMITS)
 
 
 def _options(part: Part) -> MergeOptions:

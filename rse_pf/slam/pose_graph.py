@@ -96,15 +96,6 @@ class PoseGraph:
                 hint="send the inverses of the covariances of the edges",
             )
 
-    def chi2(self, T_world_pose: Array | None = None) -> float:
-        """Return the sum of the squared Mahalanobis norms of all residuals, without a robust kernel.
-
-        Args:
-            T_world_pose: ``(n, 4, 4)``; None means the poses of this graph.
-        """
-        poses = self.T_world_pose if T_world_pose is None else T_world_pose
-        return float(self.squared_residuals(poses).sum())
-
     def squared_residuals(self, T_world_pose: Array) -> Array:
         """Return the squared Mahalanobis norms ``(m,)`` of the residuals at *T_world_pose* ``(n, 4, 4)``."""
         T_a_b = inverse(T_world_pose[self.a]) @ T_world_pose[self.b]

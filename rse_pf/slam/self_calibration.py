@@ -146,9 +146,7 @@ class Calibrated:
             that were not estimated.
         noise_m: Uncertainty of the path: root mean square of the random errors of the keyframes' positions
             after alignment, with those that the uncertainty of the estimated calibration causes.
-        cost: The Cauchy loss of all residuals plus the costs of the priors at the end.
         has_metric_scale: Whether depths determine the metric scale; else paths are compared up to scale.
-        pixel_factor: Noise of the pixels over their stated standard deviations.
         depth_factor: Noise of the depths over their stated standard deviations.
     """
 
@@ -160,9 +158,7 @@ class Calibrated:
     points_world: Array
     bends_m: Array
     noise_m: float
-    cost: float
     has_metric_scale: bool
-    pixel_factor: float
     depth_factor: float
 
     @property
@@ -656,9 +652,7 @@ class _DriveSystem:
             points_world=state.points,
             bends_m=bends_m,
             noise_m=self._path_noise_m(state, inverse_S[:poses_size, :poses_size], rho_to_centre),
-            cost=self.cost(state),
             has_metric_scale=self._has_metric_scale(),
-            pixel_factor=self.pixel_factor,
             depth_factor=self.depth_factor,
         )
 

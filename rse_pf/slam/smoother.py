@@ -89,7 +89,7 @@ def smooth(
     robust: npt.NDArray[np.bool_],
     *,
     cauchy: float,
-    wanted: Rows | None = None,
+    wanted: Rows,
     scales: ScaleTerms | None = None,
 ) -> SmoothedPoses:
     """Fit the first *free* poses to the edges, and keep the other poses fixed; the arguments do not change.
@@ -107,7 +107,7 @@ def smooth(
         information: ``(m, 6, 6)``, the inverse covariances of the residuals (metres, radians).
         robust: ``(m,)``, whether an edge may be an outlier.
         cauchy: Width of the Cauchy kernel in standard deviations, above 0.
-        wanted: Rows of free poses whose covariances are returned; None means none.
+        wanted: Rows of free poses whose covariances are returned; may be empty.
         scales: Scales that are fitted together with the poses; None means none.
 
     Source:
@@ -123,7 +123,6 @@ def smooth(
     cost = _cost(squares, robust, cauchy)
     # 2. Prepare unit vectors as further right sides: their solutions are columns of the inverse of the
     # matrix, which contain the covariances.
-    wanted = np.empty(0, dtype=np.int64) if wanted is None else wanted
     size = 6 * free + len(log_scales)
     unit_vectors = np.zeros((size, 6 * len(wanted)))
     unit_vectors[(6 * wanted[:, None] + np.arange(6)).ravel(), np.arange(6 * len(wanted))] = 1.0

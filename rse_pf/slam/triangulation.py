@@ -43,11 +43,11 @@ def triangulate(
     Source:
         Hartley and Zisserman 2004, Sect. 12.2 (linear triangulation, in normalised coordinates).
     """
-    rays = [_normalise(pixels, camera) for pixels in (first, second)]
+    rays = [camera.back_project(pixels, np.ones(len(pixels))) for pixels in (first, second)]
     A = np.empty((len(first), 4, 4))
     for view, (pose, ray) in enumerate(zip((T_first_world, T_second_world), rays, strict=True)):
         A[:, 2 * view] = ray[:, :1] * pose[2] - pose[0]
-        A[:, 2 * view + 1] = ray[:, 1:] * pose[2] - pose[1]
+        A[:, 2 * view + 1] = ray[:, 1:2] * pose[2] - pose[1]
     # The smallest eigenvector of A^T A: with four well-scaled rows as accurate as the SVD, and faster.
     homogeneous = np.linalg.eigh(A.transpose(0, 2, 1) @ A)[1][:, :, 0]
     w = homogeneous[:, 3]
@@ -99,7 +99,3 @@ def reprojection_errors(
         depths > _MIN_DEPTH, np.linalg.norm(camera.project(clipped) - pixels, axis=1), np.inf
     )
     return errors_px, depths
-
-
-def _normalise(pixels: Array, camera: Camera) -> Array:
-    return (pixels - [camera.cx, camera.cy]) / [camera.fx, camera.fy]

@@ -43,7 +43,8 @@ def problem(seed: int) -> tuple[Array, Array, PoseGraph]:
 
 def fit(graph: PoseGraph, start: Array) -> SmoothedPoses:
     return smooth(
-        start, FREE, graph.a, graph.b, graph.T_a_b, graph.information, graph.robust, cauchy=3.0
+        start, FREE, graph.a, graph.b, graph.T_a_b, graph.information, graph.robust,
+        cauchy=3.0, wanted=np.empty(0, dtype=np.int64),
     )  # fmt: skip
 
 

@@ -21,6 +21,11 @@ def rmse_m(T_estimate: Array, T_truth: Array) -> float:
     return float(np.sqrt(((T_estimate - T_truth)[:, :3, 3] ** 2).sum(axis=1).mean()))
 
 
+def chi2(graph: PoseGraph, T_world_pose: Array) -> float:
+    """Return the sum of the squared Mahalanobis norms of all residuals at *T_world_pose*."""
+    return float(graph.squared_residuals(T_world_pose).sum())
+
+
 def small_sphere(seed: int = 1) -> tuple[PoseGraph, Array]:
     """Return a sphere of 200 poses."""
     return make_sphere(seed, rings=10, per_ring=20)
@@ -32,7 +37,7 @@ def test_fits_a_drifted_sphere_better_than_the_truth_does(cauchy: float) -> None
 
     found = optimise_graph(graph, OptimiseOptions(cauchy=cauchy))
 
-    assert graph.chi2(found.T_world_pose) <= graph.chi2(truth)
+    assert chi2(graph, found.T_world_pose) <= chi2(graph, truth)
     assert rmse_m(found.T_world_pose, truth) <= 0.2 * rmse_m(graph.T_world_pose, truth)
 
 
@@ -102,7 +107,7 @@ def test_reading_written_g2o_text_gives_the_same_graph() -> None:
 
     np.testing.assert_allclose(again.T_world_pose, graph.T_world_pose, atol=1e-12)
     np.testing.assert_allclose(again.information, graph.information, rtol=1e-9)
-    assert again.chi2() == pytest.approx(graph.chi2(), rel=1e-9)
+    assert chi2(again, again.T_world_pose) == pytest.approx(chi2(graph, graph.T_world_pose), rel=1e-9)
     np.testing.assert_array_equal(again.robust, graph.robust)
 
 
@@ -152,5 +157,5 @@ def test_a_sphere_of_2500_poses_ends_below_the_truth_and_near_it() -> None:
 
     found = optimise_graph(graph)
 
-    assert graph.chi2(found.T_world_pose) <= graph.chi2(truth)
+    assert chi2(graph, found.T_world_pose) <= chi2(graph, truth)
     assert rmse_m(found.T_world_pose, truth) <= 0.1 * rmse_m(graph.T_world_pose, truth)

@@ -52,7 +52,7 @@ from rse_pf.errors import RsePfError, UsageError
 from rse_pf.files import read_document
 from rse_pf.local.state import read_state, state_folder
 from rse_pf.services.custom.cpp import INCLUDE_FOLDER
-from rse_pf.services.custom.installed import install, installed_services
+from rse_pf.services.custom.installed import NAME_PATTERN, install, installed_services
 from rse_pf.services.custom.output import format_output_line
 from rse_pf.terminal import error_lines, show, show_json, show_progress
 
@@ -63,7 +63,6 @@ _ACTIONS = (
 )  # fmt: skip
 _OF_A_NAME = ("new", "call")
 _LANGUAGES = ("python", "cpp", "lua")
-_NAME = re.compile(r"[a-z][a-z0-9_-]{0,39}")
 _OUTPUT = re.compile(r"service-output robot=(?P<robot>\S+) text=(?P<text>.*) tenant=\S+")
 _POLL_S = 0.3
 _RECORDED_FIELDS = {"request", "reply", "tolerance", "failure"}
@@ -129,7 +128,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
 
 
 def _new(name: str, language: str, where: Path) -> int:
-    if not _NAME.fullmatch(name):
+    if not NAME_PATTERN.fullmatch(name):
         raise UsageError(
             f"{name[:60]!r} is not a valid service name",
             hint="use 1 to 40 lower-case letters, digits, - and _",

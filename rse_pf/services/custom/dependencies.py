@@ -30,6 +30,7 @@ from rse_pf.services.custom.regular_files import read_regular_file
 
 __all__ = [
     "LOCK_FILE",
+    "SHA256_PATTERN",
     "Dependencies",
     "LockedRequirement",
     "build_dependencies",
@@ -58,7 +59,7 @@ _LOCKED_LINE = re.compile(
 """A line of a lock: name, extras, one version, environment marker, and at least one SHA-256."""
 _LINE_WITHOUT_HASH = re.compile(r"[\w.\[\],-]+\s*==\s*[\w.!+-]+\s*(;.*)?")
 """A line with one version but no hash, for a helpful error."""
-_SHA256 = re.compile(r"[0-9a-f]{64}")
+SHA256_PATTERN = re.compile(r"[0-9a-f]{64}")
 """A SHA-256 in hexadecimal digits."""
 _REMOVED_VARIABLES = {
     "PIP_NO_BINARY",
@@ -344,7 +345,7 @@ def _find_built(record: Path, store: Path) -> Dependencies | None:
         built = Dependencies(**{**document, "folder": store / document["digest"]})
     except (OSError, ValueError, KeyError, TypeError):
         return None
-    is_present = _SHA256.fullmatch(built.digest) and built.folder.is_dir()
+    is_present = SHA256_PATTERN.fullmatch(built.digest) and built.folder.is_dir()
     return built if is_present and tree_digest(built.folder) == built.digest else None
 
 
@@ -420,7 +421,7 @@ def _read_report_entry(entry: Mapping[str, Any]) -> LockedRequirement | None:
     if name in PROVIDED:
         return None
     sha256 = entry["download_info"].get("archive_info", {}).get("hashes", {}).get("sha256", "")
-    if not _SHA256.fullmatch(sha256):
+    if not SHA256_PATTERN.fullmatch(sha256):
         raise CommandFailed(
             f"pip found {name} {version} at a place that states no SHA-256 of a file",
             hint="name a version of which a package index has a wheel",

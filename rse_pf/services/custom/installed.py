@@ -22,17 +22,19 @@ import msgspec
 from rse_pf.errors import ConfigurationError, UsageError
 from rse_pf.service import Kind
 from rse_pf.services.custom.dependencies import (
+    SHA256_PATTERN,
     Dependencies,
     copy_dependencies,
     read_lock,
     require_same_versions,
     verify_dependencies,
 )
-from rse_pf.services.custom.regular_files import copy_regular_files, read_regular_file
+from rse_pf.services.custom.regular_files import copy_regular_files, list_files, read_regular_file
 
 __all__ = [
     "DEPENDENCIES_FOLDER",
     "ENTRY_POINTS",
+    "NAME_PATTERN",
     "InstalledService",
     "install",
     "installed_services",
@@ -54,8 +56,7 @@ _DEPENDENCIES = "dependencies.json"  # file of an installed service that names i
 DEPENDENCIES_FOLDER = ".dependencies"
 """Folder in a services folder that holds the Python packages of services, each set in a folder named by its
 digest."""
-_NAME = re.compile(r"[a-z][a-z0-9_-]{0,39}")  # pattern of a service's name
-_DIGEST = re.compile(r"[0-9a-f]{64}")  # pattern of a SHA-256 in hexadecimal digits
+NAME_PATTERN = re.compile(r"[a-z][a-z0-9_-]{0,39}")  # the name of a service
 _IGNORED = {
     "__pycache__",
     ".git",
@@ -76,7 +77,7 @@ build."""
 class _Manifest(msgspec.Struct, forbid_unknown_fields=True):
     """The content of ``service.json``."""
 
-    name: Annotated[str, msgspec.Meta(pattern=rf"^{_NAME.pattern}\Z")]
+    name: Annotated[str, msgspec.Meta(pattern=rf"^{NAME_PATTERN.pattern}\Z")]
     language: _Language
     entry: Annotated[str, msgspec.Meta(min_length=1)]
     kind: Literal["stateless", "per_robot_state"] = "stateless"
@@ -242,7 +243,7 @@ def packaged_services() -> list[InstalledService]:
     """
     services: dict[str, InstalledService] = {}
     for point in metadata.entry_points(group=ENTRY_POINTS):
-        if not _NAME.fullmatch(point.name) or point.name in services:
+        if not NAME_PATTERN.fullmatch(point.name) or point.name in services:
             raise ConfigurationError(
                 f"the service {point.name!r} of {point.value} has an invalid name, or one that is in use",
                 hint="uninstall the package, or set services.published to false, which runs no service of an "
@@ -288,7 +289,7 @@ def read_dependencies(target: Path) -> Dependencies | None:
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
         digest = str(document["digest"])
-        if not _DIGEST.fullmatch(digest):
+        if not SHA256_PATTERN.fullmatch(digest):
             raise ValueError("the digest is not a SHA-256")
         return Dependencies(**{**document, "folder": target.parent.absolute() / DEPENDENCIES_FOLDER / digest})
     except (OSError, ValueError, KeyError, TypeError) as error:
@@ -332,10 +333,8 @@ def verify_installed(target: Path) -> None:
         )
 
 
-def _list_files(folder: Path) -> Iterator[str]:
-    for path in sorted(folder.rglob("*")):
-        if (path.is_file() or path.is_symlink()) and "__pycache__" not in path.parts:
-            yield str(path.relative_to(folder))
+def _list_files(folder: Path) -> list[str]:
+    return [str(path.relative_to(folder)) for path in list_files(folder) if "__pycache__" not in path.parts]
 
 
 def _file_sha256(path: Path) -> str:

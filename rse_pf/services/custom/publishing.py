@@ -17,7 +17,7 @@ import shutil
 import tarfile
 import tempfile
 import zlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path, PurePosixPath
 
 import msgspec
@@ -25,14 +25,15 @@ import msgspec
 from rse_pf.config.resource_names import SERVICES_PREFIX
 from rse_pf.errors import ConfigurationError, Conflict, NotFound, StoreError, UsageError
 from rse_pf.object_store import ObjectStore, digest_of
-from rse_pf.services.custom.dependencies import Dependencies, require_same_versions
+from rse_pf.services.custom.dependencies import SHA256_PATTERN, Dependencies, require_same_versions
 from rse_pf.services.custom.installed import (
     DEPENDENCIES_FOLDER,
+    NAME_PATTERN,
     InstalledService,
     installed_services,
     read_dependencies,
 )
-from rse_pf.services.custom.regular_files import read_regular_file, require_regular_files
+from rse_pf.services.custom.regular_files import list_files, read_regular_file, require_regular_files
 
 __all__ = [
     "CURRENT",
@@ -91,8 +92,6 @@ _ARCHIVE_ERRORS = (
 this list again.  Other errors, such as that of a full disk, are raised as they are, and the server tries to
 install the list again at its next poll."""
 
-_NAME = re.compile(r"[a-z][a-z0-9_-]{0,39}")  # pattern of a service's name
-_DIGEST = re.compile(r"[0-9a-f]{64}")  # pattern of a SHA-256 in hexadecimal digits
 _MAX_TRIES = 8  # attempts to replace the list of services while other operators publish; then StoreError
 
 # --- What the shared libraries of a service may need ---
@@ -148,9 +147,9 @@ def decode_list(data: bytes) -> PublishedList:
         raise damaged_error(f"{LIST_NAME} is not a list of services: {error}") from error
     names = [entry.name for entry in published.services]
     digests = [entry.archive for entry in published.services]
-    if names != sorted(set(names)) or not all(map(_NAME.fullmatch, names)):
+    if names != sorted(set(names)) or not all(map(NAME_PATTERN.fullmatch, names)):
         raise damaged_error(f"{LIST_NAME} names a service twice, out of order, or by an invalid name")
-    if not all(map(_DIGEST.fullmatch, digests)):
+    if not all(map(SHA256_PATTERN.fullmatch, digests)):
         raise damaged_error(f"{LIST_NAME} names an archive without its digest")
     return published
 
@@ -196,7 +195,6 @@ def publish(service: InstalledService, root: Path, store: ObjectStore, *, now_s:
         published_s=now_s,
         packages={} if dependencies is None else dict(dependencies.packages),
     )
-    _require_compatible_packages((entry, *read_list(store).services))
     store.put(archive_name(entry.archive), archive)
     _change_list(store, {entry.name: entry})
     return entry
@@ -231,7 +229,7 @@ def require_server_platform(service: InstalledService, root: Path) -> Dependenci
             f"the packages of {service.name} are for {dependencies.platform}, servers are {SERVER_PLATFORM}",
             hint="publish with Python 3.11 on Linux (x86-64)",
         )
-    for path in _list_files(root):
+    for path in list_files(root):
         if re.search(r"\.so(\.\d+)*$", path.name):
             _require_loadable_library(service.name, path)
     return dependencies
@@ -248,7 +246,7 @@ def pack_archive(root: Path) -> bytes:
     require_regular_files(root)
     packed = io.BytesIO()
     with tarfile.open(fileobj=packed, mode="w", format=tarfile.PAX_FORMAT) as archive:
-        for path in _list_files(root):
+        for path in list_files(root):
             content = read_regular_file(path)
             member = tarfile.TarInfo(path.relative_to(root).as_posix())
             member.size, member.mode = len(content), 0o644
@@ -279,7 +277,7 @@ def _change_list(store: ObjectStore, changes: Mapping[str, PublishedService | No
         before, published = _read(store)
         merged = {**{entry.name: entry for entry in published.services}, **changes}
         entries = tuple(entry for _, entry in sorted(merged.items()) if entry is not None)
-        _require_compatible_packages(entries)
+        require_same_versions({entry.name: entry.packages for entry in entries})
         try:
             store.compare_and_swap(LIST_NAME, before, msgspec.json.encode(PublishedList(services=entries)))
         except Conflict:
@@ -289,17 +287,6 @@ def _change_list(store: ObjectStore, changes: Mapping[str, PublishedService | No
         f"other operators changed the list of services during each of {_MAX_TRIES} attempts to replace it",
         hint="publish again",
     )
-
-
-def _require_compatible_packages(entries: Sequence[PublishedService]) -> None:
-    """Raise ConfigurationError if two services need different versions of a package.
-
-    Of several entries with the same name of a service only the first one counts.
-    """
-    first_of_name: dict[str, PublishedService] = {}
-    for entry in entries:
-        first_of_name.setdefault(entry.name, entry)
-    require_same_versions({name: entry.packages for name, entry in first_of_name.items()})
 
 
 def _require_loadable_library(service: str, path: Path) -> None:
@@ -323,12 +310,6 @@ def _require_loadable_library(service: str, path: Path) -> None:
                 f"{path.name} of {service} needs {library.decode()}_{version}, Debian 12 has an older one",
                 hint=_BUILD_HINT,
             )
-
-
-def _list_files(root: Path) -> Iterator[Path]:
-    for path in sorted(root.rglob("*")):
-        if path.is_file() or path.is_symlink():
-            yield path
 
 
 def archive_name(digest: str) -> str:

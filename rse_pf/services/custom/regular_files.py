@@ -9,12 +9,12 @@ from __future__ import annotations
 import os
 import shutil
 import stat
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 from pathlib import Path
 
 from rse_pf.errors import UsageError
 
-__all__ = ["copy_regular_files", "read_regular_file", "require_regular_files"]
+__all__ = ["copy_regular_files", "list_files", "read_regular_file", "require_regular_files"]
 
 _OPEN_FLAGS = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
 """Flags to open a file that may be replaced after it was checked: links are refused, and a pipe does not
@@ -41,6 +41,13 @@ def read_regular_file(path: Path) -> bytes:
     with open(os.open(path, _OPEN_FLAGS), "rb") as file:
         _check(path, os.fstat(file.fileno()).st_mode, may_be_folder=False)
         return file.read()
+
+
+def list_files(folder: Path) -> Iterator[Path]:
+    """Yield the paths of all files and links below *folder*, in the order of their names."""
+    for path in sorted(folder.rglob("*")):
+        if path.is_file() or path.is_symlink():
+            yield path
 
 
 def require_regular_files(folder: Path, ignored: Collection[str] = ()) -> None:

@@ -11,7 +11,7 @@ import msgspec
 from rse_pf.errors import BadRequest, LimitExceeded
 from rse_pf.maps.format import MapVersion, decode_map, encode_map
 from rse_pf.service import Registry, Report
-from rse_pf.services.mapping.place import MAX_KEYFRAMES, map_limits
+from rse_pf.services.mapping.place import MAP_LIMITS, MAX_KEYFRAMES
 from rse_pf.slam.map_merge import MergedMap, MergeOptions, merge_versions
 from rse_pf.slam.optimise import ignore_progress
 
@@ -110,7 +110,7 @@ def merge_maps(request: MergeRequest, *, report: Report = ignore_progress) -> Me
         raise BadRequest(f"{len(request.maps)} maps are not within 1..{MAX_MAPS}", hint="send one or more")
     versions: list[MapVersion] = []
     for encoded in request.maps:
-        versions.append(decode_map(encoded, limits=map_limits()))
+        versions.append(decode_map(encoded, limits=MAP_LIMITS))
         count = sum(len(version.keyframes) for version in versions)
         points = sum(len(version.points) for version in versions)
         if count > MAX_KEYFRAMES or count * points > _MAX_PROJECTIONS:

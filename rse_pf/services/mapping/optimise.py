@@ -66,7 +66,7 @@ def register(registry: Registry) -> None:
         outliers = np.flatnonzero(graph.robust & (squares > 9.0 * max(options.cauchy, 3.0) ** 2))
         return OptimiseReply(
             g2o=write_g2o(replace(graph, T_world_pose=optimised.T_world_pose)),
-            chi2_before=graph.chi2(),
+            chi2_before=float(graph.squared_residuals(graph.T_world_pose).sum()),
             chi2_after=float(squares.sum()),
             cost_before=optimised.cost_before,
             cost_after=optimised.cost_after,

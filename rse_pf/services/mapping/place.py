@@ -30,6 +30,7 @@ from rse_pf.slam.relative_pose import View, landmarks_of_keyframe, measure_pose
 from rse_pf.wire.arrays import Array, reshaped
 
 __all__ = [
+    "MAP_LIMITS",
     "MAX_KEYFRAMES",
     "MAX_VIEW_FEATURES",
     "Candidate",
@@ -40,7 +41,6 @@ __all__ = [
     "Within",
     "check_comparisons",
     "index_map",
-    "map_limits",
     "open_map",
     "register",
     "view_of",
@@ -52,6 +52,8 @@ MAX_KEYFRAMES = 2000
 """Most keyframes of all maps of one request together, which bounds its time and memory."""
 MAX_FEATURES = 2_000_000
 """Most features of all keyframes of one map together, which bounds the memory of a request."""
+MAP_LIMITS = MapLimits(keyframes=MAX_KEYFRAMES, features=MAX_FEATURES)
+"""Limits of a map that a service decodes."""
 MAX_VIEW_FEATURES = 20_000
 """Most features of the view (the image to localise) of a request, which bounds the time of matching."""
 _MAX_COMPARISONS = 2_000_000_000
@@ -169,11 +171,6 @@ class MapIndex:
         return self._places.nearest(place_vector(descriptors), count, rows)
 
 
-def map_limits(keyframes: int = MAX_KEYFRAMES) -> MapLimits:
-    """Return the limits of a map that a service decodes: *keyframes* and `MAX_FEATURES`."""
-    return MapLimits(keyframes=keyframes, features=MAX_FEATURES)
-
-
 def index_map(data: bytes) -> tuple[MapVersion, MapIndex]:
     """Decode the map version *data*, and return the version with an index of its keyframes.
 
@@ -181,7 +178,7 @@ def index_map(data: bytes) -> tuple[MapVersion, MapIndex]:
         BadRequest: The bytes are not a map.
         LimitExceeded: The map has no keyframes, or more keyframes or features than the limits allow.
     """
-    version = decode_map(data, limits=map_limits())
+    version = decode_map(data, limits=MAP_LIMITS)
     if not version.keyframes:
         raise LimitExceeded(
             f"a map of 0 keyframes is not within 1..{MAX_KEYFRAMES}", hint="send a map with keyframes"

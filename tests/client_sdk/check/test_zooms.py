@@ -23,8 +23,7 @@ def adjusted(zooms: Array, deviation: float) -> Calibrated:
     return Calibrated(
         values=np.zeros(n), covariance=np.zeros((n, n)), zooms=zooms,
         zooms_covariance=deviation**2 * np.eye(VIEWS), T_camera_world=T, points_world=np.zeros((1, 3)),
-        bends_m=np.zeros((n, VIEWS, 3)), noise_m=0.0, cost=0.0, has_metric_scale=True, pixel_factor=1.0,
-        depth_factor=1.0,
+        bends_m=np.zeros((n, VIEWS, 3)), noise_m=0.0, has_metric_scale=True, depth_factor=1.0,
     )  # fmt: skip
 
 
