@@ -15,26 +15,29 @@ from rse_pf.geometry import Array, Camera, adjoint, exp_se3, inverse, transform
 
 __all__ = ["CameraFit", "fit_camera"]
 
-_ITERATIONS = 16  # number of Gauss-Newton steps, in which the scale of the loss shrinks from first to last
+_ITERATIONS = 16  # Gauss-Newton steps of a fit; the scale of the loss shrinks after each of them
 _FIRST_SCALES_PX = (16.0, 32.0)
-"""Scales of the loss, px, with which the two fits of a photo begin; the fit with the lower cost is used.
-They are as large as the errors of pixels that a focal length which is wrong by 20 and by 40 % causes."""
+"""First scale of the loss in pixels in each of the two fits of a photo, of which the fit with the lower cost
+is used.  A focal length that is wrong by 20 % moves pixels by about 16 px, and one that is wrong by 40 % by
+about 32 px, so that inliers still have a large weight."""
 _LAST_SCALE_PX = 2.0  # scale of the loss at the end, px: the noise of ORB corners
 _SCALE_SHRINK = 0.75  # factor by which the scale of the loss is multiplied after each step
 _LOG_FOCAL_DEVIATION = 0.2
-"""Prior standard deviation of the logarithm of the focal length over the stated one."""
+"""Prior standard deviation of the natural logarithm of the quotient of true and stated focal length."""
 _CENTRE_DEVIATION = 0.1  # prior standard deviation of the principal point, as a share of the image width
 _SHUTTER_DEVIATION_PX = 20.0
 """Prior standard deviation, px, of the shift between the first and the last row of an image that a rolling
 shutter and the motion of the camera cause."""
-_MIN_DEPTH_M = 0.05  # depth of a point in the camera: projections of nearer points use this depth
+# Smallest depth in metres with which a point is projected; nearer points, and those behind the camera, get it.
+_MIN_DEPTH_M = 0.05
 _MIN_VARIANCE_PX2 = 0.1  # smallest variance of a pixel, px^2, that is assumed however well all matches fit
 _CORRELATION_FACTOR = 5.0
-"""Measured ratio of the variance of a pose to that for independent errors: matches of one keyframe share the
-errors of its points, and one pixel may match several keyframes."""
+"""Factor by which the variance of a pose is larger than the variance that is computed with the assumption
+that the errors of all matches are independent.  The factor was measured.  The errors are not independent:
+matches of one keyframe share the errors of its points, and one pixel may match several keyframes."""
 _MIN_EIGENVALUE = 1e-9
-"""Smallest eigenvalue of an information matrix scaled to a diagonal of 1; smaller ones, which rounding
-decides, are raised to it."""
+"""Smallest eigenvalue of an information matrix that is scaled to a diagonal of 1.  A smaller eigenvalue is
+the result of rounding, and is replaced by this one."""
 _DEPTH_DEVIATION = 0.01  # relative standard deviation of the depth of a map point: that of a Kinect at 6 m
 _CAMERA_PARAMETERS = slice(6, 11)
 """Columns of the camera among the 11 parameters: logarithm of the focal length, principal point (2), shift by
@@ -49,7 +52,7 @@ class CameraFit:
         T_map_camera: ``(4, 4)``, m, pose with the fitted camera.
         covariance: ``(6, 6)`` of the twist (m, rad) on the left of the pose.  It contains the uncertainty of
             the focal length, the principal point and the rolling shutter.
-        log_focal: Logarithm of the fitted focal length over the stated one.
+        log_focal: Natural logarithm of the quotient of fitted and stated focal length.
         log_focal_deviation: Standard deviation of that logarithm.
         position_deviation_m: Root of the summed variances of the camera's position along the three axes.
         turn_deviation_deg: Root of the summed variances of the camera's rotation about the three axes.
@@ -66,14 +69,16 @@ class CameraFit:
 def fit_camera(
     points_map: Array, origins_map: Array, pixels: Array, T_map_camera: Array, camera: Camera
 ) -> CameraFit:
-    """Fit pose, focal length, principal point and rolling shutter to all matches, inliers and outliers.
+    """Fit pose, focal length, principal point and rolling shutter to all matches of a photo.
 
-    The rolling shutter is fitted because a quick rotation during the exposure otherwise looks like another
+    The matches that PnP rejected with the stated camera are used, too: with a wrong camera, PnP rejects right
+    matches.  The loss of the fit is robust, so that wrong matches have a small weight.  The rolling shutter
+    is fitted because the distortion by a quick rotation during the exposure would otherwise change the
     camera.
 
     Args:
         points_map: ``(n, 3)`` m, matched points of the map, at least 6.
-        origins_map: ``(n, 3)`` m, positions of the cameras that measured the points.
+        origins_map: ``(n, 3)`` m, for each point the position of the camera that measured it.
         pixels: ``(n, 2)``, pixels of the photo, undistorted by the stated camera.
         T_map_camera: ``(4, 4)`` m, pose that was computed with the stated camera, from which the fits begin.
         camera: The stated camera.
@@ -95,9 +100,9 @@ def fit_camera(
         for scale_px in _FIRST_SCALES_PX
     ]
     fit = min(fits, key=lambda fit: fit.cost)
-    # 2. Compute the information of the matches, and the part of it that is false because of errors of the
-    # points' depths: before a flat wall, only these errors make points leave their plane, and seem to
-    # determine the camera.
+    # 2. Compute the information of the matches, and the spurious part of it that results from depth errors of
+    # the points.  The points of a flat wall do not determine the focal length; but depth errors move them off
+    # their plane, so that the information matrix states that they do.
     shifted_map = points_map + _DEPTH_DEVIATION * (points_map - origins_map)
     jacobian_change = fit.jacobian_and_errors(shifted_map, pixels, camera)[0] - fit.jacobian
     weights = fit.weights[:, None, None]
@@ -127,8 +132,9 @@ class _Fit:
 
     Attributes:
         T_camera_map: ``(4, 4)``, m.
-        camera_change: ``(5,)``: logarithm of the focal length over the stated one, shift of the principal
-            point (px), shift between the first and the last row by a rolling shutter (px).
+        camera_change: ``(5,)``: natural logarithm of the quotient of this and the stated focal length, shift
+            of the principal point (2, px), shift between the first and the last row by a rolling shutter (2,
+            px).
         jacobian: ``(n, 2, 11)``, derivative of the projected pixels by twist and camera.
         errors_px: ``(n, 2)``, matched pixels minus projected ones.
         weights: ``(n,)``, weights of the Geman-McClure loss.
@@ -173,7 +179,8 @@ def _adjust(
     """Return pose and camera after Gauss-Newton steps on a loss whose scale shrinks to `_LAST_SCALE_PX`."""
     T_camera_map, camera_change, scale_px = inverse(T_map_camera), np.zeros(5), first_scale_px
     for _ in range(_ITERATIONS):
-        # The prior is weak while the scale is large, so that the fit can leave a wrong camera.
+        # The prior on the camera is multiplied by the square of last scale / scale: it is weak at first, so
+        # that the fit can move away from the stated camera if that is wrong.
         prior = _CORRELATION_FACTOR * (_LAST_SCALE_PX / scale_px) ** 2 * prior_information
         fit = _Fit(points_map, pixels, camera, T_camera_map, camera_change, scale_px)
         weighted = (fit.jacobian * fit.weights[:, None, None]).reshape(-1, 11)
@@ -194,11 +201,11 @@ def _covariance_of(
     """Return the covariance ``(11, 11)`` of pose and camera.
 
     Args:
-        information: ``(11, 11)``, information of the matches for pixels of variance 1.
-        feigned: ``(11, 11)``, the part of it that only noise of the points causes, which is subtracted.
-        variance_px2: Variance of a pixel, px^2.
-        prior_information: ``(5,)``, prior information on the camera: all that is known of the camera where
-            noise alone makes the information of the matches.
+        information: ``(11, 11)``, information matrix of the matches for pixels of variance 1 px^2.
+        feigned: ``(11, 11)``, the spurious part of *information*, which results from noise of the points and
+            is subtracted from it.
+        variance_px2: Variance of a pixel, px^2, by which the difference is divided.
+        prior_information: ``(5,)``, prior information on the parameters of the camera, which is added.
     """
     # 1. Scale to a diagonal of 1, subtract, and keep the result positive definite.
     scale = 1.0 / np.sqrt(np.diag(information))

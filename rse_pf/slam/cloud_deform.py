@@ -111,18 +111,18 @@ def find_observers(points: Array, keyframes: Sequence[Keyframe]) -> npt.NDArray[
 
 
 def voxel_keys(points: Array, voxel_m: float) -> npt.NDArray[np.int64]:
-    """Return a key of the voxel of each point; equal keys mean the same voxel.
+    """Return a key of the voxel of each point: one number, or three if one cannot hold it.
 
-    Voxels are counted from the lowest of these points, so that keys of two calls cannot be compared.
+    Two points lie in the same voxel if and only if their keys are equal.  Voxels are counted from the
+    smallest coordinates of these points, so that the keys of two calls cannot be compared.
 
     Args:
         points: ``(n, 3)`` metres.
         voxel_m: Edge of a voxel.
 
     Returns:
-        ``(n,)`` numbers, of which the smaller one has the smaller voxel index along x, then y, then z; or
-        ``(n, 3)`` with these indices if the points span more than 2**21 voxels along an axis, which one
-        number cannot hold.
+        ``(n,)`` numbers whose order is that of the voxel indices along x, then y, then z.  If the points span
+        more than 2**21 voxels along an axis: ``(n, 3)``, the voxel indices along x, y and z.
     """
     voxels = np.floor(points / voxel_m).astype(np.int64)
     voxels -= voxels.min(axis=0, initial=0)

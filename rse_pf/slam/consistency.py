@@ -43,10 +43,17 @@ clique found until then is returned."""
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OdometryNoise:
-    """Drift of odometry as a random walk: standard deviations of each axis for one step of odometry.
+    """Drift of odometry as a random walk: the variance grows by the same amount in each step of odometry.
 
-    ``step_m`` is in metres, ``step_deg`` in degrees.  ``step_scale`` is the deviation of the logarithm of the
-    metric scale of a camera without depth.  One step is the motion from a keyframe to the next one.
+    What a step is depends on the caller that counts the steps: the motion between consecutive keyframes of a
+    stored map (`rse_pf.slam.loop_closures`), or 0.25 m or 15 degrees of motion in a live map
+    (`rse_pf.live_map.graph`).
+
+    Attributes:
+        step_m: Standard deviation of the translation along each axis in one step, metres.
+        step_deg: Standard deviation of the rotation about each axis in one step, degrees.
+        step_scale: Standard deviation, in one step, of the natural logarithm of the scale of a camera without
+            depth.
     """
 
     step_m: float = 0.02
@@ -111,10 +118,10 @@ class EdgeArrays:
 
     @property
     def mean_variances(self) -> tuple[Array, Array]:
-        """Mean variance of the three axes of each relative pose, as two arrays.
+        """For each relative pose the mean of the variances along or about the three axes, as two arrays.
 
-        They are those of the translation, ``(m,)`` square metres, and of the rotation, ``(m,)`` square
-        radians.
+        The first array is that of the translation, ``(m,)`` square metres, and the second that of the
+        rotation, ``(m,)`` square radians.
         """
         return self.variances[:, :3].mean(axis=1), self.variances[:, 3:].mean(axis=1)
 
@@ -122,9 +129,9 @@ class EdgeArrays:
 def evidence_weight(inliers: int, matches: int) -> float:
     """Return the weight of a loop closure within 0 to 1, by its inliers and by its inliers per match.
 
-    The weight is the smallest of 1, *inliers* over 30, and the share of inliers among *matches* over 0.5;
-    without *matches* only the inliers count.  Weights add up: two loop closures of weight 0.5 count as one of
-    full weight.
+    The weight is the smallest of 1, ``inliers / 30`` and ``(inliers / matches) / 0.5``; the last one is left
+    out if *matches* is 0.  Weights of several loop closures are added: two of weight 0.5 count as one of full
+    weight.
     """
     ratio = inliers / matches if matches else 1.0
     return min(1.0, inliers / FULL_WEIGHT_INLIERS, ratio / FULL_WEIGHT_INLIER_RATIO)
@@ -167,17 +174,18 @@ def are_pairwise_consistent(
 ) -> npt.NDArray[np.bool_]:
     """Return ``(m,)``: whether each of *m* loop closures agrees with one reference loop closure.
 
-    The round trip over both loop closures and the odometry between their ends must be the identity.
-    Translation and rotation are tested separately, at 99 %, against the noise of both loop closures and of
-    the odometry.  Rotation noise moves the end of the trip, with the distance between both ends *a* and that
-    between both ends *b* as its levers.
+    The round trip over both loop closures and the odometry between their ends must be the identity within
+    its noise, which is that of both loop closures and of the odometry.  Translation and rotation are tested
+    separately; each test accepts 99 % of the right loop closures.  A rotation error also displaces the end of
+    the trip.  Therefore the sum of the variances of rotation, times the sum of the squared distances between
+    both ends *a* and between both ends *b*, is added to the variance of the translation.
 
-    Where the two trajectories have different units of length, the two measured scales must agree as well,
-    and the round trip uses their mean, weighted by information.
+    If the two trajectories have different units of length, the two measured scales must agree as well, and
+    the round trip uses the mean of their logarithms, weighted by their inverse variances.
 
     Args:
-        T: ``(n, 4, 4)``, poses of keyframes by odometry; those of all ends *a* are in one frame, and those of
-            all ends *b* in one frame, which may be another.
+        T: ``(n, 4, 4)``, poses of keyframes by odometry.  The poses of all ends *a* are in one frame.  The
+            poses of all ends *b* are in one frame, the same or another.
         edges: The *m* loop closures.
         reference: One loop closure between the same two trajectories.
         steps: ``(m,)``, steps of odometry between both ends *a* plus those between both ends *b*.
@@ -221,13 +229,17 @@ def fits_prediction(
 ) -> npt.NDArray[np.bool_]:
     """Return ``(m,)``: whether each of *m* loop closures agrees with a predicted relative pose.
 
-    Translation and rotation are tested apart, each by a chi-squared test at 99 %.
+    Translation and rotation are tested separately, each by a chi-squared test that accepts 99 % of the right
+    loop closures.
 
     Args:
         T_a_b: ``(m, 4, 4)``, the relative poses that odometry or a pose graph predicts.
         edges: The *m* measured loop closures.
-        steps: ``(m,)``, steps of odometry from *a* to *b*; the variance of the prediction grows with them.
-        lever_m: ``(m,)``, metres: distance over which rotation noise along the path moves its end.
+        steps: ``(m,)``, steps of odometry from *a* to *b*; the variance of the prediction is proportional to
+            their number.
+        lever_m: ``(m,)``, lever arm in metres: a rotation error of the prediction, in radians, displaces *b*
+            by this error times the lever arm.  An upper bound is the largest distance of *b* from the other
+            positions of the path from *a* to *b*.
         noise: Drift of the odometry in one step.
     """
     error = log_se3(inverse(edges.T_a_b) @ T_a_b)

@@ -2,7 +2,8 @@
 
 A descriptor is binary (uint8, compared by the Hamming distance) or a vector of whole numbers (int8, compared
 by the squared Euclidean distance); the type of the array decides.  The Hamming distance is a quarter of the
-squared Euclidean distance of bits written as -1 and 1, so that one ratio test fits both.  The native core
+squared Euclidean distance of bits written as -1 and 1.  A ratio of Hamming distances is therefore a ratio of
+squared Euclidean distances, too, so that one limit of the ratio test suits both types.  The native core
 matches ORB descriptors; numpy matches all other kinds, which a user's feature extractor computes.
 """
 
@@ -23,29 +24,31 @@ from rse_pf.native import Workspace, core_function
 __all__ = [
     "as_vectors",
     "best_matches",
+    "distance_bound",
     "distance_matrix",
     "distances_of_pairs",
     "match_all",
     "match_orb",
     "measure_distinctiveness",
-    "no_distance",
 ]
 
 Rows = npt.NDArray[np.int64]
 
 _DESCRIPTOR_DTYPES = (np.uint8, np.int8)
 _INSTRUCTION_FLAGS = {"portable": 1, "avx2": 2, "avx512": 0}
-"""Flags of the native core's ``rse_pf_match`` by the widest instructions that it may use."""
+"""Flag of a call of ``rse_pf_match`` of the native core, by the widest vector instructions that the core may
+use: 1 forbids AVX2 and AVX-512, 2 forbids AVX-512, and 0 forbids nothing."""
 _BLOCK_DISTANCES = 4_000_000
 """Largest number of distances in memory at a time where numpy matches descriptors: 16 MB of float32."""
 _BIT_COUNTS = np.array([bin(value).count("1") for value in range(256)], dtype=np.uint8)
 _WORKSPACE = Workspace()
 
 
-def no_distance(descriptors: Descriptors) -> int:
-    """Return a number that no distance between two rows of ``(n, d)`` descriptors exceeds.
+def distance_bound(descriptors: Descriptors) -> int:
+    """Return an upper bound of the distances between descriptors of the type and length of *descriptors*.
 
-    It depends on their type and on *d* alone: 256 for uint8 and 32 bytes.
+    *descriptors* is ``(n, d)``; only its type and *d* count.  For ORB descriptors (uint8, 32 bytes) the bound
+    is 256, the distance of two descriptors without an equal bit.
     """
     size = int(descriptors.shape[1])
     return 8 * size if descriptors.dtype == np.uint8 else 4 * 128 * 128 * size
@@ -94,17 +97,19 @@ def as_vectors(descriptors: Descriptors) -> npt.NDArray[np.float32]:
 def best_matches(reference: Descriptors, view: Descriptors, ratio: float) -> tuple[Rows, Rows]:
     """Match the descriptors of a reference with those of a view by Lowe's ratio test; best match first.
 
-    A match is accepted if its distance is below *ratio* times the distance of the second most similar
-    descriptor of the view.  Each descriptor of the view is matched once, with the most similar one.
+    Each descriptor of the reference is matched with the most similar one of the view.  The match is accepted
+    if its distance is below *ratio* times the distance to the second most similar descriptor of the view.  Of
+    several accepted matches with one descriptor of the view, only the one with the smallest distance is kept.
 
     Args:
         reference: ``(n, d)``.
         view: ``(m, d)``.
-        ratio: Largest accepted ratio of the best and the second best distance, above 0.
+        ratio: Limit of the quotient of the smallest and the second smallest distance, above 0; a match is
+            accepted if its quotient is below.
 
     Returns:
-        Rows of the reference, and the row of the view that matches each of them; none if the view has fewer
-        than two descriptors, since the ratio test needs a second one.
+        Rows of the reference, and the row of the view that matches each of them, in ascending order of the
+        distance; empty if the view has fewer than two descriptors, since the ratio test needs a second one.
 
     Raises:
         BadRequest: The two arrays hold descriptors of different types or lengths.
@@ -219,11 +224,12 @@ def measure_distinctiveness(
     Args:
         descriptors: ``(n, d)``, uint8 (Hamming distance) or int8 (squared Euclidean distance).
         pixels: ``(n, 2)``.
-        min_separation_px: Pixels.
+        min_separation_px: Features are compared if the difference of their columns or of their rows, in
+            pixels, is at least this number.
 
     Returns:
-        ``(n,)`` distances; where a feature is compared with no other one, a number above all distances (256
-        for ORB).
+        ``(n,)`` distances; for a feature that is compared with no other one, the bound that `distance_bound`
+        returns (256 for ORB).
 
     Raises:
         BadRequest: Shapes do not fit, or descriptors are neither uint8 nor int8.
@@ -237,13 +243,13 @@ def measure_distinctiveness(
             hint="give one descriptor of uint8 or int8 and two pixel coordinates for each feature",
         )
     if ORB.is_kind_of(descriptors):
-        nearest = np.full(len(pixels), no_distance(descriptors), dtype=np.int32)
+        nearest = np.full(len(pixels), distance_bound(descriptors), dtype=np.int32)
         _core_distinct()(
             descriptors, pixels.astype(np.float64, copy=False), len(pixels), float(min_separation_px), nearest
         )
         return nearest
     pixels = np.asarray(pixels, dtype=np.float64)
-    distances, none = distance_matrix(descriptors, descriptors), no_distance(descriptors)
+    distances, none = distance_matrix(descriptors, descriptors), distance_bound(descriptors)
     with np.errstate(invalid="ignore", over="ignore"):
         is_apart = (np.abs(pixels[:, None] - pixels[None]) >= min_separation_px).any(axis=2)
     distances[~is_apart | np.eye(len(pixels), dtype=bool)] = none

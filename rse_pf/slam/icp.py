@@ -24,8 +24,10 @@ _MIN_POINTS = 100
 alignment."""
 _NEIGHBOURS = 20  # number of nearest points from which the normal and covariance of a point are estimated
 _MIN_GAIN = 0.02
-"""Share by which the mean distance between the clouds must become smaller, for the refined pose to be
-accepted if it differs from the initial one; if it does not, the distance may become larger by this share."""
+"""Tolerance of the comparison of the mean distances between the clouds at the refined and at the initial
+pose, as a share of the latter.  If the poses differ, the refined one is accepted if its distance is smaller
+by more than this share.  If they count as equal, it is accepted unless its distance is larger by more than
+this share."""
 _UNCHANGED_M = 0.002
 """Translation in metres up to which a pose refined by ICP counts as equal to the initial pose."""
 _UNCHANGED_DEG = 0.1
@@ -33,11 +35,12 @@ _UNCHANGED_DEG = 0.1
 _CONVERGED_M = 1e-4  # translation in metres of an ICP step below which the solver has converged
 _CONVERGED_RAD = 1e-4  # rotation in radians of an ICP step below which the solver has converged
 _MAX_MISFIT_SHARE = 0.2
-"""Mean distance between the clouds, as a share of the correspondence distance, above which their surfaces do
-not fit."""
+"""Mean distance between the clouds at the refined pose, as a share of `IcpOptions.reach_m`, above which the
+pose is rejected because the surfaces do not fit."""
 _MIN_CONSTRAINT = 0.004
-"""Smallest eigenvalue of the constraint matrix at which surfaces determine all six degrees of freedom of a
-pose: a plane has 0, the corner of a room about 0.1."""
+"""Limit for the smallest eigenvalue of the constraint matrix (`_Surfaces.measure_constraint`).  If that
+eigenvalue is below the limit, the surfaces do not determine all six degrees of freedom of the pose.  It is 0
+for a plane, and about 0.1 for the corner of a room."""
 
 
 class IcpOptions(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
@@ -46,10 +49,12 @@ class IcpOptions(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     Attributes:
         voxel_m: Edge of the voxels to which both clouds are thinned, 1e-3..10 m.
         reach_m: Largest distance between corresponding points, voxel_m..100 m.
-        max_iterations: Iterations of the solver in each of its two stages, 1..1000.
+        max_iterations: Most iterations of the solver in each of its two stages, 1..1000.  The first stage
+            uses *reach_m*, the second one a third of it, but at least two voxels.
         min_overlap: Share of the source points that need a correspondence, 0.05..1.
-        max_motion_m: Largest translation from the initial pose to an accepted one.
-        max_motion_deg: Largest rotation from the initial pose to an accepted one, up to 180.
+        max_motion_m: Largest translation from the initial pose to an accepted one, metres, above 0.
+        max_motion_deg: Largest rotation from the initial pose to an accepted one, degrees, above 0 and up to
+            180.
 
     Raises:
         BadRequest: A number is out of its range.
@@ -72,7 +77,12 @@ class IcpOptions(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
             and 0 < self.max_motion_deg <= 180
         )
         if not is_within:
-            raise BadRequest("an option of icp is out of its range", hint="leave it out for the default")
+            raise BadRequest(
+                "an option of icp is out of its range: voxel_m 0.001..10, reach_m voxel_m..100, "
+                "max_iterations 1..1000, min_overlap 0.05..1, max_motion_m above 0, max_motion_deg above 0 "
+                "and up to 180",
+                hint="leave the option out for its default",
+            )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -141,7 +151,8 @@ def align_clouds(
         )
     surfaces = _Surfaces(target_cloud, target_tree, source_cloud, options.reach_m)
     before = surfaces.measure_fit(T_target_source)
-    # 2. Refine the pose with the whole correspondence distance, then with a smaller one.
+    # 2. Refine the pose with the correspondence distance reach_m, then with a third of it (but at least two
+    # voxels).
     pose, iterations, has_converged = T_target_source, 0, False
     for reach_m in (options.reach_m, max(options.reach_m / 3.0, 2.0 * options.voxel_m)):
         result = gicp.align(

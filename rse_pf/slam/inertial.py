@@ -1,14 +1,16 @@
-"""Encode what an IMU measured for a keyframe: the direction of gravity, and the motion since the last one.
+"""Encode what an IMU measured for a keyframe: the direction of gravity, and the motion before the keyframe.
 
-The motion is relative to the previous keyframe of the same segment of the robot's odometry.  Raw samples stay
-on the robot.  The content of the IMU block of a keyframe is little-endian, 40 bytes or with a motion 284::
+The motion is that since the previous keyframe of the same segment of the robot's odometry.  Raw samples stay
+on the robot.  The content of the IMU block of a keyframe is little-endian; it has 40 bytes without a motion,
+and 284 bytes with one::
 
     gravity   unit vector down in the camera's frame (3 float32), its standard deviation in rad (float32)
     mount     T_imu_camera: rotation vector in rad, translation in metres (6 float32)
-    motion    optional: duration in s, rotation vector in rad, velocity in m/s, position in m (10 float32),
-              biases of gyroscope (rad/s) and accelerometer (m/s^2) that were subtracted (6 float32), and the
-              upper triangle, row by row, of the 9x9 covariance of rotation, velocity and position
-              (45 float32): the preintegrated measurement, in the axes of the IMU
+    motion    optional: the preintegrated measurement in the axes of the IMU, see `InertialMotion`: duration
+              in s, rotation vector in rad, change of velocity in m/s and displacement in m, both without
+              gravity (10 float32), biases of gyroscope (rad/s) and accelerometer (m/s^2) that were
+              subtracted (6 float32), and the upper triangle, row by row, of the 9x9 covariance of rotation,
+              velocity and position (45 float32)
 
 The decoder checks that each number is physically possible.  A plausible but false gravity is outvoted by the
 other robots of a map, see `agreed_gravity`.
@@ -51,7 +53,7 @@ _MAX_BIAS = 10.0  # largest bias of a gyroscope in rad/s, or of an accelerometer
 _MAX_MOTION_DEVIATION = 1e3
 """Largest standard deviation of a preintegrated rotation (rad), velocity (m/s) or position (m)."""
 _MAX_GRAVITY_DIFFERENCE_DEG = 5.0
-"""Largest angle in degrees up to which two robots agree on the direction of gravity."""
+"""Largest angle in degrees between two directions of gravity that agree."""
 _MAX_DIRECTIONS = 200
 """Largest number of directions of gravity whose median is computed; of more, an even selection is taken,
 which bounds time and memory."""
@@ -162,12 +164,14 @@ def agreed_gravity(downs: Sequence[Array]) -> Array | None:
     """Return the direction of gravity ``(3,)`` on which more than half of the robots agree, else None.
 
     Each robot has one vote, the median of its own directions, so that a robot with many keyframes does not
-    outvote others.  Two votes agree if they differ by at most 5 degrees.  The result is a unit vector: the
-    median of the votes that agree with the vote on which most agree.  It is None without robots.
+    outvote others.  Two votes agree if they differ by at most 5 degrees.  The vote that agrees with most
+    votes is chosen, the first one of several.  The result is a unit vector: the median of the votes that
+    agree with the chosen one (itself included).  The result is None if they are not more than half of all
+    votes.
 
     Args:
-        downs: For each robot the directions of gravity at its keyframes, unit vectors ``(n, 3)`` with n >= 1,
-            all in the same world frame.
+        downs: For each robot with an IMU the directions of gravity at its keyframes, unit vectors ``(n, 3)``
+            with n >= 1, all in the same world frame; may be empty.
     """
     votes = np.array([_median_direction(directions) for directions in downs]).reshape(-1, 3)
     if not len(votes):
@@ -187,9 +191,8 @@ def upright_rotation(down: Array) -> Array:
     down = down / np.linalg.norm(down)
     axis = np.cross(down, [0.0, 0.0, -1.0])
     sine, cosine = float(np.linalg.norm(axis)), -float(down[2])
-    if (
-        sine < 1e-12
-    ):  # Parallel to z: no rotation, or half a turn about x, which is as good as any level axis.
+    if sine < 1e-12:
+        # *down* is parallel to z: no rotation, or half a turn, for which any level axis would do; x is taken.
         return np.diag([1.0, 1.0, 1.0, 1.0] if cosine > 0.0 else [1.0, -1.0, -1.0, 1.0])
     return exp_se3(np.concatenate([np.zeros(3), axis / sine * np.arctan2(sine, cosine)]))
 

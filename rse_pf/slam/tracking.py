@@ -20,7 +20,7 @@ from rse_pf.errors import BadRequest
 from rse_pf.geometry import Array, Camera, transform
 from rse_pf.maps.descriptors import ORB, DescriptorKind, Descriptors
 from rse_pf.native import PART_ABIS, Workspace, address_of, aligned, core_function
-from rse_pf.slam.descriptors import distances_of_pairs, no_distance
+from rse_pf.slam.descriptors import distance_bound, distances_of_pairs
 
 __all__ = [
     "Features",
@@ -517,7 +517,7 @@ def _match_by_numpy(
     # 3. Keep the best features that pass the tests of distance, of distinctiveness and of Lowe's ratio.
     max_distance = max_bits * image.descriptors.shape[1] // ORB.size
     if image.descriptors.dtype != np.uint8:
-        max_distance = no_distance(image.descriptors)
+        max_distance = distance_bound(image.descriptors)
     is_clear = (
         (best <= max_distance)
         & (best < distinctiveness_ratio * image.distinctiveness[features[starts]])

@@ -26,10 +26,10 @@ from rse_pf.service import dispatch
 from rse_pf.services.builtin import builtin_services
 from rse_pf.slam.descriptors import (
     best_matches,
+    distance_bound,
     distance_matrix,
     distances_of_pairs,
     measure_distinctiveness,
-    no_distance,
 )
 from rse_pf.slam.keyframe import (
     MAX_KEYFRAME_BYTES,
@@ -111,7 +111,7 @@ def test_distances_are_exact_whole_numbers(kind: DescriptorKind) -> None:
 
     assert np.array_equal(distance_matrix(first, second), oracle)
     assert np.array_equal(distances_of_pairs(first, second), np.diag(oracle))
-    assert oracle.max() <= no_distance(first)
+    assert oracle.max() <= distance_bound(first)
 
 
 def test_distances_of_the_longest_vectors_do_not_depend_on_the_order_of_their_dimensions() -> None:
