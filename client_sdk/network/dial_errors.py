@@ -18,17 +18,15 @@ from urllib.parse import SplitResult, urlsplit
 from client_sdk.network.peer_diagnosis import (
     HttpAnswer,
     explain_answer,
-    explain_bytes,
     explain_certificate,
-    explain_silence,
-    is_tls_server_answer,
-    parse_answer,
+    explain_no_answer,
+    is_plain_peer,
 )
-from client_sdk.network.peer_probe import PeerProbe
 from rse_pf.errors import Conflict, ConnectError, Forbidden, RsePfError, Unauthorized, UsageError
 from rse_pf.wire.refusal import CUT_OFF, RefusedHandshake, refusal_in
 
 __all__ = [
+    "ANSWERED_ERRNOS",
     "CHECK_ADDRESS",
     "CHECK_RUNNING",
     "DialError",
@@ -127,7 +125,6 @@ def no_answer_error(
     error: Exception,
     *,
     first_bytes: bytes = b"",
-    probe: PeerProbe | None = None,
     within_s: float | None = None,
 ) -> DialError:
     """Return the error of an attempt that had a TCP connection and got no HTTP/1.1 answer from *address*.
@@ -136,36 +133,25 @@ def no_answer_error(
         address: The URL as shown to users.
         error: What ended the attempt.
         first_bytes: What the peer sent instead of HTTP/1.1; empty if it sent nothing.
-        probe: Result of a second connection without a token; None if there was none.
         within_s: How many seconds the attempt waited for the answer, None if unknown.
     """
-    if first_bytes:
-        is_wrong_address = parse_answer(first_bytes) is None
-        explained = explain_bytes(address, first_bytes)
-    else:
-        peer = probe or PeerProbe()
-        explained = explain_silence(
-            address, error, certificate=peer.certificate, data=peer.data, within_s=within_s
-        )
-        if address.startswith("ws:"):
-            is_wrong_address = peer.certificate is not None
-        else:
-            is_wrong_address = bool(peer.data) and not is_tls_server_answer(peer.data)
+    explained = explain_no_answer(address, error, first_bytes=first_bytes, within_s=within_s)
+    is_other_protocol = bool(first_bytes) and not first_bytes.startswith(b"HTTP/")
+    is_wrong_address = is_other_protocol or is_plain_peer(error)
     return DialError(explained, may_be_accepted_late=True, is_wrong_address=is_wrong_address)
 
 
 def untrusted_certificate_error(
-    address: str, error: ssl.SSLCertVerificationError, *, issuer: str = "", is_enrolled: bool = False
+    address: str, error: ssl.SSLCertVerificationError, *, is_enrolled: bool = False
 ) -> DialError:
     """Return the error of a TLS certificate that this robot does not trust.
 
     Args:
         address: The URL as shown to users.
         error: Error of the TLS handshake.
-        issuer: Name of the authority that signed the certificate, empty if unknown.
         is_enrolled: Whether the robot trusts the authority in its enrolment file and no other.
     """
-    explained = explain_certificate(address, error, issuer=issuer, is_enrolled=is_enrolled)
+    explained = explain_certificate(address, error, is_enrolled=is_enrolled)
     return DialError(explained, is_wrong_address=True)
 
 

@@ -12,7 +12,7 @@ import ssl
 from collections.abc import Awaitable, Callable
 from functools import partial
 from typing import Any
-from urllib.parse import SplitResult, urlsplit
+from urllib.parse import urlsplit
 
 from websockets.asyncio.client import ClientConnection
 from websockets.asyncio.client import connect as websocket_connect
@@ -32,15 +32,10 @@ from client_sdk.network.dial_errors import (
     untrusted_certificate_error,
 )
 from client_sdk.network.http_proxy import (
-    Proxy,
-    TunnelRefused,
-    check_tunnel,
     find_proxy,
-    is_complete_head,
+    open_tunnel,
     port_of,
 )
-from client_sdk.network.peer_diagnosis import explain_proxy
-from client_sdk.network.peer_probe import PeerProbe, probe_peer
 from client_sdk.network.tcp import TcpDialler
 from rse_pf.config import SessionSettings
 from rse_pf.errors import ConnectError, Unauthorized, UnsupportedProtocol, UsageError
@@ -126,7 +121,6 @@ class Dialler:
         self._timings = timings
         self._callbacks = callbacks
         self._tcp = TcpDialler()
-        self._opened_urls: set[str] = set()
 
     async def open(self, url: str, on_answered: Callable[[], None]) -> tuple[ClientConnection, str | None]:
         """Return a WebSocket to *url* and the text of the token that it was opened with.
@@ -174,7 +168,7 @@ class Dialler:
 
     async def _connect_tcp(self, url: str, on_answered: Callable[[], None]) -> socket.socket:
         """Return a TCP connection to the host of *url*, perhaps through a proxy of the environment."""
-        parts, within_s = urlsplit(url), min(TCP_TIMEOUT_S, self._timings.connect_timeout_s)
+        parts, timeout_s = urlsplit(url), self._timings.connect_timeout_s
         host, port = parts.hostname or "", port_of(parts)
         try:
             proxy = find_proxy(parts.scheme, host, port)
@@ -182,45 +176,21 @@ class Dialler:
             raise DialError(error, is_wrong_address=True) from None
         try:
             if proxy is None:
-                connection = await self._tcp.connect(host, port, within_s)
+                connection = await self._tcp.connect(host, port, min(TCP_TIMEOUT_S, timeout_s))
             else:
-                connection = await self._tcp.connect(proxy.host, proxy.port, within_s)
+                connection = await asyncio.to_thread(open_tunnel, proxy, parts, timeout_s)
         except OSError as error:
             failure = tcp_error(hide_password(url), error)
-            if proxy is not None:
-                failure.error = _silent_proxy_error(url, proxy)
             if not failure.is_unanswered:
                 on_answered()
             raise failure from error
+        except DialError as failure:
+            if not failure.is_unanswered:
+                on_answered()
+            raise
         on_answered()
-        if proxy is not None:
-            try:
-                await self._open_tunnel(connection, proxy, parts, url)
-            except BaseException:
-                connection.close()
-                raise
+        connection.setblocking(False)
         return connection
-
-    async def _open_tunnel(
-        self, connection: socket.socket, proxy: Proxy, parts: SplitResult, url: str
-    ) -> None:
-        loop = asyncio.get_running_loop()
-
-        async def exchange_head() -> bytes:
-            request = proxy.connect_request(parts.hostname or "", port_of(parts))
-            await loop.sock_sendall(connection, request)
-            head = b""
-            while not is_complete_head(head) and (byte := await loop.sock_recv(connection, 1)):
-                head += byte
-            return head
-
-        try:
-            head = await asyncio.wait_for(exchange_head(), self._timings.connect_timeout_s)
-            check_tunnel(hide_password(url), proxy, head)
-        except (OSError, asyncio.TimeoutError) as error:
-            raise DialError(_silent_proxy_error(url, proxy)) from error
-        except TunnelRefused as refused:
-            raise DialError(refused.error, is_wrong_address=refused.is_lasting) from None
 
     async def _shake_hands(
         self, url: str, token: str | None, on_answered: Callable[[], None]
@@ -246,22 +216,13 @@ class Dialler:
             body = bytes(response.body or b"")
             raise http_status_error(address, response.status_code, headers, body) from error
         except ssl.SSLCertVerificationError as error:
-            issuer, is_enrolled = (await self._probe(url)).issuer, self.ssl_context is not None
-            raise untrusted_certificate_error(
-                address, error, issuer=issuer, is_enrolled=is_enrolled
-            ) from error
+            is_enrolled = self.ssl_context is not None
+            raise untrusted_certificate_error(address, error, is_enrolled=is_enrolled) from error
         except (OSError, asyncio.TimeoutError, WebSocketException, EOFError) as error:
-            # Where a WebSocket was open before, scheme and program are right, and a probe is not needed.
-            needs_probe = not first_bytes and url not in self._opened_urls
             raise no_answer_error(
-                address,
-                error,
-                first_bytes=bytes(first_bytes),
-                probe=await self._probe(url) if needs_probe else None,
-                within_s=options["open_timeout"],
+                address, error, first_bytes=bytes(first_bytes), within_s=options["open_timeout"]
             ) from error
         # 3. Check that the server chose our sub-protocol.
-        self._opened_urls.add(url)
         if websocket.subprotocol != self._subprotocol:
             websocket.transport.abort()
             unsupported = UnsupportedProtocol(
@@ -269,12 +230,3 @@ class Dialler:
             )
             raise DialError(unsupported, is_wrong_address=True)
         return websocket
-
-    async def _probe(self, url: str) -> PeerProbe:
-        within_s = min(TCP_TIMEOUT_S, self._timings.connect_timeout_s)
-        return await asyncio.to_thread(probe_peer, urlsplit(url), within_s)
-
-
-def _silent_proxy_error(url: str, proxy: Proxy) -> ConnectError:
-    """Return the error of a proxy that cannot be reached or sends no HTTP answer."""
-    return explain_proxy(hide_password(url), proxy.shown_url, proxy.variable, None, has_credentials=False)

@@ -7,32 +7,26 @@ upper or lower case, as other programs do.  A tunnel through the proxy is opened
 from __future__ import annotations
 
 import base64
+import http.client
 import ipaddress
 import socket
-import time
 import urllib.request
 from dataclasses import dataclass, field
 from urllib.parse import SplitResult, unquote, urlsplit
 
-from client_sdk.network.peer_diagnosis import explain_proxy, parse_answer
+from client_sdk.network.dial_errors import ANSWERED_ERRNOS, DialError
+from client_sdk.network.peer_diagnosis import shorten
 from rse_pf.config.placement import is_loopback
 from rse_pf.errors import ConnectError, UsageError
 
 __all__ = [
-    "MAX_HEAD_BYTES",
     "Proxy",
-    "TunnelRefused",
-    "check_tunnel",
     "connect_tcp",
     "find_proxy",
-    "is_complete_head",
+    "open_tunnel",
     "port_of",
-    "receive_until",
 ]
 
-MAX_HEAD_BYTES = 8192
-"""Longest answer of a proxy to CONNECT, in bytes; proxies and servers limit request heads to the same
-size."""
 DEFAULT_PROXY_PORT = 80
 """Port of a proxy whose address names none."""
 PROXY_SCHEMES = {"ws": "http", "http": "http", "wss": "https", "https": "https"}
@@ -54,22 +48,6 @@ class Proxy:
         """The address of the proxy without user name and password."""
         return f"http://{_bracket_ipv6(self.host)}:{self.port}"
 
-    def connect_request(self, host: str, port: int) -> bytes:
-        """Return the bytes of a CONNECT request for a tunnel to *host* (RFC 9110, 9.3.6)."""
-        target = f"{_bracket_ipv6(host).encode('idna').decode()}:{port}"
-        credentials = f"Proxy-Authorization: {self.authorization}\r\n" if self.authorization else ""
-        return f"CONNECT {target} HTTP/1.1\r\nHost: {target}\r\n{credentials}\r\n".encode()
-
-
-class TunnelRefused(Exception):
-    """A proxy opened no tunnel; ``is_lasting`` says whether another attempt would get the same answer."""
-
-    def __init__(self, error: ConnectError, *, is_lasting: bool) -> None:
-        """Carry the typed *error* for the user."""
-        super().__init__(error.message)
-        self.error = error
-        self.is_lasting = is_lasting
-
 
 def port_of(parts: SplitResult) -> int:
     """Return the port of an address, 443 or 80 by its scheme if it names none."""
@@ -79,45 +57,62 @@ def port_of(parts: SplitResult) -> int:
 def connect_tcp(parts: SplitResult, timeout_s: float) -> socket.socket:
     """Return a TCP connection to the host of *parts*, through the proxy of the environment if it has one.
 
-    This function blocks.  The connection to a proxy and the proxy's answer take at most *timeout_s* seconds
-    each.
+    This function blocks.  Each step takes at most *timeout_s* seconds.
 
     Raises:
+        DialError: The proxy refuses the tunnel, or cannot be reached.
         OSError: There is no connection to the host.
-        TunnelRefused: The proxy refuses the tunnel, or cannot be reached.
         UsageError: The environment variable names no HTTP proxy.
     """
     host, port = parts.hostname or "", port_of(parts)
     proxy = find_proxy(parts.scheme, host, port)
     if proxy is None:
         return socket.create_connection((host, port), timeout_s)
-    address = f"{parts.scheme}://{parts.netloc.rpartition('@')[2]}"
-    try:
-        connection = socket.create_connection((proxy.host, proxy.port), timeout_s)
-        try:
-            connection.sendall(proxy.connect_request(host, port))
-            check_tunnel(address, proxy, _read_head(connection, time.monotonic() + timeout_s))
-            connection.settimeout(timeout_s)
-        except BaseException:
-            connection.close()
-            raise
-    except OSError as error:
-        explained = explain_proxy(address, proxy.shown_url, proxy.variable, None, has_credentials=False)
-        raise TunnelRefused(explained, is_lasting=False) from error
-    return connection
+    return open_tunnel(proxy, parts, timeout_s)
 
 
-def receive_until(connection: socket.socket, max_bytes: int, deadline_s: float) -> bytes:
-    """Return at most *max_bytes* that arrive next, empty at the end; *deadline_s* is of the monotonic clock.
+def open_tunnel(proxy: Proxy, parts: SplitResult, timeout_s: float) -> socket.socket:
+    """Return a TCP connection through *proxy* to the host of *parts*; this function blocks.
+
+    Each step takes at most *timeout_s* seconds.
 
     Raises:
-        TimeoutError: The deadline has passed.
+        DialError: The proxy refuses the tunnel, or cannot be reached.
     """
-    if time.monotonic() >= deadline_s:
-        raise TimeoutError("the peer sends too slowly")
-    # A timeout of 0 would make the socket non-blocking.
-    connection.settimeout(max(0.001, deadline_s - time.monotonic()))
-    return connection.recv(max_bytes)
+    connection = http.client.HTTPConnection(proxy.host, proxy.port, timeout=timeout_s)
+    headers = {"Proxy-Authorization": proxy.authorization} if proxy.authorization else {}
+    host = (parts.hostname or "").encode("idna").decode()
+    connection.set_tunnel(_bracket_ipv6(host), port_of(parts), headers)
+    try:
+        connection.connect()
+    except (OSError, http.client.HTTPException) as error:
+        connection.close()
+        raise _tunnel_error(proxy, parts, error) from error
+    tunnel: socket.socket = connection.sock
+    return tunnel
+
+
+def _tunnel_error(proxy: Proxy, parts: SplitResult, error: Exception) -> DialError:
+    """Return the error of a tunnel that was not opened; an answer of 4xx to CONNECT counts as lasting."""
+    names = f"the proxy {proxy.shown_url}, which {proxy.variable} names,"
+    # http.client states the answer of the proxy only in the text of its error.
+    answer = shorten(str(error).partition("Tunnel connection failed: ")[2])
+    if not answer:
+        is_unanswered = isinstance(error, OSError) and error.errno not in ANSWERED_ERRNOS
+        hint = f"correct {proxy.variable}, or name {parts.hostname} in NO_PROXY"
+        return DialError(
+            ConnectError(f"{names} does not answer as a proxy", hint=hint), is_unanswered=is_unanswered
+        )
+    hint = f"ask who runs the proxy to allow CONNECT to it, or name {parts.hostname} in NO_PROXY"
+    if answer.startswith("407"):
+        hint = f"set {proxy.variable}=http://USER:PASSWORD@PROXY:PORT with the name of a user of the proxy"
+    elif answer.startswith("5"):
+        hint = "check host and port of the URL: the proxy does not reach it"
+    address = f"{parts.scheme}://{parts.netloc.rpartition('@')[2]}{parts.path}"
+    return DialError(
+        ConnectError(f"{names} answers {answer} for {address}", hint=hint),
+        is_wrong_address=answer.startswith("4"),
+    )
 
 
 def find_proxy(scheme: str, host: str, port: int) -> Proxy | None:
@@ -133,25 +128,6 @@ def find_proxy(scheme: str, host: str, port: int) -> Proxy | None:
     if name is None or is_loopback(host) or _is_exempt(host, port, proxies.get("no", "")):
         return None
     return _parse_proxy(proxies[name], f"{name.upper()}_PROXY")
-
-
-def is_complete_head(head: bytes) -> bool:
-    """Return whether *head*, the answer to CONNECT so far, is complete or longer than an answer may be."""
-    return b"\r\n\r\n" in head or b"\n\n" in head or len(head) >= MAX_HEAD_BYTES
-
-
-def check_tunnel(address: str, proxy: Proxy, head: bytes) -> None:
-    """Raise TunnelRefused unless *head*, the answer of *proxy* to CONNECT, has a status of 2xx.
-
-    A status of 4xx is lasting: another attempt gets the same answer.  *address* is the platform's, for the
-    error.
-    """
-    answer = parse_answer(head)
-    if answer is None or answer.status // 100 != 2:
-        error = explain_proxy(
-            address, proxy.shown_url, proxy.variable, answer, has_credentials=bool(proxy.authorization)
-        )
-        raise TunnelRefused(error, is_lasting=answer is not None and answer.status // 100 == 4)
 
 
 def _parse_proxy(value: str, variable: str) -> Proxy:
@@ -196,14 +172,3 @@ def _parse_network(entry: str) -> ipaddress.IPv4Network | ipaddress.IPv6Network 
 
 def _bracket_ipv6(host: str) -> str:
     return f"[{host}]" if ":" in host else host
-
-
-def _read_head(connection: socket.socket, deadline_s: float) -> bytes:
-    """Return the proxy's answer to CONNECT: complete, or cut off at its limit or where the proxy closed.
-
-    It is read byte by byte: the bytes after it belong to the server behind the proxy.
-    """
-    head = b""
-    while not is_complete_head(head) and (byte := receive_until(connection, 1, deadline_s)):
-        head += byte
-    return head

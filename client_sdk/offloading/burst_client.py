@@ -16,7 +16,8 @@ from urllib.parse import SplitResult, urlsplit
 
 from client_sdk.commands.answer_types import Answer
 from client_sdk.concurrency.tasks import cancel_tasks
-from client_sdk.network.http_proxy import TunnelRefused, connect_tcp, find_proxy, port_of
+from client_sdk.network.dial_errors import DialError
+from client_sdk.network.http_proxy import connect_tcp, find_proxy, port_of
 from client_sdk.offloading.burst_policy import BurstPolicy, burst_address
 from rse_pf.config import BurstSettings
 from rse_pf.errors import RsePfError
@@ -272,7 +273,7 @@ class BurstClient:
             reader, writer = await _open_connection(parts, context)
         except ValueError as error:  # the encoding of host names refuses a..b
             raise _BrokenHttp(f"{parts.hostname} cannot be a host name") from error
-        except TunnelRefused as refused:
+        except DialError as refused:
             raise refused.error from None
         return await self._exchange(reader, writer, head + body, idle, is_reused=False)
 

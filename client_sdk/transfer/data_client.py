@@ -30,7 +30,7 @@ import msgspec
 
 from client_sdk.concurrency.user_callbacks import UserCallbacks
 from client_sdk.enrolment import read_enrolment
-from client_sdk.network.http_proxy import TunnelRefused
+from client_sdk.network.dial_errors import DialError
 from client_sdk.transfer.data_connection import (
     MAX_SINGLE_PUT_BYTES,
     NO_UPSTREAM,
@@ -589,7 +589,7 @@ def _request_bucket(
         connection.request(method, f"{parts.path}?{parts.query}", body, dict(headers))
         answer = connection.getresponse()
         response = answer.status, answer.headers, answer.read()
-    except (OSError, ValueError, http.client.HTTPException, TunnelRefused, RsePfError):
+    except (OSError, ValueError, http.client.HTTPException, DialError, RsePfError):
         return None
     finally:
         if connection is not None:

@@ -15,16 +15,15 @@ from urllib.parse import SplitResult
 import msgspec
 
 from client_sdk.network.bearer_token import strip_token
-from client_sdk.network.dial_errors import explain_tcp_failure, show_wrong_url, split_address
-from client_sdk.network.http_proxy import TunnelRefused, connect_tcp, port_of
+from client_sdk.network.dial_errors import DialError, explain_tcp_failure, show_wrong_url, split_address
+from client_sdk.network.http_proxy import connect_tcp, port_of
 from client_sdk.network.peer_diagnosis import (
     HttpAnswer,
     explain_answer,
     explain_certificate,
-    explain_silence,
-    is_tls_server_answer,
+    explain_no_answer,
+    is_plain_peer,
 )
-from client_sdk.network.peer_probe import probe_peer
 from rse_pf.errors import (
     ConnectError,
     RsePfError,
@@ -46,9 +45,6 @@ MAX_SINGLE_PUT_BYTES = 262_144
 resumed."""
 NO_UPSTREAM = b"no healthy upstream"
 """Body of the 503 that the load balancer (Envoy) sends while it knows no data server at all."""
-PROBE_TIMEOUT_S = 1.0
-"""Time limit of each step of `probe_peer`, in seconds: it runs after a peer gave no usable answer, and a peer
-that is alive needs less."""
 HTTP_SCHEMES = {"ws": "http", "wss": "https"}
 """For each scheme of the backend servers' WebSocket address, the scheme of the data service at the same host
 and port."""
@@ -120,8 +116,8 @@ class DataConnection:
             self._connection.request(method, path, body, {**authorization, **headers})
             answer = self._connection.getresponse()
             body_received = answer.read()
-        except TunnelRefused as refused:
-            self.is_wrong_address = refused.is_lasting
+        except DialError as refused:
+            self.is_wrong_address = refused.is_wrong_address
             raise refused.error from None
         except (OSError, http.client.HTTPException) as error:
             self.close()
@@ -180,26 +176,16 @@ class DataConnection:
         )
 
     def _explain_no_answer(self, error: OSError | http.client.HTTPException) -> ConnectError:
-        """Return the typed error of a request that got no answer because of *error*.
-
-        A peer that has never answered, or whose certificate is not trusted, is probed for the cause.
-        """
+        """Return the typed error of a request without an answer; a peer that has answered before is known."""
         address = self._parts.geturl()
         if isinstance(error, ssl.SSLCertVerificationError):
             self.is_wrong_address = True
-            issuer = probe_peer(self._parts, PROBE_TIMEOUT_S).issuer
-            is_enrolled = self._ssl_context is not None
-            return explain_certificate(address, error, issuer=issuer, is_enrolled=is_enrolled)
+            return explain_certificate(address, error, is_enrolled=self._ssl_context is not None)
         if not self._has_answered:
-            peer = probe_peer(self._parts, PROBE_TIMEOUT_S)
-            data, speaks_tls = peer.data, peer.certificate is not None
-            if isinstance(error, http.client.BadStatusLine) and not isinstance(error, ConnectionResetError):
-                data = data or str(error).encode("latin-1", "replace")
-            sends_without_tls = bool(data) and not is_tls_server_answer(data)
-            self.is_wrong_address = self.uses_tls != speaks_tls and (speaks_tls or sends_without_tls)
-            return explain_silence(
-                address, error, certificate=peer.certificate, data=data, within_s=self._timeout_s
-            )
+            has_text = isinstance(error, http.client.BadStatusLine) and not isinstance(error, OSError)
+            first_bytes = str(error).encode("latin-1", "replace") if has_text else b""
+            self.is_wrong_address = has_text or is_plain_peer(error)
+            return explain_no_answer(address, error, first_bytes=first_bytes, within_s=self._timeout_s)
         return ConnectError(
             f"no answer from {self.host}: {error or type(error).__name__}",
             hint="call again to resume the transfer",
@@ -214,7 +200,7 @@ def open_connection(
     Raises:
         ConnectError: There is no TCP connection.
         OSError: The TLS handshake failed.
-        TunnelRefused: The proxy opens no tunnel, or cannot be reached.
+        DialError: The proxy opens no tunnel, or cannot be reached.
         UsageError: The environment variable for the proxy does not hold the address of an HTTP proxy.
     """
     host, port = parts.hostname or "", port_of(parts)

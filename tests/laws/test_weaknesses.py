@@ -41,16 +41,15 @@ HARMLESS: Mapping[tuple[str, str], str] = {
 
 NO_SECRETS: Mapping[tuple[str, str], str] = {
     (
-        "client_sdk/network/peer_diagnosis.py",
+        "client_sdk/network/http_proxy.py",
         "Basic Auth Credentials",
     ): "the words USER and PASSWORD of a hint",
     ("docs/local.md", "Basic Auth Credentials"): "the words USER and PASSWORD",
     ("docs/howto/own_certificates.md", "Secret Keyword"): "the name of a file",
     (
-        "tests/client_sdk/test_peer_diagnosis.py",
+        "tests/client_sdk/test_http_proxy.py",
         "Basic Auth Credentials",
     ): "made up, for a proxy of the test",
-    ("tests/client_sdk/test_http_proxy.py", "Basic Auth Credentials"): "the same",
     ("tests/hostile/test_floods.py", "Hex High Entropy String"): "digits of a long number",
     ("docs/protocol.md", "JSON Web Token"): "the page's example; its signature says 'signature'",
     ("docs/protocol.md", "Base64 High Entropy String"): "the same",
