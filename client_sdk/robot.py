@@ -140,7 +140,7 @@ class Robot:
             wall_clock=wall_clock,
             on_change=on_change,
             callbacks=self.callbacks,
-            recorder=self._recorder,
+            tap=self._recorder,
         )
         self._urls, self._enrolment = urls, enrolment
         self._offload = offload

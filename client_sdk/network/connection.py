@@ -49,7 +49,7 @@ import random as random_module
 import ssl
 import time
 from collections.abc import Callable, Coroutine, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from websockets.exceptions import ConnectionClosed
 
@@ -65,6 +65,7 @@ from client_sdk.network.dial_errors import (
     revoked_token_error,
 )
 from client_sdk.network.handshake import Dialler, Token
+from client_sdk.network.message_tap import MessageTap, NullMessageTap
 from client_sdk.network.region_choice import MAX_REGIONS, RegionChoice
 from client_sdk.network.region_sockets import Region, RegionSocket
 from rse_pf.errors import ConnectError, ProtocolError, RsePfError, UnsupportedProtocol, UsageError
@@ -81,9 +82,6 @@ from rse_pf.wire.client_session import (
 )
 from rse_pf.wire.client_subscriptions import SubscriptionEnded, Updated
 from rse_pf.wire.server_session import CLOSE_RATE, CLOSE_REPLACED, CLOSE_REVOKED, MAX_BAD_MESSAGES
-
-if TYPE_CHECKING:  # only robots that record import the recorder
-    from rse_pf.recording.robot_recorder import RobotRecorder
 
 __all__ = [
     "Connection",
@@ -144,7 +142,7 @@ class Connection:
         wall_clock: Callable[[], float] = time.time,
         on_change: OnChange = None,
         callbacks: UserCallbacks,
-        recorder: RobotRecorder | None = None,
+        tap: MessageTap | None = None,
     ) -> None:
         """Prepare the connections of one robot; `open` makes them.
 
@@ -159,7 +157,7 @@ class Connection:
             wall_clock: Unix seconds; the clock by which *token* signs.
             on_change: Function of the program that is notified when the connection changes.
             callbacks: Calls *on_change* and *token*, and survives their exceptions.
-            recorder: Records every message; None records nothing.
+            tap: Observes every message, for a recording; None observes nothing.
 
         Raises:
             UsageError: An address is no WebSocket address or appears twice, or there are too many.
@@ -172,7 +170,7 @@ class Connection:
         self.last_error = ""
         self.refusal: RsePfError | None = None
         """Why all regions refuse this robot now; None while it is connected or may be accepted."""
-        self._recorder = recorder
+        self._tap = tap or NullMessageTap()
         self._session = session
         self._settings = session.settings
         self._timings = timings
@@ -511,8 +509,7 @@ class Connection:
         # 2. Start the tasks that read and write the socket; the first message is Hello.
         socket = RegionSocket(region, websocket, self._session.open_connection(self._clock()))
         self._sockets.append(socket)
-        if self._recorder is not None:
-            socket.recorder_number = self._recorder.open_connection(self._session.codec, token)
+        socket.tap_number = self._tap.open_connection(self._session.codec, token)
         socket.tasks = [
             self._start_task(self._read_messages(socket)),
             self._start_task(self._write_messages(socket)),
@@ -547,8 +544,7 @@ class Connection:
             while True:
                 data = await socket.websocket.recv(decode=False)
                 self.bytes_in += len(data)
-                if self._recorder is not None:
-                    self._recorder.observe_message(socket.recorder_number, "down", data)
+                self._tap.observe_message(socket.tap_number, "down", data)
                 self._receive(socket, data)
         except (ConnectionClosed, OSError):
             code = socket.websocket.close_code
@@ -609,8 +605,7 @@ class Connection:
                 while socket.state.outgoing:
                     data = socket.state.outgoing.pop(0)
                     self.bytes_out += len(data)
-                    if self._recorder is not None:
-                        self._recorder.observe_message(socket.recorder_number, "up", data)
+                    self._tap.observe_message(socket.tap_number, "up", data)
                     await socket.websocket.send(data, text=is_text)
         except (ConnectionClosed, OSError):
             return  # the reading task handles the end, after the messages that still arrived
@@ -677,8 +672,7 @@ class Connection:
         # 1. Forget the socket; the session keeps its unanswered commands.
         socket.has_ended.set()
         self._sockets.remove(socket)
-        if self._recorder is not None:
-            self._recorder.close_connection(socket.recorder_number)
+        self._tap.close_connection(socket.tap_number)
         if self._session.current is socket.state and not self._is_closed:
             self._notify_change("link-lost", "closed")
         self._session.close_connection(socket.state)

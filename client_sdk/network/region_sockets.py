@@ -80,5 +80,5 @@ class RegionSocket:
         """The last ping and pong that were counted as a round trip of the region."""
         self.tasks: list[asyncio.Task[None]] = []
         self.malformed_messages = 0
-        self.recorder_number = 0
-        """The number of this connection in the recording of the robot, if there is one."""
+        self.tap_number = 0
+        """The number by which the message tap knows this connection."""

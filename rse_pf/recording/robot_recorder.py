@@ -102,7 +102,7 @@ class _Connection:
 
 
 class RobotRecorder:
-    """Record the messages, frames and maps of one robot between `start` and `stop`."""
+    """Record the messages, frames and maps of one robot between `start` and `stop`; a `MessageTap`."""
 
     def __init__(
         self, folder: str | Path, *, thumbnails: bool, session: SessionSettings, version: str = ""
