@@ -1,18 +1,15 @@
 """Pass commands of robots to the map servers of live maps, and updates back to the robots of one worker.
 
 The worker checks the scope of the robot's token, and the size and format of each request; the map server
-validates its content.  A robot that sends ten invalid requests within a minute may send no commands to live
-maps for a minute.
+validates its content.
 """
 
 from __future__ import annotations
 
 import asyncio
-import math
 import traceback
 from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -26,7 +23,6 @@ from rse_pf.errors import (
     Expired,
     Forbidden,
     InternalError,
-    InvalidCamera,
     LimitExceeded,
     RsePfError,
 )
@@ -41,10 +37,8 @@ from rse_pf.slam.keyframe import MAX_KEYFRAME_BYTES, check_odometry_range, decod
 from rse_pf.wire import Failure, Result, as_type
 from rse_pf.wire.live_map import (
     FORGET,
-    KEYFRAME,
     LIVE_REQUESTS,
     PUBLISH,
-    RELOCALISE,
     START,
     STOP,
     KeyframeRequest,
@@ -71,56 +65,6 @@ _MAX_WAITING_BYTES_PER_TENANT = _MAX_WAITING_BYTES // 4
 tenants that fill their part do not stop each other."""
 _BUSY_RETRY_MS = 500.0
 """Milliseconds after which a robot sends a command again that was refused because too many wait."""
-_INVALID_REQUEST_CODES = (BadRequest.code, BadMessage.code, LimitExceeded.code, InvalidCamera.code)
-"""Codes of errors that the sender of a request has caused, so that they count as an invalid request."""
-_SERVICES_WITH_BLAME = (KEYFRAME, RELOCALISE)
-"""Services for which an invalid-request error of the map server counts against the robot.  Errors of other
-services may come from the state of the map, for example of one that cannot be published."""
-_MAX_INVALID_REQUESTS = 10
-"""Number of invalid requests in 60 s after which live maps are closed to a robot.  A robot with a matching
-SDK sends none."""
-_WINDOW_S = 60.0
-"""Length in seconds of the time window in which the invalid requests of a robot are counted; it begins with
-an invalid request, and the first one after its end begins the next window."""
-_BLOCKED_S = 60.0
-"""Seconds for which commands to live maps of a robot that sent too many invalid requests are refused."""
-_MAX_COUNTED_ROBOTS = 4096
-"""Largest number of robots whose invalid requests a worker counts, to bound memory; the count of the robot
-whose last invalid request is oldest is dropped first."""
-
-
-@dataclass(slots=True)
-class _InvalidRequests:
-    window_start_s: float
-    count: int = 0
-    blocked_until_s: float = -math.inf
-
-
-class InvalidRequestCounter:
-    """Counts the invalid requests of each robot of a worker, and blocks robots that send too many."""
-
-    def __init__(self) -> None:
-        self._by_robot: dict[RobotId, _InvalidRequests] = {}
-
-    def count(self, robot: RobotId, now: float) -> None:
-        """Count one invalid request of *robot* at the monotonic time *now* in seconds.
-
-        The tenth one in a time window of 60 s, and each further one, blocks the robot for 60 s from *now* on.
-        """
-        requests = self._by_robot.pop(robot, None)
-        if requests is None or now - requests.window_start_s > _WINDOW_S:
-            requests = _InvalidRequests(now)
-        self._by_robot[robot] = requests
-        requests.count += 1
-        if requests.count >= _MAX_INVALID_REQUESTS:
-            requests.blocked_until_s = now + _BLOCKED_S
-        if len(self._by_robot) > _MAX_COUNTED_ROBOTS:
-            del self._by_robot[next(iter(self._by_robot))]
-
-    def seconds_blocked(self, robot: RobotId, now: float) -> float:
-        """Return for how many more seconds *robot* is blocked at the monotonic time *now*; 0 if it is not."""
-        requests = self._by_robot.get(robot)
-        return 0.0 if requests is None else max(0.0, requests.blocked_until_s - now)
 
 
 class LiveMapRouter(CommandQueue):
@@ -148,7 +92,6 @@ class LiveMapRouter(CommandQueue):
         self._monotonic = context.clocks.monotonic
         self._answer = answer
         self._client = make_client(self.update)
-        self._invalid_requests = InvalidRequestCounter()
         self._tasks: dict[asyncio.Task[None], QueuedCommand] = {}
         self._waiting_bytes = 0
         self._waiting_bytes_of_tenant: Counter[str] = Counter()
@@ -182,7 +125,6 @@ class LiveMapRouter(CommandQueue):
         """
         tenant = queued.robot.tenant
         try:
-            self._check_not_blocked(queued.robot, now)
             tenant_bytes = self._waiting_bytes_of_tenant[tenant] + queued.size_bytes
             worker_bytes = self._waiting_bytes + queued.size_bytes
             if tenant_bytes > _MAX_WAITING_BYTES_PER_TENANT or worker_bytes > _MAX_WAITING_BYTES:
@@ -194,8 +136,6 @@ class LiveMapRouter(CommandQueue):
                 )
             request = self._prepare_request(queued, now)
         except RsePfError as error:
-            if error.code in _INVALID_REQUEST_CODES:
-                self._invalid_requests.count(queued.robot, now)
             self._answer_failure(queued, error)
             return
         task = self._context.loop.create_task(self._answer_command(queued, request))
@@ -258,8 +198,6 @@ class LiveMapRouter(CommandQueue):
                 ),
             )
         except RsePfError as error:
-            if command.service in _SERVICES_WITH_BLAME and error.code in _INVALID_REQUEST_CODES:
-                self._invalid_requests.count(queued.robot, self._monotonic())
             self._answer_failure(queued, error)
         except Exception as error:  # noqa: BLE001  a defect must not leave the robot without an answer
             text = "".join(traceback.format_exception(type(error), error, error.__traceback__))
@@ -287,17 +225,6 @@ class LiveMapRouter(CommandQueue):
 
     def _answer_failure(self, queued: QueuedCommand, error: RsePfError) -> None:
         self._answer(queued, failure_of(error, queued.command, server=self._context.server_id))
-
-    def _check_not_blocked(self, robot: RobotId, now: float) -> None:
-        """Raise Forbidden, and count the refusal in the metrics, if the robot is blocked now."""
-        blocked_s = self._invalid_requests.seconds_blocked(robot, now)
-        if blocked_s > 0:
-            self._context.metrics.shed["live-garbage"] += 1
-            raise Forbidden(
-                f"this robot sent {_MAX_INVALID_REQUESTS} invalid requests to live maps within "
-                f"{_WINDOW_S:.0f} s; live maps are closed to it for {blocked_s:.0f} s",
-                hint="update the robot's SDK, or correct what it sends",
-            )
 
     # --- Subscriptions of robots to updates ---
 

@@ -1,4 +1,4 @@
-"""Commands to live maps: scopes, sizes, formats and answers, and which robots are blocked."""
+"""Commands to live maps: scopes, sizes, formats and answers, and what waits."""
 
 from __future__ import annotations
 
@@ -18,18 +18,11 @@ from server.live_map.fake_client import FakeLiveMapClient, FakeReader
 from rse_pf.auth.tokens import Claims
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import (
-    BadRequest,
     Busy,
-    InvalidCamera,
-    LimitExceeded,
-    QuotaExceeded,
-    RsePfError,
-    StoreError,
-    StoreFull,
 )
 from rse_pf.geometry import Camera
 from rse_pf.identity import RobotId
-from rse_pf.server.live_map.router import LIVE_SERVICES, LiveMapRouter
+from rse_pf.server.live_map.router import LiveMapRouter
 from rse_pf.server.ports import Clocks, WorkerContext
 from rse_pf.server.scheduling.scheduler import QueuedCommand
 from rse_pf.slam.keyframe import MAX_KEYFRAME_BYTES, SentKeyframe, encode_keyframe, make_features
@@ -316,32 +309,6 @@ async def test_a_defect_is_an_internal_failure_without_its_text() -> None:
         assert "secret" not in answer.message + answer.hint
 
 
-async def test_a_sender_of_invalid_requests_is_blocked_for_a_while_and_the_others_are_not() -> None:
-    now = [100.0]
-
-    async with a_router(now) as parts:
-        hostile, good = FakeReader("hostile"), FakeReader("good")
-        namesake = FakeReader("hostile", tenant="acme")
-        parts.client.answer = lambda operation, payload: (
-            BadRequest("a keyframe of 10 km away") if payload.segment else {}
-        )
-        for _ in range(9):
-            await parts.ask("live-keyframe", keyframe(segment=1), connection=hostile)
-        assert isinstance(await parts.ask("live-keyframe", keyframe(), connection=hostile), Result)
-
-        await parts.ask("live-keyframe", keyframe(keyframe=5), connection=hostile)
-        asked = len(parts.client.asked)
-        refused = await parts.ask("live-keyframe", keyframe(), connection=hostile)
-
-        assert isinstance(refused, Failure)
-        assert refused.code == "forbidden"
-        assert len(parts.client.asked) == asked
-        assert isinstance(await parts.ask("live-keyframe", keyframe(), connection=good), Result)
-        assert isinstance(await parts.ask("live-keyframe", keyframe(), connection=namesake), Result)
-        now[0] += 61.0
-        assert isinstance(await parts.ask("live-keyframe", keyframe(), connection=hostile), Result)
-
-
 async def test_what_a_robot_of_that_name_in_another_tenant_asked_does_not_count_as_its_own() -> None:
     async with a_router() as parts:
         parts.client.answer = lambda operation, payload: None
@@ -479,44 +446,6 @@ async def test_a_driver_whose_fresh_token_only_allows_to_watch_goes_on_reading_a
 
         assert isinstance((await settled(reader, 2))[1], Update)
         assert parts.client.may_start == {("default", "m"): False}
-
-
-@pytest.mark.parametrize(
-    "error",
-    [
-        BadRequest("the relative pose is no rotation"),
-        LimitExceeded("too many versions"),
-        InvalidCamera("fx"),
-        QuotaExceeded("the tenant is full"),
-        StoreFull("the disk is full"),
-    ],
-    ids=lambda error: error.code,
-)
-@pytest.mark.parametrize("service", sorted(LIVE_SERVICES - {"live-keyframe", "live-relocalise", "live-list"}))
-async def test_an_error_of_the_map_never_counts_against_who_asked(service: str, error: RsePfError) -> None:
-    async with a_router() as parts:
-        parts.client.answer = lambda operation, payload: error
-        payload = {"map": "m", "robot": "bob", "from": "m@ab12"}
-
-        for _ in range(15):
-            answer = await parts.ask(service, payload)
-            assert isinstance(answer, Failure)
-            assert answer.code == error.code
-
-
-@pytest.mark.parametrize(
-    "error", [QuotaExceeded("full"), StoreFull("full"), Busy("moves"), StoreError("down")]
-)
-async def test_a_keyframe_that_the_store_or_the_quota_refuses_is_no_invalid_request(
-    error: RsePfError,
-) -> None:
-    async with a_router() as parts:
-        parts.client.answer = lambda operation, payload: error
-
-        for _ in range(15):
-            answer = await parts.ask("live-keyframe", keyframe())
-            assert isinstance(answer, Failure)
-            assert answer.code == error.code
 
 
 async def test_commands_that_wait_for_map_servers_are_bounded_for_each_tenant() -> None:

@@ -110,10 +110,9 @@ class MapState:
             returns no loop closures and the failure reason ``defect``.
         """
         defect = LoopClosuresMeasured(keyframe=keyframe, failed={"defect": 1})
-        measurements = _call_guarded(lambda: self.live_map.prepare_measurement(keyframe, parts, candidates))
-        if measurements is None:
-            return [lambda: defect]
-        return [functools.partial(_measure_guarded, measure, defect) for measure in measurements]
+        prepare = functools.partial(self.live_map.prepare_measurement, keyframe, parts, candidates)
+        measurements = _call_guarded(prepare, on_defect=[lambda: defect])
+        return [functools.partial(_call_guarded, measure, on_defect=defect) for measure in measurements]
 
     def prepare_optimisation(self, optimise: GraphOptimiser) -> Callable[[], Optimised | None]:
         """Return a function that optimises a copy of the whole pose graph; the map does not change.
@@ -121,8 +120,9 @@ class MapState:
         The function calls *optimise*, while the map may change, and returns the event with the new poses;
         None if any exception but MemoryError was raised.
         """
-        optimisation = _call_guarded(lambda: self.live_map.prepare_optimisation(optimise))
-        return lambda: None if optimisation is None else _call_guarded(optimisation)
+        prepare = functools.partial(self.live_map.prepare_optimisation, optimise)
+        optimisation = _call_guarded(prepare, on_defect=None)
+        return lambda: None if optimisation is None else _call_guarded(optimisation, on_defect=None)
 
     @property
     def is_snapshot_due(self) -> bool:
@@ -162,8 +162,8 @@ class MapState:
         return outcomes, None
 
 
-def _call_guarded(act: Callable[[], _T]) -> _T | None:
-    """Return the result of *act*, or None if it raises anything but MemoryError.
+def _call_guarded(act: Callable[[], _T], *, on_defect: _T) -> _T:
+    """Return the result of *act*, or *on_defect* if it raises anything but MemoryError.
 
     A defect must not end the map server; the exception is not logged.
     """
@@ -172,14 +172,7 @@ def _call_guarded(act: Callable[[], _T]) -> _T | None:
     except MemoryError:
         raise
     except Exception:  # noqa: BLE001  every kind of defect
-        return None
-
-
-def _measure_guarded(
-    measure: Callable[[], LoopClosuresMeasured], on_defect: LoopClosuresMeasured
-) -> LoopClosuresMeasured:
-    measured = _call_guarded(measure)
-    return on_defect if measured is None else measured
+        return on_defect
 
 
 def restore(log: LiveLog, implementation: MapImplementation) -> MapState:
