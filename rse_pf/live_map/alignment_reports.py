@@ -7,18 +7,17 @@ odometry frame never jump, so a robot can use them in control loops; the alignme
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Mapping
+from types import MappingProxyType
 
 import numpy as np
 
 from rse_pf.geometry import Array, inverse
 from rse_pf.live_map.graph import MapGraph
-from rse_pf.live_map.graph_rows import Segment
-from rse_pf.live_map.outcomes import Alignment, Corrected, Joined, Outcome, Unaligned
-from rse_pf.live_map.smoothing import SmoothedWindows
+from rse_pf.live_map.graph_rows import UP_TO_SCALE, Segment
+from rse_pf.live_map.outcomes import Alignment, Corrected, Joined, Unaligned
 
-__all__ = ["UP_TO_SCALE", "alignment_of", "report_alignments"]
-
-UP_TO_SCALE = "up to scale: no robot with metres has seen what it sees"
+__all__ = ["alignment_of", "report_alignments"]
 
 MIN_REPORTED_SHIFT_M = 0.001
 """Metres by which a segment has shifted since its last correction above which its robot is sent another one,
@@ -31,21 +30,20 @@ MIN_REPORTED_LOG_SCALE = 0.002
 
 
 def report_alignments(
-    graph: MapGraph, cause: tuple[str, int] | None, windows: SmoothedWindows | None = None
-) -> list[Outcome]:
-    """Return how the alignments of the robots' newest segments changed since they were last reported.
+    graph: MapGraph, cause: tuple[str, int] | None, covariances: Mapping[int, Array] = MappingProxyType({})
+) -> Iterator[Joined | Corrected | Unaligned]:
+    """Yield how the alignments of the robots' newest segments changed since they were last reported.
 
     Changes below all three limits of this module are not reported.  Segments without keyframes, and robots
     that left, are left out.
 
     Args:
-        graph: The graph; it notes the alignments that are reported.
+        graph: The graph, which notes the reports by `MapGraph.apply`.
         cause: The keyframe (robot, number) that caused the changes, None after an optimisation or after a
             robot was forgotten.
-        windows: The smoothed windows, which know the covariances of the newest poses; without them, or for
-            poses that were not smoothed, the covariance that was noted before is reported.
+        covariances: By keyframe, the ``(6, 6)`` covariance of a pose that was smoothed.  Without that of the
+            newest keyframe of a segment, the covariance that was reported before is reported again.
     """
-    outcomes: list[Outcome] = []
     for row, T_map_odom, has_changed in _find_alignments(graph):
         segment = graph.segments[row]
         is_reported = segment.reported_T_map_odom is not None
@@ -54,31 +52,25 @@ def report_alignments(
             if is_reported:
                 is_metric = segment.component in graph.metric_components
                 default = "the links that aligned it were removed" if is_metric else UP_TO_SCALE
-                graph.report_unaligned(row, segment.reason or default)
-                outcomes.append(Unaligned(robot=segment.robot, segment=segment.number, reason=segment.reason))
+                reason = segment.reason or default
+                yield Unaligned(robot=segment.robot, segment=segment.number, reason=reason)
             continue
         # 2. Report that a segment without a reported alignment has one now, or again.
         if not is_reported:
             connections = graph.accepted_edges_by_segments().items()
             count = sum(len(numbers) for pair, numbers in connections if row in pair)
-            outcomes.append(Joined(robot=segment.robot, segment=segment.number, links=count))
+            yield Joined(robot=segment.robot, segment=segment.number, links=count)
         elif not has_changed:
             continue
         # 3. Report the new alignment.
-        newest = segment.keyframes[-1]
-        covariance = windows.covariances.get(newest) if windows is not None else None
-        graph.report_alignment(row, T_map_odom, covariance)
-        outcomes.append(
-            Corrected(
-                robot=segment.robot,
-                segment=segment.number,
-                T_map_odom=T_map_odom,
-                covariance=segment.covariance,
-                cause=cause,
-                scale=None if segment.is_metric else segment.scale,
-            )
+        yield Corrected(
+            robot=segment.robot,
+            segment=segment.number,
+            T_map_odom=T_map_odom,
+            covariance=covariances.get(segment.keyframes[-1], segment.covariance),
+            cause=cause,
+            scale=None if segment.is_metric else segment.scale,
         )
-    return outcomes
 
 
 def alignment_of(segment: Segment) -> Alignment:

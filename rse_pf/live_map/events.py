@@ -119,7 +119,7 @@ class RobotLeft(msgspec.Struct, frozen=True, kw_only=True, tag="left"):
     robot: str
 
 
-class StartKeyframe(msgspec.Struct, frozen=True, kw_only=True):
+class StartKeyframe(msgspec.Struct, frozen=True, kw_only=True, dict=True):
     """A keyframe of the version that a live map starts from.
 
     ``data`` is encoded like a keyframe of a robot; its odometry pose is the pose in the version.
@@ -127,6 +127,16 @@ class StartKeyframe(msgspec.Struct, frozen=True, kw_only=True):
 
     robot: str
     data: bytes
+
+    @cached_property
+    def keyframe(self) -> SentKeyframe:
+        """The keyframe, decoded once.
+
+        Raises:
+            BadRequest: The data are damaged.
+            InvalidCamera: The camera model cannot be right.
+        """
+        return decode_keyframe(self.data)
 
 
 class StartEdge(msgspec.Struct, frozen=True, kw_only=True):

@@ -18,18 +18,40 @@ import numpy as np
 import numpy.typing as npt
 
 from rse_pf.geometry import Array, inverse, rotation_angle_deg, scaled
-from rse_pf.live_map.graph_rows import NO_LOOP_CLOSURE_YET, LiveKeyframe, LoopEdge, Segment
+from rse_pf.live_map.decisions import (
+    AcceptEdges,
+    AddEdges,
+    Decision,
+    ExcludeSegment,
+    JoinComponents,
+    MarkAliases,
+    RecordContradictions,
+    RecordMisfits,
+    RejectEdges,
+    StateReason,
+)
+from rse_pf.live_map.events import MapStarted, MeasuredLoopClosure, matrix_of
+from rse_pf.live_map.graph_rows import NO_LOOP_CLOSURE_YET, UP_TO_SCALE, LiveKeyframe, LoopEdge, Segment
+from rse_pf.live_map.outcomes import (
+    Ambiguous,
+    Corrected,
+    Joined,
+    LoopClosureAccepted,
+    LoopClosureRejected,
+    Outcome,
+    Unaligned,
+)
 
-__all__ = ["MapGraph", "count_odometry_steps"]
+__all__ = ["STEP_LENGTH_M", "MapGraph"]
 
 STEP_LENGTH_M = 0.25  # metres of motion that are one step of odometry, for which its drift is stated
 STEP_ROTATION_DEG = 15.0  # degrees of rotation that are one step of odometry, for which its drift is stated
 MIN_STEP = 0.05  # steps of odometry that a motion counts as, at least: a stationary robot has some variance
+MAX_PENDING_EDGES = 400  # newest pending loop closures of a map that are kept, to bound memory and CPU time
 MAX_REJECTED_EDGES = 2000
 """Newest rejected loop closures that are kept, since a map decides about them again after a robot was
 forgotten or excluded."""
 MAX_ORPHANED_OBJECTS = 10_000  # newest objects of forgotten robots that are listed for deletion
-CONTRADICTION_HISTORY = 0xFFFFFFFF  # bit mask: the newest 32 records of contradictions decide about a robot
 INHERITED_CONTRADICTIONS = 0xFFFF
 """Bit mask: a robot's newest 16 records of contradictions count in its next segment, so that a hostile robot
 does not start without a record by opening a segment."""
@@ -135,6 +157,10 @@ class MapGraph:
         """Return whether *i* is the id of a keyframe whose robot was not forgotten."""
         return 0 <= i < self._size and bool(self._segment_rows[i] >= 0)
 
+    def is_pending(self, number: int) -> bool:
+        """Return whether loop closure *number* is pending; a dropped one is not."""
+        return number in self.edges and self.edges[number].state == "pending"
+
     def segment_of(self, i: int) -> Segment:
         """Return the segment of keyframe *i*, whose robot was not forgotten."""
         return self.segments[int(self._segment_rows[i])]
@@ -230,18 +256,37 @@ class MapGraph:
         """Increment the number of applied events."""
         self.events += 1
 
-    def start_from_version(self, source: str, equal_rooms_m: float, *, has_keyframes: bool) -> None:
-        """Note the version and the size of equal rooms that an empty map starts with.
+    def start_from_version(self, event: MapStarted) -> None:
+        """Begin an empty map with the keyframes and edges of a stored version, or with none.
 
-        If the version has keyframes, add the segment (row 0) that will hold them; it defines the frame of the
-        map.
+        The keyframes are in one segment (row 0), which defines the frame of the map.
         """
-        self.source, self.equal_rooms_m = source, equal_rooms_m
-        if has_keyframes:
+        self.source, self.equal_rooms_m = event.source, event.equal_rooms_m
+        if event.keyframes:
             self.segments.append(Segment(robot="", number=-1, is_from_version=True))
             self.root = 0
+        for number, start in enumerate(event.keyframes):
+            sent = start.keyframe
+            keyframe = LiveKeyframe(
+                robot=start.robot, segment=-1, number=number, timestamp_s=sent.timestamp_s, data=start.data
+            )
+            self._append(keyframe, 0, sent.T_odom_camera, sent.T_odom_camera, 0.0)
+        for edge in event.links:
+            self._add_edge(
+                LoopEdge(
+                    a=edge.a,
+                    b=edge.b,
+                    T_a_b=np.array(matrix_of(edge.T_a_b, 4, 4)),
+                    information=matrix_of(edge.information, 6, 6),
+                    inliers=0,
+                    matches=0,
+                    is_fixed=True,
+                    state="accepted",
+                )
+            )
+        self._update_components()
 
-    def find_or_add_segment(self, robot: str, number: int) -> int:
+    def _find_or_add_segment(self, robot: str, number: int) -> int:
         """Return the row of segment *number* of a robot; add the segment if there is none.
 
         If the robot has not left, only its newest segment is compared, since segment numbers never decrease.
@@ -260,32 +305,53 @@ class MapGraph:
         self.segments.append(segment)
         return row
 
-    def begin_segment(self, row: int, assumed_scale: float | None, reason: str) -> None:
-        """State the unit of length of a segment without keyframes.
-
-        The unit is a metre if *assumed_scale* is None; else it is taken for *assumed_scale* metres until the
-        scale is estimated, and *reason* says why the segment has no alignment yet.
-        """
-        segment = self.segments[row]
-        segment.is_metric = assumed_scale is None
-        if assumed_scale is not None:
-            segment.scale, segment.reason = assumed_scale, reason
-
     def add_keyframe(
-        self, keyframe: LiveKeyframe, row: int, T_odom: Array, T_component: Array, odometry_steps: float
+        self,
+        keyframe: LiveKeyframe,
+        T_odom_camera: Array,
+        *,
+        is_metric: bool = True,
+        assumed_scale: float = 1.0,
     ) -> int:
-        """Append a keyframe to segment *row*; return the id of the keyframe.
+        """Add a keyframe at the pose that odometry gives it; return the id of the keyframe.
 
-        The segment becomes the robot's newest one.  The first metric segment of a robot defines the frame of
-        a map that has none.
+        Its segment is added if there is none, and becomes the robot's newest one.  If the map has no frame,
+        the first metric segment that gets a keyframe defines it.
 
         Args:
             keyframe: The keyframe.
-            row: Row of its segment.
-            T_odom: ``(4, 4)``, its pose in the odometry frame, in the unit of the segment.
-            T_component: ``(4, 4)``, its pose in the frame and unit of the component.
-            odometry_steps: Steps of odometry from the first keyframe of the segment.
+            T_odom_camera: ``(4, 4)``, its pose in the odometry frame, in the unit of the segment.
+            is_metric: Whether this unit is a metre; only used for the first keyframe of a segment.
+            assumed_scale: Metres for which another unit is taken until the scale of the segment is estimated;
+                only used for the first keyframe of a segment.
         """
+        row = self._find_or_add_segment(keyframe.robot, keyframe.segment)
+        segment = self.segments[row]
+        # 1. State the unit of a new segment; its first keyframe defines the frame of its component.
+        if not segment.keyframes:
+            segment.is_metric = is_metric
+            if not is_metric:
+                segment.scale, segment.reason = assumed_scale, UP_TO_SCALE
+            T_component = T_odom_camera if is_metric else scaled(T_odom_camera, segment.scale)
+            steps = 0.0
+        # 2. Compute the pose of a later keyframe by odometry from the newest keyframe of the segment.
+        else:
+            newest = segment.keyframes[-1]
+            motion = inverse(self.T_odom_camera[newest]) @ T_odom_camera
+            motion = motion if segment.is_metric else scaled(motion, segment.scale)
+            T_component = self.T_component_camera[newest] @ motion
+            steps = float(self.odometry_steps[newest]) + _count_odometry_steps(motion)
+        i = self._append(keyframe, row, T_odom_camera, T_component, steps)
+        self.next_numbers[keyframe.robot] = keyframe.number + 1
+        self.newest_segments[keyframe.robot] = row
+        if self.root < 0 and segment.is_metric:
+            self.root = row
+        return i
+
+    def _append(
+        self, keyframe: LiveKeyframe, row: int, T_odom: Array, T_component: Array, odometry_steps: float
+    ) -> int:
+        """Append a keyframe to the tables and to segment *row*; return the id of the keyframe."""
         self._grow()
         i = self._size
         self._size += 1
@@ -296,11 +362,6 @@ class MapGraph:
         self._components[i] = segment.component
         self._positions[i], self._has_features[i] = len(segment.keyframes), True
         segment.keyframes.append(i)
-        if not segment.is_from_version:
-            self.next_numbers[keyframe.robot] = keyframe.number + 1
-            self.newest_segments[keyframe.robot] = row
-            if self.root < 0 and segment.is_metric:
-                self.root = row
         return i
 
     def _grow(self) -> None:
@@ -378,17 +439,100 @@ class MapGraph:
         self._update_components()
         return forgotten
 
-    def note_contradiction(self, row: int, *, is_contradiction: bool, count: int = 1) -> int:
-        """Record *count* times whether a keyframe of segment *row* contradicts the map.
+    def note_optimisation(self) -> None:
+        """Note that an optimisation of the whole graph is requested now."""
+        self.optimised_at = self._size
 
-        Return the number of contradictions among the newest 32 records of the segment.
+    def set_smoothing_debt(self, robot: str, keyframes: int) -> None:
+        """Set how many keyframes were smoothed because of *robot* beyond its allowance."""
+        self.smoothing_debt[robot] = keyframes
+
+    # --- Changes of loop closures ---
+
+    def apply(self, decisions: Iterable[Decision]) -> list[Outcome]:
+        """Carry out each decision before the next one is made, and return what is reported of them.
+
+        A generator of *decisions* sees the graph as its earlier decisions have changed it.
         """
-        bits = (1 << count) - 1 if is_contradiction else 0
-        segment = self.segments[row]
-        segment.contradictions = ((segment.contradictions << count) | bits) & CONTRADICTION_HISTORY
-        return segment.contradictions.bit_count()
+        return [outcome for decision in decisions for outcome in self._apply(decision)]
 
-    def exclude_segment(self, row: int, reason: str) -> None:
+    def _apply(self, decision: Decision) -> list[Outcome]:
+        match decision:
+            case AddEdges():
+                for closure in decision.measured:
+                    self._add_edge(_pending_edge(decision.keyframe, closure))
+            case AcceptEdges():
+                return self._accept(decision.numbers)
+            case RejectEdges():
+                edges = [self._reject(number) for number in decision.numbers]
+                if any(self._segment_rows[edge.a] != self._segment_rows[edge.b] for edge in edges):
+                    self._update_components()
+                    self._drop_pair_consistency()
+                return [LoopClosureRejected(a=edge.a, b=edge.b, reason=decision.reason) for edge in edges]
+            case JoinComponents():
+                return self._join_components(decision)
+            case MarkAliases():
+                self.aliased_keyframes.update(decision.keyframes)
+            case StateReason():
+                for row in decision.rows:
+                    self.segments[row].reason = decision.reason
+                if decision.is_reported:
+                    return [self._ambiguous(row) for row in decision.rows]
+            case RecordMisfits():
+                for number, misfits in decision.misfits.items():
+                    self.edges[number].misfits = misfits
+            case RecordContradictions():
+                self.segments[decision.row].contradictions = decision.contradictions
+            case ExcludeSegment():
+                self._exclude_segment(decision.row, decision.reason)
+                return [self._ambiguous(decision.row)]
+            case Corrected():
+                segment = self.segments[self.newest_segments[decision.robot]]
+                segment.reported_T_map_odom, segment.reason = decision.T_map_odom, ""
+                segment.reported_scale, segment.covariance = segment.scale, decision.covariance
+                return [decision]
+            case Unaligned():
+                segment = self.segments[self.newest_segments[decision.robot]]
+                segment.reported_T_map_odom, segment.reason = None, decision.reason
+                return [decision]
+            case Joined():
+                return [decision]
+        return []
+
+    def _ambiguous(self, row: int) -> Ambiguous:
+        segment = self.segments[row]
+        return Ambiguous(robot=segment.robot, segment=segment.number, reason=segment.reason)
+
+    def _add_edge(self, edge: LoopEdge) -> None:
+        """Add a pending or accepted loop closure; the caller updates the components."""
+        self.edges[self.next_edge] = edge
+        if edge.state == "accepted":
+            self._connect(self.next_edge, edge)
+        else:
+            self.pending.append(self.next_edge)
+        self.next_edge += 1
+
+    def _accept(self, numbers: Sequence[int]) -> list[Outcome]:
+        """Accept pending loop closures; the caller updates the components if they connect two."""
+        for number in numbers:
+            edge = self.edges[number]
+            edge.state, edge.misfits = "accepted", 0
+            self.pending.remove(number)
+            self._connect(number, edge)
+        edges = [self.edges[number] for number in numbers]
+        return [LoopClosureAccepted(a=edge.a, b=edge.b) for edge in edges]
+
+    def _join_components(self, join: JoinComponents) -> list[Outcome]:
+        """Move a component into the frame of another one, and accept the loop closures between both."""
+        for segment in self.segments:
+            if segment.component == join.moving and segment.keyframes:
+                self._move_segment(segment, join.T_stay_moving, join.scale)
+        outcomes = self._accept(join.numbers)
+        self._update_components()
+        self._drop_pair_consistency()
+        return outcomes
+
+    def _exclude_segment(self, row: int, reason: str) -> None:
         """Take out the loop closures of segment *row* for good, and mark it, so that later ones are ignored.
 
         Its keyframes stay.  If it defined the frame of the map, another metric segment of its component
@@ -410,115 +554,13 @@ class MapGraph:
             self.root = next(candidates, row)
         self._update_components()
 
-    def mark_aliased(self, ids: Iterable[int]) -> None:
-        """Note keyframes at places that look like another place of the map (perceptual aliases)."""
-        self.aliased_keyframes.update(ids)
-
-    def set_reason(self, row: int, reason: str) -> None:
-        """Note why segment *row* has no alignment with the map."""
-        self.segments[row].reason = reason
-
-    def report_alignment(self, row: int, T_map_odom: Array, covariance: Array | None) -> None:
-        """Note the alignment, and the present scale, that the robot of segment *row* is sent.
-
-        *T_map_odom* ``(4, 4)`` has the *covariance* ``(6, 6)`` of a left twist (metres, radians); None keeps
-        the covariance that was noted before.
-        """
-        segment = self.segments[row]
-        segment.reported_T_map_odom, segment.reason = T_map_odom, ""
-        segment.reported_scale = segment.scale
-        if covariance is not None:
-            segment.covariance = covariance
-
-    def report_unaligned(self, row: int, reason: str) -> None:
-        """Note that the robot of segment *row* is sent a report without an alignment, with this *reason*."""
-        self.segments[row].reported_T_map_odom, self.segments[row].reason = None, reason
-
-    def note_optimisation(self) -> None:
-        """Note that an optimisation of the whole graph is requested now."""
-        self.optimised_at = self._size
-
-    def set_smoothing_debt(self, robot: str, keyframes: int) -> None:
-        """Set how many keyframes were smoothed because of *robot* beyond its allowance."""
-        self.smoothing_debt[robot] = keyframes
-
-    # --- Changes of loop closures ---
-
-    def add_edges(self, edges: Iterable[LoopEdge]) -> list[int]:
-        """Add pending or accepted loop closures; return their numbers."""
-        numbers = []
-        for edge in edges:
-            number = self.next_edge
-            self.next_edge += 1
-            self.edges[number] = edge
-            numbers.append(number)
-            if edge.state == "accepted":
-                self._connect(number, edge)
-            else:
-                self.pending.append(number)
-        if any(self.edges[number].state == "accepted" for number in numbers):
-            self._update_components()
-        return numbers
-
-    def accept_edges(self, numbers: Iterable[int]) -> list[LoopEdge]:
-        """Accept those of *numbers* that are pending, and return these loop closures.
-
-        Both ends of each must be in one component, because components are not updated.
-        """
-        accepted = []
-        for number in numbers:
-            edge = self.edges[number]
-            if edge.state == "pending":
-                edge.state, edge.misfits = "accepted", 0
-                self.pending.remove(number)
-                self._connect(number, edge)
-                accepted.append(edge)
-        return accepted
-
-    def reject_edges(self, numbers: Iterable[int]) -> list[LoopEdge]:
-        """Reject pending or accepted loop closures and return them; components may fall apart."""
-        edges = [self._reject(number) for number in numbers]
-        if any(self._segment_rows[edge.a] != self._segment_rows[edge.b] for edge in edges):
-            self._update_components()
-            self._drop_pair_consistency()
-        return edges
-
-    def join_components(
-        self, moving: int, T_stay_moving: Array, scale: float, numbers: Iterable[int]
-    ) -> list[LoopEdge]:
-        """Move a component into the frame of another one and accept the loop closures that connect them.
-
-        Args:
-            moving: The component that is moved.
-            T_stay_moving: ``(4, 4)``, pose of the frame of the moved component in that of the other one, in
-                the unit of the other one.
-            scale: Length of the unit of the moved component in that of the other one.
-            numbers: The pending loop closures between both components that are accepted.
-
-        Returns:
-            The accepted loop closures.
-        """
-        for segment in self.segments:
-            if segment.component == moving and segment.keyframes:
-                self._move_segment(segment, T_stay_moving, scale)
-        accepted = self.accept_edges(numbers)
-        self._update_components()
-        self._drop_pair_consistency()
-        return accepted
-
-    def note_misfit(self, number: int, *, is_misfit: bool) -> int:
-        """Record whether an accepted loop closure misfits the smoothed graph; return its misfits in a row."""
-        edge = self.edges[number]
-        edge.misfits = edge.misfits + 1 if is_misfit else 0
-        return edge.misfits
-
     def note_pair_consistency(self, earlier: int, later: int, *, is_consistent: bool) -> None:
         """Remember whether two pending loop closures agree, so that no pair is tested twice."""
         self.pair_consistency[earlier, later] = is_consistent
 
-    def drop_oldest_pending(self, limit: int) -> None:
-        """Reject the oldest pending loop closures, so that the newest *limit* stay pending."""
-        surplus = len(self.pending) - limit
+    def drop_oldest_pending(self) -> None:
+        """Reject the oldest pending loop closures, so that the newest 400 stay pending."""
+        surplus = len(self.pending) - MAX_PENDING_EDGES
         if surplus > 0:
             for number in self.pending[:surplus]:
                 self._reject(number)
@@ -571,7 +613,7 @@ class MapGraph:
         # Steps of odometry are stated in metres, so they change with the scale.
         for before, here in pairwise(ids):
             T_before_here = inverse(self.T_odom_camera[before]) @ self.T_odom_camera[here]
-            step = count_odometry_steps(scaled(T_before_here, segment.scale))
+            step = _count_odometry_steps(scaled(T_before_here, segment.scale))
             self._odometry_steps[here] = self._odometry_steps[before] + step
 
     def _update_components(self) -> None:
@@ -645,7 +687,7 @@ class MapGraph:
         return graph
 
 
-def count_odometry_steps(T_from_to: Array) -> float:
+def _count_odometry_steps(T_from_to: Array) -> float:
     """Return a motion in steps of odometry: 0.25 m or 15 degrees are one step, the larger count decides.
 
     A motion counts as 0.05 steps at least.  The standard deviation of odometry grows with the square root of
@@ -654,3 +696,15 @@ def count_odometry_steps(T_from_to: Array) -> float:
     by_length = float(np.sqrt((T_from_to[:3, 3] ** 2).sum())) / STEP_LENGTH_M
     by_rotation = rotation_angle_deg(T_from_to[:3, :3]) / STEP_ROTATION_DEG
     return max(by_length, by_rotation, MIN_STEP)
+
+
+def _pending_edge(keyframe: int, measured: MeasuredLoopClosure) -> LoopEdge:
+    return LoopEdge(
+        a=keyframe,
+        b=measured.other,
+        T_a_b=np.array(matrix_of(measured.T_keyframe_other, 4, 4)),
+        information=matrix_of(measured.information, 6, 6),
+        inliers=measured.inliers,
+        matches=measured.matches,
+        scale=measured.scale,
+    )

@@ -14,12 +14,13 @@ import numpy as np
 from rse_pf.geometry import Array
 from rse_pf.slam.consistency import evidence_weight
 
-__all__ = ["NO_LOOP_CLOSURE_YET", "EdgeState", "LiveKeyframe", "LoopEdge", "Segment", "variances_of"]
+__all__ = ["NO_LOOP_CLOSURE_YET", "UP_TO_SCALE", "EdgeState", "LiveKeyframe", "LoopEdge", "Segment"]
 
 EdgeState = Literal["pending", "accepted", "rejected"]
 """State of a loop closure: *pending* ones wait for evidence, *accepted* ones are edges of the pose graph,
 *rejected* ones were taken out as outliers."""
 
+UP_TO_SCALE = "up to scale: no robot with metres has seen what it sees"
 NO_LOOP_CLOSURE_YET = "no loop closure between its keyframes and the map is accepted yet"
 
 MIN_RELATIVE_COVARIANCE: Array = np.diag([0.02**2] * 3 + [math.radians(0.7) ** 2] * 3)
@@ -98,19 +99,16 @@ class LoopEdge:
     information: Array
     inliers: int
     matches: int
-    variances: Array
     is_fixed: bool = False
     state: EdgeState = "pending"
     misfits: int = 0
     scale: tuple[float, float] | None = None
+    variances: Array = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.variances = np.diagonal(np.linalg.inv(self.information))
 
     @property
     def weight(self) -> float:
         """Weight of the evidence within 0 to 1; an edge of a stored version has full weight."""
         return 1.0 if self.is_fixed else evidence_weight(self.inliers, self.matches)
-
-
-def variances_of(information: Array) -> Array:
-    """Return the ``(m, 6)`` variances of twists with the ``(m, 6, 6)`` inverse covariances *information*."""
-    variances: Array = np.diagonal(np.linalg.inv(information), axis1=1, axis2=2)
-    return variances

@@ -15,29 +15,28 @@ import hashlib
 from collections.abc import Callable, Collection
 from dataclasses import replace
 from functools import partial
+from itertools import groupby
 from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
 
 from rse_pf.errors import BadRequest, InvalidCamera
-from rse_pf.geometry import Array, inverse, scaled
-from rse_pf.live_map.alignment_reports import UP_TO_SCALE, alignment_of, report_alignments
+from rse_pf.geometry import Array, inverse
+from rse_pf.live_map.alignment_reports import alignment_of, report_alignments
 from rse_pf.live_map.candidates import choose_candidates, find_redundant_keyframes
 from rse_pf.live_map.events import (
     Event,
     KeyframeAdded,
     LoopClosuresMeasured,
     MapStarted,
-    MeasuredLoopClosure,
     Optimised,
     RobotForgotten,
     RobotLeft,
     matrix_bytes,
-    matrix_of,
 )
-from rse_pf.live_map.graph import MapGraph, count_odometry_steps
-from rse_pf.live_map.graph_rows import LiveKeyframe, LoopEdge, variances_of
+from rse_pf.live_map.graph import MapGraph
+from rse_pf.live_map.graph_rows import LiveKeyframe
 from rse_pf.live_map.measure import (
     LOOP_CLOSURE_EVIDENCE,
     StoredView,
@@ -55,15 +54,14 @@ from rse_pf.live_map.outcomes import (
     OptimiseWanted,
     Outcome,
 )
-from rse_pf.live_map.outlier_rejection import (
-    GraphChanges,
-    decide_again,
-    exclude_if_contradicting,
-    has_odometry_jump,
-    has_wrong_scale,
-    process_new_edges,
+from rse_pf.live_map.outlier_rejection import decide_edges, decide_measured, has_odometry_jump
+from rse_pf.live_map.smoothing import (
+    CAUCHY_WIDTH,
+    SmoothedWindows,
+    moved_keyframes,
+    smooth_changes,
+    smooth_everything,
 )
-from rse_pf.live_map.smoothing import CAUCHY_WIDTH, SmoothedWindows, smooth_changes, smooth_everything
 from rse_pf.live_map.snapshots import (
     SnapshotParts,
     SnapshotWriter,
@@ -91,7 +89,6 @@ from rse_pf.slam.pose_graph import PoseGraph
 __all__ = ["LiveMap"]
 
 MAX_SEGMENTS = 2**31  # segment numbers of a robot are below this, so that they fit into 32 bits
-MAX_PENDING_EDGES = 400  # newest pending loop closures of a map that are kept, to bound memory and CPU time
 MIN_KEYFRAMES_BETWEEN_OPTIMISATIONS = 20
 """Keyframes that arrive between two requests of the smoother to optimise the whole graph, at least, because
 an optimisation fits all poses.  A request after a robot was forgotten or excluded does not wait."""
@@ -425,6 +422,8 @@ class LiveMap:
         """
         self._graph.count_event()
         match event:
+            case MapStarted():
+                return self._start(event)
             case KeyframeAdded():
                 return self._add_keyframe(event)
             case LoopClosuresMeasured():
@@ -435,87 +434,64 @@ class LiveMap:
                 return self._forget_robot(event.robot)
             case RobotLeft():
                 self._graph.remove_robot(event.robot)
-            case MapStarted():
-                return self._start(event)
         return []
 
     def _add_keyframe(self, event: KeyframeAdded) -> list[Outcome]:
         """Add a keyframe at the pose that odometry gives it after the newest keyframe of its segment."""
-        graph, keyframe = self._graph, event.keyframe
-        # 1. Find the segment of the keyframe, or begin a new one.
-        row = graph.find_or_add_segment(event.robot, event.segment)
-        segment, T_odom = graph.segments[row], keyframe.T_odom_camera
-        if not segment.keyframes:
-            is_metric = keyframe.features.is_metric
-            graph.begin_segment(row, None if is_metric else assumed_scale(keyframe.features), UP_TO_SCALE)
-        # 2. Compute the pose by odometry from the newest keyframe of the segment.
-        if segment.keyframes:
-            newest = segment.keyframes[-1]
-            motion = inverse(graph.T_odom_camera[newest]) @ T_odom
-            motion = motion if segment.is_metric else scaled(motion, segment.scale)
-            T_component = graph.T_component_camera[newest] @ motion
-            steps = float(graph.odometry_steps[newest]) + count_odometry_steps(motion)
-        else:
-            T_component, steps = T_odom if segment.is_metric else scaled(T_odom, segment.scale), 0.0
-        # 3. Add the keyframe to the graph and to the index of place recognition.
+        graph = self._graph
+        keyframe = event.keyframe
+        features = keyframe.features
+        # 1. Add the keyframe to the graph and to the index of place recognition.
         objects = tuple(each.digest for each in (keyframe.points, keyframe.image) if each is not None)
-        i = graph.add_keyframe(
-            LiveKeyframe(
-                robot=event.robot,
-                segment=event.segment,
-                number=event.number,
-                timestamp_s=keyframe.timestamp_s,
-                data=event.data,
-                objects=objects,
-            ),
-            row,
-            T_odom,
-            T_component,
-            steps,
+        row = LiveKeyframe(
+            robot=event.robot,
+            segment=event.segment,
+            number=event.number,
+            timestamp_s=keyframe.timestamp_s,
+            data=event.data,
+            objects=objects,
         )
-        self._places.add(i, place_vector(keyframe.features.descriptors))
-        # 4. Report alignments. Odometry changes none, so only a segment without an alignment can get one.
-        if segment.reported_T_map_odom is not None or not graph.is_aligned(row):
+        scale = assumed_scale(features)
+        T_odom_camera = keyframe.T_odom_camera
+        i = graph.add_keyframe(row, T_odom_camera, is_metric=features.is_metric, assumed_scale=scale)
+        self._places.add(i, place_vector(features.descriptors))
+        # 2. Report alignments. Odometry changes none, so only a segment without an alignment can get one.
+        if graph.segment_of(i).reported_T_map_odom is not None or not self.is_in_map(i):
             return [Added(id=i)]
-        return [Added(id=i), *report_alignments(graph, (event.robot, event.number))]
+        return [Added(id=i), *graph.apply(report_alignments(graph, (event.robot, event.number)))]
 
     def _add_loop_closures(self, event: LoopClosuresMeasured) -> list[Outcome]:
         """Add the loop closures that were measured for a keyframe, and decide which of them are right."""
-        graph, keyframe = self._graph, event.keyframe
+        graph = self._graph
+        keyframe = event.keyframe
         if not graph.exists(keyframe):
             return []
-        # 1. Add the measured loop closures as pending ones, except those of forgotten or excluded robots,
-        #    unless odometry jumped at the keyframe.
+        # 1. Leave out loop closures of forgotten or excluded robots, and all if odometry jumped.
+        was_excluded = graph.segment_of(keyframe).is_excluded
         measured = [
             closure
             for closure in event.links
-            if closure.other != keyframe
-            and not self._is_ignored(keyframe)
-            and not self._is_ignored(closure.other)
+            if closure.other != keyframe and not was_excluded and not self._is_ignored(closure.other)
         ]
         has_jumped = has_odometry_jump(graph, keyframe, measured)
         if has_jumped:
             measured = []
-        numbers = graph.add_edges(_pending_edges(keyframe, measured))
-        # 2. Accept or reject loop closures, and join components that they connect.
-        changes = process_new_edges(graph, keyframe, numbers)
-        # 3. Exclude the robot's segment if it keeps contradicting the map; then decide again about all loop
-        #    closures that are not accepted.
-        if has_jumped:
-            changes.fits.add("contrary")
-        is_scale_wrong = has_wrong_scale(graph, keyframe, measured)
-        is_excluded = exclude_if_contradicting(graph, keyframe, changes, is_scale_wrong=is_scale_wrong)
+        # 2. Accept or reject loop closures, join components, and exclude the segment of the robot if it keeps
+        #    contradicting the map; then decide again about all loop closures that are not accepted.
+        outcomes = graph.apply(decide_measured(graph, keyframe, measured, has_jumped=has_jumped))
+        is_excluded = graph.segment_of(keyframe).is_excluded and not was_excluded
         decided_again = self._decide_again() if is_excluded else []
-        # 4. Smooth the poses around the changed loop closures.
+        # 3. Smooth the poses around the changed loop closures.
         robot, number = graph.keyframes[keyframe].robot, graph.keyframes[keyframe].number
-        windows = self._smooth(changes, robot)
-        graph.drop_oldest_pending(MAX_PENDING_EDGES)
-        # 5. Report the alignments that changed.
-        reports = report_alignments(graph, (robot, number), windows)
-        # 6. Drop redundant features, and those of a keyframe whose odometry jumped, since they would
+        windows = self._smooth(moved_keyframes(outcomes), robot)
+        graph.drop_oldest_pending()
+        # 4. Report the alignments that changed.
+        reports = graph.apply(report_alignments(graph, (robot, number), windows.covariances))
+        # 5. Drop redundant features, and those of a keyframe whose odometry jumped, since they would
         #    contradict every later keyframe.
         surplus = (keyframe,) if has_jumped else find_redundant_keyframes(graph, keyframe)
-        return [*changes.outcomes, *decided_again, *reports, *self._drop_features(surplus)]
+        culled = self._drop_features(surplus)
+        return [*outcomes, *windows.outcomes, *decided_again, *reports, *culled]
 
     def _take_optimised_poses(self, event: Optimised) -> list[Outcome]:
         """Take the poses of an optimisation; keyframes that arrived later move with those before them."""
@@ -539,10 +515,9 @@ class LiveMap:
                 graph.set_poses(segment.keyframes, T)
                 motions[row] = motion
         # 2. Move segments that joined the map later, and smooth the poses where they are connected.
-        changes = GraphChanges(moved=self._move_joined_segments(motions))
-        windows = self._smooth(changes)
+        windows = self._smooth(self._move_joined_segments(motions))
         # 3. Report the alignments that changed.
-        return [*changes.outcomes, *report_alignments(graph, None, windows)]
+        return [*windows.outcomes, *graph.apply(report_alignments(graph, None, windows.covariances))]
 
     def _move_joined_segments(self, motions: dict[int, Array]) -> list[int]:
         """Move segments that joined the map during an optimisation with the segments they are connected to.
@@ -568,11 +543,12 @@ class LiveMap:
 
     def _forget_robot(self, robot: str) -> list[Outcome]:
         """Take out all that a robot contributed, and decide again about what rested on it."""
-        forgotten = self._graph.forget_robot(robot)
+        graph = self._graph
+        forgotten = graph.forget_robot(robot)
         self._snapshot_writer.forget(forgotten)
         for i in forgotten:
             self._places.remove(i)
-        return [*self._decide_again(), *report_alignments(self._graph, None)]
+        return [*self._decide_again(), *graph.apply(report_alignments(graph, None))]
 
     def _start(self, event: MapStarted) -> list[Outcome]:
         """Begin with the keyframes and edges of a stored version, or with none.
@@ -583,55 +559,46 @@ class LiveMap:
         graph = self._graph
         if len(graph):
             raise BadRequest("the map has keyframes already", hint="start a new map from the version")
-        graph.start_from_version(event.source, event.equal_rooms_m, has_keyframes=bool(event.keyframes))
-        outcomes: list[Outcome] = []
-        for number, start in enumerate(event.keyframes):
-            keyframe = decode_keyframe(start.data)
-            T_map_camera = keyframe.T_odom_camera
-            row = LiveKeyframe(
-                robot=start.robot,
-                segment=-1,
-                number=number,
-                timestamp_s=keyframe.timestamp_s,
-                data=start.data,
-            )
-            i = graph.add_keyframe(row, 0, T_map_camera, T_map_camera, 0.0)
-            self._places.add(i, place_vector(keyframe.features.descriptors))
-            outcomes.append(Added(id=i))
-        graph.add_edges(_edges_of_version(event))
-        return outcomes
+        graph.start_from_version(event)
+        for i, start in enumerate(event.keyframes):
+            self._places.add(i, place_vector(start.keyframe.features.descriptors))
+        return [Added(id=i) for i in range(len(graph))]
 
     # --- Steps that several events share ---
 
     def _decide_again(self) -> list[Outcome]:
         """Decide again about all loop closures that are not accepted, and smooth the whole graph.
 
+        Rejected loop closures become pending, and proofs of perceptual aliases are dropped before, since they
+        may rest on loop closures that were taken out.  Pending ones are decided as if they arrived now,
+        oldest first.
+
         Return what became ambiguous, and a request to optimise; accepted and rejected loop closures are not
         reported.
         """
         graph = self._graph
-        outcomes: list[Outcome] = []
-        for changes in decide_again(graph):
-            self._smooth(changes)
-            outcomes += [outcome for outcome in changes.outcomes if isinstance(outcome, Ambiguous)]
+        ambiguous: list[Outcome] = []
+        graph.reopen_rejected()
+        for keyframe, numbers in groupby(list(graph.pending), lambda number: graph.edges[number].a):
+            outcomes = graph.apply(decide_edges(graph, keyframe, list(filter(graph.is_pending, numbers))))
+            self._smooth(moved_keyframes(outcomes))
+            ambiguous += [outcome for outcome in outcomes if isinstance(outcome, Ambiguous)]
         smooth_everything(graph, self.options)
-        if graph.edges and graph.root >= 0:
-            outcomes.append(OptimiseWanted(misfit=0.0))
-        return outcomes
+        wanted = [OptimiseWanted(misfit=0.0)] if graph.edges and graph.root >= 0 else []
+        return [*ambiguous, *wanted]
 
-    def _smooth(self, changes: GraphChanges, robot: str | None = None) -> SmoothedWindows | None:
-        """Smooth around *changes*, which a keyframe of *robot* caused, and return what was smoothed.
+    def _smooth(self, moved: list[int], robot: str | None = None) -> SmoothedWindows:
+        """Smooth around the keyframes *moved*, which a keyframe of *robot* caused.
 
-        Add rejections to the outcomes of *changes*.  Add a request to optimise the whole graph if the largest
-        window was too small, and at least 20 keyframes arrived since the last such request.  Return None if
-        nothing moved.
+        Add a request to optimise the whole graph to the outcomes of the result if the largest window was too
+        small, and at least 20 keyframes arrived since the last such request.
         """
         graph = self._graph
-        windows = smooth_changes(graph, changes, self.options, robot)
+        windows = smooth_changes(graph, moved, self.options, robot)
         is_due = len(graph) - graph.optimised_at >= MIN_KEYFRAMES_BETWEEN_OPTIMISATIONS
-        if windows is not None and windows.is_strained and is_due and graph.root >= 0:
+        if windows.is_strained and is_due and graph.root >= 0:
             graph.note_optimisation()
-            changes.outcomes.append(OptimiseWanted(misfit=windows.mean_misfit))
+            windows.outcomes.append(OptimiseWanted(misfit=windows.mean_misfit))
         return windows
 
     def _drop_features(self, ids: tuple[int, ...]) -> list[Outcome]:
@@ -657,42 +624,3 @@ class LiveMap:
         is_aligned = np.array([graph.is_aligned(row) for row in range(len(graph.segments))] + [False])
         mask: npt.NDArray[np.bool_] = is_aligned[graph.segment_rows]
         return mask
-
-
-def _pending_edges(keyframe: int, measured: list[MeasuredLoopClosure]) -> list[LoopEdge]:
-    information = np.array([matrix_of(each.information, 6, 6) for each in measured]).reshape(-1, 6, 6)
-    return [
-        LoopEdge(
-            a=keyframe,
-            b=closure.other,
-            T_a_b=np.array(matrix_of(closure.T_keyframe_other, 4, 4)),
-            information=inverse_covariance,
-            inliers=closure.inliers,
-            matches=closure.matches,
-            variances=variances,
-            scale=closure.scale,
-        )
-        for closure, inverse_covariance, variances in zip(
-            measured, information, variances_of(information), strict=True
-        )
-    ]
-
-
-def _edges_of_version(event: MapStarted) -> list[LoopEdge]:
-    information = np.array([matrix_of(edge.information, 6, 6) for edge in event.links]).reshape(-1, 6, 6)
-    return [
-        LoopEdge(
-            a=edge.a,
-            b=edge.b,
-            T_a_b=np.array(matrix_of(edge.T_a_b, 4, 4)),
-            information=inverse_covariance,
-            inliers=0,
-            matches=0,
-            variances=variances,
-            is_fixed=True,
-            state="accepted",
-        )
-        for edge, inverse_covariance, variances in zip(
-            event.links, information, variances_of(information), strict=True
-        )
-    ]

@@ -12,23 +12,32 @@ To add a rule that rejects loop closures, see CONTRIBUTING.md.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
-from itertools import groupby
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Literal
 
 import numpy as np
 
 from rse_pf.geometry import inverse
+from rse_pf.live_map.decisions import (
+    AcceptEdges,
+    AddEdges,
+    CompareEdges,
+    Decision,
+    ExcludeSegment,
+    Fit,
+    JoinComponents,
+    MarkAliases,
+    RecordContradictions,
+    RecordMisfits,
+    RejectEdges,
+    StateReason,
+)
 from rse_pf.live_map.events import MeasuredLoopClosure, matrix_of
 from rse_pf.live_map.graph import MapGraph
-from rse_pf.live_map.outcomes import Ambiguous, LoopClosureAccepted, LoopClosureRejected, Outcome
 from rse_pf.live_map.pairwise_consistency import (
     ALIAS_DISTANCE_M,
     MIN_SUPPORT,
-    AmbiguousJoin,
     Contradiction,
-    Fit,
     classify_by_graph,
     decide_join,
     find_contradiction,
@@ -38,14 +47,13 @@ from rse_pf.live_map.pairwise_consistency import (
 from rse_pf.slam.consistency import evidence_weight
 
 __all__ = [
-    "GraphChanges",
-    "decide_again",
-    "exclude_if_contradicting",
+    "decide_edges",
+    "decide_exclusion",
+    "decide_measured",
+    "decide_misfits",
     "find_weakest_connection",
     "has_odometry_jump",
     "has_wrong_scale",
-    "process_new_edges",
-    "reject_misfitting_edges",
 ]
 
 MAX_SQUARED_MISFIT = 30.0
@@ -63,6 +71,7 @@ JUMP_NEIGHBOURS = 4
 """Keyframes before a new one that may prove a jump of its odometry: they saw the same place a moment before,
 so they cannot be at another place that looks the same."""
 MAX_JUMP_RATIO = 0.5  # error of odometry per length of motion above which the odometry has jumped
+CONTRADICTION_HISTORY = 0xFFFFFFFF  # bit mask: the newest 32 records of contradictions decide about a robot
 MAX_CONTRADICTIONS = 16
 """Contradictions among the last 32 records of a segment from which on it is excluded; honest robots stay far
 below, also with 10 % of wheel slip."""
@@ -74,108 +83,90 @@ FIXED_WEIGHT = 1e9  # weight of a connection that is never rejected, above any s
 _AT_SEVERAL_PLACES = "ambiguous: what it saw is in the map at several places"
 
 
-@dataclass(slots=True)
-class GraphChanges:
-    """What an update of loop closures changed.
+def decide_measured(
+    graph: MapGraph, keyframe: int, measured: Sequence[MeasuredLoopClosure], *, has_jumped: bool
+) -> Iterator[Decision]:
+    """Decide about the loop closures that were measured for *keyframe*, and about its segment.
 
-    ``outcomes`` are reported.  ``moved`` are the keyframes around which the graph must be smoothed.  ``fits``
-    collects how the loop closures of full weight within one component fitted the graph; those at perceptual
-    aliases, which say nothing about the robot, are "alias".
+    The loop closures are added as pending ones, and decided like those of `decide_edges`.  If *has_jumped*,
+    the odometry of the keyframe contradicts the keyframes before it.  The segment is excluded at 16
+    contradictions among the last 32 keyframes that were recorded.
     """
+    numbers = range(graph.next_edge, graph.next_edge + len(measured))
+    yield AddEdges(keyframe=keyframe, measured=measured)
+    # 1. Decide about the loop closures, and collect how they fit the graph.
+    fits: set[Fit | Literal["alias"]] = {"contrary"} if has_jumped else set()
+    has_accepted = False
+    for decision in decide_edges(graph, keyframe, numbers):
+        yield decision
+        if isinstance(decision, CompareEdges):
+            fits |= decision.fits
+        has_accepted |= isinstance(decision, AcceptEdges | JoinComponents)
+    # 2. Record whether the keyframe contradicts the map, and exclude its segment if it keeps doing so.
+    is_scale_wrong = has_wrong_scale(graph, keyframe, measured)
+    is_contrary = is_scale_wrong or (fits == {"contrary"} and not has_accepted)
+    if fits or is_scale_wrong:
+        yield from decide_exclusion(graph, keyframe, is_contrary=is_contrary, is_scale_wrong=is_scale_wrong)
 
-    outcomes: list[Outcome] = field(default_factory=list)
-    moved: list[int] = field(default_factory=list)
-    fits: set[Fit | Literal["alias"]] = field(default_factory=set)
 
-    def mark_moved(self, *keyframes: int) -> None:
-        """Add keyframes around which the graph must be smoothed, each at most once."""
-        self.moved += [i for i in keyframes if i not in self.moved]
-
-
-def process_new_edges(graph: MapGraph, keyframe: int, numbers: list[int]) -> GraphChanges:
+def decide_edges(graph: MapGraph, keyframe: int, numbers: Sequence[int]) -> Iterator[Decision]:
     """Accept, reject or leave pending the loop closures *numbers* of *keyframe*, and join components by them.
 
-    The graph is changed.  Loop closures without enough support stay pending.  Other pending ones may be
-    accepted together with *numbers*, and accepted ones that *numbers* outweigh are rejected.  The result
-    holds the outcomes, and the keyframes around which the graph must be smoothed.
+    Loop closures without enough support stay pending.  Other pending ones may be accepted together with
+    *numbers*, and accepted ones that *numbers* outweigh are rejected.
     """
-    changes = GraphChanges()
     # 1. Decide about the loop closures within the component of the keyframe by the poses of the graph.
     component = int(graph.components[keyframe])
     edges = {number: graph.edges[number] for number in numbers}
     others = {number: edge.b if edge.a == keyframe else edge.a for number, edge in edges.items()}
     within = [number for number in numbers if graph.components[others[number]] == component]
-    _decide_within(graph, _drop_redundant_weak(graph, within), changes)
+    yield from _decide_within(graph, _drop_redundant_weak(graph, within))
     # 2. Try to join the component with those that its loop closures lead to.
     for other in sorted({int(graph.components[i]) for i in others.values()} - {component}):
-        _join_if_consistent(graph, int(graph.components[keyframe]), other, changes)
-    return changes
+        yield from _decide_join(graph, int(graph.components[keyframe]), other)
 
 
-def decide_again(graph: MapGraph) -> Iterator[GraphChanges]:
-    """Decide again about all loop closures that are not accepted, as if they arrived now, oldest first.
-
-    Rejected loop closures become pending, and proofs of perceptual aliases are dropped before, since they may
-    rest on loop closures that were taken out.  This is a generator: the graph changes while the caller
-    iterates, and the caller smooths it around each yielded change before the next one is computed.
-    """
-    graph.reopen_rejected()
-    for keyframe, group in groupby(list(graph.pending), lambda number: graph.edges[number].a):
-        pending = [number for number in group if _is_pending(graph, number)]
-        if pending:
-            changes = process_new_edges(graph, keyframe, pending)
-            if changes.outcomes or changes.moved:
-                yield changes
-
-
-def reject_misfitting_edges(
-    graph: MapGraph, squared_misfits: Mapping[int, float], changes: GraphChanges
-) -> bool:
+def decide_misfits(graph: MapGraph, squared_misfits: Mapping[int, float]) -> Iterator[Decision]:
     """Count the misfits of accepted loop closures, and reject those with eight in a row.
 
-    Args:
-        graph: The graph after smoothing; the counts and the loop closures change.
-        squared_misfits: Squared Mahalanobis norm of the residual of each smoothed loop closure, by number.
-        changes: Receives the outcomes, and the ends of rejected loop closures as moved.
-
-    Returns:
-        Whether there was such a loop closure.
+    *squared_misfits* has the squared Mahalanobis norm of the residual of each smoothed loop closure, by
+    number.
     """
-    outliers = []
+    misfits = {}
     for number, square in squared_misfits.items():
-        is_misfit = square > MAX_SQUARED_MISFIT and not graph.edges[number].is_fixed
-        if graph.note_misfit(number, is_misfit=is_misfit) >= MAX_MISFITS:
-            outliers.append(number)
-    _reject(graph, outliers, "contrary to the graph", changes)
-    return bool(outliers)
+        edge = graph.edges[number]
+        is_misfit = square > MAX_SQUARED_MISFIT and not edge.is_fixed
+        misfits[number] = edge.misfits + 1 if is_misfit else 0
+    yield RecordMisfits(misfits=misfits)
+    outliers = [number for number, count in misfits.items() if count >= MAX_MISFITS]
+    yield RejectEdges(numbers=outliers, reason="contrary to the graph")
 
 
 # --- Loop closures within one component ---
 
 
-def _decide_within(graph: MapGraph, numbers: list[int], changes: GraphChanges) -> None:
+def _decide_within(graph: MapGraph, numbers: list[int]) -> Iterator[Decision]:
     """Accept loop closures within one component that agree with the graph; use the others as evidence.
 
     Others without enough support, and weak ones that repeat an accepted one of full weight, stay pending.
     """
     # 1. Compare the loop closures with the poses of the graph.
     fits = classify_by_graph(graph, numbers)
-    changes.fits |= {
-        "alias" if _is_at_alias(graph, number) else fit
-        for number, fit in fits.items()
-        if graph.edges[number].weight == 1.0
-    }
+    full = [number for number in numbers if graph.edges[number].weight == 1.0]
+    yield CompareEdges(fits={"alias" if _is_at_alias(graph, number) else fits[number] for number in full})
     # 2. Accept loop closures that agree with the graph: those of full weight first, weak ones only where no
     #    accepted one of full weight connects the same keyframe and segment.
     agreeing = [number for number, fit in fits.items() if fit == "agrees"]
-    _accept(graph, [number for number in agreeing if graph.edges[number].weight == 1.0], changes)
+    accepted = [number for number in agreeing if number in full]
+    if accepted:
+        yield AcceptEdges(numbers=accepted)
     for number in agreeing:
-        if _is_pending(graph, number) and not _has_full_weight_parallel(graph, number):
-            _accept(graph, [number], changes)
+        if number not in full and not _has_full_weight_parallel(graph, number):
+            yield AcceptEdges(numbers=[number])
     # 3. Compare the other loop closures with pending ones: with enough support vague ones are accepted, and
     #    contrary ones reject accepted ones.
     for number, fit in fits.items():
-        if fit == "agrees" or not _is_pending(graph, number):
+        if fit == "agrees" or not graph.is_pending(number):
             continue
         edge = graph.edges[number]
         # A rejection for an earlier loop closure of this loop may have separated the components of both ends.
@@ -184,9 +175,10 @@ def _decide_within(graph: MapGraph, numbers: list[int], changes: GraphChanges) -
         supporting = find_supporting_edges(graph, number)
         contradiction = find_contradiction(graph, number) if supporting and fit == "contrary" else None
         if fit == "vague":
-            _accept(graph, supporting, changes)
+            if supporting:
+                yield AcceptEdges(numbers=supporting)
         elif contradiction is not None:
-            _reject_contradicted(graph, number, supporting, contradiction, changes)
+            yield from _reject_contradicted(graph, number, supporting, contradiction)
 
 
 def _drop_redundant_weak(graph: MapGraph, numbers: list[int]) -> list[int]:
@@ -221,12 +213,8 @@ def _has_full_weight_parallel(graph: MapGraph, number: int) -> bool:
 
 
 def _reject_contradicted(
-    graph: MapGraph,
-    number: int,
-    consistent: list[int],
-    contradiction: Contradiction,
-    changes: GraphChanges,
-) -> None:
+    graph: MapGraph, number: int, consistent: list[int], contradiction: Contradiction
+) -> Iterator[Decision]:
     """Reject accepted loop closures that *consistent* ones, among them the contrary *number*, outweigh.
 
     Where accepted and contrary loop closures both have much weight, both are right: the robots saw two places
@@ -241,10 +229,10 @@ def _reject_contradicted(
     #    Where odometry cannot be so wrong, the contrary ones prove perceptual aliases instead.
     if row_a == row_b:
         if distance_m is not None:
-            _mark_aliases(graph, consistent, distance_m, changes)
+            yield from _mark_aliases(graph, consistent, distance_m)
         elif contradicted and total_weight(graph, contradicted) < weight:
-            _reject(graph, contradicted, reason, changes)
-            _accept(graph, consistent, changes)
+            yield RejectEdges(numbers=contradicted, reason=reason)
+            yield AcceptEdges(numbers=consistent)
         return
     # 2. Between two segments, reject the weakest connection, as long as it weighs less than the contrary
     #    loop closures, until both segments are in two components.
@@ -253,16 +241,16 @@ def _reject_contradicted(
         weakest = find_weakest_connection(graph, row_a, row_b)
         if not weakest or total_weight(graph, weakest) >= weight:
             break
-        _reject(graph, weakest, reason, changes)
+        yield RejectEdges(numbers=weakest, reason=reason)
         has_rejected = True
     component_a, component_b = graph.segments[row_a].component, graph.segments[row_b].component
     # 3. If no connection was rejected, and the contrary loop closures weigh at least 12, an error of the
     #    graph that drift cannot explain proves perceptual aliases.
     if not has_rejected and weight >= MIN_ALIAS_SUPPORT and distance_m is not None:
-        _mark_aliases(graph, consistent, distance_m, changes)
+        yield from _mark_aliases(graph, consistent, distance_m)
     # 4. Join the two components again where the contrary loop closures say.
     if has_rejected and component_a != component_b:
-        _join_if_consistent(graph, component_a, component_b, changes)
+        yield from _decide_join(graph, component_a, component_b)
 
 
 def find_weakest_connection(graph: MapGraph, row_a: int, row_b: int) -> list[int]:
@@ -329,33 +317,23 @@ def _find_path(start: int, goal: int, pairs: list[tuple[int, int]]) -> list[tupl
 # --- Joins and perceptual aliases ---
 
 
-def _join_if_consistent(graph: MapGraph, first: int, second: int, changes: GraphChanges) -> None:
+def _decide_join(graph: MapGraph, first: int, second: int) -> Iterator[Decision]:
     """Join two components if enough pending loop closures between them agree, and decide about the rest.
 
     If too few agree, nothing changes.  If they agree but are ambiguous, only the reasons of segments change.
     """
     decision = decide_join(graph, first, second)
-    if decision is None:
-        return
-    if isinstance(decision, AmbiguousJoin):
-        for row in decision.segment_rows:
-            graph.set_reason(row, decision.reason)
-            robot, segment = graph.segments[row].robot, graph.segments[row].number
-            changes.outcomes.append(Ambiguous(robot=robot, segment=segment, reason=decision.reason))
-        return
-    # 1. Move one component into the frame of the other one.
-    accepted = graph.join_components(decision.moving, decision.T_stay_moving, decision.scale, decision.edges)
-    for edge in accepted:
-        changes.outcomes.append(LoopClosureAccepted(a=edge.a, b=edge.b))
-        changes.mark_moved(edge.a, edge.b)
-    # 2. Decide about the newest pending loop closures that are now within the joined component.
-    components, joined = graph.components, graph.components[accepted[0].a]
-    pending = [(number, graph.edges[number]) for number in graph.pending]
-    within = [number for number, edge in pending if components[edge.a] == components[edge.b] == joined]
-    _decide_within(graph, within[-MAX_EDGES_AFTER_JOIN:], changes)
+    if decision is not None:
+        yield decision
+    if isinstance(decision, JoinComponents):
+        # Decide about the newest pending loop closures that are now within the joined component.
+        components, joined = graph.components, graph.components[graph.edges[decision.numbers[0]].a]
+        pending = [(number, graph.edges[number]) for number in graph.pending]
+        within = [number for number, edge in pending if components[edge.a] == components[edge.b] == joined]
+        yield from _decide_within(graph, within[-MAX_EDGES_AFTER_JOIN:])
 
 
-def _mark_aliases(graph: MapGraph, numbers: list[int], distance_m: float, changes: GraphChanges) -> None:
+def _mark_aliases(graph: MapGraph, numbers: list[int], distance_m: float) -> Iterator[Decision]:
     """Mark the ends of loop closures as two places that look the same, and undo the joins that rest on them.
 
     The places are *distance_m* metres apart.  All keyframes of the same component within half of this
@@ -368,40 +346,20 @@ def _mark_aliases(graph: MapGraph, numbers: list[int], distance_m: float, change
     for i in sorted(ends):
         distances_m = np.sqrt(((positions - positions[i]) ** 2).sum(axis=1))
         near = np.flatnonzero((distances_m < radius_m) & (components == components[i]))
-        graph.mark_aliased(near.tolist())
+        yield MarkAliases(keyframes=near.tolist())
     # 2. Reject connections between segments that have too little weight without the marked keyframes.
     for pair, connection in sorted(graph.accepted_edges_by_segments().items()):
         is_fixed = any(graph.edges[number].is_fixed for number in connection)
         distinct = [number for number in connection if not _is_at_alias(graph, number)]
         if pair[0] != pair[1] and not is_fixed and total_weight(graph, distinct) < MIN_SUPPORT:
-            _reject(graph, connection, "ambiguous: both ends look like another place", changes)
-            for row in pair:
-                graph.set_reason(row, _AT_SEVERAL_PLACES)
+            yield RejectEdges(numbers=connection, reason="ambiguous: both ends look like another place")
+            yield StateReason(rows=pair, reason=_AT_SEVERAL_PLACES, is_reported=False)
 
 
 def _is_at_alias(graph: MapGraph, number: int) -> bool:
     """Return whether an end of a loop closure is at a place that looks like another place of the map."""
     edge = graph.edges[number]
     return edge.a in graph.aliased_keyframes or edge.b in graph.aliased_keyframes
-
-
-# --- Applying decisions ---
-
-
-def _is_pending(graph: MapGraph, number: int) -> bool:
-    return number in graph.edges and graph.edges[number].state == "pending"
-
-
-def _accept(graph: MapGraph, numbers: list[int], changes: GraphChanges) -> None:
-    for edge in graph.accept_edges(numbers):
-        changes.outcomes.append(LoopClosureAccepted(a=edge.a, b=edge.b))
-        changes.mark_moved(edge.a, edge.b)
-
-
-def _reject(graph: MapGraph, numbers: list[int], reason: str, changes: GraphChanges) -> None:
-    for edge in graph.reject_edges(numbers):
-        changes.outcomes.append(LoopClosureRejected(a=edge.a, b=edge.b, reason=reason))
-        changes.mark_moved(edge.a, edge.b)
 
 
 # --- Checks of a robot: its odometry, its metric scale, and how often it contradicts the map ---
@@ -447,37 +405,25 @@ def has_odometry_jump(graph: MapGraph, keyframe: int, measured: Iterable[Measure
     return bool(jumps) and all(jumps)
 
 
-def exclude_if_contradicting(
-    graph: MapGraph, keyframe: int, changes: GraphChanges, *, is_scale_wrong: bool
-) -> bool:
+def decide_exclusion(
+    graph: MapGraph, keyframe: int, *, is_contrary: bool, is_scale_wrong: bool
+) -> Iterator[Decision]:
     """Record whether *keyframe* contradicts the map, and exclude its segment at 16 of 32 contradictions.
 
-    A keyframe contradicts the map if all its loop closures of full weight within its component do and none
-    was accepted, or if its metric scale is wrong, which counts twice.  Loop closures at perceptual aliases
-    are no contradiction.  Without such loop closures and with a right scale, nothing is recorded.
-
-    Args:
-        graph: The graph; the exclusion takes the loop closures of the segment out of it.
-        keyframe: The keyframe whose loop closures were just processed.
-        changes: How its loop closures fitted the graph; receives the outcome of an exclusion.
-        is_scale_wrong: Whether its metric scale differs from that of other robots.
-
-    Returns:
-        Whether the segment was excluded now.
+    A wrong metric scale counts as two records, because two other robots contradict it.  Nothing is recorded
+    of a segment that is excluded already, or that holds the keyframes of a stored version.
     """
     row, segment = int(graph.segment_rows[keyframe]), graph.segment_of(keyframe)
-    if not (changes.fits or is_scale_wrong) or segment.is_excluded or segment.is_from_version:
-        return False
-    has_accepted = any(isinstance(outcome, LoopClosureAccepted) for outcome in changes.outcomes)
-    is_contrary = is_scale_wrong or (changes.fits == {"contrary"} and not has_accepted)
-    contradictions = graph.note_contradiction(
-        row, is_contradiction=is_contrary, count=WRONG_SCALE_COUNT if is_scale_wrong else 1
-    )
+    if segment.is_excluded or segment.is_from_version:
+        return
+    count = WRONG_SCALE_COUNT if is_scale_wrong else 1
+    newest = (1 << count) - 1 if is_contrary else 0
+    history = ((segment.contradictions << count) | newest) & CONTRADICTION_HISTORY
+    yield RecordContradictions(row=row, contradictions=history)
+    contradictions = history.bit_count()
     if contradictions < MAX_CONTRADICTIONS or not is_contrary:
-        return False
+        return
     reason = f"contradicting: {contradictions} of the last 32 keyframes contradict their own odometry"
     if is_scale_wrong:
         reason = "contradicting: its metres are not those of two other robots"
-    graph.exclude_segment(row, reason)
-    changes.outcomes.append(Ambiguous(robot=segment.robot, segment=segment.number, reason=reason))
-    return True
+    yield ExcludeSegment(row=row, reason=reason)

@@ -21,12 +21,13 @@ import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from rse_pf.geometry import Array, inverse, median_pose, scaled
+from rse_pf.live_map.decisions import Fit, JoinComponents, StateReason
 from rse_pf.live_map.graph import STEP_LENGTH_M, MapGraph
 from rse_pf.live_map.graph_rows import LoopEdge
 from rse_pf.slam.consistency import (
@@ -41,10 +42,7 @@ from rse_pf.slam.consistency import (
 __all__ = [
     "ALIAS_DISTANCE_M",
     "MIN_SUPPORT",
-    "AmbiguousJoin",
     "Contradiction",
-    "Fit",
-    "Join",
     "classify_by_graph",
     "decide_join",
     "find_consistent_by_odometry",
@@ -57,10 +55,6 @@ __all__ = [
     "total_weight",
     "unit_segment_of",
 ]
-
-Fit = Literal["agrees", "vague", "contrary"]
-"""How a loop closure within one component fits the pose graph: it *agrees*; or it agrees, but the graph is
-too *vague* to confirm it; or it is *contrary* to the graph."""
 
 MIN_SUPPORT = 3.0
 """Summed weight of loop closures that agree pairwise, at least, before they join components or reject others;
@@ -109,33 +103,6 @@ class DirectedEdge(NamedTuple):
     T_a_b: Array
     variances: Array
     scale: tuple[float, float] | None = None
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Join:
-    """The component ``moving`` is moved into the frame of another one by ``T_stay_moving`` ``(4, 4)``.
-
-    ``scale`` is the length of the unit of the moved component in the unit of the other one; lengths of the
-    moved component are multiplied by it before ``T_stay_moving`` is applied.  ``edges`` are the numbers of
-    the loop closures that agree on this and are to be accepted.
-    """
-
-    moving: int
-    T_stay_moving: Array
-    scale: float
-    edges: list[int]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AmbiguousJoin:
-    """Loop closures agree, but may see one of several equal places; ``reason`` says why.
-
-    ``segment_rows`` are the rows of the segments that they touch, outside the map, whose noted reason differs
-    from ``reason``.
-    """
-
-    segment_rows: list[int]
-    reason: str
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -454,7 +421,7 @@ def are_consistent_between_components(
 # --- Joins of two components ---
 
 
-def decide_join(graph: MapGraph, first: int, second: int) -> Join | AmbiguousJoin | None:
+def decide_join(graph: MapGraph, first: int, second: int) -> JoinComponents | StateReason | None:
     """Return the join of two components that pending loop closures prove, or why it is ambiguous.
 
     Return None if too few loop closures agree.
@@ -471,7 +438,7 @@ def decide_join(graph: MapGraph, first: int, second: int) -> Join | AmbiguousJoi
         ends = sorted({end for edge in edges for end in (edge.a, edge.b)}, reverse=True)
         rows = dict.fromkeys(int(graph.segment_rows[i]) for i in ends if graph.components[i] != root)
         changed = [row for row in rows if graph.segments[row].reason != reason]
-        return AmbiguousJoin(segment_rows=changed, reason=reason)
+        return StateReason(rows=changed, reason=reason, is_reported=True)
     # 3. Choose the component that stays: that of the map, else the older one; but if only one is metric, that
     #    one.
     is_second = second == root or (first != root and second < first)
@@ -481,7 +448,9 @@ def decide_join(graph: MapGraph, first: int, second: int) -> Join | AmbiguousJoi
     # 4. Compute the scale and the pose of the moving component as medians over the loop closures.
     log_scale = _median_log_scale(graph, consistent, stay)
     T_stay_moving = _median_frame(graph, consistent, stay, log_scale)
-    return Join(moving=moving, T_stay_moving=T_stay_moving, scale=math.exp(log_scale), edges=consistent)
+    return JoinComponents(
+        moving=moving, T_stay_moving=T_stay_moving, scale=math.exp(log_scale), numbers=consistent
+    )
 
 
 def _find_consistent_edges(

@@ -18,7 +18,8 @@ from rse_pf.geometry import Array, adjoint, inverse, scaled
 from rse_pf.live_map.graph import MapGraph
 from rse_pf.live_map.graph_rows import LoopEdge
 from rse_pf.live_map.options import LiveMapOptions
-from rse_pf.live_map.outlier_rejection import GraphChanges, reject_misfitting_edges
+from rse_pf.live_map.outcomes import LoopClosureAccepted, LoopClosureRejected, Outcome
+from rse_pf.live_map.outlier_rejection import decide_misfits
 from rse_pf.live_map.pairwise_consistency import find_neighbours, relative_pose_of, unit_segment_of
 from rse_pf.slam.consistency import OdometryNoise
 from rse_pf.slam.smoother import ScaleTerms, SmoothedPoses, smooth
@@ -28,6 +29,7 @@ __all__ = [
     "GraphEdges",
     "SmoothedWindows",
     "information_of",
+    "moved_keyframes",
     "odometry_information",
     "select_edges",
     "smooth_around",
@@ -74,7 +76,7 @@ class SmoothedWindows:
     of all windows that were tried, also of those that were replaced by a larger one.  ``covariances`` has by
     keyframe the ``(6, 6)`` covariance of the pose of each smoothed keyframe that is the newest one of a robot
     that has not left.  It is that of a left twist (metres, radians) in the frame of the component, given the
-    poses that were held.
+    poses that were held.  ``outcomes`` are rejections of loop closures that misfitted for long.
     """
 
     is_strained: bool = False
@@ -82,16 +84,17 @@ class SmoothedWindows:
     squared_misfits: dict[int, float] = field(default_factory=dict)
     keyframe_count: int = 0
     covariances: dict[int, Array] = field(default_factory=dict)
+    outcomes: list[Outcome] = field(default_factory=list)
 
 
 def smooth_changes(
-    graph: MapGraph, changes: GraphChanges, options: LiveMapOptions, robot: str | None = None
-) -> SmoothedWindows | None:
-    """Smooth around changed loop closures, and reject those that misfit for long; None if nothing changed.
+    graph: MapGraph, moved: list[int], options: LiveMapOptions, robot: str | None = None
+) -> SmoothedWindows:
+    """Smooth around changed loop closures, and reject those that misfit for long.
 
     Args:
-        graph: The graph; its poses change.
-        changes: The keyframes to smooth around; receives the outcomes of rejections.
+        graph: The graph; its poses and loop closures change.
+        moved: The keyframes to smooth around.
         options: Sizes of windows, and the allowance of a robot.
         robot: Robot whose keyframe is the cause.  If its smoothing debt is too large, the smallest window is
             taken, and an optimisation of the whole graph does the rest.
@@ -101,18 +104,27 @@ def smooth_changes(
     if debt >= options.max_smoothing_debt:
         options = replace(options, window_sizes=options.window_sizes[:1])
     # 2. Smooth; reject loop closures that misfit the result for long; smooth again without them.
-    windows, keyframe_count = None, 0
-    if changes.moved:
-        windows = smooth_around(graph, changes.moved, graph.anchors(), options)
-        keyframe_count = windows.keyframe_count
-        if reject_misfitting_edges(graph, windows.squared_misfits, changes):
-            windows = smooth_around(graph, changes.moved, graph.anchors(), options)
-            keyframe_count += windows.keyframe_count
+    windows = smooth_around(graph, moved, graph.anchors(), options) if moved else SmoothedWindows()
+    keyframe_count = windows.keyframe_count
+    rejected = graph.apply(decide_misfits(graph, windows.squared_misfits))
+    if rejected:
+        windows = smooth_around(graph, moved_keyframes(rejected, moved), graph.anchors(), options)
+        windows.outcomes = rejected
+        keyframe_count += windows.keyframe_count
     # 3. Add what exceeds the allowance of one keyframe to the debt of the robot, or pay back debt.
     allowance = options.smoothing_allowance
     if robot is not None and (debt or keyframe_count > allowance):
-        graph.set_smoothing_debt(robot, max(0, debt + keyframe_count - allowance))
+        graph.smoothing_debt[robot] = max(0, debt + keyframe_count - allowance)
     return windows
+
+
+def moved_keyframes(outcomes: Iterable[Outcome], before: Iterable[int] = ()) -> list[int]:
+    """Return the keyframes *before*, and after them the other ends of accepted and rejected loop closures."""
+    moved = list(before)
+    for outcome in outcomes:
+        if isinstance(outcome, LoopClosureAccepted | LoopClosureRejected):
+            moved += [i for i in (outcome.a, outcome.b) if i not in moved]
+    return moved
 
 
 def smooth_around(

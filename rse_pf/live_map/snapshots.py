@@ -21,7 +21,7 @@ import numpy.typing as npt
 from rse_pf.errors import BadRequest, message_of
 from rse_pf.geometry import Array
 from rse_pf.live_map.graph import MapGraph
-from rse_pf.live_map.graph_rows import EdgeState, LiveKeyframe, LoopEdge, Segment, variances_of
+from rse_pf.live_map.graph_rows import EdgeState, LiveKeyframe, LoopEdge, Segment
 from rse_pf.slam.place_recognition import PLACE_VECTOR_SIZE, PlaceIndex
 
 __all__ = [
@@ -276,20 +276,17 @@ def _pack_edge(number: int, edge: LoopEdge) -> _PackedEdge:
 
 
 def _unpack_edges(packed: list[_PackedEdge]) -> dict[int, LoopEdge]:
-    stack = np.frombuffer(b"".join(row[4] for row in packed), dtype="<f8").reshape(-1, 6, 6)
     edges = {}
-    for row, information, variances in zip(packed, stack, variances_of(stack), strict=True):
-        number, a, b, T_a_b, _, inliers, matches, is_fixed, state, misfits = row
+    for number, a, b, T_a_b, information, inliers, matches, is_fixed, state, misfits in packed:
         if state not in _STATES:
             raise _damaged(f"a loop closure has the unknown state {state!r}")
         edges[number] = LoopEdge(
             a=a,
             b=b,
             T_a_b=_matrix(T_a_b, 4),
-            information=information,
+            information=_matrix(information, 6),
             inliers=inliers,
             matches=matches,
-            variances=variances,
             is_fixed=is_fixed,
             state=_STATES[state],
             misfits=misfits,

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from rse_pf.geometry import Array, exp_se3, inverse
+from rse_pf.live_map.decisions import AddEdges, JoinComponents
 from rse_pf.live_map.events import KeyframeAdded, LoopClosuresMeasured, MeasuredLoopClosure, matrix_bytes
 from rse_pf.live_map.graph import MapGraph
-from rse_pf.live_map.graph_rows import LiveKeyframe, LoopEdge
+from rse_pf.live_map.graph_rows import LiveKeyframe
 from rse_pf.live_map.live_map import LiveMap
 from rse_pf.live_map.outcomes import Culled
 from rse_pf.live_map.outlier_rejection import find_weakest_connection, has_odometry_jump
@@ -86,11 +87,9 @@ def step_of(metres: float) -> Array:
 def path(metres: list[float], is_metric: bool = True) -> MapGraph:
     """Return a graph with one robot, whose odometry is at these metres along x, keyframe by keyframe."""
     graph = MapGraph()
-    row = graph.find_or_add_segment("x", 0)
-    graph.begin_segment(row, None if is_metric else 1.0, "")
     for number, at in enumerate(metres):
         keyframe = LiveKeyframe(robot="x", segment=0, number=number, timestamp_s=0.0, data=None)
-        graph.add_keyframe(keyframe, row, step_of(at), step_of(at), 0.0)
+        graph.add_keyframe(keyframe, step_of(at), is_metric=is_metric)
     return graph
 
 
@@ -142,17 +141,17 @@ def test_a_robot_without_metres_separates_no_two_robots_with_metres(
 ) -> None:
     graph = MapGraph()
     for robot in ("a", "b", "x"):
-        row = graph.find_or_add_segment(robot, 0)
         keyframe = LiveKeyframe(robot=robot, segment=0, number=0, timestamp_s=0.0, data=None)
-        graph.add_keyframe(keyframe, row, np.eye(4), np.eye(4), 0.0)
+        graph.add_keyframe(keyframe, np.eye(4))
     graph.segments[2].is_metric = is_metric
     for one, other, count in ((0, 1, 1), (1, 2, 5)):
-        for _ in range(count):
-            edge = LoopEdge(
-                a=one, b=other, T_a_b=np.eye(4), information=np.eye(6), inliers=100, matches=100,
-                variances=np.ones(6), state="accepted",
-            )  # fmt: skip
-            graph.add_edges([edge])
+        numbers = list(range(graph.next_edge, graph.next_edge + count))
+        graph.apply(
+            [
+                AddEdges(keyframe=one, measured=[link(other, np.eye(4))] * count),
+                JoinComponents(moving=other, T_stay_moving=np.eye(4), scale=1.0, numbers=numbers),
+            ]
+        )
 
     numbers = find_weakest_connection(graph, 0, 2)
 

@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 
 from rse_pf.geometry import inverse
+from rse_pf.live_map.decisions import ExcludeSegment, RecordContradictions
 from rse_pf.live_map.events import RobotForgotten
 from rse_pf.live_map.graph import MapGraph
+from rse_pf.live_map.graph_rows import LiveKeyframe, Segment
 from rse_pf.live_map.live_map import LiveMap
 from rse_pf.live_map.options import LiveMapOptions
 from rse_pf.live_map.outcomes import Ambiguous, LoopClosureRejected, Unaligned
-from rse_pf.live_map.outlier_rejection import GraphChanges
 from rse_pf.live_map.smoothing import smooth_changes
 from tests.live_map.generated_drives import GeneratedWorld, circle
 from tests.live_map.hostile_robot import HOSTILE, error_cm, joins, play, scenario, without
@@ -88,9 +89,7 @@ def test_smoothing_that_a_robot_causes_has_a_budget_of_its_own() -> None:
 
     def smoothed(robot: str) -> int:
         graph.T_component_camera[:, :3, 3] *= 1.01
-        window = smooth_changes(graph, GraphChanges(moved=[len(graph) // 2]), options, robot)
-        assert window is not None
-        return window.keyframe_count
+        return smooth_changes(graph, [len(graph) // 2], options, robot).keyframe_count
 
     assert [smoothed(HOSTILE) for _ in range(6)] == [35, 35, 35, 5, 5, 5]
     restored = LiveMap.restore(live_map.snapshot())
@@ -103,12 +102,15 @@ def test_smoothing_that_a_robot_causes_has_a_budget_of_its_own() -> None:
 
 def test_a_robot_that_opens_segments_does_not_lose_its_record() -> None:
     graph = MapGraph()
-    row = graph.find_or_add_segment(HOSTILE, 0)
-    graph.note_contradiction(row, is_contradiction=True, count=32)
-    graph.exclude_segment(row, "contradicting")
 
-    second = graph.segments[graph.find_or_add_segment(HOSTILE, 1)]
-    honest = graph.segments[graph.find_or_add_segment("a", 0)]
+    def first_segment(robot: str, number: int) -> Segment:
+        keyframe = LiveKeyframe(robot=robot, segment=number, number=number, timestamp_s=0.0, data=None)
+        return graph.segment_of(graph.add_keyframe(keyframe, np.eye(4)))
+
+    first_segment(HOSTILE, 0)
+    graph.apply([RecordContradictions(row=0, contradictions=0xFFFFFFFF), ExcludeSegment(row=0, reason="x")])
+
+    second, honest = first_segment(HOSTILE, 1), first_segment("a", 0)
 
     assert (second.contradictions, second.is_excluded) == (0xFFFF, False)
     assert (honest.contradictions, honest.is_excluded) == (0, False)

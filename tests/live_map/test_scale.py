@@ -12,7 +12,6 @@ import pytest
 
 from rse_pf.errors import BadRequest
 from rse_pf.geometry import Array, exp_se3, inverse, pose_difference, scaled
-from rse_pf.live_map.alignment_reports import UP_TO_SCALE
 from rse_pf.live_map.events import (
     Event,
     LoopClosuresMeasured,
@@ -23,6 +22,7 @@ from rse_pf.live_map.events import (
     matrix_bytes,
     matrix_of,
 )
+from rse_pf.live_map.graph_rows import UP_TO_SCALE
 from rse_pf.live_map.live_map import LiveMap
 from rse_pf.live_map.measure import measure_loop_closures
 from rse_pf.live_map.outcomes import Corrected, Joined

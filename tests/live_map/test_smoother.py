@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from rse_pf.geometry import Array, exp_se3, inverse, log_se3
-from rse_pf.live_map.graph_rows import LoopEdge, variances_of
+from rse_pf.live_map.decisions import AcceptEdges, AddEdges
 from rse_pf.live_map.live_map import LiveMap
 from rse_pf.live_map.options import LiveMapOptions
 from rse_pf.live_map.smoothing import smooth_around
 from rse_pf.slam.optimise import OptimiseOptions, optimise_graph
 from rse_pf.slam.pose_graph import PoseGraph
 from rse_pf.slam.smoother import SmoothedPoses, smooth
-from tests.live_map.generated_drives import INFORMATION, GeneratedWorld, circle
+from tests.live_map.generated_drives import GeneratedWorld, circle, make_link
 
 FREE = 12
 
@@ -66,11 +66,9 @@ def test_an_accepted_loop_closure_that_is_wrong_does_not_move_the_map() -> None:
     graph, last = live._graph, len(world.seen) - 1
     before = graph.T_component_camera.copy()
     wrong = world.step(last, last - 10) @ exp_se3([0.5, -0.4, 0.0, 0.0, 0.3, 0.0])
-    edge = LoopEdge(
-        a=last, b=last - 10, T_a_b=wrong, information=INFORMATION, inliers=50, matches=90,
-        variances=variances_of(INFORMATION[None])[0], state="accepted",
-    )  # fmt: skip
-    graph.add_edges([edge])
+    number = graph.next_edge
+    planted = AddEdges(keyframe=last, measured=[make_link(last - 10, wrong, inliers=60)])
+    graph.apply([planted, AcceptEdges(numbers=[number])])
     done = smooth_around(graph, [last, last - 10], [0], LiveMapOptions())
 
     assert max(done.squared_misfits.values()) > 100.0

@@ -14,7 +14,7 @@ from rse_pf.live_map.graph_rows import LiveKeyframe
 from rse_pf.live_map.live_map import LiveMap
 from rse_pf.live_map.measure import measure_loop_closures
 from rse_pf.live_map.outcomes import Outcome, Unaligned
-from rse_pf.live_map.outlier_rejection import GraphChanges, exclude_if_contradicting, has_wrong_scale
+from rse_pf.live_map.outlier_rejection import decide_exclusion, has_wrong_scale
 from rse_pf.slam.keyframe import decode_keyframe, make_features
 from tests.live_map.generated_drives import GeneratedWorld, circle
 from tests.live_map.hostile_rig import generated_drives
@@ -24,9 +24,8 @@ def graph_of(*robots: str) -> MapGraph:
     """Return a graph with one keyframe of each robot, without loop closures."""
     graph = MapGraph()
     for robot in robots:
-        row = graph.find_or_add_segment(robot, 0)
         keyframe = LiveKeyframe(robot=robot, segment=0, number=0, timestamp_s=0.0, data=None)
-        graph.add_keyframe(keyframe, row, np.eye(4), np.eye(4), 0.0)
+        graph.add_keyframe(keyframe, np.eye(4))
     return graph
 
 
@@ -69,9 +68,11 @@ def test_robots_without_metric_scale_are_no_evidence() -> None:
 def test_after_eight_keyframes_with_a_wrong_scale_a_robot_is_excluded() -> None:
     graph = graph_of("x", "a", "b")
 
-    gone = [exclude_if_contradicting(graph, 0, GraphChanges(), is_scale_wrong=True) for _ in range(8)]
+    excluded = [
+        graph.apply(decide_exclusion(graph, 0, is_contrary=True, is_scale_wrong=True)) for _ in range(8)
+    ]
 
-    assert gone == [False] * 7 + [True]
+    assert [len(outcomes) for outcomes in excluded] == [0] * 7 + [1]
     assert graph.segments[0].is_excluded
     assert graph.segments[0].reason == "contradicting: its metres are not those of two other robots"
     assert not graph.segments[1].is_excluded
