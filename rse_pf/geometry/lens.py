@@ -31,10 +31,9 @@ such as a focal length, at the position of a coefficient.
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LensModel:
-    """A lens model: its names, its coefficients, and the functions that compute with them.
+    """A lens model: its names, its coefficients, and where OpenCV computes with them.
 
-    All functions take the module ``cv2`` first.  ``K`` is a ``(3, 3)`` camera matrix in pixels, and
-    ``coefficients`` ``(m,)`` are in OpenCV's order.
+    ``K`` is a ``(3, 3)`` camera matrix in pixels, and ``coefficients`` ``(m,)`` are in OpenCV's order.
 
     Attributes:
         name: Identifier of the model in files and requests of this platform.
@@ -47,14 +46,11 @@ class LensModel:
         plausible_field_of_view_deg: Smallest and largest field of view of a lens that SLAM can use.
         field_of_view_rad: Maps the quotient of an image side and the focal length, both in pixels, to the
             field of view along this side in radians, without distortion.
-        undistort_points: ``(cv2, pixels (n, 1, 2), K, coefficients, K_new or None)`` to ``(n, 1, 2)``: pixels
-            of a pinhole camera with the matrix K_new, or coordinates in the plane z = 1 for None.
+        part_of_opencv: Maps the module ``cv2`` to the module with the functions of this model.
         distort_points: ``(cv2, rays (n, 2), K, coefficients)`` to ``(n, 1, 2)``: the distorted pixels of
             points ``(x, y, 1)`` of the camera frame.
-        undistortion_maps: ``(cv2, K, coefficients, rotation (3, 3), K_new, (width, height))`` to the two
-            float32 maps that ``cv2.remap`` takes.
-        rectify: ``(cv2, K_left, coefficients_left, K_right, coefficients_right, (width, height), R, t)`` to
-            the rotations R1 and R2 and the projections P1 and P2 of Bouguet's rectification.
+        rectification_margin: Name of the option of ``stereoRectify`` that is 0 if the rectified images hold
+            only pixels that their camera sees.
     """
 
     name: str
@@ -64,10 +60,9 @@ class LensModel:
     is_perspective: bool
     plausible_field_of_view_deg: tuple[float, float]
     field_of_view_rad: Callable[[float], float]
-    undistort_points: Callable[..., Any]
+    part_of_opencv: Callable[[Any], Any]
     distort_points: Callable[..., Array]
-    undistortion_maps: Callable[..., tuple[Any, Any]]
-    rectify: Callable[..., tuple[Array, Array, Array, Array]]
+    rectification_margin: str
 
     def check_coefficients(self, coefficients: tuple[float, ...]) -> None:
         """Refuse coefficients that OpenCV's functions do not take.
@@ -197,20 +192,27 @@ class Lens:
         Raises:
             MissingExtra: OpenCV is not installed.
         """
-        return LENS_MODELS[self.model].undistortion_maps(
-            load_opencv(),
-            self.camera.matrix,
-            self.coefficients,
-            np.eye(3) if rotation is None else rotation,
-            camera.matrix,
-            (camera.width, camera.height),
+        cv2 = load_opencv()
+        maps: tuple[Any, Any] = (
+            LENS_MODELS[self.model]
+            .part_of_opencv(cv2)
+            .initUndistortRectifyMap(
+                self.camera.matrix,
+                self.coefficients,
+                np.eye(3) if rotation is None else rotation,
+                camera.matrix,
+                (camera.width, camera.height),
+                cv2.CV_32FC1,
+            )
         )
+        return maps
 
     def _undistort(self, pixels: Array, K_new: Array | None) -> Array:
         contiguous = np.ascontiguousarray(pixels).reshape(-1, 1, 2)
         points: Array = (
             LENS_MODELS[self.model]
-            .undistort_points(load_opencv(), contiguous, self.camera.matrix, self.coefficients, K_new)
+            .part_of_opencv(load_opencv())
+            .undistortPoints(contiguous, self.camera.matrix, self.coefficients, None, None, K_new)
             .reshape(-1, 2)
         )
         return points
@@ -245,8 +247,8 @@ def rectify_stereo_pair(
     Source:
         Bouguet's method, as ``cv2.stereoRectify`` and ``cv2.fisheye.stereoRectify`` implement it.
     """
-    R1, R2, P1, P2 = LENS_MODELS[left.model].rectify(
-        load_opencv(),
+    cv2, model = load_opencv(), LENS_MODELS[left.model]
+    R1, R2, P1, P2, *_ = model.part_of_opencv(cv2).stereoRectify(
         left.camera.matrix,
         left.coefficients,
         right.camera.matrix,
@@ -254,15 +256,10 @@ def rectify_stereo_pair(
         (left.camera.width, left.camera.height),
         T_right_left[:3, :3],
         T_right_left[:3, 3],
+        flags=cv2.CALIB_ZERO_DISPARITY,
+        **{model.rectification_margin: 0.0},
     )
     return (R1, R2), (P1, P2)
-
-
-# --- Functions of the radial-tangential model (Brown 1966), as the module cv2 implements it ---
-
-
-def _undistort_radial_tangential(cv2: Any, pixels: Array, K: Array, coefficients: Array, K_new: Any) -> Any:
-    return cv2.undistortPoints(pixels, K, coefficients, None, None, K_new)
 
 
 def _distort_radial_tangential(cv2: Any, rays: Array, K: Array, coefficients: Array) -> Any:
@@ -270,35 +267,11 @@ def _distort_radial_tangential(cv2: Any, rays: Array, K: Array, coefficients: Ar
     return cv2.projectPoints(points, np.zeros(3), np.zeros(3), K, coefficients)[0]
 
 
-def _radial_tangential_maps(cv2: Any, *arguments: Any) -> Any:
-    return cv2.initUndistortRectifyMap(*arguments, cv2.CV_32FC1)
-
-
-def _rectify_radial_tangential(cv2: Any, *pair: Any) -> Any:
-    # alpha 0 crops the rectified images so that no pixel lies outside the original images.
-    return cv2.stereoRectify(*pair, flags=cv2.CALIB_ZERO_DISPARITY, alpha=0.0)[:4]
-
-
-# --- Functions of the equidistant fisheye (Kannala and Brandt 2006), as cv2.fisheye implements it ---
-
-
-def _undistort_fisheye(cv2: Any, pixels: Array, K: Array, coefficients: Array, K_new: Any) -> Any:
-    return cv2.fisheye.undistortPoints(pixels, K, coefficients, None, None, K_new)
-
-
 def _distort_fisheye(cv2: Any, rays: Array, K: Array, coefficients: Array) -> Any:
     return cv2.fisheye.distortPoints(rays.reshape(-1, 1, 2), K, coefficients)
 
 
-def _fisheye_maps(cv2: Any, *arguments: Any) -> Any:
-    return cv2.fisheye.initUndistortRectifyMap(*arguments, cv2.CV_32FC1)
-
-
-def _rectify_fisheye(cv2: Any, *pair: Any) -> Any:
-    # balance 0 crops the rectified images so that no pixel lies outside the original images.
-    return cv2.fisheye.stereoRectify(*pair, flags=cv2.CALIB_ZERO_DISPARITY, balance=0.0)[:4]
-
-
+# The radial-tangential model is that of Brown 1966, the equidistant fisheye that of Kannala and Brandt 2006.
 _MODELS = (
     LensModel(
         name="radial-tangential",
@@ -319,10 +292,9 @@ _MODELS = (
         # No lens that this model describes has a field of view above 140 degrees.
         plausible_field_of_view_deg=(20.0, 140.0),
         field_of_view_rad=lambda side_per_focal_length: 2.0 * math.atan(side_per_focal_length / 2.0),
-        undistort_points=_undistort_radial_tangential,
+        part_of_opencv=lambda cv2: cv2,
         distort_points=_distort_radial_tangential,
-        undistortion_maps=_radial_tangential_maps,
-        rectify=_rectify_radial_tangential,
+        rectification_margin="alpha",
     ),
     LensModel(
         name="fisheye",
@@ -333,10 +305,9 @@ _MODELS = (
         # No limits: an image may show a small crop of the image circle of a fisheye lens, or all of it.
         plausible_field_of_view_deg=(0.0, math.inf),
         field_of_view_rad=lambda side_per_focal_length: side_per_focal_length,
-        undistort_points=_undistort_fisheye,
+        part_of_opencv=lambda cv2: cv2.fisheye,
         distort_points=_distort_fisheye,
-        undistortion_maps=_fisheye_maps,
-        rectify=_rectify_fisheye,
+        rectification_margin="balance",
     ),
 )
 

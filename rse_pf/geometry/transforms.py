@@ -272,23 +272,36 @@ def to_quaternion(rotation: Array) -> Array:
         Shepperd, Quaternion from Rotation Matrix, 1978: divide by the largest of the four components.
     """
     m: Any = rotation
-    four = np.array(
+    # Row i holds 4 q_i q, the quaternion q times four of its i-th component.
+    multiples = np.array(
         [
-            1.0 + m[0, 0] - m[1, 1] - m[2, 2],
-            1.0 - m[0, 0] + m[1, 1] - m[2, 2],
-            1.0 - m[0, 0] - m[1, 1] + m[2, 2],
-            1.0 + m[0, 0] + m[1, 1] + m[2, 2],
+            [
+                1.0 + m[0, 0] - m[1, 1] - m[2, 2],
+                m[0, 1] + m[1, 0],
+                m[0, 2] + m[2, 0],
+                m[2, 1] - m[1, 2],
+            ],
+            [
+                m[0, 1] + m[1, 0],
+                1.0 - m[0, 0] + m[1, 1] - m[2, 2],
+                m[1, 2] + m[2, 1],
+                m[0, 2] - m[2, 0],
+            ],
+            [
+                m[0, 2] + m[2, 0],
+                m[1, 2] + m[2, 1],
+                1.0 - m[0, 0] - m[1, 1] + m[2, 2],
+                m[1, 0] - m[0, 1],
+            ],
+            [
+                m[2, 1] - m[1, 2],
+                m[0, 2] - m[2, 0],
+                m[1, 0] - m[0, 1],
+                1.0 + m[0, 0] + m[1, 1] + m[2, 2],
+            ],
         ]
     )
-    largest = int(np.argmax(four))
-    if largest == 3:
-        q = np.array([m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1], four[3]])
-    elif largest == 0:
-        q = np.array([four[0], m[0, 1] + m[1, 0], m[0, 2] + m[2, 0], m[2, 1] - m[1, 2]])
-    elif largest == 1:
-        q = np.array([m[0, 1] + m[1, 0], four[1], m[1, 2] + m[2, 1], m[0, 2] - m[2, 0]])
-    else:
-        q = np.array([m[0, 2] + m[2, 0], m[1, 2] + m[2, 1], four[2], m[1, 0] - m[0, 1]])
+    q = multiples[int(np.argmax(multiples.diagonal()))]
     q /= np.linalg.norm(q)
     unit: Array = -q if q[3] < 0 else q
     return unit
