@@ -2,23 +2,26 @@
 
 The body of a request has the bytes that the WebSocket would carry, and the token is the same.  `BurstPolicy`
 decides whether a command may be sent.  A call of `BurstClient.ask` returns exactly one answer or failure, and
-never later than its deadline.  This is the only module of the robot that speaks HTTP in its event loop.
+never later than its deadline.  Requests are sent in threads of their own.
 """
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import http.client
 import ssl
 from collections.abc import Awaitable, Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from random import Random
-from urllib.parse import SplitResult, urlsplit
+from urllib.parse import urlsplit
 
 from client_sdk.commands.answer_types import Answer
 from client_sdk.concurrency.tasks import cancel_tasks
 from client_sdk.network.dial_errors import DialError
-from client_sdk.network.http_proxy import connect_tcp, find_proxy, port_of
-from client_sdk.offloading.burst_policy import BurstPolicy, burst_address
+from client_sdk.offloading.burst_policy import MAX_IN_FLIGHT, BurstPolicy, burst_address
+from client_sdk.transfer.data_connection import Response, open_connection
 from rse_pf.config import BurstSettings
 from rse_pf.errors import RsePfError
 from rse_pf.wire import SUBPROTOCOLS, Codec, Command, Failure, Result, Welcome
@@ -40,8 +43,6 @@ IDLE_TIMEOUT_S = 20.0
 """How long an unused HTTP connection to the burst function is kept for the next command, in seconds."""
 MAX_IDLE_CONNECTIONS = 4
 """Most unused HTTP connections to the host of the burst function that are kept."""
-MAX_HEAD_BYTES = 16384
-"""Longest status line and headers of an answer of the burst function, in bytes."""
 MAX_RETRY_AFTER_S = 86400.0
 """Longest time for which an answer of the burst function can make the robot send it no command, in seconds; a
 longer ``Retry-After`` is cut to this."""
@@ -55,25 +56,9 @@ probably fail in the same way, because the function is overloaded or unreachable
 or sends messages that the robot cannot decode.  Other codes concern the one command."""
 
 
-class _BrokenHttp(Exception):
-    """The peer sent malformed HTTP, or the token or the host name has letters that HTTP cannot carry."""
-
-
-class _StaleConnection(Exception):
-    """The peer closed an idle connection without an answer, so the request can be sent on another one."""
-
-
 @dataclass(frozen=True, slots=True)
-class _Response:
-    status: int
-    headers: dict[str, str]
-    body: bytes
-
-
-@dataclass(slots=True)
 class _IdleConnection:
-    reader: asyncio.StreamReader
-    writer: asyncio.StreamWriter
+    connection: http.client.HTTPConnection
     since_s: float
 
 
@@ -113,10 +98,10 @@ class BurstClient:
         self._user_url = url
         self._welcome_url = ""
         self.policy = BurstPolicy(commands_per_day=BurstSettings().robot_commands_per_day)
-        self._default_context: ssl.SSLContext | None = None
         self._token: tuple[float, str] | None = None
         self._idle: dict[str, list[_IdleConnection]] = {}
         self._tasks: set[asyncio.Task[Result | Failure]] = set()
+        self._threads = ThreadPoolExecutor(MAX_IN_FLIGHT, "rse-pf-burst")
 
     def read_welcome(self, welcome: Welcome) -> None:
         """Use the address of the burst function and the daily budget of commands that *welcome* states.
@@ -199,7 +184,7 @@ class BurstClient:
         await cancel_tasks(self._tasks)
         for connections in self._idle.values():
             for connection in connections:
-                connection.writer.transport.abort()
+                connection.connection.close()
         self._idle.clear()
 
     async def _post(self, address: str, body: bytes) -> tuple[Result | Failure, bool]:
@@ -208,17 +193,21 @@ class BurstClient:
             token = await self._reuse_token()
             if token is None:
                 return _failure("unauthorized", "the burst function takes no robot without a token"), False
-            response = await self._send(address, token, body)
+            loop = asyncio.get_running_loop()
+            response = await loop.run_in_executor(self._threads, self._send, address, token, body)
+        except DialError as refused:
+            return _failure(refused.error.code, refused.error.message, hint=refused.error.hint), False
         except RsePfError as error:
             return _failure(error.code, error.message, hint=error.hint), False
-        except (OSError, EOFError, asyncio.LimitOverrunError, _BrokenHttp) as error:
+        except (OSError, ValueError, http.client.HTTPException) as error:
             cause = getattr(error, "strerror", None) or str(error) or type(error).__name__
             return _failure("connect", f"cannot reach the burst function: {cause}"), False
-        if response.status == 200:
-            return self._decode(response), response.headers.get(COLD_START_HEADER) == "true"
-        if response.status == 401:
+        status, headers, content = response
+        if status == 200:
+            return self._decode(headers, content), headers.get(COLD_START_HEADER) == "true"
+        if status == 401:
             self._token = None
-        return _status_failure(response), False
+        return _status_failure(status, headers), False
 
     async def _reuse_token(self) -> str | None:
         now_s = self._clock()
@@ -229,147 +218,84 @@ class BurstClient:
             self._token = (now_s, token)
         return self._token[1]
 
-    def _decode(self, response: _Response) -> Result | Failure:
+    def _decode(self, headers: http.client.HTTPMessage, content: bytes) -> Result | Failure:
         expected_type = f"application/{SUBPROTOCOLS[self._codec.name]}"
-        if response.headers.get("content-type", "") != expected_type:
+        if headers.get("content-type", "") != expected_type:
             return _failure("connect", "another program answers at the address of the burst function")
         try:
-            message = self._codec.decode_from_server(response.body)
+            message = self._codec.decode_from_server(content)
         except RsePfError as error:
             return _failure(error.code, error.message, hint=error.hint)
         if isinstance(message, Result | Failure):
             return message
         return _failure("bad-message", "the burst function sent a message that is no answer to a command")
 
-    async def _send(self, address: str, token: str, body: bytes) -> _Response:
-        # 1. Write the HTTP request.
+    def _send(self, address: str, token: str, body: bytes) -> Response:
+        """Post *body* on an idle connection that is still open, else on a new one; this function blocks."""
         parts = urlsplit(address)
+        headers = {
+            "Authorization": f"Bearer {token}",
+            "Content-Type": f"application/{SUBPROTOCOLS[self._codec.name]}",
+        }
+        target = (parts.path or "/") + (f"?{parts.query}" if parts.query else "")
         host = parts.netloc.rpartition("@")[2]
-        target = parts.path + (f"?{parts.query}" if parts.query else "")
-        text = (
-            f"POST {target or '/'} HTTP/1.1\r\nHost: {host}\r\nAuthorization: Bearer {token}\r\n"
-            f"Content-Type: application/{SUBPROTOCOLS[self._codec.name]}\r\n"
-            f"Content-Length: {len(body)}\r\n\r\n"
-        )
-        try:
-            head = text.encode("ascii")
-        except UnicodeError as error:
-            raise _BrokenHttp("the token has a letter that HTTP cannot carry") from error
-        # 2. Send it on an idle connection, if one is still open.
         idle = self._idle.setdefault(f"{parts.scheme}://{host}", [])
         while idle:
-            connection = idle.pop()
-            if self._clock() - connection.since_s < IDLE_TIMEOUT_S and not connection.reader.at_eof():
-                try:
-                    return await self._exchange(
-                        connection.reader, connection.writer, head + body, idle, is_reused=True
-                    )
-                except _StaleConnection:
-                    continue
-            connection.writer.transport.abort()
-        # 3. Otherwise open a new connection.
-        context = self._tls_context(host) if parts.scheme == "https" else None
-        try:
-            reader, writer = await _open_connection(parts, context)
-        except ValueError as error:  # the encoding of host names refuses a..b
-            raise _BrokenHttp(f"{parts.hostname} cannot be a host name") from error
-        except DialError as refused:
-            raise refused.error from None
-        return await self._exchange(reader, writer, head + body, idle, is_reused=False)
+            last = idle.pop()
+            if self._clock() - last.since_s < IDLE_TIMEOUT_S:
+                with contextlib.suppress(ConnectionError):  # the peer has closed this connection meanwhile
+                    return self._exchange(last.connection, target, body, headers, idle)
+            last.connection.close()
+        connection = open_connection(parts, EXCHANGE_TIMEOUT_S, self._tls_context(host))
+        return self._exchange(connection, target, body, headers, idle)
 
-    async def _exchange(
+    def _exchange(
         self,
-        reader: asyncio.StreamReader,
-        writer: asyncio.StreamWriter,
-        data: bytes,
+        connection: http.client.HTTPConnection,
+        target: str,
+        body: bytes,
+        headers: dict[str, str],
         idle: list[_IdleConnection],
-        *,
-        is_reused: bool,
-    ) -> _Response:
-        """Send *data* and return the answer; then append the connection to *idle*, or abort it.
+    ) -> Response:
+        """Send a request and return the answer; then append the connection to *idle*, or close it.
 
-        It is aborted after an error, if the peer wants to close it, and if *idle* is full.
-
-        Raises:
-            _StaleConnection: *is_reused*, and the peer closed the connection without a byte of an answer.
-            _BrokenHttp: The answer is not HTTP/1 with a ``Content-Length``, or its body is too long.
+        It is closed after an error, if the peer wants to close it, and if *idle* is full.
         """
         is_kept = False
         try:
-            try:
-                writer.write(data)
-                await writer.drain()
-                head = await reader.readuntil(b"\r\n\r\n")
-            except (ConnectionError, asyncio.IncompleteReadError) as error:
-                if is_reused and not getattr(error, "partial", b""):
-                    raise _StaleConnection from error
-                raise
-            status, headers = _parse_head(head)
-            size = headers.get("content-length", "")
-            if not size.isdecimal() or int(size) > self._max_answer_bytes:
-                raise _BrokenHttp("the answer states no length, or is too long")
-            body = await reader.readexactly(int(size))
-            may_stay_open = headers.get("connection", "").lower() != "close"
-            is_kept = may_stay_open and len(idle) < MAX_IDLE_CONNECTIONS
+            connection.request("POST", target, body, headers)
+            answer = connection.getresponse()
+            content = answer.read(self._max_answer_bytes + 1)
+            if len(content) > self._max_answer_bytes:
+                raise http.client.HTTPException("the answer is too long")
+            is_kept = answer.isclosed() and not answer.will_close and len(idle) < MAX_IDLE_CONNECTIONS
             if is_kept:
-                idle.append(_IdleConnection(reader, writer, self._clock()))
-            return _Response(status, headers, body)
+                idle.append(_IdleConnection(connection, self._clock()))
+            return answer.status, answer.headers, content
         finally:
             if not is_kept:
-                writer.transport.abort()
+                connection.close()
 
-    def _tls_context(self, host: str) -> ssl.SSLContext:
+    def _tls_context(self, host: str) -> ssl.SSLContext | None:
         """Return the TLS context of the backend servers if *host* (``HOST`` or ``HOST:PORT``) is theirs.
 
-        Any other host gets a context that trusts the certificate authorities of the machine.
+        None for any other host: the certificate authorities of the machine are trusted then.
         """
         own_url, own_context = self._read_access()
-        if own_context is not None and host == urlsplit(own_url).netloc.rpartition("@")[2]:
-            return own_context
-        if self._default_context is None:
-            self._default_context = ssl.create_default_context()
-        return self._default_context
+        return own_context if host == urlsplit(own_url).netloc.rpartition("@")[2] else None
 
 
-async def _open_connection(
-    parts: SplitResult, context: ssl.SSLContext | None
-) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
-    """Open a TCP or TLS connection to the host of *parts*, through the HTTP proxy that is set, if any."""
-    host, port = parts.hostname or "", port_of(parts)
-    if find_proxy(parts.scheme, host, port) is None:
-        return await asyncio.open_connection(host, port, limit=MAX_HEAD_BYTES, ssl=context)
-    tunnel = await asyncio.to_thread(connect_tcp, parts, EXCHANGE_TIMEOUT_S)
-    server_name = host if context is not None else None
-    return await asyncio.open_connection(
-        sock=tunnel, limit=MAX_HEAD_BYTES, ssl=context, server_hostname=server_name
-    )
-
-
-def _parse_head(head: bytes) -> tuple[int, dict[str, str]]:
-    """Return HTTP status and headers of a response; the names of the headers are in lower case."""
-    first, *lines = head.decode("latin-1").split("\r\n")
-    version, _, rest = first.partition(" ")
-    if not version.startswith("HTTP/1.") or not rest[:3].isdecimal() or len(rest[:3]) != 3:
-        raise _BrokenHttp("the answer is not HTTP/1")
-    headers: dict[str, str] = {}
-    for line in lines:
-        name, colon, value = line.partition(":")
-        if colon:
-            headers[name.strip().lower()] = value.strip()
-    return int(rest[:3]), headers
-
-
-def _status_failure(response: _Response) -> Failure:
+def _status_failure(status: int, headers: http.client.HTTPMessage) -> Failure:
     """Return the failure for an answer of the burst function with an HTTP status other than 200."""
-    retry_after = response.headers.get("retry-after", "")
+    retry_after = headers.get("retry-after", "")
     is_number = retry_after.isdecimal() and len(retry_after) < 9
     retry_after_ms = float(retry_after) * 1e3 if is_number else None
-    problem = f"the burst function answers {response.status}"
-    if response.status == 401:
+    problem = f"the burst function answers {status}"
+    if status == 401:
         return _failure("unauthorized", problem)
-    if response.status == 403:
+    if status == 403:
         return _failure("forbidden", problem)
-    if response.status == 429 or response.status >= 500:
+    if status == 429 or status >= 500:
         return _failure("busy", problem, retry_after_ms=retry_after_ms)
     return _failure("connect", problem)
 
