@@ -1,4 +1,4 @@
-"""Cameras, videos, folders of images and RealSense cameras as iterators of frames, and camera calibration.
+"""Cameras, videos and folders of images as iterators of frames, and camera calibration.
 
 Tracking and mapping of the frames belong to `client_sdk.mapper`, recordings of benchmarks to
 `client_sdk.datasets`.

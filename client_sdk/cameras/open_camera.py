@@ -9,22 +9,25 @@ from pathlib import Path
 from client_sdk.cameras.folder import list_folder, list_pairs, pair_folders
 from client_sdk.cameras.opencv_video import open_video
 from client_sdk.cameras.pairs import open_pair_videos, split_pairs
-from client_sdk.cameras.realsense import open_realsense, open_realsense_stereo
+from client_sdk.cameras.realsense import open_realsense
 from client_sdk.cameras.source import (
-    FrameStream,
+    FrameSource,
     RawFrame,
     RawPair,
-    RawSource,
-    SourceInfo,
-    StereoSource,
+    checked_pairs,
     make_empty_depth,
+    rectified,
+    select_in_time,
+    undistorted,
 )
 from client_sdk.datasets import CameraChoice, open_dataset
 from client_sdk.datasets.recordings import is_listed
 from client_sdk.datasets.rig_recordings import is_euroc, is_kitti
+from client_sdk.datasets.thinning import Thinning
 from client_sdk.frontend import Frame
 from client_sdk.rigs.folder_camera import find_folder_camera
 from client_sdk.rigs.intrinsics import TYPICAL_HINT, Intrinsics, read_intrinsics
+from client_sdk.rigs.rectification import Rectification
 from client_sdk.rigs.rig import Rig
 from client_sdk.rigs.rig_file import read_calibration, read_rig
 from client_sdk.source_facts import CameraFacts, DoubtLog, SourceFacts, check_source
@@ -34,8 +37,8 @@ from rse_pf.geometry import Camera
 
 __all__ = ["is_recording", "open_camera", "source_of_frames"]
 
-_ROS_BAG_ENDINGS = {".mcap", ".db3"}  # of ROS 2 bags, which `client_sdk.bags` reads
-_REALSENSE_NAMES = ("realsense", "realsense-stereo")  # names of sources that are devices, and not files
+_BAG_ENDINGS = {".bag", ".mcap", ".db3"}  # files that `client_sdk.bags` reads
+_REALSENSE = "realsense"  # name of a source that is a device, and not a file
 _SOURCE_HINT = "name a device by its number, a video, a folder or a recording that exists"
 
 
@@ -47,22 +50,21 @@ def open_camera(
     depth: bool = True,
     camera: CameraChoice | None = None,
     imu: bool | None = None,
-) -> FrameStream:
+) -> FrameSource:
     """Open a source, and return its undistorted frames as an iterator to be closed, or used in ``with``.
 
     Args:
-        source: ``0`` (a device), a video, a stream ``rtsp://...``, a folder of images, a recording of
-            `open_dataset` other than a ROS bag, ``realsense``, or the ``.bag`` of a RealSense camera.
-            Stereo: two devices ``0,2`` or videos ``LEFT,RIGHT``, a device or video that shows both images
-            side by side (with a rig), a folder with ``left/`` and ``right/``, or ``realsense-stereo``.
-        intrinsics: Intrinsics or rig of the cameras, or a file of them (``intrinsics.json``, ``rig.json``).
-            None for folders, recordings and RealSense cameras that state their own.  A recording takes a file
-            only, ``realsense`` takes intrinsics and no rig of two cameras, folders of a stereo pair and
-            ``realsense-stereo`` take a rig of two cameras.
+        source: One camera: ``0`` (a device), a video, a stream ``rtsp://...``, a folder of images, or
+            ``realsense``.  A stereo pair: two devices ``0,2`` or videos ``LEFT,RIGHT``, a device or video
+            that shows both images side by side (with a rig), or a folder with ``left/`` and ``right/``.  A
+            recording that `open_dataset` reads, other than a bag.
+        intrinsics: Intrinsics of one camera or rig of two, or a file of them (``intrinsics.json``,
+            ``rig.json``).  May be None for folders, recordings and RealSense cameras that state their own.  A
+            recording takes a file only; folders of a stereo pair take a rig of two cameras.
         rate_hz: Frames a second to deliver on average, see `client_sdk.datasets.thinning`; None for all.
         depth: Whether depth is read, where there is some.
-        camera: ``left`` for the left camera of a rig alone, ``stereo`` for both; None for both where there
-            are two.
+        camera: ``left`` to use the left camera of a stereo pair only, ``stereo`` to require a stereo pair;
+            None to use both cameras where there are two.
         imu: Whether frames carry samples of an IMU; None for yes where there is one, which only recordings
             have.
 
@@ -75,44 +77,39 @@ def open_camera(
     word = str(source)
     path = Path(word)
     for name in (word,) if path.exists() or word.count(",") != 1 else word.split(","):
-        if not name.isdigit() and "://" not in name and name not in _REALSENSE_NAMES:
+        if not name.isdigit() and "://" not in name and name != _REALSENSE:
             check_exists(name, _SOURCE_HINT)
     own = read_calibration(intrinsics) if isinstance(intrinsics, Path | str) else intrinsics
     stated_by = str(intrinsics) if isinstance(intrinsics, Path | str) else f"the intrinsics of {word}"
     if imu and not is_recording(path):
         raise UsageError(f"{word} has no IMU", hint="leave out --imu")
-    # 2. Open a stereo source with a rig of its own, or a RealSense camera.
-    is_stereo = word == "realsense-stereo" or pair_folders(path) is not None
-    if is_stereo and own is not None and not (isinstance(own, Rig) and own.right is not None):
-        raise UsageError(
-            f"{word} is a stereo pair, and {stated_by} is of one camera",
-            hint="name a rig.json of both cameras, or leave it out to use the rig of the source",
-        )
-    if word == "realsense-stereo":
-        pairs, rig, close = open_realsense_stereo()
-        facts = SourceFacts(name=word)
-        rig = own if isinstance(own, Rig) else rig
-        return _open_pair(facts, lambda log: pairs, rig, rate_hz, camera, close)
+    # 2. Open two folders of a stereo pair, or a RealSense camera.
     if pair_folders(path) is not None:
+        if own is not None and not (isinstance(own, Rig) and own.right is not None):
+            raise UsageError(
+                f"{word} is a stereo pair, and {stated_by} is of one camera",
+                hint="name a rig.json of both cameras, or leave it out to use the rig of the source",
+            )
         rig = own if isinstance(own, Rig) else read_rig(path / "rig.json")
         images = list_pairs(path, rig.left.lens.rate_hz)
         facts = images.facts(rig.left.lens, str(intrinsics or path / "rig.json"), has_depth=False)
         return _open_pair(facts, images.pairs, rig, rate_hz, camera)
     if isinstance(own, Rig) and own.right is None:
         own = own.left.lens
-    if word == "realsense" or path.suffix == ".bag":
+    if word == _REALSENSE:
         if camera == "stereo" or isinstance(own, Rig):
             raise UsageError(
-                f"{word} is one camera with depth", hint="name realsense-stereo for its two infrared cameras"
+                f"{word} is one camera with depth", hint="give intrinsics of one camera, or none"
             )
-        raw, factory, close = open_realsense(None if word == "realsense" else path)
-        lens = own if isinstance(own, Intrinsics) else factory
+        raw, factory_lens, close = open_realsense()
+        lens = own if isinstance(own, Intrinsics) else factory_lens
         facts = _facts_of_lens(word, lens, stated_by)
-        return _open_single(facts, lambda log: _without_depth(raw, depth), lens, rate_hz, depth, close)
+        frames = raw if depth else ((stamp_s, rgb, None) for stamp_s, rgb, _ in raw)
+        return _open_single(facts, lambda log: frames, lens, rate_hz, depth, close)
     # 3. Open a recording of a benchmark, and refuse bags, which have a command of their own.
-    if path.suffix in _ROS_BAG_ENDINGS or (path / "metadata.yaml").is_file():
+    if path.suffix in _BAG_ENDINGS or (path / "metadata.yaml").is_file():
         raise UsageError(
-            f"{word} is a ROS bag",
+            f"{word} is a bag",
             hint="read it with rse-pf map from-bag (extra bags)",
         )
     if is_recording(path):
@@ -141,7 +138,9 @@ def open_camera(
         return _open_stereo_video(word, own, rate_hz, camera, stated_by)
     # 5. Open one camera: a folder, a video or a device.
     if camera == "stereo":
-        raise UsageError(f"{word} is one camera", hint="name a rig: --intrinsics rig.json")
+        raise UsageError(
+            f"{word} is one camera, and a stereo pair was asked for", hint="name a rig: --intrinsics rig.json"
+        )
     if path.is_dir():
         if own is None:
             file = path / "intrinsics.json"
@@ -165,7 +164,7 @@ def open_camera(
 
 def _open_folder(
     path: Path, lens: Intrinsics, stated_by: str, rate_hz: float | None, use_depth: bool
-) -> FrameStream:
+) -> FrameSource:
     """Return the frames of a folder of images, with depth if there is some and *use_depth* is set."""
     images = list_folder(path, lens.rate_hz)
     has_depth = use_depth and images.partners is not None
@@ -185,22 +184,25 @@ def _open_single(
     has_depth: bool,
     close: Callable[[], None] | None = None,
     span_s: tuple[float, float] | None = None,
-) -> FrameStream:
+) -> FrameSource:
     """Check the facts of one camera, and return its frames.
 
     Raises:
         UsageError: Two facts contradict each other; nothing was read then.
     """
     log = _check(facts, close)
-    info = SourceInfo(
+    thinning = None if rate_hz is None else Thinning(rate_hz)
+    in_time = select_in_time(frames(log), facts.name, log, thinning)
+    return FrameSource(
         name=facts.name,
         camera=lens.camera,
+        frames=undistorted(in_time, lens, facts.name),
         has_depth=has_depth,
         notes=facts.assumed,
         log=log,
         span_s=span_s or facts.span_s,
+        release=close,
     )
-    return RawSource(info, frames(log), lens, rate_hz=rate_hz, close=close)
 
 
 def _check(facts: SourceFacts, close: Callable[[], None] | None) -> DoubtLog:
@@ -218,7 +220,7 @@ def _check(facts: SourceFacts, close: Callable[[], None] | None) -> DoubtLog:
 
 
 def _facts_of_lens(name: str, lens: Intrinsics, stated_by: str) -> SourceFacts:
-    """Return the facts of a camera none of whose images was read; `RawSource` compares their size later."""
+    """Return the facts of a camera none of whose images was read; `undistorted` compares their size later."""
     camera = CameraFacts(stated_by=stated_by, lens=lens)
     return SourceFacts(name=name, cameras=(camera,))
 
@@ -234,34 +236,33 @@ def source_of_frames(
     notes: tuple[str, ...] = (),
     log: DoubtLog | None = None,
     span_s: tuple[float, float] | None = None,
-) -> FrameStream:
+) -> FrameSource:
     """Return a `FrameSource` of *frames* that are undistorted already, and whose depth is registered.
 
-    Without *has_depth*, the depth of each frame is replaced by one without readings.  *close* releases the
-    file of the frames.  All other arguments are the fields of `SourceInfo`.
+    Without *has_depth*, the depth image of each frame is replaced by one without readings.  *close* releases
+    the file of the frames.  All other arguments are attributes of `FrameSource`.
     """
     empty_depth = make_empty_depth(camera)
-
-    def make_frame(item: tuple[float, Frame]) -> Frame:
-        return item[1] if has_depth else replace(item[1], depth_m=empty_depth)
-
-    info = SourceInfo(
+    log = DoubtLog() if log is None else log
+    in_time = select_in_time(((frame.timestamp_s, frame) for frame in frames), name, log)
+    return FrameSource(
         name=name,
         camera=camera,
+        frames=(frame if has_depth else replace(frame, depth_m=empty_depth) for _, frame in in_time),
         has_depth=has_depth,
         has_stereo=has_stereo,
         notes=notes,
-        log=DoubtLog() if log is None else log,
+        log=log,
         span_s=span_s,
+        release=close,
     )
-    return FrameStream(info, ((frame.timestamp_s, frame) for frame in frames), make_frame, close=close)
 
 
 def is_recording(path: Path) -> bool:
     """Return whether a path is a recording for `open_dataset`, other than a ROS bag.
 
-    These are folders in the layout of TUM, EuRoC or KITTI, raw folders of NYU Depth V2, and any ``.mat``
-    file.
+    These are folders in the layout of TUM, EuRoC or KITTI, raw folders of NYU Depth V2, and files whose name
+    ends in ``.mat``.
     """
     is_raw = any(path.glob("d-*.pgm"))
     return path.suffix == ".mat" or is_listed(path) or is_raw or is_euroc(path) or is_kitti(path)
@@ -269,7 +270,7 @@ def is_recording(path: Path) -> bool:
 
 def _open_stereo_video(
     word: str, rig: Rig, rate_hz: float | None, camera: CameraChoice | None, stated_by: str
-) -> FrameStream:
+) -> FrameSource:
     """Return the stereo frames of two devices or videos, or of one that shows both images side by side."""
     if word.count(",") == 1:
         names = (word.split(",")[0], word.split(",")[1])
@@ -290,7 +291,7 @@ def _open_pair(
     camera: CameraChoice | None,
     close: Callable[[], None] | None = None,
     span_s: tuple[float, float] | None = None,
-) -> FrameStream:
+) -> FrameSource:
     """Check the facts of a stereo pair, and return its frames, or for ``left`` those of the left camera.
 
     Frames of the left camera alone are undistorted, not rectified.
@@ -308,19 +309,20 @@ def _open_pair(
             close,
             span_s,
         )
-    right = rig.left if rig.right is None else rig.right
-    right_facts = _facts_of_lens(facts.name, right.lens, f"the right camera of {facts.name}").cameras
+    if rig.right is None:
+        raise UsageError(f"the rig of {facts.name} has one camera", hint="calibrate both: --stereo")
+    right_facts = _facts_of_lens(facts.name, rig.right.lens, f"the right camera of {facts.name}").cameras
     log = _check(replace(facts, cameras=(*facts.cameras, *right_facts)), close)
-    info = SourceInfo(
+    rectification = Rectification(rig.left, rig.right)
+    thinning = None if rate_hz is None else Thinning(rate_hz)
+    in_time = select_in_time(pairs(log), facts.name, log, thinning)
+    return FrameSource(
         name=facts.name,
-        camera=rig.left.lens.camera,
+        camera=rectification.camera,
+        frames=checked_pairs(rectified(in_time, rectification), facts.name),
         has_stereo=True,
         notes=facts.assumed,
         log=log,
         span_s=span_s or facts.span_s,
+        release=close,
     )
-    return StereoSource(info, pairs(log), rig, rate_hz=rate_hz, close=close)
-
-
-def _without_depth(raw: Iterator[RawFrame], has_depth: bool) -> Iterator[RawFrame]:
-    return raw if has_depth else ((stamp_s, rgb, None) for stamp_s, rgb, _ in raw)

@@ -1,6 +1,6 @@
-"""The interface of all sources of frames, and what they have in common: order, undistortion, rectification.
+"""Sources of frames, and what they have in common: order of time, frame rate, undistortion, rectification.
 
-Devices and file formats are in the other modules of this package, and in `client_sdk.datasets`.
+Devices and file formats are read by the other modules of this package, and by `client_sdk.datasets`.
 """
 
 from __future__ import annotations
@@ -9,9 +9,9 @@ import asyncio
 import itertools
 import math
 from collections import deque
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
-from typing import Any, Protocol, TypeVar, runtime_checkable
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -22,7 +22,6 @@ from client_sdk.frontend import Frame, load_opencv
 from client_sdk.image_map import map_to_pinhole
 from client_sdk.rigs.intrinsics import Intrinsics
 from client_sdk.rigs.rectification import Rectification
-from client_sdk.rigs.rig import Rig
 from client_sdk.rigs.stereo_pair_checks import (
     PairMeasurement,
     check_stereo_pairs,
@@ -35,20 +34,20 @@ from rse_pf.geometry import Camera
 
 __all__ = [
     "FrameSource",
-    "FrameStream",
     "RawFrame",
     "RawPair",
-    "RawSource",
-    "SourceInfo",
-    "StereoSource",
+    "checked_pairs",
     "make_empty_depth",
+    "rectified",
+    "select_in_time",
+    "undistorted",
 ]
 
 _CHECKED_AT_START = 8  # stereo frames whose images are compared before the first one is delivered
 _CHECK_INTERVAL = 5  # stereo frames from one comparison of both images to the next, after the start
 _CHECKS_TO_REFUSE = 2
-"""Successive comparisons whose matches are taken together to find a fault: one comparison alone may be of a
-blurred image."""
+"""Successive comparisons of a left with a right image whose feature matches are taken together to find a
+fault: one comparison alone may be of a blurred image."""
 _Item = TypeVar("_Item", bound=tuple[Any, ...])
 
 RawFrame = tuple[float, npt.NDArray[np.uint8], "npt.NDArray[np.float32] | None"]
@@ -58,265 +57,153 @@ RawPair = tuple[float, npt.NDArray[np.uint8], npt.NDArray[np.uint8]]
 """A stereo frame before rectification: time stamp (s), left and right RGB image ``(h, w, 3)``."""
 
 
-@runtime_checkable
-class FrameSource(Protocol):
+@dataclass(slots=True, kw_only=True, eq=False)
+class FrameSource(AutoClose):
     """An iterator of undistorted frames in the order of time; a device delivers frames until it is closed.
 
-    Attributes:
-        name: Path or device, for messages.
-        camera: The pinhole camera of all frames.
-        has_depth: Whether frames have depth.
-        has_stereo: Whether frames have the right image of a stereo pair.
-    """
-
-    name: str
-    camera: Camera
-    has_depth: bool
-    has_stereo: bool
-
-    def __iter__(self) -> Iterator[Frame]:
-        """Return the source itself."""
-
-    def __next__(self) -> Frame:
-        """Return the next frame; raises UsageError if it cannot be used, and StopIteration at the end."""
-
-    def close(self) -> None:
-        """Release the device or file; may be called again.  The iterator is then at its end."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SourceInfo:
-    """The description of a source that `FrameStream` publishes, see `FrameSource`.
+    ``async for`` reads each frame in a thread, so that the event loop can serve the robot's connection.
 
     Attributes:
         name: Path or device, for messages.
         camera: The pinhole camera of all frames.
+        frames: The frames.
         has_depth: Whether frames have depth.
         has_stereo: Whether frames have the right image of a stereo pair.
         notes: Sentences for the user on what was assumed.
         log: The doubts about the source, to which reading may add some.
         span_s: First and last time stamp, s; None if they are known only while frames come.
+        release: Releases the device or file; None if there is none.
     """
 
     name: str
     camera: Camera
+    frames: Iterator[Frame]
     has_depth: bool = False
     has_stereo: bool = False
     notes: tuple[str, ...] = ()
     log: DoubtLog = field(default_factory=DoubtLog)
     span_s: tuple[float, float] | None = None
+    release: Callable[[], None] | None = None
 
-
-class FrameStream(AutoClose):
-    """A `FrameSource` that makes a frame of each item of an iterator, in the order of time.
-
-    An item is a tuple whose first element is the time stamp (s).  Items that exceed the wanted rate, and
-    items that are not later than the frame delivered last, are dropped before a frame is made.  The first
-    item that is not later adds a doubt to *log*.
-    """
-
-    def __init__(
-        self,
-        info: SourceInfo,
-        items: Iterator[_Item],
-        make_frame: Callable[[_Item], Frame],
-        *,
-        rate_hz: float | None = None,
-        close: Callable[[], None] | None = None,
-    ) -> None:
-        """Store the source; nothing is read before the first frame is asked for.
-
-        Args:
-            info: Description of the source.
-            items: Items in the order of time.
-            make_frame: Makes a frame of an item.
-            rate_hz: Frames a second that are delivered on average, see `Thinning`; None for all.
-            close: Releases the device or file; None if there is none.
-
-        Raises:
-            UsageError: The rate is not above 0.
-        """
-        self._thinning = None if rate_hz is None else Thinning(rate_hz)
-        self.name = info.name
-        self.camera = info.camera
-        self.has_depth = info.has_depth
-        self.has_stereo = info.has_stereo
-        self.notes = info.notes
-        self.log = info.log
-        self.span_s = info.span_s
-        self._items: Iterator[Any] = items
-        self._make_frame: Callable[[Any], Frame] = make_frame
-        self._last_s = -math.inf
-        self._close = close
-
-    def __iter__(self) -> FrameStream:
+    def __iter__(self) -> FrameSource:
+        """Return the source itself."""
         return self
 
-    def __aiter__(self) -> FrameStream:
+    def __aiter__(self) -> FrameSource:
+        """Return the source itself."""
         return self
 
     async def __anext__(self) -> Frame:
-        """Return the next frame, read in a thread, so that the event loop can serve the connection."""
+        """Return the next frame, read in a thread; raises as `__next__` does."""
         frame = await asyncio.to_thread(next, self, None)
         if frame is None:
             raise StopAsyncIteration
         return frame
 
     def __next__(self) -> Frame:
-        while True:
-            item = next(self._items)
-            timestamp_s = item[0]
-            if timestamp_s <= self._last_s:
-                self._report_disorder(timestamp_s)
-            elif self._thinning is None or self._thinning.selects(timestamp_s):
-                self._last_s = timestamp_s
-                return self._make_frame(item)
-
-    def _report_disorder(self, timestamp_s: float) -> None:
-        """Add a doubt about an image that is not later than the frame delivered last.
-
-        If the log has a doubt about the order of time already, nothing is added.
-        """
-        if any(doubt.name is DoubtName.TIME_ORDER for doubt in self.log.doubts):
-            return
-        sentence = (
-            f"{self.name} gives an image of {timestamp_s:.6f} s after one of {self._last_s:.6f} s; images "
-            "that are not later than the image before are left out"
-        )
-        hint = "let the driver stamp images with a clock that is never set back"
-        self.log.add(Doubt(name=DoubtName.TIME_ORDER, sentence=sentence, hint=hint))
+        """Return the next frame; raises UsageError if it cannot be used, and StopIteration at the end."""
+        return next(self.frames)
 
     def close(self) -> None:
-        """Release the device or file; the iterator is then at its end."""
-        self._items = iter(())
-        if self._close is not None:
-            self._close()
-            self._close = None
+        """Release the device or file; may be called again.  The iterator is then at its end."""
+        self.frames = iter(())
+        if self.release is not None:
+            self.release()
+            self.release = None
 
 
-class RawSource(FrameStream):
-    """A `FrameSource` over the images of one camera: checks their size, and undistorts them."""
+def select_in_time(
+    items: Iterable[_Item], name: str, log: DoubtLog, thinning: Thinning | None = None
+) -> Iterator[_Item]:
+    """Yield the items that are later than the item yielded before, and that *thinning* selects.
 
-    def __init__(
-        self,
-        info: SourceInfo,
-        raw: Iterator[RawFrame],
-        intrinsics: Intrinsics,
-        *,
-        rate_hz: float | None = None,
-        close: Callable[[], None] | None = None,
-    ) -> None:
-        """Take images from *raw* and undistort them by *intrinsics*; other arguments as of `FrameStream`.
+    The first element of an item is its time stamp, s.  The first item that is not later adds a doubt to
+    *log*, unless the log has a doubt about the order of time already.  *name* is the source, for the doubt.
+    Without *thinning*, all items that are later are yielded.
+    """
+    last_s = -math.inf
+    for item in items:
+        timestamp_s = item[0]
+        if timestamp_s > last_s:
+            if thinning is None or thinning.selects(timestamp_s):
+                last_s = timestamp_s
+                yield item
+        elif all(doubt.name is not DoubtName.TIME_ORDER for doubt in log.doubts):
+            sentence = (
+                f"{name} gives an image of {timestamp_s:.6f} s after one of {last_s:.6f} s; images "
+                "that are not later than the image before are left out"
+            )
+            hint = "let the driver stamp images with a clock that is never set back"
+            log.add(Doubt(name=DoubtName.TIME_ORDER, sentence=sentence, hint=hint))
 
-        The camera of *info* must be that of *intrinsics*.
 
-        Raises:
-            UsageError: The rate is not above 0.
-        """
-        super().__init__(info, raw, self._undistort, rate_hz=rate_hz, close=close)
-        self._undistortion = map_to_pinhole(intrinsics)
-        self._empty_depth = make_empty_depth(self.camera)
+def undistorted(raw: Iterable[RawFrame], lens: Intrinsics, name: str) -> Iterator[Frame]:
+    """Yield the frames of one camera without the distortion of *lens*; *name* is the source, for errors.
 
-    def _undistort(self, raw: RawFrame) -> Frame:
-        timestamp_s, rgb, depth_m = raw
+    Raises:
+        UsageError: An image has not the size that *lens* states.
+    """
+    camera, undistortion = lens.camera, map_to_pinhole(lens)
+    empty_depth = make_empty_depth(camera)
+    for timestamp_s, rgb, depth_m in raw:
         for image in (rgb, rgb if depth_m is None else depth_m):
             height, width = image.shape[:2]
-            if (width, height) != (self.camera.width, self.camera.height):
+            if (width, height) != (camera.width, camera.height):
                 raise UsageError(
-                    f"{self.name} gives images of {width}x{height} px, its intrinsics are for "
-                    f"{self.camera.width}x{self.camera.height} px",
+                    f"{name} gives images of {width}x{height} px, its intrinsics are for "
+                    f"{camera.width}x{camera.height} px",
                     hint="calibrate at the size that you use: rse-pf camera calibrate",
                 )
-        return Frame(
+        yield Frame(
             timestamp_s=timestamp_s,
-            rgb=self._undistortion.colour(rgb),
-            depth_m=self._empty_depth if depth_m is None else self._undistortion.depth(depth_m),
-            camera=self.camera,
+            rgb=undistortion.colour(rgb),
+            depth_m=empty_depth if depth_m is None else undistortion.depth(depth_m),
+            camera=camera,
         )
 
 
-class StereoSource(FrameStream):
-    """A `FrameSource` over the images of a stereo pair: rectifies them, and checks that both fit."""
+def rectified(raw: Iterable[RawPair], rectification: Rectification) -> Iterator[Frame]:
+    """Yield the frames of a stereo pair, rectified; raises UsageError if an image has another size."""
+    empty_depth = make_empty_depth(rectification.camera)
+    cv2 = load_opencv()
+    for timestamp_s, left, right in raw:
+        yield Frame(
+            timestamp_s=timestamp_s,
+            rgb=rectification.left(left),
+            depth_m=empty_depth,
+            camera=rectification.camera,
+            stereo=rectification.right(cv2.cvtColor(right, cv2.COLOR_RGB2GRAY)),
+            T_body_camera=rectification.T_body_camera,
+        )
 
-    def __init__(
-        self,
-        info: SourceInfo,
-        raw: Iterator[RawPair],
-        rig: Rig,
-        *,
-        rate_hz: float | None = None,
-        close: Callable[[], None] | None = None,
-    ) -> None:
-        """Take pairs from *raw* and rectify them by *rig*; other arguments as of `FrameStream`.
 
-        The camera of the source is the rectified one, whatever *info* says.
+def checked_pairs(frames: Iterator[Frame], name: str) -> Iterator[Frame]:
+    """Yield rectified stereo frames, and refuse a rig that their images show to be faulty.
 
-        Raises:
-            UsageError: The rate is not above 0, or the rig has no stereo pair.
-        """
-        if rig.right is None:
-            raise UsageError(f"the rig of {info.name} has one camera", hint="calibrate both: --stereo")
-        self._rectification = Rectification(rig.left, rig.right)
-        info = replace(info, camera=self._rectification.camera)
-        super().__init__(info, raw, self._rectify, rate_hz=rate_hz, close=close)
-        self._empty_depth = make_empty_depth(self.camera)
-        self._checked_frames: deque[Frame] | None = None  # not yet delivered; None before the first check
-        self._delivered = 0
-        self._previous: Frame | None = None
-        self._measurements: deque[PairMeasurement] = deque(maxlen=_CHECKS_TO_REFUSE)
+    The left and right images of the first eight frames are compared before the first frame is yielded, and
+    those of every fifth frame later: if a camera loses an image, all its later images belong to another
+    moment than those of the other camera.
 
-    def __next__(self) -> Frame:
-        """Return the next frame; both images of the first frames and of every fifth later one are compared.
-
-        The first call reads eight frames, which are delivered after their comparison, one in each call.
-
-        Raises:
-            UsageError: The cameras are swapped, not synchronised, or rectified wrongly.
-        """
-        if self._checked_frames is None:
-            self._checked_frames = deque()
-            for _ in range(_CHECKED_AT_START):
-                try:
-                    self._checked_frames.append(super().__next__())
-                except StopIteration:
-                    break
-            check_stereo_pairs(itertools.pairwise(self._checked_frames), self.name)
-        frame = self._checked_frames.popleft() if self._checked_frames else super().__next__()
-        self._check_later_pair(frame)
-        return frame
-
-    def _check_later_pair(self, frame: Frame) -> None:
-        """Refuse pairs that fitted at the start and no longer do.
-
-        Each call counts a frame; every fifth frame is compared.  If a camera loses an image, all its later
-        images belong to another moment than those of the other one.
-
-        Raises:
-            UsageError: The matches of the last two comparisons together show a fault.
-        """
-        if self._delivered % _CHECK_INTERVAL == 1 and self._previous is not None:
-            self._measurements.append(measure_pair(self._previous, frame))
-            fault = find_fault(self._measurements)
-            if fault is not None and len(self._measurements) == _CHECKS_TO_REFUSE:
+    Raises:
+        UsageError: The cameras are swapped, not synchronised, or rectified wrongly, or the last two
+            comparisons together show such a fault; *name* is the source in its message.
+    """
+    first_frames = list(itertools.islice(frames, _CHECKED_AT_START))
+    check_stereo_pairs(itertools.pairwise(first_frames), name)
+    measurements: deque[PairMeasurement] = deque(maxlen=_CHECKS_TO_REFUSE)
+    previous: Frame | None = None
+    for number, frame in enumerate(itertools.chain(first_frames, frames)):
+        if number % _CHECK_INTERVAL == 1 and previous is not None:
+            measurements.append(measure_pair(previous, frame))
+            fault = find_fault(measurements)
+            if fault is not None and len(measurements) == _CHECKS_TO_REFUSE:
                 raise UsageError(
-                    f"{self.name}: the pairs of images fit at the start, and no longer before "
+                    f"{name}: the pairs of images fit at the start, and no longer shortly before "
                     f"{frame.timestamp_s:.3f} s, as if a camera had lost an image: {fault.message}",
                     hint="record the time of each image (MP4, MKV or a bag), or take one: --camera left",
                 )
-        self._delivered += 1
-        self._previous = frame
-
-    def _rectify(self, raw: RawPair) -> Frame:
-        timestamp_s, left, right = raw
-        cv2 = load_opencv()
-        return Frame(
-            timestamp_s=timestamp_s,
-            rgb=self._rectification.left(left),
-            depth_m=self._empty_depth,
-            camera=self.camera,
-            stereo=self._rectification.right(cv2.cvtColor(right, cv2.COLOR_RGB2GRAY)),
-            T_body_camera=self._rectification.T_body_camera,
-        )
+        previous = frame
+        yield frame
 
 
 def make_empty_depth(camera: Camera) -> npt.NDArray[np.float32]:

@@ -32,7 +32,7 @@ from rse_pf.terminal import show, show_progress
 
 if TYPE_CHECKING:
     from client_sdk import MarkerScale, OdometryScale, Robot, TrackedFrame
-    from client_sdk.cameras.source import FrameStream
+    from client_sdk.cameras.source import FrameSource
     from client_sdk.check.motion import MotionReference
     from client_sdk.datasets import Dataset
     from client_sdk.frontend import Frame
@@ -58,7 +58,7 @@ def add_from_camera_arguments(parser: argparse.ArgumentParser) -> None:
     add(
         "source",
         metavar="SOURCE",
-        help="a device (0), two (0,2), a video, a folder, a recording, realsense or realsense-stereo",
+        help="a device (0), two (0,2), a video, a folder, a recording or realsense",
     )
     add_sensor_arguments(parser)
     add_drive_arguments(parser, Path("out-camera"))
@@ -162,7 +162,7 @@ def errors_of(
 def map_source(
     args: argparse.Namespace,
     settings: PlatformSettings,
-    source: FrameStream,
+    source: FrameSource,
     scale: OdometryScale | MarkerScale | None,
     about: Callable[[Trajectory], dict[str, Any]] | None = None,
     reference: MotionReference | None = None,
@@ -333,7 +333,7 @@ def _make_folder(folder: Path) -> None:
 async def _drive(
     args: argparse.Namespace,
     settings: PlatformSettings,
-    source: FrameStream,
+    source: FrameSource,
     scale: Any,
     frames: FrameTable,
     watch: Callable[[Frame, TrackedFrame], None],
@@ -432,7 +432,7 @@ class _Status:
 
 
 def _advice(
-    mapper: Mapper, source: FrameStream, check: DriveCheck, findings: Sequence[Mapping[str, Any]]
+    mapper: Mapper, source: FrameSource, check: DriveCheck, findings: Sequence[Mapping[str, Any]]
 ) -> str:
     """Return what to do about frames without a pose: by what the images show, a finding, or the sensors."""
     cause = check.cause_of_loss()

@@ -10,11 +10,16 @@ import numpy as np
 import pytest
 
 from client_sdk.cameras import Intrinsics
-from client_sdk.cameras.source import RawFrame, RawSource, SourceInfo
+from client_sdk.cameras.source import FrameSource, RawFrame, undistorted
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Camera
 
 INTRINSICS = Intrinsics(camera=Camera(fx=6.0, fy=6.0, cx=3.5, cy=2.5, width=8, height=6))
+
+
+def source_of(raw: Iterator[RawFrame]) -> FrameSource:
+    """Return a source of the frames of one camera."""
+    return FrameSource(name="camera", camera=INTRINSICS.camera, frames=undistorted(raw, INTRINSICS, "camera"))
 
 
 async def test_all_frames_come_while_the_loop_goes_on() -> None:
@@ -26,7 +31,7 @@ async def test_all_frames_come_while_the_loop_goes_on() -> None:
             go_on.clear()
             yield float(row), np.zeros((6, 8, 3), np.uint8), None
 
-    source = RawSource(SourceInfo(name="slow", camera=INTRINSICS.camera), slow_camera(), INTRINSICS)
+    source = source_of(slow_camera())
     stamps = []
     asyncio.get_running_loop().call_soon(go_on.set)
     async for frame in source:
@@ -39,8 +44,7 @@ def test_a_frame_that_cannot_be_used_is_refused_there_as_well() -> None:
     wrong = iter([(0.0, np.zeros((7, 8, 3), np.uint8), None)])
 
     async def read() -> None:
-        about = SourceInfo(name="wrong", camera=INTRINSICS.camera)
-        async for _ in RawSource(about, wrong, INTRINSICS):
+        async for _ in source_of(wrong):
             raise AssertionError
 
     with pytest.raises(UsageError, match="images of 8x7 px"):

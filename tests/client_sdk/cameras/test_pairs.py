@@ -112,7 +112,7 @@ def test_images_of_another_size_are_one_line(tmp_path: Path) -> None:
         ("realsense", {"imu": True}, "realsense has no IMU"),
         ("realsense", {"camera": "stereo"}, "realsense is one camera with depth"),
         ("realsense", {"intrinsics": RIG}, "realsense is one camera with depth"),
-        ("realsense-stereo", {"intrinsics": RIG.left.lens}, "realsense-stereo is a stereo pair"),
+        ("drive.bag", {}, "is a bag"),
     ],
 )
 def test_what_a_source_cannot_give_or_use_is_refused(
@@ -120,6 +120,7 @@ def test_what_a_source_cannot_give_or_use_is_refused(
 ) -> None:
     (tmp_path / "pair").mkdir()
     images(tmp_path / "pair")
+    (tmp_path / "drive.bag").touch()
     place = source if source.startswith("realsense") else tmp_path / source.replace("colours", "pair/left")
 
     with pytest.raises(UsageError, match=says) as refused:

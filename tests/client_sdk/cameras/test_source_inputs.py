@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from client_sdk.cameras import open_camera, read_intrinsics
-from client_sdk.cameras.source import FrameStream
+from client_sdk.cameras.source import FrameSource
 from rse_pf.errors import UsageError
 
 cv2 = pytest.importorskip("cv2", reason="pip install 'rse-pf[vision]'")
@@ -52,7 +52,7 @@ def tum(path: Path, stamps: Sequence[str], truth: Sequence[float] = ()) -> Path:
     return path
 
 
-def rows_of(source: FrameStream) -> list[tuple[float, int, int]]:
+def rows_of(source: FrameSource) -> list[tuple[float, int, int]]:
     """Return the time, the row of the colour and the row of the depth (-1 without) of each frame."""
     with source:
         return [
@@ -312,7 +312,7 @@ def test_poses_of_kitti_belong_to_the_numbers_of_images(tmp_path: Path) -> None:
     assert any("joined in their order" in note for note in cut.notes)
 
 
-def _pair_videos(path: Path, lefts: int, rights: int, **options: Any) -> FrameStream:
+def _pair_videos(path: Path, lefts: int, rights: int, **options: Any) -> FrameSource:
     for name, frames in (("left", lefts), ("right", rights)):
         writer = cv2.VideoWriter(str(path / f"{name}.avi"), cv2.VideoWriter_fourcc(*"MJPG"), 10.0, (64, 48))
         for row in range(frames):
@@ -346,7 +346,7 @@ def test_one_of_two_videos_of_different_lengths_can_be_taken(tmp_path: Path) -> 
     assert rows_of(source)[:5] == [(row / 10, row, -1) for row in range(5)]
 
 
-def _pair_folders(path: Path, lost: Sequence[int], names: str = "{}") -> FrameStream:
+def _pair_folders(path: Path, lost: Sequence[int], names: str = "{}") -> FrameSource:
     """Return pairs of a camera that moves down; the numbers of right images skip none that was lost."""
     texture = np.kron(np.random.default_rng(5).integers(0, 256, (90, 60)), np.ones((6, 6))).astype(np.uint8)
     rights = [row for row in range(40) if row not in lost]
@@ -371,7 +371,7 @@ def test_a_pair_whose_camera_loses_an_image_ends_there(
     frames = []
     with (
         _pair_folders(tmp_path, lost) as source,
-        pytest.raises(UsageError, match="fit at the start, and no longer before") as refused,
+        pytest.raises(UsageError, match="fit at the start, and no longer shortly before") as refused,
     ):
         frames.extend(source)
     assert lost[0] < len(frames) <= most

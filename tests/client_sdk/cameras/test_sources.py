@@ -16,7 +16,6 @@ import pytest
 
 from client_sdk.cameras import FrameSource, Intrinsics, open_camera, read_intrinsics, write_intrinsics
 from client_sdk.cameras.opencv_video import open_video
-from client_sdk.cameras.realsense import open_realsense_stereo
 from rse_pf.errors import MissingExtra, RsePfError, UsageError
 from rse_pf.geometry import Camera
 
@@ -101,64 +100,17 @@ def fake_realsense() -> SimpleNamespace:
         )
 
     device = SimpleNamespace(
-        as_playback=lambda: SimpleNamespace(set_real_time=lambda is_real: None),
         first_depth_sensor=lambda: SimpleNamespace(get_depth_scale=lambda: 0.001),
     )
     stream = SimpleNamespace(as_video_stream_profile=lambda: SimpleNamespace(get_intrinsics=lambda: lens))
     profile = SimpleNamespace(get_device=lambda: device, get_stream=lambda which: stream)
     pipeline = SimpleNamespace(start=lambda config: profile, wait_for_frames=frames, stop=lambda: None)
-    config = SimpleNamespace(enable_device_from_file=lambda *a: None, enable_stream=lambda *a: None)
+    config = SimpleNamespace(enable_stream=lambda *a: None)
     return SimpleNamespace(
         config=lambda: config, pipeline=lambda: pipeline, stream=SimpleNamespace(color=1, depth=2),
         format=SimpleNamespace(rgb8=1, z16=2), distortion=SimpleNamespace(brown_conrady="brown"),
         align=lambda to: SimpleNamespace(process=lambda each: each),
     )  # fmt: skip
-
-
-def fake_infrared(taken: list[Any]) -> SimpleNamespace:
-    """A stand-in of pyrealsense2 whose camera has two infrared images; what is set on it is *taken*."""
-    rs = fake_realsense()
-    lens = SimpleNamespace(
-        fx=60.0, fy=60.0, ppx=31.5, ppy=23.5, width=64, height=48, model="none", coeffs=[0.0] * 5
-    )
-    turned = SimpleNamespace(rotation=[1.0, 0, 0, 0, 1.0, 0, 0, 0, 1.0], translation=[-0.05, 0.0, 0.0])
-    stream = SimpleNamespace(get_intrinsics=lambda: lens, get_extrinsics_to=lambda other: turned)
-    sensor = SimpleNamespace(set_option=lambda option, value: taken.append((option, value)))
-    profile = SimpleNamespace(
-        get_device=lambda: SimpleNamespace(first_depth_sensor=lambda: sensor),
-        get_stream=lambda which, side: SimpleNamespace(as_video_stream_profile=lambda: stream),
-    )
-
-    def frames(timeout_ms: int, rows: Any = iter(range(FRAMES))) -> Any:  # noqa: B008
-        row = next(rows, None)
-        if row is None:
-            raise RuntimeError("Frame didn't arrive")
-        return SimpleNamespace(
-            get_infrared_frame=lambda side: SimpleNamespace(
-                get_data=lambda: np.full((48, 64), 100 * side, np.uint8), get_timestamp=lambda: 1e3 * row
-            )
-        )
-
-    pipeline = SimpleNamespace(start=lambda config: profile, wait_for_frames=frames, stop=lambda: None)
-    return SimpleNamespace(
-        config=rs.config, pipeline=lambda: pipeline, distortion=rs.distortion,
-        stream=SimpleNamespace(infrared=3), format=SimpleNamespace(y8=3),
-        option=SimpleNamespace(emitter_enabled="emitter"),
-    )  # fmt: skip
-
-
-def test_the_infrared_pair_of_a_realsense_is_a_stereo_camera(monkeypatch: pytest.MonkeyPatch) -> None:
-    taken: list[Any] = []
-    monkeypatch.setitem(sys.modules, "pyrealsense2", fake_infrared(taken))
-
-    pairs, rig, close = open_realsense_stereo()
-    stamp_s, left, right = next(pairs)
-    close()
-
-    assert taken == [("emitter", 0)]
-    assert (stamp_s, int(left[0, 0, 0]), int(right[0, 0, 0])) == (0.0, 100, 200)
-    assert rig.right is not None
-    assert rig.right.T_body_camera[:3, 3].tolist() == [0.05, 0.0, 0.0]
 
 
 def opened(kind: str, folder: Path, patch: pytest.MonkeyPatch) -> tuple[FrameSource, bool]:
@@ -174,11 +126,10 @@ def opened(kind: str, folder: Path, patch: pytest.MonkeyPatch) -> tuple[FrameSou
         patch.setattr(cv2, "VideoCapture", FakeDevice)
         return open_camera(0, intrinsics=INTRINSICS), False
     patch.setitem(sys.modules, "pyrealsense2", fake_realsense())
-    (folder / "r.bag").touch()
-    return open_camera(folder / "r.bag" if kind == "bag" else "realsense"), True
+    return open_camera("realsense"), True
 
 
-KINDS = ("video", "images", "images with depth", "recording", "device", "bag", "realsense")
+KINDS = ("video", "images", "images with depth", "recording", "device", "realsense")
 
 
 @pytest.mark.parametrize("kind", KINDS)
