@@ -1,9 +1,13 @@
-"""Keep what a robot knows of a live map: alignments of its own segments, other robots, state of the map.
+"""Hold what a robot knows of a live map: alignments of its own segments, other robots, state of the map.
 
-A segment is one odometry frame of the robot: a robot that has lost tracking begins another one.  The
+A segment is one odometry frame of the robot: a robot that has lost tracking begins another segment.  The
 alignment of a segment is the pose of its odometry frame in the map, with a scale for a camera without depth.
-`Alignments` takes the map's updates and returns corrections, without clock and network; `CorrectionStream`
-hands corrections to their readers.
+`Alignments` applies the map's updates and returns corrections; it uses no clock and no network.
+`CorrectionStream` passes corrections to their readers.
+
+The covariance of an alignment is that of its error as a twist on the left: the true alignment is
+``exp(twist) @ T_map_odom``, where the twist is three numbers of the translation in metres, then three of the
+rotation in radians.
 """
 
 from __future__ import annotations
@@ -24,14 +28,16 @@ from rse_pf.wire.live_map import AlignmentUpdate, MapUpdate, PoseUpdate, Relocal
 
 __all__ = ["AlignedBy", "Alignments", "Correction", "CorrectionStream", "OtherRobot", "SegmentAlignment"]
 
-_NO_ANSWER = "the map has not answered yet"  # reason of a segment that no update of the map has named
+_NO_ANSWER = "the map has not answered yet"  # reason of a segment before an update of the map names it
 _UPPER_TRIANGLE = np.triu_indices(6)
-"""Rows and columns of the 21 numbers of a 6x6 covariance that a message contains."""
+"""Rows and columns, in this order, of the 21 numbers by which a message states a 6x6 covariance."""
 _MAX_CORRECTIONS = 1000
-"""Corrections that are kept for a reader that falls behind; its oldest ones are dropped."""
+"""Most corrections that wait for one slow reader, the oldest of which are dropped; and most corrections of
+the past that a new reader gets."""
 
 AlignedBy = Literal["map", "relocalisation", "nothing"]
-"""Source of an alignment: ``map`` for its loop closures, ``relocalisation`` for one localised keyframe."""
+"""Source of an alignment: ``map``, the map server's pose graph with its loop closures; ``relocalisation``,
+one keyframe that was localised in the map; ``nothing``, which means that the segment is not aligned."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -40,10 +46,13 @@ class SegmentAlignment:
 
     Attributes:
         T_map_odom: ``(4, 4)``, metres; None while the segment is not aligned.
-        covariance: ``(6, 6)`` of the twist (metres, radians) on the left of ``T_map_odom``; None if unknown.
-        by: Source of the alignment.  One by relocalisation holds until the map has an alignment of its own.
+        covariance: ``(6, 6)`` covariance of the twist (metres, radians) on the left of ``T_map_odom``; None
+            if unknown.
+        by: Source of the alignment.  An alignment by relocalisation holds until the pose graph of the map
+            aligns the segment, or finds it ambiguous.
         reason: Why the segment is not aligned; empty if it is.
-        metres_per_unit: Metric scale of the odometry frame, 1 for a camera with depth.
+        metres_per_unit: Metric scale of the odometry frame: lengths in it times this are metres.  1 for a
+            camera with depth.
     """
 
     T_map_odom: Array | None = None
@@ -53,9 +62,9 @@ class SegmentAlignment:
     metres_per_unit: float = 1.0
 
     def pose_in_map(self, T_odom_camera: Array) -> Array | None:
-        """Return ``T_map_camera`` ``(4, 4)`` in metres for a pose in the odometry frame and its unit.
+        """Return ``T_map_camera`` ``(4, 4)`` in metres; None while the segment is not aligned.
 
-        None while the segment is not aligned.
+        *T_odom_camera* is the ``(4, 4)`` pose in the odometry frame, with the position in its unit.
         """
         if self.T_map_odom is None:
             return None
@@ -70,13 +79,15 @@ class Correction:
     Attributes:
         segment: The robot's number of the segment, from 0.
         before: ``T_map_odom`` ``(4, 4)`` before the change; None if the segment was not aligned.
-        after: ``T_map_odom`` ``(4, 4)`` from now on; None if the segment is not aligned any more.
-        covariance: ``(6, 6)`` of the twist (metres, radians) on the left of ``after``; None if unknown.
+        after: ``T_map_odom`` ``(4, 4)`` after the change; None if the segment is not aligned any more.
+        covariance: ``(6, 6)`` covariance of the twist (metres, radians) on the left of ``after``; None if
+            unknown.
         by: Source of the new alignment.
         reason: Why the segment is not aligned any more; empty if it is.
-        version: Newest position in the log of the map that an update or reply named, this one included.
-        cause: Name of the robot and number of the keyframe that changed the map; None if unknown.
-        scale: Metres per unit of the odometry frame, 1 for a camera with depth.
+        version: The map's version: `Alignments.version` after the update or reply that made this change.
+        cause: The keyframe that changed the map, as name of its robot and its number in the map; None if
+            unknown.
+        scale: Metres per unit of the odometry frame after the change, 1 for a camera with depth.
     """
 
     segment: int
@@ -96,7 +107,8 @@ class OtherRobot:
 
     Attributes:
         T_map_camera: ``(4, 4)``, metres; None while the robot's segment is not aligned.
-        timestamp_s: Time stamp of the keyframe, by that robot's camera; None while it is not aligned.
+        timestamp_s: Time stamp of the keyframe, by the clock of that robot's camera; None while the segment
+            is not aligned.
         reason: Why the robot's segment is not aligned; empty if it is.
     """
 
@@ -110,13 +122,16 @@ class Alignments:
 
     def __init__(self) -> None:
         self.version = 0
-        """Newest position in the log of the map that an update named."""
+        """Newest position in the log of the map that an update or a reply to a relocalisation has stated."""
         self.map_keyframes = 0
         """Number of keyframes of all robots in the map."""
         self.map_state = ""
-        """State of the map as its server reports it; empty before its first update."""
+        """State of the map in its last update of the key ``map``, empty before the first: ``live``,
+        ``moving`` (to another server) or ``waiting for the store`` (the platform cannot
+        use its object store, so keyframes are not accepted)."""
         self.map_server = ""
-        """Identity of the map server; empty before the map's first update."""
+        """Id of the backend server on which the map server runs; empty before the first update of the key
+        ``map``, and while the map moves."""
         self.others: dict[str, OtherRobot] = {}
         """Other robots of the map by their names."""
         self._own_name = ""
@@ -124,10 +139,10 @@ class Alignments:
         self._segments: dict[int, SegmentAlignment] = {}
 
     def identify_robot(self, name: str, first_segment: int) -> list[Correction]:
-        """Store this robot's name in the map, and the map's number of the robot's segment 0.
+        """Store this robot's name in the map, and the number that the map gives to the robot's segment 0.
 
-        A changed number of segment 0 means that the map was started again: all alignments end, and their
-        corrections are returned.
+        If this number has changed, the map was started again without its content: the segments are not
+        aligned any more, other robots are forgotten, and the corrections are returned.
         """
         is_new_map = bool(self._own_name) and first_segment != self._first_segment
         self._own_name, self._first_segment = name, first_segment
@@ -140,9 +155,9 @@ class Alignments:
         return [correction for correction in corrections if correction is not None]
 
     def get(self, segment: int) -> SegmentAlignment:
-        """Return the alignment of a segment of this robot, by the robot's own number.
+        """Return the alignment of the segment of this robot that has the number *segment* in its own count.
 
-        A segment that the map has not named is not aligned.
+        A segment that no update has named is not aligned.
         """
         return self._segments.get(segment, _UNALIGNED)
 
@@ -150,11 +165,13 @@ class Alignments:
         """Apply an update of the map's topic; return a correction if an own segment's alignment changed.
 
         Args:
-            key: ``map``, ``pose/ROBOT`` or ``alignment/ROBOT``; updates of other keys are ignored.
-            payload: A value of the message type that belongs to the key.
+            key: ``map`` (size, version and state of the map), ``pose/ROBOT`` (pose of the newest keyframe of
+                a robot) or ``alignment/ROBOT`` (alignment of a segment of a robot); other keys are ignored.
+            payload: The decoded `MapUpdate`, `PoseUpdate` or `AlignmentUpdate`.
 
         Raises:
-            BadMessage: The payload does not fit the key; no alignment and no robot has changed.
+            BadMessage: *payload* is not of the type of *key*, or has invalid numbers; no alignment and no
+                other robot was changed.
         """
         kind = key.partition("/")[0]
         if kind == "map":
@@ -174,15 +191,16 @@ class Alignments:
     def apply_relocalisation(
         self, segment: int, T_odom_camera: Array, reply: RelocaliseReply
     ) -> Correction | None:
-        """Apply the reply to a relocalisation, unless the map has aligned the segment in the meantime.
+        """Apply the reply to a relocalisation, unless the map's pose graph has aligned the segment meanwhile.
 
-        Return a correction if the alignment changed.  A reply without a pose changes only the reason why a
-        segment is not aligned.
+        Return a correction if the alignment changed.  A reply whose verdict is not ``ok`` changes only the
+        reason of a segment that is not aligned.
 
         Args:
             segment: The robot's number of the segment of the keyframe that was localised.
-            T_odom_camera: ``(4, 4)`` pose of that keyframe in its odometry frame and unit.
-            reply: The map's reply; only its verdict ``ok`` aligns the segment.
+            T_odom_camera: ``(4, 4)`` pose of that keyframe in its odometry frame, with the position in its
+                unit.
+            reply: The map's reply.
 
         Raises:
             BadMessage: A number of the reply is not finite or has the wrong shape.
@@ -218,13 +236,14 @@ class Alignments:
         if segment < 0:
             return None  # a segment of an earlier run of this robot
         if not update.aligned:
-            # A relocalisation outlives "not enough closures yet", but not the proof of an ambiguous place.
+            # A map that has too few loop closures to align the segment does not contradict a relocalisation;
+            # a map in which the segment fits several places does.
             is_ambiguous = update.reason.startswith("ambiguous")
             if self.get(segment).by == "relocalisation" and not is_ambiguous:
                 return None
             return self._set(segment, SegmentAlignment(reason=update.reason or "not aligned"), update)
         if update.T_map_odom is None:
-            raise BadMessage("an alignment without T_map_odom", hint="update the server")
+            raise BadMessage("an alignment without T_map_odom", hint="use the same version of server and SDK")
         aligned = SegmentAlignment(
             T_map_odom=_parse_pose(update.T_map_odom),
             covariance=_parse_covariance(update.covariance),
@@ -237,7 +256,10 @@ class Alignments:
     def _set(
         self, segment: int, alignment: SegmentAlignment, update: AlignmentUpdate | None
     ) -> Correction | None:
-        """Store an alignment; return the correction if pose or scale of the segment changed."""
+        """Store an alignment; return a correction if ``T_map_odom`` or the scale of the segment changed.
+
+        *update* names the cause of the correction; None without an update.
+        """
         present = self.get(segment)
         self._segments[segment] = alignment
         before, after = present.T_map_odom, alignment.T_map_odom
@@ -259,7 +281,7 @@ class Alignments:
 
 
 class CorrectionStream:
-    """Corrections of one live map, for any number of readers that each read at their own speed."""
+    """Pass the corrections of one live map to any number of readers, each of which reads at its own speed."""
 
     def __init__(self) -> None:
         self._recent: deque[Correction] = deque(maxlen=_MAX_CORRECTIONS)
@@ -267,7 +289,7 @@ class CorrectionStream:
         self._is_closed = False
 
     def publish(self, correction: Correction) -> None:
-        """Add a correction; a reader that has 1,000 unread ones loses its oldest."""
+        """Pass a correction to all readers; a reader with 1,000 unread ones loses the oldest of them."""
         self._recent.append(correction)
         for reader in self._readers:
             if reader.qsize() >= _MAX_CORRECTIONS:
@@ -275,13 +297,13 @@ class CorrectionStream:
             reader.put_nowait(correction)
 
     def close(self) -> None:
-        """End the stream: each reader gets what it has not read, then stops."""
+        """End the stream: each reader gets the corrections that it has not read, then its iteration ends."""
         self._is_closed = True
         for reader in self._readers:
             reader.put_nowait(None)
 
     async def read(self) -> AsyncIterator[Correction]:
-        """Yield the last 1,000 corrections, then each new one, until the stream is closed."""
+        """Yield the last 1,000 corrections, then each new correction, until the stream is closed."""
         reader: asyncio.Queue[Correction | None] = asyncio.Queue()
         for correction in self._recent:
             reader.put_nowait(correction)
@@ -295,14 +317,17 @@ class CorrectionStream:
             self._readers.remove(reader)
 
 
-_UNALIGNED = SegmentAlignment()  # alignment of a segment that the map has not named yet
+_UNALIGNED = SegmentAlignment()  # state of a segment that no update of the map has named
 
 
 def _parse_pose(numbers: Any) -> Array:
     """Return 16 finite numbers, row by row, as a ``(4, 4)`` pose; raises BadMessage."""
     pose = np.array(numbers, dtype=np.float64).ravel()
     if pose.shape != (16,) or not np.isfinite(pose).all():
-        raise BadMessage(f"a pose has {pose.size} numbers, not 16 finite ones", hint="update the server")
+        raise BadMessage(
+            f"a pose has {pose.size} numbers, not 16 finite ones",
+            hint="use the same version of server and SDK",
+        )
     return pose.reshape(4, 4)
 
 
@@ -313,7 +338,7 @@ def _parse_scale(metres_per_unit: float | None) -> float:
     if not 0.0 < metres_per_unit < math.inf:
         raise BadMessage(
             f"a scale of {metres_per_unit:g} metres per unit is not above 0 and finite",
-            hint="update the server",
+            hint="use the same version of server and SDK",
         )
     return metres_per_unit
 
@@ -329,7 +354,8 @@ def _parse_covariance(numbers: Any) -> Array | None:
     upper = np.array(numbers, dtype=np.float64).ravel()
     if upper.shape != (21,) or not np.isfinite(upper).all():
         raise BadMessage(
-            f"a covariance has {upper.size} numbers, not 21 finite ones", hint="update the server"
+            f"a covariance has {upper.size} numbers, not 21 finite ones",
+            hint="use the same version of server and SDK",
         )
     covariance = np.zeros((6, 6))
     covariance[_UPPER_TRIANGLE] = upper

@@ -1,9 +1,10 @@
-"""Make the points and the image that belong to a keyframe, and store them as objects in the background.
+"""Make the points and the image of a keyframe, its attachments, and store them as objects in the background.
 
-A keyframe holds references to its attachments; the attachments themselves are objects of the robot in the
-object store.  The map makes its cloud of the points, and exports the images.  Pose queries and keyframes have
-priority: attachments are uploaded at a limited byte rate while neither waits, and the oldest are dropped when
-too many wait.  A keyframe whose points were dropped makes the cloud of the map thinner, and nothing else.
+A keyframe holds a reference (digest and size) to each attachment; the attachments themselves are objects of
+the robot in the object store.  The map server makes the cloud of the map from the points, and exports the
+images.  Pose queries and keyframes have priority: each upload waits for them, at most 1 s.  Uploads have a
+limited byte rate, and the oldest attachments are dropped when too many wait.  If the points of a keyframe are
+dropped, the cloud of the map is thinner there, and nothing else changes.
 """
 
 from __future__ import annotations
@@ -42,31 +43,36 @@ from rse_pf.token_bucket import TokenBucket
 __all__ = ["Attachments", "BackgroundUploader", "EncodedAttachments", "StoreObject", "encode_keyframe_points"]
 
 StoreObject = Callable[[bytes], Awaitable[str]]
-"""Function that stores bytes as an object of the robot and returns their digest; it may raise RsePfError."""
+"""Function that stores bytes as an object of the robot and returns their sha256; it may raise RsePfError."""
 
-_BURST_S = 2.0  # seconds of the byte rate that a robot can save up for the attachments of its next keyframe
+_BURST_S = (
+    2.0  # a byte budget holds at most this many seconds of its rate, for the next keyframe after a pause
+)
 _BYTES_PER_POINT = 4.5  # mean size of an encoded point after zlib, to turn a byte budget into a point count
-_MIN_POINTS = 400  # smallest limit of a keyframe's points, about 2 kB, also when the byte budget is spent
+_MIN_POINTS = 400  # points of a keyframe (about 2 kB) that are sent even if the byte budget is spent
 _JPEG_QUALITY = 85  # JPEG quality, 0 to 100, of the images of keyframes
 
 _MIN_POINT_DEPTH_M = 0.3  # nearer readings of a depth camera are not sent, as in the robot's own cloud
 _MAX_POINT_DEPTH_M = 3.5  # farther readings are not sent: a depth camera is off by centimetres there
 _VOXEL_M = 0.01  # edge of a voxel: a keyframe sends one point for each, so that near surfaces take few bytes
 _MAX_DEPTH_STEP = 0.05
-"""Largest difference between the depths of a pixel and of its four neighbours, as a fraction of its depth: a
-pixel with a larger one lies between two surfaces, and its depth may belong to neither."""
+"""Largest difference between the depth of a pixel and that of any of its four neighbours, as a fraction of
+its depth.  A pixel with a larger difference is not sent: it lies on the edge of a surface, and its depth may
+be a mean of two surfaces."""
 
 _REQUEST_BYTES = 1_000  # bytes of request head, token and answer that the rate limit counts for each object
 _MAX_WAITING_BYTES = 16 << 20
-"""Bytes of points, and of images, that wait in memory for their upload; above it the oldest are dropped."""
+"""Most bytes that wait in memory for one `BackgroundUploader`, that of the points or that of the images;
+beyond it, the oldest objects are dropped."""
 _MAX_QUIET_WAIT_S = 1.0
-"""Longest wait of an upload for pose queries and keyframes, in seconds; they could else block it for ever."""
-_FIRST_PAUSE_S = 0.5  # pause after the first failed upload of an object; it doubles with each failure
-_MAX_PAUSE_S = 30.0  # longest pause between two attempts to upload an object
+"""Longest time for which one upload waits for pose queries and keyframes, in seconds; then it is sent in any
+case, because a robot that always has some would never upload."""
+_FIRST_PAUSE_S = 0.5  # pause after the first failed upload, in seconds; it doubles with each failure in a row
+_MAX_PAUSE_S = 30.0  # longest pause after a failed upload, in seconds
 _OBJECT_REFUSALS = (LimitExceeded, BadRequest, UsageError)
-"""Errors with which one object is refused for good: it is dropped, and the next one is tried."""
+"""Errors that concern one object, such as its size: it is dropped, because it would be refused again."""
 _ALL_REFUSALS = (Forbidden, Unauthorized, QuotaExceeded)
-"""Errors with which every object of the robot would be refused: all waiting objects are dropped."""
+"""Errors that concern every object of the robot: all waiting objects are dropped."""
 
 _Pixels = npt.NDArray[np.int64]
 
@@ -76,8 +82,9 @@ class EncodedAttachments:
     """Attachments of one keyframe as they are stored.
 
     Attributes:
-        points: Coloured points, as `rse_pf.slam.keyframe_points.encode_points` returns them; None without.
-        image: Image of the frame as JPEG; None without.
+        points: Coloured points, as `rse_pf.slam.keyframe_points.encode_points` returns them; None if the
+            keyframe has none.
+        image: Image of the frame as JPEG; None if the keyframe has none.
     """
 
     points: bytes | None = None
@@ -97,8 +104,8 @@ class EncodedAttachments:
 class Attachments:
     """Make the attachments of one robot's keyframes, and upload them in the background.
 
-    Points and images have a rate limit each, so that images, which are larger, do not delay points.  Without
-    a function that stores objects no attachment is made.
+    Points and images have a queue and a rate limit each, so that images, which are larger, do not delay
+    points.
     """
 
     def __init__(
@@ -108,17 +115,18 @@ class Attachments:
         clock: Callable[[], float],
         wait_quiet: Callable[[], Awaitable[None]],
     ) -> None:
-        """Describe the attachments; *wait_quiet* returns once no pose query is open and no keyframe waits.
+        """Store the arguments; `run` uploads.
 
         Args:
-            store: Stores one object; None: keyframes have no attachments.
+            store: Stores one object; None means that keyframes have no attachments.
             options: Number of points, whether images are wanted, and the rate limits of both.
             clock: Monotonic time in seconds.
-            wait_quiet: Delays each upload until nothing more urgent waits.
+            wait_quiet: Returns once no pose query is open and no keyframe waits; called before each upload.
         """
         self._options, self._clock = options, clock
         self.may_store_images = False
-        """Whether the operator allows images; the map says so when the robot joins it."""
+        """Whether the operator allows images of keyframes (``live.images``); `LiveMapper` sets it when the
+        map has answered."""
         self._point_uploader = self._image_uploader = None
         if store is not None and options.points > 0:
             self._point_uploader = BackgroundUploader(
@@ -136,9 +144,11 @@ class Attachments:
         )
 
     def make(self, frame: Frame, features: Features) -> EncodedAttachments:
-        """Encode points and image of a keyframe, and take their bytes from the budgets of the rate limits.
+        """Encode the points and the image of a keyframe, and take their bytes from the two byte budgets.
 
-        While a budget is short there are fewer points, but up to 400, and no image.  May run in any thread.
+        The points are at most as many as `LiveOptions.points` and the budget of the points allow; a budget
+        that is spent still allows 400.  There is no image while the budget of the images is spent.  May run
+        in any thread.
         """
         points, image, now = None, None, self._clock()
         if self._point_uploader is not None:
@@ -155,7 +165,7 @@ class Attachments:
         return EncodedAttachments(points=points, image=image)
 
     def add(self, encoded: EncodedAttachments) -> None:
-        """Hand over the attachments of a queued keyframe for upload."""
+        """Add the attachments of a queued keyframe to those that `run` uploads."""
         if self._point_uploader is not None and encoded.points is not None:
             self._point_uploader.add(encoded.points)
         if self._image_uploader is not None and encoded.image is not None:
@@ -171,7 +181,7 @@ class Attachments:
             await uploader.wait_empty()
 
     def report(self) -> dict[str, Any]:
-        """Return what `BackgroundUploader.report` says of ``points`` and ``images``, if they are in use."""
+        """Return the reports of the uploaders in use, under the keys ``points`` and ``images``."""
         image_uploader = self._image_uploader if self.may_store_images else None
         uploaders = {"points": self._point_uploader, "images": image_uploader}
         return {name: uploader.report() for name, uploader in uploaders.items() if uploader is not None}
@@ -191,11 +201,12 @@ class BackgroundUploader:
         clock: Callable[[], float],
         wait_quiet: Callable[[], Awaitable[None]],
     ) -> None:
-        """Describe the uploader; `run` uploads.
+        """Store the arguments; `run` uploads.
 
         Args:
-            store: Stores one object; any exception of it is reported, and the upload repeated.
-            bytes_per_s: Rate limit of objects and their requests.
+            store: Stores one object.  If it raises, the upload is repeated or the object is dropped, as `run`
+                says; an exception that is no RsePfError is also written to the log.
+            bytes_per_s: Rate limit in bytes per second of the objects, each with 1,000 bytes for its request.
             clock: Monotonic time in seconds.
             wait_quiet: Returns once no pose query is open and no keyframe waits.
         """
@@ -222,10 +233,10 @@ class BackgroundUploader:
         self._has_object.set()
 
     def report(self) -> dict[str, int | str]:
-        """Return the numbers of objects that were sent, wait and were dropped, the bytes sent, and trouble.
+        """Return the numbers of objects ``sent``, ``waiting``, ``dropped``, then ``bytes`` and ``trouble``.
 
-        ``bytes`` counts 1,000 bytes for each request besides its object.  ``trouble`` is the last failure as
-        ``code: sentence``, empty after a success.
+        ``bytes`` is the number of bytes sent, with 1,000 for each request in addition to its object.
+        ``trouble`` is the last failure as ``code: sentence``, empty after a success.
         """
         return {
             "sent": self._sent,
@@ -242,12 +253,13 @@ class BackgroundUploader:
     async def run(self) -> None:
         """Upload objects, the oldest first, until cancelled.
 
-        A failed upload is repeated after a pause, while later objects wait.  A refused object is dropped; if
-        the server would refuse every object of the robot, all objects that wait are dropped.
+        A failed upload is repeated after a pause, and later objects wait for it.  An object that the server
+        refuses for its content or size is dropped.  If the server would refuse every object of the robot, all
+        waiting objects are dropped.
         """
         pause_s = _FIRST_PAUSE_S
         while True:
-            # 1. Wait for an object, for the rate limit, and for pose queries and keyframes.
+            # 1. Wait for an object, for the rate limit, and until no pose query or keyframe waits.
             while not self._waiting:
                 self._is_empty.set()
                 self._has_object.clear()
@@ -282,7 +294,7 @@ class BackgroundUploader:
                 self._trouble, pause_s = "", _FIRST_PAUSE_S
 
     def _remove_if_first(self, data: bytes) -> bool:
-        """Remove the oldest object if it is *data*; return False if `add` dropped *data* in the meantime."""
+        """Remove the oldest object if it is *data*; return False if `add` has dropped *data* meanwhile."""
         is_first = bool(self._waiting) and self._waiting[0] is data
         if is_first:
             self._waiting.popleft()
@@ -291,13 +303,14 @@ class BackgroundUploader:
 
 
 def encode_keyframe_points(frame: Frame, features: Features, max_points: int) -> bytes | None:
-    """Choose and encode at most *max_points* coloured points of a keyframe; return None if it has none.
+    """Choose and encode at most *max_points* coloured points of a keyframe; return None if there are none.
 
-    Of a depth image these are pixels on a regular grid that do not lie on depth edges, 0.3 to 3.5 m away; of
-    a stereo pair the features whose depth is known to 5 % (`select_certain_rows`).  Points are thinned to one
-    in each voxel of 1 cm, and of more than *max_points* the first ones are encoded.
+    With a depth image, the points are pixels on a regular grid, row by row from the top, that have a depth of
+    0.3 to 3.5 m and do not lie on depth edges.  With a stereo pair, they are the features whose depth is
+    known to 5 % (`select_certain_rows`).  In each voxel of 1 cm only the first point stays, and of the rest
+    the first *max_points* are encoded; the step of the grid is chosen so that this leaves out few.
     """
-    # 1. Choose pixels with a trusted depth.
+    # 1. Choose pixels with a certain depth.
     if frame.stereo is None:
         pixels = _choose_grid_pixels(frame, max_points)
         depths_m = frame.depth_m[pixels[:, 1], pixels[:, 0]].astype(np.float64)
@@ -338,7 +351,7 @@ def _choose_grid_pixels(frame: Frame, max_points: int) -> _Pixels:
 
 
 def _encode_jpeg(frame: Frame) -> bytes | None:
-    """Encode the image of a frame as JPEG; None if that fails, or is too large for one request (256 KiB)."""
+    """Encode the image of a frame as JPEG; return None if that fails, or is above `MAX_SINGLE_PUT_BYTES`."""
     cv2 = load_opencv()
     bgr = np.ascontiguousarray(frame.rgb[:, :, ::-1])
     is_encoded, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])

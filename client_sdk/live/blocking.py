@@ -1,4 +1,4 @@
-"""Use a live map in a program without asyncio: the mapper runs in the event loop of a blocking robot."""
+"""Use a live map in a program without asyncio: the mapper runs in the event loop of a `BlockingRobot`."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ __all__ = ["BlockingLiveMapper"]
 
 
 class BlockingLiveMapper:
-    """Wrap a `LiveMapper` in methods that block; its properties are read from ``mapper``."""
+    """Wrap the coroutines of a `LiveMapper` in methods that block; ``mapper`` has its properties."""
 
     def __init__(self, mapper: LiveMapper, wait: Callable[[Coroutine[Any, Any, Any]], Any]) -> None:
-        """Wrap a mapper.
+        """Store the arguments.
 
         Args:
-            mapper: The live mapper to use; its properties stay available as ``mapper``.
+            mapper: The live mapper, which becomes the attribute ``mapper``.
             wait: Runs a coroutine in the event loop of the mapper's robot, and returns its result.
         """
         self.mapper = mapper
@@ -43,7 +43,7 @@ class BlockingLiveMapper:
         return tracked
 
     def corrections(self) -> Iterator[Correction]:
-        """Yield each change of an alignment, waiting for the next; see `LiveMapper.corrections`."""
+        """Yield each change of an alignment, and block until the next; see `LiveMapper.corrections`."""
         corrections = self.mapper.corrections()
 
         async def next_correction() -> Correction | None:

@@ -38,11 +38,12 @@ def encode_depth_keyframe(
     Args:
         frame: The frame; of a stereo pair the baseline is encoded, too.
         T_odom_camera: ``(4, 4)`` pose of the camera in the odometry frame, metres.
-        features: Features of the frame.  Of those that have depth the first ones are encoded.
-        max_orb_features: Limit of the number of ORB features; descriptors of more bytes have a lower limit.
-        depth_noise: Noise of the camera's depths.
-        imu: Gravity, and motion since the previous keyframe; None where they are not known.
-        attachments: Points and image, of which the keyframe gets the references.
+        features: Features of the frame.  Features without depth are left out; of the others, the first ones
+            in this order are encoded up to the limit.
+        max_orb_features: Most ORB features; of features with longer descriptors, proportionally fewer.
+        depth_noise: Noise model of the camera's depths.
+        imu: Gravity, and the motion since the previous keyframe by the IMU; None if they are not known.
+        attachments: Points and image; the keyframe gets the digest and the size of each.
     """
     depths_m = features.points_camera[:, 2]
     rows = np.flatnonzero(np.isfinite(depths_m))[: _feature_limit(max_orb_features, features.kind)]
@@ -74,15 +75,15 @@ def encode_monocular_keyframe(
     max_orb_features: int,
     imu: KeyframeImu | None,
 ) -> bytes:
-    """Encode a keyframe of a camera without depth, up to scale.
+    """Encode a keyframe of a camera without depth, in the unit of its odometry frame.
 
     Args:
         adjusted: Keyframe of the tracker, with depths in the unit of the odometry frame.  Features with a
-            landmark, thus with a depth, are encoded before those without.
-        T_odom_camera: ``(4, 4)`` pose of the camera in the odometry frame and its unit.
+            landmark, which have a depth, come before those without, which are encoded only up to the limit.
+        T_odom_camera: ``(4, 4)`` pose of the camera in the odometry frame, with the position in its unit.
         camera: Intrinsics of the camera.
-        max_orb_features: Limit of the number of ORB features; descriptors of more bytes have a lower limit.
-        imu: Gravity, and motion since the previous keyframe; None where they are not known.
+        max_orb_features: Most ORB features; of features with longer descriptors, proportionally fewer.
+        imu: Gravity, and the motion since the previous keyframe by the IMU; None if they are not known.
     """
     limit = _feature_limit(max_orb_features, adjusted.features.kind)
     rows = np.argsort(np.isnan(adjusted.depths), kind="stable")[:limit]
@@ -102,5 +103,5 @@ def encode_monocular_keyframe(
 
 
 def _feature_limit(max_orb_features: int, kind: DescriptorKind) -> int:
-    """Return the limit of features of a kind: *max_orb_features* scaled by the size of its descriptors."""
+    """Return the limit of features of *kind*: *max_orb_features*, or less if its descriptors are longer."""
     return max_orb_features * max_features(kind) // MAX_FEATURES

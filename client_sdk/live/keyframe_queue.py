@@ -5,9 +5,9 @@ folder it survives a restart of the robot's program: ``INDEX-SEGMENT.keyframe`` 
 keyframe, ``state.json`` the `NumberOffset`, and ``.lock`` is locked while a program uses the folder, because
 two programs would remove each other's keyframes.
 
-Keyframes and segments have two numberings.  The robot counts both from 0, also while it is offline.  The map
-counts those of all runs of the robot.  A `NumberOffset`, which only the map can tell, is added to the robot's
-numbers when a keyframe is sent.
+Keyframes and segments have two numberings.  The robot counts both from 0 in its own count, also while it is
+offline.  The map counts the keyframes and segments of all runs of this robot.  When a keyframe is sent, a
+`NumberOffset` is added to the robot's numbers; only the map can state it.
 """
 
 from __future__ import annotations
@@ -61,8 +61,9 @@ class _Entry:
 class NumberOffset:
     """Numbers that the map gives to keyframe 0 and to segment 0 of the robot's own count.
 
-    The map's number of a keyframe is ``number + index``; that of a segment is this ``segment`` plus the
-    robot's.  Both may be negative, after the map was started again while the robot was driving.
+    The map's number of a keyframe is ``number`` plus the robot's index of it; the map's number of a segment
+    is ``segment`` plus the robot's number of it.  Both may be negative: if a map is started again while the
+    robot makes keyframe 500, the new map expects number 0 for it, so ``number`` is -500.
     """
 
     number: int
@@ -70,24 +71,25 @@ class NumberOffset:
 
 
 class KeyframeQueue:
-    """First-in, first-out queue of keyframes; their bytes have a limit, and none is dropped to make space."""
+    """First-in, first-out queue of keyframes with a limit of bytes; no keyframe is dropped to make space."""
 
     def __init__(self, folder: Path | None, *, max_bytes: int | None = None) -> None:
-        """Describe the queue; `open` locks the folder and reads the keyframes of an earlier run.
+        """Store the arguments; `open` locks the folder and reads the keyframes of an earlier run.
 
         Args:
             folder: Folder for the keyframes of one robot in one map; None keeps them in memory.
-            max_bytes: Limit of the encoded keyframes together, above which `add` refuses another one; None
-                means 64 MiB in memory and 1 GiB in a folder.
+            max_bytes: Most bytes of all queued keyframes together; `add` refuses a keyframe that would exceed
+                it.  None means 64 MiB in memory and 1 GiB in a folder.
         """
         self._folder = folder
         self._max_bytes = max_bytes or (_MAX_MEMORY_BYTES if folder is None else _MAX_FOLDER_BYTES)
         self._entries: deque[_Entry] = deque()
         self._queued_bytes = 0
         self.next_index = 0
-        """The robot's number of the next keyframe that is added."""
+        """Index in the robot's own count that the next added keyframe gets."""
         self.offset: NumberOffset | None = None
-        """Offset from the robot's numbers to those of the map; None until the map was asked for it."""
+        """Offset from the robot's numbers to those of the map; None until `set_offset` or `open` has set
+        it."""
         self._lock_descriptor = -1
 
     def __len__(self) -> int:
@@ -95,14 +97,14 @@ class KeyframeQueue:
 
     @property
     def first_index(self) -> int:
-        """The robot's number of the oldest queued keyframe; `next_index` if the queue is empty."""
+        """The robot's index of the oldest queued keyframe; `next_index` if the queue is empty."""
         return self._entries[0].index if self._entries else self.next_index
 
     def open(self) -> int:
         """Lock the folder and read the queue of an earlier run; return the first segment of this run.
 
-        The first segment is 0 for an empty queue, else it follows the segment of the newest queued keyframe,
-        because a program that starts again does not know where the robot is in the earlier odometry.
+        It is 0 for an empty queue, else one more than the segment of the newest queued keyframe, because a
+        program that starts again does not know where the robot is in the earlier odometry frame.
 
         Raises:
             UsageError: The folder cannot be read or written, holds a file with an invalid name, or is used
@@ -142,8 +144,10 @@ class KeyframeQueue:
     def add(self, keyframe: QueuedKeyframe) -> bool:
         """Append a keyframe whose index is `next_index`; return False if the byte limit forbids it.
 
+        If it returns False or raises, the queue has not changed, and the keyframe never gets to the map.
+
         Raises:
-            UsageError: The file of the keyframe cannot be written, such as on a full disk.
+            UsageError: The file of the keyframe cannot be written, for example because the disk is full.
         """
         size_bytes = len(keyframe.data)
         if self._queued_bytes + size_bytes > self._max_bytes:
@@ -183,7 +187,7 @@ class KeyframeQueue:
         return QueuedKeyframe(entry.index, entry.segment, data)
 
     def remove_first(self) -> None:
-        """Remove the oldest keyframe, after the map has acknowledged it or refused it for good."""
+        """Remove the oldest keyframe, after the map has acknowledged it or refused its content."""
         entry = self._entries.popleft()
         self._queued_bytes -= entry.size_bytes
         if self._folder is not None:
@@ -191,7 +195,7 @@ class KeyframeQueue:
                 _keyframe_path(self._folder, entry.index, entry.segment).unlink()
 
     def set_offset(self, offset: NumberOffset) -> None:
-        """Store the offset from the robot's numbers to those of the map, with a folder also on disk.
+        """Store the offset from the robot's numbers to those of the map, in the folder, too, if there is one.
 
         Raises:
             UsageError: The state file cannot be written.
@@ -233,20 +237,21 @@ def choose_number_offset(
     next_number: int,
     unused_segment: int,
 ) -> tuple[NumberOffset, int]:
-    """Return the offset to number queued keyframes with, and how many of the oldest the map already has.
+    """Return the offset for all queued keyframes, and how many of the oldest of them the map already has.
 
-    The current offset stays valid if the number that the map expects next belongs to a queued keyframe: the
-    keyframes before that number were stored, and only their acknowledgements were lost.  Otherwise the map is
-    new, or has keyframes of this robot that this program does not know; then the oldest queued keyframe gets
-    the expected number and a segment of its own.
+    The current offset stays in use if it gives the number *next_number* to a queued keyframe or to the
+    keyframe that is added next: the map has stored the queued keyframes before it, and only their
+    acknowledgements were lost.  Otherwise the map is new, or has keyframes of this robot that this program
+    does not know.  The new offset then gives *next_number* and *unused_segment* to the oldest queued
+    keyframe; the later keyframes and segments follow in the robot's order.
 
     Args:
         current: The offset in use; None if the map was not asked before.
-        first_index: The robot's number of the oldest queued keyframe.
-        first_segment: The robot's number of the segment of that keyframe.
-        next_index: The robot's number of the next keyframe that is added to the queue.
-        next_number: The number of this robot's next keyframe, as the map expects it.
-        unused_segment: A segment number that the map has not used for this robot.
+        first_index: Index of the oldest queued keyframe in the robot's own count; *next_index* without any.
+        first_segment: The robot's number of the segment of that keyframe; the present one without any.
+        next_index: Index that the next added keyframe gets in the robot's own count.
+        next_number: The number that the map expects of this robot's next keyframe.
+        unused_segment: The smallest segment number that no keyframe of this robot in the map has.
     """
     if current is not None and current.number + first_index <= next_number <= current.number + next_index:
         return current, next_number - current.number - first_index

@@ -1,7 +1,7 @@
 """Send the queued keyframes of a robot to a live map: in order, one at a time, until each is acknowledged.
 
-The map server acknowledges a keyframe after the log of the map holds it durably.  Pose queries have
-priority: the sender waits, at most 1 s, until no query is open, and keyframes have a byte rate limit.
+The map server acknowledges a keyframe after the log of the map holds it durably.  Keyframes have a byte rate
+limit, and pose queries have priority: each keyframe waits until no query is open, at most 1 s.
 """
 
 from __future__ import annotations
@@ -45,19 +45,24 @@ __all__ = [
     "make_request",
 ]
 
-_MAX_POSE_WAIT_S = 1.0  # a keyframe waits no longer for open pose queries, which could else block it for ever
-_FIRST_PAUSE_S = 0.1  # pause after the first failed attempt to send a keyframe; it doubles with each failure
+_MAX_POSE_WAIT_S = 1.0  # longest wait of a keyframe for open pose queries, which could else delay it for ever
+_FIRST_PAUSE_S = 0.1  # pause after the first failed attempt in seconds; it doubles with each failure in a row
 _MAX_PAUSE_S = 1.0
-"""Longest pause between attempts to send a keyframe, so that a server that returns gets it soon."""
-_REFUSED_PAUSE_S = 5.0  # pause of the keyframe sender after an error that only an operator can end
+"""The pause after a failed attempt does not double beyond this, in seconds, so that a server that returns
+gets the keyframe soon; a busy server can ask for a longer pause, and `REFUSALS` have a longer one."""
+_REFUSED_PAUSE_S = 5.0  # pause after an error of REFUSALS in seconds: only an operator can end its cause
 REFUSALS = (Forbidden, Unauthorized, UnknownService)
 """Errors with which every keyframe of the robot is refused until an operator changes a right or a setting."""
 _KEYFRAME_REFUSALS = (BadRequest, LimitExceeded, InvalidCamera)
-"""Errors with which one keyframe is refused for good, because its own content is invalid or too large."""
+"""Errors with which one keyframe is refused for its content or size; it is removed, because it would be
+refused again."""
 
 
 class LiveRobot(Protocol):
-    """The methods of a `client_sdk.robot.Robot` that a live map uses; that module imports this package."""
+    """The methods of `client_sdk.robot.Robot` that a live map uses; they are documented there.
+
+    `client_sdk.robot` imports this package, so this package cannot import the class itself.
+    """
 
     async def call(
         self,
@@ -68,7 +73,7 @@ class LiveRobot(Protocol):
         deadline_s: float | None = None,
         keep: bool = False,
     ) -> Answer:
-        """Call a service of the platform and return its answer; raises RsePfError."""
+        """Call a service of the platform and return its answer, as `Robot.call` does; raises RsePfError."""
 
     @property
     def connected(self) -> bool:
@@ -80,14 +85,14 @@ class LiveRobot(Protocol):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RobotInMap:
-    """How a live map knows this robot, and what the platform says about the map.
+    """Reply of the service ``live-show`` to this robot.
 
     Attributes:
         name: Name of the robot in the map; empty while the map does not exist.
-        next_number: Number that the map expects for the next keyframe of the robot.
-        unused_segment: First of the segment numbers that no keyframe of the robot in the map has.
+        next_number: Number that the map expects of the next keyframe of this robot.
+        unused_segment: The smallest segment number that no keyframe of this robot in the map has.
         map_keyframes: Number of keyframes of all robots in the map.
-        allows_images: Whether the operator allows robots to store the images of keyframes.
+        allows_images: Whether the operator allows robots to store the images of keyframes (``live.images``).
     """
 
     name: str
@@ -102,20 +107,20 @@ class KeyframeSent:
     """Times of a keyframe that the map has acknowledged.
 
     Attributes:
-        number: The map's number of the keyframe among those of this robot.
+        number: The map's number of the keyframe; the map numbers those of each robot from 0.
         sent_s: Time of the successful attempt to send the keyframe, by the clock of the sender.
-        kept_s: Time of the acknowledgement, by the same clock.
+        acknowledged_s: Time of the acknowledgement, by the same clock.
     """
 
     number: int
     sent_s: float
-    kept_s: float
+    acknowledged_s: float
 
 
 async def fetch_robot_in_map(robot: LiveRobot, map_name: str, deadline_s: float) -> RobotInMap:
-    """Ask the service ``live-show`` how the live map knows this robot.
+    """Ask the service ``live-show`` for this robot's name and numbers in the live map *map_name*.
 
-    For a map that does not exist the name is empty, and all numbers are 0.
+    If the map does not exist, the name is empty, and all numbers are 0.
 
     Raises:
         BadMessage: The reply lacks a field.
@@ -137,7 +142,8 @@ async def fetch_robot_in_map(robot: LiveRobot, map_name: str, deadline_s: float)
         )
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise BadMessage(
-            "the reply of live-show does not say how the map knows this robot", hint="update the server"
+            "the reply of live-show does not say how the map knows this robot",
+            hint="use the same version of server and SDK",
         ) from error
 
 
@@ -156,29 +162,31 @@ class KeyframeSender:
         on_introduced: Callable[[RobotInMap, NumberOffset], None],
         on_acknowledged: Callable[[KeyframeSent], None],
     ) -> None:
-        """Describe the sender; only `introduce` and `run` use the network.
+        """Store the arguments; only `introduce` and `run` use the network.
 
         Args:
             robot: The robot that calls the services; it may connect later.
             map_name: Name of the live map.
             queue: Keyframes to send.
-            deadline_s: Deadline of one call.
-            bytes_per_s: Rate limit of the keyframes that are sent.
+            deadline_s: Deadline of one call, in seconds.
+            bytes_per_s: Rate limit of the keyframes that are sent, in bytes per second.
             clock: Monotonic time in seconds.
             on_introduced: Called after each `introduce` with the map's reply and the offset in use.
             on_acknowledged: Called for each acknowledged keyframe with its number and times.
         """
         self.trouble = ""
-        """Why the last attempt to send a keyframe failed; empty after a success.
+        """Why the last attempt to send a keyframe failed, as ``code: sentence``; empty after a success.
 
-        It is ``code: sentence``, and for a conflict about numbers the sentence alone.
+        After a `Conflict` it is the sentence without the code: the robot corrects its numbers by itself.
         """
         self.is_refused = False
-        """Whether the platform refused the last attempt with one of `REFUSALS`."""
+        """Whether the last attempt that failed for another reason than a `Conflict` failed with one of
+        `REFUSALS`; False after a success."""
         self.refused_keyframes = 0
-        """Number of keyframes that were removed because the map refused their content."""
+        """Number of keyframes that were removed because the map refused their content or size."""
         self.current_segment = 0
-        """The robot's number of the present odometry segment; the `LiveMapper` sets it."""
+        """The robot's number of the present segment, which `introduce` needs while no keyframe is queued;
+        `LiveMapper` sets it."""
         self._robot, self._map_name, self._queue = robot, map_name, queue
         self._deadline_s, self._clock = deadline_s, clock
         self._rate_limit = TokenBucket(bytes_per_s, burst=0.0)
@@ -196,11 +204,11 @@ class KeyframeSender:
         self._has_keyframe.set()
 
     def pause_for_pose_query(self) -> None:
-        """Let keyframes wait, because a pose query is open."""
+        """Delay keyframes, because a pose query is open, until `resume_after_pose_query` is called."""
         self._has_no_pose_query.clear()
 
     def resume_after_pose_query(self) -> None:
-        """Let keyframes be sent again, because the pose query was answered."""
+        """Send keyframes again, because the pose query has ended."""
         self._has_no_pose_query.set()
 
     async def wait_empty(self) -> None:
@@ -212,9 +220,9 @@ class KeyframeSender:
         await self._has_no_pose_query.wait()
 
     async def introduce(self) -> RobotInMap:
-        """Ask how the map knows this robot, number the queued keyframes accordingly, and return the reply.
+        """Ask the map for this robot's name and numbers, set the queue's number offset, and return the reply.
 
-        Keyframes that the map already has are removed from the queue: their acknowledgements were lost.
+        Queued keyframes that the map already has are removed: their acknowledgements were lost.
 
         Raises:
             RsePfError: The call failed, or the platform refused it.
@@ -238,9 +246,10 @@ class KeyframeSender:
         return robot_in_map
 
     async def run(self) -> None:
-        """Send keyframes until cancelled; failed attempts are repeated after a pause.
+        """Send the queued keyframes until cancelled; repeat failed attempts after a pause.
 
-        A conflict means that robot and map number keyframes differently: the robot asks for its numbers.
+        A `Conflict` means that the map expects another number of this robot's next keyframe: `introduce` asks
+        for it.
         """
         failures = 0
         while True:
@@ -274,10 +283,15 @@ class KeyframeSender:
         self._is_empty.clear()
 
     async def _send_first(self) -> None:
-        """Send the oldest keyframe, and remove it from the queue once it is acknowledged or refused.
+        """Send the oldest keyframe, and remove it from the queue when it is acknowledged or refused.
 
-        A failure raises an RsePfError, also the refusal of the keyframe.  Without an offset or a keyframe
-        nothing is done.
+        Without an offset or a keyframe nothing is done.
+
+        Raises:
+            BadRequest, LimitExceeded, InvalidCamera: The map refused the keyframe, which was removed.
+            Conflict: The map expects another number; it may have acknowledged this keyframe, which was
+                removed then.
+            RsePfError: The call failed; the keyframe stays in the queue.
         """
         queue, offset = self._queue, self._queue.offset
         if offset is None or not len(queue):
@@ -304,7 +318,8 @@ class KeyframeSender:
         # 3. Remove the acknowledged keyframe from the queue, and report its times.
         queue.remove_first()
         self._on_acknowledged(KeyframeSent(number, sent_s, self._clock()))
-        # 4. Find out whether the map was started again: it then expects a smaller number than the next one.
+        # 4. If the map expects a smaller number next than this keyframe's number + 1, it was started again.
+        #    `run` catches this Conflict, shows its sentence in `trouble` and asks for the new numbers.
         if answer.reply.number < number + 1:
             raise Conflict("the map was started again", hint="nothing: the robot renumbers its keyframes")
         if not self._is_known_to_map:
@@ -312,7 +327,7 @@ class KeyframeSender:
 
 
 def make_request(map_name: str, keyframe: QueuedKeyframe, offset: NumberOffset) -> KeyframeRequest:
-    """Return the request of ``live-keyframe`` for a queued keyframe, with the numbers of the map."""
+    """Return the request of ``live-keyframe`` for a queued keyframe, with its numbers in the map's count."""
     return KeyframeRequest(
         map=map_name,
         segment=offset.segment + keyframe.segment,

@@ -3,19 +3,19 @@
 `LiveMapper` tracks as `client_sdk.mapper.Mapper` does, sends keyframes in the background, and knows the pose
 of its odometry frame in the map.  `client_sdk.live` lists the way of a keyframe step by step.
 
-**Two poses.**  ``tracked.T_world_camera`` is the pose in the robot's odometry frame, which the map never
-moves or turns; control loops use this one.  ``tracked.T_map_camera`` is the pose in the map, None until the
-segment is aligned.
+**Two poses.**  ``tracked.T_world_camera`` is the pose in the robot's odometry frame, to which the map never
+applies a correction; control loops use this one.  ``tracked.T_map_camera`` is the pose in the map, None until
+the segment is aligned.
 
 **Corrections.**  Each change of an alignment is a `Correction`.  It is in `LiveMapper.corrections` before a
-pose uses it, and the first pose that uses it has ``corrected`` set.
+pose uses it, and the first tracked frame after a correction of its segment has ``corrected`` set.
 
-**Segments.**  After tracking was lost for `LiveOptions.segment_after` frames a new segment begins: its
-odometry frame continues at the last known pose, and has an alignment of its own.
+**Segments.**  A segment is one odometry frame.  After `LiveOptions.segment_after` lost frames with enough
+features a new segment begins: its first pose is the last known one, and it has an alignment of its own.
 
-**A camera without depth** is tracked up to scale.  Its keyframes are sent in the unit of their segment, after
-they have settled.  The map finds the metric scale (`LiveMapper.metres_per_unit`), so that ``T_map_camera`` is
-in metres, while ``T_world_camera`` stays in the unit of the segment.
+**A camera without depth** is tracked up to scale.  Its keyframes are sent in the unit of their segment, each
+when two newer ones exist.  The map finds the metric scale (`LiveMapper.metres_per_unit`), so that
+``T_map_camera`` is in metres, while ``T_world_camera`` stays in the unit of the segment.
 """
 
 from __future__ import annotations
@@ -56,13 +56,14 @@ from rse_pf.wire.live_map import live_topic
 __all__ = ["LiveMapper"]
 
 _JOIN_REFUSALS = (*REFUSALS, BadRequest, UnsupportedProtocol)
-"""Errors with which a live map refuses to be joined for good: another attempt would fail in the same way."""
+"""Errors with which the platform refuses a robot that joins a map, and would refuse it again: joining raises
+them, and repeats its call after all others."""
 _RESUBSCRIBE_PAUSE_S = 1.0  # pause before the robot subscribes to the map's updates again after a failure
 _LEAVE_DEADLINE_S = 1.0  # deadline of the call that leaves the map, so that a lost connection delays no exit
 _NEVER = 1_000_000_000
-"""Number of lost frames after which the tracker begins a segment by itself, which it must never do in a live
-map: `LiveMapper` begins each segment, and numbers it for the map."""
-_MAX_SENT_RECORDS = 100_000  # newest acknowledged keyframes whose times are kept for measurements
+"""``segment_after`` of the tracker: more lost frames than any drive has, so that the tracker never begins a
+segment by itself; in a live map `LiveMapper` begins each segment, and numbers it."""
+_MAX_SENT_RECORDS = 100_000  # newest acknowledged keyframes whose times are stored: about 13 MB of memory
 
 
 class LiveMapper:
@@ -95,34 +96,37 @@ class LiveMapper:
         store: StoreObject | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Describe the robot's part in a live map; ``async with`` joins the map.
+        """Store the arguments; ``async with`` joins the map.
 
         Args:
             robot: The robot that calls the services; it need not be connected yet.
             name: Name of the map: small letters, digits and hyphens.
-            ask: Answers pose queries.
+            ask: Function that computes the pose of a frame from matches of image and cloud, such as that of
+                `client_sdk.mapper.ask_robot`.
             camera: Intrinsics; frames of another camera are refused.  None takes those of the first frame.
             depth: Whether to use depth.  None: if the first frame has some, or is a stereo pair.  With True a
                 first frame without depth is refused.
-            spool: Folder for keyframes that the map has not acknowledged, for this robot alone, with a
-                subfolder for each map; they survive a restart of this program.  None keeps them in memory.
+            spool: Folder of this robot alone for keyframes that the map has not acknowledged, in a subfolder
+                for each map; they survive a restart of this program.  None keeps them in memory.
             options: Options of the tracker, of which ``segment_after`` is not used (that of *live* is); None
                 means `FrontEndOptions.live`.
-            live: Options of keyframes and of their sending.
-            map_options: Density of the robot's own cloud, to which its keyframes are added.
-            T_world_start: ``(4, 4)`` pose of the first camera in the odometry frame.  None: the identity;
-                with an IMU a pose in an odometry frame with z up, in which a level camera looks along x.
-            features: Function that finds the features of an image; None: ORB.  All robots of a map must use
-                the same.
-            motion: Function that predicts the pose of the next frame; None: constant velocity.
-            loops: Function that describes an image for the robot's own place recognition; other robots'
-                keyframes are recognised by their features.
-            store: Stores an object of this robot in the object store; None: the map gets no points and no
-                images of this robot.
+            live: Options of keyframes and of their sending; None means `LiveOptions` with its defaults.
+            map_options: Density of the robot's own cloud, to which its keyframes are added; None means the
+                defaults.
+            T_world_start: ``(4, 4)`` pose of the camera at the first frame in the odometry frame (which the
+                tracker calls world).  None means the identity; with an IMU it means a pose in an odometry
+                frame whose z axis points up, in which a level camera looks along x.
+            features: Function that finds the features of an image; None means ORB.  All robots of a map must
+                use the same.
+            motion: Function that predicts the pose of the next frame; None means constant velocity.
+            loops: Function that describes an image for the robot's own place recognition; the map server
+                recognises places by the features of keyframes instead.  None means the built-in description.
+            store: Stores an object of this robot in the object store; None means that the map gets no points
+                and no images of this robot.
             clock: Monotonic time in seconds.
 
         Raises:
-            UsageError: An argument that must be a function is none, or *features* has no name.
+            UsageError: An argument that must be a function is not one, or *features* has no name.
         """
         self.name = name
         self.options = live or LiveOptions()
@@ -181,13 +185,15 @@ class LiveMapper:
         self._is_joined = False
 
     async def __aenter__(self) -> LiveMapper:
-        """Join the map; a robot without a connection joins it as soon as it is connected.
+        """Join the map: open the spool folder, and ask the map for this robot's name and numbers.
 
-        If the call fails in a way that may pass, it is repeated in the background, and `trouble` says why.
+        A robot without a connection asks as soon as it is connected.  If asking fails with another error than
+        those below, it is repeated in the background, and `trouble` says why.
 
         Raises:
             Forbidden: The token has no scope for this map.
-            UnknownService: The platform has no live maps.
+            Unauthorized: The platform does not accept the token.
+            UnknownService, UnsupportedProtocol: The platform has no live maps.
             BadRequest: The name of the map is invalid.
             UsageError: The spool folder cannot be used, or another program uses it.
         """
@@ -219,9 +225,9 @@ class LiveMapper:
     ) -> None:
         """Send the queued keyframes and attachments, for `LiveOptions.leave_s` at most, and leave the map.
 
-        Without a connection, and after a cancellation of the block, nothing is sent; any other exception of
-        the block makes no difference.  Keyframes that were not acknowledged by then stay in the spool folder,
-        or are lost without one; `keyframes_waiting` is their number.
+        Nothing is sent without a connection, or if the block was cancelled.  After another exception in the
+        block everything is sent as usual, and the exception goes on.  Keyframes that are not acknowledged by
+        then stay in the spool folder, or are lost if there is none; `keyframes_waiting` is their number.
         """
         self._is_joined = False
         try:
@@ -249,15 +255,15 @@ class LiveMapper:
             frame: Next frame of the same camera, in the order of time.
 
         Raises:
-            UsageError: The map is not joined, the frame is of another camera, the first frame lacks the depth
-                that *depth* promised, or a keyframe cannot be written to the spool folder.
+            UsageError: The map is not joined, the frame is of another camera, the first frame has no depth
+                although *depth* is True, or a keyframe cannot be written to the spool folder.
         """
         if not self._is_joined:
             raise UsageError(
                 f"the live map {self.name} is not joined", hint="use async with robot.live_map(...)"
             )
         async with self._frame_lock:
-            # 1. Refuse a first frame without the promised depth.
+            # 1. Refuse a first frame without depth if *depth* is True.
             has_depth = frame.stereo is not None or frame.depth_m.any()
             if self.frames == 0 and self._has_depth and not has_depth:
                 raise UsageError(
@@ -270,7 +276,7 @@ class LiveMapper:
                 self._begin_segment()
             # 3. Track the frame.
             tracked = await self._mapper.track(frame)
-            # 4. Queue the keyframes that a monocular tracker has settled.
+            # 4. Without depth, queue the settled keyframes of the tracker.
             tracker = self._mapper.monocular_tracker
             if tracker is not None and tracked.T_world_camera is not None:
                 tracked = await self._follow_monocular(tracker, tracked, tracked.T_world_camera)
@@ -281,7 +287,7 @@ class LiveMapper:
                 features = self._mapper.features
                 if features is not None and self._is_keyframe(pose):
                     await self._make_keyframe(tracked, pose, features)
-            # 6. Add the pose in the map by the present alignment.
+            # 6. Compute the pose in the map with the present alignment.
             tracked = replace(
                 tracked,
                 segment=self._segment,
@@ -305,7 +311,7 @@ class LiveMapper:
     def T_map_odom(self) -> Array | None:
         """Pose ``(4, 4)`` of the present odometry frame in the map, metres; None while it is not aligned.
 
-        Lengths in the odometry frame are multiplied by `metres_per_unit` before the pose is applied.
+        It maps positions in metres: those in the unit of the odometry frame times `metres_per_unit`.
         """
         return self._alignments.get(self._segment).T_map_odom
 
@@ -318,21 +324,26 @@ class LiveMapper:
 
     @property
     def covariance(self) -> Array | None:
-        """Covariance ``(6, 6)`` of the twist (metres, radians) on the left of `T_map_odom`; None: unknown."""
+        """Covariance ``(6, 6)`` of the error of `T_map_odom`, None if unknown.
+
+        The error is a twist: the true alignment is ``exp(twist) @ T_map_odom``, where the twist is three
+        numbers of the translation in metres, then three of the rotation in radians.
+        """
         return self._alignments.get(self._segment).covariance
 
     @property
     def aligned_by(self) -> str:
-        """Source of the present segment's alignment: ``map``, ``relocalisation``, or ``nothing``."""
+        """Source of the present segment's alignment: see `client_sdk.live.alignments.AlignedBy`."""
         return self._alignments.get(self._segment).by
 
     @property
     def segment(self) -> int:
-        """The robot's own number of the present odometry frame, which grows with each new odometry frame.
+        """Number of the present segment, which is one odometry frame, in the robot's own count.
 
-        A run begins with 0, or after the segment of the newest keyframe in the spool folder.  A new odometry
-        frame begins when tracking was lost for too long; without depth also when the tracker changed its
-        segment or a loop closure changed the scale.
+        The first segment of a run is 0, or one more than that of the newest keyframe in the spool folder.
+        With depth, a new segment begins after `LiveOptions.segment_after` lost frames; without depth, when
+        the tracker begins, changes or joins its segments, or a loop closure corrects lengths by more than 3
+        %.
         """
         return self._segment
 
@@ -343,26 +354,30 @@ class LiveMapper:
 
     @property
     def version(self) -> int:
-        """Newest position in the log of the map that this robot was notified of."""
+        """Newest position in the log of the map that an update or a reply to a relocalisation has stated."""
         return self._alignments.version
 
     @property
     def map_keyframes(self) -> int:
-        """Number of keyframes of all robots in the map."""
+        """Number of keyframes of all robots in the map, as far as this robot was notified."""
         return self._alignments.map_keyframes
 
     @property
     def map_server(self) -> str:
-        """Identity of the map server, the one process that changes the map; empty until it is known."""
+        """Id of the backend server on which the map server (the one process that changes the map) runs.
+
+        Empty until it is known, and while the map moves to another server.
+        """
         return self._alignments.map_server
 
     @property
     def state(self) -> str:
-        """State of the map as this robot knows it.
+        """State of the map as this robot knows it; the first of these that is true.
 
-        ``joining``, ``live``, ``waiting for the store`` or ``moving`` (to another server), as the map server
-        reports it; ``offline`` without a connection; ``refused: ...`` if the platform refuses all keyframes
-        of this robot.
+        ``refused: ...`` if the platform refuses all keyframes of this robot, ``offline`` without a
+        connection, ``joining`` before the first update of the map.  Then the state that the platform reports:
+        ``live``, ``moving`` (to another server) or ``waiting for the store`` (the platform cannot use
+        its object store, so keyframes are not accepted).
         """
         if self._sender.is_refused:
             return f"refused: {self._sender.trouble}"
@@ -372,9 +387,10 @@ class LiveMapper:
 
     @property
     def trouble(self) -> str:
-        """The last failure to send keyframes, else to receive updates, else to relocalise, with its code.
+        """Why something does not work now, as ``code: sentence``; empty if everything works.
 
-        Empty if all of them succeed.  A failed relocalisation counts only while the segment is not aligned.
+        It is the first of these failures that lasts: to send keyframes, to join the map or receive its
+        updates, and, while the segment is not aligned, to relocalise.
         """
         relocalisation_trouble = "" if self.aligned else self._relocaliser.trouble
         return self._sender.trouble or self._update_trouble or relocalisation_trouble
@@ -390,10 +406,10 @@ class LiveMapper:
         return self._mapper.features
 
     def relocalise(self) -> None:
-        """Ask for the robot's pose in the map with the next keyframe, without the usual pause.
+        """Relocalise with the next keyframe of an unaligned segment, without the usual pause; return at once.
 
-        Nothing is asked while the segment is aligned, without a connection, and while the map has no
-        keyframes but those of this run.
+        Nothing is asked without a connection, and while the map has no other keyframes than those that this
+        robot has sent in this run.
         """
         self._relocaliser.skip_pause()
 
@@ -401,14 +417,15 @@ class LiveMapper:
     def map(self) -> PointMap:
         """The robot's own cloud of its keyframes, each at its pose in its odometry frame, metres.
 
-        The newest keyframe may be missing.  Of a camera without depth these are its landmarks, as in
-        `Mapper.map`.
+        Alignments are not applied, so the parts of several segments may not fit each other.  The newest
+        keyframe may be missing.  For a camera without depth these are the landmarks of `Mapper.map`, in its
+        unit.
         """
         return self._mapper.map
 
     @property
     def trajectory(self) -> Trajectory:
-        """Poses of all frames, each in the odometry frame of its segment.
+        """Poses of all frames, each in the odometry frame of its segment; alignments are not applied.
 
         Without depth these are the poses of `Mapper.trajectory`: those of the tracker's segment 0, in its
         unit and with its later adjustments.
@@ -434,7 +451,7 @@ class LiveMapper:
         return self._mapper.frames
 
     def restart_clock(self) -> None:
-        """Accept a next frame with an earlier time stamp, such as after a bag was started again."""
+        """Accept an earlier time stamp in the next frame, for example because a bag was started again."""
         self._mapper.restart_clock()
 
     @property
@@ -444,12 +461,12 @@ class LiveMapper:
 
     @property
     def frames_before_start(self) -> int:
-        """Number of frames of a camera without depth before it had moved enough to begin."""
+        """Number of frames before a camera without depth had moved enough for a first pose."""
         return self._mapper.frames_before_start
 
     @property
     def keyframes(self) -> int:
-        """Number of keyframes queued for the map in this run."""
+        """Number of keyframes that were put into the queue for the map in this run."""
         return self._made_keyframes
 
     @property
@@ -496,11 +513,11 @@ class LiveMapper:
         }
 
     def save(self, folder: Path) -> dict[str, Any]:
-        """Write the robot's own cloud and trajectory as `Mapper.save` does; return the report of `Mapper`."""
+        """Write `map` and `trajectory` as `Mapper.save` does, and return the report of `Mapper`."""
         return self._mapper.save(folder)
 
     def corrections(self) -> AsyncIterator[Correction]:
-        """Return an iterator over all changes of alignments, beginning with the last 1,000 before the call.
+        """Return an iterator over the changes of alignments: the last 1,000 so far, then each new one.
 
         It ends when the map is left.  A reader with more than 1,000 unread corrections loses the oldest.
         """
@@ -509,7 +526,7 @@ class LiveMapper:
     # --- Segments, and the making of keyframes ---
 
     def _begin_segment(self) -> None:
-        """Begin another odometry frame; its first keyframe is relocalised without a pause."""
+        """Begin another segment; its first keyframe is relocalised without a pause."""
         self._segment += 1
         self._sender.current_segment = self._segment
         self._last_keyframe = self._last_keyframe_s = None
@@ -524,8 +541,8 @@ class LiveMapper:
     async def _make_keyframe(self, tracked: TrackedFrame, T_odom_camera: Array, features: Features) -> None:
         """Queue a frame with depth as a keyframe, and add it to the robot's own cloud in a thread.
 
-        The thread may still run at the end.  A keyframe for which the queue has no space is only in the
-        cloud.
+        The thread may still run when this returns (`_wait_for_cloud`).  A keyframe for which the queue has no
+        space is added to the cloud only.
         """
         data, attachments = await asyncio.to_thread(
             self._encode_keyframe, tracked.frame, T_odom_camera, features
@@ -541,10 +558,10 @@ class LiveMapper:
     async def _follow_monocular(
         self, tracker: MonocularTracker, tracked: TrackedFrame, T_world_camera: Array
     ) -> TrackedFrame:
-        """Queue the settled keyframes of a camera without depth, in a new segment if the odometry broke.
+        """Queue the settled keyframes of a camera without depth, in a new segment if the odometry needs one.
 
-        Return *tracked* with its pose in the odometry frame, whose unit the live map turns into metres.
-        *T_world_camera* is its pose by the tracker.
+        Return *tracked* with its pose in the odometry frame, in the unit of that frame.  *T_world_camera* is
+        the pose of the frame by the tracker.
         """
         if self._monocular_odometry is None:
             self._monocular_odometry = MonocularOdometry(tracker)
@@ -559,7 +576,7 @@ class LiveMapper:
         return replace(tracked, T_world_camera=pose, scale="up to scale")
 
     async def _queue_keyframe(self, data: bytes, T_odom_camera: Array) -> bool:
-        """Queue an encoded keyframe and relocalise it if needed; return False if the queue is full."""
+        """Queue an encoded keyframe, and relocalise it if that is due; return False if the queue is full."""
         keyframe = QueuedKeyframe(self._queue.next_index, self._segment, data)
         if not await asyncio.to_thread(self._queue.add, keyframe):
             self._dropped_keyframes += 1
@@ -602,7 +619,7 @@ class LiveMapper:
     # --- Priorities: pose queries before keyframes, keyframes before attachments ---
 
     async def _ask_with_priority(self, query: PoseQuery) -> PoseAnswer:
-        """Ask for a pose while keyframes wait."""
+        """Ask for a pose, and delay keyframes and attachments until the answer."""
         self._sender.pause_for_pose_query()
         try:
             return await self._ask(query)
@@ -652,7 +669,7 @@ class LiveMapper:
         self._alignments.map_keyframes = max(self._alignments.map_keyframes, robot_in_map.map_keyframes)
 
     def _publish(self, correction: Correction | None) -> None:
-        """Publish a correction, if there is one; it marks the next frame if it is of the present segment."""
+        """Publish a correction, if any; one of the present segment sets ``corrected`` of the next frame."""
         if correction is not None:
             self._is_corrected |= correction.segment == self._segment
             self._correction_stream.publish(correction)

@@ -1,9 +1,9 @@
 """Turn the keyframes of a monocular tracker into an odometry whose poses and scale never change.
 
 The tracker adjusts its newest keyframes with every new keyframe, and it may change its scale.  A live map
-takes each keyframe once.  Therefore a keyframe is sent only after it has settled, and its pose is that of the
-keyframe sent before it times their present relative pose.  What the tracker adjusts later does not move a
-keyframe that was sent.
+accepts each keyframe once.  Therefore a keyframe is sent only after it has settled: when two newer ones
+exist.  Its pose is that of the keyframe sent before it, times the relative pose of the two by the tracker at
+that time.  Later adjustments by the tracker do not move a keyframe that was sent.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from rse_pf.geometry import Array, inverse, scaled
 
 __all__ = ["MonocularOdometry"]
 
-_SETTLED_AFTER = 2  # a keyframe is sent when two newer ones exist: until then each new one still moves it
+_SETTLED_AFTER = 2  # newer keyframes that must exist before one is sent: until then, each new one moves it
 _MAX_LOOP_SCALE = 1.03
-"""Largest factor by which a loop closure may correct lengths without ending the odometry, 3 % in either
-direction: beyond it, the lengths before and after the loop have different scales, and no single scale to the
-map fits both."""
+"""Largest factor by which a loop closure of the tracker may correct lengths (or divide them) within one
+odometry frame; beyond it a new odometry frame begins, because lengths before and after the loop closure
+differ by so much that no single scale to the map fits both."""
 
 
 class MonocularOdometry:
@@ -44,10 +44,11 @@ class MonocularOdometry:
         self._T_odom_last_sent: Array
 
     def start_if_broken(self) -> bool:
-        """Begin another odometry frame with this frame if needed; return whether one began after the first.
+        """Begin an odometry frame at the tracker's last frame if needed; return whether it replaces another.
 
-        It is needed if the tracker began or changed its segment, if segments were joined since the last call,
-        and if a loop closure corrected lengths by more than 3 %.
+        An odometry frame begins at the first call; later if the tracker has begun or changed its segment, has
+        joined segments, or has closed a loop that corrected lengths by more than 3 % since the last call.
+        The first call returns False.
         """
         tracker = self._tracker
         segment_and_joins = (tracker.segment, len(tracker.joins))
@@ -60,7 +61,8 @@ class MonocularOdometry:
         is_new_segment = tracker.segment > self._newest_segment
         self._segment_and_joins = segment_and_joins
         self._newest_segment = max(self._newest_segment, tracker.segment)
-        # Keyframes of a segment that was continued are those of an earlier odometry frame: skip them.
+        # A segment that the tracker continues has keyframes that belong to an earlier odometry frame: skip
+        # them.
         self._next_keyframe = 0 if is_new_segment else tracker.segment_keyframes
         self._length_factor_at_start, self._last_sent = tracker.length_factor, None
         return not is_first
@@ -68,8 +70,8 @@ class MonocularOdometry:
     def pose_in_odometry(self, T_world_camera: Array) -> Array:
         """Return ``T_odom_camera`` ``(4, 4)`` for a ``(4, 4)`` pose in the tracker's present world and unit.
 
-        The pose relative to the keyframe that was sent last is kept, in the unit of the odometry frame.
-        Before a keyframe of the odometry frame was sent, only the unit is changed.
+        The result has the same pose relative to the keyframe that was sent last, in the unit of the odometry
+        frame.  Before a keyframe of the odometry frame was sent, only the unit is changed.
         """
         tracker_to_odometry_scale = self._length_factor_at_start / self._tracker.length_factor
         if self._last_sent is None:

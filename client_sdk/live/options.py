@@ -10,37 +10,43 @@ from rse_pf.slam.keyframe_points import MAX_POINTS
 __all__ = ["LiveOptions"]
 
 _MAX_JSON_FEATURES = 650
-"""Features of a keyframe that is sent with the codec ``json``, which writes bytes in base64, a third longer:
-650 features and the rest of the message take 34 kB, as 870 do with ``zlib`` and ``bin``."""
-_MAY_BE_ZERO = ("points", "leave_s")  # options for which 0 is a value: no points, and leaving at once
+"""Most features of a keyframe that is sent with the codec ``json``, which writes bytes in base64, a third
+longer: the message then has about 34 kB, the size of one with the default 870 features in ``zlib`` or
+``bin``, so that the codec does not change how many keyframes the rate limit lets through."""
+_MAY_BE_ZERO = ("points", "leave_s")  # options that may be 0: no points are sent; leaving does not wait
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LiveOptions:
     """Options of a robot in a live map.
 
+    The three rate limits are independent: together they may use their sum.
+
     Attributes:
-        keyframe_m: A frame becomes a keyframe if it is farther than this from the last keyframe, in metres.
-            A camera without depth sends the keyframes of its tracker instead.
-        keyframe_deg: A frame becomes a keyframe if it is rotated by more than this against the last one.
-        features: Limit of the features of a keyframe that are sent: 870 take 34 kB with ``zlib`` and
-            ``bin``; `sent_with` lowers it for ``json``.
-        points: Limit of the coloured points of a keyframe that are sent for the cloud of the map; there are
-            fewer where keyframes follow each other fast.  0 sends none.
-        points_bytes_per_s: Rate limit of the points.
-        images: Whether the images of keyframes are sent, where the operator allows it (``live.images``).
-        images_bytes_per_s: Rate limit of the images; a keyframe beyond it has no image.
-        segment_after: Lost frames in a row after which a new segment begins.  Only frames with enough
-            features count, so a covered lens begins no segment.
-        relocalise_s: Shortest time between two relocalisations of a segment that is not aligned; it becomes
-            four times as long after six replies in a row that found no place in the map.
-        bytes_per_s: Rate limit of the keyframes.
-        deadline_s: Deadline of one attempt to send a keyframe, and of one relocalisation.
-        leave_s: Longest time for which leaving waits until the map has acknowledged every keyframe and every
-            attachment is uploaded.
+        keyframe_m: A frame becomes a keyframe if its camera is farther than this from that of the last
+            keyframe, in metres.  A camera without depth sends the keyframes of its tracker instead.
+        keyframe_deg: A frame also becomes a keyframe if its camera is rotated by more than this against that
+            of the last keyframe, in degrees.
+        features: Most features of a keyframe that are sent: 870 take 34 kB with ``zlib`` and ``bin``;
+            `sent_with` lowers the limit for ``json``.
+        points: Most coloured points of a keyframe that are sent for the cloud of the map.  Fewer are sent
+            while keyframes follow each other so fast that *points_bytes_per_s* would be exceeded.  0 sends
+            none.
+        points_bytes_per_s: Rate limit of the uploads of points, in bytes per second.
+        images: Whether the images of keyframes are sent, if the operator allows it (``live.images``).
+        images_bytes_per_s: Rate limit of the uploads of images, in bytes per second; a keyframe that would
+            exceed it is sent without an image.
+        segment_after: Number of lost frames since the last pose after which a new segment begins.  Only
+            frames with enough features count, so a covered lens begins no segment.  Not used without depth.
+        relocalise_s: Shortest time between two relocalisations of a segment that is not aligned, in seconds;
+            it becomes four times as long after six replies in a row that found no place in the map.
+        bytes_per_s: Rate limit of the keyframes, in bytes per second.
+        deadline_s: Deadline of one attempt to send a keyframe, and of one relocalisation, in seconds.
+        leave_s: Longest time for which leaving the map waits until the map has acknowledged every keyframe
+            and every attachment is uploaded, in seconds.
 
     Raises:
-        UsageError: A number is not above 0 (``points``, ``leave_s``: below 0), or *points* is above 16,000.
+        UsageError: A number is not above 0 (*points* and *leave_s*: is below 0), or *points* is above 16,000.
     """
 
     keyframe_m: float = 0.1
@@ -63,8 +69,10 @@ class LiveOptions:
                 limit = "at least 0" if name in _MAY_BE_ZERO else "above 0"
                 raise UsageError(f"{name} = {value:g} is not {limit}", hint="leave it out for the default")
         if self.points > MAX_POINTS:
-            raise UsageError(f"points = {self.points} is above {MAX_POINTS}", hint="use 12500")
+            raise UsageError(
+                f"points = {self.points} is above {MAX_POINTS}", hint=f"use at most {MAX_POINTS}"
+            )
 
     def sent_with(self, codec: str) -> LiveOptions:
-        """Return these options with at most the features that take 34 kB in the codec of the connection."""
+        """Return these options with at most 650 features if *codec*, that of the connection, is ``json``."""
         return replace(self, features=min(self.features, _MAX_JSON_FEATURES)) if codec == "json" else self

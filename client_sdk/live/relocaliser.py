@@ -1,4 +1,4 @@
-"""Ask a live map where a keyframe was made, while the robot's segment is not aligned."""
+"""Ask a live map at which pose a keyframe was made, while the robot's segment is not aligned."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from rse_pf.wire.live_map import LiveRelocalise, RelocaliseReply
 __all__ = ["Relocaliser"]
 
 _MAX_FAST_FAILURES = 6
-"""Relocalisations in a row that found no place, after which the robot asks less often: no other robot seems
-to have been there, and the map compares each keyframe with the others anyway."""
+"""Replies in a row that found no place in the map after which the robot asks less often: no other robot seems
+to have been there, and the map server compares each keyframe that it receives with those of others anyway."""
 _SLOW_FACTOR = 4.0
-"""Factor of the pause between relocalisations after six replies in a row that found no place."""
+"""The pause between relocalisations is this many times as long after `_MAX_FAST_FAILURES` such replies."""
 
 
 class Relocaliser:
-    """Ask a live map where keyframes were made: one keyframe at a time, with a pause between two calls."""
+    """Ask a live map at which poses keyframes were made: one at a time, with a pause between two calls."""
 
     def __init__(
         self,
@@ -33,26 +33,26 @@ class Relocaliser:
         clock: Callable[[], float],
         on_reply: Callable[[int, Array, RelocaliseReply], None],
     ) -> None:
-        """Describe the relocaliser.
+        """Store the arguments; `start_if_due` uses the network.
 
         Args:
             robot: The robot that calls ``live-relocalise``.
             map_name: Name of the live map.
             options: Pause between relocalisations, and their deadline.
             clock: Monotonic time in seconds.
-            on_reply: Called with the segment and the ``(4, 4)`` pose ``T_odom_camera`` of the keyframe, and
-                the map's reply; an RsePfError that it raises counts as a failed call.
+            on_reply: Called with the keyframe's segment, its ``(4, 4)`` pose ``T_odom_camera``, and the map's
+                reply; an RsePfError that it raises counts as a failed call.
         """
         self.trouble = ""
         """Why the last call failed, as ``code: sentence``; empty after a reply of any verdict."""
         self.verdicts: Counter[str] = Counter()
-        """Number of replies by their verdicts, and of failed calls by their error codes."""
+        """Number of replies for each verdict, and of failed calls for each error code."""
         self._robot, self._map_name, self._options = robot, map_name, options
         self._clock, self._on_reply = clock, on_reply
         self._started_s = float("-inf")
         self._failures_in_a_row = 0
         self.task: asyncio.Task[None] | None = None
-        """The call that was started last; None before the first."""
+        """The task of the last call, which may have ended; None before the first."""
 
     @property
     def pause_s(self) -> float:
@@ -61,11 +61,11 @@ class Relocaliser:
         return self._options.relocalise_s * (_SLOW_FACTOR if is_slow else 1.0)
 
     def skip_pause(self) -> None:
-        """Let the next keyframe be localised at once, and the pause be short again."""
+        """Make the next keyframe due at once, and the pause after it short again."""
         self._started_s, self._failures_in_a_row = float("-inf"), 0
 
     def start_if_due(self, keyframe: QueuedKeyframe, T_odom_camera: Array) -> None:
-        """Start a task that localises a keyframe, unless one runs or the pause is not over."""
+        """Start a task that localises a keyframe, unless a task still runs or the pause is not over."""
         now = self._clock()
         is_running = self.task is not None and not self.task.done()
         if now >= self._started_s + self.pause_s and not is_running:

@@ -66,7 +66,7 @@ class LiveRecorder:
                 "event": "keyframe",
                 "number": sent_keyframe.number,
                 "sent": self._since(sent_keyframe.sent_s),
-                "kept": self._since(sent_keyframe.kept_s),
+                "kept": self._since(sent_keyframe.acknowledged_s),
             }
             for sent_keyframe in self._mapper.sent_keyframes
         ]
