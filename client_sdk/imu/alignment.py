@@ -3,11 +3,13 @@
 The camera's poses, which may be up to scale, are measurements with noise (a loosely coupled problem):
 
 1. The bias of the gyroscope follows from the rotations of the poses (VINS-Mono, eq. 15).
-2. A linear problem gives velocities, gravity and scale (VINS-Mono, Sect. V-B), and refuses a sensor with the
-   wrong sign or scale.  Gravity is then set to 9.81 m/s^2.
-3. A nonlinear least-squares problem refines these, and the rotations, positions and biases of all poses:
-   residuals of preintegrated motions (Forster et al. 2017) and of poses, Huber loss, Levenberg-Marquardt.
-   Each pose has biases of its own.
+2. A linear problem gives velocities, gravity and scale (VINS-Mono, Sect. V-B).  If the scale is certainly
+   negative, or the magnitude of gravity certainly wrong, the accelerometer is refused.  Then the magnitude of
+   gravity is set to 9.81 m/s^2.
+3. A nonlinear least-squares problem refines velocities, gravity and scale together with the rotations,
+positions
+   and biases of all poses: residuals of preintegrated motions (Forster et al. 2017) and of poses, Huber loss,
+   Levenberg-Marquardt.  Each pose has biases of its own.
 
 Source:
     Qin et al., "VINS-Mono", T-RO 2018, for steps 1 and 2; Campos et al., "Inertial-Only Optimization for
@@ -38,22 +40,24 @@ _GYRO_BIAS = slice(9, 12)
 _ACCEL_BIAS = slice(12, 15)
 _BIASES = slice(9, 15)
 
-_GYRO_BIAS_PRIOR_RAD_S = 0.1  # standard deviation of the gyroscope's bias before anything is measured
-_ACCEL_BIAS_PRIOR_M_S2 = 0.2  # standard deviation of the accelerometer's bias before anything is measured
+_GYRO_BIAS_PRIOR_RAD_S = 0.1  # prior standard deviation of each axis of the gyroscope's bias
+_ACCEL_BIAS_PRIOR_M_S2 = 0.2  # prior standard deviation of each axis of the accelerometer's bias
 _HUBER_WIDTH = 3.0
-"""Width of the Huber loss: the loss of a residual is linear where the root mean square of the residual's
-three whitened components is above this."""
+"""Width of the Huber loss in standard deviations.  The residual of a vector has three whitened components;
+its loss is quadratic up to this root mean square of the components, and linear beyond, so that outliers count
+less."""
 _CERTAIN_DEVIATIONS = 10.0
-"""Standard deviations by which scale or gravity of the linear solution must be wrong to refuse the
-accelerometer."""
+"""The linear solution raises an error of the accelerometer only if its scale is below 0, or its magnitude of
+gravity beyond the allowed error, by more than this many of their own standard deviations: a short drive
+proves neither."""
 _MAX_ITERATIONS = 12  # largest number of accepted Levenberg-Marquardt steps of one alignment
 _CONVERGED_FRACTION = 1e-4
-"""Levenberg-Marquardt ends with a step that lowers the cost by less than this fraction."""
+"""Levenberg-Marquardt ends after a step that lowers the cost by less than this fraction of the cost."""
 _FIRST_DAMPING = 1e-5
-"""Levenberg-Marquardt damping of the first step, as a share of the diagonal.  A step that does not lower the
-cost multiplies the damping by 10; a step that does multiplies it by 0.1."""
+"""Levenberg-Marquardt damping of the first step, as the fraction of each diagonal element that is added to
+it.  A step that does not lower the cost multiplies the damping by 10, a step that does by 0.1."""
 _MIN_DAMPING = 1e-9  # smallest Levenberg-Marquardt damping of a step
-_MAX_DAMPING = 1e8  # Levenberg-Marquardt damping above which the search for a better step is given up
+_MAX_DAMPING = 1e8  # damping above which Levenberg-Marquardt ends: no step lowers the cost any more
 _COVARIANCE_FLOOR = 1e-14  # added to variances of preintegrated motions, so that a Cholesky factor exists
 
 
@@ -63,13 +67,15 @@ class ImuAlignment:
 
     Attributes:
         scale: Metres per unit of the camera's poses.
-        scale_deviation: Relative standard deviation of the scale; 0 for metric poses.
+        scale_deviation: Standard deviation of the scale divided by the scale; 0 for metric poses.
         gravity_m_s2: ``(3,)`` in the world of the poses; it points down, and its length is 9.81.
-        gravity_deviation_rad: Standard deviation of the direction of gravity about its less certain axis.
+        gravity_deviation_rad: Standard deviation of the direction of gravity, about the horizontal axis about
+            which it is less certain.
         gyro_bias_rad_s: ``(3,)`` bias of the gyroscope at the last pose.
         accel_bias_m_s2: ``(3,)`` bias of the accelerometer at the last pose.
-        misfit: Square root of the chi-square per degree of freedom: about 1 if the noise is as stated.  A
-            misfit above 1 was multiplied into both deviations above.
+        misfit: Square root of the chi-square per degree of freedom of all residuals: about 1 if poses and IMU
+            have the stated noise.  If it is above 1, *scale_deviation* and *gravity_deviation_rad* are those
+            of the stated noise multiplied by it.
     """
 
     scale: float
@@ -84,9 +90,9 @@ class ImuAlignment:
 def estimate_gyro_bias(R_world_imu: Array, motions: Sequence[Preintegration]) -> Array:
     """Return the ``(3,)`` gyroscope bias in rad/s with which motions fit the rotations ``(n, 3, 3)`` best.
 
-    The n - 1 motions lie between neighbouring rotations.  One linear step is taken from the bias with which
-    the first motion was preintegrated.  The step is exact only if all motions were preintegrated with nearly
-    the same bias.
+    The n - 1 motions lie between successive rotations.  The result is the bias with which the first motion
+    was preintegrated plus one step of linear least squares, so all motions must have been preintegrated with
+    nearly the same bias.
 
     Source:
         VINS-Mono, eq. 15.
@@ -116,15 +122,15 @@ def align_imu(
 
     Args:
         T_world_camera: ``(n, 4, 4)`` poses, n >= 5, with translations in any one unit.
-        motions: n - 1 preintegrated motions, each between two neighbouring poses.
+        motions: n - 1 preintegrated motions, each between two successive poses.
         model: Model of the IMU.
         pose_noise: Standard deviations of a pose's rotation (rad) and position (unit of the poses).
-        is_metric: Whether the unit of the poses is the metre, so that the scale is 1.
+        is_metric: Whether the unit of the poses is the metre; the scale is then fixed at 1.
 
     Raises:
-        UsageError: The scale is negative by more than ten standard deviations, or the magnitude of gravity is
-            wrong by 0.6 m/s^2 and more than ten standard deviations: the accelerometer has the wrong sign,
-            scale or bias.
+        UsageError: The scale is below 0 by more than ten standard deviations, so the accelerometer has the
+            wrong sign; or the magnitude of gravity differs from 9.81 m/s^2 by more than 0.6 m/s^2 plus ten
+            standard deviations, so the accelerometer has the wrong scale or too large a bias.
     """
     problem = _AlignmentProblem(T_world_camera, motions, model, pose_noise, is_metric=is_metric)
     gyro_bias = estimate_gyro_bias(problem.observed_R, motions)
@@ -135,10 +141,11 @@ def align_imu(
 def _deviations_of_last(matrix: Array, residuals: Array, count: int) -> Array:
     """Return the ``(count,)`` standard deviations of the last unknowns of a linear least-squares problem.
 
-    The noise is estimated from the residuals.  All are infinite if the problem does not determine them.
+    The variance of the noise is the mean square of the *residuals*.  All deviations are infinite if the
+    equations *matrix* do not determine these unknowns.
     """
     variance = np.square(residuals).sum() / max(1, len(residuals) - matrix.shape[1])
-    # In the QR decomposition the last rows of R contain the last unknowns alone.
+    # The last rows of R in the QR decomposition are equations of the last unknowns alone.
     R = np.asarray(np.linalg.qr(matrix, mode="r"))[-count:, -count:]
     if not np.abs(np.diag(R)).min() > 0.0:
         return np.full(count, np.inf)
@@ -149,8 +156,9 @@ def _deviations_of_last(matrix: Array, residuals: Array, count: int) -> Array:
 class _AlignmentProblem:
     """Nonlinear least squares over the states of all poses, the scale, and the direction of gravity.
 
-    Only the states of neighbours are coupled, and all states with scale and gravity.  The normal equations
-    are therefore block tridiagonal with a border, and are solved in time proportional to the number of poses.
+    A residual depends on the states of at most two successive poses, and on the scale and gravity.  The
+    normal equations are therefore block tridiagonal with a border (rows and columns of scale and gravity),
+    and are solved in time proportional to the number of poses.
     """
 
     def __init__(
@@ -177,7 +185,7 @@ class _AlignmentProblem:
         self._motion_biases = np.stack(
             [np.concatenate([motion.gyro_bias_rad_s, motion.accel_bias_m_s2]) for motion in motions]
         )
-        # Square roots of the information matrices of motions and of the biases' random walk.
+        # Square roots of the information matrices: 9x9 of the motions, then 6x6 of the biases' random walk.
         walk = np.repeat([model.gyro_walk, model.accel_walk], 3) ** 2
         self._sqrt_information = np.zeros((len(motions), 15, 15))
         for row, motion in enumerate(motions):
@@ -195,7 +203,7 @@ class _AlignmentProblem:
         Raises:
             UsageError: See `align_imu`.
         """
-        # 1. Correct the motions for the change of the gyroscope bias.
+        # 1. Correct the preintegrated velocities and positions for the change of the gyroscope bias.
         R, p, dt = self.observed_R, self._observed_p, self._dt
         n = len(R)
         bias_change = gyro_bias - self._motion_biases[:, :3]
@@ -219,13 +227,14 @@ class _AlignmentProblem:
         scale = 1.0 if self._is_metric else float(solution[-1])
         gravity: Array = solution[3 * n : 3 * n + 3]
         magnitude = float(np.linalg.norm(gravity))
-        # 4. Refuse an accelerometer whose sign or scale is certainly wrong.
+        # 4. Refuse an accelerometer with a certainly negative scale, or a certainly wrong magnitude of
+        #    gravity.
         if not self._is_metric and scale < 0.0:
             deviations = _deviations_of_last(matrix, right - matrix @ solution, 1)
             if -scale > _CERTAIN_DEVIATIONS * deviations[0]:
                 raise UsageError(
-                    "the accelerometer measures the opposite of how the camera moves: an axis has the wrong "
-                    "sign",
+                    "the accelerometer measures the opposite of how the camera moves: at least one axis has "
+                    "the wrong sign",
                     hint="a stationary accelerometer reads 9.81 upwards; correct its axes, or T_imu_camera",
                 )
         if not scale > 0.0 or not magnitude > 0.0:
@@ -248,8 +257,8 @@ class _AlignmentProblem:
     ) -> ImuAlignment | None:
         """Refine a first solution by Levenberg-Marquardt.
 
-        The arguments are those that `solve_linearly` returns, and the ``(3,)`` gyroscope bias.  The result
-        is None if it has no covariance with positive variances.
+        The arguments are the result of `solve_linearly`, and the ``(3,)`` gyroscope bias.  The result is None
+        if the final equations are singular, or give a variance that is not positive.
         """
         n = len(self._observed_p)
         state = _State(
@@ -276,9 +285,9 @@ class _AlignmentProblem:
         return self._make_alignment(state, equations)
 
     def _make_alignment(self, state: _State, equations: _NormalEquations) -> ImuAlignment | None:
-        """Return the alignment with its deviations, which come from the inverse of the normal equations.
+        """Return the alignment at *state*, with deviations from the inverse of the normal equations.
 
-        None if these are singular, or have a variance that is not positive.
+        None if these are singular, or give a variance that is not positive.
         """
         covariance = equations.last_covariance()
         if covariance is None or not np.isfinite(covariance).all():
@@ -309,7 +318,8 @@ class _AlignmentProblem:
     def _residuals(self, state: _State) -> tuple[Array, Array]:
         """Return the whitened residuals of motions ``(n - 1, 15)`` and of poses ``(n, 6)``.
 
-        Those of a pose are three of its rotation, then three of the camera's position.
+        Those of a motion are in the order of `_motion_residuals`; those of a pose are three of its rotation,
+        then three of the camera's position.
         """
         raw, _ = self._motion_residuals(state)
         motion_residuals = np.einsum("nij,nj->ni", self._sqrt_information, raw)
@@ -319,12 +329,15 @@ class _AlignmentProblem:
         return motion_residuals, np.concatenate([rotations, positions], axis=1)
 
     def _motion_residuals(self, state: _State) -> tuple[Array, Array]:
-        """Return the residuals of motions ``(n - 1, 15)`` in their own units, and rotation corrections.
+        """Return residuals of motions ``(n - 1, 15)`` before whitening, and corrections of their rotations.
 
-        The residuals are those of rotation (rad), velocity (m/s), position (m) and the change of both biases.
-        A motion was preintegrated with another gyroscope bias than that of *state*; its correction, a row of
-        ``(n - 1, 3)``, is the rotation vector (rad) of the rotation that is multiplied on the right of the
-        preintegrated rotation for this difference.
+        The residuals of a motion are three each of the rotation (rad), velocity (m/s) and position (m), then
+        six of the change of the biases from its first pose to its second.
+
+        A motion was preintegrated with other biases than those of *state*.  The preintegrated rotation for
+        the gyroscope bias of *state* is ``delta_rotation @ Exp(J (bias - preintegrated bias))``, with the
+        derivative J of the rotation by this bias.  The argument of Exp, a rotation vector in rad, is the
+        correction; those of all motions are ``(n - 1, 3)``.
         """
         RT = np.swapaxes(state.R[:-1], 1, 2)
         bias_changes = state.biases[:-1] - self._motion_biases
@@ -339,12 +352,12 @@ class _AlignmentProblem:
         return raw, corrections[:, :3]
 
     def _velocity_changes(self, state: _State) -> Array:
-        """Return the changes of velocity ``(n - 1, 3)`` in the world minus gravity times duration, m/s."""
+        """Return ``v_j - v_i - g dt`` of each motion ``(n - 1, 3)`` in the world, m/s."""
         changes: Array = state.v[1:] - state.v[:-1] - self._dt[:, None] * state.gravity
         return changes
 
     def _position_changes(self, state: _State) -> Array:
-        """Return ``p_j - p_i - v_i dt - g dt^2 / 2`` of each motion ``(n - 1, 3)`` in the world, m."""
+        """Return ``p_j - p_i - v_i dt - g dt^2 / 2`` of each motion ``(n - 1, 3)`` in the world, metres."""
         dt = self._dt[:, None]
         changes: Array = state.p[1:] - state.p[:-1] - dt * state.v[:-1] - 0.5 * dt**2 * state.gravity
         return changes
@@ -352,14 +365,15 @@ class _AlignmentProblem:
     def _linearise(self, state: _State) -> _NormalEquations:
         """Return the normal equations at a state, with the weights of the Huber loss.
 
-        The border holds the logarithm of the scale (unless the poses are metric) and two angles of gravity.
+        The unknowns of the border are the logarithm of the scale (unless the poses are metric) and two
+        angles, in rad, by which gravity rotates about its `_tangents`.
 
         Source:
             Jacobians of preintegrated motions: Forster et al. 2017, appendix C.
         """
         n, border_size = len(self._observed_p), 2 if self._is_metric else 3
-        # 1. Differentiate the residuals of motions by the states at their begin (before) and at their end
-        # (after), and by the border.
+        # 1. Differentiate the residuals of each motion by the state of its first pose (before), by that of
+        #    its second pose (after), and by the border.
         raw, rotation_corrections = self._motion_residuals(state)
         RT = np.swapaxes(state.R[:-1], 1, 2)
         dt = self._dt[:, None, None]
@@ -370,8 +384,9 @@ class _AlignmentProblem:
             -inverse_right_jacobian @ np.swapaxes(state.R[1:], 1, 2) @ state.R[:-1]
         )
         after[:, _ROTATION, _ROTATION] = inverse_right_jacobian
-        # A change d of the bias turns a rotation residual r into Log(Exp(-J d) Exp(r)): it acts on the left,
-        # so that the inverse left Jacobian is needed.
+        # A change d of the gyroscope bias turns the rotation residual r (a rotation vector) into
+        # Log(Exp(-J d) Exp(r)), where J is the derivative of the preintegrated rotation by the bias.  The
+        # change is a factor on the left, so that the inverse left Jacobian is needed.
         before[:, _ROTATION, _GYRO_BIAS] = (
             -np.linalg.inv(left_jacobian_so3(raw[:, :3]))
             @ right_jacobian_so3(rotation_corrections)
@@ -446,8 +461,9 @@ class _State:
     def moved_by(self, steps: Array, border_step: Array) -> _State:
         """Return the state after steps ``(n, 15)`` of the poses and ``(2,)`` or ``(3,)`` of the border.
 
-        Rotations are multiplied on the right.  The border has the change of the scale's logarithm, if it has
-        three numbers, and the angles, rad, by which gravity rotates about its two `_tangents`.
+        The step of a rotation is a rotation vector, and is multiplied on the right.  The last two numbers of
+        the border are the angles, rad, by which gravity rotates about its two `_tangents`; the first of three
+        is the change of the logarithm of the scale.
         """
         scale = self.scale * float(np.exp(border_step[0])) if len(border_step) == 3 else self.scale
         turn = exp_so3(_tangents(self.gravity) @ border_step[-2:])
@@ -477,9 +493,10 @@ class _NormalEquations:
         self.gradient, self.border_gradient = np.zeros((n, _STATE_SIZE)), np.zeros(m)
 
     def add(self, rows: slice, J: Array, border: Array, residuals: Array) -> None:
-        """Add what ``(m, k)`` residuals say of the states *rows* alone, and of these and the border.
+        """Add the terms of k *residuals* of each of the states *rows* to the equations of these states.
 
-        *J* ``(m, k, 15)`` and *border* are the Jacobians of the residuals by these states and by the border.
+        *J* ``(rows, k, 15)`` and *border* ``(rows, k, m)`` are the Jacobians of the *residuals* ``(rows, k)``
+        by these states and by the border.
         """
         JT = np.swapaxes(J, 1, 2)
         self.diagonal[rows] += JT @ J
@@ -487,15 +504,16 @@ class _NormalEquations:
         self.gradient[rows] += np.einsum("nij,nj->ni", JT, residuals)
 
     def add_border(self, border: Array, residuals: Array) -> None:
-        """Add what ``(m, k)`` residuals say of the border alone; *border* is their Jacobian by the border."""
+        """Add the terms of *residuals*, with the Jacobian *border*, to ``corner`` and ``border_gradient``."""
         borderT = np.swapaxes(border, 1, 2)
         self.corner += (borderT @ border).sum(axis=0)
         self.border_gradient += np.einsum("nij,nj->i", borderT, residuals)
 
     def solve(self, damping: float) -> tuple[Array, Array]:
-        """Return the steps of the states ``(n, 15)`` and of the border ``(m,)`` against the gradient.
+        """Return the steps of the states ``(n, 15)`` and of the border ``(m,)`` that lower the cost.
 
-        *damping* is the share of each diagonal element that is added to it; the equations stay as they are.
+        *damping* is the fraction of each diagonal element that is added to it for this solution; the stored
+        equations do not change.
         """
         # 1. Eliminate all states, so that equations of the border alone remain.
         eliminated: list[Array] = []
@@ -531,12 +549,14 @@ class _NormalEquations:
     def _eliminate_all_but_last(
         self, damping: float, eliminated: list[Array] | None = None
     ) -> tuple[Array, Array, Array, Array, Array]:
-        """Eliminate the states from the first to the last but one.
+        """Eliminate all states but the last one, from the first on.
 
-        Return diagonal and border of the last state, the corner, and the gradients of the last state and of
-        the border.  For each eliminated state, the matrix ``inverse(D) [b, C, E]`` is appended to
-        *eliminated*: D, b, C and E are the state's diagonal, gradient, border and coupling after the states
-        before were eliminated.
+        Return the equations that remain for the last state and the border: diagonal and border of the last
+        state, the corner, and the gradients of the last state and of the border.
+
+        For each eliminated state, the matrix ``inverse(D) [b, C, E]``, which back substitution needs, is
+        appended to *eliminated*.  D, b, C and E are the diagonal, the gradient, the border and the coupling
+        with the next state, after all earlier states were eliminated.
         """
         n, m = len(self.diagonal), len(self.border_gradient)
         G, c = self.corner + damping * np.diag(np.diag(self.corner)), self.border_gradient.copy()
@@ -559,12 +579,12 @@ class _NormalEquations:
 
 
 def _bias_prior() -> Array:
-    """Return the prior standard deviations ``(6,)`` of the biases at the first pose, gyroscope first."""
+    """Return the prior standard deviations ``(6,)`` of the first pose's biases: gyroscope, accelerometer."""
     return np.repeat([_GYRO_BIAS_PRIOR_RAD_S, _ACCEL_BIAS_PRIOR_M_S2], 3)
 
 
 def _tangents(gravity: Array) -> Array:
-    """Return two unit vectors ``(3, 2)`` perpendicular to gravity and to each other."""
+    """Return two unit vectors, the columns of ``(3, 2)``, perpendicular to gravity and to each other."""
     unit = gravity / np.linalg.norm(gravity)
     helper = np.eye(3)[int(np.argmin(np.abs(unit)))]
     first = np.cross(unit, helper)
@@ -573,9 +593,9 @@ def _tangents(gravity: Array) -> Array:
 
 
 def _huber_weights(residuals: Array) -> Array:
-    """Return the Huber weights ``(n, k)`` of whitened residuals ``(n, k)``, equal for the axes of a vector.
+    """Return the Huber weights ``(n, k)`` of whitened residuals ``(n, k)``.
 
-    Each three successive columns are the components of one vector.
+    Each three successive columns are the components of one vector, which have the same weight.
     """
     norms = np.linalg.norm(residuals.reshape(len(residuals), -1, 3), axis=2) / np.sqrt(3.0)
     weights: Array = np.repeat(np.minimum(1.0, _HUBER_WIDTH / np.maximum(norms, 1e-12)), 3, axis=1)
@@ -583,7 +603,7 @@ def _huber_weights(residuals: Array) -> Array:
 
 
 def _huber_cost(residuals: Array) -> Array:
-    """Return the Huber loss ``(n, k / 3)`` of whitened residuals ``(n, k)``, one per group of 3 axes."""
+    """Return the Huber loss ``(n, k / 3)`` of whitened residuals ``(n, k)``, one for each three columns."""
     squared = np.square(residuals.reshape(len(residuals), -1, 3)).sum(axis=2)
     norms = np.sqrt(squared / 3.0)
     linear = 3.0 * (2.0 * _HUBER_WIDTH * norms - _HUBER_WIDTH**2)

@@ -1,6 +1,7 @@
 """Check an IMU by its samples alone, and compare its gyroscope with the rotations of a camera.
 
-Each check returns what is wrong in one line for people; an IMU with a fault is not used.
+Each check returns a sentence for people that says what is wrong, empty if nothing is; `ImuEstimator` does not
+use an IMU for which a check returned a sentence.
 """
 
 from __future__ import annotations
@@ -25,51 +26,60 @@ __all__ = [
 
 GRAVITY_M_S2 = 9.81  # magnitude of gravity; it varies by 0.03 over the Earth, far below a sensor's bias
 MAX_GRAVITY_ERROR_M_S2 = 0.6
-"""Largest error of the magnitude of gravity, in m/s^2, that the bias of a sound accelerometer may cause:
-three standard deviations (0.2 m/s^2) of such a bias."""
+"""Largest difference between 9.81 m/s^2 and a measured magnitude of gravity that the bias of a sound
+accelerometer explains: three standard deviations of such a bias, 0.2 m/s^2 each.  Beyond it the accelerometer
+is refused."""
 
 # Limits of the samples alone, see `find_sample_trouble`
-_MIN_SAMPLES = 100  # IMU samples before faults are sought in them: half a second at 200 Hz
-_MAX_MISSING_FRACTION = 0.05  # fraction of an IMU's samples that may be missing
-_MAX_SATURATED_FRACTION = 0.01  # fraction of an IMU's samples that may be at the end of the sensor's range
-_SATURATION = 0.999  # fraction of the sensor's range from which on a sample counts as saturated
-_MIN_IN_G = 0.7  # mean magnitude of the stated forces: between this and _MAX_IN_G their unit is probably g
-_MAX_IN_G = 1.3  # mean magnitude of the stated forces: between _MIN_IN_G and this their unit is probably g
+_MIN_SAMPLES = 100  # fewer IMU samples are not checked: half a second at 200 Hz
+_MAX_MISSING_FRACTION = 0.05  # largest fraction of an IMU's samples that may be missing
+_MAX_SATURATED_FRACTION = 0.01  # largest fraction of an IMU's samples that may be saturated
+_SATURATION = 0.999  # a sample is saturated from this fraction of the sensor's range on
+_MIN_IN_G = 0.7  # lower end of the mean magnitudes of an accelerometer that are refused as being in g
+_MAX_IN_G = 1.3  # upper end of the mean magnitudes of an accelerometer that are refused as being in g
 _MIN_MEAN_ACCEL = 0.7  # smallest plausible mean magnitude of an accelerometer, as a multiple of gravity
 _MAX_MEAN_ACCEL = 1.5  # largest plausible mean magnitude of an accelerometer, as a multiple of gravity
 _REST_S = 0.5  # length of the time windows in which an IMU is tested for being stationary
 _MIN_REST_WINDOWS = 3  # stationary windows that are needed to measure the magnitude of gravity in them
-_REST_NOISE_FACTOR = 3.0  # multiple of its white noise by which a stationary sensor may scatter
-_REST_GYRO_RAD_S = 0.02  # standard deviation that a stationary gyroscope may have besides its noise
-_REST_ACCEL_M_S2 = 0.1  # standard deviation that a stationary accelerometer may have besides its noise
+_REST_NOISE_FACTOR = (
+    3.0  # multiple of its white noise by which the samples of a stationary sensor may scatter
+)
+_REST_GYRO_RAD_S = 0.02  # standard deviation of a stationary gyroscope that is allowed beyond its noise
+_REST_ACCEL_M_S2 = 0.1  # standard deviation of a stationary accelerometer that is allowed beyond its noise
 
 # Limits of the comparison with the camera, see `check_rates`
 _MIN_INTERVALS = 30  # intervals between poses that are needed to compare the rates of gyroscope and camera
 _MAX_INTERVAL_S = 0.5  # longest interval between two poses whose mean rate is compared with the gyroscope
 _MIN_RATE_SPREAD_RAD_S = 0.04
-"""Smallest standard deviation of the camera's rates about the second of their principal axes, in rad/s:
-slower rotations, or rotations about one axis, do not distinguish the axes of the gyroscope."""
+"""Smallest standard deviation of the camera's rates, in rad/s, along the second of their three principal axes
+(in the order of their variances) for which rates are compared: slower rotations, or rotations about one axis
+only, do not distinguish the axes of the gyroscope."""
 _MAX_OFFSET_S = 0.1
-"""Largest time offset between the clocks of IMU and camera that is sought, in either direction.  It is above
-`_MAX_USABLE_OFFSET_S`, so that the fault can be reported with its size."""
+"""The time offset between the clocks of IMU and camera is searched up to this size in either direction.  That
+is more than `_MAX_USABLE_OFFSET_S`, so that the size of an offset that is refused can be reported."""
 _OFFSET_STEP_S = 0.002
-"""Step of the search for the time offset between IMU and camera; the best is interpolated."""
+"""Step of the search for the time offset between IMU and camera; the result is interpolated between the
+steps."""
 _MIN_OFFSET_CHANGE_S = 0.003
-"""Smallest difference between the measured time offset and the offset in use that replaces the offset in use:
-the measurement is no better than that."""
+"""A measured time offset that differs from the offset in use by no more than this does not replace it,
+because the measurement is not more accurate."""
 _MAX_USABLE_OFFSET_S = 0.06
-"""A larger offset between the clocks of IMU and camera is a fault, and not corrected."""
+"""Largest offset between the clocks of IMU and camera that is corrected; for a larger one, up to
+`_MAX_OFFSET_S`, the IMU is refused."""
 _OUTLIER_FACTOR = 4.0
-"""Multiple of the median distance between the rates of gyroscope and camera, above which an interval is left
-out."""
+"""An interval is an outlier if its rates of gyroscope and camera differ by more than this many times the
+median difference."""
 _MAX_UNEXPLAINED = 0.5
-"""Largest part of the camera's rates (root mean square) that may remain after subtraction of the gyroscope's
-rates; above it the two sensors do not measure the same motion, and the IMU is refused."""
+"""Largest root mean square of the difference between the camera's rates and the best-fitting rotation of the
+gyroscope's rates, as a fraction of that of the camera's rates.  Above it the two sensors do not measure the
+same motion, and the IMU is refused."""
 _MIN_DEGREES_RATIO = 40.0
-"""Gyroscope rates divided by camera rates, above which the IMU is refused because its unit is degrees per
+"""Gyroscope rates divided by camera rates above which the IMU is refused because its unit is degrees per
 second: a degree per second read as rad/s is 57 times too large."""
-_MAX_RATE_RATIO = 1.25  # largest ratio of the rates of gyroscope and camera, either way, of a sound gyroscope
-_MAX_AXES_ERROR_DEG = 8.0  # largest angle between the gyroscope's axes and those that T_imu_camera states
+_MAX_RATE_RATIO = 1.25  # largest ratio of gyroscope and camera rates, or its inverse, that is not refused
+_MAX_AXES_ERROR_DEG = (
+    8.0  # largest rotation between the gyroscope's axes and T_imu_camera that is not refused
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -77,11 +87,11 @@ class RateCheck:
     """Result of comparing the rates of a gyroscope with those of a camera.
 
     Attributes:
-        trouble: Why the IMU must not be used, in one line; empty if it may be used.
-        fault: ``axes`` if wrong axes and ``offset`` if a wrong clock cause *trouble*; empty for other causes,
-            and without trouble.
-        offset_s: Time by which the clock of the IMU is ahead of that of the camera.  It is the offset that
-            was already in use, unless the measured offset differs from that by more than 3 ms.
+        trouble: Why the IMU must not be used, as a sentence; empty if it may be used.
+        fault: Kind of *trouble*: ``axes`` (they are not as ``T_imu_camera`` states), ``offset`` (the clocks
+            differ by more than 60 ms), or empty for any other kind and without trouble.
+        offset_s: Time by which the clock of the IMU is ahead of that of the camera: the measured offset if it
+            differs by more than 3 ms from the offset in use, else the offset in use.
         gyro_bias_rad_s: ``(3,)`` bias of the gyroscope, in the IMU's frame.
     """
 
@@ -92,11 +102,12 @@ class RateCheck:
 
 
 def find_sample_trouble(history: ImuHistory) -> str:
-    """Return in one line why the samples of an IMU cannot be used; empty if they can.
+    """Return as a sentence why the samples of an IMU cannot be used; empty if they can.
 
-    Faults are more than 5 % missing samples, more than 1 % saturated samples, an accelerometer that states g,
-    and one that does not measure 9.81 m/s^2 while the IMU is stationary.  Before 100 samples the result is
-    empty.
+    Faults are more than 5 % missing samples, more than 1 % saturated samples, an accelerometer whose unit is
+    g or whose mean magnitude is not 0.7 to 1.5 times gravity, and an accelerometer whose magnitude differs
+    from 9.81 m/s^2 by more than 0.6 m/s^2 while the IMU is stationary.  Fewer than 100 samples are not
+    checked.
     """
     samples, model = history.to_array(), history.model
     if len(samples) < _MIN_SAMPLES:
@@ -126,11 +137,11 @@ def find_sample_trouble(history: ImuHistory) -> str:
 
 
 def describe_gravity_error(measured_m_s2: float, circumstance: str) -> str:
-    """Return in one line how wrong an accelerometer is that measures gravity as *measured_m_s2*.
+    """Return as a sentence how wrong an accelerometer is that measures gravity as *measured_m_s2*.
 
-    Empty up to an error of 0.6 m/s^2, which the usual bias explains.  One direction of gravity does not
-    distinguish a wrong scale from a bias, so the line names both.  *circumstance* are words for the line that
-    say when it was measured, such as ``while stationary``.
+    Empty up to an error of 0.6 m/s^2, which the usual bias explains.  A measurement in one orientation does
+    not distinguish a wrong scale from a bias, so the sentence names both.  *circumstance* are words of the
+    sentence that say when gravity was measured, such as ``while stationary``.
     """
     error = measured_m_s2 - GRAVITY_M_S2
     if abs(error) <= MAX_GRAVITY_ERROR_M_S2:
@@ -143,10 +154,10 @@ def describe_gravity_error(measured_m_s2: float, circumstance: str) -> str:
 
 
 def _stationary_accel(samples: Array, model: ImuModel) -> float | None:
-    """Return the median magnitude of the specific force, m/s^2, in windows in which the IMU is stationary.
+    """Return the median magnitude of the mean specific force, m/s^2, of the stationary windows of 0.5 s.
 
-    Stationary means that neither rates nor forces scatter beyond the noise.  None with fewer than 3 such
-    windows of 0.5 s.
+    In a stationary window neither rates nor forces scatter by more than the noise of the sensor and an
+    allowance.  None if there are fewer than 3 such windows.
     """
     size = round(_REST_S * model.rate_hz)
     count = len(samples) // size
@@ -168,13 +179,15 @@ def check_rates(
     """Compare the gyroscope with the rotations of the camera: time offset, bias, unit, and axes.
 
     Args:
-        history: Samples of the time of the poses.
-        timestamps_s: ``(n,)`` of the poses, ascending.
+        history: Samples that cover the time of the poses.
+        timestamps_s: ``(n,)`` time stamps of the poses, ascending.
         R_world_camera: ``(n, 3, 3)`` rotations of the poses.
-        offset_s: Time offset in use, by which the IMU's clock is ahead; see `RateCheck.offset_s`.
+        offset_s: Offset in use, by which the clock of the IMU is ahead of that of the camera; it only decides
+            what `RateCheck.offset_s` is.
 
     Returns:
-        The result; None while there are too few poses, or the camera rotates too little to compare anything.
+        The result; None while there are fewer than 30 usable intervals between poses, or the camera rotates
+        too slowly or about one axis only.
 
     Source:
         Rotation between two sets of vectors: Kabsch, Acta Cryst. A32, 1976.
@@ -200,7 +213,7 @@ def check_rates(
         distances = np.linalg.norm(differences - np.median(differences, axis=0), axis=1)
         is_inlier = distances <= _OUTLIER_FACTOR * np.median(distances)
     camera_rates, gyro_rates = camera_rates[is_inlier], gyro_rates[is_inlier]
-    # 3. Compute the bias, and the ratio of both rates without their means.
+    # 3. Compute the gyroscope's bias, and the ratio of the deviations of both rates from their means.
     camera_centred = camera_rates - camera_rates.mean(axis=0)
     bias = gyro_rates.mean(axis=0) - camera_rates.mean(axis=0)
     gyro_centred = gyro_rates - gyro_rates.mean(axis=0)
@@ -211,7 +224,7 @@ def check_rates(
     is_mirrored = float(np.linalg.det(Q)) < 0.0
     if is_mirrored and not variances[0] > _MIN_RATE_SPREAD_RAD_S**2:
         # Rotations about two axes only do not determine the sign of the third axis: choose the sign that
-        # makes Q a rotation.
+        # makes Q a rotation.  A mirrored sensor is therefore found only from rotations about three axes.
         U[:, 2] *= -1.0
         Q, is_mirrored = U @ Vt, False
     residuals = gyro_centred @ Q.T / ratio - camera_centred
@@ -229,9 +242,10 @@ def check_rates(
 def _find_offset_s(history: ImuHistory, begins_s: Array, ends_s: Array, camera_rates: Array) -> float:
     """Return the time offset within 0.1 s at which the rates ``(n, 3)`` of camera and gyroscope fit best.
 
-    It is the time by which the clock of the IMU is ahead.  Begins and ends of the intervals are on the clock
-    of the camera.  Each offset is tried with the orthogonal matrix between the two sensors that fits best, so
-    that swapped axes do not hide an offset.  The maximum of the fit is interpolated by a parabola.
+    The offset is the time by which the clock of the IMU is ahead of that of the camera; *begins_s* and
+    *ends_s* of the intervals are on the clock of the camera.  For each offset, the rates of the gyroscope are
+    mapped to those of the camera by the orthogonal matrix that fits best, so that swapped axes do not hide an
+    offset.  The maximum of the fit is interpolated by a parabola.
     """
     camera_centred = camera_rates - camera_rates.mean(axis=0)
     offsets_s = np.arange(-_MAX_OFFSET_S, _MAX_OFFSET_S + 1e-9, _OFFSET_STEP_S)
@@ -256,12 +270,11 @@ def _find_rate_trouble(
 
     Args:
         ratio: Magnitude of the gyroscope's rates divided by that of the camera's.
-        Q: ``(3, 3)`` orthogonal matrix that maps the gyroscope's rates to the camera's; the identity if the
-            axes are as stated.
-        unexplained: Part of the camera's rates that the gyroscope does not explain with this matrix, 0 to 1.
-        offset_s: Time by which the clock of the IMU is ahead of that of the camera.
-        is_mirrored: Whether *Q* has the determinant -1, so that one axis has the wrong sign or two are
-            swapped.
+        Q: ``(3, 3)`` orthogonal matrix that maps the gyroscope's rates to the camera's, both in the frame of
+            the IMU by ``T_imu_camera``; the identity if the axes are as that pose states.
+        unexplained: What `_MAX_UNEXPLAINED` limits.
+        offset_s: Measured time by which the clock of the IMU is ahead of that of the camera.
+        is_mirrored: Whether *Q* has the determinant -1: one axis has the wrong sign, or two are swapped.
     """
     if unexplained > _MAX_UNEXPLAINED:
         return "", "the rates of the gyroscope do not follow the camera's, at any time offset within 100 ms"

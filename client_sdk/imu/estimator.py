@@ -1,4 +1,4 @@
-"""Use one IMU over a drive: check it, predict rotations between frames, and estimate gravity and scale."""
+"""Use one IMU during a drive: check it, predict rotations between frames, and estimate gravity and scale."""
 
 from __future__ import annotations
 
@@ -19,40 +19,46 @@ from rse_pf.slam.inertial import InertialMotion, KeyframeImu, upright_rotation
 
 __all__ = ["ImuEstimator", "ImuScale", "level_start_pose"]
 
-_POSE_STEP_S = 0.2  # smallest time between the tracked poses that are aligned with the IMU
-_MAX_POSES = 150  # newest poses that are aligned with the IMU, those of the last 30 seconds
-_MIN_POSES = 8  # poses that an alignment with the IMU needs
-_RETRY_S = 0.5  # time between two IMU alignments while gravity or scale are not known well enough
-_REPEAT_S = 2.0  # time between two IMU alignments once gravity and scale are known; biases still change
-_POSE_NOISE_PX = 0.33  # standard deviation of a tracked pose, as the shift of the image that it causes, px
-_MAX_SCALE_DEVIATION = 0.015  # largest relative standard deviation of a scale that is used
-_MAX_GRAVITY_DEVIATION_RAD = math.radians(0.5)  # largest standard deviation of gravity's direction in use
-_MAX_MISFIT = 12.0  # misfit of an alignment (1: the noise is as stated) above which it is not used
+_POSE_STEP_S = 0.2  # smallest time between two successive poses that are aligned with the IMU
+_MAX_POSES = 150  # most poses that are aligned with the IMU: those of the last 30 seconds
+_MIN_POSES = 8  # fewest poses that are aligned with the IMU
+_RETRY_S = 0.5  # time between two IMU alignments while gravity or scale is not known well enough
+_REPEAT_S = 2.0  # time between two IMU alignments when both are known well enough; biases still change
+_POSE_NOISE_PX = 0.33
+"""Standard deviation of a tracked pose, as the shift of the image in pixels: of the rotation it is 0.33 / fx
+rad, of the position 0.33 / fx times the median depth."""
+_MAX_SCALE_DEVIATION = 0.015  # largest standard deviation of a scale that is used, divided by the scale
+_MAX_GRAVITY_DEVIATION_RAD = math.radians(0.5)  # largest standard deviation of a direction of gravity in use
+_MAX_MISFIT = 12.0  # largest misfit of an alignment that is used; it is 1 if the noise is as stated
 _MAX_MISFITS_IN_A_ROW = 3
-"""Successive alignments with a misfit above `_MAX_MISFIT`, after which the IMU is not used any more.  A
-single such alignment may be the fault of a wrong pose."""
-_MAX_BIAS_CHANGE_RAD_S = 0.005  # change of an axis of the gyroscope's bias above which a motion is redone
+"""After this many successive alignments with a misfit above `_MAX_MISFIT` the IMU is not used any more; the
+cause of fewer may be a wrong pose."""
+_MAX_BIAS_CHANGE_RAD_S = 0.005
+"""A cached motion is preintegrated again if an axis of the gyroscope's bias has changed by more than this
+since."""
 _MAX_CACHED_MOTIONS = 4 * _MAX_POSES
-"""Preintegrated motions in the cache, above which it is emptied.  One alignment uses fewer than `_MAX_POSES`,
-so that this rarely happens."""
-_RATE_CHECK_S = 20.0  # seconds of newest poses whose rotations are compared with the gyroscope
+"""The cache of preintegrated motions is emptied when it has more than this many.  One alignment uses fewer
+than `_MAX_POSES`, so this happens rarely."""
+_RATE_CHECK_S = 20.0  # the rotations of the poses of this many last seconds are compared with the gyroscope
 _MAX_MOTION_S = 10.0  # longest preintegrated motion that a keyframe contains: longer ones are too uncertain
 _MIN_GRAVITY_DEVIATION_RAD = 1e-3  # smallest standard deviation of gravity's direction that a keyframe states
 _MAX_STATIONARY_ERROR = 0.25
-"""Largest relative difference between 9.81 m/s^2 and the magnitude of the mean specific force, for which this
-mean counts as gravity of a stationary camera."""
+"""Largest difference between the magnitude of the mean specific force and 9.81 m/s^2, as a fraction of the
+latter, with which `stationary_gravity` returns a result."""
 _R_WORLD_LEVEL_CAMERA: Array = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 """Rotation of a level camera (z ahead, y down) in a world with x ahead, y left, z up (ROS REP 103)."""
 
 
 class ImuEstimator:
-    """Estimate time offset, biases, gravity and scale of one IMU, as far as the drive has shown them.
+    """Estimate time offset, biases, gravity and scale with one IMU, as far as the motion determines them.
 
     Attributes:
-        trouble: Why the IMU is not used, in one line; empty while it may be used.  Once it is set, it stays.
+        trouble: Why the IMU is not used, as a sentence; empty while it may be used.  Once it is set, it
+            stays.
         offset_s: Time by which the clock of the IMU is ahead of that of the camera; 0 until `align` has
             measured an offset of more than 3 ms.
-        alignment: Result of the newest `align`; None before it, if it failed, and after `forget_gravity`.
+        alignment: Result of the last `align`; None before the first, if the last had no result, and after
+            `forget_gravity`.
     """
 
     def __init__(self, model: ImuModel, camera: Camera) -> None:
@@ -62,7 +68,7 @@ class ImuEstimator:
         self._history = ImuHistory(model)
         self._camera = camera
         self._gyro_bias: Array = np.zeros(3)
-        self._has_agreed = False  # whether the rates of gyroscope and camera have agreed once
+        self._has_agreed = False  # whether `check_rates` has compared the rates once and found no fault
         self._due_s = float("-inf")
         self._misfits_in_a_row = 0
         self._motions: dict[tuple[float, float], Preintegration] = {}
@@ -76,8 +82,8 @@ class ImuEstimator:
 
         Returns:
             ``R_begin_end`` ``(3, 3)``, which maps vectors from the camera's frame at the end to its frame at
-            the begin.  None if samples are missing, until the gyroscope has agreed with the camera's
-            rotations in an `align`, and once ``trouble`` is set.
+            the begin.  None if samples are missing, before an `align` has compared the gyroscope with the
+            camera's rotations and found no fault, and when ``trouble`` is set.
         """
         if not self._has_agreed or self.trouble:
             return None
@@ -93,14 +99,14 @@ class ImuEstimator:
         return camera_rotation
 
     def forget_gravity(self) -> None:
-        """Forget the alignment, because the poses are in another world from now on; `align` is due at once.
+        """Discard the alignment, because the next poses are in another world; `align` is due at once.
 
-        The gyroscope's bias and the time offset are kept.
+        The gyroscope's bias and the time offset stay.
         """
         self.alignment, self._due_s = None, float("-inf")
 
     def is_due(self, timestamp_s: float) -> bool:
-        """Return whether `align` should run at the time of a frame; never once ``trouble`` is set."""
+        """Return whether `align` should run at the frame of *timestamp_s*; False when ``trouble`` is set."""
         return not self.trouble and timestamp_s >= self._due_s
 
     def align(
@@ -109,20 +115,20 @@ class ImuEstimator:
         """Align the IMU with the newest tracked poses.
 
         Args:
-            timestamps_s: ``(n,)`` of all poses of one world, ascending; without poses the result is None.
-            T_world_camera: ``(n, 4, 4)``.
-            depth: Median depth of what the camera sees, in the unit of the poses; scales their noise.
+            timestamps_s: ``(n,)`` time stamps of all poses of one world, ascending; n may be 0.
+            T_world_camera: ``(n, 4, 4)`` poses of the camera.
+            depth: Median depth of the scene in the unit of the poses; the noise of positions is proportional.
             is_metric: Whether the unit of the poses is the metre.
 
         Returns:
-            The alignment; None if the poses do not determine it, or if there is a fault, which is then in
-            ``trouble``.
+            The alignment.  None if the poses do not determine it, if its misfit is too large to use it, or if
+            the IMU has a fault, which ``trouble`` then states.
         """
         self.alignment = None
         if not len(timestamps_s) or self.trouble:
             return None
         self._due_s = float(timestamps_s[-1]) + _RETRY_S
-        # 1. Check samples and gyroscope; find the time offset and a first bias.
+        # 1. Check the samples and the gyroscope; measure the time offset and a first gyroscope bias.
         if not self._check(timestamps_s, T_world_camera):
             return None
         # 2. Choose poses 0.2 s apart, and preintegrate the motions between them.
@@ -141,7 +147,7 @@ class ImuEstimator:
             return None
         if alignment is None:
             return None
-        # 4. Drop an alignment in which IMU and camera disagree; after three in a row give up the IMU.
+        # 4. Discard an alignment with a large misfit; after three in a row the IMU is not used any more.
         self._misfits_in_a_row = self._misfits_in_a_row + 1 if alignment.misfit > _MAX_MISFIT else 0
         if self._misfits_in_a_row >= _MAX_MISFITS_IN_A_ROW:
             self.trouble = (
@@ -150,7 +156,7 @@ class ImuEstimator:
             )
         if self._misfits_in_a_row:
             return None
-        # 5. Store the alignment and its gyroscope bias; wait longer once gravity and scale are known.
+        # 5. Store the alignment and its gyroscope bias; wait longer if gravity and scale are known.
         self._gyro_bias = alignment.gyro_bias_rad_s
         self.alignment = alignment
         is_gravity_known = alignment.gravity_deviation_rad <= _MAX_GRAVITY_DEVIATION_RAD
@@ -170,10 +176,10 @@ class ImuEstimator:
         return alignment.gravity_m_s2
 
     def stationary_gravity(self) -> Array | None:
-        """Return gravity ``(3,)`` in the frame of the camera, m/s^2: minus the mean specific force so far.
+        """Return gravity ``(3,)`` in the camera's frame, m/s^2: the negative mean specific force so far.
 
-        This is right if the camera was stationary.  None if the mean specific force is not within 25 % of
-        9.81 m/s^2: the camera moves, or the unit is another one.
+        It is right only if the camera was stationary.  None if the magnitude of the mean specific force is
+        not within 25 % of 9.81 m/s^2: the camera has moved, or the unit is not m/s^2.
         """
         accel = self._history.mean_accel()
         if accel is None or abs(float(np.linalg.norm(accel)) / GRAVITY_M_S2 - 1.0) > _MAX_STATIONARY_ERROR:
@@ -188,12 +194,12 @@ class ImuEstimator:
 
         Args:
             T_world_camera: ``(4, 4)`` pose of the keyframe in the world of the last alignment.
-            previous_s: Time stamp of the previous keyframe of the segment; None: there is none.
+            previous_s: Time stamp of the previous keyframe of the segment; None if there is none.
             timestamp_s: Time stamp of the keyframe.
 
         Returns:
-            The direction of gravity, with the motion unless samples are missing, the motion took longer than
-            10 s, or there is no previous keyframe.  None while gravity is not known.
+            None while gravity is not known.  Otherwise the direction of gravity, and the motion if there is a
+            previous keyframe, no samples are missing, and at most 10 s have passed.
         """
         gravity = self.gravity_m_s2
         if gravity is None or self.alignment is None or self.trouble:
@@ -224,8 +230,8 @@ class ImuEstimator:
     def _check(self, timestamps_s: Array, T_world_camera: Array) -> bool:
         """Return whether the IMU may be used; set ``trouble``, the time offset and the first gyroscope bias.
 
-        A changed time offset empties the cache of motions.  While the camera rotates too little to compare
-        rates, the answer is whether they have agreed once.
+        A changed time offset empties the cache of motions.  If the camera rotates too little to compare
+        rates, an earlier comparison without a fault counts.
         """
         self.trouble = find_sample_trouble(self._history)
         if self.trouble:
@@ -249,10 +255,10 @@ class ImuEstimator:
     def _covered_by_samples(
         self, timestamps_s: Array, rows: list[int]
     ) -> tuple[list[int], list[Preintegration]]:
-        """Return the newest of *rows* without a gap in the samples between them, and the motions.
+        """Return the longest end of *rows* between whose poses no samples are missing, and the motions.
 
-        The motions are those between neighbouring rows.  *rows* are ascending and not empty; the last one is
-        returned in any case.
+        The motions are those between successive rows of the result.  *rows* are ascending and not empty; the
+        last one is always in the result.
         """
         covered = rows[-1:]
         motions: list[Preintegration] = []
@@ -265,10 +271,11 @@ class ImuEstimator:
         return covered, motions
 
     def _motion_between(self, begin_s: float, end_s: float) -> Preintegration | None:
-        """Return the preintegrated motion between two times of the camera; None where samples are missing.
+        """Return the preintegrated motion between two times of the camera; None if samples are missing.
 
-        It comes from the cache, if the gyroscope's bias changed by at most 0.005 rad/s since.  The
-        accelerometer's bias is taken as 0.
+        It comes from the cache if no axis of the gyroscope's bias has changed by more than 0.005 rad/s since.
+        It is preintegrated with the present gyroscope bias and an accelerometer bias of 0; `align_imu`
+        corrects both.
         """
         motion = self._motions.get((begin_s, end_s))
         if motion is None or np.abs(motion.gyro_bias_rad_s - self._gyro_bias).max() > _MAX_BIAS_CHANGE_RAD_S:
@@ -283,7 +290,7 @@ class ImuEstimator:
 
 
 class ImuScale:
-    """Metric scale of a camera without depth by its IMU, estimated again and again over the drive."""
+    """Estimate the metric scale of a camera without depth by its IMU, repeatedly during the drive."""
 
     name = "the IMU"
 
@@ -291,10 +298,10 @@ class ImuScale:
         self._imu = imu
 
     def observe(self, timestamp_s: float, rgb: npt.NDArray[np.uint8], position_m: Array | None) -> None:
-        """Do nothing: the mapper adds the IMU samples of frames itself."""
+        """Do nothing: the mapper passes the IMU samples of frames to the `ImuEstimator` itself."""
 
     def is_due(self, timestamp_s: float, *, is_known: bool) -> bool:
-        """Return whether the scale should be estimated again, also after it is known."""
+        """Return whether the scale should be estimated again; it is repeated even if the scale is known."""
         return self._imu.is_due(timestamp_s)
 
     def metres_per_unit(
@@ -311,10 +318,10 @@ class ImuScale:
 
 
 def level_start_pose(gravity_camera: Array) -> Array:
-    """Return ``T_world_camera`` ``(4, 4)`` of a first camera, at the origin of a world whose z points up.
+    """Return the pose ``T_world_camera`` ``(4, 4)`` of the first frame, at the origin of a world with z up.
 
-    A level camera looks along x.  Another camera is rotated from there by the smallest angle that makes
-    gravity point down.
+    A level camera looks along x.  The pose of a camera that is not level is that of a level one, rotated by
+    the smallest angle with which gravity points down.
 
     Args:
         gravity_camera: ``(3,)`` gravity in the frame of the camera, of any length above 0.
@@ -326,9 +333,9 @@ def level_start_pose(gravity_camera: Array) -> Array:
 
 
 def _spaced_rows(timestamps_s: Array) -> list[int]:
-    """Return the ascending rows of poses that are at least 0.2 s apart, chosen from the first pose on.
+    """Return ascending rows of poses that are at least 0.2 s apart, beginning with the first pose.
 
-    A longer drive gives the same rows and more, so that motions between them can be cached.
+    When poses are appended, rows are appended and none changes, so that motions between rows can be cached.
     """
     rows = [0]
     for row in range(1, len(timestamps_s)):

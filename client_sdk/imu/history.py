@@ -11,15 +11,19 @@ __all__ = ["ImuHistory"]
 
 _KEPT_S = 300.0  # samples older than this are dropped, so that the memory of a long drive is bounded
 _MAX_GAP_INTERVALS = 5.0
-"""Longest distance between two samples, in sampling intervals, over which they are interpolated: beyond it
-samples were lost, and the motion between them is unknown."""
+"""Longest time between two successive samples, in sampling intervals, over which they are interpolated: after
+a longer time too many samples are missing, and the motion is unknown."""
 _MAX_HOLD_INTERVALS = 1.5
-"""Longest time after the newest sample, in sampling intervals, for which the values of this sample are
-assumed: a frame often arrives before the first sample that is later than it."""
+"""Longest time from the newest sample to the end of an interval, in sampling intervals, for which the values
+of the newest sample are used at the end: a frame often arrives before the first sample that is later than the
+frame."""
 
 
 class ImuHistory:
-    """Samples of the last five minutes; ``model`` is the model of the samples that were added last."""
+    """Samples of the last five minutes, with time stamps on the clock of the IMU.
+
+    ``model`` is the model of the samples that were added last.
+    """
 
     def __init__(self, model: ImuModel) -> None:
         self.model = model
@@ -27,7 +31,7 @@ class ImuHistory:
         self._samples: Array = np.empty((0, 7))
 
     def add(self, samples: ImuSamples) -> None:
-        """Append the samples that are later than the newest known one; the others are ignored."""
+        """Append the samples that are later than `last_s`; the others are ignored."""
         self.model = samples.model
         part = np.column_stack([samples.timestamps_s, samples.gyro, samples.accel])
         part = part[part[:, 0] > self.last_s]
@@ -46,12 +50,14 @@ class ImuHistory:
 
         Args:
             begin_s: Begin of the interval on the clock of the camera.
-            end_s: End of the interval, later than *begin_s*.
-            shift_s: Added to both times to convert them to the clock of the IMU.
+            end_s: End of the interval on the clock of the camera, later than *begin_s*.
+            shift_s: Time by which the clock of the IMU is ahead of that of the camera; it is added to both
+                times.
 
         Returns:
-            Samples with time stamps on the clock of the IMU.  None if samples are missing, or if they begin
-            after *begin_s* or end more than 1.5 sampling intervals before *end_s*.
+            Samples with time stamps on the clock of the IMU.  None if two successive samples of the interval
+            are more than 5 sampling intervals apart, if the first known sample is after the begin, or if the
+            last one is more than 1.5 sampling intervals before the end.
         """
         samples = self.to_array()
         begin_s, end_s = begin_s + shift_s, end_s + shift_s
@@ -77,8 +83,8 @@ class ImuHistory:
     def mean_gyro(self, begins_s: Array, ends_s: Array) -> Array:
         """Return the mean angular rates ``(n, 3)`` of n intervals, rad/s, in the IMU's frame.
 
-        *begins_s* and *ends_s* ``(n,)`` are on the clock of the IMU.  Before the first and after the last
-        sample the rates count as 0.
+        *begins_s* and *ends_s* ``(n,)`` are on the clock of the IMU.  The part of an interval before the
+        first sample or after the last sample counts with a rate of 0.
         """
         samples = self.to_array()
         dt = np.diff(samples[:, 0])[:, None]

@@ -6,8 +6,8 @@ With *i* and *j* the frames of the IMU at begin and end, *g* gravity in the worl
     delta_velocity = R_world_i' (v_j - v_i - g dt)
     delta_position = R_world_i' (p_j - p_i - v_i dt - g dt^2 / 2)
 
-The right sides depend on the initial velocity and on gravity; the left sides depend on the samples and the
-biases alone, so that they are computed once.
+The right sides contain the unknown poses, velocities and gravity.  The left sides depend on the samples and
+the biases alone, so that they are computed once, and not again in each step of an optimisation.
 
 Source:
     Forster et al., "On-Manifold Preintegration for Real-Time Visual-Inertial Odometry", T-RO 2017.
@@ -42,11 +42,11 @@ class Preintegration:
         delta_velocity_m_s: ``(3,)`` change of velocity without gravity, in the IMU's frame at the begin.
         delta_position_m: ``(3,)`` change of position without initial velocity and gravity, in the same frame.
         duration_s: Time between the two frames, above 0.
-        covariance: ``(9, 9)`` of the errors of rotation (rotation vector on the right, rad), velocity and
-            position.
-        bias_jacobian: ``(9, 6)`` derivatives of rotation (rotation vector on the right), velocity and
-            position by the biases of gyroscope and accelerometer, to correct the motion for small changes of
-            the biases.
+        covariance: ``(9, 9)`` covariance of the errors of rotation (a rotation vector on the right, rad),
+            velocity (m/s) and position (m), in this order.
+        bias_jacobian: ``(9, 6)`` derivatives of rotation (a rotation vector on the right), velocity and
+            position by the biases of gyroscope and accelerometer; with them the motion is corrected for small
+            changes of the biases.
         gyro_bias_rad_s: ``(3,)`` bias that was subtracted from the angular rates.
         accel_bias_m_s2: ``(3,)`` bias that was subtracted from the specific forces.
     """
@@ -65,7 +65,7 @@ def preintegrate(samples: ImuSamples, gyro_bias_rad_s: Array, accel_bias_m_s2: A
     """Preintegrate from the first sample to the last one, with the midpoint rule.
 
     Args:
-        samples: Two or more.
+        samples: Two samples or more; their white noise is that of their model.
         gyro_bias_rad_s: ``(3,)``, subtracted from the angular rates.
         accel_bias_m_s2: ``(3,)``, subtracted from the specific forces.
 
@@ -108,8 +108,8 @@ def preintegrate(samples: ImuSamples, gyro_bias_rad_s: Array, accel_bias_m_s2: A
         A[_VELOCITY, _ACCEL_BIAS] = -step_s * middle_rotation
         A[_POSITION] += 0.5 * step_s * A[_VELOCITY]
         A[_POSITION, _VELOCITY] = step_s * np.eye(3)
-        # 3. Propagate derivatives and covariance.  White noise acts on a step as a bias of this step alone
-        # would, so that the derivatives by the biases propagate it.
+        # 3. Propagate derivatives and covariance.  The white noise of a step has the same effect on rotation,
+        #    velocity and position as a bias in this step alone, so it has the same derivatives.
         transition = A @ transition
         covariance = A @ covariance @ A.T
         by_gyro, by_accel = A[:, _GYRO_BIAS].copy(), A[:, _ACCEL_BIAS].copy()

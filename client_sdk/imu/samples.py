@@ -1,6 +1,7 @@
-"""Samples of an inertial measurement unit, as they travel with the frames of a robot, and its model.
+"""Samples of an inertial measurement unit (IMU), which belong to the frames of a robot, and the IMU's model.
 
-Raw samples stay on the robot; only gravity and preintegrated motions of keyframes are sent.
+Raw samples stay on the robot; it sends only the direction of gravity and the preintegrated motion of a
+keyframe.
 """
 
 from __future__ import annotations
@@ -16,18 +17,19 @@ from rse_pf.geometry import Array, rigid
 __all__ = ["MAX_SAMPLES", "ImuModel", "ImuSamples", "check_samples"]
 
 MAX_SAMPLES = 100_000
-"""Largest number of IMU samples that one frame carries: 20 seconds of an IMU at 5 kHz."""
-_MIN_RATE_HZ = 10.0  # slowest IMU: below it the camera itself measures rotations more often
-_MAX_RATE_HZ = 10_000.0  # fastest IMU: a larger number is a rate in another unit
-_MAX_LEVER_ARM_M = 10.0  # longest distance between IMU and camera: a longer one is not in metres
+"""Most IMU samples that one frame may have: 20 seconds of an IMU at 5 kHz."""
+_MIN_RATE_HZ = 10.0  # smallest rate of an IMU: below it the camera itself measures rotations more often
+_MAX_RATE_HZ = 10_000.0  # largest rate of an IMU: a larger number is probably not in Hz
+_MAX_LEVER_ARM_M = 10.0  # longest distance between IMU and camera: a larger number is probably not in metres
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ImuModel:
-    """Mounting, noise and range of an IMU; the noise is defined as in the files of Kalibr and EuRoC.
+    """Mounting, noise and range of an IMU; the four noise densities are defined as in the files of Kalibr.
 
     Attributes:
-        T_imu_camera: ``(4, 4)`` pose of the camera (of a pair: the rectified left one) in the IMU's frame.
+        T_imu_camera: ``(4, 4)`` pose of the camera (of a stereo pair: the rectified left one) in the frame of
+            the IMU, metres.
         gyro_noise: White noise of the gyroscope, rad/s/sqrt(Hz).
         gyro_walk: Random walk of the gyroscope's bias, rad/s^2/sqrt(Hz).
         accel_noise: White noise of the accelerometer, m/s^2/sqrt(Hz).
@@ -37,7 +39,8 @@ class ImuModel:
         max_accel: Acceleration at which the accelerometer saturates, m/s^2.
 
     Raises:
-        UsageError: The pose is no rigid motion within 10 m, or a number is outside its range.
+        UsageError: *T_imu_camera* is not a rigid motion, its translation is above 10 m, or another number is
+            outside its range.
     """
 
     T_imu_camera: Array
@@ -77,15 +80,14 @@ class ImuModel:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImuSamples:
-    """Samples since the last frame.
+    """IMU samples that belong to one frame: those since the frame before it.
 
-    The time stamps should be on the clock of the camera.  `ImuEstimator` measures and corrects a constant
-    offset of up to 60 ms between the clock of the IMU and that of the camera.  The first sample is at or
-    before the last frame and the last sample at or after this frame, as far as such samples exist, so that
-    samples can be interpolated at both frames.
+    The first sample is at or before the previous frame and the last sample at or after this frame, as far as
+    such samples exist, so that samples can be interpolated at both frames.
 
     Attributes:
-        timestamps_s: ``(n,)``, strictly ascending.
+        timestamps_s: ``(n,)``, strictly ascending, on the clock of the IMU.  This clock may differ from that
+            of the camera by a constant of up to 60 ms, which `ImuEstimator` measures and corrects.
         gyro: ``(n, 3)`` angular rates in the IMU's frame, rad/s.
         accel: ``(n, 3)`` specific forces in the IMU's frame, m/s^2: a stationary IMU measures 9.81 upwards.
         model: Model of the IMU.
