@@ -260,13 +260,13 @@ class BatchMerge:
             links += [_moved(link, pair, starts) for link in links_of(result)]
             failed.update({(*pair, reason): count for reason, count in result.counts.items()})
         self._links = tuple(sorted(links, key=lambda link: (link.a, link.b)))
-        return LoopProposals(links=self._links, failed=failed)
+        return LoopProposals(loop_closures=self._links, failed=failed)
 
     def _select(
         self, atlas: Atlas, proposals: LoopProposals, options: MergeOptions
     ) -> tuple[list[LoopClosure], RejectionCounts]:
         groups: dict[tuple[int, int], list[LoopClosure]] = {pair: [] for pair in self._pairs}
-        for link in proposals.links:
+        for link in proposals.loop_closures:
             groups[map_pair_of(atlas, link.a, link.b)].append(link)
         wanted = [number for number, pair in enumerate(self._pairs) if groups[pair]]
         results = self._run([self._agreeing[number] for number in wanted])

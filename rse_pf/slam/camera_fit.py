@@ -28,7 +28,7 @@ _CENTRE_DEVIATION = 0.1  # prior standard deviation of the principal point, as a
 _SHUTTER_DEVIATION_PX = 20.0
 """Prior standard deviation, px, of the shift between the first and the last row of an image that a rolling
 shutter and the motion of the camera cause."""
-# Smallest depth in metres with which a point is projected; nearer points, and those behind the camera, get it.
+# Smallest depth in metres with which a point is projected, also a nearer one or one behind the camera.
 _MIN_DEPTH_M = 0.05
 _MIN_VARIANCE_PX2 = 0.1  # smallest variance of a pixel, px^2, that is assumed however well all matches fit
 _CORRELATION_FACTOR = 5.0

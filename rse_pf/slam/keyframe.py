@@ -13,7 +13,7 @@ All numbers are little-endian::
               (uint32); the content follows
     camera    kind 1: model (uint8; 1: pinhole), number in the rig (uint8; 0), width, height (uint16),
               fx, fy, cx, cy (float64)
-    features  kind 2: detector (uint8; 1: ORB, 2: named), metric (uint8; 1: Hamming distance of bits,
+    features  kind 2: detector (uint8; 1: ORB, 2: named), distance (uint8; 1: Hamming distance of bits,
               2: squared Euclidean distance of int8), bytes of a descriptor (uint16), number of features n
               (uint16), f (uint8): pixels are stored in units of 2**-f px, length of the name (uint8; 0 for
               ORB); n columns and n rows (uint16), n descriptors, the name of the feature kind (ASCII)
@@ -21,13 +21,15 @@ All numbers are little-endian::
               1, depths: n depths in mm (uint16);
               2, disparities of a stereo pair: focal length in px times baseline in m (float64), n
               disparities in 1/64 px (uint16), which also hold depths beyond 65 m;
-              3, depths of an odometry segment without metric scale: the unit of depth (float64), in the
-              unknown unit of length of T_odom_camera; n depths in this unit (uint16; 0: unknown depth)
-    noise     kind 5, optional: the standard deviation in metres of a depth z in metres is
-              base + growth * max(0, z - from)^2 (3 float64); without this block the noise of a Kinect
-    IMU       kind 6, optional: gravity, and the motion since the last keyframe: `rse_pf.slam.inertial`
-    points    kind 7, optional: reference to its coloured points: `rse_pf.slam.keyframe_points`
-    image     kind 8, optional: reference to its image, a JPEG file
+              3, depths of an odometry segment without metric scale: a unit (float64), and n numbers
+              (uint16; 0: unknown depth); number times unit is a depth in the unit of length of the
+              segment, which is also that of T_odom_camera and unknown in metres
+    noise     kind 5, optional: base_m, growth_per_m and from_m (3 float64) of `rse_pf.pnp.DepthNoise`;
+              without this block its default values, those of a Kinect
+    IMU       kind 6, optional: gravity, and the motion since the previous keyframe: `rse_pf.slam.inertial`
+    points    kind 7, optional: reference to the coloured points of the keyframe:
+              `rse_pf.slam.keyframe_points`
+    image     kind 8, optional: reference to the image of the keyframe, a JPEG file
 
 Blocks are in ascending order of their kinds.
 """
@@ -102,8 +104,9 @@ _OPTIONAL_BLOCKS = {_NOISE_BLOCK: "noise", _IMU_BLOCK: "IMU", _POINTS_BLOCK: "po
 _PINHOLE = 1  # number by which the camera block names the pinhole model
 _ORB_DETECTOR = 1  # number by which the features block names the detector ORB
 _NAMED_DETECTOR = 2  # number by which the features block announces the name of another kind of features
-_METRICS = {"uint8": 1, "int8": 2}
-"""Number of the metric in the features block by the dtype of descriptors: 1 Hamming, 2 Euclidean distance."""
+_DISTANCES = {"uint8": 1, "int8": 2}
+"""Number by which the features block names the distance of descriptors, by their dtype: 1 is the Hamming
+distance, 2 the squared Euclidean distance."""
 _DEPTHS = 1  # number by which the geometry block announces depths in millimetres
 _DISPARITIES = 2  # number by which the geometry block announces disparities of a stereo pair
 _SCALELESS_DEPTHS = 3  # number by which the geometry block announces depths without metric scale
@@ -118,8 +121,8 @@ _FINEST_PIXEL_FRACTION = 4
 _COARSEST_PIXEL_FRACTION = 2
 """Exponent of the coarsest unit of encoded pixels: 2**-2 px, for images up to 16,383 px wide."""
 _BORDER_PX = 64
-"""Distance in pixels by which an undistorted feature may lie beyond the right or the lower edge of the image;
-beyond the other edges its coordinates would be negative, which are not encoded."""
+"""Largest distance in pixels of an undistorted feature beyond the right or the lower edge of the image.
+Beyond the left or the upper edge a coordinate would be negative, which the encoding does not hold."""
 _DISPARITY_STEPS_PER_PX = 64  # disparities are encoded in units of 1/64 px
 _MAX_STEPS = 65_535  # largest number that encodes a depth or a disparity: a uint16
 _MIN_DEPTH_MM = 10  # smallest depth of a depth camera that is encoded, in millimetres
@@ -132,11 +135,9 @@ _MAX_MEDIAN_DEPTHS = 16.0
 """A depth without metric scale is encoded as unknown if it is more than this multiple of the median depth of
 its keyframe: the position of such a far landmark is inaccurate."""
 _MIN_UNIT = 1e-9
-"""Smallest unit in which depths without metric scale are encoded, as a multiple of their segment's unit of
-length."""
+"""Smallest quantisation step of depths without metric scale, in the unit of length of their segment."""
 _MAX_UNIT = 1e3
-"""Largest unit in which depths without metric scale are encoded, as a multiple of their segment's unit of
-length."""
+"""Largest quantisation step of depths without metric scale, in the unit of length of their segment."""
 _MAX_TIME_S = 1e12
 """Largest time of a keyframe in seconds after or before 1970; larger numbers overflow in later
 computations."""
@@ -153,14 +154,16 @@ class KeyframeFeatures:
     Attributes:
         pixels: ``(n, 2)`` float32, undistorted.
         depths_m: ``(n,)`` float32 along the optical axis.  In metres and above 0 if `unit` is None; otherwise
-            in the unknown unit of length of the robot's segment, and 0 where the depth is unknown.
+            in the unit of length of the robot's segment, which is unknown in metres, and 0 where the depth is
+            unknown.
         descriptors: ``(n, d)``.
-        noise: The robot's noise model of metric depths; not used for depths without metric scale.
+        noise: The noise model of the camera that measured metric depths; not used for depths without metric
+            scale.
         kind: The kind of the descriptors.
         f_baseline: Focal length in px times baseline in m of the stereo pair whose disparities are encoded;
             0 for a depth camera.
-        unit: None for metric depths; else the length, in the segment's unit of length, of which the depths
-            are whole multiples.
+        unit: None for metric depths; else the quantisation step of which all depths are whole multiples, in
+            the unit of length of the robot's segment.
     """
 
     pixels: npt.NDArray[np.float32]
@@ -199,8 +202,9 @@ class UnknownBlock:
 class SentKeyframe:
     """A keyframe as a robot sends it and as the log of a live map stores it.
 
-    It has no id and no robot, which a live map knows from the position in its log and from the token.  The
-    keyframe of a map version is `rse_pf.maps.format.Keyframe`: `in_map` and `from_map` convert between both.
+    It holds neither an id nor the name of its robot: a live map numbers keyframes in the order of their
+    arrival, and knows the robot from the token of the request.  The keyframe of a map version is
+    `rse_pf.maps.format.Keyframe`; `in_map` and `from_map` convert between both.
 
     Attributes:
         timestamp_s: When the image was taken, Unix seconds.
@@ -288,8 +292,8 @@ def make_features(
     """Return the features of a keyframe, rounded as they are encoded, without those that cannot be encoded.
 
     Pixels are rounded to 1/16 px (1/8 or 1/4 px in images wider than 4,095 px), depths to 1 mm, or their
-    disparities to 1/64 px.  Of more than `max_features` features the first ones are used: ORB returns the
-    features of the finest pyramid level first, which give the most loop closures.
+    disparities to 1/64 px.  Of more than `max_features` features the first ones are used.  ORB returns the
+    features of the finest pyramid level first, and features of that level give the most loop closures.
 
     Args:
         pixels: ``(n, 2)``, undistorted; features outside 0..16383 px are left out.
@@ -354,8 +358,8 @@ def make_scaleless_features(
         kind: The kind of the descriptors.
 
     Raises:
-        BadRequest: The shapes do not fit, or the depths are so small or large that their unit is not within
-            1e-9..1e3.
+        BadRequest: The shapes do not fit, or the largest depth (at most 16 times the median depth) is not
+            within 6.6e-5..6.6e7, so that its quantisation step is not within 1e-9..1e3.
     """
     _check_shapes(pixels, depths, descriptors, kind)
     # 1. Find the features with a pixel that can be encoded, and those of them with a depth.
@@ -368,7 +372,8 @@ def make_scaleless_features(
     unit = min(max_depth, float(known_depths[has_depth].max(initial=0.0)) or 1.0) / _MAX_STEPS
     if not _MIN_UNIT <= unit <= _MAX_UNIT:
         raise BadRequest(
-            f"depths up to {unit * _MAX_STEPS:g} have no unit within {_MIN_UNIT:g}..{_MAX_UNIT:g}",
+            f"depths up to {unit * _MAX_STEPS:g} are not within {_MIN_UNIT * _MAX_STEPS:g}.."
+            f"{_MAX_UNIT * _MAX_STEPS:g} units of length of the segment",
             hint="choose a unit of the segment in which depths are around 1",
         )
     # 3. Round the depths; those beyond the farthest accurate depth become unknown.
@@ -640,14 +645,14 @@ def _decode_features(
     # 1. Check the sizes by the head of the features block.
     if end - begin < _FEATURES_STRUCT.size or geometry_end - geometry_begin < _GEOMETRY_STRUCT.size:
         raise _bad_keyframe("the block of the features or of the geometry is too short")
-    detector, metric, descriptor_bytes, n, fraction, name_bytes = _FEATURES_STRUCT.unpack_from(data, begin)
+    detector, distance, descriptor_bytes, n, fraction, name_bytes = _FEATURES_STRUCT.unpack_from(data, begin)
     if not _COARSEST_PIXEL_FRACTION <= fraction <= _FINEST_PIXEL_FRACTION:
         raise _bad_keyframe(f"pixels in units of 2**-{fraction} px are not known")
     if end - begin != _FEATURES_STRUCT.size + n * (4 + descriptor_bytes) + name_bytes:
         raise _bad_keyframe(
             f"{end - begin} bytes are not {n} features with descriptors of {descriptor_bytes}"
         )
-    kind = _decode_kind(detector, metric, descriptor_bytes, bytes(data[end - name_bytes : end]))
+    kind = _decode_kind(detector, distance, descriptor_bytes, bytes(data[end - name_bytes : end]))
     if n > max_features(kind):
         raise _bad_keyframe(f"{n} features of {kind} are above {max_features(kind)}")
     # 2. Decode the depths.
@@ -658,7 +663,9 @@ def _decode_features(
     max_column = (camera.width + _BORDER_PX) << fraction
     max_row = (camera.height + _BORDER_PX) << fraction
     if n and (steps[0].max() > max_column or steps[1].max() > max_row):
-        raise _bad_keyframe(f"a pixel lies outside the image of {camera.width}x{camera.height} px")
+        raise _bad_keyframe(
+            f"a pixel lies more than {_BORDER_PX} px outside the image of {camera.width}x{camera.height} px"
+        )
     # 4. Decode the descriptors.
     descriptors = np.frombuffer(
         data, dtype=kind.dtype, count=n * kind.size, offset=begin + _FEATURES_STRUCT.size + 4 * n
@@ -683,7 +690,10 @@ def _decode_depths(
     """
     depth_type, zero, count = _GEOMETRY_STRUCT.unpack_from(data, begin)
     if depth_type not in (_DEPTHS, _DISPARITIES, _SCALELESS_DEPTHS) or zero:
-        raise _bad_keyframe(f"geometry of kind {depth_type} is not known", "send a depth for each feature")
+        raise _bad_keyframe(
+            f"geometry of kind {depth_type} is not known",
+            f"send kind {_DEPTHS}, {_DISPARITIES} or {_SCALELESS_DEPTHS}, and 0 in the byte that follows it",
+        )
     scale_begin = begin + _GEOMETRY_STRUCT.size
     depths_begin = scale_begin + (0 if depth_type == _DEPTHS else _SCALE_STRUCT.size)
     if count != n or end - depths_begin != 2 * n:
@@ -721,17 +731,17 @@ def _decode_depths(
 
 def _kind_numbers(kind: DescriptorKind) -> tuple[int, int, int]:
     """Return detector, metric and bytes of a descriptor, as the features block states them."""
-    return (_ORB_DETECTOR if kind == ORB else _NAMED_DETECTOR), _METRICS[kind.dtype], kind.size
+    return (_ORB_DETECTOR if kind == ORB else _NAMED_DETECTOR), _DISTANCES[kind.dtype], kind.size
 
 
-def _decode_kind(detector: int, metric: int, size: int, name: bytes) -> DescriptorKind:
+def _decode_kind(detector: int, distance: int, size: int, name: bytes) -> DescriptorKind:
     """Return the kind of descriptors that a features block states; raises BadRequest."""
-    if (detector, metric, size, name) == (*_kind_numbers(ORB), b""):
+    if (detector, distance, size, name) == (*_kind_numbers(ORB), b""):
         return ORB
-    dtype = next((dtype for dtype, number in _METRICS.items() if number == metric), None)
+    dtype = next((dtype for dtype, number in _DISTANCES.items() if number == distance), None)
     if detector != _NAMED_DETECTOR or dtype is None:
         raise _bad_keyframe(
-            f"features of detector {detector}, metric {metric}, with {size} bytes are not known",
+            f"features of detector {detector}, distance {distance}, with {size} bytes are not known",
             "send ORB of 32 bytes, or named features of bytes or int8",
         )
     try:
@@ -739,7 +749,10 @@ def _decode_kind(detector: int, metric: int, size: int, name: bytes) -> Descript
     except BadRequest as error:
         raise _bad_keyframe(error.message, error.hint) from error
     if kind == ORB:
-        raise _bad_keyframe("it has ORB as named features", "send them as detector 1 without a name")
+        raise _bad_keyframe(
+            f"its features of the kind ORB have detector {_NAMED_DETECTOR}, which is for all other kinds",
+            f"send ORB features as detector {_ORB_DETECTOR}, without a name",
+        )
     return kind
 
 

@@ -4,9 +4,11 @@ A keyframe holds an `ObjectReference` to this object.  The points are pixels wit
 false bytes can only give points that lie in the image of the keyframe's camera and within 65.535 m of it.
 
 The object is little-endian: ``KP``, version 1 (uint8), 0 (uint8), number of points n (uint32); then,
-compressed by zlib, five arrays of differences between neighbouring points, each stored as planes of bytes
-(the lowest byte of all numbers first): of the pixel's index, counted row by row (n uint32), of the depth in
-mm (n uint16, modulo 2**16), and of red, green and blue (n uint8 each, modulo 2**8).
+compressed by zlib, five arrays of n differences.  The points are sorted by the index of their pixel, counted
+row by row, and a difference is the number of a point minus that of the previous point (0 for the first): of
+the index (uint32), of the depth in mm (uint16, modulo 2**16), and of red, green and blue (uint8 each, modulo
+2**8).  An array is stored as planes of bytes: first the lowest byte of all its numbers, then the second byte
+of all, and so on.
 """
 
 from __future__ import annotations
@@ -24,7 +26,7 @@ from rse_pf.geometry import Array, Camera
 from rse_pf.slam.ply import Colours
 
 __all__ = [
-    "MAX_IMAGE_BYTES",
+    "MAX_OBJECT_BYTES",
     "MAX_POINTS",
     "MAX_POINTS_BYTES",
     "REFERENCE_BYTES",
@@ -37,10 +39,11 @@ __all__ = [
 
 MAX_POINTS = 16_000  # largest number of coloured points of one keyframe
 MAX_POINTS_BYTES = 160_000
-"""Largest size in bytes of the object with the coloured points of one keyframe; 16,000 points without
-compression have 144,008."""
-MAX_IMAGE_BYTES = 1 << 20
-"""Largest size in bytes of an object that a keyframe may refer to, such as its image: 1 MiB."""
+"""Largest size in bytes of the object with the coloured points of one keyframe.  16,000 points have 144,008
+bytes without compression (8 of the head, 9 for each point), so that the limit refuses no valid object."""
+MAX_OBJECT_BYTES = 1 << 20
+"""Largest size in bytes of an object to which a keyframe may refer, its image or its coloured points: 1
+MiB."""
 _HEAD_STRUCT = struct.Struct("<2sBBI")
 _REFERENCE_STRUCT = struct.Struct("<32sI")
 REFERENCE_BYTES = _REFERENCE_STRUCT.size  # size in bytes of an encoded reference to an object
@@ -68,10 +71,11 @@ class ObjectReference:
     size: int
 
     def __post_init__(self) -> None:
-        if not _DIGEST.match(self.digest) or not 0 < self.size <= MAX_IMAGE_BYTES:
+        if not _DIGEST.match(self.digest) or not 0 < self.size <= MAX_OBJECT_BYTES:
             raise BadRequest(
-                f"an object of {self.size} bytes belongs to no keyframe, or its digest is no sha256",
-                hint=f"refer to 1..{MAX_IMAGE_BYTES} bytes by their sha256",
+                f"a reference to an object has a size of {self.size} bytes, not of 1..{MAX_OBJECT_BYTES}, or "
+                "a digest that is no sha256 in 64 lower-case hexadecimal digits",
+                hint="send the size and the sha256 of the object's bytes",
             )
 
 

@@ -14,7 +14,8 @@ from rse_pf.maps.format import MapVersion
 __all__ = ["UpSource", "estimate_up", "floor_normal", "level_surface_normal"]
 
 UpSource = Literal["the map", "--up", "the floor", "the level surfaces", "the cameras"]
-"""What the direction against gravity was taken from; ``--up`` is the option of the command line."""
+"""Source of a direction against gravity: stated by the map, given on the command line as the option ``--up``,
+or estimated from the plane of the floor, from all level surfaces, or from the orientations of the cameras."""
 
 _MIN_CAMERA_AGREEMENT = 0.5
 """Length of the mean of the cameras' upward unit vectors below which the cameras do not agree on where up is;
@@ -28,8 +29,8 @@ bound the time."""
 _MIN_VOXEL_POINTS = 12  # smallest number of points of a voxel from which a surface normal is estimated
 _MIN_VOXELS = 20  # smallest number of flat voxels with similar normals that count as level surfaces
 _MAX_FLATNESS_RATIO = 0.02
-"""A voxel is flat if the variance of its points along the normal is at most this share of the second smallest
-variance."""
+"""A voxel is flat if the smallest variance of its points along a principal axis, that of the normal, is at
+most this share of the second smallest one."""
 _MAX_LEVEL_TILT_DEG = 30.0
 """Largest angle in degrees between the normal of a level surface and the rough direction up; walls are
 beyond it."""
@@ -48,10 +49,11 @@ _TUKEY_LIMITS_M = (0.4, 0.4, 0.2, 0.2, 0.1, 0.1, 0.05, 0.05, 0.05)
 """Distances in metres from the plane of the floor at which the weight of a cell becomes 0, for the successive
 iterations of its robust fit."""
 _MIN_INLIER_RATIO = 0.5
-"""Smallest share of the cells that must lie within 5 cm of the plane of the floor; stairs and storeys have
-less."""
+"""Smallest share of the cells that must lie within 5 cm of the plane of the floor; with stairs or several
+storeys in a map, the share is smaller, and the map has no floor."""
 _MIN_WIDTH_M = 1.0
-"""Smallest width in metres of a floor across its longer side: the tilt of a narrower strip is uncertain."""
+"""Smallest width in metres of a floor, measured perpendicularly to its longest extent: the tilt of a narrower
+strip is uncertain."""
 _MAX_FLOOR_TILT_DEG = 5.0
 """Largest angle in degrees between the normal of the floor and the rough direction up; ramps are beyond
 it."""
@@ -60,16 +62,19 @@ it."""
 def estimate_up(version: MapVersion) -> tuple[Array, UpSource] | None:
     """Return the unit vector ``(3,)`` against gravity in the world of a map, and what it was taken from.
 
-    The first of these that is known is returned: the direction that the map states; the normal of its floor;
-    the common normal of its level surfaces; the mean of the cameras' upward directions.
+    A direction that the map states is returned as it is.  Otherwise the estimate begins with the mean of the
+    cameras' upward directions.  It is refined by the normals of level surfaces within 30 degrees of it, and
+    then by the normal of a floor within 5 degrees of the result.  A refinement is left out if the cloud has
+    too few such surfaces; the source names the last one that was made.
 
     Args:
         version: A map with at least one keyframe.
 
     Returns:
-        None if the map does not state the direction and its cameras do not agree on one.
+        None if the map does not state the direction and the mean of the cameras' upward unit vectors is
+        shorter than 0.5; then neither level surfaces nor a floor are looked for.
     """
-    # 1. Use what the map states, which was measured by an IMU.
+    # 1. Use the direction that the map states.
     stated_up = version.up
     if stated_up is not None:
         return stated_up, "the map"

@@ -1,8 +1,9 @@
 """Localise a camera among keyframes of a map: return its pose with a verdict and a reason.
 
-The candidates come from place recognition, which only proposes.  Each candidate estimates a pose by PnP and,
-if the view has depths, by depth.  Estimates that agree confirm each other; an estimate elsewhere with many
-inliers makes the result ambiguous, because two parts of the world then look alike (perceptual aliasing).
+The candidates are keyframes that place recognition proposes.  For each candidate, the pose of the view is
+estimated by PnP from matches of the candidate's landmarks, and refined with the depths of the view if it has
+metric ones.  Estimates that agree confirm each other.  An estimate elsewhere with many inliers makes the
+result ambiguous, because two parts of the world then look alike (perceptual aliasing).
 """
 
 from __future__ import annotations
@@ -30,8 +31,8 @@ from rse_pf.slam.relative_pose import (
 __all__ = ["LocalisationCandidate", "LocalisationOptions", "Localised", "localise", "spread_candidates"]
 
 _MAX_LOG_FOCAL = 0.07
-"""Largest logarithm of the fitted over the stated focal length at which the stated camera is accepted; photos
-with a right camera stay below 0.06."""
+"""Largest absolute natural logarithm of the quotient of fitted and stated focal length at which the stated
+camera is accepted; for photos with a right camera it is below 0.06."""
 _MAX_CAMERA_STEP_M = 0.12
 """Largest distance between the poses of the fitted and of the stated camera at which the stated camera is
 accepted; photos with a right camera stay below 0.1 m."""
@@ -39,8 +40,8 @@ _MAX_CAMERA_ROTATION_DEG = 6.0
 """Largest rotation between the poses of the fitted and of the stated camera at which the stated camera is
 accepted; photos with a right camera and a rolling shutter stay below 5.1 degrees."""
 _MAX_MAP_COORDINATE_M = 1e6
-"""Largest coordinate in metres of a candidate keyframe in the map; candidates beyond it are ignored: no robot
-drives 1,000 km, and a false pose must not make a true one ambiguous."""
+"""Largest coordinate in metres of a candidate keyframe in the map.  A keyframe beyond it has a false pose,
+since no robot drives 1,000 km; it is ignored, so that it does not make the pose of the view ambiguous."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -48,25 +49,28 @@ class LocalisationOptions:
     """Conditions under which the pose of a view is accepted.
 
     Attributes:
-        measured: Limits of matches; a pose needs its ``min_inliers`` and ``min_inlier_ratio`` to be ok.
+        relative_pose: Limits for matches of a candidate.  The verdict is ok only if the best estimate has at
+            least its ``min_inliers`` and its ``min_inlier_ratio``.
         min_candidate_inliers: The estimate of a candidate with fewer inliers is dropped.
         agree_m: Largest distance between two estimates that agree.
         agree_deg: Largest rotation between two estimates that agree.
-        min_single_inliers: Inliers from which the estimate of one keyframe alone is enough.
-        rival_ratio: An estimate that disagrees with the best one, and that PnP does not call weak, makes the
-            pose ambiguous if it has at least this share of the best one's inliers; in environments without
-            repetition no such estimate was ever measured.
+        min_single_inliers: Fewest inliers of the best estimate with which the verdict may be ok although no
+            other estimate agrees with it.
+        rival_ratio: The pose is ambiguous if an estimate disagrees with the best one, is not weak by the
+            rules of PnP, and has at least this share of the inliers of the best one.  In recordings of
+            environments without repetition there was never such an estimate.
         region_m: Largest distance between two candidates that count as of one region.
         region_deg: Largest rotation between two candidates that count as of one region.
         max_per_region: Largest number of candidates of one region that are compared.
-        has_equal_rooms: Whether the map may have rooms that look alike; a view shows less than a room, so
-            that its pose is then always ambiguous.
-        fits_camera: Whether the intrinsics of a view without depths may be wrong, as those of a photo.  Its
-            pose is then ok only if a camera that is fitted to the matches has nearly the same pose, and the
-            covariance includes the difference of both poses.
+        has_equal_rooms: Whether the map may have rooms that look alike.  The verdict is then never ok, and
+            the reason is "ambiguous": a view shows less than a room, and so cannot tell the rooms apart.
+        fits_camera: Whether to fit a camera to the matches of a view without depths, because its stated
+            intrinsics may be wrong, as those of a photo.  The verdict is then ok only if the fitted camera
+            has nearly the stated focal length and nearly the same pose, and the covariance includes the
+            difference of both poses.
     """
 
-    measured: RelativePoseOptions = field(default_factory=lambda: RelativePoseOptions(min_inliers=30))
+    relative_pose: RelativePoseOptions = field(default_factory=lambda: RelativePoseOptions(min_inliers=30))
     min_candidate_inliers: int = 15
     agree_m: float = 0.2
     agree_deg: float = 6.0
@@ -91,9 +95,10 @@ class Localised:
         T_map_camera: ``(4, 4)``, metres; None if the verdict is ``none``.
         covariance: ``(6, 6)`` of the twist (metres, radians) on the left of ``T_map_camera``; None if the
             verdict is ``none``.
-        inliers: Inliers of the best keyframe.
-        matches: Matches of the best keyframe.
-        rmse_px: Root mean square reprojection error of the inliers of the best keyframe.
+        inliers: Number of inliers of the best keyframe, which is the candidate with most inliers, also if the
+            pose was computed from several keyframes.
+        matches: Number of matches of the best keyframe.
+        rmse_px: Root mean square reprojection error of the inliers of the best keyframe, at its own estimate.
         keyframes: Ids of the keyframes whose estimates agree, the one with most inliers first.
         scale: Length in metres of the unit of the view's depths; None if the depths are metric, or if the
             scale is unknown (verdict ``weak``, reason "no-scale").
@@ -168,8 +173,9 @@ def localise(
     best = estimates[0]
     agreeing = [estimate for estimate in estimates if _do_agree(estimate, best, options)]
     contradicting = [estimate for estimate in estimates if not _do_agree(estimate, best, options)]
-    # 3. Take the mean of the agreeing poses, and the covariance of the best.  For a view without metric
-    # depths, replace this mean by the pose that PnP computes from the inliers of all of them.
+    # 3. Take the mean of the agreeing poses, and the covariance of the best one.  For a view without metric
+    # depths, replace the mean, but not the covariance, by the pose that PnP computes from the inliers of all
+    # agreeing estimates together.
     solution = best.measured.solution
     T_map_camera, covariance = _fuse_estimates(agreeing)
     if (view.depths_m is None or not view.is_metric) and len(agreeing) > 1:
@@ -209,7 +215,8 @@ def spread_candidates(
     more keyframes.
 
     Args:
-        similar: Ids and similarities from place recognition, the most similar first; about six times *count*.
+        similar: Ids and similarities of keyframes from place recognition, the most similar first; about six
+            times *count* of them leave a choice.
         T_map_camera: ``(n, 4, 4)``, the poses of all keyframes, indexed by their ids.
         count: The largest number of candidates.
         options: The size of a region, and the number of candidates from each.
@@ -236,7 +243,7 @@ def _estimate_poses(
     for candidate in candidates:
         if not (np.abs(candidate.T_map_keyframe[:3, 3]) <= _MAX_MAP_COORDINATE_M).all():
             continue
-        measured = measure_pose(candidate.landmarks, view, options.measured)
+        measured = measure_pose(candidate.landmarks, view, options.relative_pose)
         if isinstance(measured, str) or measured.inliers < options.min_candidate_inliers:
             continue
         estimates.append(
@@ -244,7 +251,7 @@ def _estimate_poses(
                 keyframe=candidate.id,
                 T_map_keyframe=candidate.T_map_keyframe,
                 T_map_camera=candidate.T_map_keyframe @ inverse(measured.solution.T_camera_world),
-                covariance=measured.solution.covariance + options.measured.min_covariance(),
+                covariance=measured.solution.covariance + options.relative_pose.min_covariance(),
                 measured=measured,
             )
         )
@@ -256,7 +263,7 @@ def _estimate_scale(estimates: Sequence[_Estimate], options: LocalisationOptions
 
     The logarithms of the estimates' scales are averaged, weighted by their inverse variances.
     """
-    ratios = [measure_scale_ratio(estimate.measured, options.measured) for estimate in estimates]
+    ratios = [measure_scale_ratio(estimate.measured, options.relative_pose) for estimate in estimates]
     known = [ratio for ratio in ratios if ratio is not None]
     if not known:
         return None
@@ -291,7 +298,9 @@ def _camera_covariance(fit: CameraFit, T_map_camera: Array) -> Array:
 def _camera_weakness(fit: CameraFit, T_map_camera: Array) -> str:
     """Return "wrong-intrinsics" if the matches contradict the intrinsics of the view, else "".
 
-    What the matches do not determine, such as the focal length in front of a flat wall, contradicts nothing.
+    They contradict if focal length, position or rotation of the fitted camera differ from the stated ones by
+    more than a limit plus one standard deviation.  A quantity that the matches do not determine, such as the
+    focal length in front of a flat wall, has a large standard deviation, and so is not contradicted.
     """
     moved_m, rotated_deg = pose_difference(fit.T_map_camera, T_map_camera)
     is_contradicted = (
@@ -327,9 +336,9 @@ def _weakness(
     rivals = [e.measured.inliers for e in contradicting if not e.measured.solution.reason]
     if rivals and max(rivals) >= options.rival_ratio * best.inliers:
         return "ambiguous"
-    if best.inliers < options.measured.min_inliers:
+    if best.inliers < options.relative_pose.min_inliers:
         return "few-inliers"
-    if best.inliers < options.measured.min_inlier_ratio * best.matches:
+    if best.inliers < options.relative_pose.min_inlier_ratio * best.matches:
         return "low-inlier-ratio"
     if solution.reason:
         return solution.reason
@@ -359,7 +368,7 @@ def _solve_jointly(estimates: Sequence[_Estimate], view: View, options: Localisa
             np.concatenate(points),
             np.concatenate(pixels),
             view.camera,
-            PnpOptions(inlier_px=options.measured.inlier_px),
+            PnpOptions(inlier_px=options.relative_pose.inlier_px),
         )
     except PnpError:
         return best.measured.solution

@@ -48,15 +48,17 @@ __all__ = [
 ]
 
 RejectionCounts = Counter[tuple[int, int, str]]
-"""Number of rejected keyframe pairs by (lower map, higher map, reason)."""
+"""Number of rejected keyframe pairs by the indices of their two maps, the smaller one first, and the
+reason."""
 
 MAX_PAIRS = 700_000
-"""Largest product of the numbers of keyframes, maps and candidates of a merge, which bounds the pairs of
-keyframes that it compares: a pair needs some milliseconds."""
+"""Largest product of the number of keyframes, the number of maps and `MergeOptions.candidates`.  A merge
+compares at most so many pairs of keyframes, and the comparison of a pair takes some milliseconds."""
 WEAK_POSE_VARIANCE = 4.0
-"""Factor by which the covariance of a weakly determined relative pose is multiplied.  In rendered worlds the
-errors of such poses are 1.2 to 1.7 times, at most 2.7 times, their standard deviations; a third of the loop
-closures between two maps are weak, so a merge cannot do without them."""
+"""Factor by which the covariance of a relative pose that PnP calls weak is multiplied; standard deviations
+become twice as large.  In rendered worlds the errors of such poses were typically 1.2 to 1.7 times, and at
+most 2.7 times, the unmultiplied standard deviations.  Weak poses are used because they are a third of the
+loop closures between two maps."""
 MIN_LOOP_KEYFRAMES = 3  # smallest difference of `Atlas.order` between the ends of a loop within one map
 PAIRS_PER_REPORT = 16  # keyframe pairs between two reports of progress
 
@@ -92,7 +94,11 @@ class MergeOptions(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True
             and self.cauchy >= 0
         )
         if not is_valid:
-            raise BadRequest("an option of merge is out of its range", hint="leave it out for the default")
+            raise BadRequest(
+                "an option of merge is out of its range: candidates 1..100, min_inliers from 12, "
+                "min_inlier_ratio above 0 and up to 1, min_links from 1, cauchy from 0",
+                hint="leave the option out for its default",
+            )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -102,8 +108,10 @@ class Atlas:
     Attributes:
         keyframes: All *n* keyframes.
         of_map: ``(n,)``, the map of each keyframe.
-        order: ``(n,)``, position of each keyframe in the list.  A difference of two positions in one map is
-            taken as the number of odometry steps between them, also where another robot's keyframes begin.
+        order: ``(n,)``, position of each keyframe in the list.  The difference of two positions in one map
+            counts as the number of odometry steps between the keyframes.  For keyframes of two robots this is
+            an approximation, since no odometry connects the last keyframe of one robot with the first one of
+            the next.
         T_world_camera: ``(n, 4, 4)``, each pose in the world frame of its own map, metres.
         row_of: Row of each keyframe by (map, id).
     """
@@ -138,9 +146,14 @@ class Atlas:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class LoopProposals:
-    """Measured loop closures ``links``, and counts of keyframe pairs that ``failed``, by maps and reason."""
+    """The measured loop closures, and why other proposed pairs of keyframes gave none.
 
-    links: tuple[LoopClosure, ...]
+    Attributes:
+        loop_closures: The measured loop closures.
+        failed: The number of pairs that could not be measured, by maps and reason.
+    """
+
+    loop_closures: tuple[LoopClosure, ...]
     failed: RejectionCounts
 
 
@@ -168,7 +181,7 @@ def propose_loop_closures(
     loop_closures, failed = measure_pairs(
         atlas, pairs, options, lambda progress, text: report(0.1 + 0.7 * progress, text)
     )
-    return LoopProposals(links=tuple(loop_closures), failed=failed)
+    return LoopProposals(loop_closures=tuple(loop_closures), failed=failed)
 
 
 def choose_candidate_pairs(
@@ -299,7 +312,7 @@ def _find_fitting_odometry(
     loop_closures: Sequence[LoopClosure],
     noise: OdometryNoise,
 ) -> list[int]:
-    """Return the indices of the loop closures that differ from odometry by no more than its drift."""
+    """Return the indices of the loop closures that agree with odometry by `fits_prediction`."""
     if not loop_closures:
         return []
     edges = EdgeArrays.of(loop_closures)
@@ -311,10 +324,11 @@ def _find_fitting_odometry(
 
 
 def _lever_m(T_world_camera: Array, closure: LoopClosure) -> float:
-    """Return the largest distance, in metres, from the last position of a path to its other positions.
+    """Return the lever arm, in metres, with which a rotation error along a path displaces the end of the
+    path.
 
-    The path has the keyframes in the rows between both ends of *closure*.  The distance is the lever by which
-    a rotation error along the path moves its end.
+    The path consists of the keyframes from the lower to the higher one of the two rows that *closure*
+    connects.  The lever arm is the largest distance of its positions from that of the higher row.
     """
     first, last = sorted((closure.a, closure.b))
     path = T_world_camera[first : last + 1, :3, 3]

@@ -97,7 +97,7 @@ def _select(
     """Return the consistent loop closures of each pair of maps, and the counts of rejected ones by reason."""
     rejected = Counter(proposals.failed)
     accepted: list[LoopClosure] = []
-    for pair, closures in sorted(_group_by_maps(atlas, proposals.links).items()):
+    for pair, closures in sorted(_group_by_maps(atlas, proposals.loop_closures).items()):
         rows, reasons = select_consistent(pair, closures, atlas.T_world_camera, atlas.order, options)
         accepted += [closures[row] for row in rows]
         rejected.update(reasons)
@@ -176,7 +176,7 @@ def merge_versions(
     # 1. Propose loop closures by place recognition and PnP, and reject inconsistent ones.
     proposals = steps.propose(atlas, options, report)
     accepted, rejected = steps.select(atlas, proposals, options)
-    report(0.8, f"{len(accepted)} of {len(proposals.links)} loop closures are consistent")
+    report(0.8, f"{len(accepted)} of {len(proposals.loop_closures)} loop closures are consistent")
     # 2. Move every map that is connected with the first one into its world.
     T_world_camera, joined = _align_maps(atlas, accepted)
     used = [c for c in accepted if {int(atlas.of_map[c.a]), int(atlas.of_map[c.b])} <= joined]

@@ -1,6 +1,7 @@
 """Encode and decode coloured point clouds as binary PLY files.
 
-The decoder compares the sizes that a file states with its length before it makes an array.
+The decoder compares the size that the header of a file states with the length of the file before it allocates
+an array.
 
 Source:
     Turk, "The PLY Polygon File Format", 1994.
@@ -98,11 +99,13 @@ def _parse_header(header: bytes) -> tuple[int, np.dtype[np.void]]:
         raise _bad_cloud("it is not a binary, little-endian PLY file of version 1.0")
     count = lines[2][2] if len(lines[2]) == 3 and lines[2][:2] == ["element", "vertex"] else ""
     if not (count.isascii() and count.isdigit() and len(count) <= 12):
-        raise _bad_cloud("its first element is not a number of points")
+        raise _bad_cloud("the first element of its header is not: element vertex COUNT")
     dtypes: dict[str, str] = {}
     for words in lines[3:]:
         if len(words) != 3 or words[0] != "property" or words[1] not in _DTYPES or words[2] in dtypes:
-            raise _bad_cloud(f"{' '.join(words)[:60]!r} is not a number of a point")
+            raise _bad_cloud(
+                f"{' '.join(words)[:60]!r} in its header is not a property of a scalar type with a new name"
+            )
         dtypes[words[2]] = _DTYPES[words[1]]
     position_dtypes = {dtypes.get(name) for name in _POSITION}
     if not position_dtypes <= {"<f4", "<f8"} or {dtypes.get(name) for name in _COLOUR} != {"u1"}:

@@ -313,7 +313,7 @@ DISPARITIES_AT = FEATURES_AT + 8 + 20 * 36 + BLOCK + 4
         (changed(CAMERA_AT, "<B", 2), "camera 0 of model 2 is not known"),
         (changed(CAMERA_AT + 1, "<B", 1), "camera 1 of model 1 is not known"),
         (changed(FEATURES_AT, "<B", 2), "'' is no name of features"),
-        (changed(FEATURES_AT + 1, "<B", 2), "detector 1, metric 2, with 32 bytes are not known"),
+        (changed(FEATURES_AT + 1, "<B", 2), "detector 1, distance 2, with 32 bytes are not known"),
         (changed(FEATURES_AT + 2, "<H", 64), "descriptors of 64"),
         (changed(FEATURES_AT + 4, "<H", 65_535), "bytes are not 65535 features"),
         (changed(FEATURES_AT + 6, "<B", 200), r"2\*\*-200 px are not known"),

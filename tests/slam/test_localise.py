@@ -132,7 +132,7 @@ def test_one_keyframe_alone_needs_more_inliers(options, reason):
 
 def test_few_inliers_are_weak():
     options = LocalisationOptions()
-    strict = replace(options, measured=replace(options.measured, min_inliers=200))
+    strict = replace(options, relative_pose=replace(options.relative_pose, min_inliers=200))
 
     found = place_of(MAP[:1], VIEW, CAMERA, strict)
 
@@ -181,7 +181,7 @@ def strip(number: int, left: float, right: float) -> LocalisationCandidate:
 
 def test_keyframes_that_are_weak_alone_place_a_view_without_depths_together():
     view = replace(view_of_features(VIEW, CAMERA), depths_m=None)
-    options = LocalisationOptions(min_single_inliers=10, measured=RelativePoseOptions(min_inliers=12))
+    options = LocalisationOptions(min_single_inliers=10, relative_pose=RelativePoseOptions(min_inliers=12))
     strips = [strip(1, 60.0, 100.0), strip(2, 360.0, 400.0)]
 
     alone, together = localise(strips[:1], view, options), localise(strips, view, options)

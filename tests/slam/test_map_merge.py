@@ -95,11 +95,11 @@ def planted(share: float, seed: int):  # type: ignore[no-untyped-def]
     def propose(atlas: Atlas, options: MergeOptions, report: Report) -> LoopProposals:
         found = propose_loop_closures(atlas, options, report)
         rng = np.random.default_rng(seed)
-        links = list(found.links)
+        links = list(found.loop_closures)
         for k in rng.choice(len(links), max(1, round(share * len(links))), replace=False).tolist():
             wrong = links[k].T_a_b @ exp_se3(rng.uniform(-1, 1, 6) * [1.5, 1.5, 1.5, 1, 1, 1])
             links[k] = LoopClosure(a=links[k].a, b=links[k].b, T_a_b=wrong, information=links[k].information)
-        return LoopProposals(links=tuple(links), failed=found.failed)
+        return LoopProposals(loop_closures=tuple(links), failed=found.failed)
 
     return propose
 
@@ -116,8 +116,8 @@ def test_wrong_loops_are_refused_and_do_not_deform_the_map(seed: int) -> None:
 
     assert wrong.joined == (0, 1)
     assert rmse_m(wrong, truth) <= max(1.1 * rmse_m(clean, truth), rmse_m(clean, truth) + 0.005)
-    wrongs = planted(0.1, seed)(Atlas.of(maps), MergeOptions(), ignore_progress).links
-    rights = propose_loop_closures(Atlas.of(maps), MergeOptions()).links
+    wrongs = planted(0.1, seed)(Atlas.of(maps), MergeOptions(), ignore_progress).loop_closures
+    rights = propose_loop_closures(Atlas.of(maps), MergeOptions()).loop_closures
     fakes = {
         w.T_a_b.tobytes() for w, r in zip(wrongs, rights, strict=True) if not np.array_equal(w.T_a_b, r.T_a_b)
     }
@@ -135,8 +135,8 @@ def test_a_single_wrong_link_joins_nothing() -> None:
 
     def propose(atlas: Atlas, options: MergeOptions, report: Report) -> LoopProposals:
         links = propose_loop_closures(atlas, options, report)
-        across = [link for link in links.links if (link.a < 13) != (link.b < 13)]
-        return LoopProposals(links=tuple(across[:1]), failed=links.failed)
+        across = [link for link in links.loop_closures if (link.a < 13) != (link.b < 13)]
+        return LoopProposals(loop_closures=tuple(across[:1]), failed=links.failed)
 
     merged = merge_versions(maps, steps=MergeSteps(propose=propose))
 
@@ -234,7 +234,7 @@ def test_the_clique_is_as_large_as_the_one_of_brute_force(seed: int) -> None:
 def test_consistency_does_not_depend_on_the_world_frames() -> None:
     maps, _ = two_robots()
     atlas = Atlas.of(maps)
-    links = propose_loop_closures(atlas, MergeOptions(close_loops=False)).links
+    links = propose_loop_closures(atlas, MergeOptions(close_loops=False)).loop_closures
     moved = atlas.T_world_camera.copy()
     moved[atlas.of_map == 1] = exp_se3([5.0, -3.0, 1.0, 1.0, 2.0, 0.5]) @ moved[atlas.of_map == 1]
 

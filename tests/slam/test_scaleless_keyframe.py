@@ -84,7 +84,7 @@ def test_a_keyframe_without_features_is_read_and_no_unit_is_made_of_absurd_depth
     empty = decode_keyframe(encode_keyframe(keyframe(np.empty(0))))
 
     assert (len(empty.features), empty.features.is_metric) == (0, False)
-    with pytest.raises(BadRequest, match="have no unit"):
+    with pytest.raises(BadRequest, match="units of length of the segment"):
         keyframe(np.full(5, 1e-30))
-    with pytest.raises(BadRequest, match="have no unit"):
+    with pytest.raises(BadRequest, match="units of length of the segment"):
         keyframe(np.full(5, 1e30))

@@ -143,7 +143,7 @@ def locate(
     # 2. Choose the candidates among them.  At most three quarters of the candidates come from one region of
     # the map, so that the view is also matched to another region that looks alike.
     limits = LocalisationOptions(
-        measured=RelativePoseOptions(
+        relative_pose=RelativePoseOptions(
             min_inliers=options.min_inliers,
             min_inlier_ratio=options.min_inlier_ratio,
             inlier_px=options.inlier_px,
