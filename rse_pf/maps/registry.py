@@ -163,7 +163,15 @@ class MapRegistry:
         return heads
 
     def commit(
-        self, name: str, data: bytes, *, parent: str | None, author: str, created_s: float, note: str = ""
+        self,
+        name: str,
+        data: bytes,
+        *,
+        parent: str | None,
+        author: str,
+        created_s: float,
+        note: str = "",
+        charge: Callable[[int], None] = lambda size: None,
     ) -> MapRecord:
         """Make *data* the next version of map *name*, and its head.
 
@@ -174,6 +182,8 @@ class MapRegistry:
             author: Who made the version.
             created_s: Unix seconds.
             note: What the author says about it.
+            charge: Called before anything is written, with the size of *data* in bytes, or 0 if another
+                version of the map has the same bytes; an exception that it raises refuses the version.
 
         Raises:
             BadRequest: *data* is not a map, or *name* is not a valid name.
@@ -182,29 +192,11 @@ class MapRegistry:
             Busy: The same bytes are being removed.
             StoreError: The store failed; the head did not change.
         """
-        origin = MapOrigin(parent=parent, author=author, created_s=created_s, note=note)
-        return self.commit_charged(name, data, origin, charge=lambda size: None)
-
-    def commit_charged(
-        self, name: str, data: bytes, origin: MapOrigin, *, charge: Callable[[int], None]
-    ) -> MapRecord:
-        """Commit as `commit` does, and charge the bytes that this adds to the store.
-
-        Args:
-            name: Name of the map.
-            data: The bytes that `encode_map` returned.
-            origin: Who makes the version, and from which one.
-            charge: Called with the number of added bytes before they are written, 0 if the store has these
-                bytes already; may refuse them by an error.
-
-        Raises:
-            As `commit`, and the errors of *charge*.
-        """
         return self._commit(
             name,
             describe_map(data, self._max_bytes),
             MapContent(digest_of(data), len(data)),
-            origin,
+            MapOrigin(parent=parent, author=author, created_s=created_s, note=note),
             write=lambda blob: self._store.put(blob, data),
             charged=lambda record, size: _charge_once(charge, size),
         )

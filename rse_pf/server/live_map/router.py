@@ -290,13 +290,11 @@ class LiveMapRouter(CommandQueue):
     def update(self, tenant: str, map_name: str, payload: dict[str, Any]) -> None:
         """Pass an update of a map server to the subscribers of the map.
 
-        The field ``key`` of *payload*, or else its kind and robot, decides which older update it replaces;
-        ``key`` is not sent to robots.
+        It replaces an older update of the same kind and robot.
         """
-        fields = _decode_matrices(payload)
-        kind, robot = str(fields.get("kind", "")), fields.get("robot")
-        key = fields.pop("key", None) or (kind if robot is None else f"{kind}/{robot}")
-        self._subscriptions.update(tenant, map_name, str(key), fields)
+        kind, robot = str(payload.get("kind", "")), payload.get("robot")
+        key = kind if robot is None else f"{kind}/{robot}"
+        self._subscriptions.update(tenant, map_name, key, _decode_matrices(payload))
 
     # --- Metrics and shutdown ---
 

@@ -65,6 +65,7 @@ class _WatchedMap:
     )  # the newest update of each key, the oldest first
     subscriptions: dict[_Subscription, None] = field(default_factory=dict)
     starters: set[_Subscription] = field(default_factory=set)  # subscriptions that may start a map server
+    may_start: bool | None = None  # whether `watch` was last called with True or False; None: not called yet
 
 
 @dataclass(eq=False, slots=True)
@@ -142,11 +143,9 @@ class Subscriptions:
             find_error: Returns an error if the robot may no longer read the map; called before each sending.
             may_start: Whether a map server is started for this subscription if the map has none.
         """
-        key = (tenant, map_name)
-        watched_map = self._maps.get(key)
-        is_new = watched_map is None
+        watched_map = self._maps.get((tenant, map_name))
         if watched_map is None:
-            watched_map = self._maps[key] = _WatchedMap(tenant, map_name)
+            watched_map = self._maps[tenant, map_name] = _WatchedMap(tenant, map_name)
             watched_map.updates["map"] = _MapUpdate(_UPDATE_WITHOUT_MAP_SERVER)
         subscription = _Subscription(subscriber, identity, watched_map, find_error)
         watched_map.subscriptions[subscription] = None
@@ -154,10 +153,9 @@ class Subscriptions:
         subscription.unsent = dict.fromkeys(watched_map.updates, 1)
         subscriber.bound_unsent(_MAX_UNSENT_BYTES)
         self._schedule(subscription)
-        if is_new:
-            self._watch(tenant, map_name, may_start)
         if may_start:
-            self._set_starter(subscription, is_starter=True, notify=not is_new)
+            watched_map.starters.add(subscription)
+        self._update_watch(watched_map)
 
     def stop_starting(self, subscriber: Subscriber, identity: int) -> None:
         """Start no map server for a subscription from now on, because the robot may only watch the map.
@@ -166,22 +164,15 @@ class Subscriptions:
         """
         subscription = self._by_subscriber.get(subscriber, {}).get(identity)
         if subscription is not None:
-            self._set_starter(subscription, is_starter=False)
+            subscription.map.starters.discard(subscription)
+            self._update_watch(subscription.map)
 
-    def _set_starter(self, subscription: _Subscription, *, is_starter: bool, notify: bool = True) -> None:
-        """Set whether a map server may be started for a subscription.
-
-        If that changes whether a map server may be started for the map, and the map still has subscriptions,
-        ``watch`` is called again, unless *notify* is False.
-        """
-        watched_map = subscription.map
-        had_starters = bool(watched_map.starters)
-        if is_starter:
-            watched_map.starters.add(subscription)
-        else:
-            watched_map.starters.discard(subscription)
-        if watched_map.subscriptions and bool(watched_map.starters) != had_starters and notify:
-            self._watch(watched_map.tenant, watched_map.name, is_starter)
+    def _update_watch(self, watched_map: _WatchedMap) -> None:
+        """Call ``watch`` for a map unless its last call said the same about starting a map server."""
+        may_start = bool(watched_map.starters)
+        if may_start != watched_map.may_start:
+            watched_map.may_start = may_start
+            self._watch(watched_map.tenant, watched_map.name, may_start)
 
     def end(self, subscriber: Subscriber, identity: int) -> None:
         """End the subscription *identity* of a subscriber; does nothing if it has ended already."""
@@ -195,8 +186,10 @@ class Subscriptions:
         self._slow.pop(subscription, None)
         watched_map = subscription.map
         del watched_map.subscriptions[subscription]
-        self._set_starter(subscription, is_starter=False)
-        if not watched_map.subscriptions:
+        watched_map.starters.discard(subscription)
+        if watched_map.subscriptions:
+            self._update_watch(watched_map)
+        else:
             del self._maps[watched_map.tenant, watched_map.name]
             self._unwatch(watched_map.tenant, watched_map.name)
 

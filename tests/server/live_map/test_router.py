@@ -357,7 +357,7 @@ async def test_two_workers_tell_their_robots_the_same() -> None:
         for worker in (parts, other):
             assert worker.client.watched == [("default", "m")]
             worker.client.on_update("default", "m", payload)
-            worker.client.on_update("default", "m", {"kind": "map", "keyframes": 3, "key": "map"})
+            worker.client.on_update("default", "m", {"kind": "map", "keyframes": 3})
 
         for reader in (here, there):
             updates = {update.key: update.payload for update in await settled(reader, 2)}

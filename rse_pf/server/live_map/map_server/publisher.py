@@ -18,7 +18,6 @@ from rse_pf.errors import (
     BadMessage,
     BadRequest,
     Busy,
-    Conflict,
     LimitExceeded,
     NotFound,
     RsePfError,
@@ -26,7 +25,7 @@ from rse_pf.errors import (
 )
 from rse_pf.live_map.versions import PointSource, as_internal_error
 from rse_pf.maps.format import UP_FIELD, MapVersion, encode_map
-from rse_pf.maps.registry import MapOrigin, MapRecord, MapRegistry
+from rse_pf.maps.registry import MapRecord, MapRegistry
 from rse_pf.maps.removal import choose_superseded
 from rse_pf.object_store import digest_of
 from rse_pf.server.live_map.map_server.environment import MapServerEnvironment, Urgency
@@ -60,8 +59,6 @@ time."""
 _MAX_RETRY_S = 600.0
 """Longest wait in seconds before a failed automatic publication is tried again: encoding a large map takes
 seconds."""
-_MAX_COMMIT_TRIES = 5
-"""Largest number of tries to commit a version; a try fails if another process moves the head of the map."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -182,10 +179,8 @@ class Publisher:
         version = await self._make_version()
         version = await background(functools.partial(self._add_source_up, version))
         # 2. Charge the tenant, and make the version the head of the map.
-        origin = MapOrigin(parent=None, author=self._author, created_s=environment.wall_clock(), note=note)
         charge = functools.partial(environment.account.reserve, freed=freed_bytes)
-        commit = functools.partial(_commit_version, environment.maps, self._map_name, version, origin, charge)
-        record = await background(commit)
+        record = await background(functools.partial(self._commit_version, version, note, charge))
         self._next_allowed_s = self._clock() + self._min_interval_s
         self._published_changes, self._last_record = changes, record
         if self._due_request is due_request:  # else the map was requested again after the version was made
@@ -255,6 +250,34 @@ class Publisher:
             return version
         return dataclasses.replace(version, provenance={**version.provenance, UP_FIELD: self._source_up[1]})
 
+    def _commit_version(self, version: MapVersion, note: str, charge: Callable[[int], None]) -> MapRecord:
+        """Make *version* the head of the map in the registry; if the head has equal bytes, return its record.
+
+        Blocks on the object store.  The contents of the head before are not merged into *version*.
+
+        Raises:
+            QuotaExceeded, StoreFull: *charge* refuses the bytes that the version adds to the store.
+            Conflict: Another process moved the head meanwhile.
+            InternalError: The registry refuses the version as invalid.
+            StoreError: The store fails.
+        """
+        maps, head = self._environment.maps, None
+        with as_internal_error("the live map cannot be published"):
+            data = encode_map(version)
+            with contextlib.suppress(NotFound):
+                head = maps.head(self._map_name)
+            if head is not None and head.digest == digest_of(data):
+                return head
+            return maps.commit(
+                self._map_name,
+                data,
+                parent=None if head is None else head.id,
+                author=self._author,
+                created_s=self._environment.wall_clock(),
+                note=note,
+                charge=charge,
+            )
+
     def _remove_old_versions(self) -> int:
         """Remove the oldest automatic versions, at most ten, and return their number; blocks on the store.
 
@@ -303,39 +326,6 @@ class Publisher:
 
 def _is_automatic(record: MapRecord) -> bool:
     return record.author.startswith(_AUTHOR_PREFIX) and record.note in _AUTOMATIC_NOTES
-
-
-def _commit_version(
-    maps: MapRegistry, name: str, version: MapVersion, origin: MapOrigin, charge: Callable[[int], None]
-) -> MapRecord:
-    """Make *version* the head of the map *name* in the registry; an equal head stays and is returned.
-
-    Blocks on the object store.  The parent in *origin* is replaced by the present head; the committed version
-    therefore replaces that head without merging it.
-
-    Raises:
-        QuotaExceeded, StoreFull: *charge* refuses the bytes that the version adds to the store.
-        Conflict: Another process moved the head during each of five tries.
-        InternalError: The registry refuses the version as invalid.
-        StoreError: The store fails.
-    """
-    with as_internal_error("the live map cannot be published"):
-        data = encode_map(version)
-        digest = digest_of(data)
-        for tries_left in reversed(range(_MAX_COMMIT_TRIES)):
-            try:
-                head: MapRecord | None = maps.head(name)
-            except NotFound:
-                head = None
-            if head is not None and head.digest == digest:
-                return head
-            origin = dataclasses.replace(origin, parent=None if head is None else head.id)
-            try:
-                return maps.commit_charged(name, data, origin, charge=charge)
-            except Conflict:
-                if not tries_left:
-                    raise
-    raise AssertionError("the last try returns or raises")
 
 
 def read_start_version(maps: MapRegistry, request: LiveStart) -> tuple[MapVersion, str]:

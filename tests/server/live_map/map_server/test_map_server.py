@@ -504,7 +504,7 @@ async def test_a_map_that_the_registry_refuses_is_an_internal_error_for_who_asks
     def refuse(*args: object, **named: object) -> None:
         raise BadRequest("keyframe 1 has no rigid pose", hint="leave it out")
 
-    monkeypatch.setattr(MapRegistry, "commit_charged", refuse)
+    monkeypatch.setattr(MapRegistry, "commit", refuse)
 
     server = await bench.start("a")
     await server.keyframe(0)
