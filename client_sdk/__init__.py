@@ -28,12 +28,10 @@ if TYPE_CHECKING:
     from client_sdk.tracking.monocular_tracker import MonocularOptions
     from client_sdk.tracking.tracker import Tracker
     from client_sdk.trajectory import Trajectory
-    from client_sdk.transfer.background_upload import BackgroundUploader
     from client_sdk.transfer.data_client import DataClient, DataOptions
 
 __all__ = [
     "Answer",
-    "BackgroundUploader",
     "BlockingLiveMapper",
     "BlockingMapper",
     "BlockingRobot",
@@ -72,7 +70,6 @@ __all__ = [
 
 _HOMES = {
     "Answer": "commands.answer_types",
-    "BackgroundUploader": "transfer.background_upload",
     "BlockingLiveMapper": "live",
     "BlockingMapper": "mapper",
     "BlockingRobot": "blocking_robot",

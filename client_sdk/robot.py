@@ -32,9 +32,9 @@ from client_sdk.offloading.burst_policy import check_burst_url
 from client_sdk.offloading.command_router import CallArguments, CommandRouter, OnProgress
 from client_sdk.offloading.local_services import LocalServices
 from client_sdk.offloading.offload_policy import CloudFirst
-from client_sdk.transfer.small_objects import SmallObjectStore
+from client_sdk.transfer.data_client import DataClient, DataOptions
 from rse_pf.config import SessionSettings
-from rse_pf.errors import Disconnected, RsePfError, UsageError, error_from_code
+from rse_pf.errors import Disconnected, RsePfError, Unauthorized, UsageError, error_from_code
 from rse_pf.wire import CODECS, Failure, Welcome, as_type, make_codec
 from rse_pf.wire.client_session import Answered, ClientSession
 from rse_pf.wire.client_subscriptions import SubscriptionEnded, Updated
@@ -60,6 +60,10 @@ __all__ = ["MAX_DEADLINE_S", "OnProgress", "Robot", "connect"]
 
 MAX_DEADLINE_S = 3600.0
 """Longest deadline of a command in seconds; messages of the protocol carry no longer one."""
+
+STORE_TIMEOUT_S = 5.0
+"""Longest time for which one request of `Robot.store_object` waits for data, in seconds; the caller repeats
+what failed."""
 
 
 class Robot:
@@ -167,7 +171,8 @@ class Robot:
             burst=self._burst,
             callbacks=self.callbacks,
         )
-        self._objects = SmallObjectStore(self._read_token, self._read_access)
+        self._data_client: DataClient | None = None
+        self._data_lock = asyncio.Lock()
         self._is_open = False
         self._process = os.getpid()
 
@@ -227,7 +232,8 @@ class Robot:
                 self._handle_event(event)
         await self._connection.close()
         await self._router.close()
-        self._objects.close()
+        if self._data_client is not None:
+            self._data_client.close()
         if self._local is not None:
             self._local.close()
         if self._recorder is not None:
@@ -432,15 +438,24 @@ class Robot:
         )
 
     async def store_object(self, data: bytes) -> str:
-        """Store at most 256 KiB as an object of this robot at the data service, and return its sha256.
+        """Store *data* as an object of this robot, and return its sha256 once it is durable.
 
-        `DataClient` stores larger objects, and repeats requests that fail.
+        One object is stored after the other.  `DataClient` does the same, and repeats requests that fail.
 
         Raises:
             ConnectError: The platform has no data service, or the service does not answer.
             StoreFull, QuotaExceeded, LimitExceeded, Unauthorized, Forbidden: The service refuses the object.
         """
-        return await self._objects.store(data)
+        async with self._data_lock:
+            token = await self._read_token()
+            if token is None:
+                raise Unauthorized("objects are stored with a token only", hint="enrol the robot")
+            url, ssl_context = self._read_access()
+            if self._data_client is None or self._data_client.url != url:
+                options = DataOptions(timeout_s=STORE_TIMEOUT_S, deadline_s=0.0, ssl_context=ssl_context)
+                self._data_client = DataClient(url, token, options)
+            self._data_client.token = token
+            return await asyncio.to_thread(self._data_client.upload, data)
 
     def record_frame(self, frame: Frame, T_odom_camera: npt.NDArray[np.float64] | None = None) -> None:
         """Add a thumbnail of *frame* and its pose by odometry to the recording.

@@ -1,4 +1,4 @@
-"""The token bucket that limits every rate: commands, handshakes, recorded refusals, background uploads."""
+"""The token bucket that limits every rate: commands, handshakes, recorded refusals, uploads of robots."""
 
 from __future__ import annotations
 

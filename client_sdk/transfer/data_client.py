@@ -153,7 +153,9 @@ class DataClient:
         Raises:
             UsageError: *url* has another scheme, or no usable host or port.
         """
-        self._token = token
+        self.url = url
+        self.token = token
+        """The token of the next request, or the callable that returns it."""
         self._callbacks = UserCallbacks()
         self._options = options or DataOptions()
         self._connection = DataConnection(
@@ -422,10 +424,10 @@ class DataClient:
         return b""
 
     def _read_token(self) -> object:
-        if not callable(self._token):
-            return self._token
+        if not callable(self.token):
+            return self.token
         try:
-            token: object = self._token()
+            token: object = self.token()
         except Exception as error:
             raise self._callbacks.token_error(error) from error
         if inspect.iscoroutine(token):

@@ -29,7 +29,7 @@ SDK = {
         "MarkerScale", "OdometryScale", "Tracker", "PoseQuery", "MapOptions", "PointMap", "Trajectory",
     ),
     "Recordings": ("Dataset", "open_dataset"),
-    "Large data": ("DataClient", "DataOptions", "BackgroundUploader"),
+    "Large data": ("DataClient", "DataOptions"),
 }  # fmt: skip
 """Section -> names of `client_sdk`; names that stand nowhere get a section of their own."""
 _MODULES = ("client_sdk.cameras", "rse_pf.geometry", "rse_pf.pnp", "rse_pf.auth.robot_key", "rse_pf.service")

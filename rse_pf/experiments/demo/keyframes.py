@@ -1,64 +1,53 @@
 """The keyframes of a robot in the demo, and the map that it commits at the end.
 
-Each keyframe is uploaded to the data service in the background, after live poses, and kept for the map.  A
-keyframe holds features and a pose, never an image.
+Each keyframe is uploaded to the data service in a thread, and kept for the map.  A keyframe holds features
+and a pose, never an image.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 
 import numpy as np
 import numpy.typing as npt
 
 from client_sdk.frontend import FrontEndOptions, TrackedFrame, extract
 from client_sdk.plugins import FeaturesFunction, FeaturesPlugin
-from client_sdk.transfer.background_upload import BackgroundUploader
 from client_sdk.transfer.data_client import DataClient
 from rse_pf.experiments.demo.merge import commit
 from rse_pf.maps.format import Keyframe, MapVersion, encode_map
 
 __all__ = ["KeyframeCollector", "KeyframeUploads"]
 
-_UPLOAD_TIMEOUT_S = 30.0
+_UPLOAD_TIMEOUT_S = 30.0  # how long the end of a drive waits for uploads of keyframes, in seconds
 
 
 class KeyframeUploads:
-    """Uploads to the data service: keyframes in the background, the map at the end."""
+    """Upload the keyframes of a robot to the data service in a thread, and its map at the end."""
 
-    def __init__(
-        self,
-        url: str,
-        token: Callable[[], str],
-        spool: Path,
-        is_busy: Callable[[], bool],
-    ) -> None:
-        """Describe the uploads; while *is_busy* (a live pose is on its way) keyframes wait."""
+    def __init__(self, url: str, token: Callable[[], str]) -> None:
+        """Describe the uploads to the data service at *url*; *token* returns a valid token of the robot."""
         self._client = DataClient(url, token)
-        self._background = BackgroundUploader(DataClient(url, token), spool, is_busy=is_busy)
-
-    def start(self) -> KeyframeUploads:
-        """Begin to upload; return this object."""
-        self._background.start()
-        return self
+        self._thread = ThreadPoolExecutor(1, "keyframe-uploads")
+        self._uploads: list[Future[str]] = []
 
     def keyframe(self, data: bytes) -> None:
-        """Spool a keyframe."""
-        self._background.add(data)
+        """Upload an encoded keyframe after those before it, without waiting for the upload."""
+        self._uploads.append(self._thread.submit(self._client.upload, data))
 
     def finish(self, robot: str, data: bytes) -> int:
-        """Wait for the keyframes, commit the map under the name of the robot, and close the connections.
+        """Wait for the keyframes, commit the map under the name of the robot, and close the connection.
 
-        Returns how many keyframes have arrived.
+        Return how many keyframes were uploaded.
         """
         try:
-            self._background.wait_sent(_UPLOAD_TIMEOUT_S)
+            uploads, _ = wait(self._uploads, _UPLOAD_TIMEOUT_S)
             commit(self._client, robot, data, "a drive of the demo")
         finally:
-            self._background.close()
+            self._thread.shutdown(wait=False, cancel_futures=True)
             self._client.close()
-        return self._background.sent
+        return sum(upload.exception() is None for upload in uploads)
 
 
 class KeyframeCollector:

@@ -162,8 +162,6 @@ class _Drive:
     commands: list[CommandRecord] = field(default_factory=list)
     tracked: list[TrackedFrame] = field(default_factory=list)
     weak_poses: int = 0
-    asking: bool = False
-    """Whether a pose is requested at this moment: keyframes wait."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -230,7 +228,7 @@ async def _run(spec: RobotSpec, pipe: ParentPipe) -> None:
                 )  # fmt: skip
             pipe.send(ChildReady(len(frames)))
             began = planned = await asyncio.to_thread(pipe.wait_start)
-            collector = _collector(spec, pipe.token, lambda: drive.asking)
+            collector = _collector(spec, pipe.token)
             recorder = LiveRecorder(shared, time.monotonic, began).start() if options.live else None
             check = DriveCheck(
                 is_wanted=options.check and options.data is not None, is_thinned=loaded.is_thinned
@@ -313,14 +311,11 @@ async def _solve(
         server="",
         code="",
     )
-    drive.asking = True
     try:
         answer = await ask_robot(robot.solve_pnp, spec.session.answer_timeout_s)(query)
     except RsePfError as error:
         drive.commands.append(replace(record, answered=_since(began), code=error.code))
         raise
-    finally:
-        drive.asking = False
     drive.commands.append(
         replace(
             record,
@@ -363,12 +358,10 @@ def _load(spec: RobotSpec, pipe: ParentPipe) -> _Loaded:
     return _Loaded(frames, truth, "ground truth", True)
 
 
-def _collector(
-    spec: RobotSpec, token: Callable[[], str], is_busy: Callable[[], bool]
-) -> KeyframeCollector | None:
+def _collector(spec: RobotSpec, token: Callable[[], str]) -> KeyframeCollector | None:
     if not spec.options.merge:
         return None
-    uploads = KeyframeUploads(spec.url, token, spec.folder / "spool", is_busy).start()
+    uploads = KeyframeUploads(spec.url, token)
     features = load_features(spec.options.features)
     return KeyframeCollector(spec.name, spec.options.frontend_options, uploads, features)
 

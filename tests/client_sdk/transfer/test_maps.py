@@ -45,8 +45,8 @@ def test_an_enrolled_robot_signs_tokens_for_the_data_service(tmp_path: Path) -> 
 
     client = DataClient.enrolled(tmp_path / "robot-1.enrolment")
 
-    assert callable(client._token)
-    assert client._token().count(".") == 2
+    assert callable(client.token)
+    assert client.token().count(".") == 2
     assert client._connection._parts.geturl() == "http://127.0.0.1:9"
 
 
