@@ -15,6 +15,7 @@ import numpy.typing as npt
 from client_sdk.stereo.depth import with_offset
 from client_sdk.tracking.landmark_matching import (
     NO_LANDMARK,
+    PIXEL_SIGMA_PX,
     Landmarks,
     LazyPlaceVector,
     Matches,
@@ -38,9 +39,6 @@ Rows = npt.NDArray[np.int64]
 
 _LOCAL_KEYFRAMES = 6
 """Number of keyframes nearest to a pose whose landmarks are matched with an image there."""
-_PIXEL_SIGMA_PX = 1.0
-"""Standard deviation, in pixels, of a feature's position on the finest pyramid level; it grows with the size
-of the feature."""
 _INITIAL_CAPACITY = 4096
 """Number of landmarks for which a new map has memory; the memory doubles when it is full."""
 _DEG_PER_M = 30.0
@@ -138,7 +136,7 @@ def measure_points(
     rays = points / z[:, None]
     depth_variance = noise.variance_m2(z if expected_m is None else depths_for_noise(z, expected_m))
     covariances = rays[:, :, None] * rays[:, None, :] * depth_variance[:, None, None]
-    pixel_variance = (_PIXEL_SIGMA_PX * view.features.sizes[rows]) ** 2
+    pixel_variance = (PIXEL_SIGMA_PX * view.features.sizes[rows]) ** 2
     covariances[:, 0, 0] += pixel_variance * (z / camera.fx) ** 2
     covariances[:, 1, 1] += pixel_variance * (z / camera.fy) ** 2
     rotation = T_world_camera[:3, :3]
@@ -166,21 +164,28 @@ def observe_landmarks(view: View, matches: Matches, T_world_camera: Array, noise
         points=matches.points,
         covariances=matches.covariances,
         pixels=view.features.pixels[matches.features],
-        pixel_sigmas_px=_PIXEL_SIGMA_PX * view.features.sizes[matches.features],
+        pixel_sigmas_px=PIXEL_SIGMA_PX * view.features.sizes[matches.features],
         depths_m=depths_m,
         depth_sigmas_m=np.sqrt(noise.variance_m2(noise_depths_m)),
     )
 
 
 class KeyframeMap:
-    """Keyframes and landmarks of one segment; beyond *max_keyframes* the older keyframes are thinned out."""
+    """Keyframes and landmarks of one segment, which have one world frame.
+
+    When there are *max_keyframes*, the next keyframe first removes every second one of the older half.
+
+    Attributes:
+        views: Image of each keyframe, oldest first; not to be changed by others.
+        seen: ``(n,)`` for each keyframe: the landmark of each of its features, or NO_LANDMARK.
+        poses: ``T_world_camera`` ``(k, 4, 4)`` of the keyframes.
+    """
 
     def __init__(self, max_keyframes: int) -> None:
         self._max_keyframes = max_keyframes
-        self._views: list[View] = []
-        self._seen: list[Rows] = []
-        """The landmark of each feature of each keyframe, or NO_LANDMARK."""
-        self._poses: Array = np.empty((0, 4, 4))
+        self.views: list[View] = []
+        self.seen: list[Rows] = []
+        self.poses: Array = np.empty((0, 4, 4))
         self._place_vectors: npt.NDArray[np.float32] = np.empty((0, 0), dtype=np.float32)
         self._count = 0
         self._table = _allocate(_INITIAL_CAPACITY, np.empty((0, 0), dtype=np.uint8))
@@ -189,30 +194,12 @@ class KeyframeMap:
     @property
     def keyframe_count(self) -> int:
         """The number of keyframes."""
-        return len(self._views)
+        return len(self.views)
 
     @property
     def landmark_count(self) -> int:
         """The number of landmarks."""
         return self._count
-
-    def pose(self, keyframe: int) -> Array:
-        """Return ``T_world_camera`` ``(4, 4)`` of a keyframe."""
-        pose: Array = self._poses[keyframe]
-        return pose
-
-    def poses(self) -> Array:
-        """Return ``T_world_camera`` ``(k, 4, 4)`` of all keyframes, oldest first."""
-        poses: Array = self._poses.copy()
-        return poses
-
-    def view(self, keyframe: int) -> View:
-        """Return the image of a keyframe."""
-        return self._views[keyframe]
-
-    def landmarks_of_features(self, keyframe: int) -> Rows:
-        """Return the landmark of each feature of a keyframe, or NO_LANDMARK."""
-        return self._seen[keyframe]
 
     def add_keyframe(self, view: View, T_world_camera: Array, landmarks: Rows, noise: DepthNoise) -> Rows:
         """Add a keyframe; its features with depth and without a landmark become landmarks.
@@ -229,7 +216,7 @@ class KeyframeMap:
         descriptors = view.features.descriptors
         if not self._count:
             self._table = _allocate(len(self._table), descriptors)
-        if len(self._views) >= self._max_keyframes:
+        if len(self.views) >= self._max_keyframes:
             landmarks = self._thin_out(landmarks)
         landmarks = landmarks.copy()
         known = np.flatnonzero(landmarks != NO_LANDMARK)
@@ -243,9 +230,9 @@ class KeyframeMap:
         table.shutter_displacements[numbers] = view.shutter_displacements[new] @ T_world_camera[:3, :3].T
         for rows in (known, new):
             self._update_appearance(landmarks[rows], view, T_world_camera, rows)
-        self._views.append(view)
-        self._seen.append(landmarks)
-        self._poses = np.concatenate([self._poses, T_world_camera[None]])
+        self.views.append(view)
+        self.seen.append(landmarks)
+        self.poses = np.concatenate([self.poses, T_world_camera[None]])
         vector = view.place_vector.get()[None]
         self._place_vectors = (
             np.concatenate([self._place_vectors, vector]) if len(self._place_vectors) else vector
@@ -254,8 +241,8 @@ class KeyframeMap:
 
     def distances(self, T_world_camera: Array) -> tuple[Array, Array]:
         """Return the distances ``(k,)`` of all keyframes from a pose, in metres and in degrees."""
-        metres = np.linalg.norm(self._poses[:, :3, 3] - T_world_camera[:3, 3], axis=1)
-        cosines = (np.einsum("nij,ij->n", self._poses[:, :3, :3], T_world_camera[:3, :3]) - 1.0) / 2.0
+        metres = np.linalg.norm(self.poses[:, :3, 3] - T_world_camera[:3, 3], axis=1)
+        cosines = (np.einsum("nij,ij->n", self.poses[:, :3, :3], T_world_camera[:3, :3]) - 1.0) / 2.0
         return metres, np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0)))
 
     def rank_by_similarity(self, place: LazyPlaceVector, count: int) -> list[int]:
@@ -269,9 +256,9 @@ class KeyframeMap:
 
     def landmarks_in(self, keyframe: int) -> tuple[Rows, Descriptors]:
         """Return the numbers of the landmarks that a keyframe sees, and their descriptors in it."""
-        seen = self._seen[keyframe]
+        seen = self.seen[keyframe]
         rows = np.flatnonzero(seen != NO_LANDMARK)
-        return seen[rows], self._views[keyframe].features.descriptors[rows]
+        return seen[rows], self.views[keyframe].features.descriptors[rows]
 
     def landmarks_around(self, T_world_camera: Array) -> tuple[LandmarkAppearance, Rows]:
         """Return the appearance of all landmarks, and the ascending numbers of those around a pose.
@@ -283,7 +270,7 @@ class KeyframeMap:
         nearest = np.argsort(metres + degrees / _DEG_PER_M, kind="stable")[:_LOCAL_KEYFRAMES]
         is_seen = np.zeros(self._count + 1, dtype=bool)  # the last row is that of NO_LANDMARK
         for keyframe in (*nearest, -1):
-            is_seen[self._seen[keyframe]] = True
+            is_seen[self.seen[keyframe]] = True
         return self._table.first(self._count).appearance, np.flatnonzero(is_seen[:-1])
 
     def match(
@@ -396,7 +383,7 @@ class KeyframeMap:
     def move(self, T_new_old: Array) -> None:
         """Express the whole map in another world frame, by the ``(4, 4)`` rigid motion *T_new_old*."""
         rotation, table = T_new_old[:3, :3], self._table.first(self._count)
-        self._poses = T_new_old @ self._poses
+        self.poses = T_new_old @ self.poses
         table.points[:] = transform(T_new_old, table.points)
         table.covariances[:] = rotation @ table.covariances @ rotation.T
         for directions in (table.shutter_displacements, table.rays, table.orientations):
@@ -413,9 +400,9 @@ class KeyframeMap:
             offset_px: Pixels that are added to every disparity.
         """
         newest_keyframe = np.zeros(self._count, dtype=np.int64)
-        for keyframe, seen in enumerate(self._seen):
+        for keyframe, seen in enumerate(self.seen):
             newest_keyframe[seen[seen != NO_LANDMARK]] = keyframe
-        old, new = self._poses[newest_keyframe, :3], T_world_camera[newest_keyframe, :3]
+        old, new = self.poses[newest_keyframe, :3], T_world_camera[newest_keyframe, :3]
         table = self._table.first(self._count)
         # 1. Express each landmark in the old frame of its keyframe, and move it along its ray by the offset.
         local = np.einsum("nji,nj->ni", old[:, :, :3], table.points - old[:, :, 3])
@@ -428,14 +415,14 @@ class KeyframeMap:
         table.covariances[:] = rotation @ table.covariances @ rotation.transpose(0, 2, 1)
         table.orientations[:] = np.einsum("nij,nj->ni", rotation, table.orientations)
         table.shutter_displacements[:] = np.einsum("nij,nj->ni", rotation, table.shutter_displacements)
-        self._poses = T_world_camera.copy()
+        self.poses = T_world_camera.copy()
         # 3. Add the offset to the disparities of the points that the keyframes measured.
         points_cameras = [
-            with_offset(view.features.points_camera, f_baseline, offset_px) for view in self._views
+            with_offset(view.features.points_camera, f_baseline, offset_px) for view in self.views
         ]
-        self._views = [
+        self.views = [
             replace(view, features=replace(view.features, points_camera=points_camera))
-            for view, points_camera in zip(self._views, points_cameras, strict=True)
+            for view, points_camera in zip(self.views, points_cameras, strict=True)
         ]
 
     def append(self, other: KeyframeMap) -> int:
@@ -444,9 +431,9 @@ class KeyframeMap:
         Returned is the number that the other map's first landmark has here.
         """
         first = self._count
-        self._views += other._views
-        self._seen += [shift_landmarks(seen, first) for seen in other._seen]
-        self._poses = np.concatenate([self._poses, other._poses])
+        self.views += other.views
+        self.seen += [shift_landmarks(seen, first) for seen in other.seen]
+        self.poses = np.concatenate([self.poses, other.poses])
         self._place_vectors = np.concatenate([self._place_vectors, other._place_vectors])
         self._reserve(first + other._count)
         self._count += other._count
@@ -480,20 +467,20 @@ class KeyframeMap:
         Landmarks are renumbered.  *current*, landmark numbers (or NO_LANDMARK) that must stay, is returned
         with the new numbers.
         """
-        is_kept = np.ones(len(self._views), dtype=bool)
-        is_kept[: len(self._views) // 2 : 2] = False
+        is_kept = np.ones(len(self.views), dtype=bool)
+        is_kept[: len(self.views) // 2 : 2] = False
         kept = np.flatnonzero(is_kept)
-        self._views = [self._views[keyframe] for keyframe in kept]
-        self._seen = [self._seen[keyframe] for keyframe in kept]
-        self._poses, self._place_vectors = self._poses[kept], self._place_vectors[kept]
-        rows = np.unique(np.concatenate([*self._seen, current]))
+        self.views = [self.views[keyframe] for keyframe in kept]
+        self.seen = [self.seen[keyframe] for keyframe in kept]
+        self.poses, self._place_vectors = self.poses[kept], self._place_vectors[kept]
+        rows = np.unique(np.concatenate([*self.seen, current]))
         rows = rows[rows != NO_LANDMARK]
         new_numbers = np.full(self._count + 1, NO_LANDMARK)  # the last row is that of NO_LANDMARK
         new_numbers[rows] = np.arange(len(rows))
         for column in _columns(self._table):
             column[: len(rows)] = column[rows]
         self._count = len(rows)
-        self._seen = [new_numbers[seen] for seen in self._seen]
+        self.seen = [new_numbers[seen] for seen in self.seen]
         return new_numbers[current]
 
 

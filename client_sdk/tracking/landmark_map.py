@@ -1,6 +1,6 @@
 """The map of one segment of a camera without depth: keyframes, landmarks, and their bundle adjustment.
 
-A landmark is a point that two or more keyframes have triangulated.  `LandmarkLimits` bounds memory and time.
+A landmark is a point that two or more keyframes have triangulated.
 The tracker decides which frames become keyframes, and which keyframes show the same place.
 """
 
@@ -14,6 +14,7 @@ import numpy.typing as npt
 from client_sdk.monocular.bundle import Adjuster, Bundle, adjust
 from client_sdk.tracking.landmark_matching import (
     NO_LANDMARK,
+    PIXEL_SIGMA_PX,
     Landmarks,
     LazyPlaceVector,
     Matches,
@@ -24,17 +25,51 @@ from rse_pf.maps.descriptors import Descriptors
 from rse_pf.slam.tracking import Features, GuidedMatchLimits
 from rse_pf.slam.triangulation import parallax_deg, reprojection_errors, triangulate
 
-__all__ = ["MIN_SHARED_LANDMARKS", "LandmarkLimits", "LandmarkMap", "MonocularKeyframe", "MonocularView"]
+__all__ = [
+    "MAX_KEYFRAMES",
+    "MIN_SHARED_LANDMARKS",
+    "OUTLIER_SIGMAS",
+    "LandmarkMap",
+    "MonocularKeyframe",
+    "MonocularView",
+]
 
 Rows = npt.NDArray[np.int64]
 
 MIN_SHARED_LANDMARKS = 15
 """Fewest common landmarks of two keyframes that are neighbours in the covisibility graph."""
+MAX_KEYFRAMES = 1000
+"""Largest number of keyframes of a map; then frames are still tracked in it, but become no keyframes: bounds
+memory."""
+OUTLIER_SIGMAS = 2.45
+"""Reprojection error, in standard deviations of the pixel, above which an observation is an outlier: 95 % of
+the errors of a 2-D Gaussian are below it."""
 _LATEST_NEIGHBOURS = 2
-"""Number of keyframes just before a keyframe that count as its neighbours even without common landmarks."""
+"""Number of keyframes whose numbers are just below that of a keyframe, and which count as its neighbours even
+without common landmarks."""
+_TRIANGULATION_NEIGHBOURS = 6
+"""Number of neighbours with which a new keyframe triangulates landmarks: bounds the time of a keyframe."""
+_LOCAL_NEIGHBOURS = 20
+"""Number of neighbours of a keyframe whose landmarks are matched with a frame: bounds the time of a frame."""
+_WINDOW_KEYFRAMES = 10
+"""Number of keyframes that a local bundle adjustment moves: bounds the time of a keyframe."""
+_FIXED_KEYFRAMES = 12
+"""Number of further keyframes that take part in a local bundle adjustment with fixed poses: bounds the time
+of a keyframe."""
+_MAX_POSE_LANDMARKS = 3000
+"""Largest number of landmarks, those seen most often, by which a bundle adjustment estimates the poses;
+further landmarks are adjusted to these poses: bounds the time of an adjustment."""
+_MAX_ADJUSTED_KEYFRAMES = 200
+"""Number of keyframes of a map above which they are not adjusted all together: bounds the time to seconds."""
+_MIN_PARALLAX_DEG = 1.0
+"""Smallest angle, in degrees, between the two rays of a landmark that is triangulated: below it the depth is
+noise."""
+_SEARCH_RADIUS_PX = 30.0
+"""Radius, in pixels, around its predicted pixel in which a feature of another keyframe is matched to be
+triangulated; the prediction takes its depth from the landmarks around the feature."""
 _DEPTH_LANDMARKS = 3
-"""Number of nearest landmarks in the image whose mean inverse depth is taken for a feature without a
-landmark."""
+"""Number of landmarks nearest in the image whose mean inverse depth is the guessed inverse depth of a feature
+without a landmark, by which the pixel of this feature in another keyframe is predicted."""
 _MIN_LANDMARK_DEPTH = 1e-3
 """Smaller depths, in the unit of the map, count as this one where inverse depths are averaged."""
 _MIN_BASELINE_DEPTH_SHARE = 0.01
@@ -51,40 +86,6 @@ _CULL_AGE_KEYFRAMES = 3
 """Number of newer keyframes after which a landmark that too few keyframes have seen is removed."""
 _CULL_OBSERVATIONS = 3
 """Fewest keyframes that must have seen a landmark when it is no longer new: a wrong match is seen by two."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LandmarkLimits:
-    """Limits of the map of a camera without depth: its size, and the observations that it accepts.
-
-    Attributes:
-        neighbours: Number of neighbours with which a new keyframe triangulates landmarks.
-        local: Number of neighbours of a keyframe whose landmarks are matched with a frame.
-        search_px: Radius around its predicted pixel in which a feature of another keyframe is matched to be
-            triangulated; the prediction takes its depth from the landmarks around it.
-        window: Number of keyframes that a local bundle adjustment moves.
-        fixed: Number of further keyframes that take part in a local adjustment with fixed poses.
-        in_all: Number of landmarks, those seen most often, by which an adjustment moves the keyframes;
-            further landmarks are adjusted to the result.
-        max_in_all: Number of keyframes beyond which `LandmarkMap.adjust_all` changes nothing.
-        min_parallax_deg: Smallest angle between the rays of a new landmark, in degrees.
-        outlier_sigma: Observations whose reprojection error is larger than this many standard deviations are
-            removed.
-        pixel_sigma: Standard deviation of a feature on the finest pyramid level, in pixels.
-        max_keyframes: Number of keyframes after which the map is tracked, and no longer extended.
-    """
-
-    neighbours: int = 6
-    local: int = 20
-    search_px: float = 30.0
-    window: int = 10
-    fixed: int = 12
-    in_all: int = 3000
-    max_in_all: int = 200
-    min_parallax_deg: float = 1.0
-    outlier_sigma: float = 2.45
-    pixel_sigma: float = 1.0
-    max_keyframes: int = 1000
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -122,7 +123,6 @@ class LandmarkMap:
 
     Attributes:
         camera: Intrinsics of all keyframes.
-        limits: Limits of the map.
         keyframes: All keyframes, oldest first.
         points: ``(n, 3)`` landmarks in the world, in the unit of the map.
         descriptors: ``(n, d)``, descriptor of each landmark in the keyframe that saw it last.
@@ -130,11 +130,8 @@ class LandmarkMap:
         is_alive: ``(n,)``; removed landmarks keep their number and are not alive.
     """
 
-    def __init__(
-        self, camera: Camera, limits: LandmarkLimits | None = None, adjuster: Adjuster = adjust
-    ) -> None:
+    def __init__(self, camera: Camera, adjuster: Adjuster = adjust) -> None:
         self.camera = camera
-        self.limits = limits or LandmarkLimits()
         self.keyframes: list[MonocularKeyframe] = []
         self.points: Array = np.empty((0, 3))
         self.descriptors: Descriptors = np.empty((0, 0), dtype=np.uint8)
@@ -213,7 +210,7 @@ class LandmarkMap:
         depths = self._interpolate_depths(number)
         if depths is None:
             return 0
-        for neighbour in self._neighbours(number)[: self.limits.neighbours]:
+        for neighbour in self._neighbours(number)[:_TRIANGULATION_NEIGHBOURS]:
             self._triangulate(number, neighbour, depths)
         for neighbour in self._neighbours(number):
             self._observe_again(neighbour, np.arange(count, len(self.points)))
@@ -291,7 +288,7 @@ class LandmarkMap:
 
     def local_keyframes(self, number: int) -> list[int]:
         """Return a keyframe, and its neighbours in the order of how many landmarks they share with it."""
-        return [number, *self._neighbours(number)[: self.limits.local]]
+        return [number, *self._neighbours(number)[:_LOCAL_NEIGHBOURS]]
 
     def local_landmarks(self, number: int) -> Rows:
         """Return the ascending numbers of the landmarks that a keyframe and its neighbours see."""
@@ -335,18 +332,18 @@ class LandmarkMap:
     def adjust_around(self, number: int) -> None:
         """Adjust a keyframe, its neighbours and all landmarks that they see; remove outlier observations.
 
-        At most ``window`` keyframes move, and at most ``fixed`` further ones take part with fixed poses.
+        At most 10 keyframes move, and at most 12 further ones take part with fixed poses.
         """
-        window = [number, *self._neighbours(number)[: self.limits.window - 1]]
-        self._adjust(sorted(window), self.limits.fixed, iterations=_LOCAL_ITERATIONS)
+        window = [number, *self._neighbours(number)[: _WINDOW_KEYFRAMES - 1]]
+        self._adjust(sorted(window), _FIXED_KEYFRAMES, iterations=_LOCAL_ITERATIONS)
 
     def adjust_all(self, *, iterations: int = 12) -> None:
         """Adjust all keyframes and landmarks twice, with outliers removed in between.
 
         The first two keyframes keep their poses, which fixes the frame and the scale of the map.  A map of
-        more than ``max_in_all`` keyframes stays as it is.
+        more than 200 keyframes stays as it is.
         """
-        if len(self.keyframes) > self.limits.max_in_all:
+        if len(self.keyframes) > _MAX_ADJUSTED_KEYFRAMES:
             return
         everything = list(range(len(self.keyframes)))
         self._adjust(everything, 0, iterations=iterations)
@@ -474,9 +471,9 @@ class LandmarkMap:
             one.view.features.pixels[rows],
             two.view.features.pixels[columns],
             self.camera,
-            max_error_px=self.limits.outlier_sigma * self.limits.pixel_sigma * sizes,
+            max_error_px=OUTLIER_SIGMAS * PIXEL_SIGMA_PX * sizes,
         )
-        is_good &= parallax_deg(points, *centres) >= self.limits.min_parallax_deg
+        is_good &= parallax_deg(points, *centres) >= _MIN_PARALLAX_DEG
         self.add_landmarks(points[is_good], (neighbour, rows[is_good]), (number, columns[is_good]))
 
     def _interpolate_depths(self, number: int) -> Array | None:
@@ -520,10 +517,8 @@ class LandmarkMap:
             sizes=image.sizes[free],
             numbers=free,
         )
-        limits = GuidedMatchLimits(radius_px=self.limits.search_px)
-        matches = guesses.match(
-            one.T_camera_world, self.camera, one.view.features, limits, self.limits.search_px
-        )
+        limits = GuidedMatchLimits(radius_px=_SEARCH_RADIUS_PX)
+        matches = guesses.match(one.T_camera_world, self.camera, one.view.features, limits, _SEARCH_RADIUS_PX)
         is_free = one.landmarks[matches.features] == NO_LANDMARK
         return matches.features[is_free], matches.numbers[is_free]
 
@@ -602,7 +597,7 @@ class LandmarkMap:
             cameras=cameras,
             points=points.ravel(),
             pixels=pixels,
-            sigma_px=sizes * self.limits.pixel_sigma,
+            sigma_px=sizes * PIXEL_SIGMA_PX,
         )
         # 3. Adjust the bundle, and write its points and poses back into the map.
         bundle = self._solve(bundle, iterations)
@@ -613,7 +608,7 @@ class LandmarkMap:
         errors_px, _ = reprojection_errors(
             bundle.T_camera_world[bundle.cameras], bundle.points_world[bundle.points], pixels, self.camera
         )
-        is_outlier = errors_px > self.limits.outlier_sigma * bundle.sigma_px
+        is_outlier = errors_px > OUTLIER_SIGMAS * bundle.sigma_px
         for camera, number in enumerate(numbers):
             self.keyframes[number].landmarks[features[is_outlier & (cameras == camera)]] = NO_LANDMARK
         self._remove(used[self._count_observations()[used] < 2])
@@ -637,17 +632,16 @@ class LandmarkMap:
     def _solve(self, bundle: Bundle, iterations: int) -> Bundle:
         """Return a new bundle with adjusted poses and points.
 
-        With more than ``in_all`` landmarks, only those seen most often adjust the cameras; then all landmarks
-        are adjusted to the cameras.
+        Of more than 3,000 landmarks, only those seen most often determine the poses; then all landmarks are
+        adjusted to the new poses.
         """
-        limit = self.limits.in_all
-        if len(bundle.points_world) <= limit:
+        if len(bundle.points_world) <= _MAX_POSE_LANDMARKS:
             poses, points = self._adjust_bundle(bundle, self.camera, iterations=iterations)
             return replace(bundle, T_camera_world=poses, points_world=points)
         # 1. Adjust the cameras and the landmarks that are seen most often.
         counts = np.bincount(bundle.points, minlength=len(bundle.points_world))
         is_used = np.zeros(len(counts), dtype=bool)
-        is_used[np.argsort(-counts, kind="stable")[:limit]] = True
+        is_used[np.argsort(-counts, kind="stable")[:_MAX_POSE_LANDMARKS]] = True
         rows = is_used[bundle.points]
         poses, points = self._adjust_bundle(
             replace(

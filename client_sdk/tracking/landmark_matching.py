@@ -24,6 +24,7 @@ from rse_pf.slam.tracking import Features, GuidedMatchLimits, LandmarkAppearance
 __all__ = [
     "LATEST_KEYFRAMES",
     "NO_LANDMARK",
+    "PIXEL_SIGMA_PX",
     "Candidate",
     "Landmarks",
     "LazyPlaceVector",
@@ -39,6 +40,9 @@ Rows = npt.NDArray[np.int64]
 
 NO_LANDMARK = -1
 """Stands in arrays of landmark numbers for a feature that shows no landmark of the map."""
+PIXEL_SIGMA_PX = 1.0
+"""Standard deviation, in pixels, of a feature's position on the finest pyramid level; it grows with the size
+of the feature."""
 LATEST_KEYFRAMES = 3
 """Number of newest keyframes of the present segment that are compared with a frame after the camera was lost:
 most losses end near the place where they began."""

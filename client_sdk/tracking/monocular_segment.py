@@ -7,8 +7,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import numpy.typing as npt
 
-from client_sdk.tracking.landmark_map import LandmarkMap, MonocularView
-from client_sdk.tracking.landmark_matching import NO_LANDMARK, Matches
+from client_sdk.tracking.landmark_map import OUTLIER_SIGMAS, LandmarkMap, MonocularView
+from client_sdk.tracking.landmark_matching import NO_LANDMARK, PIXEL_SIGMA_PX, Matches
 from client_sdk.trajectory import Trajectory
 from rse_pf.geometry import Array, inverse, pose_difference, rigid, scaled, transform
 from rse_pf.slam.descriptors import match_all
@@ -249,7 +249,6 @@ class MonocularSegment:
             min_inliers: Fewest matches, and fewest of them that agree with the fitted pose.
             around: Keyframe around which landmarks are matched; None for the reference keyframe.
         """
-        limits = self.map.limits
         for radius in (radius_px, _REFINE_RADIUS_PX):
             near = GuidedMatchLimits(radius_px=radius, lowe_ratio=_VERIFY_LOWE_RATIO)
             matches = self.match(view, T_camera_world, near, around)
@@ -260,11 +259,11 @@ class MonocularSegment:
                 points=matches.points,
                 covariances=matches.covariances,
                 pixels=view.features.pixels[matches.features],
-                pixel_sigmas_px=limits.pixel_sigma * view.features.sizes[matches.features],
+                pixel_sigmas_px=PIXEL_SIGMA_PX * view.features.sizes[matches.features],
                 depths_m=np.zeros(count),
                 depth_sigmas_m=np.ones(count),
             )
-            fitted = fit_pose(observed, self.map.camera, T_camera_world, gate2=limits.outlier_sigma**2)
+            fitted = fit_pose(observed, self.map.camera, T_camera_world, gate2=OUTLIER_SIGMAS**2)
             if fitted is None or fitted.is_inlier.sum() < min_inliers:
                 return None
             pose = rigid(fitted.T_camera_world)

@@ -8,8 +8,9 @@ the frame, and keep it in the map.  Each segment has an arbitrary unit of length
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections.abc import Generator, Iterable, Iterator
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from typing import Literal
 
 import numpy as np
@@ -20,8 +21,8 @@ from client_sdk.monocular.bundle import adjust
 from client_sdk.monocular.two_view import TwoViewStart, start_from_two_views
 from client_sdk.plugins import Plugins
 from client_sdk.tracking.landmark_map import (
+    MAX_KEYFRAMES,
     MIN_SHARED_LANDMARKS,
-    LandmarkLimits,
     LandmarkMap,
     MonocularView,
 )
@@ -115,7 +116,6 @@ class MonocularOptions:
         start_parallax_deg: Smallest median parallax of the two views that begin a segment.
         segment_after: Number of frames since the last pose, with enough features and no recognised place,
             after which a new segment begins.
-        limits: Limits of the map.
     """
 
     features: int = 1000
@@ -129,7 +129,6 @@ class MonocularOptions:
     keyframe_depth_percent: float = 10.0
     start_parallax_deg: float = 2.0
     segment_after: int = 5
-    limits: LandmarkLimits = field(default_factory=LandmarkLimits)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -156,6 +155,25 @@ class _TrackState:
     unrecognised: int = 0
     candidate: Similarity | None = None
     next_loop_keyframe: int = 0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Attempt:
+    """Matches of a frame by which its pose is to be solved.
+
+    Attributes:
+        matches: The matches.
+        segment: Number of the segment whose landmarks are matched.
+        against: The source of the landmarks, see `PoseQuery`.
+        min_matches: Fewest matches for which the pose is queried.
+        keyframe: Keyframe by which the place is recognised; None around the last pose.
+    """
+
+    matches: Matches
+    segment: int
+    against: Literal["map", "frame", "keyframe"]
+    min_matches: int
+    keyframe: int | None = None
 
 
 class MonocularTracker:
@@ -282,8 +300,9 @@ class MonocularTracker:
         if self._segments and frame.camera != self._present.map.camera:
             raise UsageError("the camera of this frame is another one", hint="use one tracker per camera")
         self.frames += 1
-        self._frame, self._raw = frame, self._extract(frame)
-        return self._open.begin(self._track(self._make_view()))
+        self._frame, view = frame, self._extract(frame)
+        self._raw = view.features
+        return self._open.begin(self._track(view))
 
     def accept(
         self, query: PoseQuery, T_camera_world: Array | None, inliers: int = 0, *, is_weak: bool = False
@@ -335,7 +354,7 @@ class MonocularTracker:
         """Adjust all keyframes and landmarks of each segment together, such as at the end of a drive.
 
         This takes seconds, and corrects poses that were returned before.  A segment with more keyframes than
-        `LandmarkLimits.max_in_all` stays as it is.  The next frame is relocalised.
+        200 stays as it is.  The next frame is relocalised.
 
         Raises:
             UsageError: A query is open.
@@ -369,13 +388,8 @@ class MonocularTracker:
 
     def _track(self, view: MonocularView) -> FrameSteps:
         """Yield the queries of the present frame, and return its result."""
-        # 1. Track the frame from the last pose; if that fails, relocalise it at all known places.
-        posed = None
-        reason = "a place that was not seen before"
-        if self._state.last is not None:
-            posed, reason = yield from self._track_from_last_pose(view)
-        if posed is None and self._segments:
-            posed, reason = yield from self._relocalise(view)
+        # 1. Predict, match, solve and verify: around the last pose, then at all known places.
+        posed, reason = yield from self._pose(view)
         # 2. Decide: without a pose, the frame is lost or begins a segment.
         if posed is None:
             return self._start_or_lose(view, reason)
@@ -388,16 +402,14 @@ class MonocularTracker:
             yield from self._find_loop()
         return self._make_result(posed, is_keyframe=is_keyframe)
 
-    def _extract(self, frame: Frame) -> Features:
-        """Return features that are spread over the image; their 3-D points are NaN."""
+    # --- Extract ---
+
+    def _extract(self, frame: Frame) -> MonocularView:
+        """Return the image of a frame, with features that are spread over it and have no 3-D points."""
         wider = max(1.0, frame.camera.width / _FEATURES_WIDTH_PX)
         count = int(min(max(self.options.features, _MAX_FEATURES), self.options.features * wider))
         described = describe(frame.rgb, count, plugin=self._plugins.features)
-        return make_features(described, np.full((len(described.pixels), 3), np.nan))
-
-    def _make_view(self) -> MonocularView:
-        """Return the image of the present frame."""
-        frame, features = self._frame, self._raw
+        features = make_features(described, np.full((len(described.pixels), 3), np.nan))
         last_pixel = np.array([frame.camera.width - 1, frame.camera.height - 1])
         columns, lines = np.clip(np.rint(features.pixels).astype(np.int64), 0, last_pixel).T
         return MonocularView(
@@ -408,55 +420,89 @@ class MonocularTracker:
 
     # --- Predict and match ---
 
-    def _track_from_last_pose(
-        self, view: MonocularView
-    ) -> Generator[PoseQuery, QueryAnswer, tuple[PosedView | None, str]]:
-        """Ask for the pose of a frame around the camera's last pose.
-
-        Returned are the image with its verified pose and an empty text, or None and why the last attempt
-        failed.
-        """
-        # 1. Predict the pose.
-        last = self._state.last
-        assert last is not None
-        reason, search_px, min_inliers = "", self.options.search_px, self.options.min_inliers
-        guided = GuidedMatchLimits(radius_px=search_px)
-        wide = GuidedMatchLimits(radius_px=_WIDE_SEARCH_FACTOR * search_px)
-        T_predicted, guided_matches = self._predict_pose(), _GUIDED_MATCHES_FACTOR * min_inliers
-        # 2. Match near the predicted pixels, then in a wider radius, then with the last frame by appearance.
-        attempts: tuple[tuple[Callable[[], Matches], Literal["map", "frame"], int], ...] = (
-            (lambda: self._present.match(view, T_predicted, guided), "map", guided_matches),
-            (lambda: self._present.match(view, T_predicted, wide), "map", guided_matches),
-            (lambda: self._present.match_last_frame(view, last), "frame", min_inliers),
-        )
-        for match, against, min_matches in attempts:
-            matches = match()
-            if len(matches) < min_matches:
-                reason = f"only {len(matches)} matches with the map"
-                continue
-            # 3. Solve the pose by a query, and verify it by the landmarks around the reference keyframe.
-            answer = yield self._make_query(view, matches, against)
-            posed, reason = self._verify(self._present, view, answer, len(matches))
-            if posed is not None:
-                return posed, ""
-        return None, reason
-
-    def _predict_pose(self) -> Array:
+    def _predict_pose(self, last: PosedView) -> Array:
         """Predict ``T_camera_world`` ``(4, 4)`` of the frame by a user's motion model, if it returns a pose.
 
         Otherwise the motion between the last two frames is repeated, whatever time has passed.  Its rotation
         is replaced by that of the gyroscope, where there is one.
         """
         state, now_s = self._state, self._frame.timestamp_s
-        assert state.last is not None
         T_world_camera = self._plugins.predict_pose(now_s)
         if T_world_camera is not None:
             return inverse(T_world_camera)
         T_last_next = self._plugins.predict_motion(inverse(state.T_next_last), state.timestamp_s, now_s)
-        predicted: Array = inverse(T_last_next) @ state.last.T_camera_world
+        predicted: Array = inverse(T_last_next) @ last.T_camera_world
         return predicted
 
-    # --- Recognise known places ---
+    def _match_around_last_pose(self, view: MonocularView) -> Iterator[_Attempt]:
+        """Match a frame near the predicted pixels, then in a wider radius, then with the last frame.
+
+        There is no attempt after a loss.
+        """
+        last, number, min_inliers = self._state.last, self._state.segment, self.options.min_inliers
+        if last is None:
+            return
+        T_predicted, min_guided_matches = self._predict_pose(last), _GUIDED_MATCHES_FACTOR * min_inliers
+        for factor in (1.0, _WIDE_SEARCH_FACTOR):
+            limits = GuidedMatchLimits(radius_px=factor * self.options.search_px)
+            matches = self._present.match(view, T_predicted, limits)
+            yield _Attempt(matches=matches, segment=number, against="map", min_matches=min_guided_matches)
+        matches = self._present.match_last_frame(view, last)
+        yield _Attempt(matches=matches, segment=number, against="frame", min_matches=min_inliers)
+
+    def _match_known_places(self, view: MonocularView) -> Iterator[_Attempt]:
+        """Match a frame with the three keyframes of all segments that have the most matches.
+
+        Of these, only the best one may have too few matches for a query.
+        """
+        min_inliers, maps = self.options.min_inliers, self._maps
+        keyframes = list_relocalisation_candidates(maps, view.place_vector, self._state.segment)
+        candidates = match_candidates(maps, keyframes, view.features)
+        for rank, candidate in enumerate(candidates[:_MAX_RELOCALISATION_QUERIES]):
+            if rank == 0 or len(candidate.matches) >= min_inliers:
+                yield _Attempt(
+                    matches=candidate.matches,
+                    segment=candidate.segment,
+                    against="keyframe",
+                    min_matches=min_inliers,
+                    keyframe=candidate.keyframe,
+                )
+
+    # --- Solve ---
+
+    def _pose(self, view: MonocularView) -> Generator[PoseQuery, QueryAnswer, tuple[PosedView | None, str]]:
+        """Ask for the pose of a frame by one attempt after the other, until one gives a verified pose.
+
+        If the pose is found by a keyframe, the segment of the keyframe becomes the present one, and the
+        keyframe its reference keyframe.  Returned are the image with its verified pose and an empty text, or
+        None and why the last attempt failed.
+        """
+        reason = "a place that was not seen before"
+        for attempt in chain(self._match_around_last_pose(view), self._match_known_places(view)):
+            count, segment = len(attempt.matches), self._segments[attempt.segment]
+            if count < attempt.min_matches:
+                reason = f"only {count} matches with the map"
+                continue
+            # 1. Solve the pose by a query.
+            answer = yield self._make_query(view, attempt.matches, attempt.against)
+            reason = "the matches agree on no pose"
+            # 2. Far from the newest keyframes, only a clear answer is accepted: perceptual aliases, places
+            #    that look alike, exist.
+            keyframe = attempt.keyframe
+            if keyframe is not None:
+                is_new = keyframe >= segment.map.keyframe_count - LATEST_KEYFRAMES
+                is_near = is_new and attempt.segment == self._state.segment
+                if not (is_near or self._is_clear(answer, count)):
+                    continue
+            # 3. Verify the pose by the landmarks around the keyframe, or around the reference keyframe.
+            posed, reason = self._verify(segment, view, answer, count, keyframe)
+            if posed is None:
+                continue
+            if keyframe is not None:
+                self._state = replace(self._state, segment=attempt.segment, last=None, candidate=None)
+                segment.set_reference(keyframe)
+            return posed, ""
+        return None, reason
 
     @property
     def _present(self) -> MonocularSegment:
@@ -467,36 +513,7 @@ class MonocularTracker:
         """The map of each segment by its number."""
         return {number: segment.map for number, segment in self._segments.items()}
 
-    def _relocalise(
-        self, view: MonocularView
-    ) -> Generator[PoseQuery, QueryAnswer, tuple[PosedView | None, str]]:
-        """Ask for the pose of a frame at the keyframes of all segments that may show its place.
-
-        If a pose is found, the segment of the keyframe becomes the present one, and the keyframe its
-        reference keyframe.  Returned are the image with its verified pose and an empty text, or None and why
-        there is none.
-        """
-        present = self._state.segment
-        keyframes = list_relocalisation_candidates(self._maps, view.place_vector, present)
-        candidates = match_candidates(self._maps, keyframes, view.features)
-        reason = f"only {len(candidates[0].matches)} matches with the map"
-        for candidate in candidates[:_MAX_RELOCALISATION_QUERIES]:
-            count = len(candidate.matches)
-            if count < self.options.min_inliers:
-                break
-            segment, keyframe = self._segments[candidate.segment], candidate.keyframe
-            answer = yield self._make_query(view, candidate.matches, "keyframe")
-            reason = "the matches agree on no pose"
-            # Far from the newest keyframes, only a clear answer is accepted: perceptual aliases exist.
-            is_new = keyframe >= segment.map.keyframe_count - LATEST_KEYFRAMES
-            if not ((candidate.segment == present and is_new) or self._is_clear(answer, count)):
-                continue
-            posed, reason = self._verify(segment, view, answer, count, keyframe)
-            if posed is not None:
-                self._state = replace(self._state, segment=candidate.segment, last=None, candidate=None)
-                segment.set_reference(keyframe)
-                return posed, ""
-        return None, reason
+    # --- Join segments, and close loops ---
 
     def _find_join(self) -> Generator[PoseQuery, QueryAnswer, None]:
         """Ask for the place of the last frame in other segments; join two once two measurements agree."""
@@ -756,7 +773,7 @@ class MonocularTracker:
         first_s, first = self._waiting[0]
         unit = _START_DEPTH / float(np.median(start.points[:, 2]))
         adjuster = self._plugins.optimiser or adjust
-        new_map = LandmarkMap(self._frame.camera, self.options.limits, adjuster)
+        new_map = LandmarkMap(self._frame.camera, adjuster)
         for new_view, pose in ((first, np.eye(4)), (view, scaled(start.T_second_first, unit))):
             new_map.add_keyframe(new_view, pose, np.full(len(new_view.features), NO_LANDMARK))
         new_map.add_landmarks(unit * start.points, (0, rows[start.rows]), (1, columns[start.rows]))
@@ -841,7 +858,7 @@ class MonocularTracker:
     def _is_keyframe(self, posed: PosedView) -> bool:
         """Return whether a frame differs much from the reference keyframe, and the map may grow."""
         options, segment = self.options, self._present
-        if segment.map.keyframe_count >= options.limits.max_keyframes:
+        if segment.map.keyframe_count >= MAX_KEYFRAMES:
             return False
         reference = segment.map.keyframes[segment.reference].T_camera_world
         moved, rotated_deg = pose_difference(posed.T_camera_world, reference)

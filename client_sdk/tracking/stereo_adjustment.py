@@ -112,7 +112,7 @@ def adjust_stereo(segment_map: KeyframeMap, f_baseline: float) -> StereoAdjustme
     if landmark_count < _MIN_LANDMARKS:
         return None
     # 1. Adjust twice, with the noise of depths at the expected depths.
-    old = segment_map.poses()
+    old = segment_map.poses
     T_camera_world = inverse(old)
     points = triangulate_landmarks(observed, T_camera_world, landmark_count)
     calibrated: Calibrated | None = None
@@ -126,7 +126,7 @@ def adjust_stereo(segment_map: KeyframeMap, f_baseline: float) -> StereoAdjustme
         return None
     assert calibrated is not None
     # 2. Move the result so that the first keyframe stays.
-    new = segment_map.pose(0) @ T_camera_world[0] @ inverse(T_camera_world)
+    new = segment_map.poses[0] @ T_camera_world[0] @ inverse(T_camera_world)
     # 3. Compute by how much the path bends and grows with an offset of one pixel.
     one_pixel = np.zeros(len(UNKNOWNS))
     one_pixel[_CURVE] = 1.0 / f_baseline
@@ -134,7 +134,7 @@ def adjust_stereo(segment_map: KeyframeMap, f_baseline: float) -> StereoAdjustme
     positions -= positions.mean(axis=0)
     bends_m = calibrated.bends_m[_CURVE] / f_baseline
     adjustment = StereoAdjustment(
-        stamps_s=np.array([segment_map.view(k).timestamp_s for k in range(count)]),
+        stamps_s=np.array([view.timestamp_s for view in segment_map.views]),
         T_new_old=new @ inverse(old),
         f_baseline=f_baseline,
         offset_px=float(calibrated.values[_CURVE]) * f_baseline,
@@ -156,8 +156,7 @@ def _collect_observations(segment_map: KeyframeMap) -> tuple[int, DriveObservati
     The standard deviations of the depths are not set yet: they hold the depths themselves.
     """
     # 1. Collect landmark, keyframe and depth of every feature of every keyframe.
-    views = [segment_map.view(k) for k in range(segment_map.keyframe_count)]
-    seen = np.concatenate([segment_map.landmarks_of_features(k) for k in range(len(views))])
+    views, seen = segment_map.views, np.concatenate(segment_map.seen)
     keyframes = np.repeat(np.arange(len(views)), [len(view.features) for view in views])
     depths_m = np.concatenate([view.features.points_camera[:, 2] for view in views])
     # 2. Choose the landmarks that two or more keyframes see: those seen most often, then the nearest.

@@ -439,7 +439,7 @@ class Tracker:
             yield _Attempt(
                 matches=candidate.matches,
                 segment=candidate.segment,
-                T_world_reference=self._segments[candidate.segment].pose(candidate.keyframe),
+                T_world_reference=self._segments[candidate.segment].poses[candidate.keyframe],
                 against="keyframe",
                 min_matches=self.options.min_inliers,
                 min_ratio=0.0,
@@ -544,7 +544,7 @@ class Tracker:
         attempt = _Attempt(
             matches=best.matches,
             segment=best.segment,
-            T_world_reference=segment_map.pose(best.keyframe),
+            T_world_reference=segment_map.poses[best.keyframe],
             against="segment",
             min_matches=CLEAR_INLIERS,
             min_ratio=0.0,

@@ -60,11 +60,11 @@ def test_the_offset_of_disparities_and_the_metres_are_found(offset_px: float) ->
     assert found is not None
     assert found.offset_px == pytest.approx(offset_px, abs=4.0 * found.deviation_px + 0.01)
     assert found.deviation_px < 0.05
-    poses = np.array([known.pose(row) for row in range(known.keyframe_count)])
+    poses = known.poses
     assert np.abs(poses[:, :3, 3] - truth[:, :3, 3]).max() < 0.01  # 4 cm before
     landmarks, _ = known.landmarks_around(truth[0])
     assert np.median(np.linalg.norm(landmarks.points - points, axis=1) / points[:, 2]) < 0.03
-    measured = known.view(3).features.points_camera[:, 2]
+    measured = known.views[3].features.points_camera[:, 2]
     expected = transform(inverse(truth[3]), points)[:, 2]
     assert abs(np.median(F_BASELINE / measured - F_BASELINE / expected)) < 0.06  # 0.3 before
 
@@ -92,19 +92,19 @@ def test_poses_between_keyframes_move_with_them() -> None:
 
 def test_a_good_calibration_moves_nothing() -> None:
     known, _, _ = drive(0.0)
-    before = known.pose(3).copy()
+    before = known.poses[3].copy()
 
     found = adjust_stereo(known, F_BASELINE)
 
     assert found is not None
     assert not found.is_clear
-    np.testing.assert_array_equal(known.pose(3), before)
+    np.testing.assert_array_equal(known.poses[3], before)
 
 
 @pytest.mark.parametrize("offset_px", [OFFSET_PX, -OFFSET_PX])
 def test_what_an_offset_costs_is_what_the_path_moves_by(offset_px: float) -> None:
     known, _, _ = drive(offset_px)
-    tracked = np.array([known.pose(row) for row in range(known.keyframe_count)])[:, :3, 3]
+    tracked = known.poses[:, :3, 3]
 
     found = adjust_stereo(known, F_BASELINE)
 
@@ -118,10 +118,10 @@ def test_what_an_offset_costs_is_what_the_path_moves_by(offset_px: float) -> Non
 
 def test_few_keyframes_stay_where_they_are() -> None:
     known, _, _ = drive(OFFSET_PX, keyframes=4)
-    before = known.pose(3).copy()
+    before = known.poses[3].copy()
 
     assert adjust_stereo(known, F_BASELINE) is None
-    np.testing.assert_array_equal(known.pose(3), before)
+    np.testing.assert_array_equal(known.poses[3], before)
 
 
 def test_an_offset_moves_points_along_their_rays() -> None:
