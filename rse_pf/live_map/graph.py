@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -83,7 +84,7 @@ class MapGraph:
         orphaned_objects: (robot, digest) of the newest objects whose robot was forgotten.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, capacity: int = 64) -> None:
         self.keyframes: list[LiveKeyframe] = []
         self.segments: list[Segment] = []
         self.edges: dict[int, LoopEdge] = {}
@@ -103,13 +104,15 @@ class MapGraph:
         self.orphaned_objects: list[tuple[str, str]] = []
         self._accepted_of: dict[int, list[int]] = {}
         self._size = 0
-        self._T_component_camera = np.empty((64, 4, 4))
-        self._T_odom_camera = np.empty((64, 4, 4))
-        self._odometry_steps = np.empty(64)
-        self._segment_rows = np.empty(64, dtype=np.int64)
-        self._components = np.empty(64, dtype=np.int64)
-        self._positions = np.empty(64, dtype=np.int64)
-        self._has_features = np.empty(64, dtype=np.bool_)
+        self._tables: dict[str, npt.NDArray[Any]] = {
+            "T_component_camera": np.empty((capacity, 4, 4)),
+            "T_odom_camera": np.empty((capacity, 4, 4)),
+            "odometry_steps": np.empty(capacity),
+            "segment_rows": np.empty(capacity, dtype=np.int64),
+            "positions": np.empty(capacity, dtype=np.int64),
+            "components": np.empty(capacity, dtype=np.int64),
+            "has_features": np.empty(capacity, dtype=np.bool_),
+        }
 
     def __len__(self) -> int:
         return self._size
@@ -119,43 +122,43 @@ class MapGraph:
     @property
     def T_component_camera(self) -> Array:
         """``(n, 4, 4)``: pose of each keyframe in the frame and unit of its component."""
-        return self._T_component_camera[: self._size]
+        return self._tables["T_component_camera"][: self._size]
 
     @property
     def T_odom_camera(self) -> Array:
         """``(n, 4, 4)``: pose of each keyframe in its odometry frame, in the unit of its segment."""
-        return self._T_odom_camera[: self._size]
+        return self._tables["T_odom_camera"][: self._size]
 
     @property
     def odometry_steps(self) -> Array:
         """``(n,)``: steps of odometry from the first keyframe of the segment to each keyframe."""
-        return self._odometry_steps[: self._size]
+        return self._tables["odometry_steps"][: self._size]
 
     @property
     def segment_rows(self) -> npt.NDArray[np.int64]:
         """``(n,)``: row of the segment of each keyframe, -1 after its robot was forgotten."""
-        return self._segment_rows[: self._size]
+        return self._tables["segment_rows"][: self._size]
 
     @property
     def components(self) -> npt.NDArray[np.int64]:
         """``(n,)``: component of each keyframe, the row of its first segment; -1 for forgotten robots."""
-        return self._components[: self._size]
+        return self._tables["components"][: self._size]
 
     @property
     def positions(self) -> npt.NDArray[np.int64]:
         """``(n,)``: position of each keyframe within its segment, from 0."""
-        return self._positions[: self._size]
+        return self._tables["positions"][: self._size]
 
     @property
     def has_features(self) -> npt.NDArray[np.bool_]:
         """``(n,)``: whether the encoded features of each keyframe are kept, so that others can match them."""
-        return self._has_features[: self._size]
+        return self._tables["has_features"][: self._size]
 
     # --- Queries ---
 
     def exists(self, i: int) -> bool:
         """Return whether *i* is the id of a keyframe whose robot was not forgotten."""
-        return 0 <= i < self._size and bool(self._segment_rows[i] >= 0)
+        return 0 <= i < self._size and bool(self.segment_rows[i] >= 0)
 
     def is_pending(self, number: int) -> bool:
         """Return whether loop closure *number* is pending; a dropped one is not."""
@@ -163,7 +166,7 @@ class MapGraph:
 
     def segment_of(self, i: int) -> Segment:
         """Return the segment of keyframe *i*, whose robot was not forgotten."""
-        return self.segments[int(self._segment_rows[i])]
+        return self.segments[int(self.segment_rows[i])]
 
     def find_segment(self, robot: str, number: int) -> Segment | None:
         """Return segment *number* of a robot, None if there is none or it has no keyframes left."""
@@ -175,7 +178,7 @@ class MapGraph:
 
     def segment_pair_of(self, edge: LoopEdge) -> tuple[int, int]:
         """Return the rows of the segments of both ends of a loop closure, the lower row first."""
-        row_a, row_b = int(self._segment_rows[edge.a]), int(self._segment_rows[edge.b])
+        row_a, row_b = int(self.segment_rows[edge.a]), int(self.segment_rows[edge.b])
         return min(row_a, row_b), max(row_a, row_b)
 
     def root_component(self) -> int:
@@ -237,18 +240,13 @@ class MapGraph:
 
         A pair is missing at an end of the segment; a segment of a stored version has none.
         """
-        segment = self.segments[self._segment_rows[i]]
+        segment = self.segments[self.segment_rows[i]]
         if segment.is_from_version:
             return []
-        position, ids = int(self._positions[i]), segment.keyframes
+        position, ids = int(self.positions[i]), segment.keyframes
         return [
             (ids[first], ids[first + 1]) for first in (position - 1, position) if 0 <= first < len(ids) - 1
         ]
-
-    def next_in_segment(self, i: int) -> int:
-        """Return the keyframe after *i* in its segment, -1 if *i* is the last one."""
-        ids, position = self.segments[self._segment_rows[i]].keyframes, int(self._positions[i])
-        return int(ids[position + 1]) if position + 1 < len(ids) else -1
 
     # --- Changes of keyframes and segments ---
 
@@ -357,40 +355,32 @@ class MapGraph:
         self._size += 1
         segment = self.segments[row]
         self.keyframes.append(keyframe)
-        self._T_component_camera[i], self._T_odom_camera[i] = T_component, T_odom
-        self._odometry_steps[i], self._segment_rows[i] = odometry_steps, row
-        self._components[i] = segment.component
-        self._positions[i], self._has_features[i] = len(segment.keyframes), True
+        self.T_component_camera[i], self.T_odom_camera[i] = T_component, T_odom
+        self.odometry_steps[i], self.segment_rows[i] = odometry_steps, row
+        self.components[i] = segment.component
+        self.positions[i], self.has_features[i] = len(segment.keyframes), True
         segment.keyframes.append(i)
         return i
 
     def _grow(self) -> None:
         """Double the capacity of the tables of keyframes when they are full."""
-        if self._size < len(self._odometry_steps):
-            return
-        names = (
-            "_T_component_camera", "_T_odom_camera", "_odometry_steps", "_segment_rows", "_components",
-            "_positions", "_has_features",
-        )  # fmt: skip
-        for name in names:
-            old = getattr(self, name)
-            new = np.empty((2 * len(old), *old.shape[1:]), dtype=old.dtype)
-            new[: self._size] = old[: self._size]
-            setattr(self, name, new)
+        if self._size == len(self._tables["positions"]):
+            for name, old in self._tables.items():
+                self._tables[name] = np.concatenate([old, np.empty_like(old)])
 
     def drop_features(self, i: int) -> None:
         """Drop the encoded features of keyframe *i*; its pose and its loop closures stay."""
         self.keyframes[i].data = None
-        self._has_features[i] = False
+        self.has_features[i] = False
 
     def restore_features(self, i: int, data: bytes) -> None:
         """Give keyframe *i*, which came from a snapshot, its encoded features."""
         self.keyframes[i].data = data
-        self._has_features[i] = True
+        self.has_features[i] = True
 
     def set_poses(self, ids: Sequence[int], T_component_camera: Array) -> None:
         """Set the ``(n, 4, 4)`` poses of keyframes in the frame of their component."""
-        self._T_component_camera[ids] = T_component_camera
+        self.T_component_camera[ids] = T_component_camera
 
     def scale_segment(self, row: int, factor: float) -> None:
         """Multiply the estimated scale of segment *row* by *factor*; its poses and steps do not change."""
@@ -429,7 +419,7 @@ class MapGraph:
             self.drop_features(i)
             self.orphaned_objects += [(robot, digest) for digest in self.keyframes[i].objects]
             self.keyframes[i].objects = ()
-            self._segment_rows[i] = self._components[i] = -1
+            self.segment_rows[i] = self.components[i] = -1
         self.orphaned_objects = self.orphaned_objects[-MAX_ORPHANED_OBJECTS:]
         # 4. Choose another segment to define the frame of the map if necessary, and update the components.
         self.newest_segments.pop(robot, None)
@@ -465,7 +455,7 @@ class MapGraph:
                 return self._accept(decision.numbers)
             case RejectEdges():
                 edges = [self._reject(number) for number in decision.numbers]
-                if any(self._segment_rows[edge.a] != self._segment_rows[edge.b] for edge in edges):
+                if any(self.segment_rows[edge.a] != self.segment_rows[edge.b] for edge in edges):
                     self._update_components()
                     self._drop_pair_consistency()
                 return [LoopClosureRejected(a=edge.a, b=edge.b, reason=decision.reason) for edge in edges]
@@ -614,7 +604,7 @@ class MapGraph:
         for before, here in pairwise(ids):
             T_before_here = inverse(self.T_odom_camera[before]) @ self.T_odom_camera[here]
             step = _count_odometry_steps(scaled(T_before_here, segment.scale))
-            self._odometry_steps[here] = self._odometry_steps[before] + step
+            self.odometry_steps[here] = self.odometry_steps[before] + step
 
     def _update_components(self) -> None:
         """Compute the components of segments anew, by union-find over accepted loop closures."""
@@ -628,12 +618,12 @@ class MapGraph:
 
         for edge in self.edges.values():
             if edge.state == "accepted":
-                row_a = find_root(int(self._segment_rows[edge.a]))
-                row_b = find_root(int(self._segment_rows[edge.b]))
+                row_a = find_root(int(self.segment_rows[edge.a]))
+                row_b = find_root(int(self.segment_rows[edge.b]))
                 parent[max(row_a, row_b)] = min(row_a, row_b)
         for row, segment in enumerate(self.segments):
             segment.component = find_root(row)
-            self._components[segment.keyframes] = segment.component
+            self.components[segment.keyframes] = segment.component
 
     def _drop_pair_consistency(self) -> None:
         """Drop the known consistency of pairs that are not both pending any more."""
@@ -655,7 +645,7 @@ class MapGraph:
         cls,
         *,
         keyframes: list[LiveKeyframe],
-        arrays: Sequence[Array | npt.NDArray[np.int64]],
+        arrays: Mapping[str, npt.NDArray[Any]],
         accepted_by_keyframe: dict[int, list[int]],
         tables: Mapping[str, object],
     ) -> MapGraph:
@@ -663,27 +653,22 @@ class MapGraph:
 
         Args:
             keyframes: All keyframes by id; without data if their features are restored later.
-            arrays: Poses ``(n, 4, 4)`` in the component and in the odometry frame, steps of odometry
-                ``(n,)``, rows of segments ``(n,)``, and positions within segments ``(n,)``.
+            arrays: The tables with a row for each keyframe, by the name of their property, without
+                ``components`` and ``has_features``, which follow from the other arguments.
             accepted_by_keyframe: Numbers of accepted loop closures by keyframe.
             tables: Values of the other public attributes of `MapGraph`, by name.
         """
-        graph = cls()
-        n = graph._size = len(keyframes)
-        capacity = max(64, n)
-        names = ("_T_component_camera", "_T_odom_camera", "_odometry_steps", "_segment_rows", "_positions")
-        for name, values in zip(names, arrays, strict=True):
-            table = np.empty((capacity, *values.shape[1:]), dtype=values.dtype)
-            table[:n] = values
-            setattr(graph, name, table)
-        graph._components = np.full(capacity, -1, dtype=np.int64)
-        graph._has_features = np.zeros(capacity, dtype=np.bool_)
-        graph._has_features[:n] = [keyframe.data is not None for keyframe in keyframes]
+        graph = cls(capacity=max(64, len(keyframes)))
+        graph._size = len(keyframes)
+        for name, values in arrays.items():
+            graph._tables[name][: graph._size] = values
+        graph.components[:] = -1
+        graph.has_features[:] = [keyframe.data is not None for keyframe in keyframes]
         graph.keyframes, graph._accepted_of = keyframes, accepted_by_keyframe
         for name, value in tables.items():
             setattr(graph, name, value)
         for segment in graph.segments:
-            graph._components[segment.keyframes] = segment.component
+            graph.components[segment.keyframes] = segment.component
         return graph
 
 

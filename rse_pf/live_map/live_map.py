@@ -19,7 +19,6 @@ from itertools import groupby
 from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 
 from rse_pf.errors import BadRequest, InvalidCamera
 from rse_pf.geometry import Array, inverse
@@ -231,8 +230,8 @@ class LiveMap:
 
     def is_in_map(self, keyframe: int) -> bool:
         """Return whether a keyframe is connected with the frame of the map."""
-        row = int(self._graph.segment_rows[keyframe])
-        return row >= 0 and self._graph.is_aligned(row)
+        graph = self._graph
+        return graph.root >= 0 and bool(graph.components[keyframe] == graph.root_component())
 
     def alignments(self) -> list[Alignment]:
         """Return the reported alignment of the newest segment of each robot that has not left."""
@@ -388,7 +387,7 @@ class LiveMap:
         if self.kind is not None:
             check_same_kind(self.kind, view.features.kind, "the live map")
         # 1. Choose keyframes by place recognition that are spread over the map.
-        allowed = np.flatnonzero(graph.has_features & self._aligned_mask())
+        allowed = np.flatnonzero(graph.has_features & (graph.components == graph.root_component()))
         limit = self.options.candidates
         vector = place_vector(view.features.descriptors)
         nearest = self._places.nearest(vector, RELOCALISATION_POOL * limit, allowed)
@@ -616,11 +615,3 @@ class LiveMap:
     def _is_ignored(self, i: int) -> bool:
         """Return whether loop closures of *i* are ignored: it was forgotten, or its segment excluded."""
         return not self._graph.exists(i) or self._graph.segment_of(i).is_excluded
-
-    def _aligned_mask(self) -> npt.NDArray[np.bool_]:
-        """Return ``(n,)``: whether each keyframe is connected with the frame of the map."""
-        graph = self._graph
-        # The last entry is for forgotten keyframes, whose row is -1.
-        is_aligned = np.array([graph.is_aligned(row) for row in range(len(graph.segments))] + [False])
-        mask: npt.NDArray[np.bool_] = is_aligned[graph.segment_rows]
-        return mask

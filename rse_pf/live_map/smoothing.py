@@ -114,7 +114,7 @@ def smooth_changes(
     # 3. Add what exceeds the allowance of one keyframe to the debt of the robot, or pay back debt.
     allowance = options.smoothing_allowance
     if robot is not None and (debt or keyframe_count > allowance):
-        graph.smoothing_debt[robot] = max(0, debt + keyframe_count - allowance)
+        graph.set_smoothing_debt(robot, max(0, debt + keyframe_count - allowance))
     return windows
 
 

@@ -192,14 +192,20 @@ def decode_graph(data: bytes) -> tuple[MapGraph, dict[str, bytes]]:
                 keyframes[i].objects = digests
         # 2. Put the tables into a graph.
         n = len(keyframes)
-        layout = (("<f8", (4, 4)), ("<f8", (4, 4)), ("<f8", ()), ("<i8", ()), ("<i8", ()))
+        layout = {
+            "T_component_camera": ("<f8", (4, 4)),
+            "T_odom_camera": ("<f8", (4, 4)),
+            "odometry_steps": ("<f8", ()),
+            "segment_rows": ("<i8", ()),
+            "positions": ("<i8", ()),
+        }
         next_edge, root, events, optimised_at = packed.numbers
         graph = MapGraph.restore(
             keyframes=keyframes,
-            arrays=[
-                np.frombuffer(raw, dtype=np.dtype(kind)).reshape(n, *shape)
-                for (kind, shape), raw in zip(layout, packed.arrays, strict=True)
-            ],
+            arrays={
+                name: np.frombuffer(raw, dtype=np.dtype(kind)).reshape(n, *shape)
+                for (name, (kind, shape)), raw in zip(layout.items(), packed.arrays, strict=True)
+            },
             accepted_by_keyframe={int(i): numbers for i, numbers in packed.links_of},
             tables={
                 "segments": segments,
@@ -240,20 +246,21 @@ def _pack_segment(segment: Segment) -> tuple[str, int, list[int], int, bytes | N
 
 
 def _unpack_segments(packed: _Packed) -> list[Segment]:
-    segments = [
-        Segment(
-            robot=robot,
-            number=number,
-            keyframes=keyframes,
-            component=component,
-            reported_T_map_odom=None if reported is None else _matrix(reported, 4),
-            covariance=_matrix(covariance, 6),
-            reason=reason,
-            is_from_version=is_from_version,
+    segments = []
+    for row in packed.segments:
+        robot, number, keyframes, component, reported, covariance, reason, is_from_version = row
+        segments.append(
+            Segment(
+                robot=robot,
+                number=number,
+                keyframes=keyframes,
+                component=component,
+                reported_T_map_odom=None if reported is None else _matrix(reported, 4),
+                covariance=_matrix(covariance, 6),
+                reason=reason,
+                is_from_version=is_from_version,
+            )
         )
-        for robot, number, keyframes, component, reported, covariance, reason, is_from_version
-        in packed.segments
-    ]  # fmt: skip
     # Snapshots of earlier releases do not have the contradictions of segments.
     for segment, (contradictions, is_excluded) in zip(segments, packed.trust, strict=False):
         segment.contradictions, segment.is_excluded = contradictions, is_excluded

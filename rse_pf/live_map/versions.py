@@ -100,6 +100,7 @@ def started_from(version: MapVersion, source: str) -> MapStarted:
     )
 
 
+@as_internal_error("the live map cannot be published")
 def version_of(graph: MapGraph) -> MapVersion:
     """Return the keyframes with features that are connected with the frame of the map, and their edges.
 
@@ -109,11 +110,6 @@ def version_of(graph: MapGraph) -> MapVersion:
     Raises:
         InternalError: The map holds something that does not fit into a version.
     """
-    with as_internal_error("the live map cannot be published"):
-        return _version_of(graph)
-
-
-def _version_of(graph: MapGraph) -> MapVersion:
     # 1. Decode the keyframes, and collect the directions of gravity that their IMUs measured.
     ids = [i for i in _aligned_keyframes(graph) if graph.has_features[i]]
     keyframes: list[Keyframe] = []
@@ -243,8 +239,6 @@ def whole_graph(graph: MapGraph) -> tuple[PoseGraph, list[int]]:
 
 
 def _aligned_segments(graph: MapGraph) -> list[Segment]:
-    if graph.root < 0:
-        return []
     root = graph.root_component()
     return [segment for segment in graph.segments if segment.component == root and segment.keyframes]
 
@@ -261,7 +255,7 @@ def _odometry_edges(graph: MapGraph, ids: list[int]) -> list[Edge]:
     """
     edges = []
     for a, b in pairwise(ids):
-        is_next = graph.next_in_segment(a) == b
+        is_next = (a, b) in graph.odometry_edges_of(a)
         T_a, T_b = graph.odometry_poses([a, b]) if is_next else graph.T_component_camera[[a, b]]
         steps = float(graph.odometry_steps[b] - graph.odometry_steps[a])
         information = np.diag(odometry_information() / steps)
