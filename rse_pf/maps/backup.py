@@ -1,10 +1,10 @@
 """Back up all maps of a tenant in one file, check such a file, and restore maps from it.
 
 The file is a tar archive with the members ``MAP/blobs/DIGEST`` (encoded maps) and ``MAP/versions/ID``
-(records), whose bytes are those of the store, and as its last member ``backup.json`` with the heads, so that
-a truncated file is not accepted.  Robots may commit while a backup is written: versions never change, so that
-each version and each head in the file is complete.  A restore checks the whole file before it writes
-anything.
+(records), whose bytes are those of the store.  Its last member is ``backup.json`` (`BackupContent`): a file
+without it was truncated and is refused.  Robots may commit while a backup is written.  The backup may then
+lack the versions that were committed meanwhile, but it has the record and the bytes of each version that it
+names.  A restore checks the whole file before it writes anything.
 """
 
 from __future__ import annotations
@@ -28,13 +28,14 @@ from rse_pf.object_store import MIN_CHARGE_BYTES, ObjectStore, charge_of, name_s
 __all__ = ["BackupContent", "CheckedBackup", "check_backup", "restore_backup", "write_backup"]
 
 _CONTENT_FILE = "backup.json"
-"""Name of the last member in the tar archive of a backup, with heads and charges."""
+"""Name of the last member in the tar archive of a backup: a `BackupContent` as JSON."""
 _MEMBER = re.compile(r"(?P<map>[a-z0-9][a-z0-9-]{0,63})/(?P<kind>blobs|versions)/(?P<id>[0-9a-f]{64})")
 """Name of a member that holds an encoded map or a record: map, kind, and sha256."""
 _CHARGE = re.compile(
     r"[A-Za-z0-9][A-Za-z0-9._=-]{0,127}/(?P<map>[a-z0-9-]{1,64})/(?P<id>[0-9a-f]{64})\.\d{1,15}"
 )
-"""Name of a charge below ``charges/TENANT/``: robot, map, id of the version, and size in bytes."""
+"""Name of a charge (see `rse_pf.maps.charges`) without ``charges/TENANT/``: robot, map, id of the version and
+size in bytes."""
 _MAX_RECORD_BYTES = 1 << 20
 """Largest size in bytes of the record of one version in a backup file: 1 MiB, though a record with many
 robots has some KiB only."""
@@ -48,8 +49,8 @@ class BackupContent(msgspec.Struct, frozen=True, kw_only=True):
     """What a backup contains, the last member of its file.
 
     Attributes:
-        format: Distinguishes a backup of maps from other files.
-        version: Version of the format.
+        format: Always ``rse-pf-maps``, by which a backup is distinguished from other JSON.
+        version: Version of the file format; always 1.
         tenant: The tenant whose maps these are.
         created_s: When the backup was written, Unix seconds.
         heads: The id of the head of each map, by the name of the map.
@@ -99,7 +100,7 @@ def write_backup(
 
 def _write_map(archive: tarfile.TarFile, maps: MapRegistry, name: str) -> tuple[str, set[str]]:
     """Write a map; return the id of its head, and the ids of all versions that were written."""
-    # 1. Write the head, which exists whatever is removed meanwhile.
+    # 1. Write the version that is the head now, so that the backup has it even if it is removed meanwhile.
     head, data = _read_head(maps, name)
     _add_member(archive, f"{name}/blobs/{head.digest}", data)
     _add_record(archive, name, head)
@@ -129,7 +130,10 @@ def _list_versions(maps: MapRegistry, name: str) -> list[MapRecord]:
 
 
 def _read_head(maps: MapRegistry, name: str) -> tuple[MapRecord, bytes]:
-    """Return record and bytes of the head; read again if another process replaces and removes the head."""
+    """Return record and bytes of the head.
+
+    If another process moves the head and removes the old version between both reads, the new head is read.
+    """
     while True:
         head = maps.head(name)
         try:
@@ -171,7 +175,9 @@ class CheckedBackup:
 
 
 def check_backup(file: BinaryIO) -> CheckedBackup:
-    """Read and check all of *file*, and return the backup, which reads maps from *file* later.
+    """Read and check all of *file*, and return the backup.
+
+    *file* must stay open as long as the backup is used, because `CheckedBackup.data` reads maps from it.
 
     Raises:
         UsageError: The file is no backup, is truncated, or was changed.
@@ -181,7 +187,7 @@ def check_backup(file: BinaryIO) -> CheckedBackup:
     except (tarfile.TarError, msgspec.MsgspecError, ValueError, EOFError, OverflowError) as error:
         raise UsageError(
             f"this is not a whole backup of maps: {str(error)[:150]}",
-            hint="use another copy of it, or write it again: rse-pf map backup",
+            hint="use another copy of this file, or make a new backup: rse-pf map backup",
         ) from error
 
 
@@ -247,19 +253,25 @@ def restore_backup(
     check_room: Callable[[int], None],
     charge: Callable[[int], None],
 ) -> int:
-    """Write the versions of a backup that the store lacks, set the heads, and return the number of versions.
+    """Write the versions of a backup that the store lacks, and set the heads of its maps.
 
-    Versions that are damaged in the store are written again.  The charges of all versions in the backup are
-    written, also of those that exist.
+    A version that is damaged in the store counts as one that the store lacks.  The charges of all versions in
+    the backup are written.
 
     Args:
         backup: The backup.
         maps: The maps of the tenant of the backup.
         store: The store of the maps, for their charges.
-        is_overwriting: Whether to set the heads of maps that have another head; their newer versions stay.
+        is_overwriting: Whether to set the heads of maps that have another head in the store.  Versions in the
+            store that the backup lacks stay.
         check_room: Called once, before anything is written, with the bytes that all versions to write will be
-            charged with; may refuse them by an error.  Not called if the store lacks no version.
-        charge: Called with the size of each version before it is written; may refuse it by an error.
+            charged with; an exception that it raises ends the restore.  Not called if the store lacks no
+            version.
+        charge: Called with the size of each version before it is written; an exception that it raises ends
+            the restore.
+
+    Returns:
+        The number of versions that were written.
 
     Raises:
         UsageError: Maps exist with other heads, and *is_overwriting* is false; nothing was written.

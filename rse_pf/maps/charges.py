@@ -1,8 +1,9 @@
 """Count versions of maps against the quota of the robot that committed them.
 
-A map belongs to a tenant, but each of its versions counts for a robot.  The empty object
-``charges/TENANT/ROBOT/MAP/VERSION.SIZE`` records this; SIZE is the number of bytes that the version added to
-the store.
+A robot has a quota of its own within that of its tenant.  A version that a robot commits counts for both: the
+empty object ``charges/TENANT/ROBOT/MAP/VERSION.SIZE`` (a charge) counts it for the robot.  SIZE is the number
+of bytes that the version added to the store.  Versions of live maps have no charge, since no robot commits
+them.
 """
 
 from __future__ import annotations

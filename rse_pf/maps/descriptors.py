@@ -114,7 +114,7 @@ def _different_kinds(expected: DescriptorKind, actual: DescriptorKind, subject: 
 
 
 def decode_descriptors(data: bytes, count: int, kind: DescriptorKind = ORB) -> Descriptors:
-    """Return raw bytes as a read-only array ``(count, kind.size)`` of descriptors that shares their memory.
+    """Return *data* as a read-only array ``(count, kind.size)`` of descriptors, without copying it.
 
     Raises:
         BadRequest: *data* has another length than *count* descriptors.

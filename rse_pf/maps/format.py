@@ -1,7 +1,7 @@
 """Represent maps as values (keyframes, edges, a point cloud), and encode them as bytes.
 
-A map file is the 8 bytes ``RSEMAP1\n`` and one MessagePack map, which is compressed by zlib; its arrays are
-raw little-endian bytes.  Equal maps give equal bytes.
+A map file is the 8 bytes ``RSEMAP1\n`` and one MessagePack object with the fields of the map, compressed by
+zlib; its arrays are raw little-endian bytes.  Equal maps give equal bytes.
 
 `decode_map` returns complete and valid maps only.  Sizes and counts are checked on the bytes before an object
 is made from them, so that a malformed or hostile file costs little memory; nothing in a file is executed.
@@ -56,13 +56,14 @@ IMAGES_FOLDER = "images"
 UP_FIELD = "up"
 """Name of the field of a map's provenance that holds the unit vector against gravity in the map's world."""
 UP = (0.0, 0.0, 1.0)
-"""Value of the provenance field ``up`` in a map whose world was rotated so that its z axis points up."""
+"""Value that the field ``up`` gets when gravity is known: the world of the map is then rotated so that its z
+axis points up."""
 
 _MAGIC = b"RSEMAP1\n"  # the first bytes of a map file, with the version of the format
 _MAX_BYTES = 1 << 30  # largest size of a decompressed map file: 1 GiB
 _MAX_COMPRESSION_RATIO = 50.0
-"""Decompressed size of a map over its compressed size; features and point clouds only compress to half their
-size, so that a larger ratio means an empty or a hostile map."""
+"""Largest accepted ratio of the decompressed to the compressed size of a map file: features and point clouds
+compress to half their size only, so that a file with a larger ratio is hostile."""
 _UNCHECKED_BYTES = 1 << 20
 """Decompressed size in bytes up to which a map file may have any compression ratio: 1 MiB of memory harms
 nobody."""
@@ -76,9 +77,11 @@ _MAX_PIXEL = 1e5  # largest coordinate of a feature in pixels: no camera has wid
 _MAX_INFORMATION = 1e18
 """Largest number in the information matrix of an edge: a standard deviation of 1 nm or 1 nrad."""
 _ITEM_VALUES = {"keyframes": 100, "edges": 40}
-"""MessagePack values that one keyframe or one edge may have: more than today, so that fields can be added."""
+"""Largest number of MessagePack values (keys, numbers, strings and byte strings) of one keyframe and of one
+edge: more than they have in this release, so that a later release can add fields."""
 _OTHER_FIELD_VALUES = 1000
-"""Number of MessagePack values that a field which this release does not know may have in a map file."""
+"""Largest number of MessagePack values of a field of the map file that this release does not know, and
+ignores."""
 _UNSAFE_IN_FILE_NAMES = re.compile(r"[^A-Za-z0-9._-]+")
 
 
@@ -163,7 +166,10 @@ class Keyframe:
 
     @property
     def image_name(self) -> str:
-        """The name of the file of the keyframe's image: unique in its map, of plain letters and digits."""
+        """The name of the file of the keyframe's image, ``ROBOT-ID.jpg``, which is unique in its map.
+
+        ROBOT is the name of the robot with a hyphen in place of characters that file names should not have.
+        """
         robot = _UNSAFE_IN_FILE_NAMES.sub("-", self.robot).strip(".-") or "camera"
         return f"{robot}-{self.id:06d}.jpg"
 
@@ -202,7 +208,9 @@ class Edge:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class MapVersion:
-    """A complete map.  It never changes: a change of the map makes a new version.
+    """The content of a map at one time; a changed map is another `MapVersion`.
+
+    The registry (`rse_pf.maps.registry`) gives it an id and a record when it is committed.
 
     Attributes:
         keyframes: The keyframes, with unique ids.
@@ -379,7 +387,9 @@ def decode_map(data: bytes, max_bytes: int = _MAX_BYTES, limits: MapLimits | Non
     except (msgspec.MsgspecError, ValueError, RecursionError, BadMessage) as error:
         if isinstance(error, RsePfError) and not isinstance(error, BadMessage):
             raise
-        raise BadRequest(f"the map is damaged: {message_of(error)}", hint="fetch it again") from error
+        raise BadRequest(
+            f"the map is damaged: {message_of(error)}", hint="use another copy of the map file"
+        ) from error
 
 
 def _decompress(data: bytes, max_bytes: int) -> bytes | bytearray:
@@ -436,7 +446,8 @@ def _check_fields(content: bytes | bytearray, limits: MapLimits) -> None:
 
 
 def _field_budget(name: str, items: int) -> Budget:
-    """Return the decoding budget of the field *name* of a map file, whose list announces *items* elements."""
+    """Return the limits for decoding the field *name* of a map file, which says that it has *items*
+    elements."""
     if name == "provenance":
         return PROVENANCE
     values = LIST_VALUES + items * _ITEM_VALUES[name] if name in _ITEM_VALUES else _OTHER_FIELD_VALUES
@@ -506,7 +517,8 @@ class _LazyProvenance(Mapping[str, Any]):
             return msgspec.msgpack.decode(self._encoded, type=dict[str, Any], ext_hook=_reject_extension)
         except (msgspec.MsgspecError, ValueError, RecursionError) as error:
             raise BadRequest(
-                f"the provenance of the map is damaged: {message_of(error)}", hint="fetch it again"
+                f"the provenance of the map is damaged: {message_of(error)}",
+                hint="use another copy of the map file",
             ) from error
 
 

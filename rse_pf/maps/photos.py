@@ -16,9 +16,10 @@ __all__ = ["MapOutline", "PhotoLens", "PhotoLocation"]
 class PhotoLens(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     """The camera and lens that took a photo, as the query of a request states them.
 
-    ``fx``, ``fy``, ``cx`` and ``cy`` are pixels of an image of ``width`` by ``height``; 0 for both means the
-    size of the photo itself.  ``model`` is a name of `rse_pf.geometry.LENS_MODELS`, and ``distortion`` holds
-    the coefficients of this model in OpenCV's order, or nothing.
+    ``fx``, ``fy``, ``cx`` and ``cy`` are in pixels of an image of ``width`` by ``height`` pixels.  If
+    ``width`` and ``height`` are 0, they are in pixels of the photo.  ``model`` is a name of
+    `rse_pf.geometry.LENS_MODELS`.  ``distortion`` holds the coefficients of this model in OpenCV's order; it
+    is empty for a lens without distortion.
 
     Raises:
         BadRequest: The model is not known, the coefficients do not fit the model, or only one of width and
@@ -57,7 +58,8 @@ class PhotoLens(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
 class PhotoLocation(msgspec.Struct, frozen=True, kw_only=True):
     """Where a photo was taken, in the frame of version ``version`` of a map.
 
-    ``verdict`` is ``ok``, ``weak`` with a ``reason``, or ``lost`` with a reason and without a pose.
+    ``verdict`` is ``ok``, ``weak`` with a ``reason``, or ``lost``, which has a reason and no pose
+    (`rse_pf.slam.localise` calls this verdict ``none``).
     ``T_map_camera`` is the 4x4 pose of the camera, metres.  ``covariance`` is the 6x6 covariance of the twist
     (metres, then radians) that perturbs the pose on its left.  ``position_sigma_m`` and ``turn_sigma_deg``
     are standard deviations of the position and of the orientation of the camera: the root of the summed
@@ -81,7 +83,8 @@ class MapOutline(msgspec.Struct, frozen=True, kw_only=True):
     """Version ``version`` of a map, seen from above, metres.
 
     ``top_view`` is the 2x3 matrix that projects a position of the map into the plane seen from above.
-    ``keyframes`` and ``points`` hold such 2D positions of some keyframes and of some map points.
+    ``keyframes`` and ``points`` hold 2D positions of keyframes and of points of the cloud: of all of them, or
+    of an even selection where there are more than `rse_pf.services.mapping.photo` draws.
     """
 
     version: str

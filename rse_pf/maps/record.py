@@ -15,8 +15,10 @@ class MapRecord(msgspec.Struct, frozen=True, kw_only=True):
     Attributes:
         digest: The sha256 of the encoded map, in hexadecimal digits.
         size: Bytes of the encoded map.
-        parent: Id of the version that was the head before; None for the first version.
-        number: 1 for the first version, else that of the parent plus 1.
+        parent: Id of the version that was the head when this version was committed; None for the first
+            version.
+        number: 1 for the first version, else the number of the parent plus 1.  After a rollback, two versions
+            may have the same number.
         author: Who committed the version.
         created_s: When it was committed, Unix seconds.
         note: What the author says about it.

@@ -3,7 +3,8 @@
 A commit writes the map, then its record, then the head, and each write is durable before the next one begins.
 A crash between two writes leaves the old head and at most an object that nothing refers to.  Every version
 that a head refers to is complete, and of two commits with the same parent only one succeeds.  A removed
-version is gone with its bytes; its id may still be the parent of another version.
+version is gone with its bytes; a version that shares its bytes with one that stays is not removed.  The id of
+a removed version may still be the parent of another version.
 
 Objects in the store: ``maps/TENANT/NAME/blobs/DIGEST`` (encoded maps), ``maps/TENANT/NAME/versions/ID``
 (records; the id is the sha256 of the record) and ``maps/TENANT/NAME/head`` (the id of the head).
@@ -53,14 +54,14 @@ _MAX_VERSIONS = 10_000
 _CHUNK_BYTES = 1 << 20
 """Number of bytes of an object that are in memory at once while a map is committed from it: 1 MiB."""
 _REMOVED_AT_ONCE = 50
-"""Number of versions that are marked and removed together: even a slow store removes them within a minute,
-after which a removal stops."""
+"""Number of versions that are marked and removed together: so few that a slow store removes them before
+`MAX_REMOVAL_S`, at which a removal stops."""
 _MIN_MOTION_M = 1e-3
-"""Translation of a keyframe between two versions in metres that counts as a motion; poses in messages are
-rounded to less."""
+"""Translation of a keyframe between two versions, in metres, above which the keyframe counts as moved: more
+than the rounding of poses in messages."""
 _MIN_ROTATION_DEG = 0.05
-"""Rotation of a keyframe between two versions in degrees that counts as a motion; poses in messages are
-rounded to less."""
+"""Rotation of a keyframe between two versions, in degrees, above which the keyframe counts as moved: more
+than the rounding of poses in messages."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -136,8 +137,9 @@ class MapRegistry:
             store: The store of the maps.
             tenant: The tenant whose maps these are.
             max_bytes: The largest size of a decompressed map.
-            on_change: Called after a change with ``map.commit``, ``map.head``, ``map.remove`` or
-                ``map.restore``, the name of the map and the record of the version.
+            on_change: Called after a change with the kind of the change, the name of the map and the record
+                of the version.  The kinds are ``map.commit``, ``map.head`` (the head was set to an existing
+                version), ``map.remove`` and ``map.restore`` (the head was set from a backup).
             check: Called between two reads in long work; an error that it raises stops the work.
             wall_clock: Returns Unix seconds.
         """
@@ -218,8 +220,10 @@ class MapRegistry:
             summary: The summary of the map that `rse_pf.maps.describe.describe_map` returned.
             content: Digest and size of the object.
             origin: Who makes the version, and from which one.
-            charged: Returns the context in which the version is written, given its record and the bytes that
-                it adds to the store; may refuse the version by an error.
+            charged: Called with the record of the version and the size of the bytes that it adds to the
+                store, 0 if another version has the same bytes; returns a context manager within which the
+                version is written.  An exception that *charged* or the context manager raises on entry
+                refuses the version.
 
         Raises:
             As `commit`, and the errors of *charged*.
@@ -310,8 +314,9 @@ class MapRegistry:
         except Busy:
             self._store.delete(version)
             raise
-        # A removal that had read the records before this one was written may have removed the bytes.  It has
-        # ended, since its mark is gone, and no later removal overlooks the record.
+        # A removal that had read the records before this record was written may have removed the bytes.  That
+        # removal has ended, since its mark is gone, and each later removal sees the record: if the bytes are
+        # gone, they are written again.
         if not self._exists(blob):
             write(blob)
 
@@ -338,15 +343,17 @@ class MapRegistry:
     ) -> None:
         """Write versions from a backup, and set the head.
 
-        If *head* is *expected*, the head is neither compared nor changed, and no change is reported.
+        If *head* is *expected*, the head is neither compared nor changed, and *on_change* is not called.
 
         Args:
             name: Name of the map, which may exist.
-            records: Records of the versions to write; their bytes are written again if they exist.
+            records: Records of the versions to write; their bytes are written even if the store has them,
+                since these may be damaged.
             head: Id of the new head, which is one of *records* or exists.
             expected: Id of the present head; None if there is no map.
             read: Returns the bytes of a version.
-            charge: Called with the size of each version before it is written; may refuse it by an error.
+            charge: Called with the size of each version before it is written; an exception that it raises
+                ends the restore.
 
         Raises:
             Conflict: The head is not *expected*.
@@ -470,8 +477,8 @@ class MapRegistry:
     def images(self, version: MapVersion) -> Iterator[tuple[Keyframe, bytes]]:
         """Yield keyframes of *version* with the bytes of the JPEG files that its provenance refers to.
 
-        A robot may have written the provenance and the objects.  So images of other tenants, objects that are
-        no JPEG or have another digest, and objects that do not exist are left out.
+        The provenance and the objects are not trusted, because a robot may have written them: references to
+        another tenant, to objects that do not exist, are no JPEG or have another digest are left out.
         """
         references = version.provenance.get(IMAGES_FIELD)
         keyframes = {str(keyframe.id): keyframe for keyframe in version.keyframes}
@@ -511,7 +518,10 @@ class MapRegistry:
         return record
 
     def _move_head(self, name: str, record: MapRecord, expected: str) -> None:
-        """Move the head from the id *expected*, whose version may be removed, to the version of *record*."""
+        """Move the head from the id *expected* to the version of *record*.
+
+        The version *expected* need not exist any more.
+        """
         marks = self._marks(name)
         mark = marks.put(HELD, record.digest)
         try:
@@ -569,8 +579,8 @@ class MapRegistry:
 
         Args:
             name: Name of the map.
-            batch: By the digest of the bytes to remove: the records of the versions to remove that have these
-                bytes; empty if a crashed removal has left only the bytes.
+            batch: For each digest of bytes to remove, the records of the versions to remove that have these
+                bytes; a list without records if a crashed removal has left only the bytes.
             digests: Digests of versions by their ids; those of versions that are read are added.
 
         Raises:
@@ -580,7 +590,8 @@ class MapRegistry:
         began_s = self._wall_clock()
         set_marks: dict[str, str] = {}
         try:
-            # 1. Mark the bytes, and then read who uses them; commits and rollbacks do both in reverse order.
+            # 1. Mark the bytes, and then read which versions use them.  Commits and rollbacks first write
+            # what uses the bytes, and then read the marks.
             for digest in batch:
                 set_marks[digest] = marks.put(REMOVING, digest)
             chosen = {record.id for records in batch.values() for record in records}
@@ -594,7 +605,7 @@ class MapRegistry:
                 if not 0.0 <= self._wall_clock() - began_s < MAX_REMOVAL_S:
                     raise Busy(
                         f"the store removed fewer than {len(batch)} versions in {MAX_REMOVAL_S:g} s",
-                        hint="remove the rest later",
+                        hint="call again to remove the rest: rse-pf map prune",
                     )
                 # If an error follows, this mark stays, so that the next call finishes the removal.
                 mark = set_marks.pop(digest)
@@ -683,9 +694,9 @@ def compare_versions(before: MapVersion, after: MapVersion) -> MapDiff:
 
 @contextlib.contextmanager
 def _charge_once(charge: Callable[[int], None], size: int) -> Iterator[None]:
-    """Call *charge* with *size* when the context begins, and take nothing back if the write in it fails.
+    """Call *charge* with *size* when the context begins; do not undo the charge if the write in it fails.
 
-    The next count of the stored bytes corrects the charge.
+    `rse_pf.accounts` counts the stored bytes again at intervals, which corrects the charge.
     """
     charge(size)
     yield

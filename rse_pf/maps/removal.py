@@ -5,9 +5,9 @@ A removal first sets its mark, and then reads the records, the head and the mark
 rollback first writes its record or mark, and then looks for marks of removals.  So at least one of two
 processes sees the other, as in Dekker's algorithm, and no head refers to removed bytes.
 
-A mark is the empty object ``maps/TENANT/NAME/blobs/DIGEST.KIND-SECONDS-TOKEN``.  It needs no new folder, so
-that it can be written to a full disk.  A removal stops after `MAX_REMOVAL_S`, long before its marks count as
-abandoned after `ABANDONED_S`; the next removal finishes the work of a process that crashed.
+A mark is the empty object ``maps/TENANT/NAME/blobs/DIGEST.KIND-SECONDS-TOKEN``.  It is an empty file in an
+existing folder, which can be written to a full disk.  A removal stops after `MAX_REMOVAL_S`, long before its
+marks count as abandoned after `ABANDONED_S`; the next removal finishes the work of a process that crashed.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ MAX_REMOVAL_S = 60.0
 """Seconds after which a process that removes versions deletes nothing more, long before others ignore its
 marks."""
 ABANDONED_S = 600.0
-"""Age in seconds from which a mark in the store is ignored: its process has crashed, since it would have
-stopped earlier."""
+"""Age in seconds above which a mark in the store is ignored: a process removes its marks after at most
+`MAX_REMOVAL_S`, so that the process of an older mark has crashed."""
 _RETRY_MS = 1000.0
 """Milliseconds after which a client should repeat a commit whose bytes are just being removed."""
 _MARK = re.compile(rf"(?P<digest>[0-9a-f]{{64}})\.(?P<kind>{HELD}|{REMOVING})-(?P<set_s>\d+)-[0-9a-f]+")
@@ -126,18 +126,20 @@ def choose_superseded(
     max_bytes: float = float("inf"),
     is_counted: Callable[[MapRecord], bool] = lambda record: True,
 ) -> list[MapRecord]:
-    """Return the versions to remove so that the newest *keep* stay, oldest first.
+    """Return the versions to remove so that only the newest ones stay, in the order from oldest to newest.
 
-    The head stays, and so do versions that share their bytes with one that stays, because removing them would
-    free nothing.
+    A version that shares its bytes with a version that stays also stays, because removing it would free no
+    bytes.
 
     Args:
         records: All versions of a map.
-        head: Id of the head.
-        keep: The number of newest counted versions that stay, whether or not the head is one of them.
-        max_bytes: Bytes that the counted versions that stay may be charged with together; the newest one
-            stays in any case.
-        is_counted: Returns whether a version is counted; versions that are not counted stay.
+        head: Id of the head, which stays.
+        keep: Number of the newest versions among those of *is_counted* that stay; the head may be one of
+            them.
+        max_bytes: Largest charge in bytes of these newest versions together, else fewer of them stay; the
+            newest one stays in any case.
+        is_counted: Returns whether a version may be removed and counts for *keep* and *max_bytes*; all other
+            versions stay.
     """
     newest_first = sorted(
         records, key=lambda record: (record.created_s, record.number, record.id), reverse=True
@@ -166,5 +168,5 @@ def count_freed_bytes(removed: Sequence[MapRecord]) -> int:
 
 
 def _charge_of(record: MapRecord) -> int:
-    """Return the bytes that a tenant is charged with for a version: its map and its record."""
+    """Return the bytes of the tenant's quota that a version takes: those of its map and of its record."""
     return charge_of(record.size) + MIN_CHARGE_BYTES
