@@ -86,8 +86,9 @@ class ImuSamples:
     such samples exist, so that samples can be interpolated at both frames.
 
     Attributes:
-        timestamps_s: ``(n,)``, strictly ascending, on the clock of the IMU.  This clock may differ from that
-            of the camera by a constant of up to 60 ms, which `ImuEstimator` measures and corrects.
+        timestamps_s: ``(n,)``, strictly ascending, on the clock of the camera.  If they are off by a constant
+            of up to 60 ms, for example an unknown offset between the clocks, `ImuEstimator` measures and
+            corrects it.
         gyro: ``(n, 3)`` angular rates in the IMU's frame, rad/s.
         accel: ``(n, 3)`` specific forces in the IMU's frame, m/s^2: a stationary IMU measures 9.81 upwards.
         model: Model of the IMU.

@@ -23,7 +23,7 @@ __all__ = [
     "read_text",
 ]
 
-_MAX_FILE_BYTES = 64 << 20  # size of a text file of a recording, the longest of which lists IMU samples
+_MAX_FILE_BYTES = 64 << 20  # largest text file of a recording that is read; the longest ones list IMU samples
 _EUROC_IMU_FIELDS = {
     "gyro_noise": "gyroscope_noise_density",
     "gyro_walk": "gyroscope_random_walk",
@@ -31,13 +31,13 @@ _EUROC_IMU_FIELDS = {
     "accel_walk": "accelerometer_random_walk",
     "rate_hz": "rate_hz",
 }
-"""Fields of `RigImu`, each with its name in ``sensor.yaml``."""
+"""For each number of `RigImu` that a ``sensor.yaml`` states, its name in that file."""
 
 
 def read_euroc_camera(path: Path, name: str) -> RigCamera:
-    """Return the camera of a ``sensor.yaml`` of EuRoC under the name *name*.
+    """Return the camera that a ``sensor.yaml`` of EuRoC describes, with the name *name*.
 
-    ``T_BS`` of the file is the pose of the camera in the body, row by row.
+    The matrix ``T_BS`` of the file is ``T_body_camera``, row by row.
 
     Raises:
         UsageError: The file cannot be read, a number is missing or impossible, or the lens model is unknown.
@@ -49,7 +49,7 @@ def read_euroc_camera(path: Path, name: str) -> RigCamera:
     T_body_camera = _list_after(text, r"^\s*data:", path)
     if [len(width_height), len(fx_fy_cx_cy), len(T_body_camera)] != [2, 4, 16]:
         raise UsageError(
-            f"{path} is not that of a camera: it holds {len(width_height)} of 2 numbers of the resolution, "
+            f"{path} does not describe a camera: it has {len(width_height)} of 2 numbers of the resolution, "
             f"{len(fx_fy_cx_cy)} of 4 of the intrinsics, {len(T_body_camera)} of 16 of T_BS",
             hint="unpack the recording again",
         )
@@ -68,7 +68,7 @@ def read_euroc_camera(path: Path, name: str) -> RigCamera:
 
 
 def read_euroc_imu(path: Path) -> RigImu:
-    """Return the IMU of a ``sensor.yaml`` of EuRoC; ``T_BS`` is the pose of the IMU in the body.
+    """Return the IMU that a ``sensor.yaml`` of EuRoC describes; its matrix ``T_BS`` is ``T_body_imu``.
 
     Raises:
         UsageError: The file cannot be read, or a number is missing or impossible.
@@ -81,7 +81,7 @@ def read_euroc_imu(path: Path) -> RigImu:
     missing = [name for field, name in _EUROC_IMU_FIELDS.items() if field not in words]
     if len(T_body_imu) != 16 or missing:
         raise UsageError(
-            f"{path} is not that of an IMU: it holds {len(T_body_imu)} of 16 numbers of T_BS"
+            f"{path} does not describe an IMU: it holds {len(T_body_imu)} of 16 numbers of T_BS"
             + (f", and no {missing[0]}" if missing else ""),
             hint="unpack the recording again, or --no-imu",
         )
@@ -93,13 +93,15 @@ def read_euroc_imu(path: Path) -> RigImu:
 
 
 def read_kitti_rig(path: Path, size: tuple[int, int], projection_names: Sequence[str]) -> Rig:
-    """Return the rectified cameras of a ``calib.txt`` of KITTI; the frame of the body is that of ``P0``.
+    """Return the rectified cameras of a ``calib.txt`` of KITTI.
+
+    The frame of the body is that of the camera with the projection matrix ``P0``.
 
     Args:
         path: The file ``calib.txt``.
         size: Width and height of the images, px, which the file does not state.
-        projection_names: Names of the projections in the file, such as ``P0`` and ``P1``, the left camera
-            first.
+        projection_names: Names of one or two projection matrices in the file, such as ``P0`` and ``P1``; the
+            first one is that of the left camera.
 
     Raises:
         UsageError: The file cannot be read, or a number is missing or impossible.
@@ -119,8 +121,9 @@ def read_kitti_rig(path: Path, size: tuple[int, int], projection_names: Sequence
                 fx=numbers[0], fy=numbers[5], cx=numbers[2], cy=numbers[6], width=size[0], height=size[1]
             )
             T_body_camera = np.eye(4)
-            # P = K [I | t], where t moves points of the body (P0) into this camera; the images are rectified,
-            # so that no camera is rotated against the body.
+            # P = K [I | t]: the images are rectified, so that no camera is rotated against the body, and a
+            # point x of the body is x + t in the camera.  The position of the camera in the body is therefore
+            # -t.
             T_body_camera[:3, 3] = -np.linalg.solve(projection[:, :3], projection[:, 3])
             cameras.append(RigCamera(name=name, lens=Intrinsics(camera=camera), T_body_camera=T_body_camera))
         except (InvalidCamera, UsageError) as error:
@@ -137,7 +140,7 @@ def read_text(path: Path) -> str:
     """Return the text of a UTF-8 file of a recording.
 
     Raises:
-        UsageError: The file is missing, no regular file, larger than 64 MiB, or no UTF-8.
+        UsageError: The file is missing, is no regular file, is larger than 64 MiB, or is not UTF-8.
     """
     try:
         return read_regular_file(path, _MAX_FILE_BYTES).decode("utf-8-sig")
@@ -146,7 +149,7 @@ def read_text(path: Path) -> str:
 
 
 def parse_numbers(path: Path, text: str) -> list[float]:
-    """Return the numbers of a text, separated by spaces or commas; *path* is named in errors.
+    """Return the numbers of a text, separated by spaces or commas; *path*, its file, is named in errors.
 
     Raises:
         UsageError: A word is no number, or a number is not finite.
@@ -171,12 +174,12 @@ def read_numbers(path: Path, words: Sequence[str]) -> Array:
 
 
 def _word_after(text: str, field: str) -> str | None:
-    """Return the value of a YAML field, one word with or without quotes; None without the field."""
+    """Return the value of a YAML field, one word with or without quotes; None if the field is missing."""
     match = re.search(rf"^{field}:\s*['\"]?([\w-]+)", text, re.MULTILINE)
     return None if match is None else match[1]
 
 
 def _list_after(text: str, heading: str, path: Path) -> list[float]:
-    """Return the numbers in the brackets after the pattern *heading*; empty without the heading."""
+    """Return the numbers in the brackets after the pattern *heading*; empty if nothing matches it."""
     match = re.search(rf"{heading}\s*\[([^\]]*)\]", text, re.MULTILINE)
     return [] if match is None else parse_numbers(path, match[1])

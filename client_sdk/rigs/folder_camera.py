@@ -1,4 +1,4 @@
-"""Find the intrinsics of a folder of images in a file of another program than this one."""
+"""Find the intrinsics of a folder of images in a file of Open3D, ETH3D, SUN3D or ScanNet."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from rse_pf.geometry import Camera
 
 __all__ = ["find_folder_camera"]
 
-_JSON_FILES = ("camera_intrinsic.json", "intrinsic.json")  # intrinsics of Open3D and its recorders
+_JSON_FILES = ("camera_intrinsic.json", "intrinsic.json")  # files of Open3D and of its recorders
 _TEXT_FILES = ("calibration.txt", "intrinsics.txt", "intrinsic/intrinsic_color.txt")
-"""Intrinsics of ETH3D, SUN3D and ScanNet: texts of numbers without names."""
+"""Files of ETH3D, SUN3D and ScanNet, in this order: numbers without names."""
 
 
 def find_folder_camera(
@@ -24,12 +24,12 @@ def find_folder_camera(
 ) -> tuple[Path, Intrinsics] | None:
     """Return the file that states the camera of *folder*, and its intrinsics; None if there is no such file.
 
-    Of several files, the first of `_JSON_FILES` is read, then the first of `_TEXT_FILES`.  A text file holds
-    ``fx fy cx cy``, or the camera matrix as 3x3 or 4x4 numbers row by row.  It does not state the size of the
-    images, so that *size_px* is called for their width and height, px.
+    One file is read: the first that exists of `_JSON_FILES` and then `_TEXT_FILES`, in their order.  A text
+    file holds ``fx fy cx cy``, or the camera matrix as 3x3 or 4x4 numbers row by row.  It does not state the
+    size of the images, so *size_px* is called for their width and height, px.
 
     Raises:
-        UsageError: The file cannot be read, or its numbers are no intrinsics.
+        UsageError: The file cannot be read, or its numbers cannot be intrinsics.
     """
     for name in _JSON_FILES:
         if (folder / name).is_file():

@@ -1,4 +1,4 @@
-"""Attach to each frame the IMU samples between the frame before it and itself."""
+"""Attach to each frame of a recording the IMU samples since the frame before it."""
 
 from __future__ import annotations
 
@@ -16,13 +16,14 @@ __all__ = ["ImuTrack", "with_imu"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImuTrack:
-    """All samples of the IMU of a recording, with time stamps on the clock of the camera.
+    """All samples of the IMU of a recording.
 
     Attributes:
-        timestamps_s: ``(n,)``, strictly ascending.
+        timestamps_s: ``(n,)``, strictly ascending, on the clock of the camera: the reader of the recording
+            has subtracted `RigCamera.time_offset_s` from the time stamps of the IMU.
         gyro: ``(n, 3)`` angular rates, rad/s, in the frame of the IMU.
         accel: ``(n, 3)`` specific forces, m/s^2, in the frame of the IMU.
-        model: The noise of the IMU and its pose relative to the camera.
+        model: Noise, rate and range of the IMU, and its pose relative to the camera.
 
     Raises:
         UsageError: The shapes do not fit, a number is not finite, or time stamps do not ascend.
@@ -39,7 +40,8 @@ class ImuTrack:
     def between(self, since_s: float, until_s: float) -> ImuSamples:
         """Return the samples from the last at or before *since_s* to the first at or after *until_s*.
 
-        Where the track begins later or ends earlier, the samples begin or end with those of the track.
+        If the track begins after *since_s* or ends before *until_s*, its first or its last sample is the
+        limit.
         """
         first = max(0, int(np.searchsorted(self.timestamps_s, since_s, side="right")) - 1)
         end = int(np.searchsorted(self.timestamps_s, until_s, side="left")) + 1
@@ -48,9 +50,9 @@ class ImuTrack:
 
 
 def with_imu(frames: Iterable[Frame], track: ImuTrack | None) -> Iterator[Frame]:
-    """Yield *frames*, each with the IMU samples since the frame before it; without a track, as they are.
+    """Yield *frames*, each with the IMU samples since the frame before it; unchanged if *track* is None.
 
-    The first frame gets the samples around its own time stamp.
+    The first frame gets the last sample at or before its own time stamp and the first at or after it.
     """
     previous_s = None
     for frame in frames:

@@ -1,4 +1,4 @@
-"""Read and write ``intrinsics.json``: the camera, the lens, and the unit of depth images.
+"""Read and write ``intrinsics.json``: the pinhole camera, the distortion, and the unit of depth images.
 
 ::
 
@@ -6,12 +6,13 @@
      "model": "radial-tangential", "distortion": [k1, k2, p1, p2, k3],
      "depth_scale": 1000, "rms_px": 0.31, "views": 24}
 
-Lengths are pixels.  These fields may be left out: ``distortion`` (coefficients in OpenCV's order), ``model``
-(``radial-tangential`` by default, or ``fisheye`` with ``[k1, k2, k3, k4]``), ``depth_scale`` (units of a
-16-bit depth image in a metre), ``depth_registered_to_color`` (whether depth images show the view of the
-colour camera), ``rate_hz`` (of images that have no time stamps), ``rms_px`` (reprojection error of the
-calibration) and ``views`` (number of its images).  Fields that other programs name differently are read too.
-A field that is not known is refused, because the camera may differ by what the field states.
+Focal lengths, principal point and size are in pixels.  These fields may be left out: ``distortion``
+(coefficients in OpenCV's order), ``model`` (``radial-tangential`` by default, or ``fisheye`` with ``[k1, k2,
+k3, k4]``), ``depth_scale`` (a pixel of a 16-bit depth image divided by this is metres),
+``depth_registered_to_color`` (whether depth images show the view of the colour camera), ``rate_hz`` (rate of
+images that have no time stamps), ``rms_px`` (root mean square reprojection error of the calibration) and
+``views`` (number of images of the calibration).  The names that other programs give to these fields are read,
+too.  An unknown field is refused, because it may state something that changes the projection.
 """
 
 from __future__ import annotations
@@ -46,18 +47,22 @@ __all__ = [
 ]
 
 _T = TypeVar("_T")
-_MAX_FILE_BYTES = 1 << 20  # size of intrinsics.json or rig.json: a real file has a few hundred bytes
-_MIN_DEPTH_SCALE = 1e-2  # units of a depth image in a metre: a unit of 100 m measures no room
-_MAX_DEPTH_SCALE = 1e7  # units of a depth image in a metre: 65,535 units of 0.1 um end after 7 mm
-_MIN_RATE_HZ = 1e-3  # images in a second: slower ones show no motion that could be tracked
-_MAX_RATE_HZ = 1e4  # images in a second: no camera is faster
-_DEFAULT_DEPTH_SCALE = 1000.0  # units in a metre where nobody stated them: most depth cameras write mm
+_MAX_FILE_BYTES = (
+    1 << 20
+)  # largest intrinsics.json or rig.json that is read; a real file has some hundred bytes
+_MIN_DEPTH_SCALE = (
+    1e-2  # smallest depth_scale: with 0.01 one unit of a depth image is 100 m, too coarse to map
+)
+_MAX_DEPTH_SCALE = 1e7  # largest depth_scale: with 10^7 the largest value of 16 bits is 7 mm, too near to map
+_MIN_RATE_HZ = 1e-3  # smallest rate_hz: between slower images no motion could be tracked
+_MAX_RATE_HZ = 1e4  # largest rate_hz: no camera is faster
+_DEFAULT_DEPTH_SCALE = 1000.0  # depth_scale if nobody stated it: most depth cameras write millimetres
 _PERSPECTIVE_NAMES = {"pinhole", "perspective", "simple_pinhole", "none", ""}
-"""Values of a field for the lens model that name a perspective projection, in lower case: the distortion is
-then radial-tangential, as in files of COLMAP, Kalibr and EuRoC."""
+"""Names in lower case, in a field that states a lens model, of a perspective projection without its
+distortion model; coefficients are then radial-tangential, as in files of COLMAP, Kalibr and EuRoC."""
 _UNSPECIFIC_NAMES = {"pinhole", "perspective", "none", ""}
-"""Values of ``camera_model`` that say nothing of the distortion, and of ``distortion_model`` that say nothing
-of the projection, in lower case: another field may state the lens model."""
+"""Names in lower case with which a field does not choose a lens model, because the file may do so in another
+field: a file may state ``camera_model: pinhole`` and ``distortion_model: equidistant``."""
 _FIELD_ALIASES = {
     **dict.fromkeys(("w", "image_width"), "width"),
     **dict.fromkeys(("h", "image_height"), "height"),
@@ -74,10 +79,11 @@ _FIELD_ALIASES = {
     **dict.fromkeys(("depth_map_factor", "png_depth_scale", "depth_factor"), "depth_scale"),
     **dict.fromkeys(("fps", "frame_rate", "Camera.fps"), "rate_hz"),
 }
-"""Field names of OpenCV, ROS, COLMAP, Open3D, librealsense and nerfstudio, each with the name that
-``intrinsics.json`` gives to the same field."""
+"""For each field name of OpenCV, ROS, COLMAP, Open3D, librealsense and nerfstudio, the name of the same field
+in ``intrinsics.json``."""
 _COEFFICIENT_NAMES = {name for model in LENS_MODELS.values() for name in model.coefficient_names}
-"""Distortion coefficients that a file may state in fields of their own, such as ``k1``, of any lens model."""
+"""Names of the distortion coefficients of all lens models; a file may state each in a field, such as
+``k1``."""
 _FIELDS = {
     "fx",
     "fy",
@@ -95,9 +101,9 @@ _FIELDS = {
     "views",
     *_COEFFICIENT_NAMES,
 }
-"""Fields of ``intrinsics.json`` that are read, after `_FIELD_ALIASES` has replaced other names."""
+"""Names of the fields that are read, after `_FIELD_ALIASES` has replaced the names of other programs."""
 _REMARKS = {"name", "comment", "description", "source", "serial", "camera_name", "depth_unit"}
-"""Fields of ``intrinsics.json`` that are for people: any value is accepted, and none is used."""
+"""Fields of ``intrinsics.json`` for people: they may have any value, which is not used."""
 INTRINSICS_HINT = (
     "write fx fy cx cy width height, and distortion [k1 k2 p1 p2 k3] and depth_scale if they are known, as "
     "JSON into intrinsics.json; files of OpenCV, ROS, ORB-SLAM and COLMAP hold them (docs/cameras.md)"
@@ -111,14 +117,16 @@ TYPICAL_HINT = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Intrinsics(Lens):
-    """A calibrated lens, the unit of its 16-bit depth images, and how good the calibration is.
+    """A calibrated lens, the unit of its 16-bit depth images, and the error of the calibration.
 
     Attributes:
-        depth_scale: Units of a depth image in a metre; None if nobody stated them.
+        depth_scale: Units of a depth image per metre: metres are the value of a pixel divided by this.  None
+            if nobody stated it.
         rms_px: Root mean square reprojection error of the calibration; None if unknown.
         views: Number of images of the calibration board that were used; None if unknown.
-        rate_hz: Images in a second, for images that have no time stamps; None if unknown.
-        is_depth_registered: Whether depth images show the view of the colour camera; None if unknown.
+        rate_hz: Images per second, for images that have no time stamps; None if unknown.
+        is_depth_registered: The field ``depth_registered_to_color``: whether depth images show the view of
+            the colour camera; None if unknown.
 
     Raises:
         UsageError: The lens model is not known, the coefficients do not fit the model, or a number is not in
@@ -157,7 +165,7 @@ class Intrinsics(Lens):
 
     @property
     def depth_units_per_m(self) -> float:
-        """Units of a depth image in a metre: ``depth_scale``, or 1000 (millimetres) if nobody stated it."""
+        """Units of a depth image per metre: ``depth_scale``, or 1000 (millimetres) if nobody stated it."""
         return _DEFAULT_DEPTH_SCALE if self.depth_scale is None else self.depth_scale
 
 
@@ -177,8 +185,8 @@ def read_json(path: Path, hint: str) -> Any:
     """Return the content of a JSON file of intrinsics of at most 1 MiB.
 
     Raises:
-        UsageError: The file is missing (the hint says how to calibrate), or cannot be read, is too large,
-            or is no JSON (the hint is *hint*).
+        UsageError: The file is missing (its hint says how to calibrate); or the file cannot be read, is too
+            large, or is not JSON (its hint is *hint*).
     """
     if not path.exists():
         raise UsageError(f"there is no {path}, and the intrinsics are not known", hint=TYPICAL_HINT)
@@ -190,8 +198,8 @@ def name_file_in_errors(path: Path, hint: str) -> Iterator[None]:
     """Turn errors of the block that parses the file *path* into a UsageError that names the file.
 
     Raises:
-        UsageError: The block raised InvalidCamera or UsageError (their hint stays), or an error of Python for
-            a field that is missing or has another type (then with *hint*).
+        UsageError: The block raised InvalidCamera or UsageError, whose hint stays; or a built-in exception
+            such as KeyError or TypeError, because a field is missing or has another type, which gets *hint*.
     """
     try:
         yield
@@ -214,7 +222,7 @@ def parse_intrinsics(values: Any) -> Intrinsics:
     # 1. Give all fields the names of intrinsics.json.
     values = _replace_field_aliases(values)
     model = parse_lens_model(values.get("model"))
-    # 2. Take those of fx fy cx cy that are not stated from the camera matrix, if there is one.
+    # 2. If there is a camera matrix, take from it those of fx fy cx cy that have no field of their own.
     if "matrix" in values:
         K = np.array(values["matrix"], dtype=np.float64).reshape(3, 3)
         K = K.T if K[2, 0] or K[2, 1] else K  # Open3D writes column after column
@@ -238,10 +246,12 @@ def parse_intrinsics(values: Any) -> Intrinsics:
 
 
 def parse_lens_model(stated: Any) -> str:
-    """Return the name in `LENS_MODELS` of the lens model that a file states; radial-tangential for None.
+    """Return the name in `LENS_MODELS` of the lens model that a file states.
+
+    It is ``radial-tangential`` for None and for the names in `_PERSPECTIVE_NAMES`.
 
     Raises:
-        UsageError: No lens model has this name, and the name is not that of a perspective projection.
+        UsageError: No lens model has this name.
     """
     name = "pinhole" if stated is None else str(stated)
     if name.lower() in _PERSPECTIVE_NAMES:
@@ -258,8 +268,7 @@ def parse_lens_model(stated: Any) -> str:
 def _replace_field_aliases(values: Any) -> dict[str, Any]:
     """Return the fields of a file by the names of ``intrinsics.json``.
 
-    A field for the lens model that says only that the projection is perspective, or that there is no
-    distortion, is left out.
+    A field of the lens model with one of `_UNSPECIFIC_NAMES` is left out.
 
     Raises:
         UsageError: A field is not known, or two names of one field state different values.
@@ -285,13 +294,13 @@ def _replace_field_aliases(values: Any) -> dict[str, Any]:
 
 
 def _parse_distortion(values: dict[str, Any], model: str) -> tuple[float, ...]:
-    """Return the distortion coefficients of a file, which states them as a list or as ``k1``, ``k2``, ...
+    """Return the distortion coefficients that a file states as ``distortion``, or as ``k1``, ``k2``, ...
 
-    The result is empty if the file states none, or by names only zeros.
+    Without the list, the result is empty if all of ``k1``, ``k2``, ... are 0 or missing.
 
     Raises:
-        UsageError: There is a list, and a named coefficient is not 0; or there is no list, and a named
-            coefficient is not 0 that the lens model does not have.
+        UsageError: The file states the list and a coefficient other than 0 by its name; or, without the list,
+            it states a coefficient other than 0 by a name that *model* does not have.
     """
     names = LENS_MODELS[model].coefficient_names
     nonzero = {name for name in _COEFFICIENT_NAMES if float(values.get(name, 0.0))}
@@ -302,7 +311,10 @@ def _parse_distortion(values: dict[str, Any], model: str) -> tuple[float, ...]:
             )
         return tuple(float(values.get(name, 0.0)) for name in names) if nonzero else ()
     if nonzero:
-        raise UsageError("distortion is given twice, as a list and by names", hint="give the list")
+        raise UsageError(
+            "distortion is given twice, as a list and by names",
+            hint="remove k1, k2, ... or the list distortion",
+        )
     return tuple(float(value) for value in np.ravel(values["distortion"]))
 
 
@@ -311,12 +323,12 @@ def _convert_optional(value: Any, convert: Callable[[Any], _T]) -> _T | None:
 
 
 def write_intrinsics(path: Path | str, intrinsics: Intrinsics) -> None:
-    """Write the file that `read_intrinsics` reads; raises UsageError where it cannot be written."""
+    """Write the file that `read_intrinsics` reads; raises UsageError if it cannot be written."""
     write_json(path, intrinsics_to_json(intrinsics))
 
 
 def write_json(path: Path | str, values: Any) -> None:
-    """Write *values* as indented JSON; raises UsageError where the file cannot be written."""
+    """Write *values* as indented JSON; raises UsageError if the file cannot be written."""
     try:
         Path(path).write_text(json.dumps(values, indent=2) + "\n", encoding="utf-8")
     except OSError as error:
@@ -324,7 +336,7 @@ def write_json(path: Path | str, values: Any) -> None:
 
 
 def intrinsics_to_json(intrinsics: Intrinsics) -> dict[str, Any]:
-    """Return the JSON object that `parse_intrinsics` reads, without what is unknown or the default."""
+    """Return the JSON object that `parse_intrinsics` reads; leave out what is None or the default."""
     camera = intrinsics.camera
     values: dict[str, Any] = {
         "fx": camera.fx,

@@ -1,7 +1,8 @@
-"""Read rigs of Kalibr: ``camchain.yaml`` or ``camchain-imucam.yaml``, and ``imu.yaml`` in its folder.
+"""Read rigs of Kalibr: a camchain, and the file of the IMU in its folder.
 
-The frame of the body is that of the IMU where the camchain states ``T_cam_imu``, else that of the first
-camera.
+A camchain is the file with the calibrated cameras that Kalibr writes, ``camchain-NAME.yaml`` for cameras
+alone and ``camchain-imucam-NAME.yaml`` for cameras with an IMU.  The frame of the body is that of the IMU if
+the camchain states ``T_cam_imu``, else that of the first camera.
 """
 
 from __future__ import annotations
@@ -20,18 +21,20 @@ from rse_pf.geometry import Array, Camera, inverse
 
 __all__ = ["read_kalibr"]
 
-_MAX_FILE_BYTES = 1 << 18  # size of a camchain: that of eight cameras has a few kilobytes
+_MAX_FILE_BYTES = (
+    1 << 18
+)  # largest file of Kalibr that is read: a camchain of eight cameras has some kilobytes
 _CAMCHAIN_HINT = "name the camchain that kalibr_calibrate_cameras or kalibr_calibrate_imu_camera wrote"
 _IMU_HINT = "give the noise densities and random walks of the IMU, and update_rate, as imu.yaml has them"
-_CAMERA_NAMES = ("left", "right")  # of cam0 and cam1 in the rig; further cameras keep their names
-_IMU_FILES = ("imu.yaml", "imu0.yaml")  # names under which users keep the IMU file of Kalibr
+_CAMERA_NAMES = ("left", "right")  # names of cam0 and cam1 in the rig; further cameras keep their names
+_IMU_FILES = ("imu.yaml", "imu0.yaml")  # names that users give to the IMU's file, which Kalibr reads
 
 
 def read_kalibr(path: Path) -> Rig:
-    """Return the rig of a camchain.
+    """Return the rig of the camchain *path*.
 
     The camera ``cam0`` is called left, and ``cam1`` right; further cameras keep their names.  The rig has an
-    IMU if the camchain states ``T_cam_imu`` of ``cam0``, and a file of the IMU is in its folder.
+    IMU if the camchain states ``T_cam_imu`` of ``cam0`` and its folder has a file of the IMU.
 
     Raises:
         UsageError: The file is no camchain, or has an unknown lens model or an impossible number.
@@ -85,10 +88,11 @@ def _parse_lens(stated: Any) -> Intrinsics:
 
 
 def _read_imu_of_camchain(camchain: Path) -> RigImu | None:
-    """Return the IMU of the file that Kalibr writes into the folder of a camchain; None without a file.
+    """Return the IMU of the file in the folder of *camchain*; None if there is no such file.
 
-    The file is called like the camchain with ``imu`` for ``camchain`` or ``camchain-imucam``, else
-    ``imu.yaml`` or ``imu0.yaml``.  The pose of the IMU is the identity, since the IMU is the body of the rig.
+    Its name is the first that exists of ``imu-NAME.yaml`` (which Kalibr writes with ``camchain-NAME.yaml`` or
+    ``camchain-imucam-NAME.yaml``), ``imu.yaml`` and ``imu0.yaml``.  ``T_body_imu`` is the identity, because
+    the frame of the body is that of the IMU.
 
     Raises:
         UsageError: The file lacks a number, or a number is impossible.

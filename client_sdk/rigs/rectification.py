@@ -1,6 +1,7 @@
-"""Rectify a stereo pair: resample both images as seen by two equal pinhole cameras, one right of the other.
+"""Rectify a stereo pair: resample both images as two equal pinhole cameras side by side would see them.
 
-After that, a point of the scene lies in the same row of both images.  `client_sdk.stereo` matches those rows.
+In rectified images, a point of the scene lies in the same row of both.  `client_sdk.stereo` matches along
+rows.
 """
 
 from __future__ import annotations
@@ -17,34 +18,38 @@ from rse_pf.geometry import Array, Camera, inverse, rectify_stereo_pair
 
 __all__ = ["Rectification"]
 
-_MIN_BASELINE_M = 0.001  # between the cameras of a pair: a shorter one is no stereo rig, but a missing pose
-_MIN_SIDEWAYS_SHARE = 0.7  # of the baseline along x of the left camera: less means one camera above the other
+_MIN_BASELINE_M = 0.001  # smallest distance of the two cameras: a smaller one means that a pose is missing
+_MIN_SIDEWAYS_SHARE = 0.7
+"""Smallest x of the right camera's position in the frame of the left camera, as a fraction of the distance:
+with a smaller one the cameras are not side by side, but above or in front of each other."""
 _RECTIFIED_TOLERANCE = 1e-9
-"""Deviation of a number of the pose between two cameras from a pure translation along x, up to which the pair
-counts as rectified already."""
+"""A pair whose lenses are equal pinholes counts as rectified already if no element of the ``(4, 4)`` pose
+between its cameras deviates by this or more from a translation along x (no unit in the rotation, metres in
+the translation)."""
 
 
 class Rectification:
-    """The rectified cameras of a stereo pair, and the maps that rectify its images.
+    """The rectified cameras of a stereo pair, and the lookup tables that resample its images.
 
     Images of a pair that is rectified already are returned as they are, not copied.
 
     Attributes:
         camera: The pinhole camera of both rectified images.
         baseline_m: Distance from the left camera to the right one, metres.
-        T_body_camera: ``(4, 4)``, metres, pose of the rectified left camera in the body.  It has the position
-            of the left camera, and is rotated against it unless the pair is rectified already.
+        T_body_camera: ``(4, 4)``, metres, pose of the rectified left camera in the body.  Its position is
+            that of the left camera; its rotation differs from that of the left camera unless the pair is
+            rectified already.
 
     Source:
         Bouguet's method, see `rse_pf.geometry.rectify_stereo_pair`.
     """
 
     def __init__(self, left: RigCamera, right: RigCamera) -> None:
-        """Compute the rectified cameras and the maps of both images.
+        """Compute the rectified cameras and the lookup tables of both images.
 
         Raises:
-            UsageError: The cameras are no stereo pair: they differ in size or lens model, the right one is on
-                the left, one is above the other, or both are at one position.
+            UsageError: The cameras are no stereo pair: they differ in image size or lens model, the right one
+                is left of the left one, they are not side by side, or both are at one position.
             MissingExtra: OpenCV is not installed.
         """
         self._sizes = [(camera.lens.camera.height, camera.lens.camera.width) for camera in (left, right)]
@@ -71,7 +76,7 @@ class Rectification:
         """Return the rectified image of a left colour image ``(h, w, 3)``.
 
         Raises:
-            UsageError: The image has not the size that the left camera was calibrated with.
+            UsageError: The image does not have the size that the left camera was calibrated with.
         """
         self._check_size(0, rgb)
         return self._maps[0].colour(rgb)
@@ -80,7 +85,7 @@ class Rectification:
         """Return the rectified image of a right grey image ``(h, w)``, together with the baseline.
 
         Raises:
-            UsageError: The image has not the size that the right camera was calibrated with.
+            UsageError: The image does not have the size that the right camera was calibrated with.
         """
         self._check_size(1, gray)
         return StereoView(self._maps[1].colour(gray), self.baseline_m)
@@ -129,7 +134,7 @@ def _check_pair(left: RigCamera, right: RigCamera, right_in_left_m: Array) -> No
 
 
 def _is_rectified(left: Intrinsics, right: Intrinsics, T_right_left: Array) -> bool:
-    """Return whether both lenses are one pinhole, and the cameras differ by a translation along x only."""
+    """Return the pinhole camera of a ``(3, 4)`` projection matrix, with the size of *camera*.
     deviation = T_right_left - np.eye(4)
     deviation[0, 3] = 0.0
     are_equal_pinholes = left.camera == right.camera and left.is_pinhole and right.is_pinhole
@@ -137,10 +142,11 @@ def _is_rectified(left: Intrinsics, right: Intrinsics, T_right_left: Array) -> b
 
 
 def _pinhole_camera(projection: Array, camera: Camera) -> Camera:
-    """Return the pinhole camera of a ``(3, 4)`` rectified projection, with the image size of *camera*.
+    """Return the pinhole camera of a ``(3, 4)`` projection matrix, with the image size of *camera*.
 
     Raises:
-        UsageError: The rectified intrinsics are those of no camera: distortion or poses are far off.
+        UsageError: The rectified intrinsics cannot be those of a camera, because distortion or poses are
+            wrong.
     """
     try:
         return Camera(

@@ -17,10 +17,10 @@ from rse_pf.geometry import Array, inverse, rigid
 
 __all__ = ["Rig", "RigCamera", "RigImu"]
 
-_MAX_CAMERAS = 8  # of a rig: only the first two are used, and a longer list is no rig
-_MAX_LEVER_ARM_M = 10.0  # along each axis, from the body's origin to a sensor: more is in millimetres
-_MAX_TIME_OFFSET_S = 1.0  # between the clocks of a camera and the IMU: a larger one is in milliseconds
-_MAX_NAME_LENGTH = 64  # characters in the name of a camera, which error lines repeat
+_MAX_CAMERAS = 8  # most cameras of a rig, of which the first two are used; a longer list is probably no rig
+_MAX_LEVER_ARM_M = 10.0  # largest coordinate of a sensor in the body: a larger number is probably millimetres
+_MAX_TIME_OFFSET_S = 1.0  # largest offset of a camera's clock: a larger number is probably milliseconds
+_MAX_NAME_LENGTH = 64  # most characters of a camera's name, which errors repeat
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -28,11 +28,11 @@ class RigCamera:
     """A camera of a rig: its lens, its pose on the body, and its clock.
 
     Attributes:
-        name: Name of the camera in messages, such as ``left``.
+        name: Name of the camera in errors, such as ``left``.
         lens: Intrinsics of the camera.
         T_body_camera: ``(4, 4)``, metres, pose of the camera in the body.
-        time_offset_s: Seconds to add to a time stamp of the camera for the time on the clock of the rig,
-            which is the clock of the IMU where there is one.
+        time_offset_s: Seconds to add to a time stamp of the camera to get the time on the clock of the rig;
+            the clock of the rig is that of its IMU if it has one.
 
     Raises:
         UsageError: The name is empty or longer than 64 characters, the pose is no rigid motion or its
@@ -62,9 +62,9 @@ class RigCamera:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class RigImu:
-    """The IMU of a rig: its pose ``T_body_imu`` ``(4, 4)``, metres, on the body, and its noise.
+    """The IMU of a rig: its pose ``T_body_imu`` ``(4, 4)``, metres, in the body, its noise, rate and range.
 
-    The other fields have the units of `client_sdk.imu.samples.ImuModel`.
+    The other fields have the meaning and the units that they have in `client_sdk.imu.samples.ImuModel`.
 
     Raises:
         UsageError: The pose is no rigid motion within 10 m, or `ImuModel` refuses a number.
@@ -84,10 +84,10 @@ class RigImu:
         self.model(self.T_body_imu)
 
     def model(self, T_body_camera: Array) -> ImuModel:
-        """Return the noise and range of the IMU with its pose relative to a camera.
+        """Return the model of the IMU with its pose relative to the camera that makes the frames.
 
-        *T_body_camera* ``(4, 4)`` is the pose of the camera of the frames, metres: of a stereo pair that of
-        the rectified left one.
+        *T_body_camera* ``(4, 4)``, metres, is the pose of this camera in the body; for a stereo pair, that of
+        the rectified left camera.
         """
         return ImuModel(
             T_imu_camera=inverse(self.T_body_imu) @ T_body_camera,
@@ -105,7 +105,7 @@ class RigImu:
 class Rig:
     """The sensors of a robot: one to eight cameras, and an IMU or None.
 
-    Of a stereo rig, the first camera is the left one and the second the right one.
+    A rig of two cameras or more is a stereo rig: the first camera is the left one, the second the right one.
 
     Raises:
         UsageError: There is no camera, there are more than eight, or two cameras have the same name.
@@ -126,7 +126,7 @@ class Rig:
 
     @property
     def left(self) -> RigCamera:
-        """The first camera: the left one of a stereo rig, or the only one."""
+        """The first camera: the left one of a stereo rig, or the only camera."""
         return self.cameras[0]
 
     @property
@@ -136,9 +136,9 @@ class Rig:
 
 
 def _normalise_pose(sensor: object, field: str, name: str) -> None:
-    """Replace in place the pose *field* of a frozen *sensor* by the rigid motion that `rigid` returns.
+    """Replace the attribute *field*, a pose, of the frozen dataclass *sensor* by the result of `rigid`.
 
-    Rounding errors of a rotation are removed in this way.  *name* is how the error calls the pose.
+    That removes the rounding errors of a rotation.  *name* is the name of the pose in the error.
 
     Raises:
         UsageError: The pose is no ``(4, 4)`` rigid motion within 10 m on each axis.

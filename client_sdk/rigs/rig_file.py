@@ -7,9 +7,9 @@
      "imu": {"T_body_imu": [[...]], "gyro_noise": 1.7e-4, "gyro_walk": 2e-5,
              "accel_noise": 2e-3, "accel_walk": 3e-3, "rate_hz": 200}}
 
-A camera has the fields of ``intrinsics.json``, a name, its pose in the body (metres), and ``time_offset_s``,
-which may be left out.  The IMU has the units of `client_sdk.imu.samples.ImuModel`; ``imu``, ``max_gyro`` and
-``max_accel`` may be left out.  A camchain of Kalibr is read in the place of ``rig.json``.
+A camera has the fields of ``intrinsics.json``, a name, its pose in the body (metres), and ``time_offset_s``
+(`RigCamera`), which may be left out.  The IMU has the units of `client_sdk.imu.samples.ImuModel`; ``imu``,
+``max_gyro`` and ``max_accel`` may be left out.  A camchain of Kalibr can be given instead of a ``rig.json``.
 """
 
 from __future__ import annotations
@@ -36,16 +36,23 @@ from rse_pf.geometry import Array
 __all__ = ["read_calibration", "read_rig", "write_rig"]
 
 _HINT = "write cameras, each with name, fx fy cx cy width height and T_body_camera: see docs/cameras.md"
-_CAMERA_FIELDS = ("name", "T_body_camera", "time_offset_s")  # of a camera in rig.json, but not of its lens
-_IMU_FIELDS = ("gyro_noise", "gyro_walk", "accel_noise", "accel_walk", "rate_hz")  # that each IMU must state
-_IMU_RANGE_FIELDS = ("max_gyro", "max_accel")  # measuring ranges of an IMU; without them there is no limit
+_CAMERA_FIELDS = ("name", "T_body_camera", "time_offset_s")  # fields of a camera that intrinsics.json has not
+_IMU_FIELDS = (
+    "gyro_noise",
+    "gyro_walk",
+    "accel_noise",
+    "accel_walk",
+    "rate_hz",
+)  # numbers of an IMU, all needed
+_IMU_RANGE_FIELDS = ("max_gyro", "max_accel")  # measuring ranges of an IMU; if left out, it does not saturate
 
 
 def read_rig(path: Path | str) -> Rig:
     """Return the rig of ``rig.json``, or of a camchain of Kalibr (``.yaml``).
 
     Raises:
-        UsageError: The file is missing, lacks a number, has an impossible number, or holds one camera only.
+        UsageError: The file is missing, lacks a number, has an impossible number, or is an
+            ``intrinsics.json``.
         MissingExtra: The file is YAML, and PyYAML is not installed.
     """
     calibration = read_calibration(path)
@@ -55,9 +62,10 @@ def read_rig(path: Path | str) -> Rig:
 
 
 def read_calibration(path: Path | str) -> Intrinsics | Rig:
-    """Return the intrinsics of ``intrinsics.json``, or the rig of a file that `read_rig` reads.
+    """Return the intrinsics of an ``intrinsics.json``, or the rig of a ``rig.json`` or a camchain of Kalibr.
 
-    A JSON object with the field ``cameras`` is a rig.
+    A file with the suffix ``.yaml`` or ``.yml`` is a camchain; a JSON object with the field ``cameras`` is a
+    rig.
 
     Raises:
         UsageError: The file holds neither intrinsics nor a rig, or a number is missing or impossible.
@@ -78,7 +86,7 @@ def read_calibration(path: Path | str) -> Intrinsics | Rig:
 
 
 def write_rig(path: Path | str, rig: Rig) -> None:
-    """Write the file that `read_rig` reads; raises UsageError where it cannot be written."""
+    """Write a ``rig.json`` that `read_rig` reads; raises UsageError if it cannot be written."""
     values: dict[str, Any] = {
         "cameras": [
             {

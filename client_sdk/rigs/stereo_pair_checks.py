@@ -1,8 +1,8 @@
 """Find faults of a stereo rig in its rectified images: swapped, not synchronised, or badly rectified.
 
 In a correct pair, a point of the scene lies in the same row of both images, and farther left in the right
-one.  ORB features are matched over the whole image, not along rows, so that a faulty rig cannot hide its
-errors.
+image.  ORB features are matched over the whole image, not only along rows, because the matches of a faulty
+rig lie in other rows.
 """
 
 from __future__ import annotations
@@ -29,38 +29,50 @@ __all__ = [
     "measure_pair",
 ]
 
-_MAX_FEATURES = 600  # ORB features of each image that are matched: enough for the medians of `find_fault`
+_MAX_FEATURES = (
+    600  # most ORB features of each image that are matched: enough for the medians of `find_fault`
+)
 _MAX_DISTANCE_RATIO = 0.8
-"""Hamming distance of the nearest descriptor over that of the second nearest, above which a match is
-ambiguous (Lowe's ratio test)."""
+"""Ratio of the Hamming distances of the nearest and the second nearest descriptor, from which on a match is
+ambiguous and left out (Lowe's ratio test)."""
 _MAX_PYRAMID_SCALE = 2.0
-"""Scale of the image pyramid at which a feature was found: positions of coarser levels are too imprecise."""
-_MAX_ROW_OFFSET_PX = 40.0  # between the rows of a match: larger offsets are wrong matches, not a faulty rig
+"""Largest scale of the image pyramid of a feature that is matched: positions at coarser levels are too
+imprecise."""
+_MAX_ROW_OFFSET_PX = 40.0
+"""A match whose rows differ by this or more is left out as a wrong match; a calibration that is wrong by so
+much leaves few matches, so its fault is found only if matches with smaller offsets exist, too."""
 _MIN_MATCHES = 60
-"""Matches of all measured pairs together, below which no fault is reported.  A delay needs as many fast
-features, and half as many inliers among them."""
+"""Fewest matches of all measured pairs together for which a fault is reported.  For a delay it is also the
+fewest fast features (`_FAST_PX_S`) among them, and half of it the fewest fast features that the delay
+explains."""
 _MIN_SWAPPED_DISPARITY_PX = -1.5
-"""Disparity (column in the left minus column in the right image) below which a match says that the cameras
-are swapped; the disparity of a distant point may be a little below 0 by noise."""
+"""A match counts for swapped cameras if its disparity (column in the left minus column in the right image) is
+below this.  The limit is below 0 because noise may make the disparity of a distant point a little
+negative."""
 _SWAPPED_SHARE = 0.6
-"""Share of matches with a disparity below `_MIN_SWAPPED_DISPARITY_PX`, above which the cameras are
-swapped."""
+"""The cameras are swapped if more than this share of the matches has a disparity below
+`_MIN_SWAPPED_DISPARITY_PX`."""
 _MAYBE_SWAPPED_SHARE = 0.2
-"""Share of matches with a disparity below `_MIN_SWAPPED_DISPARITY_PX`, above which the error about wrong rows
-also names swapped cameras as a possible cause."""
+"""The error about wrong rows also names swapped cameras as a possible cause if more than this share of the
+matches has a disparity below `_MIN_SWAPPED_DISPARITY_PX`."""
 _MAX_MEDIAN_ROW_OFFSET_PX = 1.5
-"""Median of the absolute row offsets of all matches, above which the rectification counts as wrong.  Where
-the middle 80 % of the row offsets all lie beyond it on one side, no delay is looked for."""
-_MIN_DELAY_S = 0.004  # time between both images of a pair, above which the cameras are not synchronised
-_MIN_DELAY_EFFECT_PX = 0.7  # standard deviation of row offsets that a delay causes, above which it matters
+"""The rectification is wrong if the median of the absolute row offsets of all matches is above this.  If even
+the middle 80 % of the row offsets all lie beyond it on one side, this fault is certain, and no delay is
+estimated."""
+_MIN_DELAY_S = 0.004  # a shorter time between the two images of a pair is not reported as a delay
+_MIN_DELAY_EFFECT_PX = (
+    0.7  # a delay that makes row offsets scatter (standard deviation) by less is not reported
+)
 _MIN_EXPLAINED_VARIANCE = 0.3  # share of the variance of row offsets that a reported delay must explain
-_FAST_PX_S = 15.0  # speed of a feature across rows, above which a delay shifts the feature visibly
-_MAX_RESIDUAL_PX = 2.0  # between a row offset and what the delay predicts: beyond it a match is an outlier
+_FAST_PX_S = (
+    15.0  # a feature that moves up or down in the image faster than this is fast: a delay shows in it
+)
+_MAX_RESIDUAL_PX = 2.0  # a match whose row offset differs by more from that of the delay is an outlier
 _ALL_FAST_SHARE = 0.9
-"""Share of fast features, above which the slow ones are too few to show the row offset of the rectification
-alone: the median over all features is then taken for that offset."""
+"""If more than this share of the features is fast, the slow ones are too few to measure the row offset that
+the rectification causes; the median row offset of all features is subtracted instead."""
 _REFINEMENTS = 5  # least-squares fits of the delay, each to the inliers of the fit before
-_MAX_PAIRS = 14  # stereo pairs of a recording that are compared when it is opened, since each takes time
+_MAX_PAIRS = 14  # most stereo pairs of a recording that are compared when it is opened, since each takes time
 
 
 class PairMeasurement(NamedTuple):
@@ -69,8 +81,8 @@ class PairMeasurement(NamedTuple):
     Attributes:
         disparities_px: Column in the left image minus column in the right one.
         row_offsets_px: Row in the left image minus row in the right one.
-        row_rates_px_s: Speed of the feature across rows in the left image until the next frame, positive
-            downwards; NaN where the feature was not found in the left image of the next frame.
+        row_rates_px_s: Vertical speed of the feature in the left image until the next frame, positive
+            downwards; NaN if the feature was not found in the left image of the next frame.
     """
 
     disparities_px: Array
@@ -81,7 +93,8 @@ class PairMeasurement(NamedTuple):
 def choose_pairs(rows: Sequence[int]) -> list[tuple[int, int]]:
     """Return at most 14 elements of *rows*, spread evenly, each in a pair with the element after it.
 
-    *rows* are those of a recording in the order of time; with fewer than two of them, the result is empty.
+    *rows* are the indices of a recording's frames in the order of time; with fewer than two of them, the
+    result is empty.
     """
     places = np.unique(np.linspace(0, len(rows) - 2, _MAX_PAIRS).astype(int)) if len(rows) > 1 else ()
     return [(rows[place], rows[place + 1]) for place in places]
@@ -92,9 +105,11 @@ class PairFault:
     """What is wrong with a stereo rig.
 
     Attributes:
-        what: ``swapped``, ``late`` (the images are of two moments), or ``rows`` (rectified wrongly).
-        value: The share of matches that look swapped; the delay of the right image (s), negative if the right
-            image is the earlier one; or the median of the absolute row offsets (px).
+        what: ``swapped``, ``late`` (the images of a pair were taken at two times), or ``rows`` (the
+            rectification is wrong).
+        value: For ``swapped`` the share of matches that lie farther right in the right image; for ``late``
+            the time by which the right image is later (s), negative if it is earlier; for ``rows`` the median
+            of the absolute row offsets (px).
         unit: Unit of the value: ``share``, ``s`` or ``px``.
         message: One sentence for the user.
         hint: What the user can do.
@@ -113,7 +128,8 @@ def check_stereo_pairs(pairs: Iterable[tuple[Frame, Frame]], name: str) -> None:
     *pairs* are stereo frames, each with the frame after it.  A source with too few features is accepted.
 
     Raises:
-        UsageError: The images are swapped, the right one is of another time, or rows do not fit.
+        UsageError: The cameras are swapped, the two images of a pair were taken at different times, or the
+            rectification is wrong.
         MissingExtra: OpenCV is not installed.
     """
     fault = find_fault_of_frames(pairs)
@@ -124,8 +140,8 @@ def check_stereo_pairs(pairs: Iterable[tuple[Frame, Frame]], name: str) -> None:
 def find_fault_of_frames(pairs: Iterable[tuple[Frame, Frame]]) -> PairFault | None:
     """Return the fault of the rig that stereo frames show.
 
-    *pairs* are stereo frames, each with the frame after it, by which the motion in the image is measured.
-    The result is None for a correct rig, and also where the images have too few features to tell.
+    *pairs* are stereo frames, each with the frame after it, with which the motion in the image is measured.
+    The result is None for a correct rig, and if the images have too few features.
 
     Raises:
         MissingExtra: OpenCV is not installed.
@@ -136,8 +152,8 @@ def find_fault_of_frames(pairs: Iterable[tuple[Frame, Frame]]) -> PairFault | No
 def find_fault(measurements: Iterable[PairMeasurement]) -> PairFault | None:
     """Return the fault of a stereo rig that *measurements* show together.
 
-    The first fault in this order is returned: swapped cameras, images of two moments, wrong rows.  The result
-    is None without a fault, and with fewer than 60 matches in all measurements.
+    The first fault in this order is returned: swapped cameras, images that were taken at two times, a wrong
+    rectification.  The result is None without a fault, and with fewer than 60 matches in all measurements.
     """
     pairs = list(measurements)
     if not pairs:
@@ -157,9 +173,9 @@ def find_fault(measurements: Iterable[PairMeasurement]) -> PairFault | None:
             "image: the cameras are swapped",
             hint="exchange left and right, in the rig or in the images",
         )
-    # 2. Report a delay, which shifts the row of a feature in proportion to the speed of the feature.  No
-    # delay is looked for if nearly all rows are shifted far to the same side: that shows a rotation of a
-    # camera.
+    # 2. Report a delay, which shifts the row of a feature in proportion to its vertical speed.  If nearly all
+    #    rows are shifted far to the same side, the calibrated rotation of a camera is wrong, and a delay
+    #    cannot be measured.
     has_rate = np.isfinite(row_rates_px_s)
     low_px, high_px = np.percentile(row_offsets_px, (10, 90))
     is_rotated = bool(low_px * high_px > 0.0 and min(abs(low_px), abs(high_px)) > _MAX_MEDIAN_ROW_OFFSET_PX)
@@ -173,7 +189,7 @@ def find_fault(measurements: Iterable[PairMeasurement]) -> PairFault | None:
             f"{'after' if delay_s > 0 else 'before'} the left one: the cameras are not synchronised",
             hint="trigger both cameras together, or take one: --camera left",
         )
-    # 3. Report a wrong rectification, if rows do not fit for another reason.
+    # 3. Report a wrong rectification if the rows differ for any other reason.
     median_offset_px = float(np.median(np.abs(row_offsets_px)))
     if median_offset_px > _MAX_MEDIAN_ROW_OFFSET_PX:
         swap = "the cameras are swapped, or " if swapped_share > _MAYBE_SWAPPED_SHARE else ""
@@ -189,7 +205,7 @@ def find_fault(measurements: Iterable[PairMeasurement]) -> PairFault | None:
 
 
 def measure_pair(frame: Frame, later: Frame) -> PairMeasurement:
-    """Match the features of both images of *frame*, and those of its left image with *later*, the next frame.
+    """Match the left image of *frame* with the right one, and with the left one of *later*, the next frame.
 
     Matches between rows that are 40 px or more apart are left out.  A frame without a right image gives empty
     arrays.
@@ -218,15 +234,15 @@ def measure_pair(frame: Frame, later: Frame) -> PairMeasurement:
 def _estimate_delay_s(row_offsets_px: Array, row_rates_px_s: Array) -> float | None:
     """Return the delay of the right image, s, if a delay explains the row offsets ``(n,)``; else None.
 
-    A right image that is late by *t* shows a point ``t * rate`` farther down, so that ``offset = -t * rate``.
-    A negative delay means that the right image is the earlier one.  Both arrays are those of
-    `PairMeasurement`, without NaN.
+    A right image that was taken *t* seconds after the left one shows a point ``t * rate`` farther down, so
+    that ``offset = -t * rate``.  A negative delay means that the right image is the earlier one.  Both arrays
+    are those of `PairMeasurement`, without NaN.
     """
     is_fast = np.abs(row_rates_px_s) > _FAST_PX_S
     if is_fast.sum() < _MIN_MATCHES:
         return None
     # 1. Subtract the row offset that the rectification causes: the median over the slow features, or over all
-    # features if nearly all are fast.
+    #    features if nearly all are fast.
     is_reference = np.ones_like(is_fast) if is_fast.mean() > _ALL_FAST_SHARE else ~is_fast
     row_offsets_px = row_offsets_px - np.median(row_offsets_px[is_reference])
     # 2. Take as first estimate the median of the delays that explain each fast feature alone.
@@ -239,7 +255,7 @@ def _estimate_delay_s(row_offsets_px: Array, row_rates_px_s: Array) -> float | N
             return None
         x, y = row_rates_px_s[is_inlier], row_offsets_px[is_inlier]
         delay_s = -float(((x - x.mean()) * (y - y.mean())).sum() / ((x - x.mean()) ** 2).sum())
-    # 4. Report a delay only if it is long, matters in pixels, and explains the offsets.
+    # 4. Return a delay only if it is long, changes row offsets visibly, and explains their variance.
     x, y = row_rates_px_s[is_inlier], row_offsets_px[is_inlier]
     explained_variance = 1.0 - float(np.var(y + delay_s * x) / max(np.var(y), 1e-9))
     effect_px = abs(delay_s) * float(np.std(x))
@@ -253,8 +269,8 @@ def match_features(
     """Return the indices into *first* and into *second* of ORB features that match, two arrays ``(m,)``.
 
     Two features match if each is the nearest neighbour of the other, and Lowe's ratio test holds.  Features
-    of coarse levels of the image pyramid are left out; the arrays are empty if an image has fewer than two
-    others.
+    of coarse levels of the image pyramid are not used; the arrays are empty if an image has fewer than two
+    other features.
 
     Raises:
         MissingExtra: OpenCV is not installed.

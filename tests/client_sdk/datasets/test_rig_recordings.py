@@ -219,7 +219,7 @@ def test_recordings_without_truth_are_read(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("file", "text", "says"),
     [
-        ("mav0/cam0/sensor.yaml", "intrinsics: [1, 2, 3]\n", "is not that of a camera"),
+        ("mav0/cam0/sensor.yaml", "intrinsics: [1, 2, 3]\n", "does not describe a camera"),
         ("mav0/cam0/sensor.yaml", SENSOR.format(data="1, x"), "no number"),
         ("mav0/cam0/data.csv", "#\n12\n", "less than 2 values"),
         ("mav0/cam0/data.csv", "#\n", "has no images"),
