@@ -1,4 +1,4 @@
-"""Open a recording of any known format, and read RGB-D recordings: TUM folders, and NYU Depth V2.
+"""Open a recording of any known format, and read RGB-D recordings: TUM folders, and dumps of NYU Depth V2.
 
 Frames are RGB images with depth in metres, undistorted and registered to the colour camera.  An image is read
 only when its frame is needed.  EuRoC and KITTI are read in `client_sdk.datasets.rig_recordings`, bags in
@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -68,7 +68,6 @@ _FREIBURG_DEPTH_SCALE = 5000.0  # units of a depth image of the TUM benchmark in
 def open_dataset(
     path: Path | str,
     *,
-    scene: str | None = None,
     camera: CameraChoice | None = None,
     imu: bool | None = None,
     intrinsics: Path | str | None = None,
@@ -77,12 +76,10 @@ def open_dataset(
 
     Accepts a folder in TUM layout (``rgb.txt``, ``depth.txt``, or a list of associations; with or without
     ``intrinsics.json``), a recording of EuRoC or a sequence of KITTI's odometry benchmark, a raw NYU Depth V2
-    folder (``r-*.ppm``, ``d-*.pgm``), its labelled ``.mat`` file, of which *scene* picks one scene, or a ROS
-    bag.
+    folder (``r-*.ppm``, ``d-*.pgm``), or a ROS bag.
 
     Args:
         path: The folder or file.
-        scene: Name of a scene of the labelled file; None for all images, and for other formats.
         camera: ``stereo`` for both cameras of a rig, ``left`` for the left or only one; None for both where
             there are two.
         imu: Whether frames carry samples of the IMU; None for yes where there is one.
@@ -91,9 +88,9 @@ def open_dataset(
 
     Raises:
         UsageError: The path has no known format, a part of the recording is missing or broken, facts about it
-            contradict each other, it has no such scene, camera or IMU, or *intrinsics* is given for a format
+            contradict each other, it has no such camera or IMU, or *intrinsics* is given for a format
             that has a calibration of its own.
-        MissingExtra: OpenCV, h5py or rosbags is needed and not installed.
+        MissingExtra: OpenCV or rosbags is needed and not installed.
     """
     path = Path(path)
     check_exists(path, "name a folder of TUM (rgb.txt, depth.txt, images), EuRoC or KITTI, or a ROS bag")
@@ -102,21 +99,24 @@ def open_dataset(
             f"{path} has a calibration in a format of its own",
             hint="leave out --intrinsics, or change the calibration of the recording",
         )
-    if scene is None and is_euroc(path):
+    if is_euroc(path):
         return open_euroc(path, camera=camera, imu=imu)
-    if scene is None and is_kitti(path):
+    if is_kitti(path):
         return open_kitti(path, camera=camera, imu=imu)
-    if scene is None and _is_bag(path):
+    if _is_bag(path):
         use_stereo = None if camera is None else camera == "stereo"
         lens, rig = (None, None) if intrinsics is None else lens_or_rig(Path(intrinsics))
         options = BagOptions(use_stereo=use_stereo, use_imu=imu, lens=lens, rig=rig)
         return dataset_of_bag(open_bag(path, options))
-    dataset = _open_single(path, scene, None if intrinsics is None else Path(intrinsics))
+    if path.is_file():
+        raise UsageError(f"{path} is not a recording", hint="name a folder or a ROS bag")
     if camera == "stereo":
         raise UsageError(f"{path} has one camera", hint="leave out --camera stereo")
     if imu:
         raise UsageError(f"{path} has no IMU", hint="leave out --imu")
-    return dataset
+    if not is_listed(path) and any(path.glob("d-*.pgm")):
+        return _open_raw(path)
+    return _open_tum(path, path / "intrinsics.json" if intrinsics is None else Path(intrinsics))
 
 
 def _is_bag(path: Path) -> bool:
@@ -135,18 +135,6 @@ def _find_associations(folder: Path) -> Path | None:
     and a depth image, in either order, each after its time stamp.
     """
     return next(iter(sorted(folder.glob("*assoc*.txt"))), None)
-
-
-def _open_single(path: Path, scene: str | None, intrinsics: Path | None) -> Dataset:
-    if path.is_file():
-        if path.suffix != ".mat":
-            raise UsageError(f"{path} is not a recording", hint="name a folder, a ROS bag or the .mat file")
-        return _open_labelled(path, scene)
-    if scene is not None:
-        raise UsageError(f"{path} has no scenes", hint="name scenes for the labelled .mat file only")
-    if not is_listed(path) and any(path.glob("d-*.pgm")):
-        return _open_raw(path)
-    return _open_tum(path, intrinsics or path / "intrinsics.json")
 
 
 def dataset_of_bag(bag: Bag) -> Dataset:
@@ -462,10 +450,12 @@ def _read_truth(
     return None, "none", ("",)
 
 
-# --- NYU Depth V2: raw dumps, and the labelled file ---
+# --- Raw dumps of NYU Depth V2 ---
 
 
 def _open_raw(folder: Path) -> Dataset:
+    """Return the raw dump of a folder; the camera and the unit of depth are those of the data set's
+    toolbox."""
     depths, colours = nyu.raw_files(folder, "d"), nyu.raw_files(folder, "r")
     pairs = associate_stamps(
         [file.timestamp_s for file in depths],
@@ -505,36 +495,8 @@ def _open_raw(folder: Path) -> Dataset:
             is_usual=True,
         ),
     )
-    stamps_s = [depths[row].timestamp_s for row, _ in pairs]
-    return _nyu_dataset(folder.name, stamps_s, read, [loss for loss in losses if loss.lost])
-
-
-def _open_labelled(path: Path, scene: str | None) -> Dataset:
-    """Return the images of the labelled file, one second apart, because the file has no time stamps."""
-    file = nyu.LabelledFile(path)
-    rows = file.rows(scene)
-
-    def read(row: int) -> Frame:
-        rgb, depth_m = file.read(rows[row])
-        return Frame(timestamp_s=float(row), rgb=rgb, depth_m=depth_m, camera=nyu.COLOUR_CAMERA)
-
-    stamps_s = [float(row) for row in range(len(rows))]
-    assumed = f"{path} holds no time stamps: 1 s between images is assumed"
-    return _nyu_dataset(scene or path.stem, stamps_s, read, assumed=(assumed,))
-
-
-def _nyu_dataset(
-    name: str,
-    stamps_s: Sequence[float],
-    read: Callable[[int], Frame],
-    losses: Sequence[LossFacts] = (),
-    assumed: tuple[str, ...] = (),
-) -> Dataset:
-    """Return a recording of NYU Depth V2, whose camera and depth unit the toolbox of the data set states.
-
-    *read* reads the frame of a row, with depth in metres; *stamps_s* has a time stamp for each row.
-    """
-    camera = nyu.COLOUR_CAMERA
+    name, camera = folder.name, nyu.COLOUR_CAMERA
+    stamps_s = tuple(depths[row].timestamp_s for row, _ in pairs)
     depths_m = []
     for row in sorted({0, len(stamps_s) // 2, len(stamps_s) - 1}):
         with contextlib.suppress(UsageError):  # an image that cannot be read is reported in the iteration
@@ -550,13 +512,13 @@ def _nyu_dataset(
             median_m=median_depth_m(depths_m), units_per_m=1.0, is_unit_stated=True, is_registered=True
         ),
         times=(TimeFacts(stated_by=name, stamps_s=np.array(stamps_s)),),
-        losses=losses,
-        assumed=(whose, *assumed),
+        losses=[loss for loss in losses if loss.lost],
+        assumed=(whose,),
     )
     return Dataset(
         name=name,
         camera=camera,
-        timestamps_s=tuple(stamps_s),
+        timestamps_s=stamps_s,
         truth=None,
         truth_kind="none",
         rows=tuple(range(len(stamps_s))),
