@@ -134,7 +134,7 @@ def _check_pair(left: RigCamera, right: RigCamera, right_in_left_m: Array) -> No
 
 
 def _is_rectified(left: Intrinsics, right: Intrinsics, T_right_left: Array) -> bool:
-    """Return the pinhole camera of a ``(3, 4)`` projection matrix, with the size of *camera*.
+    """Return whether both lenses are one and the same pinhole, and the pose is a translation along x."""
     deviation = T_right_left - np.eye(4)
     deviation[0, 3] = 0.0
     are_equal_pinholes = left.camera == right.camera and left.is_pinhole and right.is_pinhole
