@@ -410,11 +410,20 @@ def points_at(frame: Frame, pixels: Array, options: FrontEndOptions) -> Array:
     height, width = frame.depth_m.shape
     camera, points_camera = frame.camera, np.full((len(pixels), 3), np.nan)
     _core_points_at()(
-        frame.depth_m.astype(np.float32, copy=False), width, height,
-        pixels.astype(np.float64, copy=False), len(pixels),
-        camera.fx, camera.fy, camera.cx, camera.cy, options.min_depth_m, options.max_depth_m,
-        options.depth_spread_percent / 100.0, points_camera,
-    )  # fmt: skip
+        frame.depth_m.astype(np.float32, copy=False),
+        width,
+        height,
+        pixels.astype(np.float64, copy=False),
+        len(pixels),
+        camera.fx,
+        camera.fy,
+        camera.cx,
+        camera.cy,
+        options.min_depth_m,
+        options.max_depth_m,
+        options.depth_spread_percent / 100.0,
+        points_camera,
+    )
     return points_camera
 
 

@@ -214,33 +214,78 @@ class _NearRequest(ctypes.Structure):
     """``rse_pf_near_request`` of ``rse_pf_track.h``."""
 
     _fields_ = (
-        ("abi", ctypes.c_uint32), ("flags", ctypes.c_uint32), ("sought_rows", _I), ("rows", _I),
-        ("predicted", _P), ("sought_turns", _P), ("sought_sizes", _P), ("sought", _P), ("pixels", _P),
-        ("turns", _P), ("sizes", _P), ("descriptors", _P), ("distinct", _P), ("radius_px", _D), ("ratio", _D),
-        ("distinct_ratio", _D), ("min_cosine", _D), ("max_size_ratio", _D), ("max_distance", _I),
-    )  # fmt: skip
+        ("abi", ctypes.c_uint32),
+        ("flags", ctypes.c_uint32),
+        ("sought_rows", _I),
+        ("rows", _I),
+        ("predicted", _P),
+        ("sought_turns", _P),
+        ("sought_sizes", _P),
+        ("sought", _P),
+        ("pixels", _P),
+        ("turns", _P),
+        ("sizes", _P),
+        ("descriptors", _P),
+        ("distinct", _P),
+        ("radius_px", _D),
+        ("ratio", _D),
+        ("distinct_ratio", _D),
+        ("min_cosine", _D),
+        ("max_size_ratio", _D),
+        ("max_distance", _I),
+    )
 
 
 class _SeekRequest(ctypes.Structure):
     """``rse_pf_seek_request`` of ``rse_pf_track.h``."""
 
     _fields_ = (
-        ("abi", ctypes.c_uint32), ("flags", ctypes.c_uint32), ("rows", _I), ("landmarks", _I),
-        ("numbers", _P), ("points", _P), ("rays", _P), ("turns", _P), ("sizes", _P), ("descriptors", _P),
-        ("fx", _D), ("fy", _D), ("cx", _D), ("cy", _D), ("width", _D), ("height", _D), ("margin_px", _D),
-        ("nearest_m", _D), ("min_cosine", _D), ("max_nearer", _D), ("max_farther", _D),
+        ("abi", ctypes.c_uint32),
+        ("flags", ctypes.c_uint32),
+        ("rows", _I),
+        ("landmarks", _I),
+        ("numbers", _P),
+        ("points", _P),
+        ("rays", _P),
+        ("turns", _P),
+        ("sizes", _P),
+        ("descriptors", _P),
+        ("fx", _D),
+        ("fy", _D),
+        ("cx", _D),
+        ("cy", _D),
+        ("width", _D),
+        ("height", _D),
+        ("margin_px", _D),
+        ("nearest_m", _D),
+        ("min_cosine", _D),
+        ("max_nearer", _D),
+        ("max_farther", _D),
         ("T_camera_world", _D * 16),
-    )  # fmt: skip
+    )
 
 
 class _FitRequest(ctypes.Structure):
     """``rse_pf_fit_request`` of ``rse_pf_track.h``."""
 
     _fields_ = (
-        ("abi", ctypes.c_uint32), ("flags", ctypes.c_uint32), ("rows", _I), ("points", _P), ("spreads", _P),
-        ("pixels", _P), ("pixels_px", _P), ("depths_m", _P), ("depths_dev", _P), ("fx", _D), ("fy", _D),
-        ("cx", _D), ("cy", _D), ("cauchy2", _D), ("gate2", _D), ("T_camera_world", _D * 16),
-    )  # fmt: skip
+        ("abi", ctypes.c_uint32),
+        ("flags", ctypes.c_uint32),
+        ("rows", _I),
+        ("points", _P),
+        ("spreads", _P),
+        ("pixels", _P),
+        ("pixels_px", _P),
+        ("depths_m", _P),
+        ("depths_dev", _P),
+        ("fx", _D),
+        ("fy", _D),
+        ("cx", _D),
+        ("cy", _D),
+        ("cauchy2", _D),
+        ("gate2", _D),
+        ("T_camera_world", _D * 16),
+    )
 
 
 class _FitResult(ctypes.Structure):
@@ -348,7 +393,7 @@ def match_landmarks(
         rows, features = match_predictions(predicted, image, limits)
         return predicted_rows[rows], features
     chosen = aligned(numbers, np.int64)
-    arrays = _align_arrays(
+    points, rays, orientations, sizes, descriptors = _align_arrays(
         landmarks.points,
         landmarks.rays,
         landmarks.orientations,
@@ -356,11 +401,28 @@ def match_landmarks(
         descriptors=landmarks.descriptors,
     )
     request = _SeekRequest(
-        _ABI, 0, len(chosen), len(landmarks.points), address_of(chosen), *map(address_of, arrays),
-        camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, margin_px,
-        _MIN_LANDMARK_DEPTH_M, _MIN_VIEW_COSINE, _MAX_APPROACH_RATIO, _MAX_RETREAT_RATIO,
-        (_D * 16)(*T_camera_world.ravel().tolist()),
-    )  # fmt: skip
+        abi=_ABI,
+        rows=len(chosen),
+        landmarks=len(points),
+        numbers=address_of(chosen),
+        points=address_of(points),
+        rays=address_of(rays),
+        turns=address_of(orientations),
+        sizes=address_of(sizes),
+        descriptors=address_of(descriptors),
+        fx=camera.fx,
+        fy=camera.fy,
+        cx=camera.cx,
+        cy=camera.cy,
+        width=camera.width,
+        height=camera.height,
+        margin_px=margin_px,
+        nearest_m=_MIN_LANDMARK_DEPTH_M,
+        min_cosine=_MIN_VIEW_COSINE,
+        max_nearer=_MAX_APPROACH_RATIO,
+        max_farther=_MAX_RETREAT_RATIO,
+        T_camera_world=(_D * 16)(*T_camera_world.ravel().tolist()),
+    )
     near, _referenced = _make_near_request(image, limits)
     return _call_matcher(_core("seek"), (request, near), len(chosen), len(image))
 
@@ -630,10 +692,24 @@ def _make_fit_request(
     upper_triangles = observed.covariances.reshape(-1, 9)[:, (0, 1, 2, 4, 5, 8)]
     measured = observed.pixels, observed.pixel_sigmas_px, observed.depths_m, observed.depth_sigmas_m
     arrays = [aligned(array, np.float64) for array in (observed.points, upper_triangles, *measured)]
+    points, spreads, pixels, pixels_px, depths_m, depths_dev = map(address_of, arrays)
     request = _FitRequest(
-        _ABI, 0, len(arrays[0]), *map(address_of, arrays), camera.fx, camera.fy, camera.cx, camera.cy,
-        float(cauchy * cauchy), float(gate2), (_D * 16)(*T_camera_world.ravel().tolist()),
-    )  # fmt: skip
+        abi=_ABI,
+        rows=len(observed.points),
+        points=points,
+        spreads=spreads,
+        pixels=pixels,
+        pixels_px=pixels_px,
+        depths_m=depths_m,
+        depths_dev=depths_dev,
+        fx=camera.fx,
+        fy=camera.fy,
+        cx=camera.cx,
+        cy=camera.cy,
+        cauchy2=cauchy * cauchy,
+        gate2=gate2,
+        T_camera_world=(_D * 16)(*T_camera_world.ravel().tolist()),
+    )
     return request, arrays
 
 
