@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import ctypes
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
+from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, TypeVar
@@ -141,12 +142,13 @@ def load_core(open_part: Callable[[Path], Part]) -> Part:
     return open_part(path)
 
 
-def core_function(part: str, name: str, arguments: Sequence[Any], result: Any) -> Any:
+@cache
+def core_function(part: str, name: str, arguments: tuple[Any, ...], result: Any) -> Any:
     """Return one function of the native core with its ctypes signature.
 
-    Each call finds and opens the library again, so callers keep the result.  The function takes numpy arrays
-    where C has pointers to data of their type; an array that is not C-contiguous and aligned is passed as
-    such a copy, so that C must only read it.
+    The library is opened for the first call with equal arguments only.  The function takes numpy arrays where
+    C has pointers to data of their type; an array that is not C-contiguous and aligned is passed as such a
+    copy, so that C must only read it.
 
     Args:
         part: Part of the core, a key of `PART_ABIS`.

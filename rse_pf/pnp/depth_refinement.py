@@ -10,8 +10,6 @@ native core computes the refined pose (``native/src/depth.cpp``).
 from __future__ import annotations
 
 import ctypes
-from functools import cache
-from typing import Any
 
 import msgspec
 import numpy as np
@@ -143,7 +141,8 @@ def refine_with_depth(
     )
     result = _Result()
     workspace = _WORKSPACE.words(_COLUMNS * (len(rows) + _SPARE_ROWS))
-    _function()(ctypes.byref(request), address_of(workspace), ctypes.byref(result))
+    refine = core_function("depth", "rse_pf_depth_refine", (ctypes.c_void_p,) * 3, None)
+    refine(ctypes.byref(request), address_of(workspace), ctypes.byref(result))
     if result.status == _KEPT:
         return solution
     if result.status != _REFINED:
@@ -216,8 +215,3 @@ class _Result(ctypes.Structure):
 
 _WORKSPACE = Workspace()
 """Scratch memory for calls of the core, one array in each thread."""
-
-
-@cache
-def _function() -> Any:
-    return core_function("depth", "rse_pf_depth_refine", (ctypes.c_void_p,) * 3, None)

@@ -9,6 +9,7 @@ import numpy.typing as npt
 
 from rse_pf.geometry import Array, inverse, transform
 from rse_pf.maps.format import Keyframe, MapVersion
+from rse_pf.slam.loop_closures import Atlas
 from rse_pf.slam.ply import Colours, Points
 
 __all__ = ["deform_cloud", "deform_clouds", "find_observers", "merge_clouds", "voxel_keys"]
@@ -27,8 +28,7 @@ keyframe that sees the point is preferred."""
 
 def deform_clouds(
     versions: Sequence[MapVersion],
-    of_map: npt.NDArray[np.int64],
-    keyframes: Sequence[Keyframe],
+    atlas: Atlas,
     T_world_camera: Array,
     rows: npt.NDArray[np.int64],
 ) -> tuple[Points, Colours]:
@@ -36,18 +36,17 @@ def deform_clouds(
 
     Args:
         versions: The maps, whose clouds are in their own worlds.
-        of_map: ``(n,)``, the index in *versions* of the map of each keyframe.
-        keyframes: All *n* keyframes, with their old poses.
+        atlas: All *n* keyframes, with their old poses, and the index in *versions* of the map of each.
         T_world_camera: ``(n, 4, 4)``, the new poses of the keyframes.
         rows: Indices of the keyframes of the result; maps without such a keyframe are left out.
     """
     clouds: list[Array] = []
     colours: list[Colours] = []
-    for map_index in np.unique(of_map[rows]).tolist():
+    for map_index in np.unique(atlas.of_map[rows]).tolist():
         version = versions[map_index]
-        map_rows = [int(row) for row in rows if of_map[row] == map_index]
+        map_rows = [int(row) for row in rows if atlas.of_map[row] == map_index]
         if len(version.points):
-            map_keyframes = [keyframes[row] for row in map_rows]
+            map_keyframes = [atlas.keyframes[row] for row in map_rows]
             clouds.append(deform_cloud(version.points, map_keyframes, T_world_camera[map_rows]))
             colours.append(version.colours)
     return merge_clouds(clouds, colours)

@@ -10,7 +10,6 @@ matches ORB descriptors; numpy matches all other kinds, which a user's feature e
 from __future__ import annotations
 
 import ctypes
-from functools import cache
 from typing import Any, Literal
 
 import numpy as np
@@ -42,6 +41,12 @@ _BLOCK_DISTANCES = 4_000_000
 """Largest number of distances in memory at a time where numpy matches descriptors: 16 MB of float32."""
 _BIT_COUNTS = np.array([bin(value).count("1") for value in range(256)], dtype=np.uint8)
 _WORKSPACE = Workspace()
+_POINTER = ctypes.c_void_p
+_SIZE = ctypes.c_int64
+_MATCH_ARGUMENTS = (_POINTER, _SIZE, _POINTER, _SIZE, ctypes.c_double, ctypes.c_uint32, *[_POINTER] * 3)
+"""Types of the arguments of the native core's ``rse_pf_match``."""
+_DISTINCT_ARGUMENTS = (_POINTER, _POINTER, _SIZE, ctypes.c_double, _POINTER)
+"""Types of the arguments of the native core's ``rse_pf_distinct``."""
 
 
 def distance_bound(descriptors: Descriptors) -> int:
@@ -173,15 +178,9 @@ def match_orb(
     n, m = len(reference), len(view)
     rows, view_rows = np.empty((2, min(n, m)), dtype=np.int64)
     workspace, flags = _WORKSPACE.words(n + 5 * m + 64), _INSTRUCTION_FLAGS[lanes]
-    count = _core_match()(reference, n, view, m, ratio, flags, workspace, rows, view_rows)
+    match = core_function("match", "rse_pf_match", _MATCH_ARGUMENTS, ctypes.c_int64)
+    count = match(reference, n, view, m, ratio, flags, workspace, rows, view_rows)
     return rows[:count], view_rows[:count]
-
-
-@cache
-def _core_match() -> Any:
-    pointer, size = ctypes.c_void_p, ctypes.c_int64
-    arguments = (pointer, size, pointer, size, ctypes.c_double, ctypes.c_uint32, pointer, pointer, pointer)
-    return core_function("match", "rse_pf_match", arguments, size)
 
 
 def match_all(
@@ -244,7 +243,8 @@ def measure_distinctiveness(
         )
     if ORB.is_kind_of(descriptors):
         nearest = np.full(len(pixels), distance_bound(descriptors), dtype=np.int32)
-        _core_distinct()(
+        measure = core_function("track", "rse_pf_distinct", _DISTINCT_ARGUMENTS, ctypes.c_int32)
+        measure(
             descriptors, pixels.astype(np.float64, copy=False), len(pixels), float(min_separation_px), nearest
         )
         return nearest
@@ -255,10 +255,3 @@ def measure_distinctiveness(
     distances[~is_apart | np.eye(len(pixels), dtype=bool)] = none
     most_similar: npt.NDArray[np.int32] = distances.min(axis=1, initial=none).astype(np.int32)
     return most_similar
-
-
-@cache
-def _core_distinct() -> Any:
-    pointer, size = ctypes.c_void_p, ctypes.c_int64
-    arguments = (pointer, pointer, size, ctypes.c_double, pointer)
-    return core_function("track", "rse_pf_distinct", arguments, ctypes.c_int32)

@@ -104,20 +104,6 @@ def _select(
     return accepted, Counter({key: count for key, count in rejected.items() if count})
 
 
-def _align_nothing(atlas: Atlas, T_world_camera: Array, accepted: Sequence[LoopClosure]) -> list[LoopClosure]:
-    return []
-
-
-def _optimise(graph: PoseGraph, of_map: npt.NDArray[np.int64], options: OptimiseOptions) -> OptimisedGraph:
-    return optimise_graph(graph, options)
-
-
-def _deform(
-    versions: Sequence[MapVersion], atlas: Atlas, T_world_camera: Array, rows: npt.NDArray[np.int64]
-) -> tuple[Points, Colours]:
-    return deform_clouds(versions, atlas.of_map, atlas.keyframes, T_world_camera, rows)
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MergeSteps:
     """The functions of a merge that take long; `rse_pf.batch` replaces them to use several processes.
@@ -136,10 +122,14 @@ class MergeSteps:
     select: Callable[[Atlas, LoopProposals, MergeOptions], tuple[list[LoopClosure], RejectionCounts]] = field(
         default=_select
     )
-    align: Callable[[Atlas, Array, Sequence[LoopClosure]], list[LoopClosure]] = _align_nothing
-    optimise: Callable[[PoseGraph, npt.NDArray[np.int64], OptimiseOptions], OptimisedGraph] = _optimise
+    align: Callable[[Atlas, Array, Sequence[LoopClosure]], list[LoopClosure]] = (
+        lambda atlas, T_world_camera, accepted: []
+    )
+    optimise: Callable[[PoseGraph, npt.NDArray[np.int64], OptimiseOptions], OptimisedGraph] = (
+        lambda graph, of_map, options: optimise_graph(graph, options)
+    )
     deform: Callable[[Sequence[MapVersion], Atlas, Array, npt.NDArray[np.int64]], tuple[Points, Colours]] = (
-        _deform
+        deform_clouds
     )
 
 

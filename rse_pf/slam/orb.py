@@ -11,7 +11,7 @@ import ctypes
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache, lru_cache
+from functools import lru_cache
 from operator import attrgetter
 from typing import Any, NamedTuple
 
@@ -57,6 +57,17 @@ _CELL_PX = 40
 """Width and height of the image cells over which features are spread, in pixels."""
 _RADIANS_PER_DEGREE = np.float32(math.pi / 180)
 _WORKSPACE = Workspace()
+_DESCRIBE_ARGUMENTS = (
+    ctypes.c_void_p,
+    ctypes.c_int64,
+    ctypes.c_int64,
+    ctypes.c_void_p,
+    ctypes.c_int32,
+    *[ctypes.c_void_p] * 4,
+    ctypes.c_int64,
+    *[ctypes.c_void_p] * 2,
+)
+"""Types of the arguments of the native core's ``rse_pf_describe``."""
 
 
 class Keypoints(NamedTuple):
@@ -250,7 +261,8 @@ def detect_keypoints(gray: npt.NDArray[np.uint8], count: int, threshold: int) ->
         room=capacity,
         workspace=address_of(_WORKSPACE.words(width * height // 2 + 8 * width + height + 64)),
     )
-    detected = _core_detect()(ctypes.byref(request), *map(address_of, keypoints))
+    detect = core_function("match", "rse_pf_detect", (ctypes.c_void_p,) * 5, ctypes.c_int64)
+    detected = detect(ctypes.byref(request), *map(address_of, keypoints))
     return None if detected < 0 else keypoints.select(slice(detected))
 
 
@@ -271,7 +283,8 @@ def describe_keypoints(gray: npt.NDArray[np.uint8], keypoints: Keypoints) -> npt
         cosines, sines = np.cos(angles).astype(np.float32), np.sin(angles).astype(np.float32)
     descriptors = np.empty((len(pixels), ORB.size), dtype=np.uint8)
     workspace = _WORKSPACE.words(3 * width * height // 8 + 7 * width + 64)
-    refused = _core_describe()(
+    describe = core_function("match", "rse_pf_describe", _DESCRIBE_ARGUMENTS, ctypes.c_int32)
+    refused = describe(
         address_of(gray),
         width,
         height,
@@ -283,18 +296,6 @@ def describe_keypoints(gray: npt.NDArray[np.uint8], keypoints: Keypoints) -> npt
         address_of(descriptors),
     )
     return None if refused else descriptors
-
-
-@cache
-def _core_detect() -> Any:
-    return core_function("match", "rse_pf_detect", (ctypes.c_void_p,) * 5, ctypes.c_int64)
-
-
-@cache
-def _core_describe() -> Any:
-    pointer, size, count = ctypes.c_void_p, ctypes.c_int64, ctypes.c_int32
-    arguments = (pointer, size, size, pointer, count, *[pointer] * 4, size, pointer, pointer)
-    return core_function("match", "rse_pf_describe", arguments, count)
 
 
 @lru_cache(maxsize=16)

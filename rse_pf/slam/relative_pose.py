@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
@@ -341,7 +340,7 @@ def measure_pose(
         return "no-matches"
     # 2. Compute the pose by PnP from the matches.
     try:
-        solution = solve_pnp(points, pixels, view.camera, _pnp_options(options.inlier_px))
+        solution = solve_pnp(points, pixels, view.camera, PnpOptions(inlier_px=options.inlier_px))
     except PnpError:
         return "no-pose"
     measured = MeasuredPose(solution=solution, points_keyframe=points, pixels=pixels, depths_view=depths_m)
@@ -393,8 +392,3 @@ def match_descriptors(
     first_rows, second_rows = best_matches(first, second, options.ratio)
     order = np.argsort(second_rows[: options.max_matches])
     return first_rows[order], second_rows[order]
-
-
-@lru_cache(maxsize=16)
-def _pnp_options(inlier_px: float) -> PnpOptions:
-    return PnpOptions(inlier_px=inlier_px)

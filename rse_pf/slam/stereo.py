@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import ctypes
 from dataclasses import asdict, dataclass
-from functools import cache
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -149,15 +147,10 @@ def disparities(
         pixels=address_of(pixels),
         **asdict(options),
     )
-    if _core_disparities()(ctypes.byref(request), address_of(disparities_px)):
+    measure = core_function("stereo", "rse_pf_disparities", (ctypes.c_void_p,) * 2, ctypes.c_int32)
+    if measure(ctypes.byref(request), address_of(disparities_px)):
         raise BadRequest(
             f"a stereo pair of {width}x{height} px cannot be matched: a side is above 65536 px",
             hint="give smaller images",
         )
     return disparities_px
-
-
-@cache
-def _core_disparities() -> Any:
-    pointer = ctypes.c_void_p
-    return core_function("stereo", "rse_pf_disparities", (pointer, pointer), ctypes.c_int32)

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -98,14 +97,15 @@ class SignalField:
         remains = ~np.isin(self.rows, held_out)
         if remains.sum() < _MIN_READINGS:
             return None
-        kernel = _Kernel(self.signal_dbm2, self.noise_dbm2, self.length_m)
         return _condition(
             self.positions[remains],
             self.residuals[remains],
             self.rows[remains],
             self.source,
             self.trend,
-            kernel,
+            signal_dbm2=self.signal_dbm2,
+            noise_dbm2=self.noise_dbm2,
+            length_m=self.length_m,
         )
 
 
@@ -179,34 +179,34 @@ def _fit(all_positions: Array, rows: Rows, dbm: Array) -> SignalField:
             likelihood = _log_likelihood(positions, residuals, share * total, (1.0 - share) * total, length_m)
             best = max(best, (likelihood, length_m, share))
     _, length_m, share = best
-    noise = max((1.0 - share) * total, _MIN_VARIANCE_DBM2)
-    kernel = _Kernel(share * total, noise, length_m)
-    return _condition(positions, residuals, rows, source, trend, kernel)
-
-
-class _Kernel(NamedTuple):
-    """The parameters of a Gaussian process.
-
-    Attributes:
-        signal_dbm2: Variance of the process.
-        noise_dbm2: Variance of the noise of a reading.
-        length_m: Correlation length of the process.
-    """
-
-    signal_dbm2: float
-    noise_dbm2: float
-    length_m: float
+    return _condition(
+        positions,
+        residuals,
+        rows,
+        source,
+        trend,
+        signal_dbm2=share * total,
+        noise_dbm2=max((1.0 - share) * total, _MIN_VARIANCE_DBM2),
+        length_m=length_m,
+    )
 
 
 def _condition(
-    positions: Array, residuals: Array, rows: Rows, source: Array, trend: Array, kernel: _Kernel
+    positions: Array,
+    residuals: Array,
+    rows: Rows,
+    source: Array,
+    trend: Array,
+    *,
+    signal_dbm2: float,
+    noise_dbm2: float,
+    length_m: float,
 ) -> SignalField:
-    """Return the field of a Gaussian process with *kernel*, given *residuals* at *positions* ``(r, 3)``.
+    """Return the field of a Gaussian process, given its *residuals* at *positions* ``(r, 3)``.
 
-    *rows*, *source* and *trend* are attributes of the field, and are not changed.
+    The arguments are attributes of the field.
     """
-    signal, noise, length_m = kernel
-    covariance = _kernel(positions, positions, signal, length_m) + noise * np.eye(len(positions))
+    covariance = _kernel(positions, positions, signal_dbm2, length_m) + noise_dbm2 * np.eye(len(positions))
     inverse = np.linalg.inv(covariance).astype(np.float64)
     return SignalField(
         source=source,
@@ -216,8 +216,8 @@ def _condition(
         rows=rows,
         weights=inverse @ residuals,
         inverse=inverse,
-        signal_dbm2=signal,
-        noise_dbm2=noise,
+        signal_dbm2=signal_dbm2,
+        noise_dbm2=noise_dbm2,
         length_m=length_m,
     )
 
