@@ -64,7 +64,7 @@ def test_a_merge_survives_its_workers_and_its_scheduler(tmp_path: Path, versions
 
     assert len(killed) == 2
     assert "the connection to the scheduler was lost and is there again" in events
-    expected = propose_loop_closures(Atlas.of(versions), MergeOptions()).links
+    expected = propose_loop_closures(Atlas.of(versions), MergeOptions()).loop_closures
     assert len(found.links) == len(expected)
     for one, other in zip(found.links, expected, strict=True):
         assert np.array_equal(one.T_a_b, other.T_a_b)

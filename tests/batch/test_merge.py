@@ -74,7 +74,7 @@ def poses(merged: MergedMap) -> Array:
 
 
 def test_the_links_are_those_of_one_process_to_the_bit() -> None:
-    expected = propose_loop_closures(Atlas.of(two_robots()), MergeOptions()).links
+    expected = propose_loop_closures(Atlas.of(two_robots()), MergeOptions()).loop_closures
 
     found = in_parts().links
 
