@@ -119,8 +119,8 @@ def drive_model(
         return None
     observed = DriveObservations(
         camera=camera, keyframes=renumbered[tracks.keyframes[kept]], landmarks=landmarks,
-        pixels=pixels[kept], pixels_px=_PIXEL_PX * sizes[kept], depths_m=depths[kept],
-        depths_dev_m=np.sqrt(variances[kept]), rates_m_s=rates[kept],
+        pixels=pixels[kept], pixel_deviations_px=_PIXEL_PX * sizes[kept], depths_m=depths[kept],
+        depth_deviations_m=np.sqrt(variances[kept]), rates_m_s=rates[kept],
         twists_s=np.array([keyframes[row].twist_s for row in rows]),
     )  # fmt: skip
     points = triangulate_landmarks(observed, poses[rows], len(seen))

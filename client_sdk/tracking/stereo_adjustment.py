@@ -176,9 +176,9 @@ def _collect_observations(segment_map: KeyframeMap) -> tuple[int, DriveObservati
         keyframes=keyframes[rows],
         landmarks=new_numbers[seen[rows]],
         pixels=np.concatenate([view.features.pixels for view in views])[rows],
-        pixels_px=np.concatenate([view.features.sizes for view in views])[rows],
+        pixel_deviations_px=np.concatenate([view.features.sizes for view in views])[rows],
         depths_m=depths_m[rows],
-        depths_dev_m=np.maximum(depths_m[rows], 1e-3),
+        depth_deviations_m=np.maximum(depths_m[rows], 1e-3),
         rates_m_s=np.zeros(len(rows)),
         twists_s=np.zeros((len(views), 6)),
     )
@@ -196,6 +196,6 @@ def _set_depth_noise(
     noise_depths_m = depths_for_noise(np.nan_to_num(observed.depths_m, nan=1.0), expected_m)
     return replace(
         observed,
-        depths_dev_m=_DISPARITY_SIGMA_PX * noise_depths_m**2 / f_baseline,
+        depth_deviations_m=_DISPARITY_SIGMA_PX * noise_depths_m**2 / f_baseline,
         curve_dev_per_m=_OFFSET_PRIOR_PX / f_baseline,
     )

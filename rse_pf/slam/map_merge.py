@@ -52,8 +52,9 @@ __all__ = [
 ]
 
 _STEP_NOISE = OdometryNoise(step_m=0.007, step_deg=0.5)
-"""Standard deviations of the motion between two consecutive keyframes of a tracker with depth, for which a
-map has no edge; the test whether a loop closure is consistent uses the larger default of `OdometryNoise`."""
+"""Noise of the edge that a merge adds between two consecutive keyframes of a robot which have no edge in
+their map: that of a tracker with depth.  The tests of `rse_pf.slam.consistency` use the larger default values
+of `OdometryNoise`, so that they reject fewer right loop closures."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -63,10 +64,11 @@ class MergedMap:
     Attributes:
         version: The merged map, in the world of the first map.
         joined: Ascending indices of the maps that are part of it; the first map always is.
-        not_joined: Index of each other map, with a sentence why.
+        not_joined: Index of each other map, with a sentence that says why it was not joined.
         refused: The number of rejected pairs of keyframes, by the indices of their two maps and the reason.
-        loops: The number of accepted loop closures within a map, of the joined maps.
-        merges: The number of accepted loop closures between two maps, of the joined maps.
+        loops: The number of accepted loop closures between keyframes of the same map, summed over the joined
+            maps.
+        merges: The number of accepted loop closures between keyframes of two different joined maps.
         cost_before: The robust cost of the pose graph before the optimisation.
         cost_after: The robust cost of the pose graph after it.
     """
@@ -112,7 +114,8 @@ class MergeSteps:
         propose: Returns the measured loop closures.
         select: Returns the consistent loop closures, and the counts of rejected ones by maps and reason.
         align: Returns further loop closures from aligning point clouds, given the poses ``(n, 4, 4)`` of all
-            keyframes in the world of the first map and the accepted loop closures; by default none.
+            keyframes in the world of the first map and the accepted loop closures; the default function
+            returns none.
         optimise: Returns the optimised poses of a graph; its second argument is the map of each pose.
         deform: Returns the merged point cloud for the new poses ``(n, 4, 4)``; its last argument has the rows
             of the keyframes that are part of the merged map.
@@ -201,10 +204,11 @@ def merge_versions(
 
 
 def _align_maps(atlas: Atlas, accepted: Sequence[LoopClosure]) -> tuple[Array, set[int]]:
-    """Move each map that loop closures connect with map 0 into its world, most loop closures first.
+    """Express the poses of each map that loop closures connect with map 0, directly or not, in its world.
 
-    The pose of a map is the median of the poses that its loop closures give: the pose that differs least from
-    the others, so that rotations need no averaging.
+    Starting from map 0, the map that has most loop closures with one joined map is joined next.  Each of
+    these loop closures gives a pose of the new map in the world of map 0; the medoid of these poses is taken
+    (`median_pose`), which needs no mean of rotations.
 
     Returns:
         The poses ``(n, 4, 4)`` of all keyframes, those of unconnected maps unchanged, and the indices of the
@@ -357,8 +361,9 @@ def _make_provenance(
 ) -> dict[str, Any]:
     """Return the provenance of the merged map, whose ``parents`` are the provenances of *versions*.
 
-    If it is longer than a map may have, the ``parents`` within the provenances of *versions* are left out; if
-    it is still too long, it has no ``parents`` at all.
+    If the result would exceed the limits of a map's provenance (`rse_pf.budget.PROVENANCE`), the field
+    ``parents`` of each of these provenances is left out.  If it still would, the result has no field
+    ``parents``.
 
     Args:
         versions: The merged maps.

@@ -31,7 +31,7 @@ _GTSAM_ORDER = np.ix_([3, 4, 5, 0, 1, 2], [3, 4, 5, 0, 1, 2])
 
 
 def ignore_progress(done: float, what: str) -> None:
-    """Do nothing: a `Report` for callers who do not want to know the progress."""
+    """Do nothing: a function `rse_pf.service.Report` for callers who do not want to know the progress."""
 
 
 class OptimiseOptions(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
@@ -39,8 +39,9 @@ class OptimiseOptions(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=T
 
     Attributes:
         cauchy: Width of the Cauchy kernel on loop and merge edges, in standard deviations of the residual of
-            an edge; 0 means least squares.
-        max_iterations: Iterations of Levenberg-Marquardt from each start, 1..1000.
+            an edge, up to 1e6; 0 means least squares, without a robust kernel.
+        max_iterations: Most iterations of Levenberg-Marquardt from each of its one or two starting points
+            (see `optimise_graph`), 1..1000.
 
     Raises:
         BadRequest: A number is out of its range.
@@ -92,7 +93,8 @@ def optimise_graph(
         graph: The pose graph.
         options: None means the defaults.
         report: Called with the progress.
-        chordal: Whether the chordal start is tried; it exists for connected graphs only.
+        chordal: Whether to start from the poses of the chordal relaxation, too.  They are skipped if the
+            graph is not connected, or has no loops.
 
     Raises:
         MissingExtra: GTSAM is not installed.
@@ -132,8 +134,9 @@ def optimise_graph(
 def robust_cost(graph: PoseGraph, T_world_pose: Array, cauchy: float) -> float:
     """Return the cost of the poses *T_world_pose* ``(n, 4, 4)`` of *graph*.
 
-    It is the sum of the squared Mahalanobis norms r^2 of the residuals of odometry edges, and of
-    ``cauchy^2 log(1 + r^2 / cauchy^2)`` of the other edges; of r^2 for these, too, if *cauchy* is 0.
+    With r the Mahalanobis norm of the residual of an edge, the cost is the sum of r^2 over odometry edges and
+    of ``cauchy^2 log(1 + r^2 / cauchy^2)`` over the other edges.  If *cauchy* is 0, it is the sum of r^2 over
+    all edges.
     """
     squares = graph.squared_residuals(T_world_pose)
     if cauchy > 0:

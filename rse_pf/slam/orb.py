@@ -1,8 +1,9 @@
 """ORB features of one image: detected, spread over the image, and described.
 
 Every part of the platform that compares an image with keyframes gets its ORB features here.  The native core
-detects and describes them.  OpenCV, whose results are the same to the byte, does so on processors without
-AVX2 and FMA, and for keypoints near the edge of an image.
+detects and describes them, and OpenCV gives the same bytes.  OpenCV is used instead on processors without
+AVX2, to describe also on those without FMA, and to describe the keypoints of an image of which one lies near
+the edge.
 """
 
 from __future__ import annotations
@@ -45,14 +46,16 @@ _CORE_LEVEL_SIZES = np.array(
 )
 """Scale of each pyramid level with the rounding of OpenCV, as the native core needs it for equal results."""
 _FAST_THRESHOLD = 10
-"""Grey levels: threshold of the FAST corner detector where the strongest features of the image are taken."""
+"""Threshold of the FAST corner detector in grey levels where the strongest features of the image are
+taken."""
 _FAST_THRESHOLD_SPREAD = 7
-"""Grey levels: threshold of the FAST corner detector where features are spread, so that dark cells have
-some."""
+"""Threshold of the FAST corner detector in grey levels where features are spread over the cells of the image:
+it is lower, so that there are keypoints in dark cells, too."""
 _PATCH_PX = 31.0
 """Width of ORB's patch on the finest pyramid level, in pixels."""
 _DETECTED_PER_FEATURE = 3
-"""Keypoints that are detected for each feature that is wanted, where features are spread over the image."""
+"""Quotient of the number of keypoints that are detected and the number of features that are wanted, where
+features are spread over the image."""
 _CELL_PX = 40
 """Width and height of the image cells over which features are spread, in pixels."""
 _RADIANS_PER_DEGREE = np.float32(math.pi / 180)
@@ -118,10 +121,11 @@ def describe_orb(rgb: npt.NDArray[np.uint8], count: int, *, is_spread: bool = Tr
 
     Args:
         rgb: ``(h, w, 3)``, red first.
-        count: Largest number of features; without *is_spread*, those that are as strong as the weakest one of
-            their pyramid level come in addition.
-        is_spread: Take the strongest features of each cell of 40 px, also weak ones where a cell has no
-            others; otherwise take the strongest of the image.
+        count: Number of features that are wanted.  With *is_spread*, there are never more.  Otherwise there
+            may be: of several keypoints that are equally strong as the weakest selected one of their pyramid
+            level, all are returned.
+        is_spread: Whether to spread the features over the image as `select_spread_rows` does, which takes
+            weak features where a cell has no stronger ones; otherwise the strongest of the image are taken.
 
     Raises:
         MissingExtra: OpenCV or the native core is not installed.
@@ -164,8 +168,8 @@ def describe_at(
         sizes: ``(n,)``, scale of each patch; the nearest level of the pyramid is taken.
 
     Returns:
-        The ``(k,)`` rows of *pixels* that could be described, not always in ascending order, which excludes
-        those near the edge of the image, and their ``(k, 32)`` descriptors.
+        The ``(k,)`` rows of *pixels* that could be described, and their ``(k, 32)`` descriptors.  Pixels near
+        the edge of the image cannot be described.  The rows are not always in ascending order.
 
     Raises:
         MissingExtra: OpenCV is not installed.
@@ -229,14 +233,15 @@ def detect_keypoints(gray: npt.NDArray[np.uint8], count: int, threshold: int) ->
 
     Args:
         gray: ``(h, w)``.
-        count: Number of keypoints that are wanted; those that are as strong as the weakest of their pyramid
-            level are returned as well.
+        count: Number of keypoints that are wanted.  There may be more: of several keypoints that are equally
+            strong as the weakest selected one of their pyramid level, all are returned.
         threshold: Threshold of the FAST corner detector, 0 to 255 grey levels.
 
     Returns:
-        The keypoints, by pyramid level, the finest first.  None where the processor lacks AVX2, where equally
-        strong ones make them more than twice *count* and 64, where the order in which OpenCV would return
-        them is not known, or where a side of the image is below 2 or above 16,384 px.
+        The keypoints, sorted by pyramid level, the finest first.  None, so that the caller uses OpenCV, if
+        the processor lacks AVX2, if there are more than ``2 * count + 64`` keypoints because many are equally
+        strong, if the order is not known in which OpenCV would return them, or if a side of the image is
+        below 2 or above 16,384 px.
 
     Raises:
         MissingExtra: The native core is not installed.

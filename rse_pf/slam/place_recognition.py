@@ -28,8 +28,9 @@ WORDS = 32  # number of visual words of a vocabulary
 DIRECTIONS = 16  # number of principal directions to which the residual of each word is reduced
 PLACE_VECTOR_SIZE = WORDS * DIRECTIONS  # number of elements of the place recognition vector of an image
 VOCABULARY_FILE = Path(__file__).with_name("place_words.bin")
-"""The trained vocabulary of ORB, which ``scripts/train_places.py`` writes: 32 words of 256 bits as -1..1
-times 127, and 256 x 16 numbers of the principal directions of the residuals, all int8."""
+"""The trained vocabulary of ORB, which ``scripts/train_places.py`` writes, as int8: the 32 words with 256
+elements each (means of bits written as -1 and 1, times 127), then a 256 x 16 matrix, whose columns are the
+principal directions of the residuals of all words together."""
 _ORB_BITS = 256  # number of bits of an ORB descriptor
 _WORD_SCALE = 127
 """Factor by which the words of the trained vocabulary are scaled, so that -1..1 fits int8."""
@@ -39,15 +40,18 @@ _INITIAL_ROWS = 64
 _INDEX_ROW_BYTES = 8 + 4 * PLACE_VECTOR_SIZE
 """Size of an encoded index for each keyframe in bytes: its id (int64) and its vector (float32)."""
 _MAX_BLAS_PRODUCTS = 1 << 18
-"""Largest number of multiplications in one matrix product: OpenBLAS computes a product of this size in one
-thread, and its further threads would keep a core busy while they wait."""
+"""Largest number of multiplications in one matrix product.  OpenBLAS computes a product of this size in the
+calling thread; for a larger one it would use worker threads, which then keep other cores busy while they wait
+for work."""
 
 PlaceVector = npt.NDArray[np.float32]
-"""The vector of an image for place recognition, of length 1; ``(512,)`` unless a user's function makes it."""
+"""The vector of an image for place recognition, with the Euclidean norm 1: ``(512,)`` from `place_vector`, of
+any length from a place recogniser that a user passes to a robot (`client_sdk.plugins`)."""
 
 _Vocabulary = tuple[npt.NDArray[np.float32], npt.NDArray[np.float64], npt.NDArray[np.float32]]
-"""Visual words ``(32, d)``, directions of the residuals of each word ``(32, d, 16)``, and the squared lengths
-of the words ``(32,)``: 0 in a random vocabulary, whose words are equally long."""
+"""Visual words ``(32, d)``; for each word the 16 directions to which its residual is reduced, ``(32, d,
+16)``; and the squared lengths of the words, ``(32,)``, or zeros in a random vocabulary, whose words are
+equally long."""
 
 
 def place_vector(descriptors: Descriptors) -> PlaceVector:
@@ -66,7 +70,8 @@ def place_vector(descriptors: Descriptors) -> PlaceVector:
     vectors = as_vectors(descriptors)
     is_orb = ORB.is_kind_of(descriptors)
     words, directions, squared_lengths = _orb_vocabulary() if is_orb else _random_vocabulary(vectors.shape[1])
-    # 1. Centre descriptors other than ORB: vectors without negative elements all lie in one direction.
+    # 1. Subtract the mean of the image's descriptors, except for ORB.  Descriptors without negative elements,
+    # such as SIFT, have a large component in common, which would otherwise decide which word is nearest.
     if not is_orb and len(vectors):
         vectors -= np.rint(vectors.sum(axis=0, dtype=np.float64) / len(vectors)).astype(np.float32)
     # 2. Assign each descriptor to its nearest word.  All products are integers below 2**24, so that float32
@@ -226,8 +231,9 @@ class PlaceIndex:
 def _orb_vocabulary() -> _Vocabulary:
     """Return the trained vocabulary of ORB.
 
-    The directions of each word are made orthogonal to the word: ORB descriptors of other images than those of
-    the training are all nearer to the word or all farther from it, which does not distinguish places.
+    The directions of each word are made orthogonal to the word.  The component of the residuals along the
+    word does not distinguish places: it depends on how much an image differs from those of the training, by
+    which all descriptors of the word are nearer to it, or all farther from it.
     """
     numbers = np.frombuffer(VOCABULARY_FILE.read_bytes(), dtype=np.int8)
     words = numbers[: WORDS * _ORB_BITS].reshape(WORDS, _ORB_BITS).astype(np.float64)

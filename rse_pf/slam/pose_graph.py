@@ -31,7 +31,8 @@ _MAX_ID = 2**53  # largest id of a vertex in g2o text: JSON and float64 hold it 
 _MAX_COORDINATE_M = 1e9  # largest coordinate of a pose in metres; larger ones overflow in the optimiser
 _MAX_INFORMATION = 1e18  # largest number of an information matrix; larger ones overflow in the optimiser
 _MAX_ASYMMETRY = 1e-6
-"""Largest difference between an information matrix and its transpose, as a share of the largest number."""
+"""Largest absolute element of an information matrix minus its transpose, as a share of the largest absolute
+element of the matrix."""
 _FROM_G2O = np.diag([1.0, 1.0, 1.0, 0.5, 0.5, 0.5])
 """Derivative of g2o's error (translation, vector part of a quaternion) by our twist: the vector part of a
 quaternion is half of a small rotation vector."""
@@ -49,7 +50,8 @@ class PoseGraph:
         a, b: ``(m,)``, the rows of the two poses of each edge.
         T_a_b: ``(m, 4, 4)``, the measured relative poses, metres.
         information: ``(m, 6, 6)``, symmetric and positive definite, of the twist (metres, radians).
-        robust: ``(m,)``, whether an edge may be an outlier (loop closures) or not (odometry).
+        robust: ``(m,)``, whether an edge may be an outlier, so that the cost applies a robust kernel to its
+            residual: True for loop closures, False for odometry.
         ids: ``(n,)``, the ids of the poses in a file or a command.
 
     Raises:

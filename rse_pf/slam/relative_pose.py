@@ -59,17 +59,19 @@ class RelativePoseOptions:
     """Limits of matches and inliers; the defaults were measured on the red-kitchen recording of 7-Scenes.
 
     Attributes:
-        ratio: Largest distance of the best match over that of the second best one (Lowe's ratio test).
+        ratio: Limit of the quotient of the distances of the best and of the second best match (Lowe's ratio
+            test).
         inlier_px: Largest reprojection error of an inlier.
         max_matches: Largest number of matches that are used, those with the most similar descriptors.
         min_matches: Fewer matches give no pose; None means half of ``min_inliers``.  PnP needs at least 4.
         min_inliers: Fewer inliers give no constraint.
         min_inlier_ratio: A smaller share of inliers among the matches gives no constraint.
-        floor_m: Smallest standard deviation of the translation along each axis, because errors of depth and
-            calibration are correlated.
-        floor_deg: Smallest standard deviation of the rotation about each axis, for the same reason.
-        weak_variance: Factor by which the covariance of a pose is multiplied that PnP calls weak, before it
-            becomes a constraint; 0 means that a weak pose gives no constraint.
+        floor_m: Standard deviation, along each axis, of the errors of the translation that all matches have
+            in common, such as those of depth and calibration; its square is added to the variance of PnP.
+        floor_deg: Standard deviation, about each axis, of the errors of the rotation that all matches have in
+            common; its square is added to the variance of PnP.
+        weak_variance: If PnP calls a pose weak, its covariance is multiplied by this factor before it becomes
+            a constraint; 0 means that a weak pose gives no constraint.
     """
 
     ratio: float = 0.75
@@ -123,9 +125,10 @@ class Landmarks:
 
 @dataclass(frozen=True, slots=True)
 class ScaleRatio:
-    """The logarithm of the ratio of two units of length, and its variance.
+    """The natural logarithm of the ratio of two units of length, and the variance of this logarithm.
 
-    ``exp(log_ratio)`` is the length of the first unit, expressed in the second one.
+    ``exp(log_ratio)`` is the length of the first unit, measured in the second unit.  Which units these are is
+    stated where a ratio is returned.
     """
 
     log_ratio: float
@@ -133,7 +136,7 @@ class ScaleRatio:
 
     @property
     def inverse(self) -> ScaleRatio:
-        """The length of the second unit, expressed in the first one."""
+        """The ratio with both units exchanged: the length of the second unit, measured in the first unit."""
         return ScaleRatio(-self.log_ratio, self.variance)
 
 
@@ -146,9 +149,10 @@ class MeasuredPose:
         points_keyframe: ``(k, 3)``, the matched landmarks in the frame of the keyframe, metres.
         pixels: ``(k, 2)``, the matched pixels in the view.
         depths_view: ``(k,)``, the depths of the matched features in the view, 0 where unknown.
-        depth_ratio: For a metric view with depths: the metre of the view in metres of the keyframe, which
-            differs from 1 if one of both has a wrong scale; None if too few inliers have depths, or the
-            depths disagree.
+        depth_ratio: For a metric view with depths: the length of one metre of the view's depths, measured in
+            metres of the keyframe's landmarks, see `measure_scale_ratio`.  It differs from 1 if the depths of
+            one of both have a wrong scale, as those of a depth camera with a wrong calibration.  None for
+            other views, and where `measure_scale_ratio` returns None.
     """
 
     solution: PnpSolution
@@ -178,10 +182,11 @@ class RelativePose:
             ``log(inverse(T_a_b) @ true_T_a_b)``.
         inliers: The number of inliers.
         matches: The number of matches.
-        scale: The ratio of the units of length of both keyframes, if the image that was matched is not metric
-            (`measure_inverse_relative_pose` matches that of *a*): the unit of *b*, expressed in that of *a*.
-            Else None.
-        depth_ratio: The metre of *b* in metres of *a*, where both have metric depths and it was measured.
+        scale: The length of the unit of length of *b*, measured in that of *a*.  It is given if the view that
+            was matched has depths in an unknown unit, and None otherwise.  This view is the image of *b* for
+            `measure_relative_pose`, and that of *a* for `measure_inverse_relative_pose`.
+        depth_ratio: `MeasuredPose.depth_ratio` with *b* as the view: the length of one metre of *b*, measured
+            in metres of *a*.  None if it was not measured.
     """
 
     T_a_b: Array
@@ -282,11 +287,12 @@ def measure_inverse_relative_pose(
 
 
 def measure_scale_ratio(measured: MeasuredPose, options: RelativePoseOptions = _DEFAULT) -> ScaleRatio | None:
-    """Return the unit of the view's depths in the unit of the keyframe's landmarks.
+    """Return the length of the unit of the view's depths, measured in the unit of the keyframe's landmarks.
 
-    The estimate is the median ratio, over the inliers, of the depth that a landmark has in the view by the
-    pose to the depth that the view measured.  Its variance is the sum of those of the median, of the
-    correlated errors of landmarks, and of the pose along the optical axis.
+    For each inlier with a depth in the view, the ratio is the depth of the landmark in the view that follows
+    from the pose, divided by the depth that the view measured.  The estimate is the median of the logarithms
+    of these ratios.  Its variance is the sum of three variances: that of the median, that of the errors which
+    all landmarks of a keyframe have in common, and that of the pose along the optical axis.
 
     Returns:
         None if fewer than 12 inliers have a depth in both images, or the standard deviation of the logarithms
@@ -323,7 +329,8 @@ def measure_pose(
 
     Args:
         landmarks: The landmarks of the keyframe.
-        view: The image in which they are looked for; its depth noise is taken as that of both cameras.
+        view: The image in which they are looked for.  Its depth noise is assumed for the camera that measured
+            the landmarks, too.
         options: Limits of the matches and of the reprojection error.
 
     Returns:

@@ -22,8 +22,9 @@ class NormalEquations:
         H: ``(c, c)``, the block of the camera parameters.
         g: ``(c,)``, the gradient ``J^T r`` of the camera parameters for the residuals *r*, model minus
             observation; a step goes against it.
-        E: ``(l, 3, c)``, the blocks between landmarks and camera parameters; the rows of a landmark are
-            contiguous, so that the large product in `reduce` is that of one matrix with its own transpose.
+        E: ``(l, 3, c)``, the blocks between landmarks and camera parameters.  In this layout the array is
+            also a ``(3 l, c)`` matrix, so that `reduce` computes the large product as one matrix transposed
+            times itself.
         H_landmarks: ``(l, 3, 3)``, the blocks of the landmarks.
         g_landmarks: ``(l, 3)``, the gradients ``J^T r`` of the landmarks.
     """

@@ -31,13 +31,15 @@ UNKNOWNS = ("fx", "fy", "cx", "cy", "k1", "offset", "delay", "readout", "curve")
 """Names of the nine errors of a calibration that an adjustment can estimate, in the order of all arrays
 ``(9,)``:
 
-- ``fx``, ``fy``: logarithm of the true focal length over the set one
-- ``cx``, ``cy``: true minus set principal point, px
+- ``fx``, ``fy``: natural logarithm of the quotient of true and stated focal length
+- ``cx``, ``cy``: true minus stated principal point, px
 - ``k1``: first coefficient of a radial distortion that remains after undistortion
-- ``offset``: metres that measured depth is too large
-- ``delay``: seconds by which depth lags: it shows an earlier moment than colours of the same time stamp
+- ``offset``: metres by which a measured depth is too large, at any depth
+- ``delay``: seconds by which depth images lag: they show the scene that many seconds earlier than the colour
+  images with the same time stamps
 - ``readout``: seconds from the exposure of the first to that of the last row of a rolling shutter
-- ``curve``: metres that measured depth is too large for each square metre of depth
+- ``curve``: factor c (1/m) of a depth error that grows with the depth: the measured depth of a point at the
+  depth z is ``c z^2`` metres too large
 """
 PRIOR = np.array([0.15, 0.15, 40.0, 40.0, 0.15, 0.15, 0.3, 0.02, 0.01])
 """Prior standard deviations of `UNKNOWNS`, in their units: typical errors of calibrations.  For ``curve``,
@@ -51,8 +53,8 @@ solution."""
 _RESCALE_ITERATIONS = (1, 4)
 """Indices, from 0, of the steps after which the noise is estimated again from the residuals."""
 _MIN_CONVERGED_ITERATION = 4
-"""Index, from 0, of the step up to which convergence does not end an adjustment, because the noise is
-estimated again until then."""
+"""Index, from 0, of the last step after which an adjustment goes on even if it has converged: after this step
+the noise is estimated again for the last time."""
 _CONVERGED_SHARE = 1e-4  # an adjustment ends when a step lowers the cost by less than this share
 _FIRST_DAMPING = 1e-4  # Levenberg-Marquardt's share of the diagonal: nearly Gauss-Newton at first
 _MIN_DAMPING = 1e-9  # Levenberg-Marquardt's share of the diagonal is not lowered below this
@@ -77,8 +79,9 @@ _MAX_STEP_RAD = 0.5
 """Largest rotation, in radians, of a keyframe about an axis in one step, since the linearisation does not
 hold beyond it: the whole step is shortened."""
 _ZOOM_MEAN_INFORMATION = 1e8
-"""Information, for each keyframe, on the mean of all zooms (logarithms of focal lengths of keyframes over the
-common one): it holds this mean at 0, since ``fx`` and ``fy`` already describe the common focal length."""
+"""Information, for each keyframe, on the mean of all zooms.  A zoom is the natural logarithm of the quotient
+of the focal length of a keyframe and the common one.  The information holds the mean at 0, since ``fx`` and
+``fy`` already describe the common focal length."""
 _NOISE_SAMPLES = 8  # random perturbations of a drive from which the uncertainty of its path is computed
 _POSE_INFORMATION = 1.0
 """Information (1/m^2, 1/rad^2) added to each number of a keyframe's twist, far below that of a drive: it
@@ -95,12 +98,13 @@ class DriveObservations:
         keyframes: ``(n,)``, index of the keyframe of each observation.
         landmarks: ``(n,)``, index of its landmark; a keyframe observes a landmark at most once.
         pixels: ``(n, 2)``, undistorted pixels.
-        pixels_px: ``(n,)``, standard deviations of the pixels, px.
+        pixel_deviations_px: ``(n,)``, standard deviations of the pixels, px.
         depths_m: ``(n,)``, depths along the optical axis; NaN without a depth.
-        depths_dev_m: ``(n,)``, standard deviations of the depths; not read without a depth.
+        depth_deviations_m: ``(n,)``, standard deviations of the depths; not read without a depth.
         rates_m_s: ``(n,)``, change of the depth at the pixel with time, m/s; 0 where it is not known.
-        twists_s: ``(k, 6)``, motion of each keyframe: the twist in a second (m, rad) on the left of
-            ``T_camera_world``; 0 where it is not known.
+        twists_s: ``(k, 6)``, velocity of the camera at each keyframe: translation (m/s) and rotation (rad/s)
+            of the twist by which ``T_camera_world`` is multiplied on the left in one second; 0 where it is
+            not known.
         curve_dev_per_m: Prior standard deviation of the unknown ``curve``.
 
     Raises:
@@ -111,16 +115,22 @@ class DriveObservations:
     keyframes: Rows
     landmarks: Rows
     pixels: Array
-    pixels_px: Array
+    pixel_deviations_px: Array
     depths_m: Array
-    depths_dev_m: Array
+    depth_deviations_m: Array
     rates_m_s: Array
     twists_s: Array
     curve_dev_per_m: float = float(PRIOR[-1])
 
     def __post_init__(self) -> None:
         n = len(self.keyframes)
-        columns = (self.landmarks, self.pixels_px, self.depths_m, self.depths_dev_m, self.rates_m_s)
+        columns = (
+            self.landmarks,
+            self.pixel_deviations_px,
+            self.depths_m,
+            self.depth_deviations_m,
+            self.rates_m_s,
+        )
         if any(column.shape != (n,) for column in columns) or self.pixels.shape != (n, 2):
             raise BadRequest(
                 f"the arrays of {n} observations have the shapes "
@@ -137,15 +147,17 @@ class Calibrated:
         values: ``(9,)``, errors of the calibration, see `UNKNOWNS`; those that were not estimated keep the
             value with which the adjustment began.
         covariance: ``(9, 9)`` of the values, inflated where residuals are correlated.
-        zooms: ``(k,)``, logarithm of the focal length of each keyframe over the common one.
+        zooms: ``(k,)``, natural logarithm of the quotient of the focal length of each keyframe and the common
+            one.
         zooms_covariance: ``(k, k)`` of the zooms; 0 if they were not estimated.
         T_camera_world: ``(k, 4, 4)``, adjusted poses, metres.
         points_world: ``(l, 3)``, adjusted landmarks, metres.
-        bends_m: ``(9, k, 3)``, derivative of the keyframes' positions in the world by each error of the
-            calibration: by how much the path bends if an unknown is held one unit too large; 0 for unknowns
-            that were not estimated.
+        bends_m: ``(9, k, 3)``, for each error of the calibration the derivative of the keyframes' positions
+            in the world by this error: the displacements that result if the error is fixed one unit above its
+            estimate and the poses are adjusted again.  0 for errors that were not estimated.
         noise_m: Uncertainty of the path: root mean square of the random errors of the keyframes' positions
-            after alignment, with those that the uncertainty of the estimated calibration causes.
+            after alignment, including the errors that result from the uncertainty of the estimated
+            calibration.
         has_metric_scale: Whether depths determine the metric scale; else paths are compared up to scale.
         depth_factor: Noise of the depths over their stated standard deviations.
     """
@@ -196,7 +208,7 @@ def triangulate_landmarks(observed: DriveObservations, T_camera_world: Array, co
     centres = -np.einsum("nji,nj->ni", T[:, :3, :3], T[:, :3, 3])
     has_depth = np.isfinite(observed.depths_m)
     variances = np.where(
-        has_depth, np.square(observed.depths_dev_m, where=has_depth, out=np.ones(len(T))), 1.0
+        has_depth, np.square(observed.depth_deviations_m, where=has_depth, out=np.ones(len(T))), 1.0
     )
     points_at_depth = centres + np.nan_to_num(observed.depths_m)[:, None] * rotated
     unit = rotated / np.linalg.norm(rotated, axis=1, keepdims=True)
@@ -293,10 +305,11 @@ def estimate_part_deviations(
 ) -> Array:
     """Return how far parts of a drive disagree about the calibration, as standard deviations ``(9,)``.
 
-    They are those of the mean of the parts, in the units of `UNKNOWNS`, as far as the covariances of the
-    parts do not explain them.  Parts that are adjusted alone disagree by more where the model lacks an
-    effect, such as errors of depth that change with the scene.  The result is 0 where fewer than two parts of
-    a drive have enough keyframes and can be adjusted, and for unknowns that are not in *free*.
+    The calibration of each part is estimated alone.  The result is the standard deviation of the mean of
+    these estimates, in the units of `UNKNOWNS`, that results from the variance between the parts which their
+    covariances do not explain, see `disagreement`.  It is above 0 where the model lacks an effect, such as
+    errors of depth that change with the scene.  It is 0 if fewer than two parts of the drive have enough
+    keyframes and can be adjusted, and for unknowns that are not in *free*.
 
     Args:
         observed: The observations of the whole drive.
@@ -325,10 +338,13 @@ def estimate_part_deviations(
 
 
 def disagreement(values: Array, variances: Array) -> Array:
-    """Return the standard deviation ``(n,)`` of means of estimates that goes beyond their variances.
+    """Return the standard deviations ``(n,)`` of means that the variances of the averaged estimates leave
+    out.
 
-    *values* and *variances* are ``(p, n)``: *n* quantities, each estimated *p* times, with p at least 2.  The
-    result is 0 where the variances explain how far the estimates of a quantity differ.
+    *values* and *variances* are ``(p, n)``: estimates of *n* quantities in *p* groups, with p at least 2, and
+    their variances.  If the estimates of a quantity differ more than their variances explain, there is a
+    variance between the groups; the result is the square root of this variance divided by *p*.  Otherwise it
+    is 0.
 
     Source:
         DerSimonian and Laird, Controlled Clinical Trials 1986, Sect. 2: the variance between studies.
@@ -359,9 +375,9 @@ def _select_keyframes(
         keyframes=new_index[observed.keyframes[is_selected]],
         landmarks=landmarks,
         pixels=observed.pixels[is_selected],
-        pixels_px=observed.pixels_px[is_selected],
+        pixel_deviations_px=observed.pixel_deviations_px[is_selected],
         depths_m=observed.depths_m[is_selected],
-        depths_dev_m=observed.depths_dev_m[is_selected],
+        depth_deviations_m=observed.depth_deviations_m[is_selected],
         rates_m_s=observed.rates_m_s[is_selected],
         twists_s=observed.twists_s[keyframes],
     )
@@ -407,10 +423,10 @@ class _DriveSystem:
         order = np.argsort(observed.landmarks, kind="stable")
         self.camera = observed.camera
         self.keyframes, self.landmarks = observed.keyframes[order], observed.landmarks[order]
-        self.pixels, self.pixels_px = observed.pixels[order], observed.pixels_px[order]
+        self.pixels, self.pixel_deviations_px = observed.pixels[order], observed.pixel_deviations_px[order]
         self.has_depth = np.isfinite(observed.depths_m[order])
         self.depths_m = np.where(self.has_depth, observed.depths_m[order], 0.0)
-        self.depths_dev_m = np.where(self.has_depth, observed.depths_dev_m[order], 1.0)
+        self.depth_deviations_m = np.where(self.has_depth, observed.depth_deviations_m[order], 1.0)
         self.rates_m_s = np.where(self.has_depth, observed.rates_m_s[order], 0.0)
         # 2. Take the velocity of the camera at each observation, and the time at which its row is exposed, as
         # a share of the readout: -0.5 for the first row of the image, 0.5 for the last.
@@ -435,8 +451,8 @@ class _DriveSystem:
     def residuals(self, state: _State) -> tuple[Array, Array]:
         """Return the residuals ``(n, 3)``, and the landmarks ``(n, 3)``, m, in the frames of their cameras.
 
-        A residual is model minus observation: two pixels, and metres of depth (0 without a depth).  The
-        landmarks are those at the moment of the middle row, without the motion of a rolling shutter.
+        A residual is model minus observation: of column and row, px, and of the depth, m (0 without one).
+        The landmarks are those at the moment of the middle row, without the motion of a rolling shutter.
         """
         T = state.T_camera_world[self.keyframes]
         points_camera = np.einsum("nij,nj->ni", T[:, :3, :3], state.points[self.landmarks]) + T[:, :3, 3]
@@ -472,8 +488,8 @@ class _DriveSystem:
 
     def _inverse_deviations(self) -> Array:
         """Return the inverses ``(n, 3)`` of the standard deviations of pixel and depth; 0 without a depth."""
-        pixel = 1.0 / (self.pixel_factor * self.pixels_px)
-        depth = np.where(self.has_depth, 1.0 / (self.depth_factor * self.depths_dev_m), 0.0)
+        pixel = 1.0 / (self.pixel_factor * self.pixel_deviations_px)
+        depth = np.where(self.has_depth, 1.0 / (self.depth_factor * self.depth_deviations_m), 0.0)
         return np.stack([pixel, pixel, depth], axis=1)
 
     def estimate_noise(self, state: _State) -> None:
@@ -482,10 +498,10 @@ class _DriveSystem:
         `depth_factor` stays as it is if the drive has no more than `_MIN_DEPTHS` depths.
         """
         residual, _ = self.residuals(state)
-        pixel_ratios = np.abs(residual[:, :2] / self.pixels_px[:, None])
+        pixel_ratios = np.abs(residual[:, :2] / self.pixel_deviations_px[:, None])
         self.pixel_factor = max(_MIN_PIXEL_FACTOR, _MAD_TO_SIGMA * float(np.median(pixel_ratios)))
         if self.has_depth.sum() > _MIN_DEPTHS:
-            depth_ratios = np.abs(residual[:, 2] / self.depths_dev_m)[self.has_depth]
+            depth_ratios = np.abs(residual[:, 2] / self.depth_deviations_m)[self.has_depth]
             self.depth_factor = max(_MIN_DEPTH_FACTOR, _MAD_TO_SIGMA * float(np.median(depth_ratios)))
 
     def cost(self, state: _State) -> float:
@@ -577,8 +593,8 @@ class _DriveSystem:
     def _reduce(self, damping: float) -> ReducedEquations:
         """Return the equations of keyframes and calibration without landmarks.
 
-        Their matrix ``S`` contains the information of all priors; their right side does not yet contain that
-        the priors pull zooms and values to 0, which `step` adds.
+        Their matrix ``S`` contains the information of all priors.  Their right side does not contain the
+        gradients of the priors, which pull zooms and values to 0; `step` adds them.
         """
         reduced = self._equations.reduce(damping, self._prior_information(), _POINT_INFORMATION)
         if self._keyframe_size == 7:
@@ -660,8 +676,8 @@ class _DriveSystem:
         """Return the factors ``(p,)`` by which correlated residuals make *p* variances larger.
 
         Residuals of one landmark, of one part of the drive and of one region of the image are correlated.
-        For each of these three clusterings, a factor, which begins at 1, grows by the share by which the
-        sandwich estimator (White 1980) exceeds the variance that holds for independent residuals.
+        A factor is 1 plus, for each of these three clusterings, ``max(0, v / v0 - 1)``: v is the variance by
+        the sandwich estimator (White 1980) with this clustering, and v0 that for independent residuals.
 
         Args:
             rows: ``(p, m)``, rows of the inverse of the reduced equations, one for each parameter.
@@ -689,7 +705,7 @@ class _DriveSystem:
             (self.keyframes * block_count // self._keyframe_count, block_count),
             (cells.astype(np.int64), _IMAGE_CELLS**2),
         )
-        # 3. Add up by how much the variance over clusters exceeds that of independent residuals.
+        # 3. Add the relative excess of each clustered variance over that for independent residuals.
         inflation = np.ones(len(rows))
         for clusters, count in clusterings:
             sums = _sum_by_index(influence, clusters, count)

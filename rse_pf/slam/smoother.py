@@ -19,14 +19,16 @@ Rows = npt.NDArray[np.int64]
 
 _MAX_ITERATIONS = 6  # largest number of Gauss-Newton steps of one call of `smooth`
 _MAX_STEP_TRIALS = 4
-"""Largest number of lengths of a Gauss-Newton step that are tried until the cost does not increase."""
+"""Largest number of trials of a Gauss-Newton step.  After each trial that increases the cost, the step is
+shortened by the factor `_STEP_REDUCTION`."""
 _STEP_REDUCTION = 0.25  # factor by which a Gauss-Newton step that increases the cost is shortened
 _CONVERGED_M = 6e-3
-"""Translation in metres, along each axis of each pose, of a Gauss-Newton step below which no further step is
-made: the next step would be ten times shorter, and the next keyframe's call of `smooth` makes it."""
+"""If a Gauss-Newton step moves no pose by this translation in metres along an axis, nor by `_CONVERGED_RAD`,
+no further step is made.  It would be about ten times shorter, and the call of `smooth` for the next keyframe
+makes up for it."""
 _CONVERGED_RAD = 6e-3
-"""Rotation in radians, about each axis of each pose, of a Gauss-Newton step below which no further step is
-made: the next keyframe's call of `smooth` makes it."""
+"""If a Gauss-Newton step moves no pose by this rotation in radians about an axis, nor by `_CONVERGED_M`, no
+further step is made."""
 _MIN_RELATIVE_DECREASE = 1e-3
 """Relative decrease of the cost below which a further Gauss-Newton step is not worth its time."""
 _MAX_ROTATION_STEP_RAD = 0.5
@@ -48,7 +50,7 @@ class ScaleTerms:
         plus: ``(m,)``, index of the first of two scales whose ratio an edge measures, -1 for a scale fixed at
             1.
         minus: ``(m,)``, index of the second of these two scales, -1 for a scale fixed at 1.
-        difference: ``(m,)``, the measured logarithm of the first scale less that of the second one.
+        difference: ``(m,)``, the measured ``log(first scale) - log(second scale)``, natural logarithms.
         information: ``(m,)``, the inverse variance of this difference; 0 where an edge measures no ratio.
     """
 
@@ -68,8 +70,9 @@ class SmoothedPoses:
         T: ``(n, 4, 4)``, all poses, metres.
         squares: ``(m,)``, the squared Mahalanobis norm of the residual of each edge at these poses, with that
             of the ratio of scales if the edge measures one.
-        covariances: ``(w, 6, 6)`` of the *w* wanted poses, of twists (metres, radians) on their right, given
-            the fixed poses, with the Cauchy weights and the linearisation of the last step.
+        covariances: ``(w, 6, 6)``, for each of the *w* wanted poses the covariance of the twist (metres,
+            radians) on its right.  It is conditional on the fixed poses, as if these had no errors, and is
+            computed with the Cauchy weights and the Jacobians of the last iteration.
         log_scales: ``(k,)``, the natural logarithms of the fitted scales; empty without scales.
     """
 
@@ -121,8 +124,8 @@ def smooth(
     if scales is not None:
         squares = squares + _scale_squares(scales, log_scales)
     cost = _cost(squares, robust, cauchy)
-    # 2. Prepare unit vectors as further right sides: their solutions are columns of the inverse of the
-    # matrix, which contain the covariances.
+    # 2. Prepare unit vectors as further right sides of the normal equations: their solutions are the columns
+    # of the inverse matrix that contain the covariances of the wanted poses.
     size = 6 * free + len(log_scales)
     unit_vectors = np.zeros((size, 6 * len(wanted)))
     unit_vectors[(6 * wanted[:, None] + np.arange(6)).ravel(), np.arange(6 * len(wanted))] = 1.0
@@ -267,9 +270,9 @@ def _add_scales(
 ) -> tuple[Array, Array]:
     """Return the normal equations of the poses, extended by the unknown log scales as last unknowns.
 
-    If a log scale grows by d, the measured pose of its edges moves by d times its own translation.  In the
-    frame of this pose that is ``-d`` times the translation of the inverse pose, and the residual moves by the
-    opposite.
+    If a log scale grows by a small d, the translation t of a measured pose ``T_a_b = (R, t)`` of its edges
+    grows by ``d t``.  This is the motion ``d R^T t`` in the frame of the pose, which is ``-d`` times the
+    translation of the inverse pose ``T_b_a``.  A residual e changes by ``-(I - ad(e) / 2)`` times this motion.
     """
     poses, k = len(gradient), scales.count
     error, weights = edges.error, edges.weights

@@ -24,8 +24,9 @@ Gray = npt.NDArray[np.uint8]
 _PORTABLE_FLAG = 1
 """Flag of the native core's ``rse_pf_disparities`` that forbids AVX2."""
 _BASE_NOISE_M = 1e-5
-"""Constant part of the noise of a stereo depth, in metres: the smallest that `DepthNoise` accepts, in place
-of 0, since this noise grows with the square of the depth alone."""
+"""Constant part of the standard deviation of a stereo depth, in metres.  The standard deviation is
+proportional to the square of the depth, so that this part should be 0; it is the smallest that `DepthNoise`
+accepts."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -36,9 +37,10 @@ class StereoOptions:
         min_disparity_px: Smallest accepted disparity, above 0: the depths of smaller ones are nearly unknown.
         max_disparity_px: Largest searched disparity, at most 1,024.
         min_likeness: Smallest accepted likeness: the squared normalised correlation of the two patches.
-        uniqueness: Ratio test: 1 minus the best likeness must be below this share of 1 minus the second best.
+        uniqueness: Limit of the ratio test, in which the distance of two patches is 1 minus their likeness:
+            the smallest distance must be below this factor times the second smallest one.
         left_right_px: Largest difference between the disparities of the search from left to right and of the
-            search back from right to left; -1 leaves the search back out.
+            search back from right to left; with -1 there is no search back.
 
     Raises:
         BadRequest: A number is out of its range.
@@ -65,8 +67,8 @@ class StereoOptions:
 def stereo_noise(f_baseline: float, disparity_px: float) -> DepthNoise:
     """Return the noise model of depths ``f_baseline / d`` by the noise of their disparities ``d``.
 
-    The standard deviation of a depth z is ``1e-5 m + growth * z^2``.  The growth (1/m) is *disparity_px* over
-    *f_baseline*, but at most 1, the largest that `DepthNoise` accepts.
+    The standard deviation of a depth z is ``1e-5 m + growth * z^2``.  The growth is ``disparity_px /
+    f_baseline`` (1/m), but at most 1, the largest that `DepthNoise` accepts.
 
     Args:
         f_baseline: Focal length in pixels times the baseline in metres.

@@ -13,7 +13,8 @@ _MIN_DEPTH = 1e-3
 """Smallest depth of a point before a camera, in the unit of the poses: nearer, a projection is
 meaningless."""
 _MIN_HOMOGENEOUS_SCALE = 1e-9
-"""A triangulated point whose fourth homogeneous coordinate is smaller lies at infinity."""
+"""Absolute value of the fourth coordinate of a homogeneous vector of length 1 below which the triangulated
+point counts as lying at infinity."""
 
 
 def triangulate(

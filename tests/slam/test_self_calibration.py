@@ -62,8 +62,9 @@ def made(
     pixels[wrong] += rng.uniform(-60.0, 60.0, (len(wrong), 2))
     observed = DriveObservations(
         camera=CAMERA, keyframes=keyframes[rows], landmarks=landmarks[rows], pixels=pixels[rows],
-        pixels_px=np.full(len(rows), 0.5), depths_m=depths[rows] if has_depth else np.full(len(rows), np.nan),
-        depths_dev_m=np.full(len(rows), 0.01), rates_m_s=depth_rates[rows], twists_s=rates,
+        pixel_deviations_px=np.full(len(rows), 0.5),
+        depths_m=depths[rows] if has_depth else np.full(len(rows), np.nan),
+        depth_deviations_m=np.full(len(rows), 0.01), rates_m_s=depth_rates[rows], twists_s=rates,
     )  # fmt: skip
     return observed, T
 
