@@ -66,6 +66,12 @@ _CLIP_RMS = 4.0
 """When a float descriptor becomes int8, its numbers are clipped at this many times the root mean square of
 that descriptor."""
 
+_PARTS_HINT = "see docs/own_parts.md"
+_FEATURES_HINT = (
+    "return FoundFeatures with a pixel, a score and a descriptor for each feature; cv2.KeyPoint_convert "
+    "makes pixels of keypoints"
+)
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class FoundFeatures:
@@ -139,12 +145,7 @@ class FeaturesPlugin:
         Raises:
             UsageError: The object cannot be called, or has no name that features can have.
         """
-        if not callable(function):
-            raise UsageError(
-                f"features= takes a function, not a {type(function).__name__}",
-                hint="give a function from an image to FoundFeatures",
-            )
-        self._function = function
+        self._function = _check_callable("features", function)
         self.name = str(
             getattr(function, "name", None) or getattr(function, "__name__", type(function).__name__)
         ).lower()
@@ -215,25 +216,7 @@ class FeaturesPlugin:
         )
 
     def _check_numbers(self, field: str, given: npt.ArrayLike, shape: tuple[int, ...]) -> Array:
-        """Return *given* as finite float64 numbers of *shape*, whose first length may be -1 for any.
-
-        *field* is their name in an error.  Empty numbers of any shape fit a length of -1.
-        """
-        try:
-            array = np.asarray(given, dtype=np.float64)
-        except (TypeError, ValueError) as error:
-            raise self._refusal(
-                f"returned {field} that are no numbers"
-                + ": cv2.KeyPoint_convert makes them of keypoints" * (field == "pixels")
-            ) from error
-        if not array.size and shape[0] == -1:
-            return np.empty((0, *shape[1:]))
-        if not _has_shape(array, shape):
-            wanted = tuple("n" if length == -1 else length for length in shape)
-            raise self._refusal(f"returned {field} of shape {array.shape}, not {wanted}".replace("'", ""))
-        if not np.isfinite(array).all():
-            raise self._refusal(f"returned {field} that are not finite")
-        return array
+        return _check_array(f"features function {self.name}", field, given, shape, _FEATURES_HINT)
 
     def _check_descriptors(self, given: npt.ArrayLike | None, n: int) -> Descriptors:
         array = np.asarray(given)
@@ -255,10 +238,7 @@ class FeaturesPlugin:
         return scaled.astype(np.int8)
 
     def _refusal(self, why: str) -> UsageError:
-        return UsageError(
-            f"the features function {self.name} {why}",
-            hint="return FoundFeatures with a pixel, a score and a descriptor for each feature",
-        )
+        return UsageError(f"the features function {self.name} {why}", hint=_FEATURES_HINT)
 
 
 class MotionPlugin:
@@ -288,7 +268,7 @@ class MotionPlugin:
         stamps_s = np.array([stamp_s for stamp_s, _ in self._recent])
         poses = np.array([pose for _, pose in self._recent])
         returned = _call_user("motion function", self._function, stamps_s, poses, timestamp_s)
-        T_world_camera = rigid(_check_array("motion", returned, (4, 4)))
+        T_world_camera = rigid(_check_array("motion function", "poses", returned, (4, 4)))
         if T_world_camera is None:
             raise UsageError(
                 "the motion function returned a matrix that is no pose",
@@ -312,7 +292,9 @@ class LoopsPlugin:
             UsageError: The function failed, or returned a vector of another length, of zeros, or of fewer
                 than 8 or more than 4,096 numbers.
         """
-        vector = _check_array("loops", _call_user("loops function", self._function, rgb), (-1,))
+        vector = _check_array(
+            "loops function", "place vectors", _call_user("loops function", self._function, rgb), (-1,)
+        )
         length = float(np.linalg.norm(vector))
         self._size = self._size or len(vector)
         is_fit = len(vector) == self._size and _MIN_PLACE_SIZE <= len(vector) <= _MAX_PLACE_SIZE
@@ -346,8 +328,8 @@ class OptimiserPlugin:
                 f"the optimiser function returned {type(returned).__name__}, not poses and points",
                 hint="return T_camera_world and points_world of the bundle, adjusted",
             )
-        poses = _check_array("optimiser", returned[0], bundle.T_camera_world.shape)
-        points = _check_array("optimiser", returned[1], bundle.points_world.shape)
+        poses = _check_array("optimiser function", "poses", returned[0], bundle.T_camera_world.shape)
+        points = _check_array("optimiser function", "points", returned[1], bundle.points_world.shape)
         rigid_poses = [rigid(pose) for pose in poses]
         if any(pose is None for pose in rigid_poses):
             raise UsageError(
@@ -358,9 +340,7 @@ class OptimiserPlugin:
 
 def _check_callable(argument: str, function: Any) -> Any:
     if not callable(function):
-        raise UsageError(
-            f"{argument}= takes a function, not a {type(function).__name__}", hint="see docs/own_parts.md"
-        )
+        raise UsageError(f"{argument}= takes a function, not a {type(function).__name__}", hint=_PARTS_HINT)
     return function
 
 
@@ -378,24 +358,26 @@ def _call_user(name: str, function: Callable[..., Any], *arguments: Any) -> Any:
         ) from error
 
 
-def _check_array(argument: str, given: Any, shape: tuple[int, ...]) -> Array:
-    """Return finite numbers of *shape*, where -1 stands for any length; raises UsageError."""
+def _check_array(
+    function: str, values: str, given: Any, shape: tuple[int, ...], hint: str = _PARTS_HINT
+) -> Array:
+    """Return what a user's function gave as finite float64 numbers of *shape*, in which -1 is any length.
+
+    Without numbers, *given* may have any shape if the first length of *shape* is -1.  *function* and *values*
+    name the function and the values in the UsageError for anything else.
+    """
+    statement = f"the {function} returned {values}"
     try:
         array = np.asarray(given, dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise UsageError(f"the {argument} function returned no numbers", hint="return an array") from error
+        raise UsageError(f"{statement} that are no numbers", hint=hint) from error
+    if not array.size and shape[0] == -1:
+        return np.empty((0, *shape[1:]))
     if not _has_shape(array, shape):
         wanted = f"{shape}".replace("-1", "n")
-        raise UsageError(
-            f"the {argument} function returned an array of shape {array.shape}, not {wanted}",
-            hint=f"return an array of shape {wanted}",
-        )
+        raise UsageError(f"{statement} of shape {array.shape}, not {wanted}", hint=hint)
     if not np.isfinite(array).all():
-        raise UsageError(
-            f"the {argument} function returned {np.count_nonzero(~np.isfinite(array))} numbers that are not "
-            "finite",
-            hint="return finite numbers only",
-        )
+        raise UsageError(f"{statement} that are not finite", hint=hint)
     return array
 
 

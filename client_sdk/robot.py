@@ -537,8 +537,6 @@ class Robot:
         counter, session, connection = self._counter, self._session, self._connection
         current = session.current
         clock = current.clock_offset if current else None
-        last = current.last_exchange if current else None
-        delays = clock.delays_s(last) if clock is not None and last is not None else None
         return Stats(
             sent=counter.sent,
             answered=counter.answered,
@@ -565,9 +563,6 @@ class Robot:
             compute_ms=counter.percentiles("compute_ms"),
             down_ms=counter.percentiles("down_ms"),
             clock_offset_s=clock.offset_s if clock else None,
-            clock_uncertainty_s=clock.uncertainty_s if clock else None,
-            delay_up_s=delays[0] if delays else None,
-            delay_down_s=delays[1] if delays else None,
             server=current.server if current else "",
             region=connection.region if current else "",
             last_error=connection.last_error,

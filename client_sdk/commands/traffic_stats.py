@@ -58,9 +58,6 @@ class Stats:
         compute_ms: Time of the computation on the server.
         down_ms: Delay from server to robot.
         clock_offset_s: Server clock minus robot clock, None if unknown.
-        clock_uncertainty_s: Half of the round trip by which the offset was measured, None if unknown.
-        delay_up_s: Delay from robot to server of the last ping, None if unknown.
-        delay_down_s: Delay from server to robot of the last ping, None if unknown.
         server: Name of the server that is connected now, empty without one.
         region: Address of the platform that is used now, empty without one.
         last_error: Last problem of the connection, empty without one.
@@ -93,9 +90,6 @@ class Stats:
     compute_ms: Percentiles
     down_ms: Percentiles
     clock_offset_s: float | None
-    clock_uncertainty_s: float | None
-    delay_up_s: float | None
-    delay_down_s: float | None
     server: str
     region: str
     last_error: str

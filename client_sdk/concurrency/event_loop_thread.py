@@ -7,6 +7,7 @@ ends every call that waits.
 from __future__ import annotations
 
 import asyncio
+import concurrent.futures
 import contextlib
 import os
 import threading
@@ -20,11 +21,10 @@ __all__ = ["EventLoopThread", "wrong_process_error"]
 T = TypeVar("T")
 
 CLOSE_TIMEOUT_S = 5.0
-"""How long the last coroutine of the event loop may take, in seconds: it closes connections and a
-recording."""
+"""Longest time for the coroutine of *at_end*, which closes connections and a recording, in seconds."""
 THREAD_JOIN_S = 1.0
-"""How long the thread of the loop may take to end after its last coroutine: a function of the program may
-block it."""
+"""How long `EventLoopThread.close` waits after `CLOSE_TIMEOUT_S` for the loop, and then for its thread, in
+seconds: a function of the program may block them."""
 
 
 def wrong_process_error(process: int) -> Disconnected:
@@ -41,10 +41,9 @@ class EventLoopThread:
     def __init__(self, at_end: Callable[[], Coroutine[Any, Any, None]]) -> None:
         """Prepare a thread for `start`; *at_end* makes the last coroutine of its loop, for 5 s at most."""
         self._at_end = at_end
-        self._calls: set[_Call] = set()
-        self._lock = (
-            threading.RLock()
-        )  # reentrant: a signal handler may call `close` in a thread that holds it
+        self._calls: set[concurrent.futures.Future[Any]] = set()
+        # Reentrant: a signal handler may call `close` in a thread that holds this lock.
+        self._lock = threading.RLock()
         self._process = os.getpid()
         self._loop: asyncio.AbstractEventLoop | None = None
         self._stop: asyncio.Event
@@ -70,27 +69,25 @@ class EventLoopThread:
             Expired: *work* took longer than *limit_s*.
             UsageError: The thread of the loop itself calls, and would wait for itself.
         """
-        call = _Call(work)
         try:
-            self._submit(call)
+            future = self._submit(work)
         except BaseException:
             work.close()
             raise
         try:
-            if not call.done.wait(limit_s):
-                raise Expired(
-                    f"no answer within {limit_s:g} s, the deadline included",
-                    hint="set a longer deadline_s, or give the robot more CPU time",
-                )
-        except BaseException:
-            self._cancel(call)
-            raise
+            return future.result(limit_s)
+        except concurrent.futures.CancelledError:
+            raise _not_connected_error() from None
+        except concurrent.futures.TimeoutError:
+            if future.done():  # *work* itself raised this error
+                raise
+            raise Expired(
+                f"no answer within {limit_s:g} s, which is deadline_s and a little more",
+                hint="set a longer deadline_s, or give the robot more CPU time",
+            ) from None
         finally:
-            self._calls.discard(call)
-        if call.error is not None:
-            raise call.error
-        result: T = call.result
-        return result
+            future.cancel()
+            self._calls.discard(future)
 
     def close(self) -> None:
         """End the loop and every call that waits, within 7 s; any thread may call this, repeatedly.
@@ -110,7 +107,7 @@ class EventLoopThread:
             self._ended.wait(CLOSE_TIMEOUT_S + THREAD_JOIN_S)
             self._thread.join(THREAD_JOIN_S)
 
-    def _submit(self, call: _Call) -> None:
+    def _submit(self, work: Coroutine[Any, Any, T]) -> concurrent.futures.Future[T]:
         if os.getpid() != self._process:
             raise wrong_process_error(self._process)
         if threading.current_thread() is self._thread:
@@ -121,13 +118,9 @@ class EventLoopThread:
         with self._lock:
             if self._loop is None or self._is_closing:
                 raise _not_connected_error()
-            self._calls.add(call)
-            self._loop.call_soon_threadsafe(call.begin)  # the loop begins it before it sees a later `close`
-
-    def _cancel(self, call: _Call) -> None:
-        with self._lock, contextlib.suppress(RuntimeError):
-            if self._loop is not None:
-                self._loop.call_soon_threadsafe(call.cancel)
+            future = asyncio.run_coroutine_threadsafe(work, self._loop)
+            self._calls.add(future)
+        return future
 
     def _run(self) -> None:
         try:
@@ -151,41 +144,9 @@ class EventLoopThread:
             self._is_closing = True
             calls = list(self._calls)
         for call in calls:
-            call.end(error=_not_connected_error())
+            call.cancel()
         self._started.set()  # `start` waits for this, also if no loop could be made
         self._ended.set()
-
-
-class _Call:
-    """Carry a coroutine into the loop, and its result back to the thread that waits."""
-
-    def __init__(self, work: Coroutine[Any, Any, Any]) -> None:
-        self.done = threading.Event()
-        self.result: Any = None
-        self.error: BaseException | None = None
-        self._work = work
-        self._task: asyncio.Task[Any] | None = None
-
-    def begin(self) -> None:
-        self._task = asyncio.get_running_loop().create_task(self._work)
-        self._task.add_done_callback(self._take_result)
-
-    def cancel(self) -> None:
-        if self._task is not None:
-            self._task.cancel()
-
-    def end(self, result: Any = None, error: BaseException | None = None) -> None:
-        if not self.done.is_set():
-            self.result, self.error = result, error
-            self.done.set()
-
-    def _take_result(self, task: asyncio.Task[Any]) -> None:
-        if task.cancelled():
-            self.end(error=_not_connected_error())
-        elif (error := task.exception()) is not None:
-            self.end(error=error)
-        else:
-            self.end(task.result())
 
 
 def _not_connected_error() -> RsePfError:

@@ -14,6 +14,7 @@ import functools
 import hashlib
 import http.client
 import inspect
+import io
 import json
 import os
 import random
@@ -191,15 +192,15 @@ class DataClient:
             StoreFull, QuotaExceeded, LimitExceeded, Unauthorized, Forbidden: The server refuses the object.
             UsageError: The file cannot be read.
         """
-        with self._lock, _Source(source) as reader:
-            size, digest = reader.size, reader.digest()
+        with self._lock, _open_source(source) as file:
+            size, digest = file.seek(0, os.SEEK_END), _digest(file)
             if size <= MAX_SINGLE_PUT_BYTES:
                 self._request(
-                    "PUT", f"/data/v1/objects/{digest}", StoredReply, reader.read(0, size), digest=digest
+                    "PUT", f"/data/v1/objects/{digest}", StoredReply, _read_at(file, 0, size), digest=digest
                 )
                 self._report(progress, size, size)
             else:
-                self._upload_parts(reader, digest, progress)
+                self._upload_parts(file, size, digest, progress)
             return digest
 
     def download(self, digest: str, to: Path | None = None, progress: OnBytes | None = None) -> bytes:
@@ -326,15 +327,15 @@ class DataClient:
             path = f"{LOCALISE_PATH}{quote(name, safe='')}"
             return self._reply("GET", path, MapOutline)
 
-    def _upload_parts(self, reader: _Source, digest: str, progress: OnBytes | None) -> None:
-        path, size = f"/data/v1/uploads/{digest}", reader.size
+    def _upload_parts(self, file: BinaryIO, size: int, digest: str, progress: OnBytes | None) -> None:
+        path = f"/data/v1/uploads/{digest}"
         request = json.dumps({"size": size}).encode()
-        state = self._open_upload(path, request, reader, digest, progress)
+        state = self._open_upload(path, request, file, size, digest, progress)
         part_bytes = min(state.part_bytes, self._options.part_bytes)
         offset = state.offset
         self._report(progress, offset, size)
         while offset < size:
-            part = reader.read(offset, min(part_bytes, size - offset))
+            part = _read_at(file, offset, min(part_bytes, size - offset))
             try:
                 state = self._reply(
                     "PATCH", path, _Upload, part, {"Upload-Offset": str(offset)}, digest=digest
@@ -346,7 +347,7 @@ class DataClient:
             self._report(progress, offset, size)
 
     def _open_upload(
-        self, path: str, request: bytes, reader: _Source, digest: str, progress: OnBytes | None
+        self, path: str, request: bytes, file: BinaryIO, size: int, digest: str, progress: OnBytes | None
     ) -> _Upload:
         """Open an upload, and send the object to a presigned URL if the data service offers one.
 
@@ -360,7 +361,7 @@ class DataClient:
             if direct is None or not attempts or not self._may_use(direct.url):
                 return state
             attempts -= 1
-            body = reader.pieces(functools.partial(self._report, progress))
+            body = _pieces(file, size, functools.partial(self._report, progress))
             if not _request_bucket("PUT", direct.url, direct.headers, body, self._options.timeout_s):
                 self._options.sleep(pause_s)
                 pause_s *= 2
@@ -527,51 +528,41 @@ class _DownloadRoute:
     attempts_left: int = PRESIGNED_ATTEMPTS
 
 
-class _Source:
-    """Read bytes or a file at any offset."""
+def _open_source(source: bytes | Path) -> BinaryIO:
+    if isinstance(source, bytes):
+        return io.BytesIO(source)
+    try:
+        return source.open("rb")
+    except OSError as error:
+        raise UsageError(
+            f"cannot read {source}: {error.strerror}", hint="name a file that can be read"
+        ) from error
 
-    def __init__(self, source: bytes | Path) -> None:
-        self._data = source if isinstance(source, bytes) else b""
-        self._file: BinaryIO | None = None
-        if isinstance(source, Path):
-            try:
-                self._file = source.open("rb")
-            except OSError as error:
-                raise UsageError(
-                    f"cannot read {source}: {error.strerror}", hint="name a file that can be read"
-                ) from error
-        self.size = os.fstat(self._file.fileno()).st_size if self._file else len(self._data)
 
-    def digest(self) -> str:
-        digest = hashlib.sha256()
-        for piece in self.pieces(None):
-            digest.update(piece)
-        return digest.hexdigest()
+def _read_at(file: BinaryIO, offset: int, length: int) -> bytes:
+    file.seek(offset)
+    return file.read(length)
 
-    def pieces(self, progress: OnBytes | None) -> Iterator[bytes]:
-        for offset in range(0, self.size, PIECE_BYTES):
-            yield self.read(offset, PIECE_BYTES)
-            if progress is not None:
-                progress(min(offset + PIECE_BYTES, self.size), self.size)
 
-    def read(self, offset: int, length: int) -> bytes:
-        if self._file is None:
-            return self._data[offset : offset + length]
-        self._file.seek(offset)
-        return self._file.read(length)
+def _pieces(file: BinaryIO, size: int, progress: Callable[[int, int], None]) -> Iterator[bytes]:
+    """Yield the *size* bytes of *file* in pieces, and call *progress* after each piece."""
+    for offset in range(0, size, PIECE_BYTES):
+        yield _read_at(file, offset, PIECE_BYTES)
+        progress(min(offset + PIECE_BYTES, size), size)
 
-    def __enter__(self) -> _Source:
-        return self
 
-    def __exit__(self, *_: object) -> None:
-        if self._file is not None:
-            self._file.close()
+def _digest(file: BinaryIO) -> str:
+    digest = hashlib.sha256()
+    file.seek(0)
+    while piece := file.read(PIECE_BYTES):
+        digest.update(piece)
+    return digest.hexdigest()
 
 
 def is_allowed(url: str, *, secure: bool) -> bool:
-    """Return whether a presigned *url* may carry data: ``https:``, and ``http:`` only if *secure* is False.
+    """Return whether a presigned *url* may carry data: without TLS only if *secure* is False.
 
-    *secure* says whether the robot reaches the data service itself by TLS.
+    *secure* says whether the data service itself is reached by TLS.
     """
     parts = urlsplit(url)
     return bool(parts.hostname) and parts.scheme in (("https",) if secure else ("http", "https"))

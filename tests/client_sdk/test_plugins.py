@@ -281,9 +281,9 @@ def test_a_motion_function_that_is_far_off_costs_the_guided_match_only() -> None
 @pytest.mark.parametrize(
     ("returned", "why"),
     [
-        (None, "an array of shape"),
-        (np.eye(3), r"an array of shape \(3, 3\)"),
-        (np.full((4, 4), np.nan), "16 numbers that are not finite"),
+        (None, "poses of shape"),
+        (np.eye(3), r"poses of shape \(3, 3\)"),
+        (np.full((4, 4), np.nan), "poses that are not finite"),
         (2 * np.eye(4), "a matrix that is no pose"),
         ("text", "no numbers"),
     ],
