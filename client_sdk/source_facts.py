@@ -41,6 +41,7 @@ __all__ = [
     "rows_in_time",
     "some_names",
     "stamps_in_seconds",
+    "time_unit_s",
     "unresolved",
 ]
 
@@ -296,7 +297,7 @@ def unresolved(doubts: Iterable[Doubt], accepted: Iterable[str]) -> tuple[Doubt,
     return tuple(doubt for doubt in doubts if doubt.name.value not in accepted_names)
 
 
-def _time_unit_s(stamps: Array) -> tuple[str, float]:
+def time_unit_s(stamps: Array) -> tuple[str, float]:
     """Return the name and the length (s) of the most likely unit of time stamps ``(n,)`` that state no unit.
 
     Time stamps since 1970 show their unit by their size.  All others show it by their median interval: below
@@ -341,7 +342,7 @@ def stamps_in_seconds(
             returned unless that is seconds.
     """
     expected = layout_unit or "seconds"
-    unit, unit_s = _time_unit_s(stamps)
+    unit, unit_s = time_unit_s(stamps)
     if layout_unit is not None:
         unit, unit_s = _unit_since_1970(stamps) or (expected, _TIME_UNITS_S[expected])
     notes = () if unit == expected else (f"the time stamps of {stated_by} are taken as {unit}",)

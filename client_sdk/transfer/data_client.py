@@ -560,9 +560,9 @@ def _digest(file: BinaryIO) -> str:
 
 
 def is_allowed(url: str, *, secure: bool) -> bool:
-    """Return whether a presigned *url* may carry data: without TLS only if *secure* is False.
+    """Return whether a presigned *url* may carry data: ``https:``, and ``http:`` only if *secure* is False.
 
-    *secure* says whether the data service itself is reached by TLS.
+    *secure* says whether the robot reaches the data service itself by TLS.
     """
     parts = urlsplit(url)
     return bool(parts.hostname) and parts.scheme in (("https",) if secure else ("http", "https"))
