@@ -446,8 +446,7 @@ def _check_fields(content: bytes | bytearray, limits: MapLimits) -> None:
 
 
 def _field_budget(name: str, items: int) -> Budget:
-    """Return the limits for decoding the field *name* of a map file, which says that it has *items*
-    elements."""
+    """Return the limits for decoding the field *name* of a map file, which announces *items* elements."""
     if name == "provenance":
         return PROVENANCE
     values = LIST_VALUES + items * _ITEM_VALUES[name] if name in _ITEM_VALUES else _OTHER_FIELD_VALUES

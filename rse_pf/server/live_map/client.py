@@ -32,17 +32,20 @@ from rse_pf.wire.live_map import LiveRequest
 __all__ = ["LiveMapClient"]
 
 _STORE_THREADS = 4
-"""Number of threads in which a worker waits for the object store while it reads leases of live maps."""
+"""Number of threads in which a worker reads leases of live maps: as many leases are read at the same time."""
 _RELEASE_TIMEOUT_S = 5.0
 """Seconds for which a worker that ends waits until its map servers have released their maps."""
 _LISTED_STATES = {"serving": "live", "starting": "moving", "released": "idle", "stopped": "stopped"}
-"""State of a map in the reply of ``live-list``, for each state of its lease."""
+"""State of a map in the reply of ``live-list``, for each state of its lease: ``live`` while a map server
+answers requests, ``moving`` while a map server restores the map, ``idle`` without a map server, ``stopped``
+after ``live-stop``."""
 
 
 class LiveMapClient:
-    """The live maps as one worker, or a command of an operator, uses them.
+    """The live maps as one process uses them: a worker of a server, or ``rse-pf map live``.
 
-    All methods are called in the event loop.
+    A live map exists from its first request that begins it (`can_begin_map`) until ``live-stop``.  All
+    methods are called in the event loop.
     """
 
     def __init__(
@@ -63,7 +66,7 @@ class LiveMapClient:
             server_id: Id of this backend server.
             log: Log of the worker.
             on_update: Called with tenant, map name and payload of each update of a watched map.
-            implementation: Location of the `MapImplementation`, as ``module:name``.
+            implementation: Import path of the `MapImplementation`, as ``module:name``.
         """
         self._store = store
         self._settings = settings
@@ -131,7 +134,7 @@ class LiveMapClient:
         return listed
 
     def watch(self, tenant: str, map_name: str, *, may_start: bool = True) -> None:
-        """Begin the updates of a map; each map server of the map first sends the current state.
+        """Begin the updates of a map.  After each connection to a map server, all its updates are sent first.
 
         A further call for the same map only replaces *may_start*.
 
@@ -154,7 +157,7 @@ class LiveMapClient:
             self._update_spare()
 
     def give_up(self) -> None:
-        """Order the map servers of this worker to release their maps, because the server drains.
+        """Order the map servers of this worker to give their maps up, because the server drains.
 
         No map server is started any more.
         """
@@ -166,7 +169,7 @@ class LiveMapClient:
 
     @property
     def processes(self) -> list[MapServerProcess]:
-        """Map-server processes of this worker that claim or serve a map; the spare is not among them."""
+        """Map-server processes of this worker that claim or serve a map."""
         return self._pool.in_use
 
     async def close(self) -> None:
@@ -202,7 +205,10 @@ class LiveMapClient:
         return connection
 
     def _update_spare(self) -> None:
-        """Keep a spare process while some map may need a map server of this worker; kill it otherwise."""
+        """Let the pool keep a spare process if a map has requests or subscribers that may start a map server.
+
+        Otherwise the spare is killed.
+        """
         is_used = any(connection.may_need_process for connection in self._connections.values())
         self._pool.set_used(is_used=is_used)
 

@@ -1,10 +1,11 @@
 """Authenticate the TLS connection between a worker and the map server of a live map on any backend server.
 
-1. A map server makes a self-signed certificate when it starts and writes its SHA-256 into the lease, which
-   only servers can write.
+Only servers have access to the leases and the key below ``live/`` in the object store.
+
+1. A map server makes a self-signed certificate when it starts and writes its SHA-256 into the lease.
 2. A worker connects with TLS 1.3 and pins that SHA-256.
-3. The worker sends a token that is valid for 30 s, for one tenant, map, epoch and certificate, signed by
-   HMAC-SHA-256 with a key that only servers can read.
+3. The worker sends a token, signed by HMAC-SHA-256 with the key.  The token is valid for 30 s, and for one
+   tenant, map, epoch and certificate, so that it cannot be used at another map server.
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ _TLS_VERSION = ssl.TLSVersion.TLSv1_3
 
 
 class ConnectionClaims(msgspec.Struct, frozen=True, kw_only=True):
-    """State for which connection a token between servers is valid.
+    """The content of a token between servers: for which connection, and until when, it is valid.
 
     Attributes:
         tenant: Tenant of the live map.
@@ -85,7 +86,7 @@ def internal_key(store: ObjectStore) -> bytes:
     if len(key) != _KEY_BYTES:
         raise StoreError(
             f"the key {INTERNAL_KEY!r} has {len(key)} bytes instead of {_KEY_BYTES}",
-            hint="delete this object; a server then makes a new key",
+            hint="delete this object and restart all servers; one of them makes a new key",
         )
     return key
 
@@ -107,7 +108,8 @@ def check_token(
         expected: Claims that the token must have; ``expires_s`` is ignored.
         now_s: Current Unix time in seconds.
         leeway_s: Tolerated difference between the clocks of two servers, in seconds.  A token that expires
-            later than ``TOKEN_S + leeway_s`` from now is refused too.
+            later than ``TOKEN_S + leeway_s`` from now is refused too, because the clock of its sender is
+            wrong.
     """
     signature_bytes = hashlib.sha256().digest_size
     signature, body = token[:signature_bytes], token[signature_bytes:]
@@ -173,7 +175,7 @@ def check_certificate(connection: Any, expected: str) -> None:
     if not hmac.compare_digest(hashlib.sha256(certificate).hexdigest(), expected):
         raise Unauthorized(
             "the map server does not have the certificate that its lease names",
-            hint="let servers reach each other directly, without a proxy that ends TLS",
+            hint="let servers reach each other directly, without a proxy that terminates TLS",
         )
 
 

@@ -31,15 +31,14 @@ __all__ = [
 
 _MAP_NAME = re.compile(r"[a-z0-9][a-z0-9-]{0,63}")
 _RENEWALS_PER_LEASE = 3
-"""Number of renewals of a lease within ``live.lease_s``: two renewals may fail or be late before another
-server takes the map over."""
+"""Number of renewals of a lease within ``live.lease_s``: one renewal may fail, and the next one still comes
+before the lease expires."""
 _FAILED_STARTS_BEFORE_BACKOFF = 2
-"""Value of `LeaseRecord.tries` up to which a dead map server is replaced after ``live.lease_s``; for each
-failure beyond, the wait before another takeover doubles."""
+"""Number of takeovers in a row (`LeaseRecord.tries`) up to which a map server that died is replaced
+``live.lease_s`` after its last renewal; each takeover beyond this number doubles the wait."""
 _MAX_TAKEOVER_WAIT_S = 60.0
-"""Longest wait in seconds (at least ``live.lease_s``) before the takeover of a map whose map servers fail
-again and again: a map that kills its map servers loads no server with restarts, and is retried once a
-minute."""
+"""Longest wait in seconds before the takeover of a map whose map servers fail again and again, unless
+``live.lease_s`` is longer: a map whose data crash its map servers is tried once a minute."""
 
 LeaseState = Literal["starting", "serving", "released", "stopped"]
 LeaseAction = Literal["claim", "connect", "wait"]
@@ -60,10 +59,10 @@ class LeaseRecord(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True)
         port: TCP port at which the map server listens; 0 before it serves.
         certificate: SHA-256 in hex of the map server's TLS certificate, which workers pin.
         beat: Number of renewals by this map server.
-        base: Position in the log at which the map was stopped last; entries up to it do not belong to the
-            map.  0 if the map was never stopped.
-        tries: Number of times in a row that the map was taken over from a dead map server; 0 again when a map
-            server has served for a while or has given the map up.
+        base: Position in the log at which a map of this name was stopped last; a later map of the same name
+            begins with the next entry.  0 if no map of this name was stopped.
+        tries: Number of takeovers in a row from a map server that died; 0 again when a map server has renewed
+            the lease with ``is_settled``, or has given the map up.
     """
 
     state: LeaseState
@@ -170,14 +169,17 @@ class MapLease:
             clock: Returns monotonic time in seconds.
         """
         self.record = LeaseRecord(state="starting", owner=owner, epoch=0, server=server)
-        """The lease record as this process wrote it last, also after another process has replaced it."""
+        """The lease record as this process wrote it last, also after another process has replaced it.
+
+        Before the first claim, a record with epoch 0 that is not in the store.
+        """
         self._lease = Lease(store, name, decode_lease, clock)
 
     @property
     def age_s(self) -> float:
-        """Seconds since the last successful write of the lease began; this process held the lease then.
+        """Seconds since this process began its last successful write of the lease; infinity before the first.
 
-        Infinity before the first one.
+        No other process can have taken the map before that time.
         """
         return self._lease.age_s
 
@@ -190,7 +192,8 @@ class MapLease:
             False if another process changed the lease first.
 
         Raises:
-            StoreError: The store fails, so that the outcome is unknown; call again with the same *known*.
+            StoreError: The store fails, so that the outcome is unknown; call again with the same *known*,
+                which succeeds if this write did.
         """
         before = self._lease.note(known)
         if before is None:
@@ -271,7 +274,7 @@ class MapLease:
             if not self._is_held:
                 return False
             # The stored record has the name of this process, so an earlier write has succeeded although its
-            # reply was lost.  The compare-and-swap is repeated against that record.
+            # reply was lost.  `Lease.write` has read that record: the next round of this loop replaces it.
         self.record = record
         return True
 

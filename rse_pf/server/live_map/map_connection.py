@@ -58,22 +58,23 @@ _READ_BYTES = 1 << 18  # largest number of bytes that one read of a socket retur
 _CONNECT_TIMEOUT_S = 1.0
 """Seconds within which a map server must accept a connection, and then as many to answer the hello."""
 _POLL_S = 0.1
-"""Seconds between two reads of the lease while a map moves to another map server or the store fails, or while
-the map server is silent."""
+"""Seconds between two reads of the lease while the map has no connected map server but needs one, while the
+store fails, or while the connected map server has not renewed its lease for `_PREPARE_SHARE` of it."""
 _RECONNECT_S = 0.02
-"""Seconds after the end of a connection until the lease is read again: a map server that gave the map up is
-releasing the lease then."""
+"""Seconds after the end of a connection until the lease is read again: a map server that gives the map up
+refuses requests first, and releases its lease a moment later."""
 _IDLE_POLL_S = 1.0
 """Seconds between two reads of the lease of a map that has no map server and needs none."""
 _LINGER_S = 10.0
 """Seconds for which a worker keeps its connection to a map server after the last request or subscriber."""
 _PREPARE_SHARE = 0.66
-"""Share of ``live.lease_s`` for which a worker has seen no renewal when it starts a process, so that the
+"""Share of ``live.lease_s`` without a renewal after which a worker starts a spare process, so that the
 process has imported its modules when the lease expires."""
 _BUSY_RETRY_MS = 500.0
 """Milliseconds after which a robot sends a request again that no map server answered in time."""
 _EMPTY_MAP_UPDATE = {"kind": "map", "keyframes": 0, "version": 0, "owner": ""}
-"""Fields of the update ``map``, without its state, that a worker sends before the map server has sent one."""
+"""Fields of the update ``map``, without its state, that subscribers get before the first one of a map server.
+The field ``owner`` is the id of the backend server on which the map server runs."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -85,7 +86,7 @@ class ConnectionContext:
         settings: Section ``live`` of the settings.
         server_id: Id of this backend server.
         log: Log of the worker.
-        call: Runs a blocking function in a thread.
+        call: Runs a blocking function in one of the worker's threads for the object store.
         key: Returns the key that signs tokens between servers; blocks on the store.
         pool: Map-server processes of this worker.
         clock: Returns monotonic time in seconds.
@@ -221,7 +222,10 @@ class MapConnection:
 
     @property
     def may_need_process(self) -> bool:
-        """Whether this object ever had requests, or has subscribers for whom a map server is started."""
+        """Whether the map may soon need a map server of this worker.
+
+        This is so if this object ever had a request, or if a subscriber may start a map server.
+        """
         return self._had_requests or self.may_start
 
     async def close(self) -> None:
@@ -260,11 +264,11 @@ class MapConnection:
             self._refuse_requests_without_map(is_stopped=record is not None)
             if not any(can_begin_map(pending.request) for pending in self._pending.values()):
                 if self._context.settings.warm_standby:
-                    self._prepare_spare()  # subscribers send the first keyframe within seconds
+                    self._prepare_spare()  # a robot that subscribes usually sends its first keyframe soon
                 await self._pause(_IDLE_POLL_S)
                 return
-        # 2. Decide the next step; a map server whose process has certainly exited counts as silent for at
-        # least ``live.lease_s``.
+        # 2. Decide the next step.  If the process of the map server has certainly exited, its lease counts as
+        # expired.
         unchanged_s = self._lease.unchanged_s
         if record is not None and record.epoch == self._dead_epoch:
             unchanged_s = max(lease_s, unchanged_s)
@@ -300,8 +304,8 @@ class MapConnection:
             await spare.wait_ready(_POLL_S)
             return
         process = pool.take(self.tenant, self._on_process_exit, is_watched_only=is_watched_only)
-        # 2. Take a process.  If there is none, subscribers wait until no other map needs one; requests wait
-        # while a process is being freed, and are refused otherwise.
+        # 2. If no process is free, wait.  A map with subscribers only tries again after a second; requests
+        # wait if another map is giving its process up, and are refused otherwise.
         if process is None and is_watched_only:
             self._send_state("idle")
             await self._pause(_IDLE_POLL_S)
@@ -333,7 +337,10 @@ class MapConnection:
             process.kill()
 
     def _on_process_exit(self, process: MapServerProcess, exit_code: int) -> None:
-        """Note that a process that was taken for this map has exited; if it served the map, nobody does."""
+        """Note that a process that was taken for this map has exited.
+
+        If it served the map, the map can be claimed at once, although its lease has not expired.
+        """
         if process.epoch is not None:
             self._dead_epoch = process.epoch
             self._context.log.info("live-owner-ended", map=self.map_name, epoch=process.epoch, code=exit_code)
@@ -538,9 +545,9 @@ class MapConnection:
             )
 
     def _send_state(self, state: str) -> None:
-        """Send the subscribers of this worker the update ``map`` with *state*, unless they received it last.
+        """Send the subscribers of this worker the update ``map`` with *state*, if the state has changed.
 
-        Its other fields are those of the last such update.
+        Its other fields are those of the last update ``map``.
         """
         if self.is_watched and self._newest_map_update.get("state") != state:
             self._newest_map_update = {**(self._newest_map_update or _EMPTY_MAP_UPDATE), "state": state}

@@ -1,14 +1,17 @@
 """Start the map-server processes of one worker, and share them between maps and tenants.
 
 A worker has at most ``live.max_owners`` map servers.  When all are in use and another map gets commands, one
-map gives its process up, the first of these that exists:
+map is given up: its process exits, and a new process serves the map in need.  The map that is given up is of
+the first of these kinds that exists:
 
 1. a map that is only watched, of a tenant that holds at least two processes more than the tenant in need;
-2. a map that is only watched, of the tenant in need or of a tenant that holds more;
-3. a map in use of the tenant that holds most, if that tenant holds at least two more than the tenant in need.
+2. a map that is only watched, of the tenant in need itself, or of a tenant that holds more processes;
+3. a map in use of the tenant that holds most processes, if these are at least two more than those of the
+   tenant in need.
 
-A map counts as only watched if it gets no commands.  Among such maps, the one that was not used for longest
-comes first.  If no map can give its process up, requests to the map in need fail with Busy.
+A map counts as only watched if it gets no commands.  Of several such maps, the one without commands for
+longest is given up; of several maps of the third kind, the one whose process was taken last.  If there is no
+map of these kinds, requests to the map in need fail with Busy.
 
 One started process may wait for its map (the spare), so that a takeover does not wait for imports.
 """
@@ -43,11 +46,11 @@ _SPARE_IMPORT_NICE = 10
 """Additional niceness of a spare process while it imports modules, because nobody waits for it."""
 _READ_BYTES = 1 << 16  # largest number of bytes that one read of a process's socket returns
 _SPARE_DELAY_S = 3.0
-"""Seconds after a process was taken until the next spare is started: the takeover needs the processors."""
+"""Seconds after a process was taken until the next spare is started, so that the imports of the spare do not
+compete for the CPU with the process that restores a map."""
 _RESERVATION_S = 3.0
-"""Seconds for which a process that a map gave up is reserved for the tenant that needed it.  For as long
-after a map with commands got no process, maps that are only watched get none: that map asks again within this
-time."""
+"""Seconds after a map with commands got no process during which the next free process is reserved for the
+tenant of that map, and maps that are only watched get none.  The map asks again within this time."""
 
 
 class ClaimOrder(msgspec.Struct, frozen=True, kw_only=True):
@@ -233,7 +236,7 @@ class MapServerPool:
         self._clock = clock
         self._reserved_for = ""  # tenant for whose map a process was freed
         self._reserved_until_s = float("-inf")
-        self._wanted_until_s = float("-inf")  # until then, a map that gets commands may ask again
+        self._wanted_until_s = float("-inf")  # until then, maps that are only watched get no process
         self._in_use: dict[MapServerProcess, None] = {}
         self._cpu_s_of_exited: defaultdict[str, float] = defaultdict(float)
         self._spare: MapServerProcess | None = None
@@ -281,7 +284,7 @@ class MapServerPool:
         # 1. Give a map that is only watched none while a map that gets commands may ask again.
         if is_watched_only and now < self._wanted_until_s:
             return None
-        # 2. Keep one process back if it is reserved for a tenant that holds fewer than this one.
+        # 2. Leave one process free if it is reserved for a tenant that holds fewer processes than *tenant*.
         is_reserved = (
             now < self._reserved_until_s and in_use_by_tenant[tenant] > in_use_by_tenant[self._reserved_for]
         )
@@ -314,7 +317,10 @@ class MapServerPool:
         return self._spare
 
     def set_used(self, *, is_used: bool) -> None:
-        """Start a spare in 3 s if live maps are used and the pool keeps spares; kill it if they are not."""
+        """Note whether a live map may need a process: start a spare in 3 s, or kill the spare.
+
+        A spare is started only if the pool keeps spares.
+        """
         if is_used:
             self._prepare_spare_later()
         else:
@@ -341,9 +347,8 @@ class MapServerPool:
     def _free_process(self, tenant: str, in_use_by_tenant: Counter[str], now: float) -> None:
         """Order a map server to give its map up, and reserve its process for *tenant*.
 
-        The choice is that of the module's docstring; of the maps in use of the tenant that holds most, the
-        newest is chosen.  Nothing is ordered while the pool drains or another map is being given up; in the
-        second case, a reservation for *tenant* is prolonged.
+        The docstring of this module says which one.  Nothing is ordered while the pool drains or another map
+        is being given up; in the second case, a reservation for *tenant* is prolonged.
 
         Args:
             tenant: Tenant of the map that needs a process.
@@ -369,7 +374,7 @@ class MapServerPool:
             released = min(
                 unused, key=lambda process: (process not in of_larger_tenants, process.unused_since_s)
             )
-        elif of_larger_tenants:  # of the tenant with most processes, the newest is chosen
+        elif of_larger_tenants:
             released = max(reversed(of_larger_tenants), key=lambda process: in_use_by_tenant[process.tenant])
         else:
             return

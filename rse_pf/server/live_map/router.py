@@ -56,13 +56,14 @@ LIVE_SERVICES = frozenset((*LIVE_REQUESTS, LIVE_LIST))
 """Names of all services of live maps."""
 
 _OPERATOR_SERVICES = frozenset((PUBLISH, STOP, FORGET, START))
-"""Services that need the scope ``maps:write``; all others need ``maps:live``."""
+"""Services that need the scope ``maps:write`` of their map.  The others need ``maps:live``; ``live-list``
+lists only the maps for which the token has it."""
 _MAX_WAITING_BYTES = 64 << 20
 """Largest total size in bytes of the messages of one worker that wait for map servers.  Beyond it, commands
 are refused with Busy, and robots keep their keyframes."""
 _MAX_WAITING_BYTES_PER_TENANT = _MAX_WAITING_BYTES // 4
-"""Largest total size in bytes of the messages of one tenant that wait for map servers in one worker: four
-tenants that fill their part do not stop each other."""
+"""Largest total size in bytes of the messages of one tenant that wait for map servers in one worker: a
+quarter of the total, so that one tenant cannot fill it."""
 _BUSY_RETRY_MS = 500.0
 """Milliseconds after which a robot sends a command again that was refused because too many wait."""
 
@@ -71,7 +72,7 @@ class LiveMapRouter(CommandQueue):
     """The live maps as the robots of one worker use them: a queue of commands, and subscriptions."""
 
     judges_scope = True
-    """The scope of a token is checked here, because it contains the name of the map."""
+    """The caller does not check the scope of a command: this class does, since the scope names the map."""
 
     def __init__(
         self,
@@ -113,7 +114,7 @@ class LiveMapRouter(CommandQueue):
         return service in LIVE_SERVICES
 
     def backlog(self, queued: QueuedCommand) -> QueueBacklog:
-        """Return the number of commands to live maps by the robot of *queued* that have no answer yet."""
+        """Return how many commands to live maps of the robot of *queued* have no answer yet."""
         return QueueBacklog(self._waiting_of_robot[queued.robot])
 
     # --- Commands of robots and operators ---
@@ -251,9 +252,9 @@ class LiveMapRouter(CommandQueue):
         checked_claims = connection.claims
 
         def find_error() -> RsePfError | None:
-            """Return an error if the robot has a new token without the right to read the map, else None.
+            """Check a token that the robot has renewed; return an error if it may not read the map.
 
-            If the new token may only watch the map, no map server is started for the subscription any more.
+            If it may only watch the map, from now on no map server is started for this subscription.
             """
             nonlocal checked_claims
             if connection.claims is checked_claims:
@@ -277,10 +278,10 @@ class LiveMapRouter(CommandQueue):
         self._subscriptions.end(connection, identity)
 
     def withdraw(self, owner: Any, command_id: int) -> None:
-        """Do nothing: a command to a live map cannot be cancelled, and is answered by its deadline."""
+        """Do nothing: a command to a live map cannot be cancelled, and expires at its deadline."""
 
     def leave(self, owner: Subscriber) -> list[QueuedCommand]:
-        """End the subscriptions of a closed connection, and return no withdrawn commands.
+        """End the subscriptions of a closed connection, and return an empty list: no command is withdrawn.
 
         Commands of the connection, such as keyframes, are still passed to their map.
         """

@@ -24,16 +24,16 @@ from rse_pf.wire.server_session import ServerSession
 __all__ = ["Subscriptions"]
 
 _MIN_ROUND_INTERVAL_S = 0.01
-"""Shortest time in seconds between two rounds of sending, unless a round could not send everything; updates
-that arrive in between replace older ones of their key."""
+"""Shortest time in seconds between two rounds of sending; updates that arrive in between replace older ones
+of their key.  After a round that could not send all due updates, the next one follows without a pause."""
 _SLOW_RETRY_S = 0.05
 """Seconds after which a subscriber whose socket was full is tried again."""
 _MAX_UNSENT_BYTES = 16_384
 """Bytes that may wait in the socket of a subscriber.  Above this limit no updates are written until the
 subscriber has read some bytes; answers to commands are written in any case."""
 _MAX_SENT_PER_ROUND = 200
-"""Largest number of updates that are sent in one round of the event loop.  Each takes about 20 us, and
-commands of robots wait meanwhile."""
+"""Largest number of updates that are sent in one round.  An update takes about 20 us, and commands of robots
+wait until the round has ended."""
 _MAX_KEYS = 1024
 """Largest number of keys of one map whose newest update is stored; the key whose update is oldest is dropped
 first."""
@@ -74,10 +74,12 @@ class _Subscription:
     id: int
     map: _WatchedMap
     find_error: Callable[[], RsePfError | None]
-    seq: int = 0  # sequence number of the last update that was sent; those that were replaced count too
+    # Sequence number of the last update that was sent.  Replaced updates count too: a gap in the numbers
+    # shows a subscriber how many updates it did not get.
+    seq: int = 0
     unsent: dict[str, int] = field(default_factory=dict)
-    """For each key with an unsent update, the number of updates since the last one that was sent.  The key
-    that has waited longest comes first."""
+    """For each key with an unsent update, the number of updates of this key since the last one that was sent.
+    The key that has waited longest comes first."""
 
 
 class Subscriptions:

@@ -43,8 +43,9 @@ FIRST_RETRY_S = 0.05
 _MAX_RETRY_S = 1.0
 """Longest wait in seconds between two tries of a failing object store: a map goes on soon after an outage."""
 _MATCHING_THREADS = 3
-"""Number of threads that match keyframes: two measure loop closures and one may relocalise a robot.  Matching
-and solving release Python's interpreter lock (GIL), so these threads run in parallel."""
+"""Number of threads that match keyframes: one more than the measurements of loop closures that run at the
+same time, so that a robot can be relocalised meanwhile.  Matching and solving release Python's interpreter
+lock (GIL), so these threads run in parallel."""
 _BACKGROUND_NICE = 10
 """Niceness of the thread that writes snapshots and versions, because nobody waits for them.  The threads that
 measure loop closures keep the normal priority, because robots wait for the corrections."""
@@ -59,11 +60,11 @@ _T = TypeVar("_T")
 class Urgency(enum.IntEnum):
     """Priority of work in the thread that holds the map; work with a smaller value is done first."""
 
-    APPLY = 0  # events of durable log entries are applied to the map
-    VALIDATE = 1  # keyframes are validated before they are logged
-    ANSWER = 2  # requests that only read the map are answered
-    MEASURE = 3  # candidates for loop closures of a keyframe are chosen
-    BACKGROUND = 4  # versions and the optimisation of the whole graph are prepared
+    APPLY = 0  # apply the events of a durable log entry
+    VALIDATE = 1  # validate a keyframe before it is logged
+    ANSWER = 2  # answer a request that only reads the map
+    MEASURE = 3  # choose candidates for the loop closures of a keyframe
+    BACKGROUND = 4  # prepare a version, or the optimisation of the whole graph
 
 
 class MapServerThreads:
@@ -178,12 +179,13 @@ class MapServerEnvironment:
         clock: Returns monotonic time in seconds.
         wall_clock: Returns Unix time in seconds.
         sleep: Waits for a number of seconds.
-        account: Storage account of the tenant; charged before the map server writes.
+        account: Storage account of the tenant; charged before a log entry or a version is written.
         objects: Points and images that robots store together with their keyframes.
         log: Log of the server.
         send_update: Sends an update payload to every worker that has subscribers of the map.
-        on_renewal: Called with the number of each successful renewal of the lease.
-        on_use: Called with True when commands begin to arrive, and with False after a time without any.
+        on_renewal: Called after each successful renewal of the lease, with the number of renewals so far.
+        on_use: Called with True when commands begin to arrive, and with False when none has arrived for a
+            sixth of ``live.idle_s``.
         optimise: Optimises the whole pose graph of the map; called in a thread for matching.
     """
 

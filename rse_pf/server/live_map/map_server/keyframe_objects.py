@@ -30,15 +30,17 @@ _MAX_SOURCES = 4_000
 publication."""
 _MAX_POINTS = 3_000_000
 """Largest number of points of a cloud before it is thinned to one for each voxel: they take about 400 MB of
-the map server's memory.  With many keyframes, fewer points of each keyframe are used."""
+the map server's memory.  Each of n keyframes may contribute a part of 1/n of them; of a keyframe with more
+points, every second, third, ... point is used."""
 _MAX_CACHED_BYTES = 128 << 20
-"""Memory in bytes for encoded points of keyframes that are kept for the cloud of the next version, so that
-they need not be read from the object store again."""
+"""Largest total size in bytes of the encoded points that stay in memory after a cloud was built, so that they
+need not be read from the object store again for the next version."""
 _MAX_DISTANCE_M = 100.0
-"""Points are left out if the absolute value of a coordinate in the camera frame is above this distance in
-metres: a camera that reports such points has no metric depth."""
+"""Largest absolute value in metres of a coordinate of a point in the camera frame; points beyond it are left
+out, since depth cameras and stereo pairs do not measure so far."""
 _DELETIONS = 2
-"""How often the objects of a forgotten robot are deleted: an upload may arrive after the first deletion."""
+"""Number of times that each object of a forgotten robot is deleted: its upload may end after the first
+time."""
 _CULLED_OBJECTS_DELAYED = 64
 """Number of objects of recently culled keyframes that are not deleted yet: their uploads may still arrive."""
 
@@ -123,9 +125,9 @@ class KeyframeObjects:
                 self._account.release(size_bytes)
 
     def delete_of_forgotten(self, objects: Iterable[tuple[str, str]]) -> None:
-        """Delete the objects of forgotten robots; a third and later call with the same object ignores it.
+        """Delete the objects of forgotten robots, except those that two earlier calls have deleted.
 
-        The second deletion removes an object whose upload arrived after the first one.
+        The second deletion removes an object whose upload ended after the first one.
 
         Raises:
             StoreError: The store fails; the next call deletes the remaining objects.

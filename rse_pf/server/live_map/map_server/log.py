@@ -5,10 +5,11 @@ Object names below ``live/TENANT/MAP/``:
 - ``log/NUMBER``: an entry with one or more events, numbered from 1 without gaps.  It is created by
   compare-and-swap and never changed, so two map servers cannot write the same number: the one that finds its
   number taken has lost the map.
-- ``snapshot/NUMBER``: the state of the map after that entry.  The two newest are kept; entries before the
-  older one are deleted.
-- ``features/EPOCH-SHA256``: parts of snapshots.  Snapshots share unchanged parts.  A map server deletes no
-  part of a later epoch, because the snapshot that uses the part may not be written yet.
+- ``snapshot/NUMBER``: the state of the map after that entry.  The two newest are kept; entries up to the
+  number of the older one are deleted.
+- ``features/EPOCH-SHA256``: parts of snapshots, with the epoch of the map server that wrote them.  Snapshots
+  share unchanged parts.  A map server deletes no part of a later epoch: it may have lost the map without
+  knowing, and its successor may not have written the snapshot yet that uses the part.
 
 `LogWriter` collects events that arrive during a write into the next entry (group commit).
 """
@@ -46,24 +47,25 @@ __all__ = [
 ]
 
 _MIN_ENTRIES_BETWEEN_SNAPSHOTS = 40
-"""Fewest log entries between two snapshots, as of a small map; a restart applies them again in less than
-0.2 s."""
+"""Number of log entries between two snapshots of a small map, the smallest such number; a restart applies
+them again in less than 0.2 s."""
 _MAX_ENTRIES_BETWEEN_SNAPSHOTS = 200
-"""Most log entries between two snapshots, as of a large map; a restart applies them again in less than
-0.8 s."""
+"""Number of log entries between two snapshots of a large map, the largest such number; a restart applies them
+again in less than 0.8 s."""
 _ENTRIES_PER_KEYFRAME = 0.25
 """Log entries between two snapshots for each keyframe in the map, within the two limits above: a snapshot of
 a larger map costs more, so snapshots are written less often."""
 _SNAPSHOTS_KEPT = 2
 """Number of snapshots of a map that are kept: if the newest is damaged, a restart uses the one before."""
 _MAX_ENTRY_EVENTS = 64
-"""Largest number of events in one log entry; it bounds the time for which an entry occupies the map."""
+"""Largest number of events in one log entry; it bounds the time for which the thread of the map applies
+it."""
 _MAX_ENTRY_BYTES = 4 << 20
 """Largest total size in bytes of the keyframes that share one log entry; it bounds the time of a write.  A
 larger keyframe has an entry of its own."""
 _MAX_QUEUED_EVENTS = 1024
-"""Number of events that may wait for the object store; beyond it, keyframes are refused with Busy, and other
-events still wait."""
+"""Number of waiting events from which on keyframes are refused with Busy while the object store is slow;
+other events are small and few, and are queued in any case."""
 SLOW_STORE_S = 1.0
 """Seconds after which a write to the object store counts as slow, and subscribers are sent the state "waiting
 for the store"."""
@@ -107,7 +109,8 @@ class MapSnapshot:
 
     Attributes:
         position: Number of the entry.
-        unmeasured: Ids of keyframes in the map whose loop closures have not been logged yet.
+        unmeasured: Ids of keyframes in the map without an event `LoopClosuresMeasured` in the log.  A
+            keyframe that was measured without finding a loop closure has such an event.
         head: Encoded state of the map without the parts.
         parts: Content of the parts that *head* needs, by name; None for a part that is stored already.
     """
@@ -158,12 +161,12 @@ class LiveLog:
             owner: Name of the process that writes entries.
             epoch: Epoch of the lease under which entries are written.
             base: Position at which the map was stopped last; entries up to it do not belong to the map.
-            keeps_all: Whether entries before the older snapshot are kept (``live.keep_log``).
+            keeps_all: Whether no entry is deleted when a snapshot is written (``live.keep_log``).
         """
         self.position = base
         """Number of the entry that was read or written last."""
         self.stored_parts: dict[str, str] = {}
-        """For each part of the newest snapshot that was read or written, the name of its object below
+        """The parts of the snapshot that this object read or wrote last: names of their objects below
         ``features/``, keyed by the name of the part."""
         self._store = store
         self._entry_prefix = f"{folder}log/"
@@ -218,7 +221,7 @@ class LiveLog:
             if number != self.position + 1:
                 raise StoreError(
                     f"entry {self.position + 1} of the log is missing, but {number} is there",
-                    hint="restore the store from a backup, or stop the live map",
+                    hint="restore the store from a backup, or stop the live map: rse-pf map live stop",
                 )
             entry = self._read_entry(stored_object.name)
             self.position = number
@@ -357,7 +360,7 @@ class SubmittedEvent:
 
     Attributes:
         event: The event.
-        size_bytes: Size of the keyframe in the event; 0 for short events.
+        size_bytes: Size of the keyframe in the event; 0 for an event without a keyframe.
         applied: Gets the outcomes of the event when it is durable and applied to the map, or the error with
             which it is refused.
     """
@@ -390,7 +393,7 @@ class LogWriter:
             apply_entry: Called with the number and the events of each entry when it is durable; applies the
                 events to the map and completes each ``applied``.
             on_waiting: Called during and after each try to write an entry: with True if the try takes longer
-                than 1 s, or if it failed and was not the first one, else with False.
+                than 1 s, or if the second or a later try for the same entry has failed, else with False.
             on_lost: Called with a reason when another process has taken the map over.
         """
         self._log = log
@@ -475,7 +478,8 @@ class LogWriter:
         """Write *batch* as the next entry, retry while the store fails, and return the entry's number.
 
         Every try writes the same bytes, because the entry of a failed try may be stored.  If another process
-        has written an entry with this number, the loss of the map is reported, and this method never returns.
+        has written an entry with this number, ``on_lost`` is called, and this method waits until it is
+        cancelled.
 
         Raises:
             StoreFull: There is no space for the keyframes of *batch*, and the entry was not stored.

@@ -48,20 +48,20 @@ from rse_pf.wire.live_map import STOP
 __all__ = ["MapMoving", "MapServer", "ServiceEnd"]
 
 PUBLISH_INTERVAL_S = 600.0
-"""Seconds between two requests of a map server to its `Publisher` for a version of the map with the note
-`NOTE_CHANGED`; a map that has not changed gets none."""
+"""Interval in seconds at which a map server publishes the map if it has changed."""
 _SETTLED_S = 5.0
 """Seconds after its start at which a map server counts as stable, so that earlier failures no longer delay a
-takeover.  A map server that has measured keyframes and has none left to measure counts as stable at once."""
+takeover.  A map server that has measured all keyframes counts as stable at once: no keyframe that waited for
+its measurement crashes the process."""
 _MAX_FINAL_PUBLICATION_S = 3.0
 """Seconds for which the release of a map waits for the publication of its last version; if that takes longer,
 the next map server publishes the version."""
 _UNUSED_SHARE = 1.0 / 6.0
-"""A map without any command for this share of ``live.idle_s`` counts as watched only, and not used: its
-process may be taken for another map."""
+"""Share of ``live.idle_s`` without a command after which a map counts as not used, whether or not it has
+subscribers: its process may then be taken for another map."""
 _WAITING_FOR_STORE = "waiting for the store"  # state of the map that subscribers are sent
 _ALIGNMENT_OUTCOMES = (Joined, Corrected, Unaligned, Ambiguous, LoopClosureRejected)
-"""Classes of outcomes after which the alignments of robots are compared with those that were sent last."""
+"""Classes of outcomes that can change an alignment, or the reason why a robot has none."""
 
 ServiceEnd = Literal["lost", "released", "stopped", "defect"]
 """Why a map server stopped serving: another process took the map, it was given up, an operator ended it, or
@@ -96,8 +96,8 @@ class MapServer:
             lease: Lease of the map, which this process has claimed.
         """
         self.users = 0
-        """Number of connected workers, which `WorkerConnections` maintains; after ``live.idle_s``
-        without one, the map is given up."""
+        """Number of workers that are connected to this map server, which `WorkerConnections` maintains; after
+        ``live.idle_s`` without a connected worker, the map is given up."""
         self._environment = environment
         self._state = state
         self._log = log
@@ -172,8 +172,9 @@ class MapServer:
     async def answer(self, robot: RobotId, operation: str, request: bytes) -> dict[str, Any]:
         """Do what a robot or an operator requests, and return the reply.
 
-        While the lease is too old, the finished reply is held back until the lease is renewed or lost.  Only
-        the reply of ``live-stop``, which gives the lease up, is not held back.
+        While the last successful renewal of the lease began ``live.lease_s`` ago or earlier, the reply is
+        held back until the lease is renewed or lost.  Only the reply of ``live-stop``, which gives the lease
+        up, is not held back.
 
         Args:
             robot: Robot that asks.
@@ -202,7 +203,8 @@ class MapServer:
         """Give the map up, so that any server may take it.
 
         Submitted events are written and applied, a snapshot is written, a requested version is published if
-        that takes at most 3 s, and the lease is released, which is tried until the store works.
+        that takes at most 3 s, and the lease is released; that is tried until it succeeds or the lease is
+        lost.
         """
         await self._close(self._lease.release, "released")
 
@@ -230,9 +232,9 @@ class MapServer:
     def _apply_events(
         self, position: int, events: list[Event]
     ) -> tuple[AppliedEntry, list[dict[str, Any]], list[tuple[str, str]]]:
-        """Apply the events of an entry, and log the alignments that were made or lost.
+        """Apply the events of an entry; called in the thread of the map.
 
-        Called in the thread of the map.
+        Alignments that were made or lost are written to the server's log.
 
         Returns:
             The effects, the updates that changed and must be sent, and the objects of culled keyframes as
@@ -313,9 +315,10 @@ class MapServer:
     async def charge(self, size_bytes: int) -> None:
         """Charge the tenant's quota with *size_bytes* that are written to the log next.
 
-        A snapshot stores the features of keyframes a second time before the log is shortened, so the bytes
-        that were logged since the last snapshot must be free as well.  If the store fails in
-        another way than by StoreFull, nothing is charged: the entry waits for the store and is counted later.
+        The bytes that were logged since the last snapshot must be free in the quota as well, without being
+        charged: the next snapshot stores their features a second time before log entries are deleted.  If the
+        store fails in another way than by StoreFull, nothing is charged: the entry waits for the store, and
+        `rse_pf.accounts` counts it later.
 
         Raises:
             QuotaExceeded: The tenant would store more than its quota.
@@ -336,7 +339,7 @@ class MapServer:
         self._bytes_since_snapshot += size_bytes
 
     async def _write_snapshot(self) -> None:
-        """Write a snapshot; if the store fails, log that: a restart reads more entries until the next one."""
+        """Write a snapshot; if the store fails, only warn, since a restart can read the log instead."""
         threads = self._environment.threads
         saved_bytes = self._bytes_since_snapshot
         snapshot = await threads.compute(
@@ -434,7 +437,7 @@ class MapServer:
         return not self._ended.done() and self._lease.age_s < self._environment.settings.lease_s
 
     async def _close(self, give_up: Callable[[], bool], end: ServiceEnd) -> None:
-        """Write what waits, change the lease by *give_up*, and end the service with *end*.
+        """Write all submitted events, change the lease by *give_up*, and end the service with *end*.
 
         The service ends with "lost" if *give_up* returns False, because another process has the lease.  While
         the map is already being given up, a further call only waits for the end.
@@ -473,7 +476,8 @@ class MapServer:
         map goes on, and the error is raised.
         """
         background, record = self._environment.threads.background, None
-        # 1. Publish the map as a version; the bytes of its log, which is deleted afterwards, count as free.
+        # 1. Publish the map as a version.  The log is deleted afterwards, so its bytes need not be free in
+        # the quota a second time.
         if self._state.keyframes:
             freed_bytes = await background(self._log.charged_bytes)
             record = await self._publisher.publish("the live map was stopped", freed_bytes)
@@ -512,7 +516,9 @@ class MapServer:
             server=self._lease.record.server,
             state=service_state,
         ):
-            if service_state == _WAITING_FOR_STORE:  # nobody can take the lease while the store fails
+            # This state is sent also with a lease that is too old: while the store fails, no other process
+            # can take the lease and contradict it.
+            if service_state == _WAITING_FOR_STORE:
                 self._environment.send_update(payload)
             else:
                 self._send_update(payload)

@@ -37,8 +37,8 @@ __all__ = [
 ]
 
 _CONCURRENT_MEASUREMENTS = 2
-"""Largest number of keyframes that are measured at the same time.  If no further keyframe waits, the
-candidates of a keyframe are divided into this number of parts, which are measured in parallel."""
+"""Number of parallel measurements: of that many keyframes, or, if no further keyframe waits, of that many
+parts of the candidates of one keyframe."""
 _SHORT_QUEUE = 4
 """With at most this number of waiting keyframes, each keyframe is compared with all candidates that the map
 chooses."""
@@ -66,7 +66,7 @@ def choose_candidate_count(waiting: int) -> int | None:
 
 
 class KeyframeMeasurer:
-    """Measures the loop closures of keyframes, and optimises the whole graph on request when none waits.
+    """Measures the loop closures of keyframes, and optimises the graph on request while no keyframe waits.
 
     Measurements begin in the order of the keyframes; the results are submitted to the log as events.
 
@@ -98,7 +98,10 @@ class KeyframeMeasurer:
 
     @property
     def is_proven(self) -> bool:
-        """Whether this process has measured a keyframe and none is left, so that none of them kills it."""
+        """Whether this process has measured a keyframe, and all keyframes of the map are measured.
+
+        No keyframe that the previous map server left unmeasured then crashes this process.
+        """
         return self._has_measured and not self._state.unmeasured
 
     def add_keyframes(self, keyframes: Iterable[int]) -> None:
@@ -107,7 +110,7 @@ class KeyframeMeasurer:
         self._has_work.set()
 
     def request_optimisation(self) -> None:
-        """Optimise the whole pose graph as soon as no keyframe waits; requests until then count once."""
+        """Optimise the whole pose graph once as soon as no keyframe waits, however often this is called."""
         self._needs_optimisation = True
         self._has_work.set()
 

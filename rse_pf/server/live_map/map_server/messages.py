@@ -26,11 +26,13 @@ __all__ = ["MapUpdates", "decode_request", "paths_reply", "relocalise_reply", "s
 
 Payload = dict[str, Any]
 _MAX_PATH_POINTS = 4_000
-"""Number of keyframe positions to which the reply of ``live-show`` is thinned, about 100 kB of JSON of the
-256 KiB that a message may have; the first and the last position of each segment are sent in any case."""
+"""Number of keyframe positions to which the reply of ``live-show`` is thinned; the first and the last
+position of each segment are sent in any case.  4,000 positions are about 100 kB of JSON, and a message may
+have 256 KiB."""
 _UPPER_TRIANGLE = np.triu_indices(6)  # row and column indices of the upper triangle of a 6 x 6 covariance
 _FIELDS_NOT_COMPARED = ("cause", "version")
-"""Fields of an alignment or pose update in which a change alone is not sent to robots."""
+"""Fields of alignment and pose updates that are not compared: an update that differs from the last one in
+these fields only is not sent."""
 
 
 def decode_request(operation: str, data: bytes) -> LiveRequest:
@@ -124,7 +126,7 @@ def show_reply(
 
 
 def paths_reply(state: MapState, name_of: Callable[[str], str]) -> list[Payload]:
-    """Return the trajectories of all aligned segments: robot, segment, and positions (m, in the map frame).
+    """Return robot, segment and positions (metres, map frame) of the keyframes of all aligned segments.
 
     Of more than 4,000 keyframes, about 4,000 are chosen evenly, and the first and the last of each segment in
     any case.  Positions are rounded to 1 mm.  *name_of* returns the displayed name of a robot, given its
@@ -165,8 +167,9 @@ class MapUpdates:
         """Replace the alignments of all robots, and return the updates of those that changed.
 
         Args:
-            alignments: Where the newest segment of each robot lies in the map.  Updates of robots that are
-                not among them are removed, and nothing is sent for them.
+            alignments: The alignment of the newest segment of each robot, also of segments that are not
+                aligned.  Updates of robots without an alignment in the list are removed, and nothing is sent
+                for them.
             outcomes: Outcomes of the last entry; those of the class `Corrected` name the keyframe that caused
                 a correction.
             version: Position of the map in its log.
@@ -219,7 +222,7 @@ class MapUpdates:
         )
 
     def has_segment(self, event: KeyframeAdded) -> bool:
-        """Return whether the alignment that was set last for a keyframe's robot is that of its segment."""
+        """Return whether the alignment of the keyframe's robot belongs to the segment of the keyframe."""
         alignment = self._alignments.get(event.robot)
         return alignment is not None and alignment.segment == event.segment
 

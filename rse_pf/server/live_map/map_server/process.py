@@ -8,7 +8,8 @@ The process talks with its worker over a socket (`rse_pf.ipc`):
 3. The worker sends a `ClaimOrder`.
 4. The process claims the lease, restores the map, and sends ``serving``; or ``lost`` if another process was
    first, and exits.
-5. While it serves, it sends ``used`` when commands begin or cease to arrive.
+5. While it serves, it sends ``used`` with true when commands begin to arrive, and with false when none has
+   arrived for a while.
 6. When the worker sends ``release``, the process gives the map up and exits.  If the worker exits, Linux
    kills the process.
 """
@@ -72,11 +73,12 @@ _SWITCH_INTERVAL_S = 0.0005
 """Seconds after which a running thread passes the interpreter lock (GIL) to a waiting one.  Python's default
 of 5 ms would delay each step of a keyframe while other threads compute."""
 _MAX_VERSION_OBJECTS = 4
-"""The limit of the size of a map's version is ``data.max_object_bytes`` times this number."""
+"""Largest size of a decompressed version of a map, in units of ``data.max_object_bytes``."""
 _PROBE_ADDRESS_IPV4 = ("192.0.2.1", 9)
+"""Address reserved for documentation (RFC 5737) and a port.  Nothing is sent there; the operating system's
+route to it tells the address of this machine's main network interface."""
 _PROBE_ADDRESS_IPV6 = ("2001:db8::1", 9)
-"""Addresses reserved for documentation (RFC 5737, RFC 3849).  Nothing is sent to them; the operating system's
-route to them tells the address of this machine's main network interface."""
+"""The same for IPv6 (RFC 3849)."""
 _T = TypeVar("_T")
 
 
@@ -225,7 +227,7 @@ class _MapServerProcess:
             await asyncio.sleep(renewal_s(lease_s))
 
     async def _take_over(self) -> tuple[MapState, LiveLog]:
-        """Restore the map from its log, and write the log entry that excludes the previous map server.
+        """Restore the map from its log, and write a log entry, after which its predecessor can write none.
 
         This is tried again as long as the store fails, or an entry of the log is missing or damaged.
 

@@ -2,8 +2,9 @@
 
 Two versions are at least ``live.publish_pause_s`` apart, except for one that is published when the map is
 given up.  A new map server reads the time of the last version from the registry, so the interval also holds
-across a change of the map server.  It does not know whether the one before published the newest state; it
-publishes once, and the registry keeps equal versions only once.
+across a change of the map server.  A new map server does not know whether its predecessor published the
+newest state: the first time that a version is due, it publishes also an unchanged map, and the registry keeps
+equal versions only once.  The head of a map in the registry is its current version.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ __all__ = ["NOTE_ALL_LEFT", "NOTE_CHANGED", "NOTE_UNUSED", "Publisher", "read_st
 NOTE_ALL_LEFT = "the last robot left"
 """Note of a version that is published because all robots have left the live map."""
 NOTE_CHANGED = "live map"
-"""Note of a version that the map server requests every 10 minutes while it serves a map that changes."""
+"""Note of a version that is published because the map has changed since the version 10 minutes before."""
 NOTE_UNUSED = "nobody used the live map"
 """Note of a version that is published because the live map is not used and is given up."""
 _AUTOMATIC_NOTES = (NOTE_ALL_LEFT, NOTE_CHANGED, NOTE_UNUSED)
@@ -57,8 +58,8 @@ _FIRST_RETRY_S = 5.0
 """Seconds after which a failed automatic publication is tried again for the first time; the wait doubles each
 time."""
 _MAX_RETRY_S = 600.0
-"""Longest wait in seconds before a failed automatic publication is tried again: encoding a large map takes
-seconds."""
+"""Longest wait in seconds before a failed automatic publication is tried again: each try of a large map takes
+seconds of CPU time, and an operator may need minutes to free space."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -282,8 +283,8 @@ class Publisher:
         """Remove the oldest automatic versions, at most ten, and return their number; blocks on the store.
 
         The newest ``live.keep_versions`` of them stay (0: all), as far as they fit into a quarter of the
-        tenant's quota.  The newest one, the head of the map, and versions that share their bytes with one
-        that stays are not removed.
+        tenant's quota.  The newest one and the head of the map stay in any case, and so do versions that have
+        the same bytes as a version that stays.
 
         Raises:
             Busy, StoreError: The removal is not complete; the next publication goes on.

@@ -82,7 +82,8 @@ class RequestHandler:
         self._robot_names: dict[str, str] = {}  # displayed names, keyed by RobotId.folder
         # Keyframes that are being added, keyed by RobotId.folder and keyframe number.
         self._additions: dict[tuple[str, int], asyncio.Task[None]] = {}
-        self._present_robots: set[str] = set()  # folders of robots that sent keyframes and have not left
+        # Folders of robots that have sent keyframes to this process and have not left since then.
+        self._present_robots: set[str] = set()
 
     def name_of(self, folder: str) -> str:
         """Return the name that is displayed for the robot with the `RobotId.folder` *folder*."""
@@ -179,7 +180,7 @@ class RequestHandler:
         return relocalise_reply(await threads.match(relocalise), position)
 
     async def _leave(self, robot: RobotId) -> dict[str, Any]:
-        """Log that a robot has left, if it had not; when no robot is present any more, publish the map.
+        """Submit the event `RobotLeft` if the map has the robot; publish the map if no robot is present.
 
         The reply does not wait for the publication.
         """
@@ -229,7 +230,8 @@ class RequestHandler:
     async def _start_map(self, request: LiveStart) -> dict[str, Any]:
         """Begin an empty map, or a map with the keyframes of a version; raises Conflict if it has begun.
 
-        An empty map without ``equal_rooms_m`` is not written to the log, and may be begun again.
+        An empty map without ``equal_rooms_m`` has no event in the log: the request then changes nothing, and
+        may be sent again.
         """
         map_name, background = self._environment.map_name, self._environment.threads.background
         if self._state.changes or self._state.keyframes:

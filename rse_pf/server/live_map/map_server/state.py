@@ -1,6 +1,6 @@
 """Hold a live map in its map server: restored from the log, and changed only by durable entries of the log.
 
-All processes that read the same log hold the same map to the byte; `MapState.digest` proves it.
+All processes that read the same log hold the same map to the byte, and `MapState.digest` is then equal.
 """
 
 from __future__ import annotations
@@ -81,7 +81,8 @@ class MapState:
         """Apply the events of the durable log entry *position* to the map, in their order.
 
         If the map raises an exception for an event (a defect of the program), the exception is returned, and
-        the next event is applied; every replay does the same.  MemoryError is raised, and ends the process.
+        the next event is applied.  What the failed event has changed until then stays, and is the same in
+        every replay.  MemoryError is raised, and ends the process.
         """
         outcomes: list[list[Outcome]] = []
         defects: list[Exception | None] = []
@@ -165,7 +166,7 @@ class MapState:
 def _call_guarded(act: Callable[[], _T], *, on_defect: _T) -> _T:
     """Return the result of *act*, or *on_defect* if it raises anything but MemoryError.
 
-    A defect must not end the map server; the exception is not logged.
+    A defect must not end the map server.
     """
     try:
         return act()

@@ -2,7 +2,7 @@
 
 A message is a MessagePack list with its length in front (`rse_pf.ipc`):
 
-1. The worker sends ``hello`` with a token within a few seconds, else its connection is closed.
+1. The worker sends ``hello`` with a token within `FIRST_REQUEST_S` seconds, else its connection is closed.
 2. The map server answers ``welcome``, or ``refused`` and closes the connection.
 3. The worker sends any number of ``request``, ``watch`` (send updates) and ``unwatch``.
 4. The map server replies to each request with ``answer``, ``refused`` or ``again`` (the map moves), in any
@@ -69,7 +69,7 @@ class WorkerConnections:
 
         Args:
             map_server: Answers the requests.
-            check_token: Raises Unauthorized for a token that is not valid for this map server now.
+            check_token: Raises Unauthorized unless a token is valid for a connection to this map server now.
             on_defect: Called with each unexpected exception.
         """
         self._map_server = map_server
@@ -187,7 +187,7 @@ class _WorkerConnection:
         self._has_unsent.set()
 
     async def flush(self) -> None:
-        """Wait until all queued messages and updates are written to the socket; one must have been queued."""
+        """Wait until the messages and updates that were queued before this call are written to the socket."""
         await self._is_flushed.wait()
 
     async def finish(self) -> None:
