@@ -264,7 +264,7 @@ def are_scales_consistent(difference2: Array, variance: Array) -> npt.NDArray[np
 def _are_twists_noise(xi: Array, variance_m2: Array, variance_rad2: Array) -> npt.NDArray[np.bool_]:
     """Return ``(m,)``: whether translation and rotation of each twist ``(m, 6)`` are noise, each at 99 %.
 
-    *variance_m2* and *variance_rad2* are the variances ``(m,)`` of one axis of both.
+    *variance_m2* and *variance_rad2* ``(m,)`` are the variances of translation and rotation for each axis.
     """
     fits: npt.NDArray[np.bool_] = ((xi[:, :3] ** 2).sum(axis=1) <= CHI2_99_PERCENT_3 * variance_m2) & (
         (xi[:, 3:] ** 2).sum(axis=1) <= CHI2_99_PERCENT_3 * variance_rad2

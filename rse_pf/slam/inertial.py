@@ -227,7 +227,9 @@ def _decode_motion(numbers: Array) -> InertialMotion:
         or np.abs(biases).max() > _MAX_BIAS
     ):
         raise _bad_block(
-            "a rotation, velocity, position or bias of its motion is larger than that of any robot"
+            f"its motion has a rotation above {_MAX_ROTATION_RAD:g} rad, a velocity above "
+            f"{_MAX_VELOCITY_M_S:g} m/s, a displacement above {_MAX_POSITION_M:g} m, or a bias above "
+            f"{_MAX_BIAS:g} rad/s or m/s^2"
         )
     covariance = np.zeros((9, 9))
     covariance[_TRIANGLE] = numbers[16:]

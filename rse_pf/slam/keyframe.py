@@ -714,7 +714,8 @@ def _decode_depths(
     f_baseline: float = _SCALE_STRUCT.unpack_from(data, scale_begin)[0]
     if not _MIN_F_BASELINE <= f_baseline <= _MAX_F_BASELINE:
         raise _bad_keyframe(
-            f"its focal length times baseline {f_baseline:g} is that of no stereo pair",
+            f"its focal length times baseline, {f_baseline:g} px m, is not within "
+            f"{_MIN_F_BASELINE:g}..{_MAX_F_BASELINE:g} px m",
             "send pixels times metres",
         )
     min_step, max_step = int(steps.min(initial=_MAX_STEPS)), int(steps.max(initial=1))

@@ -233,7 +233,7 @@ def measure_relative_pose(
         reason why PnP calls the pose weak, unless ``weak_variance`` accepts weak poses.
 
     Raises:
-        BadRequest: The descriptors of both are of different kinds.
+        BadRequest: The descriptors to be matched are of different kinds.
         MissingExtra: They are ORB descriptors, and the native core is not installed.
     """
     measured = measure_pose(landmarks, view, options)
@@ -337,7 +337,7 @@ def measure_pose(
         The pose, or the reason why there is none: "no-matches" or "no-pose".
 
     Raises:
-        BadRequest: The descriptors of both are of different kinds.
+        BadRequest: The descriptors to be matched are of different kinds.
         MissingExtra: They are ORB descriptors, and the native core is not installed.
     """
     # 1. Match the landmarks with the features of the view.
@@ -370,7 +370,7 @@ def match_landmarks(
         rounded to 0.1 mm, 0.01 px and 1 mm.  *k* is at most ``max_matches``, and may be 0.
 
     Raises:
-        BadRequest: The descriptors of both are of different kinds.
+        BadRequest: The descriptors to be matched are of different kinds.
         MissingExtra: They are ORB descriptors, and the native core is not installed.
     """
     landmark_rows, view_rows = best_matches(landmarks.descriptors, view.descriptors, options.ratio)
@@ -393,7 +393,7 @@ def match_descriptors(
     The matches are sorted by their row of *second*.
 
     Raises:
-        BadRequest: The descriptors of both are of different kinds.
+        BadRequest: The descriptors to be matched are of different kinds.
         MissingExtra: They are ORB descriptors, and the native core is not installed.
     """
     first_rows, second_rows = best_matches(first, second, options.ratio)

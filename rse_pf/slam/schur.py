@@ -53,7 +53,7 @@ class NormalEquations:
         # 1. Factor the damped blocks of the landmarks: inverse(block) = root^T root.
         damped = self.H_landmarks * (1.0 + damping * np.eye(3)) + landmark_prior * np.eye(3)
         root: Array = np.linalg.inv(np.linalg.cholesky(damped)).astype(np.float64, copy=False)
-        # 2. Subtract E^T inverse(block) E from H, and the same of the gradients.
+        # 2. Subtract E^T inverse(block) E from H, and E^T inverse(block) g_landmarks from g.
         Z = (root @ self.E).reshape(3 * len(self.E), c)
         S = self.H - Z.T @ Z
         right = (root @ self.g_landmarks[:, :, None]).ravel() @ Z - self.g

@@ -67,7 +67,7 @@ _TIME_BLOCKS = 6  # number of consecutive parts of a drive; errors within a part
 _IMAGE_CELLS = 6
 """Number of columns, and of rows, of regions into which images are divided; errors within a region count as
 correlated."""
-_MAD_TO_SIGMA = 1.4826  # standard deviation of normal noise over its median absolute deviation
+_MAD_TO_SIGMA = 1.4826  # quotient of standard deviation and median absolute deviation of normal noise
 _MIN_PIXEL_FACTOR = 0.05  # smallest ratio of the noise of pixels to their stated deviations
 _MIN_DEPTH_FACTOR = 0.1  # smallest ratio of the noise of depths to their stated deviations
 _MIN_DEPTHS = 20  # number of depths of a drive above which their noise is estimated from residuals
@@ -84,9 +84,12 @@ of the focal length of a keyframe and the common one.  The information holds the
 ``fy`` already describe the common focal length."""
 _NOISE_SAMPLES = 8  # random perturbations of a drive from which the uncertainty of its path is computed
 _POSE_INFORMATION = 1.0
-"""Information (1/m^2, 1/rad^2) added to each number of a keyframe's twist, far below that of a drive: it
-fixes the gauge, which is position and orientation of the world, and its scale without depth."""
-_POINT_INFORMATION = 1e-3  # information added to each landmark, 1/m^2, far below that of one pixel
+"""Information (1/m^2, 1/rad^2) of a prior that is added for each component of a keyframe's twist.  It is far
+below the information from the observations of a drive, and fixes what these leave open (the gauge): position
+and orientation of the world, and without depths its scale."""
+# Information of a prior (1/m^2) that is added for each coordinate of a landmark, far below that from one
+# pixel.
+_POINT_INFORMATION = 1e-3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -719,11 +722,13 @@ class _DriveSystem:
     def _path_noise_m(self, state: _State, poses_covariance: Array, rho_to_centre: Array) -> float:
         """Return the root mean square error of the path after alignment, m.
 
-        It is that of `_NOISE_SAMPLES` random draws, always the same ones, from the covariance of the poses.
+        The error is simulated: `_NOISE_SAMPLES` sets of errors of all poses are drawn from their covariance,
+        with a fixed seed.
 
         Args:
             state: The adjusted poses.
-            poses_covariance: Covariance of the parameters of all keyframes, without those of the calibration.
+            poses_covariance: Covariance of the parameters of all keyframes: their block of the covariance of
+                all parameters.
             rho_to_centre: ``(k, 3, 3)``, maps the translation of a twist on the left of ``T_camera_world`` to
                 the motion of the camera's centre in the world.
         """

@@ -30,7 +30,7 @@ _CONVERGED_RAD = 6e-3
 """If a Gauss-Newton step moves no pose by this rotation in radians about an axis, nor by `_CONVERGED_M`, no
 further step is made."""
 _MIN_RELATIVE_DECREASE = 1e-3
-"""Relative decrease of the cost below which a further Gauss-Newton step is not worth its time."""
+"""Relative decrease of the cost in a Gauss-Newton step up to which no further step is made."""
 _MAX_ROTATION_STEP_RAD = 0.5
 """Largest rotation in radians of a pose about an axis in a Gauss-Newton step; beyond it the linearisation is
 invalid, and the steps of all poses are shortened."""
@@ -272,7 +272,7 @@ def _add_scales(
 
     If a log scale grows by a small d, the translation t of a measured pose ``T_a_b = (R, t)`` of its edges
     grows by ``d t``.  This is the motion ``d R^T t`` in the frame of the pose, which is ``-d`` times the
-    translation of the inverse pose ``T_b_a``.  A residual e changes by ``-(I - ad(e) / 2)`` times this motion.
+    translation of the inverse pose ``T_b_a``.  A residual e changes by ``-(I - ad(e) / 2)`` times the motion.
     """
     poses, k = len(gradient), scales.count
     error, weights = edges.error, edges.weights
