@@ -1,7 +1,8 @@
 """Report how the alignments of robots' segments with a live map changed.
 
 An alignment ``T_map_odom`` maps from the odometry frame of a segment to the frame of the map.  Poses in the
-odometry frame never jump, so a robot can use them in control loops; the alignment takes all corrections.
+odometry frame never jump, so a robot can use them in control loops; corrections of the map change the
+alignment only.
 """
 
 from __future__ import annotations
@@ -20,13 +21,11 @@ from rse_pf.live_map.outcomes import Alignment, Corrected, Joined, Unaligned
 __all__ = ["alignment_of", "report_alignments"]
 
 MIN_REPORTED_SHIFT_M = 0.001
-"""Metres by which a segment has shifted since its last correction above which its robot is sent another one,
-even if the segment has not turned."""
+"""Metres: a larger change of the translation of ``T_map_odom`` is reported; a smaller one is noise."""
 MIN_REPORTED_ROTATION_DEG = 0.05
-"""Degrees by which a segment has turned since its last correction above which its robot is sent another one,
-even if the segment has not shifted."""
+"""Degrees: a larger change of the rotation of ``T_map_odom`` is reported; it moves a point at 1 m by 1 mm."""
 MIN_REPORTED_LOG_SCALE = 0.002
-"""Change of the logarithm of a segment's scale above which its robot is sent a correction."""
+"""A larger change of the natural logarithm of a segment's scale is reported; 0.002 are 0.2 %."""
 
 
 def report_alignments(
@@ -34,13 +33,14 @@ def report_alignments(
 ) -> Iterator[Joined | Corrected | Unaligned]:
     """Yield how the alignments of the robots' newest segments changed since they were last reported.
 
-    Changes below all three limits of this module are not reported.  Segments without keyframes, and robots
-    that left, are left out.
+    An alignment has changed if its translation, its rotation or its scale changed by more than the limit of
+    this module since the robot was last sent it.  Only the newest segment of a robot is reported, and only if
+    it has keyframes and the robot has not left.
 
     Args:
-        graph: The graph, which notes the reports by `MapGraph.apply`.
-        cause: The keyframe (robot, number) that caused the changes, None after an optimisation or after a
-            robot was forgotten.
+        graph: The graph, whose `MapGraph.apply` notes the results as reported.
+        cause: The keyframe (robot, number) that caused the changes, None if an optimisation or the removal of
+            a robot caused them.
         covariances: By keyframe, the ``(6, 6)`` covariance of a pose that was smoothed.  Without that of the
             newest keyframe of a segment, the covariance that was reported before is reported again.
     """
@@ -74,7 +74,7 @@ def report_alignments(
 
 
 def alignment_of(segment: Segment) -> Alignment:
-    """Return the alignment of a segment as its robot was last sent it, or why it has none."""
+    """Return the alignment of a segment as its robot was last sent it; without one it holds the reason."""
     is_aligned = segment.reported_T_map_odom is not None
     return Alignment(
         robot=segment.robot,
@@ -88,10 +88,11 @@ def alignment_of(segment: Segment) -> Alignment:
 
 
 def _find_alignments(graph: MapGraph) -> list[tuple[int, Array, bool]]:
-    """Return (row, ``T_map_odom``, whether it changed since the last report) of each newest segment.
+    """Return (row, ``T_component_odom``, whether it changed since the last report) of each newest segment.
 
-    Segments without keyframes are left out.  ``T_map_odom`` leads to the frame of the segment's component,
-    which may not be the map.  Without a report, the third value says nothing.
+    Segments without keyframes are left out.  ``T_component_odom`` ``(4, 4)`` maps from the odometry frame to
+    the frame of the segment's component; it is ``T_map_odom`` if the component is that of the map.  The third
+    value has no meaning if the robot was never sent an alignment of the segment.
     """
     rows = [row for row in graph.newest_segments.values() if graph.segments[row].keyframes]
     # 1. The pose of the newest keyframe in the map and in its odometry frame give the alignment.

@@ -16,10 +16,10 @@ MIN_LOOP_STEPS = 0.8
 closure between closer ones would only repeat the odometry."""
 MIN_LOOP_STEPS_UNDER_LOAD = 12.0
 """Steps of odometry that two keyframes of one segment are apart, at least, before an overloaded map server
-compares them, because loop closures over short paths join no robots."""
-SAME_PLACE_M = 0.12  # metres along each axis, at most, between two keyframes at the same place
-SAME_PLACE_DEG = 8.0  # degrees of rotation, at most, between two keyframes with the same view of a place
-MAX_KEYFRAMES_OF_VIEW = 2  # keyframes of the map with the same view of a place that keep their features
+compares them: drift is small over a shorter path, so its loop closure would correct little."""
+SAME_VIEW_M = 0.12  # metres along each axis, at most, between two keyframes with the same view
+SAME_VIEW_DEG = 8.0  # degrees of rotation, at most, between two keyframes with the same view
+MAX_KEYFRAMES_OF_VIEW = 2  # keyframes with the same view that keep their features; more would add nothing
 
 
 def choose_candidates(
@@ -27,8 +27,8 @@ def choose_candidates(
 ) -> list[int]:
     """Return the ids of up to *limit* keyframes that may show the same place as *keyframe*, ascending.
 
-    Up to half of *limit* are from other components, which loop closures may join with that of the keyframe;
-    the others are from the component of the keyframe.
+    At most half of *limit* are from other components, which loop closures may join with that of the keyframe.
+    Keyframes of the keyframe's own component fill the rest of *limit*, also if other components have fewer.
 
     Args:
         graph: The graph.
@@ -57,23 +57,24 @@ def choose_candidates(
 
 
 def find_redundant_keyframes(graph: MapGraph, keyframe: int) -> tuple[int, ...]:
-    """Return the ids of the keyframes with the same view as *keyframe*, except the newest two, ascending.
+    """Return the ids of the keyframes whose features are redundant after *keyframe* was added, ascending.
 
-    Two keyframes have the same view if they are within 0.12 m along each axis and within 8 degrees.  Only
-    keyframes with features that are connected with the map count; *keyframe* counts as one of them, but is
-    never returned.  The result is empty if *keyframe* is not connected with the map.
+    Two keyframes have the same view if they are within 0.12 m along each axis and within 8 degrees.  Of the
+    keyframes with the view of *keyframe*, itself among them, the two with the largest ids keep their
+    features, and all others but *keyframe* are redundant.  Only keyframes with features that are connected
+    with the map count.  The result is empty if *keyframe* is not connected with the map.
     """
     if not graph.is_aligned(int(graph.segment_rows[keyframe])):
         return ()
     T = graph.T_component_camera
-    # 1. Find keyframes at the same position; the first coordinate alone excludes most of them.
-    is_near = np.abs(T[:, 0, 3] - T[keyframe, 0, 3]) <= SAME_PLACE_M
+    # 1. Find keyframes at the same position; the first coordinate alone excludes most keyframes of the map.
+    is_near = np.abs(T[:, 0, 3] - T[keyframe, 0, 3]) <= SAME_VIEW_M
     near = np.flatnonzero(graph.has_features & is_near)
     distance_m = np.abs(T[near, :3, 3] - T[keyframe, :3, 3]).max(axis=1)
-    near = near[distance_m <= SAME_PLACE_M]
+    near = near[distance_m <= SAME_VIEW_M]
     # 2. Of those, find keyframes with the same rotation.
     traces = np.einsum("nij,ij->n", T[near, :3, :3], T[keyframe, :3, :3])
-    near = near[traces >= 1.0 + 2.0 * math.cos(math.radians(SAME_PLACE_DEG))]
+    near = near[traces >= 1.0 + 2.0 * math.cos(math.radians(SAME_VIEW_DEG))]
     # 3. All but the newest two of those that are connected with the map are redundant.
     in_map = [i for i in near.tolist() if graph.is_aligned(int(graph.segment_rows[i]))]
     surplus = max(0, len(in_map) - MAX_KEYFRAMES_OF_VIEW)

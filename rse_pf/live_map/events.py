@@ -1,7 +1,7 @@
 """The events of a live map: the content of its log, and all that its state depends on.
 
-The log of a map is a list of entries, and an entry is a list of events.  Events hold plain numbers.  All
-events from the first one on, or a snapshot and the events after it, give the same map on every computer.
+The log of a map is a list of entries, and an entry is a list of events.  All events from the
+first one on, or a snapshot and the events after it, give the same map on every computer.
 
 The tags and the names of fields are encoded in stored logs and never change.
 """
@@ -40,9 +40,10 @@ __all__ = [
 class KeyframeAdded(msgspec.Struct, frozen=True, kw_only=True, dict=True, tag="keyframe-2"):
     """A robot made a keyframe.
 
-    ``robot`` is the text of `RobotId.folder`.  ``segment`` counts the odometry frames of the robot: a new
-    segment begins when tracking was lost, or when the robot started again.  ``number`` counts the robot's
-    keyframes over all segments, from 0 and without gaps.  ``data`` is the keyframe as the robot encoded it.
+    ``robot`` is the text of `RobotId.folder`: its tenant, its name, and its enrolment if it has one.
+    ``segment`` is the number of the robot's odometry frame, from 0, which never decreases: a new segment
+    begins when tracking was lost, or when the robot started again.  ``number`` counts the robot's keyframes
+    over all segments, from 0 and without gaps.  ``data`` is the keyframe as the robot encoded it.
     """
 
     robot: str
@@ -62,17 +63,17 @@ class KeyframeAdded(msgspec.Struct, frozen=True, kw_only=True, dict=True, tag="k
 
 
 class MeasuredLoopClosure(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """The measured pose of keyframe ``other`` relative to the keyframe of a `LoopClosuresMeasured`.
+    """The measured pose of keyframe ``other`` relative to ``keyframe`` of a `LoopClosuresMeasured`.
 
-    ``T_keyframe_other`` ``(4, 4)`` and its ``information`` ``(6, 6)``, the inverse covariance of the twist on
-    its right (length, then radians), are bytes as `matrix_bytes` makes them.  Lengths are metres if one of
-    both keyframes is metric, else in the unit of the measured keyframe.  ``inliers`` of ``matches`` fit the
-    pose.
+    ``T_keyframe_other`` ``(4, 4)`` and its ``information`` ``(6, 6)`` are bytes as `matrix_bytes` makes them.
+    The information is the inverse covariance of a small motion of the other camera in its own frame (three
+    lengths, then three radians).  Lengths are metres if one of both keyframes is metric, else in the unit of
+    ``keyframe``.  ``inliers`` of ``matches`` fit the pose.
 
-    ``scale`` is None between two metric keyframes; else it holds the logarithm of the length of the other
-    keyframe's unit in the unit of the measured one, and the variance of this logarithm.  ``off_scale`` is the
-    logarithm of the length of the other keyframe's metre in metres of the measured one, if both are metric
-    and the difference is significant, else None.
+    ``scale`` is None between two metric keyframes; else it holds the natural logarithm of the length of the
+    unit of ``other`` in the unit of ``keyframe``, and the variance of this logarithm.  ``off_scale`` is None
+    unless both keyframes are metric and their depths differ significantly; then one robot's metre is wrong,
+    and ``off_scale`` is the logarithm of the length of the metre of ``other`` in metres of ``keyframe``.
     """
 
     other: int
@@ -87,7 +88,8 @@ class MeasuredLoopClosure(msgspec.Struct, frozen=True, kw_only=True, omit_defaul
 class LoopClosuresMeasured(msgspec.Struct, frozen=True, kw_only=True, tag="links"):
     """The loop closures that were measured for a keyframe, and how many candidates failed, by reason.
 
-    The reasons are those that `rse_pf.slam.relative_pose.measure_relative_pose` returns.
+    The reasons are those that `rse_pf.slam.relative_pose.measure_relative_pose` returns: "no-matches" and
+    others.
     """
 
     keyframe: int
@@ -96,10 +98,10 @@ class LoopClosuresMeasured(msgspec.Struct, frozen=True, kw_only=True, tag="links
 
 
 class Optimised(msgspec.Struct, frozen=True, kw_only=True, tag="optimised"):
-    """The whole pose graph, as it was after ``up_to`` events, was optimised in the background.
+    """All keyframes that were connected with the frame of the map were optimised in the background.
 
-    ``T_map_camera`` has the poses ``(n, 4, 4)`` of the keyframes ``ids`` in the frame of the map, as
-    `matrix_bytes` makes them.
+    The optimisation began when the map had applied ``up_to`` events.  ``T_map_camera`` has the optimised
+    poses ``(n, 4, 4)`` of the keyframes ``ids`` in the frame of the map, as `matrix_bytes` makes them.
     """
 
     up_to: int
@@ -114,7 +116,7 @@ class RobotForgotten(msgspec.Struct, frozen=True, kw_only=True, tag="forgotten")
 
 
 class RobotLeft(msgspec.Struct, frozen=True, kw_only=True, tag="left"):
-    """A robot left the map; its keyframes and loop closures stay."""
+    """A robot asked to leave the map; its keyframes and loop closures stay."""
 
     robot: str
 
@@ -142,9 +144,10 @@ class StartKeyframe(msgspec.Struct, frozen=True, kw_only=True, dict=True):
 class StartEdge(msgspec.Struct, frozen=True, kw_only=True):
     """An edge of the version that a live map starts from.
 
-    ``a`` and ``b`` are positions in the keyframes of the `MapStarted`, from 0.  ``T_a_b`` ``(4, 4)``, which
-    maps points of the camera of *b* to that of *a*, and ``information`` ``(6, 6)``, the inverse covariance of
-    the twist on its right (metres, then radians), are bytes as `matrix_bytes` makes them.
+    ``a`` and ``b`` are indices, from 0, of the keyframes of the `MapStarted`.  ``T_a_b`` ``(4, 4)``, which
+    maps points of the camera of *b* to that of *a*, and ``information`` ``(6, 6)`` are bytes as
+    `matrix_bytes` makes them.  The information is the inverse covariance of a small motion of camera *b* in
+    its own frame (metres, then radians).
     """
 
     a: int
@@ -157,7 +160,7 @@ class MapStarted(msgspec.Struct, frozen=True, kw_only=True, tag="started-2"):
     """The map begins with the keyframes and edges of the version ``source``, or empty.
 
     ``equal_rooms_m`` is the size, in metres, of rooms that look the same; 0 if every place looks unique.
-    Loop closures that join robots must then extend over more than this size.
+    The keyframes of the loop closures that join two components must then extend over more than this size.
     """
 
     source: str
@@ -167,7 +170,10 @@ class MapStarted(msgspec.Struct, frozen=True, kw_only=True, tag="started-2"):
 
 
 class MapServerChanged(msgspec.Struct, frozen=True, kw_only=True, tag="owner"):
-    """Another process, the map server ``owner``, writes the log from now on, with lease number ``epoch``."""
+    """Another process, the map server ``owner``, writes the log from now on.
+
+    ``epoch`` is the number of its lease of the map, which every change of the map server increments.
+    """
 
     owner: str
     epoch: int
@@ -183,6 +189,8 @@ Event = (
     | MapServerChanged
 )
 
+
+RESTART_HINT = "start a new map from the last published version: rse-pf map live start MAP --from MAP"
 
 _ENCODER = msgspec.msgpack.Encoder(order="deterministic")
 _DECODER = msgspec.msgpack.Decoder(list[Event])
@@ -202,9 +210,7 @@ def decode_events(data: bytes) -> list[Event]:
     try:
         return _DECODER.decode(data)
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:
-        raise BadRequest(
-            f"an entry of the log is damaged: {message_of(error)}", hint="restore the map from a snapshot"
-        ) from error
+        raise BadRequest(f"an entry of the log is damaged: {message_of(error)}", hint=RESTART_HINT) from error
 
 
 def matrix_bytes(matrix: Array) -> bytes:
@@ -221,7 +227,7 @@ def matrix_of(data: bytes, rows: int, columns: int) -> Array:
     if len(data) != 8 * rows * columns:
         raise BadRequest(
             f"a matrix of {rows}x{columns} has {8 * rows * columns} bytes, not {len(data)}",
-            hint="send float64, little-endian, row-major",
+            hint=RESTART_HINT,
         )
     matrix: Array = np.frombuffer(data, dtype="<f8").reshape(rows, columns)
     return matrix

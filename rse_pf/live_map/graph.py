@@ -2,7 +2,8 @@
 
 Vertices are the poses of keyframes.  Edges are the odometry between consecutive keyframes of a segment, and
 accepted loop closures.  A *segment* holds the keyframes that one robot made in one odometry frame.  Segments
-that accepted loop closures connect form a *component*, which has one frame and one unit of length.
+that accepted loop closures connect form a *component*, which has one frame and one unit of length.  The
+*map* that robots are aligned with, and that is published, is one of the components; the others may join it.
 
 `MapGraph` owns all tables and keeps them consistent; other modules of this package read them, and change them
 through its methods only.  Nothing here decides which loop closures are right: `outlier_rejection` does.
@@ -45,17 +46,17 @@ from rse_pf.live_map.outcomes import (
 
 __all__ = ["STEP_LENGTH_M", "MapGraph"]
 
-STEP_LENGTH_M = 0.25  # metres of motion that are one step of odometry, for which its drift is stated
-STEP_ROTATION_DEG = 15.0  # degrees of rotation that are one step of odometry, for which its drift is stated
+STEP_LENGTH_M = 0.25  # metres of motion that are one step of odometry; `OdometryNoise` is the drift of a step
+STEP_ROTATION_DEG = 15.0  # degrees of rotation that are one step of odometry, as 0.25 m are
 MIN_STEP = 0.05  # steps of odometry that a motion counts as, at least: a stationary robot has some variance
 MAX_PENDING_EDGES = 400  # newest pending loop closures of a map that are kept, to bound memory and CPU time
 MAX_REJECTED_EDGES = 2000
-"""Newest rejected loop closures that are kept, since a map decides about them again after a robot was
-forgotten or excluded."""
+"""Rejected loop closures that are kept, the newest ones.  A map decides about them again after a robot was
+forgotten or excluded; the limit bounds memory and the time of these decisions."""
 MAX_ORPHANED_OBJECTS = 10_000  # newest objects of forgotten robots that are listed for deletion
 INHERITED_CONTRADICTIONS = 0xFFFF
-"""Bit mask: a robot's newest 16 records of contradictions count in its next segment, so that a hostile robot
-does not start without a record by opening a segment."""
+"""Bit mask of `Segment.contradictions`: a new segment of a robot inherits the newest 16 bits of its last one,
+so that a hostile robot does not start without a record by opening a segment."""
 
 
 class MapGraph:
@@ -68,20 +69,20 @@ class MapGraph:
         pending: Numbers of the pending loop closures, oldest first.
         rejected: The newest rejected loop closures by number, which `reopen_rejected` makes pending again
             after a robot was forgotten or excluded, since its evidence may have rejected them.
-        pair_consistency: By the numbers of two pending loop closures, the lower first: whether both agree.
-            Pairs that were not tested are missing.
+        pair_consistency: By the numbers of two pending loop closures, the lower first: whether both agree
+            with each other.  Pairs that were not tested are missing.
         next_edge: Number that the next added loop closure gets.
         root: Row of the segment whose first keyframe defines the frame of the map, -1 while there is none.
         events: Number of events that were applied.
         next_numbers: Number that the next keyframe of each robot must have.
         newest_segments: Row of the newest segment of each robot that has not left.
         optimised_at: Number of keyframes when an optimisation of the whole graph was last requested.
-        smoothing_debt: By robot, the keyframes that were smoothed because of it beyond its allowance, less
-            those that its later keyframes paid back.
+        smoothing_debt: By robot, the keyframes that were smoothed because of its events beyond
+            `LiveMapOptions.smoothing_allowance`; an event for which fewer are smoothed lowers the number.
         aliased_keyframes: Keyframes at places that look like another place of the map (perceptual aliases).
         source: Name of the version that the map started from, empty if it started from none.
         equal_rooms_m: Metres: size of rooms that look the same, 0 if every place looks unique.
-        orphaned_objects: (robot, digest) of the newest objects whose robot was forgotten.
+        orphaned_objects: (robot, digest) of the objects of forgotten robots, the last 10,000 of them.
     """
 
     def __init__(self, capacity: int = 64) -> None:
@@ -141,7 +142,7 @@ class MapGraph:
 
     @property
     def components(self) -> npt.NDArray[np.int64]:
-        """``(n,)``: component of each keyframe, the row of its first segment; -1 for forgotten robots."""
+        """``(n,)``: component of each keyframe: the lowest row of its segments; -1 for forgotten robots."""
         return self._tables["components"][: self._size]
 
     @property
@@ -191,12 +192,12 @@ class MapGraph:
 
     @property
     def metric_components(self) -> set[int]:
-        """The components whose unit is a metre: one of their segments is metric and has keyframes."""
+        """The components whose unit is a metre: at least one metric segment of theirs has keyframes."""
         return {each.component for each in self.segments if each.is_metric and each.keyframes}
 
     @property
     def has_scales(self) -> bool:
-        """Whether a segment has no metric scale of its own, so that scales must be estimated."""
+        """Whether scales must be estimated, because at least one segment is not metric."""
         return not all(segment.is_metric for segment in self.segments)
 
     def odometry_poses(self, ids: Sequence[int]) -> Array:
@@ -238,7 +239,8 @@ class MapGraph:
     def odometry_edges_of(self, i: int) -> list[tuple[int, int]]:
         """Return the pairs (before, *i*) and (*i*, after) of consecutive keyframes of the segment of *i*.
 
-        A pair is missing at an end of the segment; a segment of a stored version has none.
+        A pair is missing at an end of the segment.  In the segment of a stored version, whose keyframes are
+        not consecutive, there is no pair at all.
         """
         segment = self.segments[self.segment_rows[i]]
         if segment.is_from_version:
@@ -287,8 +289,9 @@ class MapGraph:
     def _find_or_add_segment(self, robot: str, number: int) -> int:
         """Return the row of segment *number* of a robot; add the segment if there is none.
 
-        If the robot has not left, only its newest segment is compared, since segment numbers never decrease.
-        A new segment inherits the newest 16 records of contradictions of the robot's last segment.
+        If the robot has not left, *number* is that of its newest segment or of a new one, since the numbers
+        of segments never decrease; else all segments are searched.  A new segment inherits the newest 16
+        records of contradictions of the robot's last segment.
         """
         newest = self.newest_segments.get(robot)
         for row in range(len(self.segments)) if newest is None else (newest,):
@@ -313,8 +316,8 @@ class MapGraph:
     ) -> int:
         """Add a keyframe at the pose that odometry gives it; return the id of the keyframe.
 
-        Its segment is added if there is none, and becomes the robot's newest one.  If the map has no frame,
-        the first metric segment that gets a keyframe defines it.
+        Its segment is added if there is none, and becomes the robot's newest one.  If no segment defines the
+        frame of the map yet, this segment does, provided that it is metric.
 
         Args:
             keyframe: The keyframe.
@@ -414,7 +417,7 @@ class MapGraph:
             segment.keyframes, segment.reported_T_map_odom = [], None
             segment.contradictions, segment.is_excluded = 0, False
         self.smoothing_debt.pop(robot, None)
-        # 3. Drop the features of the keyframes, and remember their stored objects until these are deleted.
+        # 3. Drop the features of the keyframes, and list their objects in the object store for deletion.
         for i in forgotten:
             self.drop_features(i)
             self.orphaned_objects += [(robot, digest) for digest in self.keyframes[i].objects]
@@ -503,7 +506,7 @@ class MapGraph:
         self.next_edge += 1
 
     def _accept(self, numbers: Sequence[int]) -> list[Outcome]:
-        """Accept pending loop closures; the caller updates the components if they connect two."""
+        """Accept pending loop closures; the caller updates the components if they connect two components."""
         for number in numbers:
             edge = self.edges[number]
             edge.state, edge.misfits = "accepted", 0
@@ -559,8 +562,8 @@ class MapGraph:
     def reopen_rejected(self) -> None:
         """Make all rejected loop closures pending again, and drop what was concluded from loop closures.
 
-        No keyframe is a perceptual alias any more, and the consistency of all pairs is unknown.  Segments
-        without an alignment get the reason of a new segment, except excluded ones.
+        No keyframe is a perceptual alias any more, and the consistency of all pairs is unknown.  The reason
+        of segments without an alignment is `NO_LOOP_CLOSURE_YET` again, except that of excluded ones.
         """
         for number, edge in self.rejected.items():
             edge.state, edge.misfits = "pending", 0
@@ -592,7 +595,7 @@ class MapGraph:
     def _move_segment(self, segment: Segment, T_stay_moving: Array, scale: float) -> None:
         """Move the poses of a segment by *T_stay_moving*, after their lengths were multiplied by *scale*.
 
-        The scale of the segment and its steps of odometry change with *scale*.
+        The scale of the segment is multiplied by *scale*, and its steps of odometry are counted anew.
         """
         ids = segment.keyframes
         if scale == 1.0:
@@ -600,7 +603,7 @@ class MapGraph:
             return
         self.set_poses(ids, T_stay_moving @ scaled(self.T_component_camera[ids], scale))
         segment.scale *= scale
-        # Steps of odometry are stated in metres, so they change with the scale.
+        # The length of a step is stated in metres, so the number of steps depends on the scale.
         for before, here in pairwise(ids):
             T_before_here = inverse(self.T_odom_camera[before]) @ self.T_odom_camera[here]
             step = _count_odometry_steps(scaled(T_before_here, segment.scale))
@@ -675,8 +678,8 @@ class MapGraph:
 def _count_odometry_steps(T_from_to: Array) -> float:
     """Return a motion in steps of odometry: 0.25 m or 15 degrees are one step, the larger count decides.
 
-    A motion counts as 0.05 steps at least.  The standard deviation of odometry grows with the square root of
-    these steps.  *T_from_to* is ``(4, 4)``, in metres.
+    A motion counts as 0.05 steps at least.  The standard deviation of a relative pose by odometry grows with
+    the square root of its steps.  *T_from_to* is ``(4, 4)``, in metres.
     """
     by_length = float(np.sqrt((T_from_to[:3, 3] ** 2).sum())) / STEP_LENGTH_M
     by_rotation = rotation_angle_deg(T_from_to[:3, :3]) / STEP_ROTATION_DEG

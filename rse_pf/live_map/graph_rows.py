@@ -23,9 +23,9 @@ EdgeState = Literal["pending", "accepted", "rejected"]
 UP_TO_SCALE = "up to scale: no robot with metres has seen what it sees"
 NO_LOOP_CLOSURE_YET = "no loop closure between its keyframes and the map is accepted yet"
 
-MIN_RELATIVE_COVARIANCE: Array = np.diag([0.02**2] * 3 + [math.radians(0.7) ** 2] * 3)
-"""``(6, 6)``, square metres and square radians: covariance of a segment's alignment until smoothing has
-computed one.  The same numbers are added to the covariance of each measured relative pose."""
+DEFAULT_COVARIANCE: Array = np.diag([0.02**2] * 3 + [math.radians(0.7) ** 2] * 3)
+"""``(6, 6)``: covariance of a segment's alignment until smoothing has computed one, square metres and square
+radians: 2 cm along and 0.7 degrees around each axis, the least noise of one measured relative pose."""
 
 
 @dataclass(slots=True, eq=False)
@@ -33,8 +33,8 @@ class LiveKeyframe:
     """A keyframe of one robot in the graph.
 
     ``segment`` and ``number`` are those of its `KeyframeAdded`.  ``data`` holds the encoded keyframe; it is
-    None after the keyframe was culled or its robot was forgotten.  ``objects`` are the digests of the objects
-    (points, image) that the robot stored with it, also after culling.
+    None after its features were dropped or its robot was forgotten.  ``objects`` are the digests of the
+    objects (points, image) that the robot stored with it; they stay when the features are dropped.
     """
 
     robot: str
@@ -60,7 +60,7 @@ class Segment:
     """Row of the first segment of the component that this segment belongs to."""
     reported_T_map_odom: Array | None = None
     """``(4, 4)``: the alignment with the map that the robot was last sent, None while it has none."""
-    covariance: Array = field(default_factory=lambda: MIN_RELATIVE_COVARIANCE.copy())
+    covariance: Array = field(default_factory=lambda: DEFAULT_COVARIANCE.copy())
     """``(6, 6)``: covariance of the reported alignment, of a twist on its left (metres, radians)."""
     reason: str = NO_LOOP_CLOSURE_YET
     """Why the segment has no alignment with the map; shown to operators and robots."""
@@ -71,11 +71,11 @@ class Segment:
     is_excluded: bool = False
     """Whether loop closures of the segment are ignored, because it kept contradicting the map."""
     is_metric: bool = True
-    """Whether odometry and depths of the segment are in metres; a single camera has no metric scale."""
+    """Whether odometry and depths of the segment are in metres; those of a monocular camera are not."""
     scale: float = 1.0
-    """Length of the segment's unit in the unit of its component: a metre if the component is metric."""
+    """Length of the segment's unit in the unit of its component, which is a metre in a metric component."""
     reported_scale: float = 1.0
-    """The scale that was reported with the alignment; a robot with metres is not sent it."""
+    """The scale at the last report of the alignment; reports to a robot with metric odometry leave it out."""
 
 
 @dataclass(slots=True, eq=False)
@@ -89,8 +89,8 @@ class LoopEdge:
     ``scale`` is None between two metric segments; otherwise it holds the logarithm of the length of the unit
     of *b* in the unit of *a*, and the variance of this logarithm.
     ``is_fixed`` marks an edge of the version that the map started from, which is never rejected.
-    ``inliers`` of the ``matches`` between both images fit the pose.  ``misfits`` counts the last updates in a
-    row in which the loop closure did not fit the graph.
+    ``inliers`` of the ``matches`` between both images fit the pose.  ``misfits`` counts the last smoothings
+    in a row after which the accepted loop closure did not fit the graph.
     """
 
     a: int
@@ -110,5 +110,9 @@ class LoopEdge:
 
     @property
     def weight(self) -> float:
-        """Weight of the evidence within 0 to 1; an edge of a stored version has full weight."""
+        """Weight of the evidence, above 0 to 1, by `evidence_weight`; *full weight* is 1.
+
+        A loop closure has full weight with at least 30 inliers that are at least half of its matches; an edge
+        of a stored version has it always.
+        """
         return 1.0 if self.is_fixed else evidence_weight(self.inliers, self.matches)

@@ -5,8 +5,8 @@ the byte.  Expensive work (matching images, optimising the whole graph) only rea
 event, so that it can run in other threads while the map changes.
 
 Source:
-    Kimera-Multi (Tian et al., T-RO 2022) and its outlier rejection by pairwise consistency maximisation
-    (Mangelson et al., ICRA 2018) are the nearest relatives; here one process holds the graph of all robots.
+    Outlier rejection is the pairwise consistency maximisation of Mangelson et al. (ICRA 2018), as in
+    Kimera-Multi (Tian et al., T-RO 2022); unlike there, one process holds the graph of all robots.
 """
 
 from __future__ import annotations
@@ -89,19 +89,20 @@ __all__ = ["LiveMap"]
 
 MAX_SEGMENTS = 2**31  # segment numbers of a robot are below this, so that they fit into 32 bits
 MIN_KEYFRAMES_BETWEEN_OPTIMISATIONS = 20
-"""Keyframes that arrive between two requests of the smoother to optimise the whole graph, at least, because
-an optimisation fits all poses.  A request after a robot was forgotten or excluded does not wait."""
+"""Keyframes that arrive, at least, between two outcomes `OptimiseWanted` that smoothing causes, because an
+optimisation of all poses is expensive.  After a robot was forgotten or excluded there is no such limit."""
 RELOCALISATION_POOL = 6
-"""Keyframes that place recognition proposes for each one that a relocalisation compares.  Those compared are
-spread over the map, so that a second place that looks the same is compared as well."""
+"""Ratio of the keyframes that place recognition proposes to those that a relocalisation compares.  Those
+compared are chosen spread over the map: if two places look the same, both are compared, and the pose is
+refused as ambiguous."""
 
 
 class LiveMap:
     """One map that several robots build together.
 
     The id of a keyframe is its position in order of arrival, from 0; ids are never used again.  The frame of
-    the map is that of the first metric segment, or of the stored version that the map started from.  If that
-    robot is forgotten or excluded, another metric segment defines the frame.
+    the map is that of the first metric segment, or of the stored version that the map started from.  If the
+    robot of that segment is forgotten or excluded, another metric segment defines the frame.
     """
 
     def __init__(self, options: LiveMapOptions | None = None) -> None:
@@ -115,7 +116,9 @@ class LiveMap:
 
     @classmethod
     def restore(cls, snapshot: bytes, options: LiveMapOptions | None = None) -> LiveMap:
-        """Return the map whose `snapshot` this is.
+        """Return the map that `LiveMap.snapshot` encoded as *snapshot*.
+
+        Replays are equal only if *options* are those of the encoded map.
 
         Raises:
             BadRequest: The snapshot is damaged, or has another format version.
@@ -133,12 +136,13 @@ class LiveMap:
     def restore_parts(
         cls, head: bytes, part: Callable[[str], bytes], options: LiveMapOptions | None = None
     ) -> LiveMap:
-        """Return the map whose `snapshot_parts` these are.
+        """Return the map that `LiveMap.snapshot_parts` encoded.
 
         Args:
             head: The head of the snapshot.
             part: Returns the bytes of a part by name.
-            options: Limits of the work for one keyframe.
+            options: Limits of the work for one keyframe; replays are equal only if they are those of the
+                encoded map.
 
         Raises:
             BadRequest: The head or a part is damaged, or has another format version.
@@ -155,7 +159,7 @@ class LiveMap:
         return self._snapshot_writer.encode(self._graph, self._places, known)
 
     def digest(self) -> str:
-        """Return the SHA-256 of the pose graph with all features, in hexadecimal; equal for equal maps."""
+        """Return the SHA-256 of the pose graph and the features, in hexadecimal, without the place index."""
         return hashlib.sha256(encode_graph(self._graph, {})).hexdigest()
 
     # --- What the map holds ---
@@ -180,7 +184,7 @@ class LiveMap:
 
     @property
     def loop_closure_count(self) -> int:
-        """The number of accepted loop closures, and of edges of the version that the map started from."""
+        """The number of accepted loop closures, plus all edges of the version that the map started from."""
         return len(self._graph.edges) - len(self._graph.pending)
 
     @property
@@ -259,7 +263,10 @@ class LiveMap:
         return image_references(self._graph, version)
 
     def paths(self, most: int) -> list[tuple[str, int, Array]]:
-        """Return (robot, segment, positions ``(n, 3)`` in metres) of about *most* keyframes in the map."""
+        """Return (robot, segment, positions ``(n, 3)`` in metres) of the segments in the map.
+
+        About *most* keyframes are chosen evenly; the ends of each segment are among them, also beyond *most*.
+        """
         return paths_of(self._graph, most)
 
     def objects_of(self, keyframes: Collection[int]) -> list[tuple[str, str]]:
@@ -269,7 +276,7 @@ class LiveMap:
 
     @property
     def deletable_objects(self) -> list[tuple[str, str]]:
-        """(robot, digest) of the newest objects of forgotten robots, which must be deleted."""
+        """(robot, digest) of the last 10,000 objects of forgotten robots; the map server deletes them."""
         return list(self._graph.orphaned_objects)
 
     # --- Work that only reads the map and returns an event ---
@@ -281,8 +288,9 @@ class LiveMap:
         The map does not change.
 
         Raises:
-            BadRequest: The keyframe is the next one, and its segment, pose, features or time cannot be right,
-                or its descriptors are of another kind than those of the map.
+            BadRequest: The keyframe is the next one, and its data are damaged, its segment is older than the
+                newest one of the robot, its odometry is out of range, or its descriptors are of another kind
+                than those of the map.
             InvalidCamera: The keyframe is the next one, and its camera model cannot be right.
         """
         expected = self.next_number(event.robot)
@@ -292,14 +300,14 @@ class LiveMap:
         if not oldest <= event.segment < MAX_SEGMENTS:
             raise BadRequest(
                 f"segment {event.segment} is not within {oldest}..{MAX_SEGMENTS - 1}",
-                hint="count segments upwards, one for each time that tracking starts again",
+                hint="count segments upwards: use the newest one, or the next one after tracking was lost",
             )
         features = event.keyframe.features
         segment = self._graph.find_segment(event.robot, event.segment)
         if segment is not None and segment.is_metric != features.is_metric:
             raise BadRequest(
                 f"segment {event.segment} has keyframes with and without metres",
-                hint="begin a new segment where depths begin or end",
+                hint="begin a new segment where the camera changes between one with and one without depth",
             )
         scale = assumed_scale(features) if segment is None else segment.scale
         try:
@@ -323,9 +331,9 @@ class LiveMap:
             keyframe: The keyframe that is compared with others.
             pieces: Largest number of functions, among which the candidates are divided; at least one is
                 returned, and `merge_measurements` merges their results.
-            candidates: Largest number of keyframes to compare with; None for that of the options.  An
-                overloaded map server states one; then keyframes of the same segment within 12 steps of
-                odometry (3 m of straight motion) are left out.
+            candidates: None for the number of the options.  An overloaded map server states the largest
+                number of keyframes to compare with; a stated number also leaves out keyframes of the same
+                segment within 12 steps of odometry (3 m of straight motion).
         """
         stored = self._stored(keyframe)
         if stored is None or self._is_ignored(keyframe):
@@ -342,7 +350,7 @@ class LiveMap:
     def optimise(self) -> Optimised:
         """Optimise the whole graph and return its new poses as an event; the map does not change.
 
-        A segment must define the frame of the map.
+        It may be called only after `OptimiseWanted`: without a frame of the map, the result is undefined.
 
         Raises:
             MissingExtra: gtsam is not installed.
@@ -354,7 +362,7 @@ class LiveMap:
     ) -> Callable[[], Optimised]:
         """Return a function that does the work of `optimise`, in any thread while the map changes.
 
-        A segment must define the frame of the map.  *solve* takes the place of `optimise_graph` and returns
+        It may be called only after `OptimiseWanted`.  *solve* takes the place of `optimise_graph` and returns
         the optimised poses ``(n, 4, 4)``, for example from a process of its own.
         """
         pose_graph, ids = whole_graph(self._graph)
@@ -413,7 +421,8 @@ class LiveMap:
     def apply(self, event: Event) -> list[Outcome]:
         """Change the map by *event* and return what changed; deterministic.
 
-        Events about keyframes of forgotten robots, and a change of the map server, are counted only.
+        Events about keyframes of forgotten robots, and a change of the map server, only increment the number
+        of events.
 
         Raises:
             BadRequest: The event starts a map that has keyframes already, or its data are damaged.
@@ -486,14 +495,18 @@ class LiveMap:
         graph.drop_oldest_pending()
         # 4. Report the alignments that changed.
         reports = graph.apply(report_alignments(graph, (robot, number), windows.covariances))
-        # 5. Drop redundant features, and those of a keyframe whose odometry jumped, since they would
-        #    contradict every later keyframe.
+        # 5. Drop redundant features, and those of a keyframe whose odometry jumped, since later loop closures
+        #    with it would contradict the graph.
         surplus = (keyframe,) if has_jumped else find_redundant_keyframes(graph, keyframe)
         culled = self._drop_features(surplus)
         return [*outcomes, *windows.outcomes, *decided_again, *reports, *culled]
 
     def _take_optimised_poses(self, event: Optimised) -> list[Outcome]:
-        """Take the poses of an optimisation; keyframes that arrived later move with those before them."""
+        """Take the poses of an optimisation.
+
+        A keyframe that arrived later moves by the same rigid motion as the optimised one before it in its
+        segment.
+        """
         graph = self._graph
         T_optimised = np.frombuffer(event.T_map_camera, dtype="<f8").reshape(-1, 4, 4)
         index_of = {i: index for index, i in enumerate(event.ids) if graph.exists(i) and self.is_in_map(i)}
@@ -522,12 +535,12 @@ class LiveMap:
         """Move segments that joined the map during an optimisation with the segments they are connected to.
 
         Args:
-            motions: By row of an optimised segment, the motion ``(4, 4)`` of its newest keyframe in the frame
-                of the map; receives the motions of the moved segments.
+            motions: By row of an optimised segment, the motion ``(4, 4)`` of its newest optimised keyframe in
+                the frame of the map; the motions of the moved segments are added to it.
 
         Returns:
-            Both ends of one loop closure between each moved segment and the one that it moved with, to smooth
-            around them.
+            Keyframes to smooth around: for each moved segment, both ends of one loop closure that connects it
+            with the segment whose motion it took.
         """
         graph = self._graph
         ends: list[int] = []
@@ -572,8 +585,8 @@ class LiveMap:
         may rest on loop closures that were taken out.  Pending ones are decided as if they arrived now,
         oldest first.
 
-        Return what became ambiguous, and a request to optimise; accepted and rejected loop closures are not
-        reported.
+        Return what became ambiguous, and a request to optimise.  Accepted and rejected loop closures are left
+        out, because all of them were decided; the caller reports the alignments.
         """
         graph = self._graph
         ambiguous: list[Outcome] = []
@@ -583,21 +596,21 @@ class LiveMap:
             self._smooth(moved_keyframes(outcomes))
             ambiguous += [outcome for outcome in outcomes if isinstance(outcome, Ambiguous)]
         smooth_everything(graph, self.options)
-        wanted = [OptimiseWanted(misfit=0.0)] if graph.edges and graph.root >= 0 else []
+        wanted = [OptimiseWanted()] if graph.edges and graph.root >= 0 else []
         return [*ambiguous, *wanted]
 
     def _smooth(self, moved: list[int], robot: str | None = None) -> SmoothedWindows:
         """Smooth around the keyframes *moved*, which a keyframe of *robot* caused.
 
-        Add a request to optimise the whole graph to the outcomes of the result if the largest window was too
-        small, and at least 20 keyframes arrived since the last such request.
+        Add a request to optimise the whole graph to the outcomes of the result if the border of the largest
+        window moved too far, and at least 20 keyframes arrived since the last such request.
         """
         graph = self._graph
         windows = smooth_changes(graph, moved, self.options, robot)
         is_due = len(graph) - graph.optimised_at >= MIN_KEYFRAMES_BETWEEN_OPTIMISATIONS
         if windows.is_strained and is_due and graph.root >= 0:
             graph.note_optimisation()
-            windows.outcomes.append(OptimiseWanted(misfit=windows.mean_misfit))
+            windows.outcomes.append(OptimiseWanted())
         return windows
 
     def _drop_features(self, ids: tuple[int, ...]) -> list[Outcome]:

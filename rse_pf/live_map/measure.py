@@ -43,14 +43,15 @@ __all__ = [
 ASSUMED_MEDIAN_DEPTH_M = 2.0
 """Metres: median depth that a keyframe without metric scale is assumed to have, as in a room."""
 MIN_WRONG_LOG_SCALE = 0.04
-"""Logarithm of the ratio of two robots' depths from which on their metric scales differ; good cameras stay
-below: the three robots of the kitchen recordings differ by 1 to 2 %."""
+"""Absolute natural logarithm of the ratio of two robots' depths from which on one metric scale is wrong; the
+depths of the three robots of the 7-Scenes red kitchen recordings differ by 1 to 2 %."""
 MIN_WRONG_SCALE_DEVIATIONS = 2.0
-"""Standard deviations of the measured ratio of depths from which on two metric scales differ."""
+"""Standard deviations of the measured ratio of depths from which on one metric scale is wrong."""
 
 LOOP_CLOSURE_EVIDENCE = RelativePoseOptions(min_inliers=15, min_inlier_ratio=0.3, min_matches=15)
-"""Evidence that the measured relative pose of two keyframes needs to become a pending loop closure; below
-full weight, so that several weak loop closures can join robots together."""
+"""Evidence that the measured relative pose of two keyframes needs to become a pending loop closure.  It is
+half of what full weight needs (30 inliers, half of the matches), so that several weak loop closures can join
+robots."""
 
 StoredView = tuple[int, bytes]
 """Id of a keyframe, and the keyframe as encoded by the robot."""
@@ -176,7 +177,7 @@ def view_of_features(features: KeyframeFeatures, camera: Camera) -> View:
 def assumed_scale(features: KeyframeFeatures) -> float:
     """Return the metres that a unit of a keyframe is assumed to have, so that its median depth is 2 m.
 
-    The result is 1 if the keyframe is metric, or has no depths.
+    The result is 1 if the keyframe is metric, or has no depth at all.
     """
     depths = features.depths_m[features.depths_m > 0.0]
     if features.is_metric or not len(depths):
@@ -204,9 +205,10 @@ def placed_keyframe(stored: StoredView, T_map_keyframe: Array, scale: float = 1.
 
 
 def _wrong_log_scale(measured: RelativePose) -> float | None:
-    """Return the logarithm of the ratio of both keyframes' metres if it clearly differs from 0, else None.
+    """Return the logarithm of the length of the metre of *b* in metres of *a*, None if it is near 0.
 
-    The ratio is the length of the other keyframe's metre in metres of the measured one.
+    Here *a* and *b* are the keyframes of ``T_a_b``.  Near 0 is below 0.04 or two standard deviations, the
+    larger of both.
     """
     ratio = measured.depth_ratio
     if ratio is None:
@@ -218,10 +220,10 @@ def _wrong_log_scale(measured: RelativePose) -> float | None:
 def _in_robots_units(
     measured: RelativePose, features: KeyframeFeatures, other: KeyframeFeatures
 ) -> RelativePose:
-    """Return a relative pose in the units that both robots use, given one in assumed metres.
+    """Return a relative pose, given in assumed metres, with lengths and scale in the robots' own units.
 
-    If one keyframe is metric, the pose is in its metres already, and only the ratio of the units changes.  If
-    both are metric, nothing changes.
+    If both keyframes are not metric, the pose gets the unit of the first one (*features*).  If one is metric,
+    the pose is in its metres already, and only the scale changes.  If both are metric, nothing changes.
     """
     if measured.scale is None:
         return measured

@@ -1,7 +1,7 @@
 """How much work a live map does for each keyframe.
 
-The numbers that decide which loop closures are right are constants beside their rules.
-``python -m benchmarks live.one_process`` measures accuracy and CPU time.
+The numbers that decide which loop closures are right are constants beside their rules.  Before one of these
+options changes, ``python -m benchmarks live.one_process`` must show the accuracy and the CPU time of maps.
 """
 
 from __future__ import annotations
@@ -13,7 +13,9 @@ __all__ = ["LiveMapOptions"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LiveMapOptions:
-    """Limits of the work for one keyframe; a map server never changes them while a map exists.
+    """Limits of the work for one keyframe.
+
+    A map server never changes them while a map exists, because a replay of the log must give the same map.
 
     Attributes:
         candidates: Older keyframes that place recognition proposes and a new keyframe is compared with, at
@@ -24,8 +26,9 @@ class LiveMapOptions:
             as too small.
         max_border_rotation_deg: Degrees that a keyframe at the border of a window may turn before the window
             counts as too small.
-        smoothing_allowance: Keyframes that may be smoothed for each keyframe of a robot; more become a debt
-            of the robot, which keyframes that need less pay back.
+        smoothing_allowance: Keyframes that may be smoothed because of one keyframe of a robot.  Those beyond
+            it are added to the debt of the robot; a later keyframe that needs fewer lowers the debt by the
+            difference.
         max_smoothing_debt: Keyframes of debt from which on only the smallest window is taken for a robot, so
             that no robot uses the CPU time of the others.
     """

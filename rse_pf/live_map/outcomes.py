@@ -32,7 +32,7 @@ class Added:
 class Joined:
     """A segment of a robot is aligned with the map from now on.
 
-    ``links`` counts the accepted loop closures between this segment and others, or within it.
+    ``links`` counts the accepted loop closures that have one end or both ends in this segment.
     """
 
     robot: str
@@ -46,9 +46,9 @@ class Corrected:
 
     ``T_map_odom`` ``(4, 4)`` maps from the odometry frame of the segment to the frame of the map.
     ``covariance`` ``(6, 6)`` is that of its left twist (metres, radians).  ``cause`` is the keyframe (robot,
-    number) that changed the alignment, None after an optimisation or after a robot was forgotten.  ``scale``
-    is the length in metres of the segment's unit, by which translations of the odometry are multiplied before
-    ``T_map_odom`` is applied; None if the odometry is in metres.
+    number) whose event changed the alignment, None if an optimisation or the removal of a robot did.
+    ``scale`` is the length in metres of the segment's unit, by which translations of the odometry are
+    multiplied before ``T_map_odom`` is applied; None if the odometry is in metres.
     """
 
     robot: str
@@ -87,18 +87,12 @@ class LoopClosureRejected:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OptimiseWanted:
-    """The whole pose graph should be optimised in the background, by `LiveMap.prepare_optimisation`.
-
-    ``misfit`` is the mean squared Mahalanobis norm of the residuals of the smoothed loop closures, 0 after a
-    robot was forgotten or excluded.
-    """
-
-    misfit: float
+    """The whole pose graph should be optimised in the background, by `LiveMap.prepare_optimisation`."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Ambiguous:
-    """A segment is not aligned because of perceptual aliases, or was excluded because it contradicts the map.
+    """A segment cannot be aligned: it may be at one of several equal places, or it contradicts the map.
 
     ``reason`` is a sentence for the operator.
     """

@@ -6,7 +6,7 @@ but agree with each other, are evidence against loop closures that were accepted
 odometry or metric scale keeps contradicting the other robots is excluded: its keyframes stay, but its loop
 closures are ignored.
 
-To add a rule that rejects loop closures, see CONTRIBUTING.md.
+To add a rule, see CONTRIBUTING.md, "How to add a rule that rejects loop closures".
 """
 
 from __future__ import annotations
@@ -57,16 +57,17 @@ __all__ = [
 ]
 
 MAX_SQUARED_MISFIT = 30.0
-"""Squared Mahalanobis norm of a loop closure's residual (six degrees of freedom) above which it counts as a
-misfit; one true loop closure in 25,000 is above."""
+"""Squared Mahalanobis norm of a loop closure's residual above which it counts as a misfit.  By the chi-square
+distribution with six degrees of freedom, one true loop closure in 25,000 is above."""
 MAX_MISFITS = 8  # updates in a row in which a loop closure misfits the smoothed graph until it is rejected
 MAX_EDGES_AFTER_JOIN = 48  # newest pending loop closures that are classified after a join, to bound CPU time
 MAX_ALIAS_RADIUS_M = 5.0
-"""Metres around a place that looks like another one within which all keyframes are taken for aliases, at
-most."""
+"""Largest radius, in metres, around a place that looks like another one, within which all keyframes are taken
+for perceptual aliases."""
 MIN_ALIAS_SUPPORT = 12
-"""Summed weight of contrary loop closures between two segments, at least, that proves perceptual aliases
-where no connection weighs less, so that none can be rejected."""
+"""Summed weight of contrary loop closures between two segments, at least, that proves perceptual aliases.
+They prove it only if they outweigh no connection (all accepted loop closures between two segments) on the
+strongest path between both segments; else that connection is rejected."""
 JUMP_NEIGHBOURS = 4
 """Keyframes before a new one that may prove a jump of its odometry: they saw the same place a moment before,
 so they cannot be at another place that looks the same."""
@@ -76,9 +77,9 @@ MAX_CONTRADICTIONS = 16
 """Contradictions among the last 32 records of a segment from which on it is excluded; honest robots stay far
 below, also with 10 % of wheel slip."""
 WRONG_SCALE_COUNT = 2
-"""Records of a contradiction that a keyframe with a wrong metric scale counts as, because two other robots
-measured the scale."""
-FIXED_WEIGHT = 1e9  # weight of a connection that is never rejected, above any sum of loop closures' weights
+"""Contradictions that a keyframe with a wrong metric scale counts as: one for each of the two other robots,
+at least, that contradict the scale."""
+FIXED_WEIGHT = 1e9  # weight of a connection that is never rejected, above any other connection's weight
 
 _AT_SEVERAL_PLACES = "ambiguous: what it saw is in the map at several places"
 
@@ -88,9 +89,11 @@ def decide_measured(
 ) -> Iterator[Decision]:
     """Decide about the loop closures that were measured for *keyframe*, and about its segment.
 
-    The loop closures are added as pending ones, and decided like those of `decide_edges`.  If *has_jumped*,
-    the odometry of the keyframe contradicts the keyframes before it.  The segment is excluded at 16
-    contradictions among the last 32 keyframes that were recorded.
+    The loop closures are added as pending ones, and decided by `decide_edges`.  The keyframe contradicts the
+    map if all its loop closures of full weight within one component do and none was accepted, if its odometry
+    has jumped (*has_jumped*), or if its metric scale is wrong.  The segment is excluded at 16 contradictions
+    among its last 32 records.  A keyframe with a right scale and without loop closures of full weight within
+    one component is not recorded.
     """
     numbers = range(graph.next_edge, graph.next_edge + len(measured))
     yield AddEdges(keyframe=keyframe, measured=measured)
@@ -182,9 +185,10 @@ def _decide_within(graph: MapGraph, numbers: list[int]) -> Iterator[Decision]:
 
 
 def _drop_redundant_weak(graph: MapGraph, numbers: list[int]) -> list[int]:
-    """Return the loop closures of one keyframe without weak ones to a segment that a full one leads to.
+    """Return the loop closures *numbers* of one keyframe without redundant weak ones, which stay pending.
 
-    A weak loop closure adds nothing there, and costs the CPU time of a decision; it stays pending.
+    A weak loop closure is redundant if another one of *numbers*, of full weight, connects the keyframe with
+    the same segment: it would add little, and costs the CPU time of a decision.
     """
     full = [number for number in numbers if graph.edges[number].weight == 1.0]
     connected = {int(graph.segment_rows[graph.edges[number].b]) for number in full}
@@ -196,9 +200,9 @@ def _drop_redundant_weak(graph: MapGraph, numbers: list[int]) -> list[int]:
 
 
 def _has_full_weight_parallel(graph: MapGraph, number: int) -> bool:
-    """Return whether an accepted loop closure of full weight connects the same keyframe and segment.
+    """Return whether an accepted loop closure of full weight makes the weak loop closure *number* redundant.
 
-    It leads from one end of loop closure *number* to any keyframe in the segment of the other end.
+    Such a loop closure connects one end of *number* with any keyframe in the segment of the other end.
     """
     edge = graph.edges[number]
     for near, far in ((edge.a, edge.b), (edge.b, edge.a)):
@@ -217,8 +221,8 @@ def _reject_contradicted(
 ) -> Iterator[Decision]:
     """Reject accepted loop closures that *consistent* ones, among them the contrary *number*, outweigh.
 
-    Where accepted and contrary loop closures both have much weight, both are right: the robots saw two places
-    that look the same (perceptual aliases).
+    Where the accepted and the contrary loop closures both have much weight, nobody knows which are wrong: two
+    places look the same, and the keyframes there are marked as perceptual aliases.
     """
     reason = f"{len(consistent)} later links agree with each other and contradict it"
     edge = graph.edges[number]
@@ -257,10 +261,10 @@ def find_weakest_connection(graph: MapGraph, row_a: int, row_b: int) -> list[int
     """Return the loop closures of the weakest connection on the strongest path between two segments.
 
     A *connection* is all accepted loop closures between two segments.  The strongest path is the one whose
-    weakest connection has the largest summed weight of loop closures.  Connections with an edge of a stored
-    version are never returned; nor are those between two metric segments if segment *row_a* or *row_b* is
-    not metric, because a segment of unknown scale proves nothing against known scales.  Return an empty list
-    if there is no other connection on the path.
+    weakest connection has the largest summed weight of loop closures.  Return an empty list if there is no
+    path, or if its weakest connection may not be rejected.  That is so for a connection with an edge of a
+    stored version; and for one between two metric segments if segment *row_a* or *row_b* is not metric,
+    because a segment of unknown scale proves nothing against known scales.
     """
     # 1. Sum the weights of the loop closures of each connection between two segments.
     connections = {
@@ -279,7 +283,7 @@ def find_weakest_connection(graph: MapGraph, row_a: int, row_b: int) -> list[int
     for min_weight in sorted(set(weights.values()), reverse=True):
         path = _find_path(row_a, row_b, [pair for pair in weights if weights[pair] >= min_weight])
         if path:
-            # 3. Return the weakest connection on the path, unless nothing may reject it.
+            # 3. Return the weakest connection on the path, unless it may not be rejected.
             weakest = min(path, key=lambda pair: (weights[pair], pair))
             return [] if weights[weakest] == FIXED_WEIGHT else connections[weakest]
     return []
@@ -334,7 +338,7 @@ def _decide_join(graph: MapGraph, first: int, second: int) -> Iterator[Decision]
 
 
 def _mark_aliases(graph: MapGraph, numbers: list[int], distance_m: float) -> Iterator[Decision]:
-    """Mark the ends of loop closures as two places that look the same, and undo the joins that rest on them.
+    """Mark two places that look the same, the ends of loop closures, and reject connections that rest on them.
 
     The places are *distance_m* metres apart.  All keyframes of the same component within half of this
     distance, at most 5 m, of an end are marked, since they may look like the other place as well.
@@ -347,7 +351,7 @@ def _mark_aliases(graph: MapGraph, numbers: list[int], distance_m: float) -> Ite
         distances_m = np.sqrt(((positions - positions[i]) ** 2).sum(axis=1))
         near = np.flatnonzero((distances_m < radius_m) & (components == components[i]))
         yield MarkAliases(keyframes=near.tolist())
-    # 2. Reject connections between segments that have too little weight without the marked keyframes.
+    # 2. Reject connections between segments whose weight, without loop closures at aliases, is too small.
     for pair, connection in sorted(graph.accepted_edges_by_segments().items()):
         is_fixed = any(graph.edges[number].is_fixed for number in connection)
         distinct = [number for number in connection if not _is_at_alias(graph, number)]
@@ -410,8 +414,9 @@ def decide_exclusion(
 ) -> Iterator[Decision]:
     """Record whether *keyframe* contradicts the map, and exclude its segment at 16 of 32 contradictions.
 
-    A wrong metric scale counts as two records, because two other robots contradict it.  Nothing is recorded
-    of a segment that is excluded already, or that holds the keyframes of a stored version.
+    *is_contrary* says that the keyframe contradicts the map; a wrong metric scale counts as two
+    contradictions.  Nothing is recorded of a segment that is excluded already, or that holds the keyframes of
+    a stored version.
     """
     row, segment = int(graph.segment_rows[keyframe]), graph.segment_of(keyframe)
     if segment.is_excluded or segment.is_from_version:

@@ -1,13 +1,14 @@
 """Test which loop closures of a live map agree, and decide whether they join two components.
 
 1. A loop closure *within one component* is compared with the poses of the graph (`classify_by_graph`), and
-   with other loop closures by odometry alone (`find_consistent_by_odometry`).  What a loop closure that is
-   contrary to the graph proves, `find_contradiction` returns as a value.
+   with other loop closures by odometry alone (`find_consistent_by_odometry`).  `find_contradiction` returns
+   what a loop closure that is contrary to the graph proves.
 2. Loop closures *between two components* are compared pairwise; the largest set that agrees joins both
    components (`decide_join`), unless perceptual aliases may explain it.
 
-All functions only read the tables of the graph, which remembers the pairs that were tested.  They take loop
-closures as values in one direction and one unit of length, and call the tests of `rse_pf.slam.consistency`.
+All functions only read the graph, except that it keeps the result of each tested pair
+(`MapGraph.note_pair_consistency`).  They take loop closures as values in one direction and one unit of
+length, and call the tests of `rse_pf.slam.consistency`.
 
 Source:
     Mangelson et al., Pairwise consistent measurement set maximization for robust multi-robot map merging,
@@ -57,8 +58,8 @@ __all__ = [
 ]
 
 MIN_SUPPORT = 3.0
-"""Summed weight of loop closures that agree pairwise, at least, before they join components or reject others;
-0 of 2,000 random wrong loop closures were accepted on generated drives."""
+"""Summed weight of loop closures that agree pairwise, at least, before they join components or reject others.
+With this value, 0 of 2,000 random wrong loop closures were accepted (``benchmarks live.one_process``)."""
 MIN_SUPPORTING_KEYFRAMES = 2
 """Different keyframes on each side, at least, that loop closures must connect before they join components or
 reject others, because loop closures of one keyframe share its errors."""
@@ -69,25 +70,26 @@ MAX_CONFIRMED_STEPS = 12.0
 """Steps of odometry between both ends of a loop closure beyond which drift makes the graph too vague to
 confirm a single loop closure."""
 MAX_PATH_STEPS = 200.0
-"""Steps of odometry that stand for a path which the search does not find: the upper limit along one segment,
-the lower limit elsewhere.  Along a path of that length, drift leaves no information on the relative pose."""
+"""Steps of odometry of a path along which drift leaves no information on the relative pose.  A path that the
+search does not find counts as at most so many steps within one segment, where odometry connects both ends,
+and as at least so many steps elsewhere."""
 MAX_VISITED_KEYFRAMES = 250  # keyframes that one search for shortest paths visits, to bound its CPU time
 MAX_DRIFT_RATIO = 0.15
 """Error of odometry, in metres per metre of path, that is possible; a larger disagreement with loop closures
 means that two places look the same."""
 KNOWN_SCALE_DEVIATION = 0.03
-"""Standard deviation of the logarithm of a scale that the graph has estimated; the first loop closures leave
-an error of 1 to 3 %."""
+"""Standard deviation of the natural logarithm of a segment's scale in the graph: after the first loop
+closures of the segment, the error of the estimated scale is 1 to 3 %."""
 
 TEST_NOISE = OdometryNoise()
 """Drift of odometry that the tests of loop closures assume: two to three times that of the smoother, so that
 no true loop closure fails."""
 ALIAS_DISTANCE_M = 1.0
-"""Metres between two estimates of one pose above which they are taken for two places that look the same, and
-not for one place with an error."""
+"""Metres between two estimates of one pose above which they are taken for poses at two places that look the
+same, and not for one place with an error."""
 RIVAL_WEIGHT = 0.5
-"""Share of the weight of the best consistent set from which on a second set, which says another place, makes
-the join ambiguous."""
+"""Share of the weight of the best consistent set from which on a second set, whose loop closures give another
+relative pose of both components, makes the join ambiguous."""
 
 
 class DirectedEdge(NamedTuple):
@@ -110,7 +112,8 @@ class Contradiction:
     """What a loop closure that is contrary to the graph says.
 
     ``alias_distance_m`` is the distance of two places that look the same, None if drift explains the error.
-    ``edges`` are the numbers of the accepted loop closures within the same segment that contradict it.
+    ``edges`` are the numbers of the accepted loop closures of the same segment that contradict the contrary
+    one; there are none between two segments, or with an alias.
     """
 
     alias_distance_m: float | None = None
@@ -128,13 +131,13 @@ def total_weight(graph: MapGraph, numbers: Iterable[int]) -> float:
 def has_enough_support(graph: MapGraph, numbers: Sequence[int]) -> bool:
     """Return whether loop closures together weigh at least 3 and touch at least two keyframes on each side.
 
-    The sides are the two components; or within one component the two segments; or within one segment the
-    keyframes that were measured and those that they were compared with.
+    The sides are the two components; within one component they are the two segments; and within one segment
+    the ends ``a`` and the ends ``b`` of the loop closures.
     """
     if total_weight(graph, numbers) < MIN_SUPPORT:
         return False
     first = graph.edges[numbers[0]]
-    # 1. Choose the table whose entry tells the sides apart: that of segments within a component.
+    # 1. Tell the sides apart by the segments of the ends within one component, else by their components.
     is_within_component = graph.components[first.a] == graph.components[first.b]
     side_of = graph.segment_rows if is_within_component else graph.components
     # 2. Collect the different keyframes of each side.
@@ -149,10 +152,10 @@ def has_enough_support(graph: MapGraph, numbers: Sequence[int]) -> bool:
 
 
 def choose_testable_edges(graph: MapGraph, numbers: Sequence[int]) -> list[int]:
-    """Return the loop closures of *numbers* that are tested: up to four of each keyframe.
+    """Return the loop closures of *numbers* that are tested: at most four of any keyframe, and 48 in all.
 
-    Loop closures are taken from the most inliers to the fewest, unless one of both ends has four already.  Of
-    those, at most the newest 48 are returned, sorted by number.
+    Loop closures are taken from the most inliers to the fewest; one is left out if four of those taken
+    already end at one of its keyframes.  The newest 48 of those taken are returned, sorted by number.
     """
     edges_of_keyframe: Counter[int] = Counter()
     chosen = []
@@ -182,8 +185,8 @@ def classify_by_graph(graph: MapGraph, numbers: Sequence[int]) -> dict[int, Fit]
         targets.setdefault(edge.a, []).append(edge.b)
     paths = {a: shortest_paths(graph, a, ends) for a, ends in targets.items()}
     steps = [paths[edge.a][edge.b] for edge in edges]
-    # 3. Compute the lever of rotation noise; on a round trip no pose is farther away than the diameter of
-    #    the circle.
+    # 3. Compute the lever arm by which rotation noise moves the far end: the distance of both ends, or, after
+    #    a round trip, the diameter of a circle whose circumference is the path.
     steps_between = np.maximum(np.array(steps), 1.0)
     distance_m = np.sqrt((predicted[:, :3, 3] ** 2).sum(axis=1))
     lever_m = np.maximum(distance_m, STEP_LENGTH_M * steps_between / math.pi)
@@ -278,7 +281,7 @@ def find_contradiction(graph: MapGraph, number: int) -> Contradiction | None:
     The error of the relative pose of both ends is computed by odometry within one segment, and by the poses
     of the graph between two segments of one component.  An error above 1 m and above 15 % of the path along
     odometry proves perceptual aliases; a smaller one within a segment may be that of accepted loop closures.
-    Return None if *number* says nothing: between two segments, at a known perceptual alias.
+    Return None if *number* is between two segments and an end is a known perceptual alias: it proves nothing.
     """
     # 1. Compute the error of the relative pose, and the steps of odometry between both ends.
     rows, edge = graph.segment_rows, graph.edges[number]
@@ -312,9 +315,10 @@ def find_contradiction(graph: MapGraph, number: int) -> Contradiction | None:
 def shortest_paths(graph: MapGraph, start: int, targets: Iterable[int]) -> dict[int, float]:
     """Return the steps of odometry from keyframe *start* to each target along the shortest path.
 
-    A loop closure counts as one step.  The search (Dijkstra) visits 250 keyframes at most.  A target that it
-    does not reach gets the steps along the segment, at most 200, if it is in the segment of *start*; else the
-    steps to the farthest visited keyframe, at least 200.
+    A loop closure counts as one step.  The search (Dijkstra) visits 250 keyframes at most.  For a target that
+    the search does not reach, the result is an estimate.  In the segment of *start* it is the number of steps
+    along the segment, but at most 200; elsewhere it is the number of steps to the farthest visited keyframe,
+    but at least 200.
     """
     wanted = set(targets)
     steps: dict[int, float] = {}
@@ -491,7 +495,9 @@ def _find_consistent_edges(
 def _find_heaviest_clique(
     graph: MapGraph, numbers: Sequence[int], adjacency: npt.NDArray[np.bool_]
 ) -> list[int]:
-    """Return a maximum clique of all loop closures, or of those with full weight if it weighs more.
+    """Return the heavier one of two maximum cliques: of all loop closures, and of those with full weight.
+
+    A maximum clique has the largest number of loop closures; its weight is their summed weight.
 
     Row and column *i* of *adjacency* are those of the loop closure ``numbers[i]``.
     """
@@ -504,10 +510,10 @@ def _find_heaviest_clique(
 
 
 def _thin_out(graph: MapGraph, numbers: list[int], component: int, min_distance_m: float) -> list[int]:
-    """Return loop closures whose ends in *component* are apart, in the order of *numbers*.
+    """Return loop closures whose ends in *component* are at a distance from each other, sorted as *numbers*.
 
     A loop closure is left out if its end is within *min_distance_m* metres, along each axis, of the end of
-    the last one that was taken.
+    the loop closure that was taken before it; ends of loop closures taken earlier may be nearer.
     """
     chosen: list[int] = []
     last = np.full(3, np.inf)
@@ -562,9 +568,10 @@ def _median_log_scale(graph: MapGraph, numbers: list[int], stay: int) -> float:
 
 
 def _median_frame(graph: MapGraph, numbers: list[int], stay: int, log_scale: float) -> Array:
-    """Return ``T_stay_moving`` ``(4, 4)``: the medoid of the poses that single loop closures give.
+    """Return ``T_stay_moving`` ``(4, 4)``: the pose of the frame of the moving component in that of *stay*.
 
-    The lengths of the moving component are multiplied by the exponential of *log_scale* before.
+    It is the medoid of the poses that single loop closures give, after the lengths of the moving component
+    were multiplied by the exponential of *log_scale*.
     """
     poses = []
     for number in numbers:

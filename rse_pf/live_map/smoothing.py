@@ -1,8 +1,8 @@
 """Smooth the pose graph of a live map around what changed, in windows of keyframes.
 
 A window holds the keyframes nearest to the change along the graph; all other poses are held.  A window whose
-border would move is replaced by a larger one, so the cost depends on the window and not on the map.  The
-scales of segments that are not metric are estimated together with the poses.
+border would move more than `LiveMapOptions` allows is replaced by a larger one, so the cost depends on the
+window and not on the map.  The scales of segments that are not metric are estimated together with the poses.
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ times as much, so that no true loop closure fails."""
 CAUCHY_WIDTH = 3.0
 """Width of the Cauchy kernel on loop closures, standard deviations; larger residuals have less effect."""
 MAX_SCALE_KEYFRAMES = 600
-"""Keyframes of a segment around the window whose edges determine the scale of the segment, to bound CPU
-time."""
+"""Keyframes of a segment, from 300 before the window on, whose edges determine the scale of the segment.  The
+limit bounds the CPU time of a window."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -72,15 +72,14 @@ class SmoothedWindows:
 
     ``is_strained`` says that the border of a window of the largest size moved too far, so that the whole
     graph should be optimised.  ``squared_misfits`` holds the squared Mahalanobis norm of the residual of each
-    smoothed loop closure by number, and ``mean_misfit`` is their mean.  ``keyframe_count`` sums the keyframes
-    of all windows that were tried, also of those that were replaced by a larger one.  ``covariances`` has by
-    keyframe the ``(6, 6)`` covariance of the pose of each smoothed keyframe that is the newest one of a robot
-    that has not left.  It is that of a left twist (metres, radians) in the frame of the component, given the
-    poses that were held.  ``outcomes`` are rejections of loop closures that misfitted for long.
+    smoothed loop closure by number.  ``keyframe_count`` sums the keyframes of all windows that were tried,
+    also of those that were replaced by a larger one.  ``covariances`` has the ``(6, 6)`` covariance of the
+    newest pose of each robot that has not left, by keyframe, if this pose was smoothed.  It is that of a left
+    twist (metres, radians) in the frame of the component, given the held poses, so it leaves out their
+    uncertainty.  ``outcomes`` are rejections of loop closures that misfitted for long.
     """
 
     is_strained: bool = False
-    mean_misfit: float = 0.0
     squared_misfits: dict[int, float] = field(default_factory=dict)
     keyframe_count: int = 0
     covariances: dict[int, Array] = field(default_factory=dict)
@@ -147,7 +146,6 @@ def smooth_around(
             seeds_of.setdefault(int(graph.components[i]), []).append(i)
     newest_segments = [graph.segments[row] for row in graph.newest_segments.values()]
     newest = [segment.keyframes[-1] for segment in newest_segments if segment.keyframes]
-    total = 0.0
     for _, seeds in sorted(seeds_of.items()):
         for size in options.window_sizes:
             # 2. Choose the keyframes of the window, and the edges that touch them.
@@ -171,18 +169,15 @@ def smooth_around(
             graph.set_poses(ids, smoothed.T[: len(ids)])
             for row, log_factor in zip(free_scales, smoothed.log_scales.tolist(), strict=True):
                 graph.scale_segment(row, math.exp(log_factor))
-            squared_misfits = {
+            result.squared_misfits |= {
                 int(number): float(square)
                 for number, square in zip(edges.numbers, smoothed.squares, strict=True)
                 if number >= 0
             }
-            result.squared_misfits |= squared_misfits
-            total += sum(squared_misfits.values())
             for i, right in zip(wanted, smoothed.covariances, strict=True):
                 Ad = adjoint(graph.T_component_camera[i])
                 result.covariances[i] = Ad @ (0.5 * (right + right.T)) @ Ad.T
             break
-    result.mean_misfit = total / max(1, len(result.squared_misfits))
     return result
 
 
@@ -202,8 +197,8 @@ def select_edges(graph: MapGraph, ids: Iterable[int]) -> GraphEdges:
     """Return odometry and accepted loop closures with at least one end among the keyframes *ids*.
 
     Relative poses are in the unit of the component.  The information of odometry is that of a random walk.
-    The information of a loop closure is multiplied by the square of its weight: half of the evidence counts
-    as twice the standard deviation.
+    The information of a loop closure is multiplied by the square of its weight: a weight of 0.5 doubles its
+    standard deviation.
     """
     # 1. Find the edges that touch the keyframes.
     loop_numbers: set[int] = set()
@@ -250,7 +245,7 @@ def select_edges(graph: MapGraph, ids: Iterable[int]) -> GraphEdges:
 
 
 def odometry_information() -> Array:
-    """Return ``(6,)``: inverse variances of one step of odometry (per square metre, per square radian)."""
+    """Return ``(6,)``: the diagonal of the information of one step of odometry, 1/m² and 1/rad²."""
     information: Array = np.array([DRIFT.step_m] * 3 + [math.radians(DRIFT.step_deg)] * 3) ** -2.0
     return information
 
@@ -271,10 +266,10 @@ def information_of(graph: MapGraph, edge: LoopEdge) -> Array:
 def _choose_window(
     graph: MapGraph, seeds: Sequence[int], size: int, held: set[int]
 ) -> tuple[list[int], bool]:
-    """Return up to *size* keyframes around *seeds*, and whether no others are connected with them.
+    """Return up to *size* keyframes around *seeds*, and whether they are all that the search can reach.
 
-    The search is breadth-first along the graph, and neither takes nor passes *held* keyframes.  Of too many
-    seeds the last are taken.
+    The search is breadth-first along the graph, and neither takes nor passes *held* keyframes.  Of more than
+    *size* seeds the last ones of the sequence are taken.
     """
     frontier = [i for i in seeds if i not in held][-size:]
     seen = set(frontier)
@@ -373,9 +368,9 @@ def _scale_terms(graph: MapGraph, edges: GraphEdges, free_scales: list[int]) -> 
 
     Return None if *free_scales* is empty.
 
-    All measured ratios of depths that a segment causes count as one measurement, because an error of its
-    depths is in all of them.  So the lengths of paths, measured in the metres of other robots, decide, and no
-    robot moves others by false depths.
+    All scales that the loop closures of one segment measure count as one measurement, because an error of the
+    depths of the segment is in all of them.  So the relative poses of loop closures, in the metres of other
+    robots, determine the scale, and no robot moves others by false depths.
     """
     if not free_scales:
         return None

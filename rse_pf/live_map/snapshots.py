@@ -69,10 +69,11 @@ class _Packed(msgspec.Struct, kw_only=True):
 
     ``links`` are its edges, ``removed`` the rejected ones, ``open`` the pending numbers, ``agreements`` the
     pair consistency (lower number, higher number, whether both agree), and ``links_of`` the numbers of
-    accepted loop closures by id of the keyframe.  ``numbers`` are next edge, root, events, and keyframes at
-    the last optimisation.  ``newest`` are the rows of the newest segments by robot, ``lookalikes`` the
-    aliased keyframes, ``smoothing`` the smoothing debts.  ``trust`` has the contradictions of each segment,
-    and whether it is excluded.  ``left`` is always empty.  ``arrays`` are the tables with a row for each
+    accepted loop closures by id of the keyframe.  ``numbers`` are `MapGraph.next_edge`,
+    ``root``, ``events`` and ``optimised_at``.  ``newest`` are the rows of the newest segments by robot,
+    ``lookalikes`` the aliased keyframes, ``smoothing`` the smoothing debts.  ``trust`` has the contradictions
+    of each segment, and whether it is excluded.  ``left`` held robots that had left in earlier releases, and
+    is always empty now.  ``arrays`` are the tables with a row for each
     keyframe, as raw bytes.
     """
 
@@ -338,7 +339,10 @@ class SnapshotWriter:
     """
 
     def __init__(self, full_parts: dict[int, tuple[str, frozenset[int]]] | None = None) -> None:
-        """Begin with full parts of an earlier snapshot: name and ids of keyframes, by number of the part."""
+        """Begin with full parts of an earlier snapshot: name and ids of keyframes, by number of the part.
+
+        The part with number *k*, from 0, is that of the keyframes from 128 *k* on.
+        """
         self._full = full_parts or {}
 
     def encode(self, graph: MapGraph, places: PlaceIndex, stored: Collection[str]) -> SnapshotParts:
@@ -367,7 +371,7 @@ class SnapshotWriter:
         return SnapshotParts(head=encode_graph(graph, extra, with_features=False), parts=parts)
 
     def forget(self, keyframes: Iterable[int]) -> None:
-        """Encode the parts with these keyframes anew next time, so that no part holds forgotten features."""
+        """Encode the parts with these keyframes anew in the next snapshot, without forgotten features."""
         for number in {i // PART_KEYFRAMES for i in keyframes}:
             self._full.pop(number, None)
 

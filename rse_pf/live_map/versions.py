@@ -35,8 +35,8 @@ __all__ = [
 ]
 
 MAX_IMAGE_REFERENCES = 8_000
-"""Newest keyframes of a version whose images are listed in its provenance, which may have 1 MiB; a reference
-needs 75 bytes."""
+"""Newest keyframes of a version whose images are listed in its provenance: a reference needs 75 bytes, and
+the registry of maps refuses a provenance above 1 MiB."""
 MAX_ROBOT_NAME = 64  # characters of a robot's name in a version
 
 
@@ -67,10 +67,10 @@ def as_internal_error(prefix: str) -> Iterator[None]:
 
 
 def started_from(version: MapVersion, source: str) -> MapStarted:
-    """Return the event by which a live map starts from *version*, whose name is *source*.
+    """Return the event by which a live map starts from *version*, whose name is *source* (MAP@NUMBER).
 
-    Features without a depth are left out, and so is the point cloud of the version.  ``equal_rooms_m`` of the
-    event is 0; the caller sets it.
+    Features without a depth are left out; the point cloud of the version is left out as well.
+    ``equal_rooms_m`` of the event is 0; the caller sets it.
 
     Raises:
         InternalError: The information of an edge is not positive definite.
@@ -104,8 +104,9 @@ def started_from(version: MapVersion, source: str) -> MapStarted:
 def version_of(graph: MapGraph) -> MapVersion:
     """Return the keyframes with features that are connected with the frame of the map, and their edges.
 
-    Odometry edges lead from each such keyframe of a segment to the next one.  If more than half of the robots
-    with an IMU agree on the direction of gravity, the z axis of the version points up.
+    Odometry edges lead from each such keyframe of a segment to the next one.  If the map did not start from a
+    version, and more than half of the robots with an IMU agree on the direction of gravity, the z axis of the
+    version points up; else the version has the axes of the live map.
 
     Raises:
         InternalError: The map holds something that does not fit into a version.
@@ -251,7 +252,8 @@ def _odometry_edges(graph: MapGraph, ids: list[int]) -> list[Edge]:
     """Return edges between consecutive keyframes *ids* of a segment.
 
     Where keyframes in between have lost their features, the edge is the relative pose of the graph, which is
-    more accurate than the odometry over a longer path.  The information is that of the odometry in any case.
+    more accurate than the odometry over a longer path.  The information is that of the odometry in any case:
+    the covariance of the relative pose in the graph is not known, and is smaller.
     """
     edges = []
     for a, b in pairwise(ids):
@@ -264,7 +266,7 @@ def _odometry_edges(graph: MapGraph, ids: list[int]) -> list[Edge]:
 
 
 def _kind_of(graph: MapGraph, edge: LoopEdge) -> EdgeKind:
-    if edge.is_fixed:  # An edge of the version that the map started from: the log does not hold its kind.
+    if edge.is_fixed:  # Neither the log nor the graph holds the kind of the edges of a stored version.
         return "odometry"
     return "merge" if graph.segment_rows[edge.a] != graph.segment_rows[edge.b] else "loop"
 
