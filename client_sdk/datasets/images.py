@@ -28,6 +28,7 @@ __all__ = [
     "probe",
     "read_colour",
     "read_depth",
+    "read_stored_pixels",
     "readable",
 ]
 
@@ -53,7 +54,7 @@ class UnreadableImage(UsageError):
         self.name = path.name
 
 
-def _read_raw(path: Path) -> npt.NDArray[Any]:
+def read_stored_pixels(path: Path) -> npt.NDArray[Any]:
     """Return the pixels of an image file as they are stored: grey ``(h, w)``, BGR or BGRA ``(h, w, c)``.
 
     Raises:
@@ -133,7 +134,7 @@ def read_colour(path: Path) -> npt.NDArray[np.uint8]:
         UsageError: The image has other channels or bits than `colour_of` takes.
         MissingExtra: OpenCV is not installed.
     """
-    return colour_of(_read_raw(path), str(path))
+    return colour_of(read_stored_pixels(path), str(path))
 
 
 def read_depth(path: Path, depth_scale: float) -> npt.NDArray[np.float32]:
@@ -146,7 +147,7 @@ def read_depth(path: Path, depth_scale: float) -> npt.NDArray[np.float32]:
         UsageError: The image has not one channel of 16 bits.
         MissingExtra: OpenCV is not installed.
     """
-    image = _read_raw(path)
+    image = read_stored_pixels(path)
     if image.dtype != np.uint16 or image.ndim != 2:
         raise UsageError(
             f"{path} is not a 16-bit depth image",

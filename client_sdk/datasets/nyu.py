@@ -10,13 +10,12 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from rse_pf.errors import UsageError
-from rse_pf.files import read_regular_file
+from client_sdk.datasets.images import read_stored_pixels
 from rse_pf.geometry import Array, Camera, Lens, transform
 
 __all__ = [
@@ -25,11 +24,9 @@ __all__ = [
     "DEPTH_CAMERA",
     "DEPTH_LENS",
     "RawFile",
-    "depth_from_raw",
     "raw_files",
-    "read_pnm",
+    "read_raw_depth",
     "register_depth",
-    "truncated_files",
 ]
 
 COLOUR_CAMERA = Camera(
@@ -65,10 +62,6 @@ _DEPTH_DISTORTION = (
 COLOUR_LENS = Lens(camera=COLOUR_CAMERA, distortion=_COLOUR_DISTORTION)
 DEPTH_LENS = Lens(camera=DEPTH_CAMERA, distortion=_DEPTH_DISTORTION)
 _MAX_DEPTH_M = 10.0  # depth of a reading, beyond which its pixel counts as without a reading
-_MAX_PNM_BYTES = 16 << 20  # size of an image file of a raw dump: 640x480 RGB pixels have 0.9 MB
-_PNM_HEAD = re.compile(rb"(P[56])\s+(?:#[^\n]*\n\s*)*(\d{1,5})\s+(\d{1,5})\s+(\d{1,5})\s")
-"""Header of a binary PNM file: kind, comments, width, height and largest value.  A comment ends with its
-line, so that the pattern matches a header in one way only, and takes linear time."""
 _RAW_FILE_NAME = re.compile(r"[dr]-(\d+(?:\.\d+)?)-\d+\.(?:pgm|ppm)$")
 
 
@@ -95,11 +88,16 @@ def T_colour_depth() -> Array:
     return T
 
 
-def depth_from_raw(raw: npt.NDArray[np.uint16]) -> npt.NDArray[np.float32]:
-    """Return the depth image ``(h, w)``, m, of raw values of a Kinect ``(h, w)``: ``351.3 / (1092.5 - raw)``.
+def read_raw_depth(path: Path) -> npt.NDArray[np.float32]:
+    """Return the depth image ``(h, w)``, m, of a PGM file of a raw dump.
 
-    Pixels without a reading, and readings beyond 10 m, are 0.
+    The file holds values of a Kinect in little endian, contrary to the PGM format.  A value is turned into a
+    depth by ``351.3 / (1092.5 - value)``.  Pixels without a reading, and readings beyond 10 m, are 0.
+
+    Raises:
+        UnreadableImage: The file is missing, or no whole image; the published dumps have such files.
     """
+    raw = read_stored_pixels(path).byteswap()
     difference = 1092.5 - raw.astype(np.float32)
     is_reading = (raw > 0) & (difference >= 351.3 / _MAX_DEPTH_M)
     return np.where(is_reading, 351.3 / np.where(is_reading, difference, 1.0), 0.0).astype(np.float32)
@@ -125,53 +123,10 @@ def register_depth(depth_m: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
 
 
 def raw_files(folder: Path, prefix: str) -> list[RawFile]:
-    """Return the images of a raw dump in the order of time, without those of `truncated_files`.
+    """Return the images of a raw dump in the order of time.
 
     *prefix* is ``d`` for depth, or ``r`` for colour; a file is named ``PREFIX-SECONDS-TICKS.pgm`` or
     ``.ppm``.
     """
-    return [file for file in _list_raw_files(folder, prefix) if not _is_truncated(file)]
-
-
-def truncated_files(folder: Path) -> list[str]:
-    """Return the names of images whose files are far too small: at most one byte for each pixel.
-
-    Depth images come first, then colour images; the published dump has some.  `read_pnm` refuses others that
-    are cut off.
-    """
-    files = [*_list_raw_files(folder, "d"), *_list_raw_files(folder, "r")]
-    return [file.path.name for file in files if _is_truncated(file)]
-
-
-def _list_raw_files(folder: Path, prefix: str) -> list[RawFile]:
     stamped = [(_RAW_FILE_NAME.match(path.name), path) for path in folder.glob(f"{prefix}-*.p[gp]m")]
     return sorted(RawFile(float(stamp[1]), path) for stamp, path in stamped if stamp)
-
-
-def _is_truncated(file: RawFile) -> bool:
-    return file.path.stat().st_size <= COLOUR_CAMERA.width * COLOUR_CAMERA.height
-
-
-def read_pnm(path: Path) -> npt.NDArray[Any]:
-    """Return the pixels of a binary PPM ``(h, w, 3)`` or PGM ``(h, w)``.
-
-    They are uint16 if the header states a largest value above 255, as for depth, else uint8, as for colour.
-    Values of 16 bits are read as little endian: those of the raw dump are, contrary to the format.
-
-    Raises:
-        UsageError: The file cannot be read, is cut off, or is no binary PPM or PGM.
-    """
-    try:
-        content = read_regular_file(path, _MAX_PNM_BYTES)
-    except OSError as error:
-        raise UsageError(f"cannot read {path}: {error.strerror}", hint="unpack the dump again") from error
-    head = _PNM_HEAD.match(content)
-    if head:
-        width, height = int(head[2]), int(head[3])
-        channels = 3 if head[1] == b"P6" else 1
-        dtype = np.dtype("<u2") if int(head[4]) > 255 else np.dtype(np.uint8)
-        body = content[head.end() :]
-        if len(body) >= width * height * channels * dtype.itemsize:
-            pixels = np.frombuffer(body, dtype=dtype, count=width * height * channels)
-            return pixels.reshape((height, width, 3) if channels == 3 else (height, width))
-    raise UsageError(f"{path} is not a complete PPM or PGM image", hint="unpack the dump again")

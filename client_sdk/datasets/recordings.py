@@ -7,7 +7,6 @@ only when its frame is needed.  EuRoC and KITTI are read in `client_sdk.datasets
 
 from __future__ import annotations
 
-import contextlib
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -39,7 +38,6 @@ from client_sdk.source_facts import (
     check_source,
     median_depth_m,
     rows_in_time,
-    some_names,
     stamps_in_seconds,
 )
 from client_sdk.trajectory import Trajectory, read_trajectory
@@ -454,8 +452,7 @@ def _read_truth(
 
 
 def _open_raw(folder: Path) -> Dataset:
-    """Return the raw dump of a folder; the camera and the unit of depth are those of the data set's
-    toolbox."""
+    """Return the raw dump of a folder; camera and unit of depth are those of the data set's toolbox."""
     depths, colours = nyu.raw_files(folder, "d"), nyu.raw_files(folder, "r")
     pairs = associate_stamps(
         [file.timestamp_s for file in depths],
@@ -472,35 +469,25 @@ def _open_raw(folder: Path) -> Dataset:
 
     def read(row: int) -> Frame:
         depth_row, colour_row = pairs[row]
-        depth_m = nyu.depth_from_raw(nyu.read_pnm(depths[depth_row].path))
+        depth_m = nyu.read_raw_depth(depths[depth_row].path)
         return Frame(
             timestamp_s=depths[depth_row].timestamp_s,
-            rgb=colour_undistortion.colour(nyu.read_pnm(colours[colour_row].path)),
+            rgb=colour_undistortion.colour(read_colour(colours[colour_row].path)),
             depth_m=nyu.register_depth(depth_undistortion.depth(depth_m)),
             camera=nyu.COLOUR_CAMERA,
         )
 
-    truncated, unpaired = nyu.truncated_files(folder), len(depths) - len(pairs)
-    losses = (
-        LossFacts(
-            sentence=f"{len(truncated)} truncated images of {folder} left out: {some_names(truncated)}",
-            lost=len(truncated),
-            total=len(depths) + len(colours),
-        ),
-        LossFacts(
-            sentence=f"{unpaired} of {len(depths)} depth images of {folder} have no colour image "
-            f"within {_MAX_RAW_STAMP_DIFFERENCE_S:g} s and are left out",
-            lost=unpaired,
-            total=len(depths),
-            is_usual=True,
-        ),
+    lost = len(depths) - len(pairs)
+    unpaired = LossFacts(
+        sentence=f"{lost} of {len(depths)} depth images of {folder} have no colour image "
+        f"within {_MAX_RAW_STAMP_DIFFERENCE_S:g} s and are left out",
+        lost=lost,
+        total=len(depths),
+        is_usual=True,
     )
     name, camera = folder.name, nyu.COLOUR_CAMERA
     stamps_s = tuple(depths[row].timestamp_s for row, _ in pairs)
-    depths_m = []
-    for row in sorted({0, len(stamps_s) // 2, len(stamps_s) - 1}):
-        with contextlib.suppress(UsageError):  # an image that cannot be read is reported in the iteration
-            depths_m.append(read(row).depth_m)
+    depths_m = probe(range(len(pairs)), lambda row: read(row).depth_m)
     whose = (
         f"the camera of {name} is that of the toolbox of NYU Depth V2: fx {camera.fx:.2f} fy {camera.fy:.2f} "
         f"cx {camera.cx:.2f} cy {camera.cy:.2f}"
@@ -512,7 +499,7 @@ def _open_raw(folder: Path) -> Dataset:
             median_m=median_depth_m(depths_m), units_per_m=1.0, is_unit_stated=True, is_registered=True
         ),
         times=(TimeFacts(stated_by=name, stamps_s=np.array(stamps_s)),),
-        losses=[loss for loss in losses if loss.lost],
+        losses=(unpaired,) if lost else (),
         assumed=(whose,),
     )
     return Dataset(

@@ -7,7 +7,7 @@ camera of the frames.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -69,31 +69,6 @@ def is_kitti(folder: Path) -> bool:
     return (folder / "calib.txt").is_file() and any((folder / left).is_dir() for left, _ in _KITTI_PAIRS)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _RigImages:
-    """The images of a recording with one camera or a stereo pair, in the order of time.
-
-    Attributes:
-        lefts: Images of the left camera, or of the only one.
-        rights: For each left image the image of the right camera; None if the right camera is not used.
-        stamps_s: ``(n,)``, s, time stamps of the left images.
-        stated_by: The file of the calibration, and the file of the time stamps, for messages.
-        truth: The file of the true path, for messages.
-        notes: Sentences on what was assumed.
-        losses: Left images without a right one, of recordings that pair images by time.
-        doubts: Doubts about time stamps, and about left images without a right one of the same number.
-    """
-
-    lefts: Sequence[Path]
-    rights: Sequence[Path] | None
-    stamps_s: Array
-    stated_by: tuple[str, str]
-    truth: str = ""
-    notes: tuple[str, ...] = ()
-    losses: tuple[LossFacts, ...] = ()
-    doubts: tuple[Doubt, ...] = ()
-
-
 def open_euroc(folder: Path, camera: CameraChoice | None = None, imu: bool | None = None) -> Dataset:
     """Return the recording of a folder in the layout of EuRoC: ``cam0`` or both cameras, with ``imu0``.
 
@@ -145,18 +120,19 @@ def open_euroc(folder: Path, camera: CameraChoice | None = None, imu: bool | Non
         samples = values.reshape(-1, 7)
         samples[:, 0], imu_notes = stamps_in_seconds(samples[:, 0], str(folder / "imu0"), "nanoseconds")
         notes += imu_notes
-    stated_by = str(folder / "cam0" / "sensor.yaml"), str(folder / "cam0" / "data.csv")
-    images = _RigImages(
+    return _make_dataset(
+        name or folder.name,
+        rig,
         lefts=lefts,
         rights=rights,
         stamps_s=stamps_s,
+        body_path=body_path,
+        samples=samples,
+        stated_by=(str(folder / "cam0" / "sensor.yaml"), str(folder / "cam0" / "data.csv"), _EUROC_TRUTH),
         notes=notes,
-        doubts=doubts,
-        stated_by=stated_by,
-        truth=_EUROC_TRUTH,
         losses=losses,
+        doubts=doubts,
     )
-    return _make_dataset(name or folder.name, rig, images, body_path, samples)
 
 
 def open_kitti(folder: Path, camera: CameraChoice | None = None, imu: bool | None = None) -> Dataset:
@@ -220,16 +196,18 @@ def open_kitti(folder: Path, camera: CameraChoice | None = None, imu: bool | Non
     height, width = probe(lefts, read_colour)[0].shape[:2]
     projections = (f"P{left[-1]}", f"P{right[-1]}") if has_stereo else (f"P{left[-1]}",)
     rig = read_kitti_rig(folder / "calib.txt", (width, height), projections)
-    images = _RigImages(
+    dataset = _make_dataset(
+        folder.name,
+        rig,
         lefts=lefts,
         rights=rights,
         stamps_s=stamps_s[used],
+        body_path=truth,
+        samples=None,
+        stated_by=(str(folder / "calib.txt"), str(folder / "times.txt"), str(truth_file)),
         notes=notes,
         doubts=doubts,
-        stated_by=(str(folder / "calib.txt"), str(folder / "times.txt")),
-        truth=str(truth_file),
     )
-    dataset = _make_dataset(folder.name, rig, images, truth, None)
     # KITTI's poses are those of the camera P0, which `read_kitti_rig` takes as the body; no other body is
     # known.
     return replace(dataset, T_body_camera=None)
@@ -294,24 +272,40 @@ def _match_kitti_lines(
 
 
 def _make_dataset(
-    name: str, rig: Rig, images: _RigImages, body_path: Trajectory | None, samples: Array | None
+    name: str,
+    rig: Rig,
+    *,
+    lefts: Sequence[Path],
+    rights: Sequence[Path] | None,
+    stamps_s: Array,
+    body_path: Trajectory | None,
+    samples: Array | None,
+    stated_by: tuple[str, str, str],
+    notes: tuple[str, ...],
+    losses: tuple[LossFacts, ...] = (),
+    doubts: tuple[Doubt, ...],
 ) -> Dataset:
     """Return the recording of a rig.
 
     Args:
         name: Name of the recording.
         rig: The cameras that are used, and the IMU.
-        images: The images of these cameras.
+        lefts: Images of the left camera, or of the only one, in the order of time.
+        rights: For each left image the image of the right camera; None if the right camera is not used.
+        stamps_s: ``(n,)``, s, time stamps of the left images.
         body_path: True poses of the body in the world; None without a truth.
         samples: ``(n, 7)``, samples of the IMU: time stamp (s), angular rate (rad/s), specific force (m/s^2);
             None without an IMU.
+        stated_by: The files of the calibration, of the time stamps and of the true path, for messages.
+        notes: Sentences on what was assumed.
+        losses: Left images without a right one, of recordings that pair images by time.
+        doubts: Doubts about time stamps, and about left images without a right one of the same number.
 
     Raises:
         UsageError: There is no image, the cameras are no stereo pair, or facts contradict each other.
         MissingExtra: OpenCV is not installed.
     """
     # 1. Prepare the undistortion or rectification, with which a frame is read later.
-    lefts, rights, stamps_s = images.lefts, images.rights, images.stamps_s
     if not len(lefts):
         raise UsageError(f"{name} has no images", hint="unpack the recording again")
     left, right = rig.left, rig.right
@@ -356,19 +350,19 @@ def _make_dataset(
     # 3. Collect the facts about the recording, and compare them.
     cameras = [
         CameraFacts(
-            stated_by=images.stated_by[0] if rig_camera is left else f"the right camera of {name}",
+            stated_by=stated_by[0] if rig_camera is left else f"the right camera of {name}",
             lens=rig_camera.lens,
         )
         for rig_camera in rig.cameras
     ]
-    references = () if truth is None else (TimeFacts(stated_by=images.truth, stamps_s=truth.timestamps_s),)
+    references = () if truth is None else (TimeFacts(stated_by=stated_by[2], stamps_s=truth.timestamps_s),)
     facts = SourceFacts(
         name=name,
         cameras=cameras,
-        losses=images.losses,
-        doubts=images.doubts,
-        assumed=images.notes,
-        times=(TimeFacts(stated_by=images.stated_by[1], stamps_s=stamps_s),),
+        losses=losses,
+        doubts=doubts,
+        assumed=notes,
+        times=(TimeFacts(stated_by=stated_by[1], stamps_s=stamps_s),),
         references=references,
     )
     return Dataset(

@@ -272,12 +272,12 @@ def test_intrinsics_that_are_none_are_one_line(intrinsics: Path, text: str):
     "head", [b"P5 " + b"# " * 5000 + b"x", b"P5 " + b"9" * 5000 + b" 1 255\n", b"P6 99999 99999 255\n"]
 )
 def test_the_head_of_a_raw_image_takes_no_time(tmp_path: Path, head: bytes):
-    from client_sdk.datasets.nyu import read_pnm
+    from client_sdk.datasets.nyu import read_raw_depth
 
     (tmp_path / "d-1.0-1.pgm").write_bytes(head)
 
-    with pytest.raises(UsageError, match="is not a complete PPM or PGM image"):
-        read_pnm(tmp_path / "d-1.0-1.pgm")
+    with pytest.raises(UsageError, match="cannot read the image"):
+        read_raw_depth(tmp_path / "d-1.0-1.pgm")
 
 
 def _pinhole() -> dict[str, float]:

@@ -178,10 +178,12 @@ def test_paths_without_a_recording_are_refused(tmp_path: Path):
 # --- NYU Depth V2 -------------------------------------------------------------------------------
 
 
-def test_raw_depth_becomes_metres():
+def test_raw_depth_becomes_metres(tmp_path: Path):
     raw = np.array([[0, 600, 741, 1057, 1058, 2047]], np.uint16)
     # 351.3 / 492.5, 351.3 / 351.5, 351.3 / 35.5; 1058 would be 10.18 m, 2047 is "no reading"
-    np.testing.assert_allclose(nyu.depth_from_raw(raw), [[0, 0.713299, 0.999431, 9.895775, 0, 0]], atol=1e-5)
+    (tmp_path / "d.pgm").write_bytes(b"P5\n6 1\n65535\n" + raw.astype("<u2").tobytes())
+    depth_m = nyu.read_raw_depth(tmp_path / "d.pgm")
+    np.testing.assert_allclose(depth_m, [[0, 0.713299, 0.999431, 9.895775, 0, 0]], atol=1e-5)
 
 
 def test_depth_is_registered_where_the_colour_camera_sees_it():
@@ -216,7 +218,7 @@ def test_a_raw_dump_is_paired_by_the_times_in_its_names(tmp_path: Path):
     for stamp in ("100.000000", "100.033000"):
         write_pgm(tmp_path / f"d-{stamp}-5.pgm", np.full((480, 640), 741, np.uint16))
     (tmp_path / "d-100.066000-5.pgm").write_bytes(b"")  # the published dump has such files
-    for stamp, red in (("99.990000", 10), ("100.040000", 20), ("100.500000", 30)):
+    for stamp, red in (("99.990000", 10), ("100.040000", 20), ("100.070000", 30), ("100.500000", 40)):
         body = np.zeros((480, 640, 3), np.uint8)
         body[..., 0] = red
         (tmp_path / f"r-{stamp}-7.ppm").write_bytes(b"P6\n640 480\n255\n" + body.tobytes())
@@ -225,7 +227,7 @@ def test_a_raw_dump_is_paired_by_the_times_in_its_names(tmp_path: Path):
     frames = list(dataset)
 
     (doubt,) = dataset.doubts
-    assert doubt.sentence.endswith("left out: d-100.066000-5.pgm")
+    assert doubt.sentence.endswith("left out, damaged or empty: d-100.066000-5.pgm")
     assert any("is that of the toolbox of NYU Depth V2: fx 518.86" in note for note in dataset.notes)
     assert [frame.timestamp_s for frame in frames] == [100.0, 100.033]
     assert [frame.rgb[240, 320].tolist() for frame in frames] == [[10, 0, 0], [20, 0, 0]]
