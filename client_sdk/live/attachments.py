@@ -146,15 +146,15 @@ class Attachments:
     def make(self, frame: Frame, features: Features) -> EncodedAttachments:
         """Encode the points and the image of a keyframe, and take their bytes from the two byte budgets.
 
-        The points are at most as many as `LiveOptions.points` and the budget of the points allow; a budget
-        that is spent still allows 400.  There is no image while the budget of the images is spent.  May run
+        The points are at most as many as `LiveOptions.points` and the budget of the points allow; also a
+        budget that is spent allows 400.  There is no image while the budget of the images is spent.  May run
         in any thread.
         """
         points, image, now = None, None, self._clock()
         if self._point_uploader is not None:
             self._point_budget.fill(now)
             affordable_points = int(self._point_budget.tokens / _BYTES_PER_POINT)
-            max_points = max(min(self._options.points, affordable_points), _MIN_POINTS)
+            max_points = min(self._options.points, max(affordable_points, _MIN_POINTS))
             points = encode_keyframe_points(frame, features, max_points)
             self._point_budget.spend(len(points or b""), now)
         if self._image_uploader is not None and self.may_store_images:

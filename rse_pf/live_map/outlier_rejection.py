@@ -338,7 +338,7 @@ def _decide_join(graph: MapGraph, first: int, second: int) -> Iterator[Decision]
 
 
 def _mark_aliases(graph: MapGraph, numbers: list[int], distance_m: float) -> Iterator[Decision]:
-    """Mark two places that look the same, the ends of loop closures, and reject connections that rest on them.
+    """Mark the ends of loop closures as places that look the same, and reject connections that rest on them.
 
     The places are *distance_m* metres apart.  All keyframes of the same component within half of this
     distance, at most 5 m, of an end are marked, since they may look like the other place as well.

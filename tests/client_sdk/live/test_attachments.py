@@ -151,6 +151,16 @@ async def test_a_robot_that_cannot_store_points_still_maps_and_leaves(
     assert mapper.report()["live"]["points"]["trouble"]
 
 
+async def test_a_keyframe_has_at_most_the_points_of_the_options(robot: FakeLiveRobot) -> None:
+    objects = Objects()
+    live = replace(QUICK, points=50, points_bytes_per_s=1e9, leave_s=5.0)
+    async with mapper_of(robot, objects, live) as mapper:
+        await drive(mapper, range(5))
+
+    assert objects.held
+    assert all(len(decode_points(data, CAMERA)[0]) <= 50 for data in objects.held.values())
+
+
 async def test_no_points_are_made_where_none_are_wanted(robot: FakeLiveRobot) -> None:
     objects = Objects()
     async with mapper_of(robot, objects, replace(QUICK, points=0)) as mapper:
