@@ -89,8 +89,8 @@ class LensModel:
         largest = max(map(abs, coefficients), default=0.0)
         if len(coefficients) > len(self.coefficient_names) or largest > MAX_STATED_COEFFICIENT:
             raise InvalidCamera(
-                f"{len(coefficients)} distortion numbers of up to {largest:g} are more than the "
-                f"{len(self.coefficient_names)} of the lens model {self.name}, or above "
+                f"{len(coefficients)} distortion numbers, of which the largest is {largest:g}, are given; "
+                f"the lens model {self.name} has up to {len(self.coefficient_names)} numbers, each of up to "
                 f"{MAX_STATED_COEFFICIENT:g}",
                 hint=f"give {' '.join(self.coefficient_names)}",
             )

@@ -107,11 +107,11 @@ def fit_camera(
     jacobian_change = fit.jacobian_and_errors(shifted_map, pixels, camera)[0] - fit.jacobian
     weights = fit.weights[:, None, None]
     information = (fit.jacobian * weights).reshape(-1, 11).T @ fit.jacobian.reshape(-1, 11)
-    feigned = (jacobian_change * weights).reshape(-1, 11).T @ jacobian_change.reshape(-1, 11)
+    spurious = (jacobian_change * weights).reshape(-1, 11).T @ jacobian_change.reshape(-1, 11)
     # 3. Estimate the variance of a pixel from the errors that remain, and compute the covariance with it.
     squares_px2 = float(fit.weights @ np.square(fit.errors_px).sum(axis=1))
     variance_px2 = max(_MIN_VARIANCE_PX2, squares_px2 / (2.0 * float(fit.weights.sum())))
-    covariance = _covariance_of(information, feigned, _CORRELATION_FACTOR * variance_px2, prior_information)
+    covariance = _covariance_of(information, spurious, _CORRELATION_FACTOR * variance_px2, prior_information)
     variances = np.diag(covariance)
     # 4. Convert the twist left of T_camera_map into that left of T_map_camera: the inverse of exp(xi) T has
     # the twist -Ad(inverse(T)) xi on its left.
@@ -196,20 +196,20 @@ def _adjust(
 
 
 def _covariance_of(
-    information: Array, feigned: Array, variance_px2: float, prior_information: Array
+    information: Array, spurious: Array, variance_px2: float, prior_information: Array
 ) -> Array:
     """Return the covariance ``(11, 11)`` of pose and camera.
 
     Args:
         information: ``(11, 11)``, information matrix of the matches for pixels of variance 1 px^2.
-        feigned: ``(11, 11)``, the spurious part of *information*, which results from noise of the points and
+        spurious: ``(11, 11)``, the spurious part of *information*, which results from noise of the points and
             is subtracted from it.
         variance_px2: Variance of a pixel, px^2, by which the difference is divided.
         prior_information: ``(5,)``, prior information on the parameters of the camera, which is added.
     """
     # 1. Scale to a diagonal of 1, subtract, and keep the result positive definite.
     scale = 1.0 / np.sqrt(np.diag(information))
-    values, vectors = np.linalg.eigh((information - feigned) * np.outer(scale, scale))
+    values, vectors = np.linalg.eigh((information - spurious) * np.outer(scale, scale))
     corrected = (vectors * np.maximum(values, _MIN_EIGENVALUE)) @ vectors.T / np.outer(scale, scale)
     # 2. Add the prior, and invert.
     corrected /= variance_px2

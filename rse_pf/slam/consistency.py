@@ -82,10 +82,10 @@ class LoopClosure:
 class EdgeArrays:
     """*m* measured relative poses as arrays: from the keyframes in rows ``a`` to those in rows ``b``.
 
-    ``T_a_b`` is ``(m, 4, 4)``; ``variances`` ``(m, 6)`` are those of its twist (square metres, square
-    radians).  ``scales`` ``(m, 2)`` is given where the poses of *b* have another unit of length than those of
-    *a*: the logarithm of the length of the unit of *b* in the unit of *a*, and the variance of this
-    logarithm.  ``T_a_b`` is then in the unit of *a*.
+    ``T_a_b`` is ``(m, 4, 4)``, and ``variances`` ``(m, 6)`` holds the variances of the twist on its right
+    (square metres, square radians).  ``scales`` ``(m, 2)`` is given if the poses of *b* have another unit of
+    length than those of *a*: the natural logarithm of the length of the unit of *b*, measured in the unit of
+    *a*, and the variance of this logarithm.  ``T_a_b`` is then in the unit of *a*.
     """
 
     a: npt.NDArray[np.int64]
@@ -251,7 +251,9 @@ def fits_prediction(
 
 
 def are_scales_consistent(difference2: Array, variance: Array) -> npt.NDArray[np.bool_]:
-    """Return ``(m,)``: whether differences of logarithms of scales are noise, at 99 %.
+    """Return ``(m,)``: whether differences of logarithms of scales are explained as noise.
+
+    A chi-squared test is used that accepts 99 % of noise.
 
     Args:
         difference2: ``(m,)``, the squares of the differences.
@@ -262,9 +264,10 @@ def are_scales_consistent(difference2: Array, variance: Array) -> npt.NDArray[np
 
 
 def _are_twists_noise(xi: Array, variance_m2: Array, variance_rad2: Array) -> npt.NDArray[np.bool_]:
-    """Return ``(m,)``: whether translation and rotation of each twist ``(m, 6)`` are noise, each at 99 %.
+    """Return ``(m,)``: whether translation and rotation of each twist ``(m, 6)`` are explained as noise.
 
-    *variance_m2* and *variance_rad2* ``(m,)`` are the variances of translation and rotation for each axis.
+    Each is tested by a chi-squared test that accepts 99 % of noise.  *variance_m2* and *variance_rad2*
+    ``(m,)`` are the variances of translation and rotation along or about each axis.
     """
     fits: npt.NDArray[np.bool_] = ((xi[:, :3] ** 2).sum(axis=1) <= CHI2_99_PERCENT_3 * variance_m2) & (
         (xi[:, 3:] ** 2).sum(axis=1) <= CHI2_99_PERCENT_3 * variance_rad2

@@ -70,8 +70,8 @@ MAX_KEYFRAME_BYTES = 36_000
 """Largest size in bytes of one encoded keyframe; the 894 ORB features that a robot sends by default need
 33.3 kB."""
 MAX_FEATURES = 894
-"""Largest number of features of one keyframe with ORB descriptors; `max_features` gives that for larger
-descriptors."""
+"""Largest number of features of one keyframe with ORB descriptors; for other kinds of descriptors,
+`max_features` returns the number."""
 MAX_BLOCKS = 16
 """Largest number of blocks in one encoded keyframe; this release knows seven kinds of blocks."""
 

@@ -275,7 +275,7 @@ def _dependencies_in(folder: Path) -> Iterator[tuple[str, Dependencies]]:
 
 
 def read_dependencies(target: Path) -> Dependencies | None:
-    """Return the packages of the installed service in the folder *target*, without a look at their files.
+    """Return the packages of the installed service in the folder *target*; their files are not verified.
 
     The result is None if the service has no packages, or if it was not installed: its folder has no
     ``pins.json``.

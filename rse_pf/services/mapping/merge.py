@@ -115,8 +115,8 @@ def merge_maps(request: MergeRequest, *, report: Report = ignore_progress) -> Me
         points = sum(len(version.points) for version in versions)
         if count > MAX_KEYFRAMES or count * points > _MAX_PROJECTIONS:
             raise LimitExceeded(
-                f"{count} keyframes are above {MAX_KEYFRAMES}, or with {points} points of clouds above "
-                f"{_MAX_PROJECTIONS} projections",
+                f"the maps have {count} keyframes and {points} points, but may have up to {MAX_KEYFRAMES} "
+                f"keyframes, and up to {_MAX_PROJECTIONS} as the product of keyframes and points",
                 hint="merge fewer maps at once, or thin their clouds",
             )
     if not all(version.keyframes for version in versions):

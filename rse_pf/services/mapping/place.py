@@ -181,7 +181,7 @@ def index_map(data: bytes) -> tuple[MapVersion, MapIndex]:
     version = decode_map(data, limits=MAP_LIMITS)
     if not version.keyframes:
         raise LimitExceeded(
-            f"a map of 0 keyframes is not within 1..{MAX_KEYFRAMES}", hint="send a map with keyframes"
+            f"the map has 0 keyframes, not 1..{MAX_KEYFRAMES}", hint="send a map with keyframes"
         )
     return version, MapIndex(version.keyframes)
 
