@@ -19,18 +19,19 @@ from rse_pf.geometry import Array
 
 __all__ = ["Board", "find_corners", "write_board"]
 
-_MARKER_SHARE = 0.75  # side of a ChArUco marker over that of its square
+_MARKER_SHARE = 0.75  # side of a ChArUco marker as a fraction of the side of its square
 _SQUARE_PX = 8
-"""Side of a square, pixels, in the smallest exact image of a board: a ChArUco marker of 6x6 modules, a pixel
-each, fills 0.75 of that side."""
-_MIN_CHARUCO_CORNERS = 6  # corners of a ChArUco board that must be found in an image
-_MIN_CORNERS = 3  # corners of a board in a row or column: OpenCV needs at least three
+"""Side of a square in pixels, in the smallest image of a board in which all edges lie between pixels: the
+marker of a ChArUco board has 6x6 modules, which are 6 of the 8 pixels (`_MARKER_SHARE`) at one pixel each."""
+_MIN_CHARUCO_CORNERS = 6  # fewest corners of a ChArUco board with which an image is used
+_MIN_CORNERS = 3  # fewest inner corners of a board in a row or column: OpenCV needs three
 _MAX_CORNERS = 40
-"""Corners of a board in a row or column: the 1000 markers of DICT_4X4_1000 are enough for it."""
-_MIN_SQUARE_M = 0.001  # side of a square: a smaller one is a length in metres where millimetres were meant
-_MAX_SQUARE_M = 1.0  # side of a square: a larger one is a length in a smaller unit
+"""Most inner corners of a board in a row or column: a board of 40x40 needs 840 of the 1000 markers of the
+dictionary DICT_4X4_1000."""
+_MIN_SQUARE_M = 0.001  # smallest side of a square: users who state less have stated metres as millimetres
+_MAX_SQUARE_M = 1.0  # largest side of a square: a larger number is probably not in millimetres
 _MM_PER_POINT = 25.4 / 72.0  # millimetres in a point, the unit of PDF
-_PNG_PX_PER_MM = 300 / 25.4  # pixels of a PNG in a millimetre, at 300 dots per inch
+_PNG_PX_PER_MM = 300 / 25.4  # pixels of a PNG per millimetre, at 300 dots per inch
 _MARGIN_MM = 10.0  # white margin around the board on a PDF page: printers do not print to the edge
 
 
@@ -39,10 +40,11 @@ class Board:
     """A calibration board.
 
     Attributes:
-        columns: Inner corners in a row.
-        rows: Inner corners in a column.
+        columns: Number of inner corners in a row.
+        rows: Number of inner corners in a column.
         square_m: Side of a square, m.
-        charuco: Whether the board is a ChArUco board, of which a part is enough; else a chessboard.
+        charuco: Whether the board is a ChArUco board, of which an image may show a part; else it is a
+            chessboard, of which an image must show all.
 
     Raises:
         UsageError: The size is not within 3..40 corners, or the squares are not within 1 mm to 1 m.
@@ -67,7 +69,7 @@ class Board:
 
     @classmethod
     def parse(cls, size: str, square_mm: float, *, charuco: bool = False) -> Board:
-        """Return the board of *size*, a word such as ``9x6``, with squares of *square_mm*.
+        """Return the board with *size* inner corners, a word such as ``9x6``, and squares of *square_mm*.
 
         Raises:
             UsageError: The word is no size, or `Board` refuses the numbers.
@@ -94,7 +96,7 @@ class Board:
 def find_corners(gray: npt.NDArray[np.uint8], board: Board) -> tuple[npt.NDArray[np.int64], Array] | None:
     """Find the corners of *board* in a grey image ``(h, w)``.
 
-    A chessboard is found whole or not at all; of a ChArUco board, six corners are enough.
+    All corners of a chessboard must be visible; of a ChArUco board, six are enough.
 
     Returns:
         Indices ``(n,)`` of the corners in `Board.points`, and their pixels ``(n, 2)``, column and row, to a
@@ -123,9 +125,10 @@ def find_corners(gray: npt.NDArray[np.uint8], board: Board) -> tuple[npt.NDArray
 
 
 def write_board(path: Path, board: Board) -> None:
-    """Write an image of a board: ``.pdf``, which prints at its true size, or ``.png``.
+    """Write an image of a board to print: ``.pdf``, which has its true size, or ``.png``.
 
-    A PNG has the true size if it is printed at 300 dots per inch, which the file does not state.
+    A PNG must be printed at 300 dots per inch to have the true size; the file does not state this resolution,
+    so that the printing program must be told.
 
     Raises:
         UsageError: The file name has another ending, or the file cannot be written.

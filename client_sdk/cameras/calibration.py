@@ -18,20 +18,21 @@ from rse_pf.geometry import Array, Camera
 
 __all__ = ["BoardViews", "calibrate"]
 
-MIN_VIEWS = 8  # images of the board that a calibration needs, of one camera or of a stereo pair
+MIN_VIEWS = 8  # fewest views of the board for a calibration, of one camera or of a stereo pair
 _MAX_FOCAL_DEVIATION_PERCENT = 2.0
-"""Largest standard deviation of the focal length, percent of the focal length: above it the views are too
-similar."""
+"""Largest standard deviation of the focal length, in percent of it, of a calibration that is not refused:
+with a larger one the views are too similar."""
 _MIN_TILT_DEG = 20.0
-"""Smallest value of the largest angle between the boards of any two views: without such an angle, focal
-length and distance of the board cannot be separated, and the standard deviation of the focal length says
-nothing."""
+"""A calibration is refused if no two of its views show the board at orientations that differ by this angle:
+then focal length and distance of the board cannot be separated, and even a small standard deviation of the
+focal length proves nothing."""
 _MIN_MOTION_SHARE = 0.05
-"""Motion of the corner that moved most, as a share of the image width, which a new view must reach against
-each earlier view."""
+"""An image is a new view only if, compared with each earlier view, some corner has moved by this fraction of
+the image width; otherwise it is counted as similar and not used."""
 _MAX_VIEW_ERROR_FACTOR = 2.5
-"""Reprojection error of a view over the median of all views, above which the view is left out."""
-_MAX_GOOD_VIEW_ERROR_PX = 0.1  # reprojection error of a view below which the view is never left out
+"""A view is left out if its reprojection error is above this many times the median of all views, and also
+above `_MAX_GOOD_VIEW_ERROR_PX`."""
+_MAX_GOOD_VIEW_ERROR_PX = 0.1  # a view with at most this reprojection error is never left out
 
 
 @dataclass(slots=True, eq=False)
@@ -42,8 +43,9 @@ class BoardViews:
         board: The calibration board.
         size: Width and height of the images, px; None before the first image.
         images: Number of images that were searched for the board.
-        similar: Number of images that show the board, but too similar to an earlier view.
-        views: Of each view, indices ``(n,)`` of the corners on the board, and their pixels ``(n, 2)``.
+        similar: Number of images that show the board, but nearly as an earlier view does.
+        views: For each view, the indices ``(n,)`` of its corners in `Board.points`, and their pixels ``(n,
+            2)``.
     """
 
     board: Board
@@ -97,13 +99,13 @@ class BoardViews:
 def calibrate(views: BoardViews, *, max_rms_px: float = 1.0, depth_scale: float | None = None) -> Intrinsics:
     """Return the radial-tangential intrinsics that explain the views of a board best.
 
-    Views with a far larger error than the others are left out, unless fewer than 8 views remain; `rms_px` and
-    `views` of the result count the other ones only.
+    Views with a far larger error than the others are left out, unless fewer than 8 views would remain;
+    ``rms_px`` and ``views`` of the result are the error and the number of the views that were used.
 
     Args:
-        views: The views of the board, which stay as they are.
+        views: The views of the board, which do not change.
         max_rms_px: Largest root mean square reprojection error, px, of a calibration that is accepted.
-        depth_scale: Units of the camera's depth images in a metre, which is copied into the result.
+        depth_scale: Units of the camera's depth images per metre, which is copied into the result.
 
     Raises:
         CommandFailed: There are too few views, they are too similar, or the error is above *max_rms_px*.
@@ -127,8 +129,8 @@ def calibrate(views: BoardViews, *, max_rms_px: float = 1.0, depth_scale: float 
     rms_px, K, distortion, rotations, _, deviations, _, view_errors_px = cv2.calibrateCameraExtended(
         points, pixels, views.size, None, None
     )
-    # 2. Calibrate again without views that are far worse than the others (blurred or half found), if enough
-    # views remain.
+    # 2. If enough views remain, calibrate again without those whose error is far larger than that of the
+    #    others, such as blurred ones.
     max_error_px = max(_MAX_VIEW_ERROR_FACTOR * float(np.median(view_errors_px)), _MAX_GOOD_VIEW_ERROR_PX)
     good_rows = np.flatnonzero(view_errors_px.ravel() <= max_error_px)
     if MIN_VIEWS <= len(good_rows) < len(points):

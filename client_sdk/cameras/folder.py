@@ -1,9 +1,10 @@
 """Read a folder of images as a camera, with or without depth, and two folders as a stereo pair.
 
-Colour images are in ``rgb/``, ``color/``, ``images/`` or the folder itself.  Depth images (16 bits) are in
-``depth/``, or in the folder of the colour images with ``depth`` in their names.  Images that belong together
-share their name, a number in their name, or their time.  Names that are decimal numbers, or times since 1970,
-are time stamps.  Recordings that list their images in a file are read by `client_sdk.datasets`.
+Colour images are in a folder that `_COLOUR_FOLDERS` names, such as ``rgb/``, or in the folder itself.  Depth
+images (16 bits) are in a folder that `_DEPTH_FOLDERS` names, such as ``depth/``, or in the folder of the
+colour images with ``depth`` in their names.  Images that belong together share their name, a number in their
+name, or their time.  Names that are decimal numbers, or times since 1970, are time stamps.  Recordings that
+list their images in a file are read by `client_sdk.datasets`.
 """
 
 from __future__ import annotations
@@ -46,18 +47,22 @@ from rse_pf.geometry import Array
 __all__ = ["FolderImages", "list_folder", "list_pairs", "pair_folders"]
 
 _COLOUR_FOLDERS = ("rgb", "color", "colour", "image", "images", "results")
-"""Names of the folder of the colour images, the first of which that exists is used, see `_find_folder`."""
+"""Names that other programs give to the folder of the colour images; the first that exists is used (see
+`_find_folder`).  Replica recordings have colour and depth images in ``results``."""
 _DEPTH_FOLDERS = ("depth", "depths", "aligned_depth", "depth_image", "depth_images")
-"""Names of the folder of the depth images, as for `_COLOUR_FOLDERS`."""
+"""Names that other programs give to the folder of the depth images; the first that exists is used."""
 _PAIR_FOLDERS = ("{}", "image_{}", "images_{}", "{}_images", "img_{}", "rgb_{}")
-"""Names of the folders of a stereo pair, with ``left`` or ``right`` in the place of the braces."""
-_ASSUMED_PERIOD_S = 0.1  # time between images where neither names nor intrinsics state times or a rate
-_MAX_PAIR_DIFFERENCE_S = 0.02  # between the times in the names of two images that are paired by time
+"""Names of the two folders of a stereo pair, with ``left`` and ``right`` in the place of the braces."""
+_ASSUMED_PERIOD_S = 0.1  # time between images if neither their names nor the intrinsics state times or a rate
+_MAX_PAIR_DIFFERENCE_S = (
+    0.02  # largest difference of the times in the names of two images that are paired by time
+)
 _NANOSECOND_DIGITS = 9
-"""Digits of whole nanoseconds in a name: ROS names images SECONDS.NANOSECONDS, often without leading zeros of
-the nanoseconds."""
+"""Most digits of the nanoseconds in a name: ROS names images SECONDS.NANOSECONDS, often without the leading
+zeros of the nanoseconds."""
 _NAME_WITH_TIME = re.compile(r"(?:[A-Za-z][A-Za-z_]*[-_]?)?(-?\d+(?:\.\d+)?)(?:[._-][A-Za-z]+)?")
-"""Name of an image that may state its time: a word or none, the number, and a word after a mark or none."""
+"""Name of an image that may state its time: the number, perhaps with a word before it, and perhaps with a
+mark and a word after it, such as ``frame_12.5-color``."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -66,12 +71,12 @@ class FolderImages:
 
     Attributes:
         name: Path of the folder, for messages.
-        images: Colour images, or images of the left camera.
-        partners: For each image its depth image, or the image of the right camera; None if the folder has
-            neither.
+        images: Files of the colour images, or of the images of the left camera.
+        partners: For each image, the file of its depth image or of the image of the right camera; None if the
+            folder has neither.
         stamps_s: ``(n,)``, s, time stamps of the images, which increase.
-        doubts: Doubts about the time stamps, and about images without a partner.
-        assumed: Sentences on what the folder does not state.
+        doubts: Doubts about the time stamps, and about images without a partner, which are left out.
+        assumed: Sentences for the user on what was assumed because the folder does not state it.
     """
 
     name: str
@@ -82,7 +87,9 @@ class FolderImages:
     assumed: tuple[str, ...]
 
     def facts(self, lens: Intrinsics, stated_by: str, *, has_depth: bool) -> SourceFacts:
-        """Return what the folder states; its first, middle and last image are read to compare it.
+        """Return what the folder states, and the image size and median depth with which that is compared.
+
+        Both are measured in the first, the middle and the last image.
 
         Args:
             lens: Intrinsics of the images.
@@ -90,7 +97,7 @@ class FolderImages:
             has_depth: Whether the partners are depth images that will be used.
 
         Raises:
-            UsageError: No image can be read, or a depth image has not 16 bits.
+            UsageError: None of these images can be read, or a depth image does not have 16 bits.
         """
         assumed = self.assumed
         depth = None
@@ -126,11 +133,9 @@ class FolderImages:
         return width, height
 
     def frames(self, log: DoubtLog, depth_units_per_m: float | None) -> Iterator[RawFrame]:
-        """Yield the frames, not undistorted; *log* counts frames of which an image cannot be read.
+        """Yield the frames, not undistorted; leave out, and count in *log*, unreadable ones.
 
-        These are left out.
-
-        *depth_units_per_m* are the units of a depth image in a metre; with None, depth is not read.
+        *depth_units_per_m* is the number of units of a depth image per metre; with None, depth is not read.
         """
 
         def read(row: int) -> RawFrame:
@@ -142,9 +147,9 @@ class FolderImages:
         return readable(range(len(self.images)), read, log)
 
     def pairs(self, log: DoubtLog) -> Iterator[RawPair]:
-        """Yield the stereo pairs, not rectified; *log* counts pairs of which an image cannot be read.
+        """Yield the stereo pairs, not rectified; leave out, and count in *log*, unreadable ones.
 
-        These are left out.  The partners must be the images of the right camera.
+        `partners` must be the images of the right camera.
         """
         rights = self.partners or ()
 
@@ -157,7 +162,7 @@ class FolderImages:
 def list_folder(folder: Path, rate_hz: float | None = None) -> FolderImages:
     """Return the images of a folder, with their depth images if there are some.
 
-    *rate_hz* is the rate of images whose names state no time; None for 10 Hz.
+    *rate_hz* is the rate of images whose names state no time; None means 10 Hz, with a sentence in `assumed`.
 
     Raises:
         UsageError: There is no image, or there are depth images and none belongs to a colour image.
@@ -177,7 +182,8 @@ def list_folder(folder: Path, rate_hz: float | None = None) -> FolderImages:
 def pair_folders(folder: Path) -> tuple[Path, Path] | None:
     """Return the folders of the left and of the right images of a stereo pair, inside *folder*.
 
-    The first names of `_PAIR_FOLDERS` count of which both folders exist; None if there are none.
+    They have the first names of `_PAIR_FOLDERS` for which both folders exist; the result is None without
+    such.
     """
     for name in _PAIR_FOLDERS:
         left, right = (folder / name.format(side) for side in ("left", "right"))
@@ -208,8 +214,8 @@ def _order_by_time(
         name: Path of the folder, for messages.
         images: All images, in the order of the numbers in their names.
         partners: All depth images or right images, in any order; None without any.
-        partner_kind: What partners are called in messages.
-        rate_hz: Rate of images whose names state no time; None for 10 Hz.
+        partner_kind: Word for a partner in messages, such as ``depth image``.
+        rate_hz: Rate of images whose names state no time; None means 10 Hz.
 
     Raises:
         UsageError: No image has a partner.
@@ -243,7 +249,7 @@ def _order_by_time(
         images = [images[row] for row, _ in pairs]
         paired = [partners[row] for _, row in pairs]
         stamps_s = stamps_s[[row for row, _ in pairs]]
-    # 3. Sort the images by time, and leave out images with the time stamp of the image before.
+    # 3. Sort the images by time, and leave out each image that has the time stamp of the image before it.
     order = np.argsort(stamps_s, kind="stable")
     times = TimeFacts(stated_by=name, stamps_s=stamps_s[order])
     rows, time_doubts = rows_in_time(times)
@@ -259,10 +265,10 @@ def _order_by_time(
 
 
 def _find_folder(folder: Path, names: Sequence[str]) -> Path | None:
-    """Return the folder inside *folder* with the first of *names* that exists, None if none does.
+    """Return the folder inside *folder* with the first of *names* that exists; None if none exists.
 
-    Case and a number at the end are ignored: ``rgb_0`` has the name ``rgb``.  Of several folders with the
-    same name, the first in alphabetical order is returned.
+    Upper case, and digits and underscores at the end, are ignored: ``RGB_0`` counts as ``rgb``.  If several
+    folders count as the same name, the first of them in alphabetical order is returned.
     """
     folders = sorted((path for path in folder.iterdir() if path.is_dir()), reverse=True)
     by_name = {path.name.lower().rstrip("_0123456789"): path for path in folders}
@@ -272,10 +278,11 @@ def _find_folder(folder: Path, names: Sequence[str]) -> Path | None:
 def _match_names(firsts: list[Path], seconds: list[Path]) -> list[tuple[int, int]]:
     """Return the pairs (index in *firsts*, index in *seconds*) of files that belong together by their names.
 
-    The rules, in this order: equal names, equal numbers in the names, equal last numbers, equal first
-    numbers.  The first rule counts that tells all files of a list apart and joins more than half of the
-    shorter list.  If there is none, files whose names state times are paired with the nearest time within
-    20 ms, also if these are few.  The result is empty if no file is joined.
+    Files belong together by one of these rules, which are tried in this order: equal names, equal numbers in
+    the names, equal last numbers, equal first numbers.  A rule is used for all files if no two files of the
+    same list are equal by it, and if it pairs more than half of the files of the shorter list.  If no rule
+    does, and all names state times, each file is paired with the one nearest in time within 20 ms, however
+    few pairs that gives.  The result is empty if there is no pair.
     """
     keys: tuple[Callable[[Path], Hashable], ...] = (
         lambda path: path.stem,
@@ -305,8 +312,8 @@ def _match_names(firsts: list[Path], seconds: list[Path]) -> list[tuple[int, int
 def _times_in_names(paths: Sequence[Path], name: str) -> tuple[Array | None, tuple[str, ...]]:
     """Return the times ``(n,)``, s, that the names of files state, and notes on what was assumed of them.
 
-    The times are None if a name is no number, or if the numbers are whole and no times since 1970.  *name* is
-    the folder, for the notes.
+    The times are None if a name states no number (`_NAME_WITH_TIME`), or if the numbers are whole and cannot
+    be times since 1970: they are probably frame numbers.  *name* is the folder, for the notes.
     """
     matches = [_NAME_WITH_TIME.fullmatch(path.stem) for path in paths]
     words = [match[1] for match in matches if match is not None]
@@ -327,8 +334,8 @@ def _times_in_names(paths: Sequence[Path], name: str) -> tuple[Array | None, tup
 def _parse_seconds_and_nanoseconds(words: Sequence[str]) -> Array | None:
     """Return the times ``(n,)``, s, of words ``SECONDS.NANOSECONDS`` whose leading zeros are missing.
 
-    None means that the words are decimal numbers: the most digits after a point are not nine, or all words
-    have the same number of digits there.
+    Words are of this kind if the longest has nine digits after its point and another one has fewer.  For
+    other words, which are decimal numbers, the result is None.
     """
     parts = [word.partition(".") for word in words]
     lengths = {len(fraction) for _, _, fraction in parts}
@@ -338,9 +345,10 @@ def _parse_seconds_and_nanoseconds(words: Sequence[str]) -> Array | None:
 
 
 def _unevenness(stamps_s: Array) -> float:
-    """Return the median absolute deviation of the intervals of times ``(n,)``, divided by their median.
+    """Return how much the intervals between successive times ``(n,)`` vary, after sorting the times.
 
-    The times are sorted first.  The result is 0 for two times, and NaN for fewer.
+    It is the median absolute deviation of the intervals from their median, divided by this median; 0 for two
+    times, and NaN for fewer.
     """
     intervals_s = np.diff(np.sort(stamps_s))
     median_s = float(np.median(intervals_s)) if len(intervals_s) else 1.0

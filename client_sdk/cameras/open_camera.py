@@ -1,4 +1,4 @@
-"""Open any source of frames by its name: a device, a video, a folder, a recording, or a RealSense camera."""
+"""Open a source of frames by its name: a device, a video, a folder, a recording, or a RealSense camera."""
 
 from __future__ import annotations
 
@@ -53,24 +53,34 @@ def open_camera(
 ) -> FrameSource:
     """Open a source, and return its undistorted frames as an iterator to be closed, or used in ``with``.
 
+    The intrinsics that each kind of source accepts:
+
+    ========================================  =====================  =============================
+    source                                    *intrinsics*           None means
+    ========================================  =====================  =============================
+    device ``0``, video, ``rtsp://...``       one camera             an error
+    device or video with images side by side  a rig of two cameras   an error
+    two devices ``0,2`` or videos ``L,R``     a rig of two cameras   an error
+    folder of images                          one camera             the file in the folder
+    folder with ``left/`` and ``right/``      a rig of two cameras   ``rig.json`` in the folder
+    ``realsense``                             one camera             those that the camera states
+    recording of `open_dataset`, not a bag    a file, not an object  those of the recording
+    ========================================  =====================  =============================
+
     Args:
-        source: One camera: ``0`` (a device), a video, a stream ``rtsp://...``, a folder of images, or
-            ``realsense``.  A stereo pair: two devices ``0,2`` or videos ``LEFT,RIGHT``, a device or video
-            that shows both images side by side (with a rig), or a folder with ``left/`` and ``right/``.  A
-            recording that `open_dataset` reads, other than a bag.
-        intrinsics: Intrinsics of one camera or rig of two, or a file of them (``intrinsics.json``,
-            ``rig.json``).  May be None for folders, recordings and RealSense cameras that state their own.  A
-            recording takes a file only; folders of a stereo pair take a rig of two cameras.
-        rate_hz: Frames a second to deliver on average, see `client_sdk.datasets.thinning`; None for all.
-        depth: Whether depth is read, where there is some.
-        camera: ``left`` to use the left camera of a stereo pair only, ``stereo`` to require a stereo pair;
-            None to use both cameras where there are two.
-        imu: Whether frames carry samples of an IMU; None for yes where there is one, which only recordings
-            have.
+        source: Number, path, address or word of the first column.
+        intrinsics: Intrinsics or rig of the second column, or a file of them (``intrinsics.json``,
+            ``rig.json``).
+        rate_hz: Frames per second to deliver on average, see `client_sdk.datasets.thinning`; None means all.
+        depth: Whether depth is read if the source has depth.
+        camera: ``left`` uses only the left camera of a stereo pair, ``stereo`` refuses a source that is no
+            stereo pair; None uses both cameras if there are two.
+        imu: Whether frames have samples of an IMU, which only recordings can have; with True, a source
+            without an IMU is refused; None means yes if there is one.
 
     Raises:
-        UsageError: There is no such source, its intrinsics are missing or of another kind, it lacks what
-            *camera* or *imu* asks for, or facts about it contradict each other.
+        UsageError: There is no such source, its intrinsics are missing or of the wrong kind, it is not what
+            *camera* or *imu* requires, or facts about it contradict each other.
         MissingExtra: A package for this kind of source is not installed.
     """
     # 1. Check that the source exists, and read the intrinsics that the user names.
@@ -82,7 +92,7 @@ def open_camera(
     own = read_calibration(intrinsics) if isinstance(intrinsics, Path | str) else intrinsics
     stated_by = str(intrinsics) if isinstance(intrinsics, Path | str) else f"the intrinsics of {word}"
     if imu and not is_recording(path):
-        raise UsageError(f"{word} has no IMU", hint="leave out --imu")
+        raise UsageError(f"{word} has no IMU", hint="leave out imu=True, or --imu")
     # 2. Open two folders of a stereo pair, or a RealSense camera.
     if pair_folders(path) is not None:
         if own is not None and not (isinstance(own, Rig) and own.right is not None):
@@ -106,7 +116,7 @@ def open_camera(
         facts = _facts_of_lens(word, lens, stated_by)
         frames = raw if depth else ((stamp_s, rgb, None) for stamp_s, rgb, _ in raw)
         return _open_single(facts, lambda log: frames, lens, rate_hz, depth, close)
-    # 3. Open a recording of a benchmark, and refuse bags, which have a command of their own.
+    # 3. Open a recording of a benchmark; refuse a bag, which another command reads.
     if path.suffix in _BAG_ENDINGS or (path / "metadata.yaml").is_file():
         raise UsageError(
             f"{word} is a bag",
@@ -188,7 +198,7 @@ def _open_single(
     """Check the facts of one camera, and return its frames.
 
     Raises:
-        UsageError: Two facts contradict each other; nothing was read then.
+        UsageError: Two facts contradict each other; the source is closed then.
     """
     log = _check(facts, close)
     thinning = None if rate_hz is None else Thinning(rate_hz)
@@ -206,7 +216,7 @@ def _open_single(
 
 
 def _check(facts: SourceFacts, close: Callable[[], None] | None) -> DoubtLog:
-    """Return the doubts about a source; *close* it where its facts contradict each other.
+    """Return the doubts about a source; call *close* if its facts contradict each other.
 
     Raises:
         UsageError: Two facts contradict each other.
@@ -220,7 +230,7 @@ def _check(facts: SourceFacts, close: Callable[[], None] | None) -> DoubtLog:
 
 
 def _facts_of_lens(name: str, lens: Intrinsics, stated_by: str) -> SourceFacts:
-    """Return the facts of a camera none of whose images was read; `undistorted` compares their size later."""
+    """Return the facts of a camera before any image is read; `undistorted` checks the size of images."""
     camera = CameraFacts(stated_by=stated_by, lens=lens)
     return SourceFacts(name=name, cameras=(camera,))
 
@@ -239,8 +249,8 @@ def source_of_frames(
 ) -> FrameSource:
     """Return a `FrameSource` of *frames* that are undistorted already, and whose depth is registered.
 
-    Without *has_depth*, the depth image of each frame is replaced by one without readings.  *close* releases
-    the file of the frames.  All other arguments are attributes of `FrameSource`.
+    If *has_depth* is False, the depth image of each frame is replaced by an empty one.  *close* releases the
+    file of the frames.  All other arguments are attributes of `FrameSource`.
     """
     empty_depth = make_empty_depth(camera)
     log = DoubtLog() if log is None else log
@@ -259,9 +269,9 @@ def source_of_frames(
 
 
 def is_recording(path: Path) -> bool:
-    """Return whether a path is a recording for `open_dataset`, other than a ROS bag.
+    """Return whether a path is a recording that `open_camera` opens with `open_dataset`.
 
-    These are folders in the layout of TUM, EuRoC or KITTI, and raw folders of NYU Depth V2.
+    These are folders in the layout of TUM, EuRoC or KITTI, and raw folders of NYU Depth V2; ROS bags are not.
     """
     return is_listed(path) or any(path.glob("d-*.pgm")) or is_euroc(path) or is_kitti(path)
 
@@ -269,7 +279,7 @@ def is_recording(path: Path) -> bool:
 def _open_stereo_video(
     word: str, rig: Rig, rate_hz: float | None, camera: CameraChoice | None, stated_by: str
 ) -> FrameSource:
-    """Return the stereo frames of two devices or videos, or of one that shows both images side by side."""
+    """Return the frames of two devices or videos, or of one that gives both images side by side."""
     if word.count(",") == 1:
         names = (word.split(",")[0], word.split(",")[1])
         both = open_pair_videos(*names)
@@ -290,12 +300,12 @@ def _open_pair(
     close: Callable[[], None] | None = None,
     span_s: tuple[float, float] | None = None,
 ) -> FrameSource:
-    """Check the facts of a stereo pair, and return its frames, or for ``left`` those of the left camera.
+    """Check the facts of a stereo pair, and return its rectified frames.
 
-    Frames of the left camera alone are undistorted, not rectified.
+    If *camera* is ``left``, they are those of the left camera alone, undistorted and not rectified.
 
     Raises:
-        UsageError: Two facts contradict each other, or the rig has no stereo pair.
+        UsageError: Two facts contradict each other, or *rig* has one camera.
     """
     if camera == "left":
         return _open_single(

@@ -1,7 +1,7 @@
 """Open cameras and videos with OpenCV: a device by its number, a video file, or a stream by its address.
 
-The time stamps of a file are its presentation times; those of a device or stream are times of arrival on a
-monotonic clock.  There is no depth.
+The time stamps of a file are its presentation times, or follow from a rate if it has none; those of a device
+or stream are times of arrival on a monotonic clock.  There is no depth.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from rse_pf.images import MAX_IMAGE_PIXELS, load_opencv
 
 __all__ = ["Video", "open_video"]
 
-_PROBED_FRAMES = 3  # frames that are read to find out whether a file has presentation times
-_MAX_MISSES = 30  # successive reads without an image, after which a device counts as disconnected
-_MIN_RATE_HZ = 0.1  # rate that a file may state; a lower one is a mistake of its container
-_MAX_RATE_HZ = 1000.0  # rate that a file may state; a higher one is a mistake of its container
-_ASSUMED_RATE_HZ = 30.0  # rate of a file that states none
-_TEXT_PROBE_BYTES = 64  # bytes at the start of a file that show whether the file is a text
+_PROBED_FRAMES = 3  # the presentation times of this many frames show whether a file has such times
+_MAX_MISSES = 30  # a device that gave no image in this many successive reads counts as disconnected
+_MIN_RATE_HZ = 0.1  # smallest rate of a file that is used; a smaller one is a mistake of its container
+_MAX_RATE_HZ = 1000.0  # largest rate of a file that is used; a larger one is a mistake of its container
+_ASSUMED_RATE_HZ = 30.0  # rate of a file that states no rate that is used
+_TEXT_PROBE_BYTES = 64  # this many first bytes show whether a file is a text
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -36,8 +36,8 @@ class Video:
     Attributes:
         images: Its images, not undistorted, without depth.
         close: Releases the device or file.
-        frame_count: Number of frames that a file states; 0 if it states none, and of a device or stream.
-        period_s: Time between frames of a file, s; 0 of a device or stream.
+        frame_count: Number of frames that a file states; 0 if it states none, and for a device or stream.
+        period_s: Time between frames of a file, s, by its stated rate or 30 Hz; 0 for a device or stream.
         notes: Sentences for the user on what was assumed.
     """
 
@@ -51,7 +51,7 @@ class Video:
     def span_s(self) -> tuple[float, float] | None:
         """Start and end of a file, s: 0, and its stated number of frames times the time between two frames.
 
-        None of a device, a stream, or a file that states no number of frames.
+        None for a device, a stream, or a file that states no number of frames.
         """
         return (0.0, self.frame_count * self.period_s) if self.frame_count else None
 
@@ -67,7 +67,8 @@ def open_video(source: str, clock: Callable[[], float] = time.monotonic) -> Vide
         UsageError: There is no such device or file, OpenCV cannot read it, or its images are too large.
         MissingExtra: OpenCV is not installed.
     """
-    # 1. Refuse what is no video, before OpenCV waits for it or follows other files that it names.
+    # 1. Refuse a path that is no video, because OpenCV would wait for a pipe, or open the files that a
+    #    playlist names.
     cv2 = load_opencv()
     is_device, is_file = source.isdigit(), not source.isdigit() and "://" not in source
     if is_file:
@@ -107,7 +108,7 @@ def open_video(source: str, clock: Callable[[], float] = time.monotonic) -> Vide
             f"{source} has images of {width}x{height} px, above {MAX_IMAGE_PIXELS} pixels",
             hint="make them smaller",
         )
-    # 3. Let a device deliver its latest image, and a file all images, with presentation times or a rate.
+    # 3. Make a device deliver its latest image; give a file presentation times, or times by its rate.
     if is_device:
         capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
     if not is_file:
@@ -128,7 +129,8 @@ def open_video(source: str, clock: Callable[[], float] = time.monotonic) -> Vide
 def _has_times(cv2: Any, source: str) -> bool:
     """Return whether the presentation times of the first three frames of a file increase.
 
-    Some containers have no presentation times.  The result is True for fewer than two frames.
+    Some containers have no presentation times; time stamps then follow from the rate of the file.  The result
+    is True for fewer than two frames.
     """
     capture = cv2.VideoCapture(source)
     try:
@@ -141,9 +143,9 @@ def _has_times(cv2: Any, source: str) -> bool:
 
 
 def _is_text(path: Path) -> bool:
-    """Return whether the first 64 bytes of a file are printable text; True also for an empty file.
+    """Return whether the first 64 bytes of a file are printable text; True for an empty file, too.
 
-    A YUV4MPEG2 video, whose head is printable, too, is no text.
+    False for a YUV4MPEG2 video, although its head is printable.
     """
     try:
         with path.open("rb") as file:
@@ -154,16 +156,16 @@ def _is_text(path: Path) -> bool:
 
 
 def _silence_warnings(cv2: Any) -> None:
-    """Keep OpenCV from printing warnings of its own, in the whole process.
+    """Stop OpenCV from printing its warnings, in the whole process.
 
-    Since OpenCV 4.14, the function that does so is in another module.
+    OpenCV has the function in one of two modules, depending on its version.
     """
     logging = cv2 if hasattr(cv2, "setLogLevel") else cv2.utils.logging
     logging.setLogLevel(0)
 
 
 def _file_images(cv2: Any, capture: Any, name: str, period_s: float | None) -> Iterator[RawFrame]:
-    """Yield the images of a file with their presentation times, or every *period_s* if it is not None."""
+    """Yield the images of a file with their presentation times, or with times that are *period_s* apart."""
     row = 0
     while True:
         is_read, image = capture.read()
@@ -177,7 +179,7 @@ def _file_images(cv2: Any, capture: Any, name: str, period_s: float | None) -> I
 
 
 def _device_images(capture: Any, name: str, clock: Callable[[], float]) -> Iterator[RawFrame]:
-    """Yield the images of a device or stream with their times of arrival, until it delivers no more.
+    """Yield the images of a device or stream with their times of arrival.
 
     Raises:
         UsageError: The device has delivered no image in 30 successive reads.

@@ -1,6 +1,7 @@
-"""Read the pairs of images of a stereo camera: from two devices or videos, or from images with both halves.
+"""Read the image pairs of a stereo camera: from two devices or videos, or from images that show both side by
+side.
 
-Whether the images of a pair fit each other is checked in `client_sdk.rigs.stereo_pair_checks`.
+`client_sdk.rigs.stereo_pair_checks` checks whether the images of a pair fit each other.
 """
 
 from __future__ import annotations
@@ -18,23 +19,23 @@ from rse_pf.errors import UsageError
 __all__ = ["PairVideos", "open_pair_videos", "split_pairs"]
 
 _MAX_TIME_DIFFERENCE = 0.4
-"""Difference between the times of two images of a pair, in image intervals of the faster video: images that
-are farther apart belong to two moments."""
+"""Largest difference between the times of the two images of a pair of two videos, in image intervals of the
+video with the higher rate: images that are farther apart were not taken together."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PairVideos:
-    """Two open devices, or two open videos, of a stereo pair; ``name`` is for messages."""
+    """Two open devices, or two open videos, of a stereo pair; ``name`` names both in messages."""
 
     name: str
     left: Video
     right: Video
 
     def facts(self, names: tuple[str, str]) -> SourceFacts:
-        """Return the facts about both: of videos also the number of images and the time between them.
+        """Return the facts about both: notes, and of videos the number of images and their interval.
 
-        *names* are the names of both, left first; devices, and videos that state no number, give no such
-        facts.
+        *names* are the names of both, left first.  Devices, and videos that state no number of images, have
+        only the former.
         """
         stated = {
             name: VideoFacts(frames=video.frame_count, period_s=video.period_s)
@@ -46,11 +47,12 @@ class PairVideos:
     def pairs(self, log: DoubtLog) -> Iterator[RawPair]:
         """Yield pairs, with the time stamps of the left images, until one side has no more images.
 
-        Of devices, images are paired as they come; of videos, images whose times differ by at most 0.4 image
-        intervals of the faster video.  *log* counts images of videos without a partner, but not those that
-        the longer video has left at the end.
+        The next image of the left device is paired with the next image of the right one, whatever their
+        times, so that an image that one device loses shifts all later pairs.  Images of videos are paired if
+        their times differ by at most 0.4 image intervals of the video with the higher rate.  *log* counts
+        images of videos without a partner, but not those that remain in the longer video at the end.
         """
-        # 0 for devices, whose images are taken as they come.
+        # It is 0 for devices, whose images are paired without comparing times.
         max_difference_s = _MAX_TIME_DIFFERENCE * min(self.left.period_s, self.right.period_s)
         left, right = next(self.left.images, None), next(self.right.images, None)
         while left is not None and right is not None:
@@ -87,7 +89,7 @@ def open_pair_videos(left: str, right: str) -> PairVideos:
 
 
 def split_pairs(raw: Iterator[RawFrame], name: str) -> Iterator[RawPair]:
-    """Yield the left and the right half of each image of *raw*, a camera that shows both images side by side.
+    """Yield the left and right half of each image of *raw*, a camera that gives both images side by side.
 
     Raises:
         UsageError: The width of an image is odd; *name* is the source, for the message.

@@ -18,9 +18,9 @@ from rse_pf.geometry import Camera
 
 __all__ = ["open_realsense"]
 
-_SIZE = (640, 480)  # width and height of the images that the camera is asked for, px
-_RATE_HZ = 30  # images a second that the camera is asked for
-_TIMEOUT_MS = 5000  # wait for an image, after which a camera counts as disconnected
+_SIZE = (640, 480)  # width and height in px to which the camera is set
+_RATE_HZ = 30  # images per second to which the camera is set
+_TIMEOUT_MS = 5000  # a camera that has given no image for this long counts as disconnected
 _CABLE_HINT = "check the cable: USB 3 is needed"
 
 
@@ -48,8 +48,8 @@ def open_realsense() -> tuple[Iterator[RawFrame], Intrinsics, Callable[[], None]
         raise UsageError(f"no RealSense camera can be opened: {error}", hint=_CABLE_HINT) from error
     lens = profile.get_stream(rs.stream.color).as_video_stream_profile().get_intrinsics()
     unit_m = float(profile.get_device().first_depth_sensor().get_depth_scale())
-    # Only coefficients of the model Brown-Conrady are used; images of any other model are taken as
-    # undistorted.
+    # Images of any other lens model than Brown-Conrady, such as its inverse, are used as if undistorted: the
+    # coefficients of RealSense cameras are then nearly 0.
     is_distorted = lens.model == rs.distortion.brown_conrady
     intrinsics = Intrinsics(
         camera=Camera(
@@ -62,7 +62,11 @@ def open_realsense() -> tuple[Iterator[RawFrame], Intrinsics, Callable[[], None]
 
 
 def _images(pipeline: Any, align: Any, unit_m: float) -> Iterator[RawFrame]:
-    """Yield the images of a *pipeline*, with depths in units of *unit_m* metres, until the camera is gone."""
+    """Yield the images of a *pipeline*, whose depth values times *unit_m* are metres.
+
+    Raises:
+        UsageError: The camera has given no image for 5 s.
+    """
     while True:
         try:
             frames = align.process(pipeline.wait_for_frames(_TIMEOUT_MS))

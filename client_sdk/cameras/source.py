@@ -43,11 +43,11 @@ __all__ = [
     "undistorted",
 ]
 
-_CHECKED_AT_START = 8  # stereo frames whose images are compared before the first one is delivered
-_CHECK_INTERVAL = 5  # stereo frames from one comparison of both images to the next, after the start
+_CHECKED_AT_START = 8  # first stereo frames that are read and checked before the first one is delivered
+_CHECK_INTERVAL = 5  # later, the left and right image of each this-many-th stereo frame are compared
 _CHECKS_TO_REFUSE = 2
-"""Successive comparisons of a left with a right image whose feature matches are taken together to find a
-fault: one comparison alone may be of a blurred image."""
+"""The rig is refused by the matches of this many successive comparisons together: one comparison may be of a
+blurred image.  A comparison matches features of the left image with those of the right image of one frame."""
 _Item = TypeVar("_Item", bound=tuple[Any, ...])
 
 RawFrame = tuple[float, npt.NDArray[np.uint8], "npt.NDArray[np.float32] | None"]
@@ -64,14 +64,14 @@ class FrameSource(AutoClose):
     ``async for`` reads each frame in a thread, so that the event loop can serve the robot's connection.
 
     Attributes:
-        name: Path or device, for messages.
+        name: Path or name of the device, for messages.
         camera: The pinhole camera of all frames.
         frames: The frames.
         has_depth: Whether frames have depth.
         has_stereo: Whether frames have the right image of a stereo pair.
-        notes: Sentences for the user on what was assumed.
-        log: The doubts about the source, to which reading may add some.
-        span_s: First and last time stamp, s; None if they are known only while frames come.
+        notes: Sentences for the user on what was assumed because the source does not state it.
+        log: The doubts about the source; reading may add some.
+        span_s: First and last time stamp, s; None if they are not known before the frames are read.
         release: Releases the device or file; None if there is none.
     """
 
@@ -101,11 +101,15 @@ class FrameSource(AutoClose):
         return frame
 
     def __next__(self) -> Frame:
-        """Return the next frame; raises UsageError if it cannot be used, and StopIteration at the end."""
+        """Return the next frame; raises UsageError if it cannot be used, and StopIteration at the end.
+
+        The first call on a stereo pair reads eight frames (`checked_pairs`), so that the first eight frames
+        of two devices are delivered late.
+        """
         return next(self.frames)
 
     def close(self) -> None:
-        """Release the device or file; may be called again.  The iterator is then at its end."""
+        """Release the device or file, so that the iterator is at its end; may be called again."""
         self.frames = iter(())
         if self.release is not None:
             self.release()
@@ -115,11 +119,11 @@ class FrameSource(AutoClose):
 def select_in_time(
     items: Iterable[_Item], name: str, log: DoubtLog, thinning: Thinning | None = None
 ) -> Iterator[_Item]:
-    """Yield the items that are later than the item yielded before, and that *thinning* selects.
+    """Yield the items that are later than the last yielded item, and that *thinning* selects.
 
-    The first element of an item is its time stamp, s.  The first item that is not later adds a doubt to
-    *log*, unless the log has a doubt about the order of time already.  *name* is the source, for the doubt.
-    Without *thinning*, all items that are later are yielded.
+    The first element of an item is its time stamp, s.  An item that is not later than the last yielded one is
+    left out; the first such item adds a doubt to *log*, unless the log has a doubt about the order of time
+    already.  *name* is the source, for the doubt.  If *thinning* is None, all later items are yielded.
     """
     last_s = -math.inf
     for item in items:
@@ -141,7 +145,7 @@ def undistorted(raw: Iterable[RawFrame], lens: Intrinsics, name: str) -> Iterato
     """Yield the frames of one camera without the distortion of *lens*; *name* is the source, for errors.
 
     Raises:
-        UsageError: An image has not the size that *lens* states.
+        UsageError: An image does not have the size that *lens* states.
     """
     camera, undistortion = lens.camera, map_to_pinhole(lens)
     empty_depth = make_empty_depth(camera)
@@ -163,7 +167,7 @@ def undistorted(raw: Iterable[RawFrame], lens: Intrinsics, name: str) -> Iterato
 
 
 def rectified(raw: Iterable[RawPair], rectification: Rectification) -> Iterator[Frame]:
-    """Yield the frames of a stereo pair, rectified; raises UsageError if an image has another size."""
+    """Yield the rectified frames of a stereo pair; raises UsageError if an image has another size."""
     empty_depth = make_empty_depth(rectification.camera)
     cv2 = load_opencv()
     for timestamp_s, left, right in raw:
@@ -178,15 +182,15 @@ def rectified(raw: Iterable[RawPair], rectification: Rectification) -> Iterator[
 
 
 def checked_pairs(frames: Iterator[Frame], name: str) -> Iterator[Frame]:
-    """Yield rectified stereo frames, and refuse a rig that their images show to be faulty.
+    """Yield rectified stereo frames, and refuse a rig if their images show a fault.
 
-    The left and right images of the first eight frames are compared before the first frame is yielded, and
-    those of every fifth frame later: if a camera loses an image, all its later images belong to another
-    moment than those of the other camera.
+    The left and right images of the first eight frames are compared before the first frame is yielded.  Later
+    those of every fifth frame are compared, because two devices whose images are paired by their order get
+    out of step when one of them loses an image.
 
     Raises:
-        UsageError: The cameras are swapped, not synchronised, or rectified wrongly, or the last two
-            comparisons together show such a fault; *name* is the source in its message.
+        UsageError: The first frames together, or the last two comparisons together, show that the cameras are
+            swapped, not synchronised, or rectified wrongly; *name* is the source in its message.
     """
     first_frames = list(itertools.islice(frames, _CHECKED_AT_START))
     check_stereo_pairs(itertools.pairwise(first_frames), name)
@@ -198,7 +202,7 @@ def checked_pairs(frames: Iterator[Frame], name: str) -> Iterator[Frame]:
             fault = find_fault(measurements)
             if fault is not None and len(measurements) == _CHECKS_TO_REFUSE:
                 raise UsageError(
-                    f"{name}: the pairs of images fit at the start, and no longer shortly before "
+                    f"{name}: the left and right images fit each other at the start, but no longer at "
                     f"{frame.timestamp_s:.3f} s, as if a camera had lost an image: {fault.message}",
                     hint="record the time of each image (MP4, MKV or a bag), or take one: --camera left",
                 )
@@ -207,7 +211,7 @@ def checked_pairs(frames: Iterator[Frame], name: str) -> Iterator[Frame]:
 
 
 def make_empty_depth(camera: Camera) -> npt.NDArray[np.float32]:
-    """Return a depth image ``(h, w)`` without readings (0 m), read-only, for cameras without depth."""
+    """Return a read-only depth image ``(h, w)`` of zeros, which mean that there are no readings."""
     depth_m = np.zeros((camera.height, camera.width), dtype=np.float32)
     depth_m.flags.writeable = False
     return depth_m

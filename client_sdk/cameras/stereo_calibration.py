@@ -1,6 +1,7 @@
 """Calibrate a stereo pair from images of a calibration board that both cameras see.
 
-The intrinsics of each camera are calibrated first, and then kept while the pose between both is estimated.
+The intrinsics of each camera are calibrated first.  They do not change when the pose between both cameras is
+estimated.
 """
 
 from __future__ import annotations
@@ -20,12 +21,12 @@ from rse_pf.geometry import inverse
 
 __all__ = ["PairViews", "StereoCalibration", "calibrate_pair"]
 
-_MIN_COMMON_CORNERS = 6  # corners of the board that both images of a view must show
+_MIN_COMMON_CORNERS = 6  # fewest corners that both images of a pair must show, so that the pair is used
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StereoCalibration:
-    """A calibrated stereo rig, and how good the calibration is.
+    """A calibrated stereo rig, and the error of the calibration.
 
     Attributes:
         rig: The rig; the frame of its body is that of the left camera.
@@ -62,8 +63,8 @@ class PairViews:
     def add(self, left: npt.NDArray[np.uint8], right: npt.NDArray[np.uint8]) -> bool:
         """Find the board in two grey images ``(h, w)``, and return whether both are new views of the board.
 
-        Only then they are a pair.  If one of them is a new view, it still counts for the intrinsics of its
-        camera.
+        If both are, they become a pair.  If only one is, it is used for the intrinsics of its camera, but not
+        for the pose between the cameras.
 
         Raises:
             UsageError: An image has another size than the images of this camera before.
@@ -85,7 +86,7 @@ def calibrate_pair(views: PairViews, *, max_rms_px: float = 1.0) -> StereoCalibr
     Raises:
         CommandFailed: One camera cannot be calibrated, both see the board in too few views, or the error is
             above *max_rms_px*.
-        UsageError: The cameras differ in size, or the right camera is not to the right of the left one.
+        UsageError: The cameras differ in image size, or the right camera is not right of the left one.
         MissingExtra: OpenCV is not installed.
 
     Source:
@@ -98,7 +99,8 @@ def calibrate_pair(views: PairViews, *, max_rms_px: float = 1.0) -> StereoCalibr
             lenses.append(calibrate(views_of_side, max_rms_px=max_rms_px))
         except CommandFailed as error:
             raise CommandFailed(f"the {side} camera: {error.message}", hint=error.hint) from error
-    # 2. Select of each pair the corners that both cameras see, and leave out pairs with fewer than six.
+    # 2. Select the corners of each pair that both cameras see, and leave out pairs with fewer than six of
+    #    them.
     points, left_pixels, right_pixels = [], [], []
     for left_view, right_view in views.pairs:
         left_indices, left_corners = views.left.views[left_view]

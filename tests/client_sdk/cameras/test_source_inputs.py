@@ -371,7 +371,7 @@ def test_a_pair_whose_camera_loses_an_image_ends_there(
     frames = []
     with (
         _pair_folders(tmp_path, lost) as source,
-        pytest.raises(UsageError, match="fit at the start, and no longer shortly before") as refused,
+        pytest.raises(UsageError, match="fit each other at the start, but no longer at") as refused,
     ):
         frames.extend(source)
     assert lost[0] < len(frames) <= most
