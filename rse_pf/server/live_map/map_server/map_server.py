@@ -130,8 +130,7 @@ class MapServer:
         self._is_closing = False
         self._idle_since_s = self._began_s = environment.clock()
         self._publish_due_s = self._began_s + PUBLISH_INTERVAL_S
-        self._is_used = False
-        self._last_command_s = float("-inf")
+        self._last_command_s: float | None = None  # None: the worker knows that no commands arrive
         self._ended: asyncio.Future[ServiceEnd] = asyncio.get_running_loop().create_future()
         self._tasks: set[asyncio.Task[None]] = set()
 
@@ -187,7 +186,7 @@ class MapServer:
         """
         if self._is_closing or self._ended.done():
             raise self._moving_error()
-        self._set_used(is_used=True)
+        self._note_command()
         if operation == STOP:
             return await self._stop_map()
         reply = await self._requests.answer(robot, operation, request)
@@ -404,8 +403,10 @@ class MapServer:
             self._publish_due_s = now + PUBLISH_INTERVAL_S
             self._publisher.request(NOTE_CHANGED)
         # 3. Notify the worker if commands have ceased, and give up a map that had no connections for long.
-        if now - self._last_command_s >= _UNUSED_SHARE * environment.settings.idle_s:
-            self._set_used(is_used=False)
+        unused_s = _UNUSED_SHARE * environment.settings.idle_s
+        if self._last_command_s is not None and now - self._last_command_s >= unused_s:
+            self._last_command_s = None
+            environment.on_use(False)
         if self.users:
             self._idle_since_s = now
         elif now - self._idle_since_s >= environment.settings.idle_s:
@@ -414,13 +415,11 @@ class MapServer:
         # 4. Publish the requested version if the map has changed and ``live.publish_pause_s`` has passed.
         self.start_task(self._publisher.publish_due())
 
-    def _set_used(self, *, is_used: bool) -> None:
-        """Note that a command has arrived, or that none has for a while; notify the worker of a change."""
-        if is_used:
-            self._last_command_s = self._environment.clock()
-        if is_used != self._is_used:
-            self._is_used = is_used
-            self._environment.on_use(is_used)
+    def _note_command(self) -> None:
+        """Note that a command has arrived, and notify the worker if none had for a while."""
+        if self._last_command_s is None:
+            self._environment.on_use(True)
+        self._last_command_s = self._environment.clock()
 
     async def _give_up_idle_map(self) -> None:
         """Publish the map if it has changed, and release it unless a worker has connected meanwhile.

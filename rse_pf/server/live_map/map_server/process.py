@@ -20,7 +20,6 @@ import asyncio
 import contextlib
 import functools
 import importlib
-import ipaddress
 import os
 import secrets
 import socket
@@ -74,11 +73,14 @@ _SWITCH_INTERVAL_S = 0.0005
 of 5 ms would delay each step of a keyframe while other threads compute."""
 _MAX_VERSION_OBJECTS = 4
 """Largest size of a decompressed version of a map, in units of ``data.max_object_bytes``."""
-_PROBE_ADDRESS_IPV4 = ("192.0.2.1", 9)
-"""Address reserved for documentation (RFC 5737) and a port.  Nothing is sent there; the operating system's
-route to it tells the address of this machine's main network interface."""
-_PROBE_ADDRESS_IPV6 = ("2001:db8::1", 9)
-"""The same for IPv6 (RFC 3849)."""
+_PROBES = {
+    "0.0.0.0": (socket.AF_INET, "192.0.2.1", "127.0.0.1"),
+    "::": (socket.AF_INET6, "2001:db8::1", "::1"),
+}
+"""For each address that stands for all interfaces: its family, an address reserved for documentation (RFC
+5737, RFC 3849), to which nothing is sent, and the loopback address.  The operating system's route to the
+second address tells the address of this machine's main network interface."""
+_PROBE_PORT = 9  # any port: nothing is sent to it
 _T = TypeVar("_T")
 
 
@@ -88,18 +90,14 @@ def advertised_address(host: str) -> str:
     For ``0.0.0.0`` and ``::`` this is the address of the main network interface, or the loopback address if
     the machine has no route to other networks; any other *host* is returned unchanged.
     """
-    try:
-        is_unspecified = ipaddress.ip_address(host).is_unspecified
-    except ValueError:
-        is_unspecified = False
-    if not is_unspecified:
+    if host not in _PROBES:
         return host
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    family, address, loopback = _PROBES[host]
     with socket.socket(family, socket.SOCK_DGRAM) as probe:
         try:
-            probe.connect(_PROBE_ADDRESS_IPV4 if family == socket.AF_INET else _PROBE_ADDRESS_IPV6)
+            probe.connect((address, _PROBE_PORT))
         except OSError:
-            return "127.0.0.1" if family == socket.AF_INET else "::1"
+            return loopback
         return str(probe.getsockname()[0])
 
 

@@ -1,10 +1,9 @@
 """Publish versions of a live map to the registry of maps, and remove old ones that nobody asked for.
 
-Two versions are at least ``live.publish_pause_s`` apart, except for one that is published when the map is
-given up.  A new map server reads the time of the last version from the registry, so the interval also holds
-across a change of the map server.  A new map server does not know whether its predecessor published the
-newest state: the first time that a version is due, it publishes also an unchanged map, and the registry keeps
-equal versions only once.  The head of a map in the registry is its current version.
+Two versions of one map server are at least ``live.publish_pause_s`` apart, except for one that is published
+when the map is given up.  A new map server does not know whether its predecessor published the newest state:
+the first time that a version is due, it publishes also an unchanged map, and the registry keeps equal
+versions only once.  The head of a map in the registry is its current version.
 """
 
 from __future__ import annotations
@@ -22,7 +21,6 @@ from rse_pf.errors import (
     LimitExceeded,
     NotFound,
     RsePfError,
-    StoreError,
 )
 from rse_pf.live_map.versions import PointSource, as_internal_error
 from rse_pf.maps.format import UP_FIELD, MapVersion, encode_map
@@ -54,12 +52,9 @@ also when the server drains."""
 _MAX_WAIT_S = 10.0
 """Longest time in seconds for which a request for a version waits until ``live.publish_pause_s`` has passed;
 a request that would wait longer is refused with Busy."""
-_FIRST_RETRY_S = 5.0
-"""Seconds after which a failed automatic publication is tried again for the first time; the wait doubles each
-time."""
-_MAX_RETRY_S = 600.0
-"""Longest wait in seconds before a failed automatic publication is tried again: each try of a large map takes
-seconds of CPU time, and an operator may need minutes to free space."""
+_RETRY_S = 30.0
+"""Seconds after which a failed automatic publication is tried again: each try of a large map takes seconds of
+CPU time."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -90,15 +85,9 @@ class Publisher:
         self._source_up: tuple[str, list[float] | None] = "", None
         self._published_changes: int | None = None  # MapState.changes at the last publication
         self._last_record: MapRecord | None = None
-        self._next_allowed_s: float | None = None  # None: the registry was not read yet
+        self._next_allowed_s = float("-inf")  # end of the pause after the last version
         self._due_request: _Request | None = None  # the last request, until a version is published after it
-        self._retry_s = _FIRST_RETRY_S
         self._retry_at_s = float("-inf")  # until then, publish_due does nothing
-
-    @property
-    def is_due(self) -> bool:
-        """Whether `request` was called since the last version, and the map has changed since then."""
-        return self._due_request is not None and self._is_changed
 
     async def publish(self, note: str, freed_bytes: int = 0) -> MapRecord:
         """Publish the map and return the record of the version.
@@ -124,7 +113,7 @@ class Publisher:
                 )
             if self._last_record is not None and not self._is_changed:
                 return self._last_record
-            wait_s = await self._seconds_until_allowed()
+            wait_s = self._next_allowed_s - self._clock()
             if wait_s > _MAX_WAIT_S:
                 raise Busy(
                     f"the live map {self._map_name!r} was published less than "
@@ -144,30 +133,23 @@ class Publisher:
     async def publish_due(self) -> None:
         """Publish the due version if ``live.publish_pause_s`` has passed since the last version.
 
-        Do nothing if no version is due, or a publication is under way.  After an error, the version stays due
-        and is tried again with exponential back-off; a call before that time does nothing.
+        Do nothing if no version is due, a publication is under way, or one has failed less than 30 s ago.
         """
-        if not self.is_due or self._lock.locked() or self._clock() < self._retry_at_s:
-            return
-        with contextlib.suppress(StoreError):  # the next call reads the registry again
-            if await self._seconds_until_allowed() <= 0:
-                await self.publish_now()
+        if not self._lock.locked() and self._clock() >= max(self._next_allowed_s, self._retry_at_s):
+            await self.publish_now()
 
     async def publish_now(self) -> None:
         """Publish the due version, if there is one, although ``live.publish_pause_s`` may not have passed.
 
         An error is logged, and the version stays due.
         """
-        if not self.is_due:
-            return
         try:
             async with self._lock:
                 if self._due_request is not None and self._is_changed:
                     await self._publish(self._due_request.note)
         except RsePfError as error:
             self._environment.log.warning("live-publish-failed", map=self._map_name, error=error.message)
-            self._retry_at_s = self._clock() + self._retry_s
-            self._retry_s = min(_MAX_RETRY_S, 2 * self._retry_s)
+            self._retry_at_s = self._clock() + _RETRY_S
 
     @property
     def _is_changed(self) -> bool:
@@ -186,7 +168,6 @@ class Publisher:
         self._published_changes, self._last_record = changes, record
         if self._due_request is due_request:  # else the map was requested again after the version was made
             self._due_request = None
-        self._retry_s = _FIRST_RETRY_S
         environment.log.info("live-map-published", map=self._map_name, id=record.id, number=record.number)
         # 3. Remove old automatic versions.
         try:
@@ -302,27 +283,6 @@ class Publisher:
         for record in removed:
             account.release(record.size)
         return len(removed)
-
-    async def _seconds_until_allowed(self) -> float:
-        """Return the seconds until the next version may be published; 0 or negative if it may be now.
-
-        Raises:
-            StoreError: The registry had to be read, and the store fails.
-        """
-        if self._next_allowed_s is None:
-            age_s = await self._threads.background(self._newest_version_age_s)
-            self._next_allowed_s = self._clock() + max(0.0, self._min_interval_s - max(0.0, age_s))
-        return self._next_allowed_s - self._clock()
-
-    def _newest_version_age_s(self) -> float:
-        """Return the age in seconds of the head of the map in the registry, infinity without one.
-
-        Blocks on the object store; raises StoreError.
-        """
-        try:
-            return self._environment.wall_clock() - self._environment.maps.head(self._map_name).created_s
-        except NotFound:
-            return float("inf")
 
 
 def _is_automatic(record: MapRecord) -> bool:
