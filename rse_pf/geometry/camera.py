@@ -13,7 +13,9 @@ from rse_pf.geometry.transforms import Array
 
 __all__ = ["Camera"]
 
-MAX_IMAGE_SIDE_PX = 16384  # width or height: no sensor of a robot is larger, and a larger one is a wrong unit
+# Largest width or height of an image in pixels: no sensor of a robot is larger; a larger number has another
+# unit.
+MAX_IMAGE_SIDE_PX = 16384
 # Smallest focal length, as a multiple of the longer side of the image: a smaller one is in another unit, such
 # as millimetres.
 MIN_FOCAL_LENGTH = 0.05

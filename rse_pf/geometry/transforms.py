@@ -47,7 +47,9 @@ EXACT_TOLERANCE = 1e-9
 that deviates more by the nearest rotation.  Rotations that this platform writes deviate less, so that a pose
 is read back with every bit unchanged."""
 LAST_ROW_TOLERANCE = 1e-5  # largest deviation of a pose's last row from 0 0 0 1: float32 rounds by less
-MAX_TRANSLATION_M = 1e9  # metres along each axis of a pose: beyond any map, far from the limits of float64
+# Largest absolute coordinate of a pose's translation in metres: beyond any map, and far from the limits of
+# float64.
+MAX_TRANSLATION_M = 1e9
 NEAR_HALF_TURN_COSINE = -0.999
 """Cosine of the rotation angle below which `log_se3` computes the rotation vector from the quaternion, which
 is for angles above 177.4 degrees: the antisymmetric part of the matrix, which it uses for smaller angles,

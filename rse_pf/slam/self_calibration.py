@@ -44,7 +44,9 @@ UNKNOWNS = ("fx", "fy", "cx", "cy", "k1", "offset", "delay", "readout", "curve")
 PRIOR = np.array([0.15, 0.15, 40.0, 40.0, 0.15, 0.15, 0.3, 0.02, 0.01])
 """Prior standard deviations of `UNKNOWNS`, in their units: typical errors of calibrations.  For ``curve``,
 the last one, an adjustment takes `DriveObservations.curve_dev_per_m` instead."""
-_ZOOM_PRIOR = 0.15  # prior standard deviation of the logarithm of the focal length of one keyframe
+# Prior standard deviation of a zoom: the natural logarithm of the quotient of the focal length of one
+# keyframe and the common one.
+_ZOOM_PRIOR = 0.15
 _CAUCHY_SCALE = 2.0  # residual, in its standard deviations, to which the Cauchy loss gives half the weight
 _ITERATIONS = 12  # largest number of steps of an adjustment in which all keyframes share one focal length
 _ZOOM_ITERATIONS = 6
@@ -59,7 +61,8 @@ _CONVERGED_SHARE = 1e-4  # an adjustment ends when a step lowers the cost by les
 _FIRST_DAMPING = 1e-4  # Levenberg-Marquardt's share of the diagonal: nearly Gauss-Newton at first
 _MIN_DAMPING = 1e-9  # Levenberg-Marquardt's share of the diagonal is not lowered below this
 _MAX_DAMPING = 1e4  # an adjustment ends when no step with damping up to this share lowers the cost
-_MIN_DEPTH_M = 0.02  # depth of a landmark in a camera: projections of nearer landmarks use this depth
+# Smallest depth in metres with which a landmark is projected, also a nearer one or one behind the camera.
+_MIN_DEPTH_M = 0.02
 _BEHIND_COST = 1e3
 """Cost, far above that of an outlier, of a pixel whose landmark is behind the camera or nearer than
 `_MIN_DEPTH_M`."""

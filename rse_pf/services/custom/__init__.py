@@ -18,7 +18,7 @@ The life of such a service:
    (`output`).
 8. Stop: the sandbox exits some time after the last connection of the robot, or is killed if a command takes
    much longer than its deadline.  If the service has ``snapshot`` and ``restore``, the server stores a
-   snapshot of its state after each command, and the next sandbox of the robot, on the same or another server,
+   snapshot of its state after each reply, and the next sandbox of the robot, on the same or another server,
    restores it.
 
 `rse_pf.server.sandbox` isolates the processes.  Nothing of a service is executed before step 6, neither code

@@ -42,7 +42,7 @@ _MIN_DBM = -120.0  # weakest plausible signal, dBm: below the thermal noise of a
 _MAX_DBM = 0.0  # strongest plausible signal, dBm: 1 mW at the antenna
 
 # --- Calibration of the uncertainty ---
-_ONE_SIGMA = 0.68  # probability that the true position lies within the radius of the reply
+_RADIUS_PROBABILITY = 0.68  # probability that the true position lies within sigma_m of the reply
 # Candidate exponents of the likelihood, ascending: 1 takes the errors of access points as independent.
 _TEMPERS = np.array([0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0])
 _DEFAULT_TEMPER = 0.4  # exponent of the likelihood where a survey is too small to calibrate the exponent
@@ -275,7 +275,7 @@ def _posterior(grid: Array, log_likelihood: Array, temper: float) -> tuple[Array
     weight /= weight.sum()
     mean = weight @ grid
     distance = np.linalg.norm(grid[:, :2] - mean[:2], axis=1)
-    return mean, _weighted_quantile(distance, weight, _ONE_SIGMA)
+    return mean, _weighted_quantile(distance, weight, _RADIUS_PROBABILITY)
 
 
 def _calibrate_temper(survey: Sequence[Survey], model: SignalModel, options: WifiOptions) -> float:
@@ -307,7 +307,7 @@ def _calibrate_temper(survey: Sequence[Survey], model: SignalModel, options: Wif
     # of positions inside should fall from candidate to candidate.  Where it rises by chance, it is replaced
     # by the smallest share of the smaller powers, so that the interpolation has one result.
     share = np.minimum.accumulate(inside / count)
-    return float(np.interp(-_ONE_SIGMA, -share, _TEMPERS))
+    return float(np.interp(-_RADIUS_PROBABILITY, -share, _TEMPERS))
 
 
 def _check_fingerprint(fingerprint: Fingerprint) -> None:
