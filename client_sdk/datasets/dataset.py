@@ -1,4 +1,5 @@
-"""A recording as frames in the order of time, at a lower rate or divided among robots if wanted."""
+"""A recording as frames in the order of time; all of them, fewer per second, or the part of one robot of
+several."""
 
 from __future__ import annotations
 
@@ -24,24 +25,24 @@ __all__ = ["Dataset"]
 class Dataset:
     """A recording: iterate over it for its frames in the order of time.
 
-    Images are read during the iteration; one that cannot be read is left out, and counted in `doubts`.
+    Images are read during the iteration; a frame whose image cannot be read is left out, and counted in
+    `doubts`.
 
     Attributes:
         name: Name of the recording, for messages.
         camera: The pinhole camera of all frames; the rectified left one of a stereo pair.
         timestamps_s: Time stamps of the frames, s.
-        truth: Path of the camera to compare with, of the kind *truth_kind*; None without one.
-        truth_kind: ``ground truth``, ``reference`` for poses that are an estimate of another program, or
-            ``none``.
-        rows: For each time stamp, the argument with which *read* reads its frame.
-        read: Reads a frame; raises UnreadableImage if an image is damaged.
-        notes: Sentences for the user on what was assumed.
+        truth: Trajectory of the camera with which an estimate can be compared; None if there is none.
+        truth_kind: ``ground truth``, ``reference`` if *truth* is an estimate of another program, or ``none``.
+        rows: For each time stamp, the index of its frame, which is the argument of *read*.
+        read: Reads the frame with an index; raises UnreadableImage if an image is damaged.
+        notes: Sentences for the user on what was assumed because the recording does not state it.
         has_depth: Whether frames have depth.
         has_stereo: Whether frames have the right image of a stereo pair.
-        T_body_camera: ``(4, 4)``, m, pose of the camera in the body whose path was measured; None if the path
-            is that of the camera itself, or the pose is not known.
-        imu: All samples of the IMU, or None; each frame carries those since the frame before it.
-        log: Collects the `doubts`.
+        T_body_camera: ``(4, 4)``, m, pose of the camera of the frames in the body of its rig, which each
+            frame gets; None if it is not known.  *truth* is the trajectory of the camera in any case.
+        imu: All samples of the IMU, or None; each frame gets those since the frame before it.
+        log: Collects the `doubts`; recordings that `thinned` and `share` return have the same log.
     """
 
     name: str
@@ -60,7 +61,7 @@ class Dataset:
 
     @property
     def doubts(self) -> tuple[Doubt, ...]:
-        """The doubts about the recording, with images that were left out in iterations so far."""
+        """The doubts about the recording, including the images that iterations so far have left out."""
         return self.log.doubts
 
     @property
@@ -70,7 +71,7 @@ class Dataset:
 
     @property
     def has_imu(self) -> bool:
-        """Whether frames carry IMU samples."""
+        """Whether frames have IMU samples."""
         return self.imu is not None
 
     @property
@@ -89,7 +90,7 @@ class Dataset:
         return with_imu(frames, self.imu)
 
     def check(self) -> None:
-        """Compare the images of some stereo pairs, and refuse a faulty rig; without stereo, do nothing.
+        """Compare the images of some stereo pairs, and refuse a faulty rig; do nothing without stereo pairs.
 
         Raises:
             UsageError: The cameras are swapped, not synchronised, or rectified wrongly.
@@ -112,10 +113,10 @@ class Dataset:
         return readable(choose_pairs(self.rows), read, DoubtLog())
 
     def thinned(self, rate_hz: float) -> Dataset:
-        """Return a recording of some of the frames: *rate_hz* on average, or all if there are not more.
+        """Return a recording of *rate_hz* of the frames per second on average, or all if there are not more.
 
-        This recording stays as it is; both share their *log*.  `Thinning` selects the frames, so that jitter
-        of the time stamps drops no frame.
+        This recording does not change; both share their *log*.  `Thinning` selects the frames so that jitter
+        of the time stamps does not change their number.
 
         Raises:
             UsageError: The rate is not above 0.
@@ -125,12 +126,13 @@ class Dataset:
         return self._select(indices)
 
     def share(self, robot: int, robots: int) -> Dataset:
-        """Return a recording of the consecutive frames that *robot* 0, 1, ... plays.
+        """Return the part of the recording that one robot of several replays as its own drive.
 
-        They are ``ceil(n / robots)`` of the n frames; the last robots get what is left, fewer or none.
+        The n frames are divided into parts of ``ceil(n / robots)`` consecutive frames, the first for robot 0;
+        the last robots get the remaining frames, fewer or none.
 
         Raises:
-            UsageError: The robot is not within 0..robots - 1.
+            UsageError: *robot* is not within 0..robots - 1.
         """
         if not 0 <= robot < robots:
             raise UsageError(f"robot {robot} is not one of 0..{robots - 1}", hint="count robots from 0")

@@ -1,4 +1,4 @@
-"""Read image files in one way for all sources: orientation, grey, 16 bits, and damaged files.
+"""Read image files for all sources: as stored, without rotation by metadata; grey or colour, 8 or 16 bits.
 
 Formats of single benchmarks are read by the other modules of this package.
 """
@@ -36,15 +36,16 @@ _Row = TypeVar("_Row")
 _Result = TypeVar("_Result")
 _IMAGE_ENDINGS = {".png", ".jpg", ".jpeg", ".bmp", ".ppm", ".pgm", ".tif", ".tiff", ".webp"}
 _WHOLE_NUMBER = re.compile(r"\d+")  # in the name of a file
-_NO_READING = 65535  # value of a 16-bit depth image with which some recorders mark a pixel without a reading
+_NO_READING = 65535  # value with which some recorders mark a pixel without a reading in a 16-bit depth image
 _WHITE_PERCENTILE = 99.9
-"""Percentile of a 16-bit image's values that becomes white: brighter pixels are defects of the sensor."""
+"""The values of a 16-bit image are scaled so that this percentile of them becomes 255; the brighter pixels,
+also 255 then, are mostly defects of the sensor.  Each image is scaled by itself."""
 _BRIGHTNESS_STRIDE = 4
 """Step in rows and columns between the pixels from which the brightness of a 16-bit image is measured."""
 
 
 class UnreadableImage(UsageError):
-    """An image file is damaged, cut off, empty or too large; sources leave such a frame out."""
+    """An image file is missing, damaged, cut off, empty or too large; sources leave its frame out."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(
@@ -58,7 +59,7 @@ def read_stored_pixels(path: Path) -> npt.NDArray[Any]:
     """Return the pixels of an image file as they are stored: grey ``(h, w)``, BGR or BGRA ``(h, w, c)``.
 
     Raises:
-        UnreadableImage: The file is missing, or no whole image.
+        UnreadableImage: The file is missing, damaged, cut off, empty or too large.
         MissingExtra: OpenCV is not installed.
     """
     image = read_image(path, load_opencv().IMREAD_UNCHANGED)
@@ -68,12 +69,12 @@ def read_stored_pixels(path: Path) -> npt.NDArray[Any]:
 
 
 def is_image(path: Path) -> bool:
-    """Return whether a file has the name of an image; files ``._NAME``, which macOS adds, are none."""
+    """Return whether a path is a file with the ending of an image, and not a file ``._NAME`` of macOS."""
     return path.suffix.lower() in _IMAGE_ENDINGS and not path.name.startswith("._") and path.is_file()
 
 
 def image_files(folder: Path) -> list[Path]:
-    """Return the image files directly in a folder, by the numbers in their names and then by their names."""
+    """Return the image files directly in a folder, sorted by the numbers in their names, then by name."""
     paths = [path for path in folder.iterdir() if is_image(path)]
     return sorted(paths, key=lambda path: (numbers_in_name(path), path.name))
 
@@ -89,7 +90,7 @@ def readable(rows: Iterable[_Row], read: Callable[[_Row], _Result], log: DoubtLo
     *log* counts the rows that are left out.
 
     Raises:
-        UnreadableImage: There are rows, and the image of none can be read; raised after the last row.
+        UnreadableImage: There is a row, but no row whose image can be read; raised after the last row.
     """
     failed: UnreadableImage | None = None
     is_empty = True
@@ -140,11 +141,11 @@ def read_colour(path: Path) -> npt.NDArray[np.uint8]:
 def read_depth(path: Path, depth_scale: float) -> npt.NDArray[np.float32]:
     """Return the depth image ``(h, w)`` of a file, m, with 0 for pixels without a reading.
 
-    *depth_scale* are the units of the file in a metre; the values 0 and 65535 are no readings.
+    A value of the file divided by *depth_scale* is metres; the values 0 and 65535 are no readings.
 
     Raises:
         UnreadableImage: The file is missing, or no whole image.
-        UsageError: The image has not one channel of 16 bits.
+        UsageError: The image does not have one channel of 16 bits.
         MissingExtra: OpenCV is not installed.
     """
     image = read_stored_pixels(path)
@@ -161,8 +162,8 @@ def read_depth(path: Path, depth_scale: float) -> npt.NDArray[np.float32]:
 def colour_of(image: npt.NDArray[Any], name: str) -> npt.NDArray[np.uint8]:
     """Return the RGB image ``(h, w, 3)`` of an image as OpenCV reads it: grey, BGR or BGRA, 8 or 16 bits.
 
-    Values of 16 bits are scaled so that the brightest pixels of this image are white, because cameras use 10,
-    12, 14 or all 16 bits.  *name* is the file, for the message.
+    Values of 16 bits are scaled so that the brightest pixels of this image become 255, because cameras use
+    10, 12, 14 or all 16 bits, and the file does not state how many.  *name* is the file, for the message.
 
     Raises:
         UsageError: The image has another number of channels, or neither 8 nor 16 bits.

@@ -1,6 +1,7 @@
 """Read the raw dumps of NYU Depth V2, which a Kinect recorded.
 
-Images are undistorted in `client_sdk.datasets.recordings`, before depth is registered to the colour image.
+`client_sdk.datasets.recordings` makes frames with these functions: it reads a depth image (`read_raw_depth`),
+undistorts it, and registers it to the undistorted colour image (`register_depth`).
 
 Source:
     Silberman et al., ECCV 2012; the calibration is the one shipped with the data set's toolbox.
@@ -61,7 +62,7 @@ _DEPTH_DISTORTION = (
 )
 COLOUR_LENS = Lens(camera=COLOUR_CAMERA, distortion=_COLOUR_DISTORTION)
 DEPTH_LENS = Lens(camera=DEPTH_CAMERA, distortion=_DEPTH_DISTORTION)
-_MAX_DEPTH_M = 10.0  # depth of a reading, beyond which its pixel counts as without a reading
+_MAX_DEPTH_M = 10.0  # largest depth that is used; a pixel with a larger one counts as without a reading
 _RAW_FILE_NAME = re.compile(r"[dr]-(\d+(?:\.\d+)?)-\d+\.(?:pgm|ppm)$")
 
 
@@ -75,8 +76,8 @@ class RawFile(NamedTuple):
 def T_colour_depth() -> Array:
     """Return the pose ``(4, 4)`` of the depth camera in the frame of the colour camera, m.
 
-    The toolbox stores the negative rotation and translation, and then divides by a negative z.  This pose
-    gives the same pixels, with points in front of the camera.
+    The toolbox stores the matrices -R and -t, with which points get a negative z; x / z and y / z are the
+    same as with R and t, which this function returns.
     """
     T = np.eye(4)
     T[:3, :3] = [
@@ -91,11 +92,12 @@ def T_colour_depth() -> Array:
 def read_raw_depth(path: Path) -> npt.NDArray[np.float32]:
     """Return the depth image ``(h, w)``, m, of a PGM file of a raw dump.
 
-    The file holds values of a Kinect in little endian, contrary to the PGM format.  A value is turned into a
-    depth by ``351.3 / (1092.5 - value)``.  Pixels without a reading, and readings beyond 10 m, are 0.
+    The values of the file are the disparities of a Kinect, in little endian, while the PGM format demands big
+    endian.  The depth of a value is ``351.3 / (1092.5 - value)``, as in the toolbox.  Pixels without a
+    reading, and readings beyond 10 m, are 0.
 
     Raises:
-        UnreadableImage: The file is missing, or no whole image; the published dumps have such files.
+        UnreadableImage: The file is missing, damaged or cut off; some files of the published dumps are.
     """
     raw = read_stored_pixels(path).byteswap()
     difference = 1092.5 - raw.astype(np.float32)
@@ -104,10 +106,10 @@ def read_raw_depth(path: Path) -> npt.NDArray[np.float32]:
 
 
 def register_depth(depth_m: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-    """Return an undistorted depth image ``(h, w)``, m, as seen by the colour camera.
+    """Return the view of the colour camera ``(h, w)``, m, of an undistorted image of the depth camera.
 
-    Each reading is projected to the nearest pixel; where several meet, the nearest surface hides the others.
-    Pixels without a reading are 0.
+    Each reading is projected to the nearest pixel of the colour camera; if several meet in a pixel, the
+    nearest to the camera stays.  Pixels without a reading are 0.
     """
     rows, columns = np.nonzero(depth_m > 0)
     pixels = np.column_stack((columns, rows)).astype(np.float64)

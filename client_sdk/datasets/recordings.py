@@ -1,8 +1,8 @@
 """Open a recording of any known format, and read RGB-D recordings: TUM folders, and dumps of NYU Depth V2.
 
-Frames are RGB images with depth in metres, undistorted and registered to the colour camera.  An image is read
-only when its frame is needed.  EuRoC and KITTI are read in `client_sdk.datasets.rig_recordings`, bags in
-`client_sdk.bags`.
+Frames are undistorted RGB images with depth in metres; the depth images of NYU Depth V2 are registered to the
+colour camera here, those of TUM folders must be already.  An image is read only when its frame is needed.
+EuRoC and KITTI are read in `client_sdk.datasets.rig_recordings`, bags in `client_sdk.bags`.
 """
 
 from __future__ import annotations
@@ -47,11 +47,13 @@ from rse_pf.geometry import Camera, Lens
 
 __all__ = ["associate_stamps", "dataset_of_bag", "is_listed", "open_dataset"]
 
-_MAX_LIST_BYTES = 64 << 20  # size of rgb.txt or depth.txt: enough for a million images
-_MAX_STAMP_DIFFERENCE_S = 0.02  # between a colour and a depth image of a TUM folder: as in TUM's associate.py
+_MAX_LIST_BYTES = 64 << 20  # largest rgb.txt or depth.txt that is read: enough for a million images
+_MAX_STAMP_DIFFERENCE_S = 0.02
+"""Largest time between the colour and the depth image of a frame of a TUM folder, as in TUM's
+``associate.py``."""
 _MAX_RAW_STAMP_DIFFERENCE_S = 0.05
-"""Time between a colour and a depth image of a raw dump of NYU Depth V2: its streams are not synchronised, so
-that the nearest images are up to half a period apart."""
+"""Largest time between the colour and the depth image of a frame of a raw dump of NYU Depth V2: one period at
+the lowest rate of its two streams, which are not synchronised and have 20 to 30 images per second."""
 _FREIBURG: dict[str, tuple[float, float, float, float, tuple[float, ...]]] = {
     "freiburg1": (517.3, 516.5, 318.6, 255.3, (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
     "freiburg2": (520.9, 521.0, 325.1, 249.7, (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
@@ -60,7 +62,7 @@ _FREIBURG: dict[str, tuple[float, float, float, float, tuple[float, ...]]] = {
 }
 """Cameras of the TUM benchmark by a part of the folder's name: fx, fy, cx, cy (px), and distortion k1 k2 p1
 p2 k3.  The last entry, for all other names, is the benchmark's default for a Kinect."""
-_FREIBURG_DEPTH_SCALE = 5000.0  # units of a depth image of the TUM benchmark in a metre
+_FREIBURG_DEPTH_SCALE = 5000.0  # units of a depth image of the TUM benchmark per metre
 
 
 def open_dataset(
@@ -78,11 +80,12 @@ def open_dataset(
 
     Args:
         path: The folder or file.
-        camera: ``stereo`` for both cameras of a rig, ``left`` for the left or only one; None for both where
-            there are two.
-        imu: Whether frames carry samples of the IMU; None for yes where there is one.
-        intrinsics: File of intrinsics or of a rig that is used instead of those of a folder in TUM layout (it
-            must state ``depth_scale`` if there is depth) or of a bag; None for their own.
+        camera: ``stereo`` uses both cameras of a stereo pair, and refuses a recording without; ``left`` uses
+            the left camera of a pair, or the only camera; None uses both cameras if there are two.
+        imu: Whether frames have samples of the IMU; True refuses a recording without an IMU; None means yes
+            if there is one.
+        intrinsics: File of intrinsics or of a rig that replaces the calibration of a folder in TUM layout or
+            of a bag (for a folder with depth it must state ``depth_scale``); None uses their own.
 
     Raises:
         UsageError: The path has no known format, a part of the recording is missing or broken, facts about it
@@ -95,7 +98,7 @@ def open_dataset(
     if intrinsics is not None and not (_is_bag(path) or is_listed(path)):
         raise UsageError(
             f"{path} has a calibration in a format of its own",
-            hint="leave out --intrinsics, or change the calibration of the recording",
+            hint="leave out --intrinsics, or correct the calibration file of the recording",
         )
     if is_euroc(path):
         return open_euroc(path, camera=camera, imu=imu)
@@ -122,7 +125,7 @@ def _is_bag(path: Path) -> bool:
 
 
 def is_listed(path: Path) -> bool:
-    """Return whether a folder has a list of its images: ``rgb.txt``, or a list of associations."""
+    """Return whether a folder has a list of its images: ``rgb.txt``, or a list of pairs (``*assoc*.txt``)."""
     return (path / "rgb.txt").is_file() or _find_associations(path) is not None
 
 
@@ -136,7 +139,7 @@ def _find_associations(folder: Path) -> Path | None:
 
 
 def dataset_of_bag(bag: Bag) -> Dataset:
-    """Return an open bag as a recording, whose frames can be read until the bag is closed."""
+    """Return an open bag as a recording; its frames can be read only while the bag is open."""
     return Dataset(
         name=bag.name,
         camera=bag.camera,
@@ -173,10 +176,10 @@ class _ImageList:
     """The colour or the depth images of a folder in TUM layout, in the order of time.
 
     Attributes:
-        times: All time stamps of the list, in its order, for `check_source`.
+        times: All time stamps of the list, in the order of its lines, for `check_source`.
         stamps_s: Time stamps of the images that are used, s, which increase.
         images: Paths of the images that are used, relative to the folder.
-        notes: Sentences on the unit of the time stamps.
+        notes: Sentences for the user on the assumed unit of the time stamps.
     """
 
     times: TimeFacts
@@ -188,8 +191,9 @@ class _ImageList:
 def _open_tum(folder: Path, intrinsics_file: Path) -> Dataset:
     """Return the recording of a folder in TUM layout.
 
-    If *intrinsics_file* is in the folder and does not exist, files of other programs are tried, and then the
-    cameras of the benchmark.  An *intrinsics_file* elsewhere must exist.
+    If *intrinsics_file* is a path directly in *folder*, such as the default ``intrinsics.json``, it need not
+    exist: then a file of another program in *folder* is used, or without one the camera of the benchmark.  A
+    path elsewhere must exist.
 
     Raises:
         UsageError: A file is missing or broken, or facts about the recording contradict each other.
@@ -290,9 +294,9 @@ def _open_tum(folder: Path, intrinsics_file: Path) -> Dataset:
 def _read_lists(folder: Path) -> tuple[_ImageList, _ImageList | None]:
     """Return the lists of the colour and of the depth images.
 
-    ``rgb.txt`` is read rather than a list of associations.  The list of depth images is None if there is
-    neither ``depth.txt`` nor a folder ``depth``.  In a list of associations, the images whose path contains
-    ``depth`` are the depth images, else the second ones of a line.
+    If there is an ``rgb.txt``, a list of associations is not read.  The list of depth images is None if there
+    is neither ``depth.txt`` nor a folder ``depth``.  In a list of associations, the second images of the
+    lines are the depth images, unless only the path of the first image contains ``depth``.
 
     Raises:
         UsageError: A list is missing, empty or broken.
@@ -314,7 +318,7 @@ def _read_lists(folder: Path) -> tuple[_ImageList, _ImageList | None]:
 def _make_list(folder: Path, name: str, rows: Sequence[Sequence[str]]) -> _ImageList:
     """Return the images of the *rows* of the file *name*, each row a time stamp and a path.
 
-    Images are left out as by `rows_in_time`: those with the time stamp of the image before, and all after the
+    `rows_in_time` leaves out the images with the time stamp of the image before, and all images after the
     clock went back.
 
     Raises:
@@ -338,7 +342,7 @@ def _make_list(folder: Path, name: str, rows: Sequence[Sequence[str]]) -> _Image
 def _read_rows(path: Path, columns: int) -> list[list[str]]:
     """Return the words of each line of a list of images: time stamps, each followed by a path.
 
-    *columns* is 2 for ``rgb.txt``, and 4 for a list of associations.
+    *columns*, the number of words of a line, is 2 for ``rgb.txt`` and 4 for a list of associations.
 
     Raises:
         UsageError: The file is missing, or a line has no finite time stamp or no path below the folder.
@@ -379,18 +383,19 @@ def _find_intrinsics(
 ) -> tuple[Intrinsics, bool, tuple[str, ...]]:
     """Find the intrinsics of a folder in TUM layout.
 
-    They are *stated*, else those of *file*.  If *file* is in the folder and does not exist, they are those of
-    the camera of the benchmark whose name is part of the folder's name, else those of a Kinect.
+    They are *stated* if it is not None, else those of *file*.  If *file* is a path directly in *folder* and
+    does not exist, they are those of the benchmark's camera whose name is part of the folder's name, else
+    those of a Kinect.
 
     Args:
-        folder: The folder, whose name may be that of a camera of the benchmark.
+        folder: The folder, whose name may contain that of a camera of the benchmark.
         file: ``intrinsics.json``, the file that the user named, or the file of another program.
-        stated: What the file of another program states; None for the other files.
+        stated: The intrinsics in the file of another program; None if *file* is not of another program.
         has_depth: Whether the folder has depth images.
 
     Returns:
-        The intrinsics, of the left camera if the file is one of a rig; whether the unit of depth is stated or
-        not needed, and not assumed; and notes on what was assumed.
+        The intrinsics (those of the left camera if the file is one of a rig); False if the unit of depth is
+        assumed, else True; and sentences for the user on what was assumed.
 
     Raises:
         UsageError: The file cannot be read, or states no unit of depth although there is depth.
@@ -425,10 +430,11 @@ def _find_intrinsics(
 def _read_truth(
     folder: Path,
 ) -> tuple[Trajectory | None, Literal["ground truth", "reference", "none"], tuple[str, ...]]:
-    """Return the reference path of the camera, its kind, and its file followed by notes on its time stamps.
+    """Return the true trajectory of the camera, its kind as `Dataset.truth_kind`, and a tuple of texts.
 
-    ``groundtruth.txt``, which is read if both files are there, is a ground truth; ``reference_poses.txt`` is
-    an estimate of another program.  Without either file the result is None, ``none`` and an empty file name.
+    The first text is the file of the trajectory; the others are sentences for the user on its time stamps.
+    The file is ``groundtruth.txt`` (a ground truth), else ``reference_poses.txt`` (an estimate of another
+    program).  Without both, the trajectory is None, the kind ``none`` and the only text empty.
 
     Raises:
         UsageError: The file is broken.

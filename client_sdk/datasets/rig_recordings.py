@@ -1,7 +1,7 @@
-"""Read recordings of EuRoC (ASL) and KITTI odometry: left camera or stereo pair, IMU, and true path.
+"""Read recordings of EuRoC (ASL) and KITTI odometry: left camera or stereo pair, IMU, and true trajectory.
 
-Frames of one camera are undistorted, those of a stereo pair are rectified.  The true path is that of the
-camera of the frames.
+Frames of one camera are undistorted, those of a stereo pair are rectified.  The true trajectory is that of
+the camera of the frames: the left camera, or the rectified left camera.
 """
 
 from __future__ import annotations
@@ -50,13 +50,13 @@ __all__ = ["CameraChoice", "is_euroc", "is_kitti", "open_euroc", "open_kitti"]
 
 CameraChoice = Literal["stereo", "left"]
 
-_EUROC_TRUTH = "state_groundtruth_estimate0/data.csv"  # the file of the true path, in the folder mav0
+_EUROC_TRUTH = "state_groundtruth_estimate0/data.csv"  # file of the true trajectory in the folder mav0
 _MAX_PAIR_DIFFERENCE_S = 0.005
-"""Largest time between both images of a stereo pair: their shutters open together, so that images farther
-apart belong to different moments."""
+"""Largest time between the two images of a stereo pair of EuRoC: the shutters of both cameras open together,
+so images that are farther apart were not taken together."""
 _KITTI_PAIRS = (("image_0", "image_1"), ("image_2", "image_3"))
-"""Folders of the grey and of the colour cameras of KITTI, left and right; the digit is that of the camera's
-projection in ``calib.txt``."""
+"""Folders of the left and the right camera of KITTI: first the grey ones, then the colour ones.  The digit of
+a folder is that of its camera's projection matrix in ``calib.txt``, such as ``P0``."""
 
 
 def is_euroc(folder: Path) -> bool:
@@ -74,8 +74,8 @@ def open_euroc(folder: Path, camera: CameraChoice | None = None, imu: bool | Non
 
     Args:
         folder: The folder ``mav0``, or the folder that contains it.
-        camera: ``stereo`` or ``left``; None for both cameras where there are two.
-        imu: Whether frames carry samples of the IMU; None for yes where there is one.
+        camera: ``stereo`` or ``left``; None means both cameras if there are two.
+        imu: Whether frames have samples of the IMU; None means yes if there is one.
 
     Raises:
         UsageError: A file is missing or broken, facts about the recording contradict each other, or there is
@@ -100,7 +100,7 @@ def open_euroc(folder: Path, camera: CameraChoice | None = None, imu: bool | Non
     rig = Rig(
         cameras=tuple(cameras), imu=read_euroc_imu(folder / "imu0" / "sensor.yaml") if has_imu else None
     )
-    # 2. Read the true path of the body, if the recording has one.
+    # 2. Read the true trajectory of the body, if the recording has one.
     body_path = None
     if (folder / _EUROC_TRUTH).is_file():
         rows = [row[:8] for row in _read_table(folder / _EUROC_TRUTH, 8)]
@@ -138,15 +138,15 @@ def open_euroc(folder: Path, camera: CameraChoice | None = None, imu: bool | Non
 def open_kitti(folder: Path, camera: CameraChoice | None = None, imu: bool | None = None) -> Dataset:
     """Return a sequence of KITTI's odometry benchmark: one camera, or a stereo pair.
 
-    The grey cameras are used where the sequence has them, else the colour cameras.
+    The grey cameras are used if the sequence has them, else the colour cameras.
 
-    The true path is in ``poses.txt``, or in ``../../poses/NAME.txt``, where NAME is that of the folder; a
-    sequence with neither file has none.
+    The true trajectory is in ``poses.txt`` of the folder, or in ``../../poses/NAME.txt``, where NAME is the
+    name of the folder; a sequence with neither file has none.
 
     Args:
         folder: The folder of the sequence.
-        camera: ``stereo`` or ``left``; None for both cameras where there are two.
-        imu: Must not be True, since the sequences have no IMU.
+        camera: ``stereo`` or ``left``; None means both cameras if there are two.
+        imu: Must not be True, because the sequences have no IMU.
 
     Raises:
         UsageError: A file is missing or broken, facts about the recording contradict each other, or there is
@@ -188,7 +188,7 @@ def open_kitti(folder: Path, camera: CameraChoice | None = None, imu: bool | Non
             )
             doubts = (*doubts, doubt)
         rights = [partners[paths[row].stem] for row in used]
-    # 3. Take the true path, and read the rig.
+    # 3. Select the poses of the used images, and read the rig.
     truth = None
     if poses is not None:
         truth = Trajectory(stamps_s[used], poses[rows["poses.txt"]][used])
@@ -208,13 +208,12 @@ def open_kitti(folder: Path, camera: CameraChoice | None = None, imu: bool | Non
         notes=notes,
         doubts=doubts,
     )
-    # KITTI's poses are those of the camera P0, which `read_kitti_rig` takes as the body; no other body is
-    # known.
+    # The body of `read_kitti_rig` is the camera of P0, because KITTI states no pose of a camera in a vehicle.
     return replace(dataset, T_body_camera=None)
 
 
 def _read_kitti_poses(path: Path) -> Array:
-    """Return the poses ``(n, 4, 4)``, m, of the camera ``P0`` in the world.
+    """Return the poses ``(n, 4, 4)``, m, of the camera with the projection matrix ``P0`` in the world.
 
     Each line of the file has the 12 numbers of a 3x4 matrix, row by row.
 
@@ -238,8 +237,8 @@ def _match_kitti_lines(
     """Return for each file, by its name, the line that belongs to each image, and notes on what was assumed.
 
     Line *n* (from 0) belongs to the image of number *n*.  If a file is too short for these numbers, or a name
-    is no number, but the file has as many lines as there are images, the file was cut together with the
-    images, and the lines belong to the images in their order.
+    is no number, but the file has as many lines as there are images, both are a part of the sequence: the
+    lines then belong to the images in their order.
 
     Args:
         paths: The images; their names are their numbers.
@@ -247,7 +246,8 @@ def _match_kitti_lines(
         folder: The folder of the sequence, for messages.
 
     Raises:
-        UsageError: A file is too short for the numbers of the images, and has not one line for each image.
+        UsageError: A file is too short for the numbers of the images, and does not have one line for each
+            image.
     """
     numbers = [int(path.stem) if path.stem.isdecimal() else None for path in paths]
     rows: dict[str, list[int]] = {}
@@ -265,7 +265,8 @@ def _match_kitti_lines(
         else:
             counts = ", ".join(f"{count} lines in {file}" for file, count in line_counts.items())
             raise UsageError(
-                f"{folder}: {len(paths)} images with numbers up to {paths[-1].stem}, {counts}",
+                f"{folder}: lines and images do not match: {len(paths)} images with numbers up to "
+                f"{paths[-1].stem}, {counts}",
                 hint="unpack the sequence again: line n belongs to the image of number n",
             )
     return rows, notes
@@ -290,16 +291,17 @@ def _make_dataset(
     Args:
         name: Name of the recording.
         rig: The cameras that are used, and the IMU.
-        lefts: Images of the left camera, or of the only one, in the order of time.
-        rights: For each left image the image of the right camera; None if the right camera is not used.
+        lefts: Image files of the left camera, or of the only camera, in the order of time.
+        rights: For each left image, the image file of the right camera; None if the right camera is not used.
         stamps_s: ``(n,)``, s, time stamps of the left images.
-        body_path: True poses of the body in the world; None without a truth.
+        body_path: True trajectory of the body in the world; None if the recording has none.
         samples: ``(n, 7)``, samples of the IMU: time stamp (s), angular rate (rad/s), specific force (m/s^2);
-            None without an IMU.
-        stated_by: The files of the calibration, of the time stamps and of the true path, for messages.
-        notes: Sentences on what was assumed.
-        losses: Left images without a right one, of recordings that pair images by time.
-        doubts: Doubts about time stamps, and about left images without a right one of the same number.
+            None if no IMU is used.
+        stated_by: The files of the calibration, of the time stamps and of the true trajectory, for messages.
+        notes: Sentences for the user on what was assumed.
+        losses: For EuRoC, which pairs images by time: the left images without a right one, if there are some.
+        doubts: Doubts about time stamps; for KITTI, which pairs images by number, also about the left images
+            without a right one.
 
     Raises:
         UsageError: There is no image, the cameras are no stereo pair, or facts contradict each other.
@@ -334,8 +336,8 @@ def _make_dataset(
             stereo=rectification.right(cv2.cvtColor(right_rgb, cv2.COLOR_RGB2GRAY)),
         )
 
-    # 2. Put IMU samples on the clock of the left camera, and turn the path of the body into that of the
-    # camera of the frames.
+    # 2. Convert the time stamps of the IMU to the clock of the left camera, and the true trajectory of the
+    #    body to that of the camera of the frames.
     track = None
     if samples is not None and rig.imu is not None:
         track = ImuTrack(
@@ -387,7 +389,8 @@ def _pair_images(
 ) -> tuple[list[tuple[int, int]], tuple[LossFacts, ...]]:
     """Return the pairs (left row, right row) of images that were taken together, and the loss of left images.
 
-    The loss is an empty tuple if each left image has a right one.  *name* is the recording, for messages.
+    The loss is one fact in a tuple, which is empty if each left image has a right one.  *name* is the
+    recording, for messages.
 
     Raises:
         UsageError: No two images are within 5 ms.
@@ -406,10 +409,10 @@ def _pair_images(
 
 
 def _is_used(path: Path, wanted: bool | None, name: str) -> bool:
-    """Return whether the sensor *name* is used: as *wanted*, or for None if its file or folder *path* exists.
+    """Return whether the sensor *name* is used: *wanted*, or whether *path* exists if that is None.
 
     Raises:
-        UsageError: The sensor is wanted, and does not exist.
+        UsageError: *wanted* is True, and *path*, the sensor's file or folder, does not exist.
     """
     if wanted and not path.exists():
         option = "--imu" if name == "imu0" else "--camera stereo"
@@ -427,8 +430,8 @@ def _mav0_of(folder: Path) -> Path:
 def _read_euroc_images(folder: Path) -> tuple[list[Path], Array, tuple[str, ...], tuple[Doubt, ...]]:
     """Return the images of a camera, their time stamps ``(n,)`` (s), notes, and doubts.
 
-    Images are left out as by `rows_in_time`, so that the time stamps increase.  A note names
-    the unit in which the time stamps were read, if that is not the nanosecond.
+    `rows_in_time` leaves out images, so that the time stamps increase.  A note names the unit in which the
+    time stamps were read, if that is not the nanosecond.
 
     Raises:
         UsageError: ``data.csv`` cannot be read, or names a file outside of the folder ``data``.

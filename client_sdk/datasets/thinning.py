@@ -12,27 +12,28 @@ from rse_pf.errors import UsageError
 __all__ = ["Thinning", "median_interval_s"]
 
 _SAME_RATE_RATIO = 1.05
-"""Ratio of the frame interval at the wanted rate to that of the recording, up to which both rates count as
-the same: cameras of 30 Hz have 29.97 or 30.2 Hz."""
+"""All frames are selected if the wanted period is at most this many times the frame interval: cameras of 30
+Hz have 29.97 or 30.2 Hz, and must not lose frames when 30 Hz are wanted."""
 _INTERVAL_WINDOW = 31
-"""Number of the latest time stamps of a live camera, whose median interval is taken as its frame interval."""
-_ROUNDING_S = 1e-6  # error of time stamps and periods that are rounded decimal fractions
+"""The frame interval of a live camera is the median interval of this many latest time stamps."""
+_ROUNDING_S = 1e-6  # largest error, in seconds, of time stamps and periods that are rounded decimal fractions
 
 
 class Thinning:
-    """Decides for each frame, in the order of time, whether the frame belongs to a recording at a lower rate.
+    """Select frames, one after the other in the order of time, so that *rate_hz* frames per second remain.
 
-    Due times are a grid with the period ``1 / rate_hz`` that begins at the first frame.  For each due time,
-    the first frame that is at most half a frame interval early is selected.  Two selected frames are at least
-    half a period apart.  At the rate of the frames themselves, or a higher one, all frames are selected.
+    The wanted period is ``1 / rate_hz``; the frame interval is the median time between two given frames.
+    Frames are due at multiples of the wanted period after the first frame.  For each due time, the first
+    frame later than half a frame interval before it is selected; two selected frames are at least half a
+    wanted period apart.  All frames are selected if the wanted rate is that of the frames, or higher.
     """
 
     def __init__(self, rate_hz: float, *, interval_s: float | None = None) -> None:
-        """Begin without a frame.
+        """Store the rate; no frame was given yet.
 
         Args:
-            rate_hz: Wanted frames a second.
-            interval_s: Median time between frames, s; None to estimate it from the latest 31 frames.
+            rate_hz: Wanted frames per second.
+            interval_s: Frame interval, s; None estimates it from the latest 31 frames.
 
         Raises:
             UsageError: The rate is not above 0.
@@ -69,7 +70,7 @@ class Thinning:
 def median_interval_s(timestamps_s: Iterable[float]) -> float:
     """Return the median time between successive frames, s; 0 for fewer than two frames.
 
-    Of an even number of intervals, that is the shorter one of the two in the middle.
+    The median of an even number of intervals is the shorter of the two in the middle.
     """
     intervals = sorted(later - earlier for earlier, later in pairwise(timestamps_s))
     return intervals[(len(intervals) - 1) // 2] if intervals else 0.0

@@ -410,7 +410,7 @@ def _sensor(path: Path, model: str) -> Path:
          "is 9 m at assumed 1000 units a metre"),
         (lambda path: tum(path, ["0", "0.2", "0.1", "0.3", "0.2"]), "2 of 5 time stamps are earlier"),
         (lambda path: kitti(path, (0, 1, 2), 2, 5),
-         "3 images with numbers up to 000002, 2 lines in times.txt, 5 lines in poses.txt"),
+         "not match: 3 images with numbers up to 000002, 2 lines in times.txt, 5 lines in poses.txt"),
         (lambda path: (tum(path, ["0"]) / "intrinsics.json").rename(path / "calibration.txt") and
          (path / "calibration.txt").write_text("50 51 30 20 0.1") and path,
          "calibration.txt holds 5 numbers, neither fx fy cx cy nor a matrix"),
