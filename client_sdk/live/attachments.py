@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import hashlib
 import math
 from collections import deque
 from collections.abc import Awaitable, Callable
@@ -37,7 +36,7 @@ from rse_pf.errors import (
     UsageError,
 )
 from rse_pf.slam.cloud_deform import voxel_keys
-from rse_pf.slam.keyframe_points import ObjectReference, encode_points
+from rse_pf.slam.keyframe_points import encode_points
 from rse_pf.token_bucket import TokenBucket
 
 __all__ = ["Attachments", "BackgroundUploader", "EncodedAttachments", "StoreObject", "encode_keyframe_points"]
@@ -69,10 +68,9 @@ _MAX_QUIET_WAIT_S = 1.0
 case, because a robot that always has some would never upload."""
 _FIRST_PAUSE_S = 0.5  # pause after the first failed upload, in seconds; it doubles with each failure in a row
 _MAX_PAUSE_S = 30.0  # longest pause after a failed upload, in seconds
-_OBJECT_REFUSALS = (LimitExceeded, BadRequest, UsageError)
-"""Errors that concern one object, such as its size: it is dropped, because it would be refused again."""
-_ALL_REFUSALS = (Forbidden, Unauthorized, QuotaExceeded)
-"""Errors that concern every object of the robot: all waiting objects are dropped."""
+_REFUSALS = (BadRequest, Forbidden, LimitExceeded, QuotaExceeded, Unauthorized, UsageError)
+"""Errors with which an object would be refused again: it is dropped, and the next one is tried after a
+pause."""
 
 _Pixels = npt.NDArray[np.int64]
 
@@ -89,16 +87,6 @@ class EncodedAttachments:
 
     points: bytes | None = None
     image: bytes | None = None
-
-    @property
-    def points_reference(self) -> ObjectReference | None:
-        """Digest and size of the points, as they are written into the keyframe; None without points."""
-        return _make_reference(self.points)
-
-    @property
-    def image_reference(self) -> ObjectReference | None:
-        """Digest and size of the image, as they are written into the keyframe; None without an image."""
-        return _make_reference(self.image)
 
 
 class Attachments:
@@ -178,7 +166,7 @@ class Attachments:
     async def wait_empty(self) -> None:
         """Wait until every attachment was uploaded or dropped."""
         for uploader in self._uploaders():
-            await uploader.wait_empty()
+            await uploader.is_empty.wait()
 
     def report(self) -> dict[str, Any]:
         """Return the reports of the uploaders in use, under the keys ``points`` and ``images``."""
@@ -219,8 +207,10 @@ class BackgroundUploader:
         self._callbacks = UserCallbacks()
         self._waiting: deque[bytes] = deque()
         self._waiting_bytes = 0
-        self._has_object, self._is_empty = asyncio.Event(), asyncio.Event()
-        self._is_empty.set()
+        self.is_empty = asyncio.Event()
+        """Set while every added object was uploaded or dropped."""
+        self._has_object = asyncio.Event()
+        self.is_empty.set()
 
     def add(self, data: bytes) -> None:
         """Add an object to upload; while more than 16 MiB wait, the oldest waiting objects are dropped."""
@@ -229,7 +219,7 @@ class BackgroundUploader:
         while self._waiting_bytes > _MAX_WAITING_BYTES:
             self._waiting_bytes -= len(self._waiting.popleft())
             self._dropped += 1
-        self._is_empty.clear()
+        self.is_empty.clear()
         self._has_object.set()
 
     def report(self) -> dict[str, int | str]:
@@ -246,22 +236,17 @@ class BackgroundUploader:
             "trouble": self._trouble,
         }
 
-    async def wait_empty(self) -> None:
-        """Wait until every added object was uploaded or dropped."""
-        await self._is_empty.wait()
-
     async def run(self) -> None:
         """Upload objects, the oldest first, until cancelled.
 
         A failed upload is repeated after a pause, and later objects wait for it.  An object that the server
-        refuses for its content or size is dropped.  If the server would refuse every object of the robot, all
-        waiting objects are dropped.
+        refuses is dropped.
         """
         pause_s = _FIRST_PAUSE_S
         while True:
             # 1. Wait for an object, for the rate limit, and until no pose query or keyframe waits.
             while not self._waiting:
-                self._is_empty.set()
+                self.is_empty.set()
                 self._has_object.clear()
                 await self._has_object.wait()
             data = self._waiting[0]
@@ -279,13 +264,8 @@ class BackgroundUploader:
                         f"store raised {type(error).__name__}", hint="read its traceback in the log"
                     )
                 self._trouble = f"{error.code}: {error.message}"
-                if isinstance(error, _OBJECT_REFUSALS):
+                if isinstance(error, _REFUSALS):
                     self._dropped += self._remove_if_first(data)
-                elif isinstance(error, _ALL_REFUSALS):
-                    self._dropped += len(self._waiting)
-                    self._waiting.clear()
-                    self._waiting_bytes = 0
-                    self._is_empty.set()
                 await asyncio.sleep(pause_s)
                 pause_s = min(2 * pause_s, _MAX_PAUSE_S)
             else:
@@ -356,7 +336,3 @@ def _encode_jpeg(frame: Frame) -> bytes | None:
     bgr = np.ascontiguousarray(frame.rgb[:, :, ::-1])
     is_encoded, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
     return data.tobytes() if is_encoded and data.nbytes <= MAX_SINGLE_PUT_BYTES else None
-
-
-def _make_reference(data: bytes | None) -> ObjectReference | None:
-    return None if data is None else ObjectReference(hashlib.sha256(data).hexdigest(), len(data))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+
 import numpy as np
 
 from client_sdk.frontend import Features, Frame
@@ -19,6 +21,7 @@ from rse_pf.slam.keyframe import (
     make_scaleless_features,
     max_features,
 )
+from rse_pf.slam.keyframe_points import ObjectReference
 
 __all__ = ["encode_depth_keyframe", "encode_monocular_keyframe"]
 
@@ -61,8 +64,8 @@ def encode_depth_keyframe(
             f_baseline,
         ),
         imu=imu,
-        points=attachments.points_reference,
-        image=attachments.image_reference,
+        points=_refer_to(attachments.points),
+        image=_refer_to(attachments.image),
     )
     return encode_keyframe(keyframe)
 
@@ -105,3 +108,8 @@ def encode_monocular_keyframe(
 def _feature_limit(max_orb_features: int, kind: DescriptorKind) -> int:
     """Return the limit of features of *kind*: *max_orb_features*, or less if its descriptors are longer."""
     return max_orb_features * max_features(kind) // MAX_FEATURES
+
+
+def _refer_to(data: bytes | None) -> ObjectReference | None:
+    """Return digest and size of an attachment, as they are written into the keyframe; None for None."""
+    return None if data is None else ObjectReference(hashlib.sha256(data).hexdigest(), len(data))

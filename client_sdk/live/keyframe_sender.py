@@ -159,6 +159,7 @@ class KeyframeSender:
         deadline_s: float,
         bytes_per_s: float,
         clock: Callable[[], float],
+        current_segment: Callable[[], int],
         on_introduced: Callable[[RobotInMap, NumberOffset], None],
         on_acknowledged: Callable[[KeyframeSent], None],
     ) -> None:
@@ -171,6 +172,8 @@ class KeyframeSender:
             deadline_s: Deadline of one call, in seconds.
             bytes_per_s: Rate limit of the keyframes that are sent, in bytes per second.
             clock: Monotonic time in seconds.
+            current_segment: Returns the robot's number of the present segment, with which the next keyframe
+                is numbered while none is queued.
             on_introduced: Called after each `introduce` with the map's reply and the offset in use.
             on_acknowledged: Called for each acknowledged keyframe with its number and times.
         """
@@ -184,40 +187,25 @@ class KeyframeSender:
         `REFUSALS`; False after a success."""
         self.refused_keyframes = 0
         """Number of keyframes that were removed because the map refused their content or size."""
-        self.current_segment = 0
-        """The robot's number of the present segment, which `introduce` needs while no keyframe is queued;
-        `LiveMapper` sets it."""
         self._robot, self._map_name, self._queue = robot, map_name, queue
         self._deadline_s, self._clock = deadline_s, clock
         self._rate_limit = TokenBucket(bytes_per_s, burst=0.0)
+        self._current_segment = current_segment
         self._on_introduced, self._on_acknowledged = on_introduced, on_acknowledged
-        self._has_keyframe, self._is_empty = asyncio.Event(), asyncio.Event()
-        self._has_no_pose_query = asyncio.Event()
-        self._is_empty.set()
-        self._has_no_pose_query.set()
+        self.is_empty = asyncio.Event()
+        """Set while no keyframe is queued."""
+        self.has_no_pose_query = asyncio.Event()
+        """Set while no pose query is open; the mapper clears it during a query, and keyframes then wait."""
+        self._has_keyframe = asyncio.Event()
+        self.is_empty.set()
+        self.has_no_pose_query.set()
         self._introduction_lock = asyncio.Lock()
         self._is_known_to_map = False
 
     def notify_added(self) -> None:
         """Wake the sender after a keyframe was added to the queue."""
-        self._is_empty.clear()
+        self.is_empty.clear()
         self._has_keyframe.set()
-
-    def pause_for_pose_query(self) -> None:
-        """Delay keyframes, because a pose query is open, until `resume_after_pose_query` is called."""
-        self._has_no_pose_query.clear()
-
-    def resume_after_pose_query(self) -> None:
-        """Send keyframes again, because the pose query has ended."""
-        self._has_no_pose_query.set()
-
-    async def wait_empty(self) -> None:
-        """Wait until no keyframe is queued."""
-        await self._is_empty.wait()
-
-    async def wait_no_pose_query(self) -> None:
-        """Wait until no pose query is open."""
-        await self._has_no_pose_query.wait()
 
     async def introduce(self) -> RobotInMap:
         """Ask the map for this robot's name and numbers, set the queue's number offset, and return the reply.
@@ -233,7 +221,7 @@ class KeyframeSender:
             offset, acknowledged = choose_number_offset(
                 queue.offset,
                 first_index=queue.first_index,
-                first_segment=queue.first().segment if len(queue) else self.current_segment,
+                first_segment=queue.first().segment if len(queue) else self._current_segment(),
                 next_index=queue.next_index,
                 next_number=robot_in_map.next_number,
                 unused_segment=robot_in_map.unused_segment,
@@ -277,10 +265,10 @@ class KeyframeSender:
 
     async def _wait_for_keyframe(self) -> None:
         while not len(self._queue):
-            self._is_empty.set()
+            self.is_empty.set()
             self._has_keyframe.clear()
             await self._has_keyframe.wait()
-        self._is_empty.clear()
+        self.is_empty.clear()
 
     async def _send_first(self) -> None:
         """Send the oldest keyframe, and remove it from the queue when it is acknowledged or refused.
@@ -300,7 +288,7 @@ class KeyframeSender:
         keyframe = await asyncio.to_thread(queue.first)
         await asyncio.sleep(self._rate_limit.spend(len(keyframe.data), self._clock()))
         with contextlib.suppress(asyncio.TimeoutError):
-            await asyncio.wait_for(self.wait_no_pose_query(), _MAX_POSE_WAIT_S)
+            await asyncio.wait_for(self.has_no_pose_query.wait(), _MAX_POSE_WAIT_S)
         # 2. Send the keyframe with the map's number.
         number = offset.number + keyframe.index
         sent_s = self._clock()

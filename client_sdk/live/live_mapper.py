@@ -141,6 +141,7 @@ class LiveMapper:
             deadline_s=self.options.deadline_s,
             bytes_per_s=self.options.bytes_per_s,
             clock=clock,
+            current_segment=lambda: self._segment,
             on_introduced=self._apply_introduction,
             on_acknowledged=self.sent_keyframes.append,
         )
@@ -206,7 +207,6 @@ class LiveMapper:
         return self
 
     async def _join(self) -> None:
-        self._sender.current_segment = self._segment
         if self._robot.connected:
             try:
                 await self._sender.introduce()
@@ -528,7 +528,6 @@ class LiveMapper:
     def _begin_segment(self) -> None:
         """Begin another segment; its first keyframe is relocalised without a pause."""
         self._segment += 1
-        self._sender.current_segment = self._segment
         self._last_keyframe = self._last_keyframe_s = None
         self.relocalise()
 
@@ -620,20 +619,20 @@ class LiveMapper:
 
     async def _ask_with_priority(self, query: PoseQuery) -> PoseAnswer:
         """Ask for a pose, and delay keyframes and attachments until the answer."""
-        self._sender.pause_for_pose_query()
+        self._sender.has_no_pose_query.clear()
         try:
             return await self._ask(query)
         finally:
-            self._sender.resume_after_pose_query()
+            self._sender.has_no_pose_query.set()
 
     async def _wait_quiet(self) -> None:
         """Wait until no keyframe is queued and no pose query is open."""
-        await self._sender.wait_empty()
-        await self._sender.wait_no_pose_query()
+        await self._sender.is_empty.wait()
+        await self._sender.has_no_pose_query.wait()
 
     async def _wait_sent(self) -> None:
         """Wait until the map has acknowledged every keyframe, and every attachment was uploaded."""
-        await self._sender.wait_empty()
+        await self._sender.is_empty.wait()
         await self._attachments.wait_empty()
 
     async def _wait_for_cloud(self) -> None:

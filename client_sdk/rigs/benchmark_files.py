@@ -8,14 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
-from client_sdk.rigs.intrinsics import Intrinsics, parse_lens_model
+from client_sdk.rigs.intrinsics import Intrinsics, name_file_in_errors, parse_lens_model
 from client_sdk.rigs.rig import Rig, RigCamera, RigImu
-from rse_pf.errors import InvalidCamera, UsageError
+from rse_pf.errors import UsageError
 from rse_pf.files import read_regular_file
 from rse_pf.geometry import Array, Camera
 
 __all__ = [
-    "parse_numbers",
     "read_euroc_camera",
     "read_euroc_imu",
     "read_kitti_rig",
@@ -24,6 +23,7 @@ __all__ = [
 ]
 
 _MAX_FILE_BYTES = 64 << 20  # largest text file of a recording that is read; the longest ones list IMU samples
+_HINT = "unpack the recording again"
 _EUROC_IMU_FIELDS = {
     "gyro_noise": "gyroscope_noise_density",
     "gyro_walk": "gyroscope_random_walk",
@@ -51,10 +51,10 @@ def read_euroc_camera(path: Path, name: str) -> RigCamera:
         raise UsageError(
             f"{path} does not describe a camera: it has {len(width_height)} of 2 numbers of the resolution, "
             f"{len(fx_fy_cx_cy)} of 4 of the intrinsics, {len(T_body_camera)} of 16 of T_BS",
-            hint="unpack the recording again",
+            hint=_HINT,
         )
     (fx, fy, cx, cy), (width, height) = fx_fy_cx_cy, width_height
-    try:
+    with name_file_in_errors(path, _HINT):
         camera = Camera(fx=fx, fy=fy, cx=cx, cy=cy, width=int(width), height=int(height))
         parse_lens_model(_word_after(text, "camera_model"))  # refuses projections such as omni
         lens = Intrinsics(
@@ -63,8 +63,6 @@ def read_euroc_camera(path: Path, name: str) -> RigCamera:
             distortion=tuple(distortion),
         )
         return RigCamera(name=name, lens=lens, T_body_camera=np.array(T_body_camera).reshape(4, 4))
-    except (InvalidCamera, UsageError) as error:
-        raise UsageError(f"{path}: {error.message}", hint=error.hint) from error
 
 
 def read_euroc_imu(path: Path) -> RigImu:
@@ -86,10 +84,8 @@ def read_euroc_imu(path: Path) -> RigImu:
             hint="unpack the recording again, or --no-imu",
         )
     numbers = {field: float(read_numbers(path, [word])[0]) for field, word in words.items()}
-    try:
+    with name_file_in_errors(path, _HINT):
         return RigImu(T_body_imu=np.array(T_body_imu).reshape(4, 4), **numbers)
-    except UsageError as error:
-        raise UsageError(f"{path}: {error.message}", hint=error.hint) from error
 
 
 def read_kitti_rig(path: Path, size: tuple[int, int], projection_names: Sequence[str]) -> Rig:
@@ -109,14 +105,14 @@ def read_kitti_rig(path: Path, size: tuple[int, int], projection_names: Sequence
     lines = dict(line.split(":", 1) for line in read_text(path).splitlines() if ":" in line)
     cameras = []
     for projection_name, name in zip(projection_names, ("left", "right"), strict=False):
-        numbers = parse_numbers(path, lines.get(projection_name, ""))
+        numbers = read_numbers(path, lines.get(projection_name, "").split()).tolist()
         if len(numbers) != 12:
             raise UsageError(
                 f"{path} has {len(numbers)} of the 12 numbers of {projection_name}",
-                hint="unpack the sequence again",
+                hint=_HINT,
             )
         projection = np.array(numbers).reshape(3, 4)
-        try:
+        with name_file_in_errors(path, _HINT):
             camera = Camera(
                 fx=numbers[0], fy=numbers[5], cx=numbers[2], cy=numbers[6], width=size[0], height=size[1]
             )
@@ -126,13 +122,6 @@ def read_kitti_rig(path: Path, size: tuple[int, int], projection_names: Sequence
             # -t.
             T_body_camera[:3, 3] = -np.linalg.solve(projection[:, :3], projection[:, 3])
             cameras.append(RigCamera(name=name, lens=Intrinsics(camera=camera), T_body_camera=T_body_camera))
-        except (InvalidCamera, UsageError) as error:
-            raise UsageError(f"{path}: {error.message}", hint=error.hint) from error
-        except np.linalg.LinAlgError as error:
-            raise UsageError(
-                f"{path}: the matrix of {projection_name} is singular, which is no camera",
-                hint="unpack the sequence again",
-            ) from error
     return Rig(cameras=tuple(cameras))
 
 
@@ -145,17 +134,7 @@ def read_text(path: Path) -> str:
     try:
         return read_regular_file(path, _MAX_FILE_BYTES).decode("utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
-        raise UsageError(f"cannot read {path}", hint="unpack the recording again") from error
-
-
-def parse_numbers(path: Path, text: str) -> list[float]:
-    """Return the numbers of a text, separated by spaces or commas; *path*, its file, is named in errors.
-
-    Raises:
-        UsageError: A word is no number, or a number is not finite.
-    """
-    numbers: list[float] = read_numbers(path, text.replace(",", " ").split()).tolist()
-    return numbers
+        raise UsageError(f"cannot read {path}", hint=_HINT) from error
 
 
 def read_numbers(path: Path, words: Sequence[str]) -> Array:
@@ -167,9 +146,9 @@ def read_numbers(path: Path, words: Sequence[str]) -> Array:
     try:
         values = np.array([float(word) for word in words])
     except ValueError as error:
-        raise UsageError(f"{path} holds a word that is no number", hint="unpack it again") from error
+        raise UsageError(f"{path} holds a word that is no number", hint=_HINT) from error
     if not np.isfinite(values).all():
-        raise UsageError(f"{path} holds a number that is not finite", hint="unpack it again")
+        raise UsageError(f"{path} holds a number that is not finite", hint=_HINT)
     return values
 
 
@@ -182,4 +161,5 @@ def _word_after(text: str, field: str) -> str | None:
 def _list_after(text: str, heading: str, path: Path) -> list[float]:
     """Return the numbers in the brackets after the pattern *heading*; empty if nothing matches it."""
     match = re.search(rf"{heading}\s*\[([^\]]*)\]", text, re.MULTILINE)
-    return [] if match is None else parse_numbers(path, match[1])
+    numbers: list[float] = read_numbers(path, match[1].replace(",", " ").split()).tolist() if match else []
+    return numbers
