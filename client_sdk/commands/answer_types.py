@@ -30,10 +30,11 @@ class _Origin:
         source: Who computed the answer.
         server: Name of the server, ``lambda`` for the burst function, or ``robot``.
         round_trip_ms: From the call to the answer, as the caller measured it.
-        queue_ms: Time that the command waited on the server.
+        queue_ms: Time that the command waited on the server; 0 if *source* is not ``cloud``.
         compute_ms: Time of the computation.
-        up_ms: Delay from robot to server, None if the offset of their clocks is unknown.
-        down_ms: Delay from server to robot, None if the offset of their clocks is unknown.
+        up_ms: Delay from robot to server; None if the offset of their clocks is unknown, or if *source* is
+            not ``cloud``.
+        down_ms: Delay from server to robot; None as for *up_ms*.
         payload_bytes: Size of the command's message; 0 if it was not sent.
         why: Why no server answered; empty if *source* is ``cloud``.
     """
@@ -53,10 +54,9 @@ class _Origin:
 class Answer(_Origin):
     """The answer to a command: its reply, who computed it, and how long each step took in ms.
 
-    If *source* is ``burst`` or ``robot``, ``why`` says why no server answered.  Long services store their
-    reply as an object of the data service, whose digest is in ``object``.  A reply that is too large for a
-    message is only there: ``reply`` is None, and
-    ``decode_reply(DataClient(...).download(answer.object), ReplyType)`` returns it.
+    A long service stores its reply as an object of the data service, too; ``object`` is its digest.  If the
+    reply is too large for a message, ``reply`` is None, and
+    ``decode_reply(DataClient(...).download(answer.object), ReplyType)`` returns the reply.
     """
 
     reply: Any
@@ -90,5 +90,7 @@ def decode_reply(data: bytes, reply_type: type[T]) -> T:
     try:
         plain = msgspec.msgpack.decode(data, ext_hook=extension_hook)
     except msgspec.DecodeError as error:
-        raise BadMessage("this object is not a reply", hint="download what answer.object names") from error
+        raise BadMessage(
+            "these bytes are not a reply", hint="download the object that answer.object names"
+        ) from error
     return as_type(plain, reply_type)

@@ -1,7 +1,7 @@
-"""Deliver the updates of subscribed topics to a program: the newest value of each key, without a queue.
+"""Deliver the updates of subscribed topics to a program: of each key only the newest value.
 
-A value that arrives before the program has read an earlier one of the same key replaces it.  A subscription
-survives reconnects and changes of the server; the new server sends the present values again.
+A value that arrives before the program has read an earlier value of its key replaces that value.  A
+subscription survives reconnects and changes of the server; the new server sends the present values again.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ from rse_pf.wire.client_subscriptions import SubscriptionEnded, Updated
 __all__ = ["BlockingUpdates", "RobotSubscriptions", "Updates"]
 
 MAX_UNREAD_KEYS = 4096
-"""Most keys of one subscription whose values the program has not read yet; the oldest is dropped beyond
-it."""
+"""Most keys of one subscription whose values the program has not read yet; beyond it, the value that has
+waited longest is dropped, and not counted in `Updates.replaced`."""
 
 
 class Updates:
     """Iterate over the updates of one topic as pairs of key and value, until the subscription is closed.
 
-    ``async with robot.subscribe(topic) as updates`` closes the subscription at the end of the block, an
-    ``async for`` over the updates at the end of the loop.
+    ``async with robot.subscribe(topic) as updates`` closes the subscription at the end of the block.  An
+    ``async for`` over the updates closes the subscription, too, when the loop ends.
     """
 
     def __init__(self, topic: str, on_close: Callable[[], None]) -> None:

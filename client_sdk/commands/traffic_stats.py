@@ -13,7 +13,7 @@ __all__ = ["Percentiles", "Stats", "TrafficCounter"]
 SAMPLE_SIZE = 2048
 """Largest number of values in the uniform sample of each quantity, from which percentiles are computed."""
 RECENT_ROUND_TRIPS = 32
-"""Number of the last round trips to a server whose 95th percentile is expected of the next one."""
+"""Number of the last round trips to a server; their 95th percentile is the prediction of the next one."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -30,7 +30,7 @@ class Stats:
     """A snapshot of the counters of one robot, which start at zero when the robot is made.
 
     Attributes:
-        sent: Commands that the program asked for.
+        sent: Commands that the program gave to `Robot.call`, whether or not they have left the robot.
         answered: Commands that ended with an answer.
         failed: Commands that ended with an error.
         sent_to_burst: Commands that were sent to the burst function within the present 24 hours, also those
@@ -44,7 +44,8 @@ class Stats:
         held_back: Commands that were not sent at once although there was a connection: by ``busy`` (the
             server's answer to this command or another one of its stream) or ``own-limit`` (limits of the
             Welcome).
-        duplicates: Second answers that reached a caller: always 0.
+        duplicates: Second answers to a command that passed the session, which drops them: 0 unless the SDK is
+            faulty.
         reconnects: How often a lost connection was replaced.
         moves: How often a server asked the robot to change to another one, and it did.
         region_changes: How often the robot changed to another of its addresses.

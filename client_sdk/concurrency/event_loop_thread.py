@@ -90,7 +90,8 @@ class EventLoopThread:
             self._calls.discard(future)
 
     def close(self) -> None:
-        """End the loop and every call that waits, within 7 s; any thread may call this, repeatedly.
+        """End the loop and every call that waits, and return within 7 s; any thread may call this,
+        repeatedly.
 
         The thread of the loop does not wait for its own end.  A forked child process does nothing.
         """

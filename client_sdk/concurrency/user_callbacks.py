@@ -32,11 +32,13 @@ TOKEN_TIMEOUT_S = 30.0
 """A token function that takes longer than this has failed: services that issue tokens answer within
 seconds."""
 SLOW_CALL_S = 3.0
-"""A function that blocks the event loop for more than this many seconds is reported: it is the default of the
-setting session.ping_timeout_s, after which a connection without an answer to a ping counts as lost."""
+"""Without another limit, a function that blocks the event loop for more than this many seconds is reported.
+The limit of a robot is session.ping_timeout_s, after which a connection without an answer to a ping counts as
+lost; its default is as long."""
 THREAD_JOIN_S = 0.2
-"""How long the end of a robot waits for a function that still runs; such a function may block for ever."""
-CREDENTIAL_FUNCTION = "the token callable"
+"""How long `UserCallbacks.end_thread` waits for a function that still runs, in seconds; such a function may
+block for ever."""
+TOKEN_FUNCTION = "the token callable"
 """Name of the program's token function in reports and errors."""
 
 
@@ -54,7 +56,10 @@ class UserCallbacks:
         self._token_loop: asyncio.AbstractEventLoop | None = None
 
     def start_thread(self) -> None:
-        """Call user functions in a new thread from now on, and token functions in the loop of another."""
+        """Call user functions in a new thread from now on.
+
+        Token functions are called in the event loop of a second thread, which starts when one is needed.
+        """
         self._calls = queue.SimpleQueue()
         self._thread = threading.Thread(
             target=self._run_calls, args=(self._calls,), name="rse-pf-callbacks", daemon=True
@@ -62,9 +67,10 @@ class UserCallbacks:
         self._thread.start()
 
     def end_thread(self) -> None:
-        """End the thread after the calls that wait in its queue; the thread itself may call this.
+        """End the thread after the calls that wait in its queue.
 
-        Another thread waits `THREAD_JOIN_S` for this end; a function that still runs then goes on.
+        This waits `THREAD_JOIN_S` for the end, unless it is called in the thread itself; a function that
+        still runs after that goes on.
         """
         if self._calls is not None and self._thread is not None:
             self._calls.put(None)
@@ -134,16 +140,16 @@ class UserCallbacks:
     def token_error(self, error: BaseException) -> ConnectError:
         """Report *error*, which a token function raised, and return it as an error of the connection."""
         if isinstance(error, RsePfError):  # its message and hint tell users enough without a traceback
-            self.report(CREDENTIAL_FUNCTION, error, has_traceback=False)
+            self.report(TOKEN_FUNCTION, error, has_traceback=False)
             return ConnectError(f"no token: {error.message}", hint=error.hint)
-        self.report(CREDENTIAL_FUNCTION, error)
+        self.report(TOKEN_FUNCTION, error)
         return ConnectError(
-            f"no token: {CREDENTIAL_FUNCTION} raised {type(error).__name__}",
+            f"no token: {TOKEN_FUNCTION} raised {type(error).__name__}",
             hint="repair the token callable: the log has its traceback",
         )
 
     def report(self, name: str, error: BaseException, *, has_traceback: bool = True) -> None:
-        """Count *error* of the user function *name*; log it unless the same line raised its type before."""
+        """Count *error* of the user function *name*; log each type of error once a line that raised it."""
         frames = traceback.extract_tb(error.__traceback__)
         source_line = f"{frames[-1].filename}:{frames[-1].lineno}" if frames else ""
         if self._is_new((name, type(error).__name__, source_line)):
@@ -199,7 +205,7 @@ class UserCallbacks:
 
 
 def _log_error(text: str, *values: object, exc_info: BaseException | None = None) -> None:
-    """Log an error; handlers and filters of the program may raise, like all of its functions."""
+    """Log an error, and ignore exceptions of the program's own log handlers and filters."""
     with contextlib.suppress(Exception):
         _log.error(text, *values, exc_info=exc_info)
 
@@ -232,16 +238,16 @@ async def _await_token(function: Callable[[], Awaitable[str]]) -> Any:
         token = function()
         if not inspect.isawaitable(token):
             raise UsageError(
-                f"{CREDENTIAL_FUNCTION} returned a {type(token).__name__} and is not an async function",
+                f"{TOKEN_FUNCTION} returned a {type(token).__name__} and is not an async function",
                 hint="pass an async function, such as read_enrolment(FILE).token",
             )
         return await token
     except (SystemExit, KeyboardInterrupt) as error:  # these exceptions would end the event loop
         if _is_interrupt(error):
             raise
-        raise RuntimeError(f"{CREDENTIAL_FUNCTION} raised {type(error).__name__}") from error
+        raise RuntimeError(f"{TOKEN_FUNCTION} raised {type(error).__name__}") from error
     finally:
-        _exit_forked_child(process, CREDENTIAL_FUNCTION)
+        _exit_forked_child(process, TOKEN_FUNCTION)
 
 
 def _exit_forked_child(parent: int, name: str) -> None:

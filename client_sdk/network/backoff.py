@@ -2,12 +2,13 @@
 
 Two rules bound the attempts:
 
-    1. Pauses grow while attempts are answered and fail (exponential backoff with full jitter).  An attempt
-       that nobody answers reaches no server, so it is repeated every second whatever came before.
-    2. A token bucket bounds the attempts that are answered: `DIAL_BURST` at once, then `DIALS_PER_MINUTE`.
-       Pauses alone would not bound them while a server accepts connections and closes them.  The web firewall
-       counts attempts by IP address, and its limit is computed from these two numbers
-       (`rse_pf.config.front_door`), and from the number of robots that may share one address.
+    1. Pauses grow while attempts fail that a machine answered, which means that it accepted or refused the
+       TCP connection (exponential backoff with full jitter).  An attempt that nobody answers reaches no
+       server, so the next one starts 1 to 1.25 s later, however many attempts have failed.
+    2. A token bucket bounds the attempts that are answered: `DIAL_BURST` at once, then `DIALS_PER_MINUTE`
+       (both in `rse_pf.config.front_door`).  Pauses alone would not bound them while a server accepts
+       connections and closes them.  The web firewall of the platform counts attempts by IP address; its
+       limit is the sum of these two numbers, times the number of robots that may share one address.
 """
 
 from __future__ import annotations
@@ -22,26 +23,27 @@ from rse_pf.token_bucket import TokenBucket
 __all__ = ["Backoff"]
 
 RECONNECT_BASE_S = 0.1
-"""Upper bound of the first pause before a reconnect, in seconds; it doubles with each attempt ("full jitter",
-AWS Architecture Blog, 2015)."""
+"""Upper limit of the first pause before a reconnect, in seconds.  The limit doubles with each attempt, and a
+pause is a random time from 0 to its limit ("full jitter", AWS Architecture Blog, 2015)."""
 MAX_PAUSE_RATIO = 1.0 / 3.0
-"""A pause is at most this share of the time for which attempts have failed: after an outage of a minute a
-robot is back within 20 seconds."""
+"""Once attempts have failed for more than three times ``reconnect_max_s``, a pause is at most this share of
+the time for which they have failed: after an outage of a minute a robot is back within 20 seconds."""
 UNANSWERED_MIN_S = 1.0
 """Shortest time between the starts of two attempts that nobody answers: such attempts load no server."""
 UNANSWERED_MAX_S = 1.25
 """Longest time between the starts of two attempts that nobody answers; it differs from the shortest one so
 that robots of one site do not dial at the same moment."""
 REVOCATION_JITTER_S = 0.5
-"""After a revocation, robots come back spread over this many seconds from when new tokens are valid."""
+"""After a revocation, a robot dials at a random time within this many seconds from the moment at which new
+bearer tokens are accepted, so that not all robots dial at once."""
 MOVE_RESERVE = 0.5
 """While a robot is connected and moves to another server, this share of its token bucket is kept for the case
 that it loses its connection."""
 RETRY_AFTER_SPREAD = 1.25
 """A robot waits up to this multiple of the time that a server asked for, so that robots that got the same
 number do not come back at the same moment."""
-MAX_DOUBLINGS = 16
-"""The exponential pause stops doubling after this many attempts, so that the number stays finite."""
+MAX_PAUSE_DOUBLINGS = 16
+"""The limit of the exponential pause stops doubling after this many attempts, so that it stays finite."""
 
 
 class Backoff:
@@ -56,15 +58,16 @@ class Backoff:
         self._bucket = TokenBucket(DIALS_PER_MINUTE / 60.0, DIAL_BURST)
 
     def reset(self) -> None:
-        """Return to short pauses: the last connection lasted, or a server asked the robot to move.
+        """Return to short pauses.
 
-        The token bucket is not refilled.
+        Call this after a connection that lasted longer than ``reconnect_max_s``, and before a move to another
+        server.  The token bucket is not refilled.
         """
         self._attempts = 0
         self._failing_since_s = None
 
     def count_attempt(self, now_s: float) -> None:
-        """Take a token for an attempt that was answered at *now_s*, seconds of the robot's clock."""
+        """Take one from the token bucket for an attempt that was answered at *now_s*, robot's clock."""
         self._bucket.spend(1.0, now_s)
 
     def pause_s(
@@ -79,22 +82,24 @@ class Backoff:
         """Return how many seconds to wait from now before the next attempt.
 
         Call it once for each attempt: each call makes later pauses longer, unless the last attempt was
-        refused or not answered.
+        refused or not answered.  The pause is a random time:
 
-        While attempts are answered and fail, the pause is exponential with full jitter up to
-        ``reconnect_max_s``.  When they have failed for more than three times ``reconnect_max_s``, it is
-        between a sixth and a third of the time for which they have failed, up to ``reconnect_long_max_s``.
-        After a refusal it is between half of ``reconnect_long_max_s`` and all of it, but at most half a
-        second longer than *valid_in_s*; after an attempt that nobody answered it is 1 to 1.25 s.  The time
-        that the server asked for, up to 1.25 times as long, is added, and the pause is never shorter than the
-        token bucket demands.  Except after a refusal, the duration of the last attempt is a part of the
-        pause, so that an attempt that timed out is repeated at once; the result is still at least the time
-        that the server asked for.
+            - after an attempt that was answered and failed: from 0 to a limit that doubles up to
+              ``reconnect_max_s``; once attempts have failed for more than three times ``reconnect_max_s``, a
+              sixth to a third of the time for which they have failed, up to ``reconnect_long_max_s``;
+            - after an attempt that nobody answered: 1 to 1.25 s;
+            - after a refusal: half of ``reconnect_long_max_s`` to all of it, but at most half a second longer
+              than *valid_in_s*.
+
+        The time that the server asked for (``Retry-After``), times 1 to 1.25, is added, and the token bucket
+        may demand a longer pause.  The duration of the last attempt is a part of the pause, except after a
+        refusal; the result is still at least the time that the server asked for.
 
         Args:
             now_s: Seconds of the robot's clock.
             failure: Failure of the last attempt; None if none has failed since the connection was lost.
-            valid_in_s: Seconds until tokens signed at that moment are accepted again, None if unknown.
+            valid_in_s: After a refusal: seconds until the servers accept a bearer token that is signed then;
+                None if unknown.
             spent_s: Duration of the last attempt, in seconds.
             is_move: Whether the robot is connected and only changes the server; half of the token bucket then
                 stays in reserve.
@@ -123,7 +128,7 @@ class Backoff:
             self._failing_since_s = now_s
         failing_s = 0.0 if self._failing_since_s is None else now_s - self._failing_since_s
         longest_s = min(timings.reconnect_long_max_s, MAX_PAUSE_RATIO * failing_s)
-        doublings = min(self._attempts, MAX_DOUBLINGS)
+        doublings = min(self._attempts, MAX_PAUSE_DOUBLINGS)
         self._attempts += 1
         if longest_s > timings.reconnect_max_s:
             return uniform(0.5 * longest_s, longest_s)

@@ -12,7 +12,7 @@ from rse_pf.errors import Unauthorized
 __all__ = ["strip_token"]
 
 PRINTABLE_ASCII = re.compile(r"[!-~]+")
-"""Letters that the HTTP header Authorization can hold behind the word Bearer."""
+"""Characters that the HTTP header Authorization can hold behind the word Bearer."""
 USAGE_HINT = (
     "pass the text that rse-pf token issue ROBOT prints, or a function that returns it: an async one to "
     "connect, a plain one to DataClient (client_sdk.enrolment.read_enrolment returns both)"
@@ -23,7 +23,7 @@ def strip_token(token: object) -> str:
     """Return *token* without the white space around it, which files and shells add.
 
     Raises:
-        Unauthorized: *token* is not a text, is empty, or has letters that an HTTP header cannot hold.
+        Unauthorized: *token* is not a text, is empty, or has characters that an HTTP header cannot hold.
     """
     if not isinstance(token, str):
         raise Unauthorized(f"the token is a {type(token).__name__}, not a text", hint=USAGE_HINT)
@@ -32,8 +32,8 @@ def strip_token(token: object) -> str:
         raise Unauthorized("the token is empty", hint=USAGE_HINT)
     if not PRINTABLE_ASCII.fullmatch(text):
         raise Unauthorized(
-            f"the token has {len(text)} letters, and some of them are in no token: a space, a line break or "
-            "a letter outside of ASCII",
+            f"the token has {len(text)} characters, and some of them are in no token: a space, a line break "
+            "or a character outside of ASCII",
             hint=USAGE_HINT,
         )
     return text

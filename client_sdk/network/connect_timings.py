@@ -15,11 +15,11 @@ class ConnectTimings:
 
     Attributes:
         connect_timeout_s: Time limit of each step of an attempt: proxy, WebSocket handshake, Welcome.
-        reconnect_max_s: Longest pause between attempts in the first seconds without a connection.
-        reconnect_long_max_s: Longest pause after minutes without a connection; after a refusal the pause is
-            between half of this number and all of it.
+        reconnect_max_s: Longest pause between attempts that have failed for less than three times as long.
+        reconnect_long_max_s: Longest pause between attempts that have failed for longer; after a refusal the
+            pause is between half of this number and all of it.
         region_hold_s: How long another region must be clearly nearer before a robot with several addresses
-            changes to it.
+            changes to it: its round trip is at most 75 % of the present one, and 20 ms shorter.
 
     Raises:
         UsageError: A number is not positive, or *reconnect_long_max_s* is less than *reconnect_max_s*.

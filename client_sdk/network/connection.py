@@ -6,7 +6,7 @@ several; for each region a task keeps one WebSocket open.
 
 States of a WebSocket (`RegionSocket`):
 
-    OPENING   The handshake is over and Hello is sent; no Welcome has arrived (``welcomed`` is not done).
+    OPENING   The handshake is over and Hello is sent; no Welcome of the server has arrived.
     STANDBY   Welcomed; it is pinged, and it carries no command.
     CURRENT   Welcomed; new commands are sent on it (``session.current``).  At most one socket is CURRENT.
     LEAVING   Another socket became CURRENT; answers to commands that were sent here still arrive here.
@@ -20,24 +20,24 @@ Transitions:
     2. Adopt: `_adopt` makes a STANDBY socket CURRENT.  The session sends every unanswered command on it that
        has no open socket, under its old id.  A socket that was CURRENT is LEAVING.
     3. Drain: `flush` closes a LEAVING socket once all commands that were sent on it are answered.
-    4. Lose: a close, an error, silence or a missing pong makes a socket ENDED (`_discard_socket`).  If it was
-       CURRENT, the nearest STANDBY socket of another region is adopted at once (`_switch_to_standby`).
-    5. Reconnect: the task of each region (`_maintain_region`) dials again whenever its region has no socket,
+    4. Lose: a close, an error or a missing pong makes a socket ENDED (`_discard_socket`).  If it was CURRENT,
+       the nearest STANDBY socket of another region is adopted at once (`_switch_to_standby`).
+    5. Reconnect: the task of each region (`_maintain_region`) dials while its region has no socket,
        after the pauses of `client_sdk.network.backoff`; `_adopt_if_disconnected` then adopts the
        socket.
     6. Move: when a server asks for it, `_move_to_other_server` opens a socket to another server of the same
        region first, adopts it, and leaves the old one to drain (make before break).
     7. Change of region: `_record_round_trip` adopts the socket of a region that has been nearer for long
        enough; the earlier one drains and its region dials a new STANDBY socket.
-    8. Refusal: while every region refuses this robot, commands end with the reason (`_fail_refused_commands`)
-       and the regions go on dialling.
+    8. Refusal: while every region refuses this robot, its commands end with the typed refusal, and are not
+       sent again (`_fail_refused_commands`); the regions go on dialling.
     9. Close: `close` ends all tasks and sockets.  Only the program ends a robot that was connected once.
 
 Promises, and what keeps them:
 
     - Every command is answered exactly once: ids live in the session, across sockets; a second answer to an
       id is dropped there.
-    - A command that was not answered is sent again after a reconnect: steps 2 and 4.
+    - A command that has not ended is sent again after a reconnect: steps 2 and 4.
     - A planned change of server or region loses no command and interrupts none: steps 3, 6 and 7.
     - A robot never gives up: steps 5 and 8.
 """
@@ -96,7 +96,8 @@ OnChange = Callable[[str, str], None] | None
 """Called with the name of a change of the connection and its detail.
 
 ``link-lost`` and ``refused`` come with the reason, ``link-back`` and ``moved`` with the name of the server
-that is used now, ``stands-by`` with the name of a server of a further region that is connected and unused.
+that gets the commands now, ``stands-by`` with the name of a server of another region, to which a connection
+is open that carries no command.
 """
 
 FIRST_CONNECT_ATTEMPTS = 4
@@ -104,22 +105,23 @@ FIRST_CONNECT_ATTEMPTS = 4
 MIN_TIMER_PAUSE_S = 0.001
 """Shortest pause of the timer task, so that deadlines that are due at once do not make it spin."""
 OTHER_REGIONS_WAIT_RATIO = 1.0
-"""A first connect waits for further regions by this multiple of the time after which the first region could
-be used: a region that needs longer is not the nearest."""
+"""Once the first region can be used, a first connect waits for the others for this multiple of the time that
+has passed: a region that needs longer is not the nearest."""
 OTHER_REGIONS_MAX_WAIT_S = 0.7
 """Longest wait for the other regions of a first connect once one of them can be used."""
 DUPLICATE_REGION_S = 5.0
-"""If a server closes a connection as replaced within this many seconds after the robot opened one in another
-region, both addresses lead to the same platform, and the robot itself is the cause."""
+"""A platform keeps one connection of a robot, and closes the older one as replaced when a newer one opens.
+If it does so within this many seconds after the robot opened a connection in another region, both addresses
+lead to the same platform."""
 LATE_WELCOME_S = 60.0
-"""A stalled server may accept a connection attempt this long after the robot gave it up, which replaces the
-robot's newer connection; a replacement within this time is therefore not blamed on another program."""
+"""A stalled server may accept an attempt to connect up to this many seconds after the robot gave it up.  The
+platform then closes the robot's newer connection as replaced, and no other program is the cause."""
 SHORT_REFUSAL_S = 2.0
-"""A refusal that ends within this many seconds is not reported: commands and a first connect wait for its
-end."""
+"""If the servers will accept this robot within this many seconds, their refusal is not reported: commands and
+a first connect wait until then."""
 TOKEN_CLOCK_STEP_S = 1.0
-"""After a revocation the robot waits this many seconds before it signs a new token, so that the new one,
-whose time is in whole seconds, is certainly later than the revocation."""
+"""After a revocation the robot waits this many seconds before it signs a new token: a token states its time
+in whole seconds, which must be later than the revocation."""
 
 
 class Connection:
@@ -169,7 +171,7 @@ class Connection:
         self.bytes_out = 0
         self.last_error = ""
         self.refusal: RsePfError | None = None
-        """Why all regions refuse this robot now; None while it is connected or may be accepted."""
+        """The refusal of the first region while all regions refuse this robot, else None."""
         self._tap = tap or NullMessageTap()
         self._session = session
         self._settings = session.settings
@@ -201,20 +203,20 @@ class Connection:
 
     @property
     def url(self) -> str:
-        """The address whose socket carries the commands, or the first one while none does."""
+        """The address whose socket carries the commands; while none does, the first address."""
         return self._current_region().url
 
     @property
     def region(self) -> str:
-        """The same address as `url`, without user name and password."""
+        """The address of `url` without user name and password, as the name of the region."""
         return self._current_region().shown_url
 
     async def open(self, *, may_be_down: bool = False) -> None:
-        """Connect for the first time, with at most four attempts, and start the tasks that keep connected.
+        """Connect for the first time, with at most four attempts in each region, and start the tasks.
 
         Args:
-            may_be_down: Return after a first attempt that failed by a cause that may pass, such as no answer,
-                and go on dialling in the background.
+            may_be_down: If the first attempt fails by a cause that may pass, such as no answer, return and go
+                on dialling in the background.
 
         Raises:
             Unauthorized: The token is missing, wrong or expired.
@@ -250,9 +252,9 @@ class Connection:
         await cancel_tasks(self._tasks)
 
     def flush(self) -> None:
-        """Let the sockets send the messages of the session, and close drained sockets.
+        """Send the messages that the session has written, and close drained sockets.
 
-        Call it after every change of the session.  The timer task is woken if a deadline came closer.
+        Call this after each method of the session.  The timer task is woken if a deadline came closer.
         """
         for socket in list(self._sockets):
             if socket.state.outgoing:
@@ -289,9 +291,10 @@ class Connection:
         return {number: socket for number, socket in usable.items() if socket is not None}
 
     async def _join_nearest_region(self) -> list[DialError]:
-        """Dial all regions at once; return when the nearest is known, with the failures of the others.
+        """Dial all regions at once, and return the failures once the nearest usable region is known.
 
-        Attempts that still run are left to `Region.first_join`.  The list is never empty.
+        Attempts that still run are left to `Region.first_join`.  Without a failure, the list holds the error
+        for the case that no socket can be used any more, so that it is never empty.
         """
         # 1. Dial every region, and wait until the first one can be used or all have failed.
         began_s = self._clock()
@@ -318,7 +321,7 @@ class Connection:
         return failures or [lost]
 
     async def _join_region(self, region: Region) -> DialError | None:
-        """Dial *region* and hold its socket; return the failure, or None.
+        """Dial *region*, and make the new socket its STANDBY socket; return the failure, or None.
 
         A robot with several regions also waits for the first round trip, at most ``session.ping_timeout_s``.
         """
@@ -345,13 +348,13 @@ class Connection:
                 self._notify_change("stands-by", socket.state.server)
 
     def _record_round_trip(self, socket: RegionSocket) -> None:
-        """Count the last pong of *socket*, and adopt a region that has been nearer for long enough."""
+        """Count the last pong of *socket*, and adopt the socket of a region that has long been nearer."""
         exchange = socket.state.last_exchange
         if exchange is None or exchange is socket.measured_exchange:
             return
         socket.measured_exchange = exchange
         socket.has_round_trip.set()
-        # Measured by the robot's clock alone: a server could claim that all of the time was its own.
+        # The time that a pong states for the server is not subtracted: a server could state all of it.
         self._choice.add_round_trip(socket.region.number, exchange.returned_s - exchange.sent_s)
         usable, current = self._usable_sockets(), self._current_region()
         if len(self._regions) > 1 and current.number in usable:
@@ -371,7 +374,7 @@ class Connection:
     # --- Tasks that run from open to close ------------------------------------------------------
 
     async def _run_timers(self) -> None:
-        """Call the session whenever a deadline, a ping or a retry is due."""
+        """Let the session act whenever a deadline, a ping or the repeat of a command is due."""
         while not self._is_closed:
             now_s = self._clock()
             self._handle_events(None, self._session.due(now_s))
@@ -529,7 +532,10 @@ class Connection:
         return socket
 
     async def _renew_token(self, socket: RegionSocket) -> None:
-        """Send a fresh token on *socket*; without one the server will close it, and the robot reconnects."""
+        """Send a fresh token on *socket*, which the session requests before the old token expires.
+
+        Without a fresh token the server closes the socket later, and the robot reconnects.
+        """
         try:
             token = await self.dialler.read_token()
         except DialError as failure:
@@ -563,7 +569,7 @@ class Connection:
             self._discard_socket(socket)
 
     def _is_replaced_by_another_program(self, socket: RegionSocket) -> bool:
-        """Return whether no newer connection of this robot itself explains that *socket* was replaced.
+        """Return whether a connection of another program, and none of this robot, has replaced *socket*.
 
         The region of *socket* is marked if it is a duplicate of another one.
         """
@@ -641,7 +647,7 @@ class Connection:
                     region.move_request = (socket, self._clock() + event.within_s)
                     region.has_changed.set()
             case MoveRequested() if len(self._regions) > 1 and not socket.state.leaving:
-                self._start_task(self._close_socket(socket))  # a STANDBY socket carries no command
+                self._start_task(self._close_socket(socket))  # STANDBY, so it carries no command
 
     def _adopt(self, socket: RegionSocket) -> None:
         """Make *socket* CURRENT, and send the waiting commands on it; does nothing if it has ended."""

@@ -1,9 +1,9 @@
-"""Turn a failed attempt to connect into a `DialError`: the cause for the user, what to do for the robot.
+"""Turn a failed attempt to connect into a `DialError`: an error for the user, and facts for the next attempt.
 
 Nothing here opens a socket.  `client_sdk.network.peer_diagnosis` explains answers of machines that are no
-RSE-PF servers.  A 401 or 403 concerns the robot itself only if its body carries the mark of an RSE-PF server
-(`rse_pf.wire.refusal`): it is then a refusal, which is reported, and the robot tries again after a long
-pause.
+RSE-PF servers.  A 401 or 403 concerns the robot itself only if its body has the JSON member by which RSE-PF
+servers mark it (`rse_pf.wire.refusal`): it is then a refusal, which is reported, and the robot tries again
+after a long pause.
 """
 
 from __future__ import annotations
@@ -47,19 +47,21 @@ CHECK_RUNNING = "start the platform by rse-pf local start, or check host and por
 CHECK_ADDRESS = "check host, port and path of the URL: a WebSocket server of another program answers there"
 """Hint for an address where a WebSocket server does not speak the protocol of RSE-PF."""
 RENEWAL_HINT = (
-    "a token of rse-pf token issue is valid for 15 minutes: issue another one, or give the robot a key by "
-    "rse-pf robot enrol; if it has one, rse-pf robot list shows whether it was disabled or has a newer key"
+    "issue another token by rse-pf token issue (it is valid for 15 minutes), or give the robot a key by "
+    "rse-pf robot enrol; for a robot with a key, rse-pf robot list shows whether it was disabled or has a "
+    "newer key"
 )
 """Hint for a token that is expired, revoked or wrong."""
 MAX_RETRY_AFTER_S = 300.0
 """Longest wait that a robot accepts from the header Retry-After, so that a wrong answer cannot keep it
 away."""
 WRONG_ADDRESS_STATUSES = (400, 404, 405, 407, 410, 426)
-"""HTTP statuses that every attempt gets until somebody changes the URL, the proxy, or the program there."""
+"""HTTP statuses that every attempt gets until somebody changes the URL, the proxy, or the program there, so
+that a first connect raises its error at once."""
 ANSWERED_ERRNOS = (errno.ECONNREFUSED, errno.ECONNRESET, errno.ECONNABORTED)
 """Errors of a TCP connection that a machine at the address caused: it is there, and answered."""
-CAUSES_FOR_ANY_TOKEN = ("disabled", CUT_OFF, "not-yet-valid")
-"""Causes in a refusal that a token signed now would meet as well, so that no second one is tried."""
+REFUSALS_OF_ANY_TOKEN = ("disabled", CUT_OFF, "not-yet-valid")
+"""Causes that a refusal names and that a token signed now would meet as well, so that none is signed."""
 
 
 class DialError(Exception):
@@ -71,7 +73,8 @@ class DialError(Exception):
         is_wrong_address: Whether the URL, a proxy or a program at the address has to change first.
         is_refusal: Whether an RSE-PF server refused this robot, perhaps for a long time.
         is_unanswered: Whether nobody accepted the TCP connection, or no packet left this machine.
-        may_be_accepted_late: Whether a stalled server may still accept this attempt.
+        may_be_accepted_late: Whether a stalled server may still accept this attempt; it would then close a
+            newer connection of this robot.
         refuses_any_token: Whether another token, signed now, would be refused as well.
         valid_from_s: Unix time from which new tokens are accepted, None if unknown.
     """
@@ -96,7 +99,7 @@ class DialError(Exception):
         self.is_refusal = is_refusal
         self.is_unanswered = is_unanswered
         self.may_be_accepted_late = may_be_accepted_late
-        self.refuses_any_token = cause in CAUSES_FOR_ANY_TOKEN
+        self.refuses_any_token = cause in REFUSALS_OF_ANY_TOKEN
         self.valid_from_s = valid_from_s
 
 
@@ -186,8 +189,8 @@ def http_status_error(address: str, status: int, headers: Mapping[str, str], bod
 def revoked_token_error(valid_from_s: float | None) -> DialError:
     """Return the error of a connection that its server closed because the token was revoked.
 
-    *valid_from_s* is the Unix time at which a freshly signed token may be accepted again; None if the robot
-    has one fixed token, which stays revoked.
+    *valid_from_s* is the Unix time from which newly signed tokens are accepted; None if the robot has one
+    fixed token, which stays revoked.
     """
     error = Unauthorized("the token was revoked, or the robot was disabled", hint=RENEWAL_HINT)
     return DialError(error, is_refusal=True, valid_from_s=valid_from_s)
@@ -208,7 +211,7 @@ def _refusal_error(address: str, status: int, refusal: RefusedHandshake) -> RseP
 
 
 def split_address(url: str, schemes: tuple[str, ...], error: UsageError) -> SplitResult:
-    """Return the parts of *url*; raise *error* if scheme, host or port cannot be used."""
+    """Return the parts of *url*; raise the caller's *error* if scheme, host or port cannot be used."""
     try:
         parts = urlsplit(url)
         parts.port  # noqa: B018 - urllib checks the port only when it is read

@@ -47,8 +47,9 @@ Token = str | Callable[[], Awaitable[str]] | None
 """A robot's token, or an async function that returns a fresh one for each connection and each renewal."""
 
 TCP_TIMEOUT_S = 1.0
-"""Longest attempt to open a TCP connection, in seconds, even if ``connect_timeout_s`` is longer: Linux
-repeats an unanswered attempt after 1, 3 and 7 s, for which a robot whose network is back must not wait."""
+"""Longest attempt to open a TCP connection, in seconds, even if ``connect_timeout_s`` is longer.  Linux
+repeats an unanswered attempt only after 1, 3 and 7 s; a new attempt reaches a server sooner when the network
+is back."""
 MAX_FIRST_BYTES = 4096
 """How many first bytes of the peer are kept, to explain an answer that is not HTTP/1.1: head and page
 title."""
@@ -57,8 +58,7 @@ title."""
 def websocket_options(settings: SessionSettings, timings: ConnectTimings) -> dict[str, Any]:
     """Return the options with which the library websockets opens every WebSocket of the SDK.
 
-    Compression and pings of the library are off: the codec compresses, and pings of the protocol measure
-    delays.
+    Compression and pings of the library are off: the codec compresses, and RSE-PF's own pings measure delays.
     """
     return {
         "compression": None,
@@ -123,7 +123,7 @@ class Dialler:
         self._tcp = TcpDialler()
 
     async def open(self, url: str, on_answered: Callable[[], None]) -> tuple[ClientConnection, str | None]:
-        """Return a WebSocket to *url* and the text of the token that it was opened with.
+        """Return a WebSocket to *url*, and the text of the token in its handshake (None without a token).
 
         If the token is refused and comes from a function, a second one is requested and tried once, unless
         the refusal says that no token would be accepted now.

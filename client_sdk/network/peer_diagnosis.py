@@ -106,18 +106,22 @@ class HttpAnswer:
 
 
 def explain_answer(address: str, answer: HttpAnswer) -> ConnectError:
-    """Return the error for an HTTP *answer* of *address* that is neither a success nor a typed failure."""
+    """Return the error for an HTTP *answer* of *address* that is neither a success nor a typed failure.
+
+    A load balancer, a proxy, a login page or another program has sent the answer.
+    """
     status, statement = answer.status, f"{address} answers {answer.shown_status}"
-    # 1. Recognise a wrong scheme in the URL, and a 400 of RSE-PF for headers that a proxy on the way removed.
+    # 1. Recognise a wrong scheme in the URL.
     if status == 400 and TLS_WANTED.search(answer.body) and not _is_tls_address(address):
         return _explain_tls(address)
+    # 2. Recognise a 400 of an RSE-PF server that misses the headers which a proxy on the way removed.
     if status == 400 and refusal_in(answer.body, "bad-message") is not None:
         status = 426
-    # 2. Look up the cause of a status that has one usual cause.
+    # 3. Look up the cause of a status that has one usual cause.
     if status in CAUSE_AND_HINT:
         cause, hint = CAUSE_AND_HINT[status]
         return ConnectError(f"{statement}{cause}", hint=hint)
-    # 3. Name redirects and pages, which a login page (captive portal) sends.
+    # 4. Name redirects and pages, which a login page (captive portal) sends.
     if 300 <= status < 400:
         target = _redirect_target(address, answer)
         hint = f"open {target} in a web browser: log in there, or write its host and scheme in the URL"
@@ -127,7 +131,7 @@ def explain_answer(address: str, answer: HttpAnswer) -> ConnectError:
         page = f"{WEB_SCHEME[parts.scheme]}://{parts.netloc}/"
         hint = f"open {page} in a web browser: log in there, or correct the URL if it is another site"
         return ConnectError(f"{statement} with a web page, perhaps a login page", hint=hint)
-    # 4. Report another program.
+    # 5. Report another program.
     if status < 300:
         return ConnectError(f"{statement} as no RSE-PF server does", hint=CHECK_PORT)
     server = shorten(answer.headers.get("server", ""))

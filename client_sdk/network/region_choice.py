@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 __all__ = ["MAX_REGIONS", "RegionChoice"]
 
 MAX_REGIONS = 4
-"""Most addresses of one robot; a connection to each is kept, and takes the place of a robot at its
+"""Most addresses of one robot; a connection to each is kept, and counts as one robot in the limits of its
 platform."""
 MEDIAN_SIZE = 3
 """The round trip of a region is the median of this many pings, so that one late pong does not count."""
@@ -25,11 +25,11 @@ MIN_ROUND_TRIP_GAIN_S = 0.02
 """A region is clearly nearer only if its round trip is shorter by at least this time in seconds: a smaller
 gain is not worth a change, however large its share."""
 MAX_MEASUREMENT_GAP_S = 10.0
-"""If a region was not compared for this long, the time for which it has been nearer starts again: the robot
-may have been suspended."""
+"""If a region was not compared for this many seconds, the time for which it has been nearer is counted from 0
+again: the robot may have been suspended."""
 LOSS_MEMORY_S = 3600.0
 """Lost connections of a region make a change to this region harder for this long, in seconds."""
-MAX_DOUBLINGS = 4
+MAX_HOLD_DOUBLINGS = 4
 """The time for which a region must be nearer doubles with each of its losses after the first, at most this
 often: it becomes at most 16 times as long."""
 
@@ -62,7 +62,7 @@ class RegionChoice:
         self._regions[region].round_trips_s.append(round_trip_s)
 
     def add_loss(self, region: int, now_s: float) -> None:
-        """Record that the connection to *region* was lost at *now_s*, seconds of any clock.
+        """Record that the connection to *region* was lost at *now_s*, by the clock of `find_nearer_region`.
 
         The region then counts as infinitely far until its next ping.
         """
@@ -86,7 +86,8 @@ class RegionChoice:
     def find_nearer_region(self, current: int, regions: Iterable[int], now_s: float) -> int | None:
         """Return the one of *regions* to change to: clearly nearer than *current* for long enough; or None.
 
-        Call this after each measurement.  A returned region restarts the comparison of all regions.
+        Call this after each measurement; *now_s* is in seconds of a monotonic clock.  If a region is
+        returned, `restart_comparison` is called for all regions.
         """
         candidates = []
         for region in regions:
@@ -122,4 +123,4 @@ class RegionChoice:
         """Return for how many seconds a region with this history must be nearer."""
         while history.losses_s and history.losses_s[0] <= now_s - LOSS_MEMORY_S:
             history.losses_s.popleft()
-        return self._hold_s * 2.0 ** min(MAX_DOUBLINGS, max(0, len(history.losses_s) - 1))
+        return self._hold_s * 2.0 ** min(MAX_HOLD_DOUBLINGS, max(0, len(history.losses_s) - 1))

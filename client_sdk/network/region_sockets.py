@@ -39,7 +39,7 @@ class Region:
         self.first_join: asyncio.Task[DialError | None] | None = None
         """The attempt of the robot's first connect that was still running when another region was chosen."""
         self.move_request: tuple[RegionSocket, float] | None = None
-        """The socket that its server wants closed, and until when another server is looked for.
+        """The socket whose server asks the robot to move, and when attempts to reach another server end.
 
         The time is in seconds of the robot's monotonic clock.  None: no server asks for a move.
         """
@@ -47,7 +47,7 @@ class Region:
         """Whether another address of the robot leads to the same platform, which keeps one connection
         only."""
         self.last_failure: DialError | None = None
-        """Why the last attempt failed or the server closed the socket; None leads to a short pause only."""
+        """Why the last attempt failed or the server closed the socket; None if neither has a known cause."""
         self.has_changed = asyncio.Event()
         """Set when the task that maintains this region has to look at its state again."""
 

@@ -78,7 +78,10 @@ class TcpDialler:
 
 
 async def _connect_first(addresses: list[_AddressInfo], until_s: float) -> socket.socket:
-    """Try *addresses* one after the other without waiting for a failure; return the first connection."""
+    """Return the first connection to one of *addresses*.
+
+    An attempt begins `NEXT_ADDRESS_S` after the one before, or when that one fails; earlier ones go on.
+    """
     loop = asyncio.get_running_loop()
     untried, running = deque(addresses), set[asyncio.Task[socket.socket]]()
     failure: OSError | None = None
