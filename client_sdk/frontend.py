@@ -43,7 +43,8 @@ __all__ = [
 ]
 
 _MAX_STAMP_S = 1e10
-"""Seconds since 1970, in the year 2286: a larger time stamp is one of milliseconds or nanoseconds."""
+"""Largest absolute time stamp of a frame, in seconds, in the year 2286: a frame with a larger number, which
+is most likely one of milliseconds or nanoseconds, is refused."""
 _MAX_MATCHES_OF_CODEC = {"zlib": 530, "bin": 400, "json": 220}
 """Matches that fit into a command of 10 kB by codec: a match takes 14 to 18 bytes with JSON and zlib, 24 with
 MessagePack (``bin``), and 40 to 43 with plain JSON."""
@@ -90,7 +91,7 @@ class Frame:
             )
         if not abs(self.timestamp_s) <= _MAX_STAMP_S:
             raise UsageError(
-                f"timestamp_s = {self.timestamp_s:g} is not within {_MAX_STAMP_S:g} s",
+                f"timestamp_s = {self.timestamp_s:g} is not within -{_MAX_STAMP_S:g} to {_MAX_STAMP_S:g} s",
                 hint="give seconds; divide nanoseconds by 1e9 and milliseconds by 1e3",
             )
         if self.stereo is not None and self.stereo.gray.shape != size:
@@ -109,7 +110,7 @@ class Frame:
 class FrontEndOptions:
     """Options of a robot's front end: how features are extracted and matched, and which poses are accepted.
 
-    The defaults were measured on the red-kitchen recording at 5 and 10 Hz (ATE 4 to 5 cm).
+    With the defaults, the absolute trajectory error of the red-kitchen recording is 3.0 cm at 10 Hz.
 
     Attributes:
         features: Number of features of a frame.
@@ -126,12 +127,13 @@ class FrontEndOptions:
         min_inliers: Smallest number of inliers of an accepted pose; a keyframe needs twice as many.
         max_jump_m: Largest plausible translation between two frames; after a loss, and for a stereo pair that
             sees far, the tracker allows more.
-        keyframe_m: A frame becomes a keyframe if it is farther than this from every keyframe, or rotated by
-            more than *keyframe_deg*: for each keyframe one of both suffices.
+        keyframe_m: A frame becomes a keyframe if no keyframe of its segment is both within this distance, in
+            metres, and rotated against it by at most *keyframe_deg*.
         keyframe_deg: See *keyframe_m*.
-        keyframe_share: A frame that sees less than this share of the landmarks that the newest keyframe saw
-            becomes a keyframe.
-        search_px: Radius around the predicted pixel of a landmark in which features are compared.
+        keyframe_share: A frame also becomes a keyframe if it sees less than this share, 0 to 1, of the number
+            of landmarks that the newest keyframe saw.
+        search_px: Radius, in pixels, around the predicted pixel of a landmark in which features are compared
+            with the landmark.
         segment_after: Number of frames since the last pose, with enough features and no recognised place,
             after which a new segment begins.
         max_keyframes: Largest number of keyframes of a segment; beyond it older keyframes are thinned out.
@@ -166,8 +168,8 @@ class FrontEndOptions:
             )
         if not (0 <= self.min_depth_m < self.max_depth_m and self.inlier_px > 0):
             raise UsageError(
-                f"depths from {self.min_depth_m:g} to {self.max_depth_m:g} m or "
-                f"inlier_px = {self.inlier_px:g} cannot be used",
+                f"min_depth_m = {self.min_depth_m:g} must be from 0 to below max_depth_m = "
+                f"{self.max_depth_m:g}, and inlier_px = {self.inlier_px:g} above 0",
                 hint="leave them out to get the defaults",
             )
 
@@ -190,8 +192,9 @@ class FrontEndOptions:
     def live(cls) -> FrontEndOptions:
         """Return options for live maps: the strongest features of the image, which close most loops.
 
-        With spread features the last of three robots joins the kitchen's map at its frame 67, and 63 % of all
-        poses are aligned when they are returned; with these options at frame 17, and 90 %.
+        Three robots share the frames of the red-kitchen recording.  With spread features the last of them is
+        aligned with the live map at its 67th frame, and 63 % of all poses are aligned when they are returned;
+        with these options at its 17th frame, and 90 %.
         """
         return cls(is_spread=False)
 
@@ -199,9 +202,9 @@ class FrontEndOptions:
     def wide_baseline(cls) -> FrontEndOptions:
         """Return options for views that lie 0.4 to 0.8 m apart, such as those of the NYU dining room.
 
-        Four times the features find the few matches that survive such a change of
-        view: 24, 32, 30 and 530 inliers on the four pairs of that room, where 3000 features leave 11 to 13
-        for the first pair.  The largest plausible motion is above the baseline.
+        4,000 features, four times the default, find the few matches that survive such a change of view: 24,
+        32, 30 and 530 inliers for the four pairs of neighbouring views of that room, where 3,000 features
+        find 11 to 13 for the first pair.  ``max_jump_m`` is above the distance of the views.
         """
         return cls(features=4000, is_spread=False, inlier_px=4.0, min_inliers=12, max_jump_m=1.5)
 
@@ -211,8 +214,7 @@ class Correspondences:
     """Correspondences between 3-D points and pixels of one view, as they are sent.
 
     Attributes:
-        points_world: ``(n, 3)`` in the world of this one query, rounded to 0.0001: metres in the frame of a
-            *reference camera*; of a camera without depth, in the frame and unit of the segment's map.
+        points_world: ``(n, 3)``, rounded to 0.0001, in the world of the query, see `PoseQuery`.
         pixels: ``(n, 2)``: pixel *i* shows point *i*; rounded to 0.01 px.
         depths_m: ``(n,)``, depth along the optical axis, measured at each pixel, 0 where it is missing or
             unreliable.
@@ -300,9 +302,10 @@ def describe(
 class PoseQuery:
     """A query for the PnP service: the pose of a camera in the world of the query.
 
-    That world is the frame of a reference camera; of a camera without depth, it is the frame of the segment's
-    map.  The solved pose maps it to the camera, and is passed to the tracker's ``accept`` as
-    ``T_camera_world``.
+    With depth, the world of the query is the frame of a reference camera, in metres: a camera whose pose in
+    the segment the tracker knows, such as that of a keyframe.  Without depth, it is the frame of the
+    segment's map, in the unit of that map.  The PnP service returns ``T_camera_world``, which maps the world
+    of the query to the frame of the camera, and which is passed to the tracker's ``accept``.
 
     Attributes:
         timestamp_s: Time of the frame, in seconds.
@@ -311,8 +314,9 @@ class PoseQuery:
         inlier_px: Largest reprojection error of an inlier, in pixels.
         max_iterations: Largest number of RANSAC iterations.
         against: The source of the points: the ``map`` around the predicted or last pose, the last ``frame``,
-            a ``keyframe`` by which the place is recognised, or, as ``segment``, a keyframe by which a tracked
-            frame is found in another segment or in a loop.
+            a ``keyframe`` by which an untracked frame is relocalised, or, as ``segment``, a keyframe of
+            another segment or of an older place, which is compared with a tracked frame for a join or a loop
+            closure.
         depth_noise: Noise model of the depths; None for a Kinect's.
     """
 
@@ -338,24 +342,27 @@ class TrackedFrame:
         matches: Number of matches with landmarks; without a pose, the largest number of an attempt (0 without
             depth).
         status: ``lost`` without a pose, ``starting`` without a pose before a camera without depth has moved
-            enough, ``tracked`` with a pose.  `Mapper` reports the first pose as ``first``; a `Tracker` itself
-            leaves ``tracked`` also without a pose.
+            enough, ``first`` with the first pose, ``tracked`` with another one.  These are the values that
+            `Mapper.track` returns; a `Tracker` itself reports ``tracked`` in place of ``lost`` and ``first``.
         reason: Why there is no pose, why the pose is weak, or that its segment is not joined to the first
             one; empty otherwise.
         scale: Whether lengths are metres, or of an arbitrary unit.
-        covariance: ``(6, 6)`` of the twist (metres, radians) on the left of the pose that answered the last
-            query, which maps the query's world to the camera; filled by `Mapper.track`.
+        covariance: ``(6, 6)`` covariance of the answer to the last query, not of *T_world_camera*: of the
+            twist (metres, radians) on the left of ``T_camera_world``, which maps the world of the query to
+            the camera; filled by `Mapper.track`.
         source: Who solved the last query: a server (``cloud``), the Lambda (``burst``), or the ``robot``;
             filled by `Mapper.track`.
-        round_trip_ms: Duration of the last query in milliseconds; filled by `Mapper.track`.
+        round_trip_ms: Time from the last query to its answer in milliseconds, whoever solved the query;
+            filled by `Mapper.track`.
         corrected: Whether poses that were returned before have changed, so that the trajectory must be read
             again; in a live map, whether the alignment of the segment has changed since the last frame.
-        T_new_old: ``(4, 4)``: the world was rotated since the last frame, such as upright, and a pose that
-            was returned before is ``T_new_old @ T_world_camera`` now; None if it was not.
+        T_new_old: ``(4, 4)``, by which the world was rotated since the last frame, such as to let z point up:
+            a pose that was returned before is ``T_new_old @ T_world_camera`` now.  None if the world was not
+            rotated.
         T_map_camera: ``(4, 4)``, the pose in the live map; None until the segment is aligned.
         segment: Number of the present segment, that is, of the odometry frame.
-        features: Features of the image with its rolling shutter, None where none were extracted; their points
-            are NaN where depth is not used.
+        features: Features where the image shows them, whose rolling shutter is not undone; None where none
+            were extracted.  Their points are NaN where depth is not used.
     """
 
     frame: Frame
@@ -390,8 +397,8 @@ class TrackedFrame:
 def points_at(frame: Frame, pixels: Array, options: FrontEndOptions) -> Array:
     """Return the 3-D points that a frame shows at given pixels.
 
-    The depth of a pixel is the median of the readings in its 3x3 patch.  A stereo pair is matched at the
-    pixels instead, see `client_sdk.stereo.depth`.
+    The depth of a pixel is the median of the readings in its 3x3 patch.  The points of a stereo pair are
+    those of the disparities at the pixels, see `client_sdk.stereo.depth`.
 
     Args:
         frame: Image with depth, or a stereo pair.

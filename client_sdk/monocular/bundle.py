@@ -23,11 +23,12 @@ _HUBER_SIGMAS = 2.45
 """Threshold of the Huber loss, in standard deviations: 95 % of the residuals of a 2-D Gaussian are below
 it."""
 _MIN_DEPTH = 1e-3
-"""Smallest depth of a point before its camera, in the unit of the map; an observation of a nearer point, or
-of one behind the camera, has no weight."""
+"""Smallest depth of a point before its camera, in the unit of the map: an observation of a nearer point, or
+of one behind the camera, has no weight in the normal equations, and costs `_BEHIND_COST`."""
 _BEHIND_COST = 1e4
-"""Cost of an observation whose point lies behind its camera, in squared standard deviations: above that of
-usual outliers, so that a step that moves points behind cameras raises the cost."""
+"""Cost of an observation whose point is not `_MIN_DEPTH` before its camera, in squared standard deviations:
+above that of usual outliers, so that a step that moves points behind cameras raises the cost, and is
+refused."""
 _INITIAL_DAMPING = 1e-4
 """Initial damping of Levenberg-Marquardt as a share of the diagonal: nearly Gauss-Newton."""
 _MIN_DAMPING = 1e-9
@@ -36,13 +37,13 @@ _MAX_DAMPING = 1e6
 """Largest damping of Levenberg-Marquardt as a share of the diagonal: with more, a step is shorter than the
 rounding of a pose."""
 _DAMPING_FACTOR = 10.0
-"""The damping of Levenberg-Marquardt is multiplied by this after a step that fails, and divided after one
-that succeeds."""
+"""The damping of Levenberg-Marquardt is multiplied by this factor after a step that does not lower the cost,
+and divided by it after one that does."""
 _CONVERGED_SHARE = 1e-4
 """The adjustment ends when a step lowers the cost by less than this share."""
 _ADDED_INFORMATION = 1e-9
-"""Information added to the diagonals of cameras and points, far below that of any pixel: without it, a point
-behind all of its cameras has no inverse."""
+"""Information added to the diagonal blocks of cameras and points, far below that of any pixel: without it,
+the block of a point behind all of its cameras, where all weights are 0, has no inverse."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -72,7 +73,10 @@ class Adjuster(Protocol):
     """A function that adjusts a bundle, such as `adjust` or a user's optimiser."""
 
     def __call__(self, bundle: Bundle, camera: Camera, *, iterations: int = 8) -> tuple[Array, Array]:
-        """Return adjusted poses ``T_camera_world`` ``(c, 4, 4)`` and points ``(p, 3)``."""
+        """Return adjusted poses ``T_camera_world`` ``(c, 4, 4)`` and points ``(p, 3)``.
+
+        Fixed cameras keep their poses, and *iterations* is the largest number of steps, as in `adjust`.
+        """
 
 
 def adjust(bundle: Bundle, camera: Camera, *, iterations: int = 8) -> tuple[Array, Array]:
@@ -117,7 +121,10 @@ def adjust(bundle: Bundle, camera: Camera, *, iterations: int = 8) -> tuple[Arra
 
 
 class _System:
-    """The normal equations of a bundle; its observations are sorted by their points."""
+    """The normal equations of a bundle.
+
+    Observations are sorted by their points, so that the blocks of a point are sums over neighbouring rows.
+    """
 
     def __init__(self, bundle: Bundle, camera: Camera) -> None:
         order = np.argsort(bundle.points, kind="stable")
@@ -129,7 +136,8 @@ class _System:
         self._free_cameras = np.flatnonzero(~bundle.is_fixed)
         self._observations_of = [np.flatnonzero(self._cameras == c) for c in self._free_cameras]
         size, count = 6 * len(self._free_cameras), len(self._seen_points)
-        # E keeps its zeros, for points that a camera does not see, from one step to the next.
+        # The blocks between points and cameras (E) are 0 where a camera does not see a point.  These zeros
+        # are written once here; `linearise` writes all other blocks.
         self._equations = NormalEquations(
             np.zeros((size, size)),
             np.zeros(size),

@@ -22,16 +22,18 @@ _MAX_STAMP_DIFFERENCE_S = 0.05
 """Largest difference, in seconds, between the times of a frame and of a recorded position that belong
 together."""
 _STAMP_DIGITS = 6
-"""Digits after the point to which time stamps in seconds are rounded, so that they can be keys."""
+"""Digits after the point to which time stamps in seconds are rounded, so that the time of a tracked pose
+finds the measurements of the same frame."""
 _MIN_ODOMETRY_FRAMES = 5
 """Fewest frames with a position from which odometry gives the scale."""
 _MIN_MARKER_VIEWS = 4
 """Fewest frames that must show a marker before it gives the scale."""
 _MIN_MARKER_PARALLAX_DEG = 5.0
-"""Smallest mean parallax of a marker's corners, in degrees, between its first view and the one farthest from
-it, with which it gives the scale."""
+"""Smallest mean parallax of a marker's corners, in degrees, between the first view of the marker and the view
+farthest from it: with less, the marker gives no scale."""
 _MAX_CORNER_ERROR_PX = 4.0
-"""Largest reprojection error of a marker's corner that is triangulated, in pixels."""
+"""Largest reprojection error of a marker's corner that is triangulated, in pixels: with a larger one, the
+marker gives no scale."""
 _CORNER_SIGMA_PX = 0.5
 """Standard deviation of a marker's corner, in pixels, after its refinement."""
 _MAX_EDGE_RATIO = 1.2
@@ -45,7 +47,8 @@ _MAX_MARKER_M = 5.0
 class OdometryScale:
     """Metric scale by odometry: the spread of the measured path divided by that of the tracked path.
 
-    ``name`` is how the scale is reported.
+    The spread of a path is the root of the sum of squared distances of its positions from their mean.
+    ``name`` describes the source of the scale in reports.
     """
 
     def __init__(
@@ -58,16 +61,17 @@ class OdometryScale:
         """Use the first *first_m* metres of odometry.
 
         Args:
-            timestamps_s: ``(n,)`` seconds, ascending; None if each frame is given with its position.
-            positions_m: ``(n, 3)`` metres of the camera in any fixed frame; None if each frame is given with
-                its position.
-            first_m: Length of the path that is used, in metres; the scale is known after it.
+            timestamps_s: ``(n,)`` seconds, ascending; None if `observe` is given the position of each frame.
+            positions_m: ``(n, 3)`` metres of the camera in any fixed frame; None if `observe` is given the
+                position of each frame.
+            first_m: Length of the measured path that is used, in metres, from its start; the scale is not
+                known before the odometry has measured this length.
 
         Raises:
             UsageError: The arrays do not fit together, or the length is not above 0.
         """
         if not first_m > 0:
-            raise UsageError(f"first_m = {first_m:g} is not above 0", hint="use 1 metre")
+            raise UsageError(f"first_m = {first_m:g} is not above 0", hint="leave first_m out to get 1 m")
         if (timestamps_s is None) != (positions_m is None) or (
             timestamps_s is not None
             and positions_m is not None
@@ -101,7 +105,7 @@ class OdometryScale:
             self._positions_m[_stamp_key(timestamp_s)] = np.asarray(position_m, dtype=np.float64)
 
     def is_due(self, timestamp_s: float, *, is_known: bool) -> bool:
-        """Return whether the scale should be computed now: whenever it is not known yet."""
+        """Return whether the scale should be computed at a frame: only while it is not known (*is_known*)."""
         return not is_known
 
     def metres_per_unit(
@@ -138,7 +142,7 @@ class OdometryScale:
 class MarkerScale:
     """Metric scale by square ArUco markers (dictionary 4x4_50) of one size that several frames show.
 
-    ``name`` is how the scale is reported.
+    ``name`` describes the source of the scale in reports.
     """
 
     def __init__(self, size_m: float) -> None:
@@ -181,7 +185,7 @@ class MarkerScale:
             views[_stamp_key(timestamp_s)] = corners.reshape(4, 2).astype(np.float64)
 
     def is_due(self, timestamp_s: float, *, is_known: bool) -> bool:
-        """Return whether the scale should be computed now: whenever it is not known yet."""
+        """Return whether the scale should be computed at a frame: only while it is not known (*is_known*)."""
         return not is_known
 
     def metres_per_unit(

@@ -19,10 +19,10 @@ __all__ = ["TwoViewStart", "start_from_two_views"]
 _RANSAC_CONFIDENCE = 0.9999
 """Probability with which RANSAC finds an essential matrix without outliers."""
 _MIN_GOOD_SHARE = 0.5
-"""Smallest share of the inlier matches whose points lie before both cameras and have parallax: in a
-degenerate view, such as of one plane, most points do not."""
+"""Smallest share of the inlier matches whose points lie before both cameras and have parallax: where the
+relative pose is wrong, as it may be if both views show one plane, the share is smaller."""
 _MIN_POINT_PARALLAX_SHARE = 0.3
-"""Smallest parallax of a point that is kept, as a share of the smallest median parallax of a start."""
+"""Smallest parallax of a point that is kept, as a share of the argument *min_parallax_deg* of a start."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -60,8 +60,8 @@ def start_from_two_views(
         first: ``(n, 2)`` undistorted pixels in the first view.
         second: ``(n, 2)`` pixels of the same points in the second view.
         camera: Intrinsics of both views.
-        inlier_px: Largest distance of a pixel from its epipolar line, and half of the largest reprojection
-            error.
+        inlier_px: Largest distance of a pixel from its epipolar line; the largest reprojection error of a
+            good point is twice this.
         min_points: Fewest good points of a start.
         min_parallax_deg: Smallest median angle, in degrees, between the two rays of a point; below it depths
             are noise.
@@ -97,7 +97,7 @@ def start_from_two_views(
     rows = np.flatnonzero(mask.ravel())
     if len(rows) < min_points:
         return no_start
-    # 2. Choose the one of its four poses with the most points before both cameras.
+    # 2. Choose that of the four poses of the essential matrix with the most points before both cameras.
     _, rotation, translation, _ = cv2.recoverPose(essential, first[rows], second[rows], camera.matrix)
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = rotation, translation.ravel()

@@ -18,8 +18,8 @@ _NEAREST_M = 0.3
 _FARTHEST_M = 900.0
 """Largest depth of a stereo point, in metres: it limits the smallest disparity that is accepted."""
 _MAX_DISPARITY_SHARE = 0.2
-"""Largest disparity that is searched, as a share of the image width: a third of the time of a search is spent
-on near points, which are few."""
+"""Largest disparity that is searched, as a share of the image width: points with larger disparities are few,
+and without this limit a search takes half as long again."""
 _MAX_DISPARITY_PX = 512
 """Largest disparity that is searched, in pixels, however wide the image."""
 _MIN_DISPARITY_PX = 1.0
@@ -39,8 +39,9 @@ def stereo_points(rgb: npt.NDArray[np.uint8], stereo: StereoView, camera: Camera
         pixels: ``(n, 2)``, column and row in the left image.
 
     Returns:
-        ``(n, 3)`` metres in the left camera's frame; NaN where no disparity was found.  Disparities are
-        sought from 1 px to a fifth of the width, at most 512 px, and for depths of 0.3 to 900 m.
+        ``(n, 3)`` metres in the left camera's frame; NaN where no disparity was found.  The smallest
+        disparity is the larger one of 1 px and that of 900 m; the largest is the smallest one of 512 px, a
+        fifth of the width, and that of 0.3 m.
 
     Raises:
         MissingExtra: OpenCV or the native core is not installed.
@@ -62,9 +63,7 @@ def noise_of(stereo: StereoView, camera: Camera) -> DepthNoise:
 
 
 def with_offset(points_camera: Array, f_baseline: float, offset_px: float) -> Array:
-    """Return new stereo points as they would be if all disparities were larger by an offset.
-
-    Each point moves along its ray.
+    """Return stereo points after an offset was added to the disparities; each point moves along its ray.
 
     Args:
         points_camera: ``(n, 3)`` metres, in the left camera's frame, NaN without depth.

@@ -38,12 +38,12 @@ class StereoView:
     def __post_init__(self) -> None:
         if self.gray.ndim != 2 or self.gray.dtype != np.uint8:
             raise UsageError(
-                f"a right image of shape {self.gray.shape} and type {self.gray.dtype} cannot be used",
+                f"a right image of shape {self.gray.shape} and type {self.gray.dtype} is not (h, w) of uint8",
                 hint="give a rectified grey image of one byte a pixel",
             )
         if not _MIN_BASELINE_M <= self.baseline_m <= _MAX_BASELINE_M:
             raise UsageError(
                 f"a baseline of {self.baseline_m:g} m is not within {_MIN_BASELINE_M:g} to "
                 f"{_MAX_BASELINE_M:g} m",
-                hint="give it in metres, from the left camera to the right one",
+                hint="give the distance of the two cameras in metres",
             )

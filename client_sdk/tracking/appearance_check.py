@@ -1,7 +1,8 @@
 """Appearance check of a recognised place: does the image look as the landmarks of the map predict?
 
-The number of matches alone can only support a pose.  A repeating wallpaper also matches at another wall,
-where everything else that the map knows of the place is missing: this is what the check finds.
+Matches are evidence for a pose, but missing matches are not counted as evidence against it.  A repeating
+wallpaper also matches at another wall, where most other landmarks that the pose predicts do not look as
+predicted: this check counts them.
 """
 
 from __future__ import annotations
@@ -18,14 +19,16 @@ from rse_pf.slam.tracking import predict_features
 __all__ = ["has_predicted_appearance"]
 
 _EDGE_PX = 40.0
-"""Width of the border of an image, in pixels, in which no ORB descriptor can be computed."""
+"""Width of the border of an image, in pixels, whose landmarks are not compared: nearer to the edge, OpenCV
+does not compute ORB descriptors."""
 _MAX_LANDMARKS = 300
 """Largest number of landmarks whose appearance is compared, an even sample of all: bounds the time."""
 _HIDDEN_DEPTH_SHARE = 0.9
-"""A landmark is hidden, and not compared, if the depth measured at its pixel is below this share of its
-own."""
+"""A landmark is hidden, and not compared, if the depth measured at its predicted pixel is below this share of
+the depth that the pose predicts for the landmark."""
 _SIMILAR_BITS = 64
-"""Largest Hamming distance, in bits of 256, between two descriptors of one landmark."""
+"""Largest Hamming distance, out of 256 bits, between the descriptor of a landmark and that of the image at
+its predicted pixel, at which the landmark looks as predicted."""
 _MIN_SIMILAR_SHARE = 0.25
 """Smallest share of the predicted landmarks that must look as predicted: right poses of the recordings have
 0.43 and more, also with blur, and poses at another wall of the same paper have 0.13."""
@@ -34,14 +37,16 @@ _MIN_SIMILAR_SHARE = 0.25
 def has_predicted_appearance(
     frame: Frame, segment_map: KeyframeMap, T_world_camera: Array, min_landmarks: int
 ) -> bool:
-    """Return whether enough of the landmarks that a pose predicts look as predicted in the frame's image.
+    """Return whether at least 25 % of the landmarks that a pose predicts look as predicted in a frame's
+    image.
 
     Args:
         frame: Image with its depth; landmarks that something nearer hides are left out.  Where the depth is
             0, as everywhere in a stereo pair, no landmark counts as hidden.
         segment_map: Map of the place, whose landmarks have ORB descriptors.
         T_world_camera: ``(4, 4)``, the pose to check, in the world of the map.
-        min_landmarks: Fewest landmarks that must be compared; with fewer the answer is False.
+        min_landmarks: Fewest landmarks that must be compared, after hidden ones were left out; with fewer the
+            result is False.
     """
     # 1. Predict the landmarks, and leave out those that are hidden.
     T_camera_world = inverse(T_world_camera)

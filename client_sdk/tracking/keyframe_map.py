@@ -1,8 +1,8 @@
 """The map of one segment of a camera with depth: keyframes, and the landmarks that they measured.
 
 A landmark is a feature with depth.  Every frame that sees it again measures it again, and the measurements
-are fused by their covariances.  A keyframe keeps its pose in the map: there is no bundle adjustment here, and
-`KeyframeMap.move` and `KeyframeMap.correct` set the poses of all keyframes at once.
+are fused by their covariances.  The pose of a keyframe is not adjusted when further frames are added: only
+`KeyframeMap.move` and `KeyframeMap.correct` change it, together with those of all other keyframes.
 """
 
 from __future__ import annotations
@@ -38,15 +38,16 @@ __all__ = ["KeyframeMap", "PosedView", "View", "depths_for_noise", "measure_poin
 Rows = npt.NDArray[np.int64]
 
 _LOCAL_KEYFRAMES = 6
-"""Number of keyframes nearest to a pose whose landmarks are matched with an image there."""
+"""Number of keyframes nearest to a pose whose landmarks are matched with an image that has this pose."""
 _INITIAL_CAPACITY = 4096
 """Number of landmarks for which a new map has memory; the memory doubles when it is full."""
 _DEG_PER_M = 30.0
 """Degrees of rotation that change a view as much as a metre of translation, where nearest keyframes are
 sought."""
-_FUSION_FLOOR_M2 = 0.003**2 / 20.0
-"""Square metres that each fusion adds to the variance of a landmark, (3 mm)^2 in 20 fusions: the errors of
-its measurements are correlated, so that its variance must not fall to 0."""
+_FUSION_NOISE_M2 = 0.003**2 / 20.0
+"""Square metres that each fusion adds to the variance of a landmark, (3 mm)^2 in 20 fusions, as the process
+noise of a Kalman filter: the errors of its measurements are correlated, so that its variance must not fall to
+0."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -55,8 +56,8 @@ class View:
 
     Attributes:
         features: Features of the image with their points, ``n`` of them.
-        shutter_displacements: ``(n, 3)``, how far each point moves in the camera's frame for each second that
-            the camera's rolling-shutter readout takes longer.
+        shutter_displacements: ``(n, 3)``, metres per second in the camera's frame: the derivative of each
+            corrected point by the readout time of the camera's rolling shutter.
         camera: Intrinsics.
         place_vector: Vector by which the place of the image is recognised.
         is_stereo: Whether depths are computed from disparities, whose noise has no constant part.
@@ -81,12 +82,12 @@ class PosedView:
         landmarks: ``(n,)``, number of the landmark that each feature shows, or NO_LANDMARK; only features
             that agree with the pose have one.
         inliers: Number of features that agree with the pose; 0 for the first frame of a segment.
-        matches: Number of matches of the query or of the verification, whichever is larger; 0 for the first
-            frame of a segment.
-        is_weak: Whether the solver calls the pose weak; the image then changes no landmark, and never becomes
-            a keyframe.
+        matches: Number of matches for which the pose was queried, or of those by which it was verified,
+            whichever is larger; 0 for the first frame of a segment.
+        is_weak: Whether the verdict of the solver is ``weak``: the evidence for the pose is little.  The
+            image then changes no landmark, and never becomes a keyframe.
         rotation_rate: ``(3,)`` rad/s in the camera's frame, mean rate since the camera's last pose; zeros
-            unless the camera moved there from its last pose.
+            after a loss, a cut, and where the place was recognised far from the last pose.
     """
 
     view: View
@@ -103,8 +104,9 @@ def depths_for_noise(measured_m: Array, expected_m: Array) -> Array:
 
     They are the geometric means of the measured depths and of those that the map predicts.
 
-    The noise at the measured depth itself would favour points that are measured too near, and draw the map
-    nearer.  At the geometric mean, the deviation of a depth is exactly that of its disparity.
+    The noise grows with the depth.  At the measured depth, a point that is measured too near would get too
+    small a noise, thus too much weight, and would draw the map nearer.  At the geometric mean, the error of a
+    depth divided by its noise is exactly the error of its disparity divided by that of the disparity.
 
     Args:
         measured_m: ``(n,)`` metres.
@@ -211,7 +213,8 @@ class KeyframeMap:
             noise: Noise model of the depths.
 
         Returns:
-            ``(n,)``, landmark of each feature, with the new ones; numbers change if the map was thinned out.
+            ``(n,)``, landmark of each feature, with the new ones.  If keyframes were removed before, all
+            landmarks have new numbers, and only the returned ones are valid.
         """
         descriptors = view.features.descriptors
         if not self._count:
@@ -251,7 +254,7 @@ class KeyframeMap:
         return ranked[:count]
 
     def matched(self, numbers: Rows, features: Rows) -> Matches:
-        """Return landmarks by their numbers as those that *features*, rows of an image's features, show."""
+        """Pair the landmark ``numbers[i]`` with row ``features[i]`` of an image's features, for each *i*."""
         return self._table.matched(numbers, features)
 
     def landmarks_in(self, keyframe: int) -> tuple[Rows, Descriptors]:
@@ -261,10 +264,11 @@ class KeyframeMap:
         return seen[rows], self.views[keyframe].features.descriptors[rows]
 
     def landmarks_around(self, T_world_camera: Array) -> tuple[LandmarkAppearance, Rows]:
-        """Return the appearance of all landmarks, and the ascending numbers of those around a pose.
+        """Return the appearance of all landmarks, and the ascending numbers (rows) of those around a pose.
 
-        These are the landmarks that at least one of the six keyframes with the nearest poses, or the newest
-        keyframe, sees.  The distance of a pose is that in metres plus that in degrees divided by 30.
+        Around a pose are the landmarks that at least one of the six nearest keyframes, or the newest
+        keyframe, sees.  The distance of a keyframe is that of its pose in metres, plus its rotation in
+        degrees over 30.
         """
         metres, degrees = self.distances(T_world_camera)
         nearest = np.argsort(metres + degrees / _DEG_PER_M, kind="stable")[:_LOCAL_KEYFRAMES]
@@ -284,15 +288,17 @@ class KeyframeMap:
     ) -> Matches:
         """Match the landmarks around a pose, and those of the last frame, with an image near their pixels.
 
-        Where a feature or a landmark has a match of both kinds, that with the last frame is taken.
-        Landmarks are also predicted in a border around the image as wide as the radius of the limits.
+        Where a feature or a landmark has a match of both kinds, that with the last frame is taken, whose
+        descriptor is the newest.  Landmarks are also predicted in a border around the image as wide as the
+        radius of the limits.
 
         Args:
             view: The image.
             T_world_camera: ``(4, 4)``, its predicted pose.
             limits: Conditions of a match.
-            last: The last frame; None to match with the landmarks around the pose only.
-            noise: Noise model of the depths, for points of the last frame that are in no map.
+            last: The last frame, with its features with depth that are not landmarks of the map, too; None to
+                match with the landmarks around the pose only.
+            noise: Noise model of the depths, for those features of the last frame.
             enough: If the landmarks around the pose give this many matches, the last frame is left out.
         """
         # 1. Match the landmarks that the nearest keyframes see.
@@ -373,10 +379,10 @@ class KeyframeMap:
         displacements = view.shutter_displacements[rows] @ T_world_camera[:3, :3].T
         for column, measured in ((table.points, points), (table.shutter_displacements, displacements)):
             column[numbers] += np.einsum("nij,nj->ni", gain, measured - column[numbers])
-        table.covariances[numbers] = (np.eye(3) - gain) @ prior + _FUSION_FLOOR_M2 * np.eye(3)
+        table.covariances[numbers] = (np.eye(3) - gain) @ prior + _FUSION_NOISE_M2 * np.eye(3)
 
     def change_readout(self, change_s: float) -> None:
-        """Move all landmarks to where they are if the camera's readout takes *change_s* seconds longer."""
+        """Correct all landmarks after the estimate of the readout time grew by *change_s* seconds."""
         table, count = self._table, self._count
         table.points[:count] += change_s * table.shutter_displacements[:count]
 
@@ -390,9 +396,10 @@ class KeyframeMap:
             directions[:] = directions @ rotation.T
 
     def correct(self, T_world_camera: Array, f_baseline: float, offset_px: float) -> None:
-        """Set corrected poses of all keyframes, and add an offset to all disparities.
+        """Set corrected poses of all keyframes, and add an offset to the disparities of their images.
 
-        Each landmark moves with the newest keyframe that sees it, and along its ray in that keyframe.
+        Each landmark moves with the newest keyframe that sees it, and along its ray in that keyframe to the
+        depth that the changed disparity gives.
 
         Args:
             T_world_camera: ``(k, 4, 4)``, corrected poses of all keyframes.
@@ -453,7 +460,7 @@ class KeyframeMap:
         table.sizes[numbers] = view.features.sizes[rows]
 
     def _reserve(self, count: int) -> None:
-        """Provide memory for *count* landmarks, at least twice as much as before if it does not suffice."""
+        """Provide memory for *count* landmarks in total; if it must grow, it is at least doubled."""
         if count <= len(self._table):
             return
         larger = _allocate(max(count, 2 * len(self._table)), self._table.descriptors)
@@ -464,8 +471,8 @@ class KeyframeMap:
     def _thin_out(self, current: Rows) -> Rows:
         """Remove every second keyframe of the older half, and landmarks that no keyframe sees any more.
 
-        Landmarks are renumbered.  *current*, landmark numbers (or NO_LANDMARK) that must stay, is returned
-        with the new numbers.
+        The first keyframe is among those removed.  Landmarks are renumbered.  *current*, landmark numbers (or
+        NO_LANDMARK) that must stay, is returned with the new numbers.
         """
         is_kept = np.ones(len(self.views), dtype=bool)
         is_kept[: len(self.views) // 2 : 2] = False

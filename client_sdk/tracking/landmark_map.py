@@ -85,7 +85,8 @@ _LOCAL_ITERATIONS = 5
 _CULL_AGE_KEYFRAMES = 3
 """Number of newer keyframes after which a landmark that too few keyframes have seen is removed."""
 _CULL_OBSERVATIONS = 3
-"""Fewest keyframes that must have seen a landmark when it is no longer new: a wrong match is seen by two."""
+"""Fewest keyframes that must have seen a landmark when it is no longer new: a landmark of a wrong match is
+mostly seen only by the two keyframes that triangulated it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -124,7 +125,8 @@ class LandmarkMap:
     Attributes:
         camera: Intrinsics of all keyframes.
         keyframes: All keyframes, oldest first.
-        points: ``(n, 3)`` landmarks in the world, in the unit of the map.
+        points: ``(n, 3)`` landmarks in the world, in the unit of the map, which is arbitrary until the map is
+            scaled to metres.
         descriptors: ``(n, d)``, descriptor of each landmark in the keyframe that saw it last.
         colours: ``(n, 3)`` uint8.
         is_alive: ``(n,)``; removed landmarks keep their number and are not alive.
@@ -138,8 +140,8 @@ class LandmarkMap:
         self.colours: npt.NDArray[np.uint8] = np.empty((0, 3), dtype=np.uint8)
         self.is_alive: npt.NDArray[np.bool_] = np.empty(0, dtype=bool)
         self._adjust_bundle = adjuster
-        self._first_keyframes: Rows = np.empty(0, dtype=np.int64)
-        """The newest keyframe when each landmark was made."""
+        self._creation_keyframes: Rows = np.empty(0, dtype=np.int64)
+        """Number of the newest keyframe when each landmark was made, which gives the age of the landmark."""
         self._rays: Array = np.empty((0, 3))
         self._orientations: Array = np.empty((0, 3))
         self._sizes: Array = np.empty(0)
@@ -191,7 +193,7 @@ class LandmarkMap:
             descriptors=view.features.descriptors[second[1]],
             colours=view.colours[second[1]],
             is_alive=np.ones(count, dtype=bool),
-            _first_keyframes=np.full(count, len(self.keyframes) - 1),
+            _creation_keyframes=np.full(count, len(self.keyframes) - 1),
             _rays=np.zeros((count, 3)),
             _orientations=np.zeros((count, 3)),
             _sizes=np.ones(count),
@@ -204,7 +206,8 @@ class LandmarkMap:
         """Triangulate new landmarks from a keyframe and its neighbours; return how many were added.
 
         All neighbours then observe the new landmarks, too, where a feature matches.  A keyframe that sees no
-        landmark adds none, since depths are guessed by landmarks.
+        landmark adds none: the depths of its features, by which their pixels in the neighbours are predicted,
+        are guessed from landmarks.
         """
         count = len(self.points)
         depths = self._interpolate_depths(number)
@@ -233,7 +236,7 @@ class LandmarkMap:
             descriptors=other.descriptors,
             colours=other.colours,
             is_alive=other.is_alive,
-            _first_keyframes=other._first_keyframes + keyframe,
+            _creation_keyframes=other._creation_keyframes + keyframe,
             _rays=other._rays,
             _orientations=other._orientations,
             _sizes=other._sizes,
@@ -268,9 +271,9 @@ class LandmarkMap:
         )
 
     def matched(self, numbers: Rows, features: Rows) -> Matches:
-        """Return landmarks by their numbers as those that *features*, rows of an image's features, show.
+        """Pair the landmark ``numbers[i]`` with row ``features[i]`` of an image's features, for each *i*.
 
-        Their covariances are 0.
+        The covariances are 0.
         """
         return Matches(
             features=features,
@@ -330,15 +333,15 @@ class LandmarkMap:
     # --- Adjust, move and clean up ---
 
     def adjust_around(self, number: int) -> None:
-        """Adjust a keyframe, its neighbours and all landmarks that they see; remove outlier observations.
+        """Adjust a keyframe, at most 9 neighbours, and all landmarks that these keyframes see.
 
-        At most 10 keyframes move, and at most 12 further ones take part with fixed poses.
+        At most 12 further keyframes take part with fixed poses.  Outlier observations are removed.
         """
         window = [number, *self._neighbours(number)[: _WINDOW_KEYFRAMES - 1]]
         self._adjust(sorted(window), _FIXED_KEYFRAMES, iterations=_LOCAL_ITERATIONS)
 
     def adjust_all(self, *, iterations: int = 12) -> None:
-        """Adjust all keyframes and landmarks twice, with outliers removed in between.
+        """Adjust all keyframes and landmarks twice; each time, outlier observations are removed afterwards.
 
         The first two keyframes keep their poses, which fixes the frame and the scale of the map.  A map of
         more than 200 keyframes stays as it is.
@@ -352,10 +355,10 @@ class LandmarkMap:
     def cull(self) -> None:
         """Remove landmarks that fewer than two keyframes see, and older ones that only two keyframes see.
 
-        Older landmarks are those since which three or more keyframes were added.
+        Older landmarks are those after whose newest keyframe at creation three or more keyframes were added.
         """
         counts = self._count_observations()
-        age = len(self.keyframes) - 1 - self._first_keyframes
+        age = len(self.keyframes) - 1 - self._creation_keyframes
         is_old = age >= _CULL_AGE_KEYFRAMES
         is_doubtful = (counts < 2) | (is_old & (counts < _CULL_OBSERVATIONS))
         self._remove(np.flatnonzero(self.is_alive & is_doubtful))
@@ -375,8 +378,9 @@ class LandmarkMap:
     def bend(self, older: int, newer: int, T_new_old: Array, scale: float) -> None:
         """Distribute the similarity that closes a loop over the keyframes of the loop.
 
-        Keyframes between *older* and *newer*, and the landmarks that were made with them, move by a share of
-        the similarity that grows from 0 to 1.
+        Each keyframe between *older* and *newer* moves by a share of the similarity that grows with its
+        number from 0 to 1.  A landmark moves with the keyframe that was the newest one when the landmark was
+        made.
 
         Args:
             older: Number of the keyframe that stays, with all before it.
@@ -391,7 +395,9 @@ class LandmarkMap:
         shares = np.clip((numbers - older) / max(1, newer - older), 0.0, 1.0)
         rotations = exp_se3(shares[:, None] * twist)[:, :3, :3]
         scales = scale**shares
-        # A point x of a keyframe moves to centre + share (moved_centre - centre) + scale R (x - centre).
+        # With the centre of the newer keyframe's camera before and after the whole similarity, and with the
+        # share, scale and rotation R of a keyframe, a point x of this keyframe moves to
+        # centre + share (moved_centre - centre) + scale R (x - centre).
         shifts = centre + shares[:, None] * (moved_centre - centre)
         shifts -= scales[:, None] * (rotations @ centre)
         for number in np.flatnonzero(shares > 0.0):
@@ -399,7 +405,7 @@ class LandmarkMap:
             motion[:3, 3] = shifts[number]
             keyframe = self.keyframes[number]
             keyframe.T_camera_world = scaled(keyframe.T_camera_world, scales[number]) @ inverse(motion)
-        of = self._first_keyframes
+        of = self._creation_keyframes
         self.points = scales[of, None] * np.einsum("nij,nj->ni", rotations[of], self.points) + shifts[of]
 
     def fuse(self, number: int, landmarks: Rows, radius_px: float) -> int:
@@ -477,7 +483,7 @@ class LandmarkMap:
         self.add_landmarks(points[is_good], (neighbour, rows[is_good]), (number, columns[is_good]))
 
     def _interpolate_depths(self, number: int) -> Array | None:
-        """Guess the depths of a keyframe's features by the three nearest landmarks in the image.
+        """Guess the depths of a keyframe's features by the three landmarks nearest in the image.
 
         The inverse of a guess is the mean of the inverse depths of these landmarks.  Returned is ``(n,)``,
         also for features with a landmark; None if the keyframe sees no landmark.

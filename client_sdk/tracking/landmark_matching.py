@@ -45,7 +45,8 @@ PIXEL_SIGMA_PX = 1.0
 of the feature."""
 LATEST_KEYFRAMES = 3
 """Number of newest keyframes of the present segment that are compared with a frame after the camera was lost:
-most losses end near the place where they began."""
+most losses end near the place where they began.  Without depth, also those at which an unclear answer is
+accepted."""
 _SIMILAR_KEYFRAMES = 5
 """Number of keyframes of each segment that place recognition proposes for a frame."""
 
@@ -54,7 +55,8 @@ _SIMILAR_KEYFRAMES = 5
 class Landmarks:
     """Points of the world with their uncertainty, and how each looked in the last image that showed it.
 
-    The last image is a keyframe, except for landmarks that were made of a single frame.
+    The last image is the newest keyframe that sees the landmark.  `KeyframeMap.landmarks_of_view` also
+    returns landmarks whose last image is a frame that is no keyframe.
 
     Attributes:
         points: ``(n, 3)``, world, in metres or in the unit of the segment.
@@ -97,7 +99,8 @@ class Landmarks:
         return Landmarks(**{column.name: getattr(self, column.name)[:count] for column in fields(self)})
 
     def matched(self, rows: Rows, features: Rows) -> Matches:
-        """Return the landmarks of *rows* as those that *features*, rows of an image's features, show."""
+        """Pair the landmark of row ``rows[i]`` with row ``features[i]`` of an image's features, for each
+        *i*."""
         return Matches(
             features=features,
             numbers=self.numbers[rows],
@@ -120,7 +123,7 @@ class Landmarks:
             T_camera_world: ``(4, 4)``, the predicted pose of the image.
             camera: Intrinsics of the image.
             image: Features of the image.
-            limits: Conditions of a match.
+            limits: Radius, Lowe's ratio and further conditions of a match.
             margin_px: Width of the border around the image in which landmarks are predicted, too.
         """
         rows, features = match_landmarks(
@@ -192,12 +195,18 @@ class RecognisableMap(Protocol):
         """Return the numbers of the landmarks that a keyframe sees, and their descriptors in it."""
 
     def matched(self, numbers: Rows, features: Rows) -> Matches:
-        """Return landmarks by their numbers as those that *features*, rows of an image's features, show."""
+        """Pair the landmark ``numbers[i]`` with row ``features[i]`` of an image's features, for each *i*."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Candidate:
-    """A keyframe that may show the place of an image, and the matches of its landmarks with that image."""
+    """A keyframe that may show the place of an image.
+
+    Attributes:
+        segment: Number of the segment of the keyframe.
+        keyframe: Number of the keyframe in its segment.
+        matches: Matches of the landmarks that the keyframe sees with the features of the image.
+    """
 
     segment: int
     keyframe: int
@@ -207,12 +216,12 @@ class Candidate:
 def make_place_vector(
     descriptors: Descriptors, rgb: npt.NDArray[np.uint8], plugin: LoopsPlugin | None
 ) -> LazyPlaceVector:
-    """Make the place vector of an image from its descriptors, or by a user's place recogniser.
+    """Make the place vector of an image from its descriptors, or by a function that the user of the SDK gave.
 
     Args:
         descriptors: ``(n, d)``, of the image's features.
         rgb: ``(h, w, 3)``, the image.
-        plugin: A user's place recogniser; None for the vector of the descriptors (VLAD).
+        plugin: The user's function for place recognition; None for the vector of the descriptors (VLAD).
     """
     if plugin is None:
         return LazyPlaceVector(lambda: place_vector(descriptors))

@@ -19,20 +19,23 @@ __all__ = ["AdjustedKeyframe", "MonocularSegment", "PosedView", "Similarity", "m
 Rows = npt.NDArray[np.int64]
 
 _REFINE_RADIUS_PX = 5.0
-"""Radius around projected landmarks in which a fitted pose is matched again."""
+"""Radius, in pixels, around landmarks projected by a fitted pose in which they are matched again, for a
+second fit."""
 _VERIFY_LOWE_RATIO = 0.9
 """Lowe's ratio for matches around the pixels of a solved pose: looser than elsewhere, since the radius is
 small."""
 _AGREEMENT_DEPTH_SHARE = 0.07
-"""Largest distance of the camera's centre between two measurements of one similarity that confirm each other,
-as a share of the median depth."""
+"""Two measurements of where one segment lies in another confirm each other only if the two points to which
+they move the centre of the camera are at most this share of the median depth apart."""
 _AGREEMENT_DEG = 4.0
-"""Largest rotation, in degrees, between two measurements of one similarity that confirm each other."""
+"""Two measurements of where one segment lies in another confirm each other only if their rotations differ by
+at most this angle, in degrees."""
 _AGREEMENT_SCALE_RATIO = 1.1
-"""Largest ratio of the scales of two measurements of one similarity that confirm each other."""
+"""Two measurements of where one segment lies in another confirm each other only if the ratio of their scales,
+the larger over the smaller, is at most this."""
 _MAX_SCALE_SPREAD = 0.15
-"""Largest median deviation of the ratios of depths from their median, as a share of it, with which they give
-the scale between two segments."""
+"""Largest median deviation of the ratios of depths from their median, as a share of this median: where it is
+larger, no scale between two segments is known, and they are not joined."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -88,12 +91,13 @@ class PosedView:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Similarity:
-    """Where a segment lies in another one, or the newer part of a segment in its older part.
+    """A similarity transformation: where a segment lies in another one, for a join.
 
-    A point ``x`` of the segment lies at ``T (scale x)`` in the other one.
+    For a loop closure, both are the same segment, and the transformation is that of its newer part, which has
+    drifted, to its older part.  A point ``x`` of the segment lies at ``T (scale x)`` in the other one.
 
     Attributes:
-        segment: Number of the other segment; the same one for its newer part.
+        segment: Number of the other segment; that of the same segment for a loop closure.
         keyframe: Keyframe of the other segment that shows the same place.
         T: ``(4, 4)``, rigid motion into the other segment, after all lengths are multiplied by *scale*.
         scale: Factor of all lengths.
@@ -166,7 +170,9 @@ class MonocularSegment:
     Attributes:
         map: Keyframes and landmarks.
         length_factor: Factor by which the lengths around the newest frames were multiplied since the segment
-            began.
+            began: by changes of the unit, which concern all lengths, and by loop closures, which multiply
+                older
+            lengths by less.
         frames: Poses of all frames of the segment.
         reference: The reference keyframe, around which frames are tracked.
         reference_landmarks: Number of landmarks that it saw when it became the reference.
@@ -179,7 +185,7 @@ class MonocularSegment:
     reference_landmarks: int = 0
 
     def set_reference(self, keyframe: int) -> None:
-        """Track frames around a keyframe from now on."""
+        """Match further frames with the landmarks of a keyframe and its neighbours."""
         self.reference = keyframe
         self.reference_landmarks = len(self.map.landmarks_of(keyframe))
 
@@ -191,7 +197,8 @@ class MonocularSegment:
         )
 
     def move(self, T_new_old: Array, scale: float) -> None:
-        """Express the segment in another frame: multiply all lengths by *scale*, then apply *T_new_old*."""
+        """Express map and frames in another world: multiply all lengths by *scale*, then apply
+        *T_new_old*."""
         self.map.move(T_new_old, scale)
         self.length_factor *= scale
         self.frames = [

@@ -2,8 +2,9 @@
 
 `MonocularTracker` is a state machine without input or output, with the steps of `Tracker`: extract features,
 predict the pose, match landmarks, solve the pose (elsewhere, by a query), verify it, decide what becomes of
-the frame, and keep it in the map.  Each segment has an arbitrary unit of length until
-`MonocularTracker.rescale` is called, or the segment is joined to an older one, whose unit it takes.
+the frame, and keep it in the map.  Each segment has an arbitrary unit of length.  `MonocularTracker.rescale`
+changes it, which `Mapper` calls once the metric scale is known; a segment that is joined to an older one
+takes the unit of the older one at that time.
 """
 
 from __future__ import annotations
@@ -63,7 +64,7 @@ _MAX_FEATURES = 2000
 time of a frame."""
 _START_DEPTH = 2.0
 """Median depth of a segment's first landmarks in its arbitrary unit: large enough that the rounding of points
-to 0.0001 in a pose query does not matter."""
+to 0.0001 units in a pose query does not matter."""
 _MAX_WAITING_FRAMES = 30
 """Largest number of frames that are kept as possible first views of a new segment; then the oldest is
 dropped: bounds memory."""
@@ -88,12 +89,12 @@ _LOOP_CANDIDATES = 2
 """Number of similar older keyframes with which a new keyframe is matched to find a loop closure: bounds the
 time of a keyframe."""
 _LOOP_AGE_KEYFRAMES = 15
-"""Fewest keyframes between the two keyframes of a loop closure, and between two loop closures: nearer
-keyframes are connected by common landmarks anyway."""
+"""Smallest difference of the numbers of the two keyframes of a loop closure: nearer keyframes are connected
+by common landmarks anyway.  After a loop closure, the next one is looked for this many keyframes later."""
 _MERGE_ITERATIONS = 6
-"""Iterations of the bundle adjustment of all keyframes after a join, after a loop closure, and at the end of
-a
-drive: bounds its time to seconds."""
+"""Iterations of the bundle adjustment of all keyframes after a join, after a loop closure, and in
+`MonocularTracker.adjust`: bounds its time to seconds.  The two keyframes of a new segment are adjusted with
+the default of `LandmarkMap.adjust_all`."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -102,12 +103,13 @@ class MonocularOptions:
 
     Attributes:
         features: Number of features of a frame of 640 px; wider frames have more, up to 2000.
-        max_matches: Largest number of matches that a pose query sends, an even sample of all; 250 keep a
-            command below 10 kB in every codec.
+        max_matches: Largest number of matches that a pose query sends, an even sample of all; 250 keep the
+            command of a query below 10 kB with the codecs zlib and MessagePack, and below 11 kB with JSON.
         inlier_px: Largest reprojection error, in pixels, of an inlier of a pose query.
         max_iterations: Largest number of RANSAC iterations.
         min_inliers: Smallest number of inliers of an accepted pose.
-        search_px: Radius around the predicted pixel of a landmark in which features are compared.
+        search_px: Radius, in pixels, around the predicted pixel of a landmark in which features are compared
+            with the landmark.
         keyframe_share: A frame that sees less than this share of its reference keyframe's landmarks becomes a
             keyframe.
         keyframe_deg: A frame rotated by more than this from its reference keyframe becomes a keyframe.
@@ -139,13 +141,14 @@ class _TrackState:
         segment: Number of the present segment.
         last: The last frame with its pose; None after a loss and after `MonocularTracker.adjust`.
         timestamp_s: Time of the last pose, in seconds.
-        T_next_last: ``(4, 4)``, maps the frame of the last camera to that of the next one, assumed to be that
-            between the last two frames; the identity if these do not tell it.
+        T_next_last: ``(4, 4)``, maps the frame of the last camera to that of the next one: the motion between
+            the last two frames, which is assumed to repeat; the identity after a loss.
         unrecognised: Number of frames since the last accepted pose that show enough features and no known
             place.
         candidate: Where the segment may lie in another one, or its newest part in an older one, measured once
-            and not confirmed; None without one.
-        next_loop_keyframe: Number of the first keyframe for which a loop closure is looked for again.
+            and not confirmed by a second measurement; None without one.
+        next_loop_keyframe: Number of the first keyframe for which a loop closure is looked for, after the
+            last loop closure.
     """
 
     segment: int = 0
@@ -182,7 +185,8 @@ class MonocularTracker:
     Use it as `Tracker`: ``prepare(frame)``, then ``accept(query, T_camera_world, inliers)`` until a
     `TrackedFrame` comes back.
 
-    A segment begins with two views that have parallax; the frames between them get their poses then.  A frame
+    A segment begins with two views that have parallax; when the second view comes, the frames between the two
+    views also get poses.  A frame
     is matched near the pixels at which a constant velocity predicts the landmarks around the reference
     keyframe, then in a wider radius, then with the last frame, then with the newest keyframes and with the
     most similar keyframes of all segments.  If no pose fits, the frame is lost, and waits for the start of a
@@ -198,7 +202,8 @@ class MonocularTracker:
         starting_frames: Number of frames without a pose before the first start, also those that get their
             poses then.
         joins: All joins of segments so far, in their order.
-        loop_scales: By what each loop closure so far multiplied the lengths around the newest frames.
+        loop_scales: For each loop closure so far, the factor by which it multiplied the lengths around the
+            newest frames, in their order.
     """
 
     def __init__(
@@ -236,9 +241,9 @@ class MonocularTracker:
 
     @property
     def unrecognised(self) -> int:
-        """Number of frames since the last pose that show enough features and no known place.
+        """Number of frames since the last pose that show at least 100 features and no known place.
 
-        An image with few features, such as that of a covered lens, does not count.
+        An image with fewer features, such as that of a covered lens, does not count.
         """
         return self._state.unrecognised
 
@@ -256,13 +261,13 @@ class MonocularTracker:
     def length_factor(self) -> float:
         """Factor by which `rescale` and loop closures multiplied the lengths around the newest frames so far.
 
-        It counts from the begin of the present segment, of which there must be one.
+        The factor is 1 when the present segment begins.  Before the first segment it must not be read.
         """
         return self._present.length_factor
 
     @property
     def segment_keyframes(self) -> int:
-        """The number of keyframes of the present segment, of which there must be one."""
+        """The number of keyframes of the present segment; not to be read before the first segment."""
         return self._present.map.keyframe_count
 
     def keyframe(self, number: int, segment: int | None = None) -> AdjustedKeyframe:
@@ -298,7 +303,10 @@ class MonocularTracker:
         """
         self._open.refuse_open()
         if self._segments and frame.camera != self._present.map.camera:
-            raise UsageError("the camera of this frame is another one", hint="use one tracker per camera")
+            raise UsageError(
+                "the camera of this frame is another one: its intrinsics or its size differ",
+                hint="use one tracker per camera",
+            )
         self.frames += 1
         self._frame, view = frame, self._extract(frame)
         self._raw = view.features
@@ -367,8 +375,9 @@ class MonocularTracker:
     def rescale(self, scale: float, segment: int = 0) -> None:
         """Multiply all lengths of a segment by *scale*, such as by the metres per unit.
 
-        The start pose of the world is the centre, and stays; all other poses and points of the segment that
-        were returned before change.  A segment that does not exist is ignored.
+        The lengths are multiplied about the position of *T_world_start*, where segment 0 begins.  The poses
+        and points of the segment that were returned before change, but for a pose at that position.  A
+        segment that does not exist is ignored.
         """
         if segment not in self._segments:
             return
@@ -516,7 +525,11 @@ class MonocularTracker:
     # --- Join segments, and close loops ---
 
     def _find_join(self) -> Generator[PoseQuery, QueryAnswer, None]:
-        """Ask for the place of the last frame in other segments; join two once two measurements agree."""
+        """Ask for the place of the last frame in other segments; join two once two measurements agree.
+
+        Two measurements are compared if they are of the same other segment and no measurement lies between
+        them.
+        """
         last, present = self._state.last, self._state.segment
         assert last is not None
         keyframes = list_other_segments(self._maps, last.view.place_vector, present)
@@ -568,8 +581,8 @@ class MonocularTracker:
             keyframes: (segment, keyframe) of the candidates.
 
         Returns:
-            The similarity, if the measurement before it is of the same segment and agrees.  Otherwise None;
-            the measurement is then kept for the comparison with the next one.
+            The similarity, if the measurement before this one is of the same segment and agrees with it.
+            Otherwise None; a new measurement is kept in the state for the comparison with the next one.
         """
         # 1. Solve and verify the pose by the keyframe with the most matches.
         best = match_candidates(self._maps, keyframes, posed.view.features)[0]
@@ -606,7 +619,8 @@ class MonocularTracker:
         Args:
             segment: Number of the newer segment.
             similarity: Where it lies in the older one.
-            keyframe: Keyframe of the newer segment that shows the same place as that of *similarity*.
+            keyframe: Keyframe of the newer segment that shows the same place as ``similarity.keyframe``, a
+                keyframe of the older one.
         """
         newer, into = self._segments.pop(segment), self._segments[similarity.segment]
         newer.move(similarity.T, similarity.scale)
@@ -676,7 +690,10 @@ class MonocularTracker:
         )
 
     def _is_clear(self, answer: QueryAnswer, match_count: int) -> bool:
-        """Return whether an answer to a query of *match_count* matches, sent or not, alone proves a place."""
+        """Return whether an answer alone proves a place.
+
+        *match_count* is the number of all matches, of which the query may have sent only a part.
+        """
         return answer.is_clear(min(match_count, self.options.max_matches))
 
     def _verify(
@@ -712,8 +729,8 @@ class MonocularTracker:
     def _start_or_lose(self, view: MonocularView, reason: str) -> TrackedFrame:
         """Let a frame without a pose wait for a second view; or begin a segment with it as the second view.
 
-        A frame with fewer than 100 features does neither.  A later segment begins only if more than
-        ``segment_after`` frames with enough features came since the last pose.
+        A frame with fewer than 100 features is lost without waiting.  A segment after the first begins only
+        if more than ``segment_after`` frames with 100 features or more came since the last pose.
         """
         if len(view.features) >= _MIN_START_MATCHES:
             self._state = replace(self._state, unrecognised=self._state.unrecognised + 1)
@@ -735,7 +752,7 @@ class MonocularTracker:
     def _find_start(self, view: MonocularView) -> tuple[TwoViewStart | None, Rows, Rows, str]:
         """Find the oldest waiting view that shows the same place as the present one, and their relative pose.
 
-        Waiting views before it are dropped.
+        Older waiting views, which do not show that place, are dropped.
 
         Returns:
             The start, None if the two views do not suffice; the rows of matched features in both views; why

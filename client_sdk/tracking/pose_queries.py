@@ -22,10 +22,11 @@ from rse_pf.slam.tracking import Features
 __all__ = ["CLEAR_INLIERS", "FrameSteps", "OpenQuery", "QueryAnswer", "make_query", "round_for_wire"]
 
 CLEAR_INLIERS = 40
-"""Fewest inliers of an answer that recognises a place which the camera did not see just before."""
+"""Fewest inliers of an answer that is accepted without further evidence, at a place that the camera did not
+see just before."""
 _CLEAR_RATIO = 0.5
-"""Smallest share of inliers among the matches of an answer that recognises a place which the camera did not
-see just before: perceptual aliases have fewer."""
+"""Smallest share of inliers among the matches of an answer that is accepted without further evidence, at a
+place that the camera did not see just before: perceptual aliases have fewer."""
 _MIN_REFERENCE_DEPTH_M = 0.01
 """Depths are sent only if all points lie more than this, in metres, before the reference camera."""
 
@@ -52,7 +53,10 @@ class QueryAnswer:
         return rigid(self.T_camera_world)
 
     def is_clear(self, match_count: int) -> bool:
-        """Return whether the answer alone proves a place: enough of its *match_count* matches are inliers."""
+        """Return whether the answer alone proves a place.
+
+        At least 40 matches, and at least half of its *match_count* matches, must be inliers.
+        """
         return not self.is_weak and self.inliers >= max(CLEAR_INLIERS, _CLEAR_RATIO * match_count)
 
 
@@ -82,8 +86,8 @@ def make_query(
         max_iterations: Largest number of RANSAC iterations.
         max_matches: Largest number of matches that are sent; an even sample is taken of more.
         against: The source of the landmarks, see `PoseQuery`.
-        T_world_reference: ``(4, 4)``, pose of the reference camera, in whose frame points are sent; None
-            sends them in the frame of the map.
+        T_world_reference: ``(4, 4)``, pose of the reference camera, in whose frame points are sent: the
+            predicted camera, the last one, or that of a keyframe.  None sends points in the frame of the map.
         depth_noise: Noise model of the depths; None for a Kinect's.
     """
     rows = np.arange(len(matches))
@@ -96,7 +100,8 @@ def make_query(
         points = transform(inverse(T_world_reference), points)
     points, pixels = round_for_wire(points, image.pixels[features])
     sent_depths_m = np.zeros(len(points))
-    # The solver compares depths with those of the reference camera: all points must lie before it.
+    # With depths, the solver also uses the depth of each point in the frame of the reference camera, which
+    # must be above 0.
     if not (len(points) and points[:, 2].min() <= _MIN_REFERENCE_DEPTH_M):
         depths_m = image.points_camera[features, 2]
         sent_depths_m = np.nan_to_num(depths_m, posinf=0.0, neginf=0.0).round(3)
@@ -112,15 +117,17 @@ def make_query(
 
 
 def round_for_wire(points_world: Array, pixels: Array) -> tuple[Array, Array]:
-    """Round points to 0.0001 (0.1 mm) and pixels to 0.01 px: server and robot then solve the same numbers.
+    """Round points to 0.0001 (0.1 mm) and pixels to 0.01 px.
 
-    The rounding moves a pose by about 0.02 mm and shrinks the message to a third.
+    A server and the solver on the robot then get the same numbers.  The rounding moves a pose by about 0.02
+    mm and shrinks the message to a third.
     """
     return np.round(points_world, 4), np.round(pixels, 2)
 
 
 class OpenQuery:
-    """The steps of the present frame, and the query that waits for its answer."""
+    """The generator of the present frame's steps, and the query whose answer it waits for, if there is
+    one."""
 
     def __init__(self) -> None:
         self._steps: FrameSteps | None = None

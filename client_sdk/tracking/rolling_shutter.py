@@ -30,16 +30,18 @@ __all__ = [
 _MAX_READOUT_S = 0.05
 """Largest estimated readout time of a camera, in seconds: slower sensors are not built."""
 _INITIAL_SIGMA_S = 0.02
-"""Standard deviation, in seconds, of the readout time around 0 before any image was measured."""
+"""Standard deviation, in seconds, of the first estimate of the readout time, which is 0 (a global
+shutter)."""
 _MIN_RATE_RAD_S = 0.2
 """Rotation rate, in rad/s, below which an image does not update the readout time: its shear is too small."""
 _SMALL_SINE = 1e-5
 """Sine of an angle below which the angle equals its sine in double precision."""
 _ROTATION_SIGMA_RAD = 0.01
-"""Standard deviation, in radians, of the rotation during a readout that one image measures: the errors of its
-features are correlated, so that more features do not make it smaller."""
+"""Standard deviation, in radians, with which one image measures the rotation of the camera during its
+readout: the errors of its features are correlated, so that more features do not make it smaller."""
 _DRIFT_SIGMA_S = 0.0003
-"""Standard deviation, in seconds, by which the readout time may change from one image to the next."""
+"""Standard deviation, in seconds, that the Kalman filter adds for each image, so that it does not rely on the
+first images for ever; the readout time itself is constant."""
 _MIN_LANDMARKS = 30
 """Fewest inliers with depth by which one image measures the readout time."""
 
@@ -65,10 +67,11 @@ def undo_rolling_shutter(features: Features, camera: Camera, rotation_rad: Array
 
 
 def shutter_displacements(features: Features, points_camera: Array, camera: Camera, rate: Array) -> Array:
-    """Return how far corrected points move for each second that the readout of the image takes longer.
+    """Return the derivatives of the corrected points by the readout time.
 
-    The displacements are added to points that `undo_rolling_shutter` returned.  Points of the middle row do
-    not move, and only the rotation of the camera counts.
+    If the estimated readout time grows by *t* seconds, a point that `undo_rolling_shutter` returned moves by
+    *t* times its displacement.  Points of the middle row do not move, and only the rotation of the camera
+    counts.
 
     Args:
         features: ``n`` features as the image shows them.
@@ -77,7 +80,7 @@ def shutter_displacements(features: Features, points_camera: Array, camera: Came
         rate: ``(3,)`` rad/s, rotation rate of the camera in its own frame.
 
     Returns:
-        ``(n, 3)``, in the unit of the points a second, in the camera's frame.
+        ``(n, 3)``, in the unit of the points per second, in the camera's frame.
     """
     moments = _readout_moments(features.pixels, camera)
     displacements: Array = moments[:, None] * (points_camera @ skew(rate).T)
@@ -178,7 +181,9 @@ def _readout_moments(pixels: Array, camera: Camera) -> Array:
 
 
 def _rotate_by_shares(points: Array, shares: Array, rotation_rad: Array) -> Array:
-    """Rotate each of ``(n, 3)`` points by its share of a rotation vector; exact to 1e-5 below half a radian.
+    """Rotate each of ``(n, 3)`` points by its share of a rotation vector.
+
+    The relative error of a rotated point is below 1e-5 if its share of the rotation is below half a radian.
 
     This is the formula of Rodrigues with sine and cosine as series of the angle.
     """

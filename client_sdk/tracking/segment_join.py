@@ -9,7 +9,8 @@ from rse_pf.geometry import Array
 __all__ = ["NOT_JOINED", "Join"]
 
 NOT_JOINED = "in a segment that is not joined to the first one yet"
-"""Reason in the result of a frame whose pose is not in the frame of the first segment."""
+"""`TrackedFrame.reason` of a frame that has a pose, but in the world of its own segment and not in that of
+the first segment."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,6 @@
-"""Records of the segments of a drive that a mapper keeps: poses, point cloud and keyframes, until a join.
+"""Records of the segments of a drive that a mapper keeps: poses, point cloud and keyframes.
+
+At a join, the record of the newer segment is added to that of the older one, and is removed.
 
 A tracker without depth keeps its segments itself, because every new keyframe corrects them; here are
 functions that read them out.
@@ -37,8 +39,8 @@ _MAX_DEPTH_DEVIATION = 0.05
 """Largest uncertainty of the depth of a stereo pair's point that is added to a cloud, as a share of the
 depth."""
 _DISPARITY_SIGMAS = 2.0
-"""Uncertainty of a stereo pair's depth that is compared with `_MAX_DEPTH_DEVIATION`, in standard deviations
-of a sharp image: other images are about twice as noisy."""
+"""The standard deviation of a stereo pair's depth in a sharp image times this is compared with
+`_MAX_DEPTH_DEVIATION`: other images are about twice as noisy."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,7 +68,7 @@ class SegmentRecord:
         cloud: Point cloud.
         stamps_s: Times of the frames with a pose, in seconds.
         poses: ``T_world_camera`` ``(4, 4)`` of these frames.
-        keyframes: Keyframes of a map, if the mapper keeps them.
+        keyframes: Keyframes for an encoded map, if the mapper keeps them (its *keyframes_of* is a name).
         keyframe_points: Points that each stereo keyframe added to the cloud, by which the cloud is made again
             after an adjustment; None once there were more than `MAX_ADJUSTED_KEYFRAMES` keyframes.
     """
@@ -107,8 +109,8 @@ class SegmentRecord:
         """Return a new record of the segment after an adjustment of its stereo keyframes.
 
         The poses of all frames and keyframes, and the depths of the keyframes, are corrected.  The cloud is
-        built anew from the points of the keyframes; without such points (they were forgotten, or the cloud
-        has other sources) it is the same object as before.
+        built anew from the points of the keyframes; without such points (there were too many keyframes, or
+        the cloud was not made of keyframes) the cloud stays uncorrected, as the same object.
         """
 
         def moved(stamp_s: float, pose: Array) -> Array:
@@ -159,7 +161,10 @@ class SegmentRecord:
 
 
 class DriveRecords:
-    """The records of all segments of one drive; the first segment, 0, is what the user of a mapper sees."""
+    """The records of all segments of one drive.
+
+    The first segment, number 0, is that of `Mapper.trajectory` and `Mapper.map`.
+    """
 
     def __init__(self, options: MapOptions) -> None:
         self._options = options
@@ -277,7 +282,7 @@ def select_certain_rows(frame: Frame, features: Features) -> npt.NDArray[np.int6
 
 
 def make_keyframe(tracked: TrackedFrame, pose: Array, features: Features, robot: str) -> Keyframe:
-    """Return a tracked frame as a keyframe of a map, with the number 0.
+    """Return a tracked frame as a keyframe of a map; `Mapper.encoded_map` replaces its number 0.
 
     Args:
         tracked: The frame.
@@ -301,7 +306,8 @@ def make_keyframe(tracked: TrackedFrame, pose: Array, features: Features, robot:
 def landmark_keyframes(tracker: MonocularTracker, camera: Camera, robot: str) -> list[Keyframe]:
     """Return the keyframes of the first segment of a tracker without depth, as they are adjusted now.
 
-    All have the number 0.  Features without a landmark have no point (NaN).
+    All have the number 0, which `Mapper.encoded_map` replaces.  Features without a landmark have no point
+    (NaN).
 
     Args:
         tracker: The tracker.

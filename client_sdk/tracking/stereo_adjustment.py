@@ -1,8 +1,8 @@
 """Adjust the keyframes of a stereo drive together with their landmarks and the offset of its disparities.
 
-A calibration whose disparities are all a little too small makes far points too far, and a path too long.
-Points that are seen both near and far determine the offset, but only if poses and landmarks are adjusted with
-it.
+An error of the calibration, such as a small rotation of one camera, adds a nearly constant offset to all
+disparities.  If disparities are too small, far points are too far, and a path is too long.  Points that are
+seen both near and far determine the offset, but only if poses and landmarks are adjusted with it.
 """
 
 from __future__ import annotations
@@ -49,9 +49,9 @@ adjustment does not improve their drives."""
 _MIN_CLEAR_SIGMAS = 4.0
 """Smallest disparity offset that changes a map, in its own standard deviations."""
 _CURVE = UNKNOWNS.index("curve")
-"""Index of ``curve`` among the unknowns of a self-calibration: the metres by which a measured depth is too
-large, for each square metre of depth.  Times focal length (pixels) and baseline (metres) it is the disparity
-offset."""
+"""Index of ``curve`` among the unknowns of a self-calibration.  A measured depth z is too large by curve
+times z^2; the unit of the curve is 1/m.  Times focal length (pixels) and baseline (metres) the curve is the
+disparity offset in pixels."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -65,9 +65,11 @@ class StereoAdjustment:
         offset_px: Pixels by which all disparities are too small.
         deviation_px: Standard deviation of the offset, in pixels.
         bend_m_per_px: Root mean square change of the keyframes' positions, in metres, by an offset of one
-            pixel that is not corrected, see `Calibrated.bend_m`.
-        growth_per_px: Relative growth of the path if the offset were larger by a pixel.
-        noise_m: Root mean square of the random error of the keyframes' positions, in metres.
+            pixel that is not corrected, see `Calibrated.bend_m`; `rse-pf check` reports it.
+        growth_per_px: Relative growth of the extent of the path if one pixel more is added to the
+            disparities; negative, since points are then nearer.
+        noise_m: Root mean square of the random error of the keyframes' positions, in metres, by the
+            covariance of the adjustment.
     """
 
     stamps_s: Array

@@ -49,17 +49,20 @@ Rows = npt.NDArray[np.int64]
 
 _GUIDED_MATCHES_FACTOR = 3
 """Fewest matches near the predicted pose for which a pose is queried, as a multiple of ``min_inliers``: with
-fewer the prediction is most likely wrong, and the frame is matched with the last one instead.  Also the
-fewest features with depth of the first frame of a later segment, as such a multiple."""
+fewer the prediction is most likely wrong, and the frame is matched with the last one instead."""
+_BEGIN_DEPTHS_FACTOR = 3
+"""Fewest features with depth of the frame that begins a later segment, as a multiple of ``min_inliers``: a
+frame with fewer is most likely of a covered lens."""
 _GUIDED_RATIO = 0.35
-"""Smallest share of inliers among the matches that a query sent, for a pose that was solved by matches near a
-predicted pose to be verified."""
+"""Smallest share of inliers among the matches that a query sent, for a pose that was solved by matches near
+predicted pixels: with fewer the pose is dropped without verification."""
 _LAST_FRAME_RATIO = 0.4
 """Smallest share of inliers among the matches that a query sent, for a pose that was solved by matches with
-the last frame to be verified: no prediction supports these matches."""
+the last frame: with fewer the pose is dropped without verification.  No prediction supports these matches."""
 _NEARBY_RATIO = 0.25
-"""Smallest share of inliers among all matches with a keyframe, also those that the query did not send, for a
-pose near the camera's last pose: low, because the place itself is plausible."""
+"""Smallest share of inliers among all matches with a keyframe, also those that the query did not send, with
+which an untracked frame is relocalised near the camera's last pose: low, because the place itself is
+plausible."""
 _VERIFIED_RATIO = 0.3
 """Smallest share of the landmarks matched around a solved pose that must agree with the fitted pose."""
 _VERIFY_RADIUS_PX = 8.0
@@ -76,16 +79,18 @@ _ENOUGH_MAP_MATCHES = 120
 """With this many matched landmarks of the map, a pose is verified without points of the last frame: a chain
 of frames drifts, the map does not."""
 _MAX_JUMPS = 4
-"""Largest multiple of the plausible motion between two frames that is allowed after a loss; the multiple
-grows by one with each lost frame.  A recognised place farther away is accepted only by a clear answer."""
+"""Largest multiple of the plausible motion between two frames that is allowed after a loss; the multiple is 2
+after one lost frame, and grows by one with each further lost frame up to this.  A recognised place farther
+away is accepted only by a clear answer."""
 _STEREO_JUMP_SHARE = 0.15
 """Largest plausible motion of a stereo pair between two frames, as a share of the median depth that it sees,
 where this is more than ``max_jump_m``: a fast car sees far."""
 _MIN_INTERVAL_S = 1e-3
 """Smallest time between two frames, in seconds, by which a rotation is divided: time stamps may repeat."""
 _MAX_RATE_RAD_S = 3.0
-"""Largest rotation rate, in rad/s, that is taken for a motion and not for a cut in a video: with a readout of
-20 ms it would shear an image by 3.4 degrees."""
+"""Largest rotation rate, in rad/s, at which the rolling shutter is undone: with a readout of 20 ms the image
+is sheared by 3.4 degrees.  A faster rotation between two frames is most likely a cut in a video; such a frame
+is tracked, but its image is used as it is."""
 _MAX_RELOCALISATION_QUERIES = 3
 """Largest number of pose queries by which one lost frame is relocalised, against the keyframes with the most
 matches: bounds the time of a lost frame."""
@@ -168,7 +173,8 @@ class Tracker:
         step = tracker.prepare(frame)
         while isinstance(step, PoseQuery):
             T_camera_world, inliers = ...   # the PnP service's answer, or None, 0 on any failure
-            step = tracker.accept(step, T_camera_world, inliers)
+            is_weak = ...                   # whether the verdict of the answer is "weak"
+            step = tracker.accept(step, T_camera_world, inliers, is_weak=is_weak)
         # step is now the TrackedFrame
 
     A frame is matched near the pixels at which a constant velocity predicts the landmarks of the nearest
@@ -236,9 +242,10 @@ class Tracker:
 
     @property
     def unrecognised(self) -> int:
-        """Number of frames since the last pose that show enough features and no known place.
+        """Number of frames since the last pose that show enough features with depth and no known place.
 
-        An image with few features, such as that of a covered lens, does not count.
+        Enough are three times ``min_inliers``.  An image with fewer, such as that of a covered lens, does not
+        count.
         """
         return self._state.unrecognised
 
@@ -279,8 +286,9 @@ class Tracker:
         further frames.  The next frame is relocalised in any case.
 
         Returns:
-            By segment, how the poses that were returned before change; only of the segments that were
-            changed.  Empty without stereo pairs, and if no frame came since the last call.
+            The adjustment of each segment that was changed, by the number of the segment; it tells how poses
+            that were returned before change.  Empty without stereo pairs, and if no frame came since the last
+            call.
 
         Raises:
             UsageError: A query is open.
@@ -331,8 +339,9 @@ class Tracker:
 
         Args:
             query: The query that `prepare` or `accept` returned last.
-            T_camera_world: ``(4, 4)`` as the PnP service returns it, where world is the frame of the query's
-                reference camera; None if there was no answer.
+            T_camera_world: ``(4, 4)`` as the PnP service returns it: maps the world of the query, which is
+                the frame of its reference camera and not the world of the segment, to the frame of the
+                camera.  None if there was no answer.
             inliers: Number of correspondences that agree with the pose.
             is_weak: Whether the service calls the evidence for the pose weak; the frame then changes no
                 landmark and becomes no keyframe.
@@ -641,7 +650,7 @@ class Tracker:
 
         An accepted pose updates the estimate of the depth noise.  With *is_continuous* the image of a depth
         camera (not of a stereo pair) also updates the estimate of the readout time, and the second frame of a
-        segment corrects the first.
+        segment gives the rotation rate by which the rolling shutter of the first frame is undone.
 
         Args:
             view: The image.
@@ -773,7 +782,8 @@ class Tracker:
     def _is_keyframe(self, posed: PosedView) -> bool:
         """Return whether a frame is far from all keyframes, or sees much fewer landmarks than the newest.
 
-        A frame with a weak pose, or with fewer than twice ``min_inliers``, is never a keyframe.
+        The limits are the options ``keyframe_m``, ``keyframe_deg`` and ``keyframe_share``.  A frame with a
+        weak pose, or with fewer inliers than twice ``min_inliers``, is never a keyframe.
         """
         options = self.options
         if posed.is_weak or posed.inliers < 2 * options.min_inliers:
@@ -786,12 +796,12 @@ class Tracker:
     def _begin_or_lose(self, view: View, match_count: int) -> TrackedFrame:
         """Lose a frame without a pose; or begin a segment with it, if enough frames before it were lost.
 
-        The first segment begins at the start pose, with ``min_inliers`` features with depth.  Later ones
-        begin at the last accepted pose, with three times as many, after more than ``segment_after`` such
-        frames.
+        The first segment begins at the start pose, with a frame of at least ``min_inliers`` features with
+        depth.  A later one begins at the last accepted pose, with a frame of at least three times as many,
+        after more than ``segment_after`` frames with so many features, but without a pose, came since then.
         """
         feature_count = int(np.isfinite(view.features.points_camera[:, 2]).sum())
-        factor = _GUIDED_MATCHES_FACTOR if self._segments else 1
+        factor = _BEGIN_DEPTHS_FACTOR if self._segments else 1
         if feature_count < factor * self.options.min_inliers:
             return self._lose(match_count)
         if self._segments:
