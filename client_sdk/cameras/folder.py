@@ -54,9 +54,8 @@ _DEPTH_FOLDERS = ("depth", "depths", "aligned_depth", "depth_image", "depth_imag
 _PAIR_FOLDERS = ("{}", "image_{}", "images_{}", "{}_images", "img_{}", "rgb_{}")
 """Names of the two folders of a stereo pair, with ``left`` and ``right`` in the place of the braces."""
 _ASSUMED_PERIOD_S = 0.1  # time between images if neither their names nor the intrinsics state times or a rate
-_MAX_PAIR_DIFFERENCE_S = (
-    0.02  # largest difference of the times in the names of two images that are paired by time
-)
+_MAX_PAIR_DIFFERENCE_S = 0.02
+"""Largest difference of the times in the names of two images that are paired by time."""
 _NANOSECOND_DIGITS = 9
 """Most digits of the nanoseconds in a name: ROS names images SECONDS.NANOSECONDS, often without the leading
 zeros of the nanoseconds."""

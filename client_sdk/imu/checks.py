@@ -41,9 +41,8 @@ _MIN_MEAN_ACCEL = 0.7  # smallest plausible mean magnitude of an accelerometer, 
 _MAX_MEAN_ACCEL = 1.5  # largest plausible mean magnitude of an accelerometer, as a multiple of gravity
 _REST_S = 0.5  # length of the time windows in which an IMU is tested for being stationary
 _MIN_REST_WINDOWS = 3  # stationary windows that are needed to measure the magnitude of gravity in them
-_REST_NOISE_FACTOR = (
-    3.0  # multiple of its white noise by which the samples of a stationary sensor may scatter
-)
+_REST_NOISE_FACTOR = 3.0
+"""Multiple of its white noise by which the samples of a stationary sensor may scatter."""
 _REST_GYRO_RAD_S = 0.02  # standard deviation of a stationary gyroscope that is allowed beyond its noise
 _REST_ACCEL_M_S2 = 0.1  # standard deviation of a stationary accelerometer that is allowed beyond its noise
 
@@ -77,9 +76,8 @@ _MIN_DEGREES_RATIO = 40.0
 """Gyroscope rates divided by camera rates above which the IMU is refused because its unit is degrees per
 second: a degree per second read as rad/s is 57 times too large."""
 _MAX_RATE_RATIO = 1.25  # largest ratio of gyroscope and camera rates, or its inverse, that is not refused
-_MAX_AXES_ERROR_DEG = (
-    8.0  # largest rotation between the gyroscope's axes and T_imu_camera that is not refused
-)
+_MAX_AXES_ERROR_DEG = 8.0
+"""Largest rotation between the gyroscope's axes and T_imu_camera that is not refused."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

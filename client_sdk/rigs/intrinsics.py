@@ -47,12 +47,10 @@ __all__ = [
 ]
 
 _T = TypeVar("_T")
-_MAX_FILE_BYTES = (
-    1 << 20
-)  # largest intrinsics.json or rig.json that is read; a real file has some hundred bytes
-_MIN_DEPTH_SCALE = (
-    1e-2  # smallest depth_scale: with 0.01 one unit of a depth image is 100 m, too coarse to map
-)
+_MAX_FILE_BYTES = 1 << 20
+"""Largest intrinsics.json or rig.json that is read; a real file has some hundred bytes."""
+_MIN_DEPTH_SCALE = 1e-2
+"""Smallest depth_scale: with 0.01 one unit of a depth image is 100 m, too coarse to map."""
 _MAX_DEPTH_SCALE = 1e7  # largest depth_scale: with 10^7 the largest value of 16 bits is 7 mm, too near to map
 _MIN_RATE_HZ = 1e-3  # smallest rate_hz: between slower images no motion could be tracked
 _MAX_RATE_HZ = 1e4  # largest rate_hz: no camera is faster

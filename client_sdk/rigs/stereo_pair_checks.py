@@ -29,9 +29,8 @@ __all__ = [
     "measure_pair",
 ]
 
-_MAX_FEATURES = (
-    600  # most ORB features of each image that are matched: enough for the medians of `find_fault`
-)
+_MAX_FEATURES = 600
+"""Most ORB features of each image that are matched: enough for the medians of `find_fault`."""
 _MAX_DISTANCE_RATIO = 0.8
 """Ratio of the Hamming distances of the nearest and the second nearest descriptor, from which on a match is
 ambiguous and left out (Lowe's ratio test)."""
@@ -60,13 +59,11 @@ _MAX_MEDIAN_ROW_OFFSET_PX = 1.5
 the middle 80 % of the row offsets all lie beyond it on one side, this fault is certain, and no delay is
 estimated."""
 _MIN_DELAY_S = 0.004  # a shorter time between the two images of a pair is not reported as a delay
-_MIN_DELAY_EFFECT_PX = (
-    0.7  # a delay that makes row offsets scatter (standard deviation) by less is not reported
-)
+_MIN_DELAY_EFFECT_PX = 0.7
+"""A delay that makes row offsets scatter (standard deviation) by less is not reported."""
 _MIN_EXPLAINED_VARIANCE = 0.3  # share of the variance of row offsets that a reported delay must explain
-_FAST_PX_S = (
-    15.0  # a feature that moves up or down in the image faster than this is fast: a delay shows in it
-)
+_FAST_PX_S = 15.0
+"""A feature that moves up or down in the image faster than this is fast: a delay shows in it."""
 _MAX_RESIDUAL_PX = 2.0  # a match whose row offset differs by more from that of the delay is an outlier
 _ALL_FAST_SHARE = 0.9
 """If more than this share of the features is fast, the slow ones are too few to measure the row offset that

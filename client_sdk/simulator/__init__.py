@@ -1,8 +1,8 @@
 """Render a furnished world for robots without a camera: exact poses, and images with the noise of a Kinect.
 
 1. `world` makes the rooms and their furniture as textured rectangles.
-2. `drive` makes the trajectories of robots through the rooms, and yields their frames.
-3. `renderer` draws images and exact depths, and adds the noise of the sensors.
+2. `renderer` draws images and exact depths, and adds the noise of the sensors.
+3. `drive` makes the trajectories of robots through the rooms, and yields the rendered frames.
 """
 
 from client_sdk.simulator.drive import (

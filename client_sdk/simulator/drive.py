@@ -32,21 +32,23 @@ __all__ = [
 ]
 
 RATE_HZ = 5.0  # frames per second of a rendered drive, as in the paper's experiments (Sect. 6.2)
-STEP_M = 0.068  # distance between the camera positions of two frames: a robot that drives at 0.34 m/s
+STEP_M = 0.068  # distance along the loop between two successive frames: a robot that drives at 0.34 m/s
 SIMULATED_CAMERA = Camera(fx=525.0, fy=525.0, cx=319.5, cy=239.5, width=640, height=480)
 """Intrinsics of the rendered images: the nominal ones of a Kinect."""
-_OVERLAP_M = 0.6  # distance that a robot drives beyond the start of the next robot, so that their maps merge
+_OVERLAP_M = 0.6  # distance that a robot drives past the start of the next robot, so that their maps overlap
 _LUMA_WEIGHTS = (0.299, 0.587, 0.114)  # weights of red, green and blue in a grey image (ITU-R BT.601)
 _EYE_HEIGHT_M = 1.25  # mean height of the camera above the floor
-_LOOK_AHEAD_M = 1.0  # the camera looks at the point of the loop that is this far ahead
-_SWAY_M = 1.7  # length of the path after which the swaying in height repeats; pitch and roll sway more slowly
+_LOOK_AHEAD_M = 1.0  # the camera looks in the horizontal direction of the point of the loop this far ahead
+_SWAY_PERIOD_M = 1.7
+"""Distance along the loop after which the height repeats; pitch and roll have longer periods."""
 _PATH_STEP_M = 0.01  # distance between the points that describe the loop
 _SMOOTHING_POINTS = 45
-"""Points of the loop, 1 cm apart, on either side of a point, over which each of two passes averages the loop
-to round its corners."""
+"""To round the corners of the loop, each point (1 cm apart) is replaced by the mean of itself and this many
+points on either side; this is done twice."""
 
-# Corners (x, y) of the loop, metres: x from the wall of their room that has the smaller x, y from the wall of
-# all rooms at y = 0.  The way there leads to larger x, the way back to smaller x.
+# Corners (x, y) of the loop in one room, metres.  x is measured from the beginning of the room, its wall with
+# the smaller x; y is that of the world.  On the way there a robot drives to larger x, on the way back to
+# smaller x.
 _Corners = tuple[tuple[float, float], ...]
 _WAY_THERE_WITHOUT_TABLE: _Corners = ((1.4, 1.75), (2.5, 1.65), (3.6, 1.75))
 _WAY_THERE_WITH_TABLE: _Corners = ((1.3, 1.35), (2.5, 1.0), (3.7, 1.35))
@@ -63,7 +65,7 @@ _DOOR_ON_WAY_BACK = (0.0, 2.55)
 
 
 def render_frames(robot: int, robots: int, frames: int, seed: int, rooms: int = ROOMS) -> Iterator[Frame]:
-    """Yield the RGB-D frames of one robot of a fleet; frame i is at pose i of `true_trajectory`.
+    """Yield the RGB-D frames of one robot of a fleet; frame i has pose i of `true_trajectory`.
 
     Args:
         robot: Number of the robot, from 0.
@@ -86,7 +88,7 @@ def render_along(truth: Trajectory, world: World, noise: Sequence[int]) -> Itera
     Args:
         truth: Pose and time stamp of each frame.
         world: The world to draw.
-        noise: Numbers that, followed by the row of the frame in *truth*, seed the noise of image and depth.
+        noise: Numbers that, followed by the index of the frame in *truth*, seed the noise of image and depth.
     """
     renderer = Renderer(world, SIMULATED_CAMERA)
     for row in range(len(truth)):
@@ -108,7 +110,7 @@ def render_pairs(truth: Trajectory, world: World, noise: Sequence[int], baseline
     Args:
         truth: Pose of the left camera and time stamp of each frame.
         world: The world to draw.
-        noise: Numbers that, followed by the row of the frame in *truth*, seed the noise of both images.
+        noise: Numbers that, followed by the index of the frame in *truth*, seed the noise of both images.
         baseline_m: Distance from the left camera to the right one, along x of the left camera.
     """
     renderer, T_left_right = Renderer(world, SIMULATED_CAMERA), np.eye(4)
@@ -128,7 +130,7 @@ def render_pairs(truth: Trajectory, world: World, noise: Sequence[int], baseline
 
 
 def true_trajectory(robot: int, robots: int, frames: int, seed: int, rooms: int = ROOMS) -> Trajectory:
-    """Return the exact poses ``T_world_camera`` of `render_frames`, which has the same arguments.
+    """Return the exact poses ``T_world_camera`` of the frames of `render_frames` with the same arguments.
 
     The z axis of the world points up.  From frame to frame a robot moves by 6.8 cm and rotates by at most 4
     degrees; in three rooms the loop is about 28 m long.
@@ -149,17 +151,16 @@ def loop_trajectory(
 ) -> Trajectory:
     """Return exact poses ``T_world_camera`` on the loop, with time stamps 0.2 s apart from 0 on.
 
-    The time stamps do not depend on *step_m*.  The loop begins at the door between rooms 0 and 1, leads
-    through each room before the last one in 5 m, then around the last room, back through the others, and
-    around room 0.
+    The time stamps do not depend on *step_m*.  For rooms 0 to n - 1, the closed loop begins in the door
+    between rooms 0 and 1.  It leads through rooms 1 to n - 2, around room n - 1, back through rooms n - 2 to
+    1, around room 0, and to its beginning.
 
     Args:
-        begin_m: Distance along the loop at which the first pose lies; the loop is closed, so that distances
-            beyond its length begin again.
+        begin_m: Distance along the loop at which the first pose lies; it may be longer than the loop.
         frames: Number of poses.
         seed: Seed of the phase of the camera's swaying.
         rooms: Number of rooms in a row.
-        step_m: Distance along the loop between two poses.
+        step_m: Distance along the loop between two successive poses.
 
     Raises:
         UsageError: There are fewer than 2 rooms.
@@ -173,13 +174,14 @@ def loop_trajectory(
 def frames_to_overlap(robots: int, rooms: int = ROOMS) -> int:
     """Return how many frames a robot needs to reach the start of the next robot and drive 0.6 m past it.
 
-    The starts are spread evenly over the loop.  A single robot reaches its own start.
+    The starts are spread evenly over the loop.  For a single robot, the next start is its own, after the
+    whole loop.
     """
     return math.ceil((_make_loop(rooms)[1] / robots + _OVERLAP_M) / STEP_M)
 
 
 def _make_loop(rooms: int) -> tuple[Array, float]:
-    """Return the closed, rounded loop as ``(n, 2)`` points x and y about 1 cm apart, and its length (m)."""
+    """Return the closed, rounded loop as ``(n, 2)`` points (x, y) about 1 cm apart, and its length (m)."""
     path = _resample(np.array(_loop_corners(rooms)))[0]
     for _ in range(2):
         path = _resample(_smooth(path))[0]
@@ -187,7 +189,7 @@ def _make_loop(rooms: int) -> tuple[Array, float]:
 
 
 def _loop_corners(rooms: int) -> list[tuple[float, float]]:
-    """Return the corners x and y of the loop through a number of rooms, in metres."""
+    """Return the corners (x, y) of the loop through a number of rooms, in the world, metres."""
     if rooms < 2:
         raise UsageError(f"a loop needs 2 rooms or more, not {rooms}", hint="ask for two rooms or more")
     parts: list[tuple[int, _Corners]] = []
@@ -212,7 +214,7 @@ def _resample(points: Array) -> tuple[Array, float]:
 
 
 def _smooth(path: Array) -> Array:
-    """Return the moving average of a closed path ``(n, 2)`` over 45 points on either side."""
+    """Return the moving average of a closed path ``(n, 2)`` over each point and 45 points on either side."""
     half = _SMOOTHING_POINTS
     window = np.ones(2 * half + 1) / (2 * half + 1)
     extended = np.vstack((path[-half:], path, path[:half]))
@@ -222,13 +224,13 @@ def _smooth(path: Array) -> Array:
 def _pose_at(path: Array, length_m: float, distance_m: float, phase_rad: float) -> Array:
     """Return ``T_world_camera`` ``(4, 4)`` at a distance along the loop.
 
-    The camera is turned towards the point of the loop that is 1 m ahead, looks 7 degrees down, and sways a
-    little in height, pitch and roll.  Its x axis points to the right, y down, and z forward.
+    The camera looks towards the point of the loop that is 1 m ahead and 7 degrees down, and sways a little in
+    height, pitch and roll.  Its x axis points to the right, y down, and z forward.
     """
     position = _point_at(path, length_m, distance_m)
     ahead = _point_at(path, length_m, distance_m + _LOOK_AHEAD_M)
     yaw = np.arctan2(*(ahead - position)[::-1])
-    sway = 2.0 * np.pi * distance_m / _SWAY_M + phase_rad
+    sway = 2.0 * np.pi * distance_m / _SWAY_PERIOD_M + phase_rad
     pitch = np.radians(-7.0 + 1.2 * np.sin(0.6 * sway))
     roll = np.radians(0.8 * np.sin(0.8 * sway))
     height_m = _EYE_HEIGHT_M + 0.02 * np.sin(sway)
@@ -243,7 +245,7 @@ def _pose_at(path: Array, length_m: float, distance_m: float, phase_rad: float) 
 
 
 def _point_at(path: Array, length_m: float, distance_m: float) -> Array:
-    """Return the point x and y at a distance along a closed path, interpolated between its points."""
+    """Return the point (x, y) at a distance along a closed path, interpolated between its points."""
     index = (distance_m % length_m) / length_m * len(path)
     low = int(index) % len(path)
     fraction = index - int(index)

@@ -20,29 +20,37 @@ __all__ = ["Renderer", "add_depth_noise", "add_image_noise"]
 
 _Image = npt.NDArray[np.float32]
 
-_NEAR_M = 0.05  # depth of the near plane: what is nearer to the camera is not drawn
-_MIP_BIAS = 0.7  # added to a mip level before it is truncated: 0.5 would round, 0.7 prefers the coarser one
-_MIN_MIP_COSINE = 0.05  # smallest cosine of incidence for the choice of the mip level, to limit its blur
+_NEAR_M = 0.05  # depth of the near plane: nearer parts of faces are not drawn
+_MIP_BIAS = 0.7
+"""Added to a mip level before truncation; 0.5 would round, 0.7 prefers a coarser level: less aliasing."""
+_MIN_MIP_COSINE = 0.05  # smallest cosine of incidence with which a mip level is chosen, to limit the blur
 _MAX_MIP_LEVELS = 12  # levels of a texture of 2048x2048 texels, the largest that is supported
 
-# Brightness of the surfaces in a room
-_LAMP_BELOW_CEILING_M = 0.35  # distance of each room's lamp from the middle of the ceiling, downwards
-_AMBIENT = 0.68  # brightness of a surface without its lamp, where 1 is the colour of the texture
-_LAMP = 0.62  # brightness that the lamp adds at distance 0
-_LAMP_FALLOFF = 0.12  # per square metre: a lamp's light is divided by 1 + this times the squared distance
+# Brightness of the surfaces in a room, by which the colour of a texture is multiplied
+_LAMP_BELOW_CEILING_M = 0.35  # vertical distance of each room's lamp from the middle of the ceiling
+_AMBIENT = 0.68  # brightness without the lamp of the room
+_LAMP = 0.62  # brightness that the lamp adds to a surface at distance 0
+_LAMP_FALLOFF = 0.12
+"""Per m^2: the lamp's part is divided by 1 + this times the squared distance from the lamp."""
 _CORNER_SHADE = 0.28  # darkening at the edges of a face, where surfaces meet: 0 is none, 1 is black
-_CORNER_FALLOFF = 70.0  # per square metre: that darkening is divided by 1 + this times the squared distance
-_FACING_LIGHT = 0.06  # part of the light that only a surface facing the camera reflects
+_CORNER_FALLOFF = 70.0
+"""Per m^2: `_CORNER_SHADE` is divided by 1 + this times the squared distance of a point from the
+nearest edge of its face."""
+_FACING_LIGHT = 0.06
+"""This share of the brightness is multiplied by the cosine of incidence of the camera's ray."""
 
-# Depths and images of a Kinect
-_DISPARITY_M_PX = 0.075 * 580.0  # baseline times focal length of a Kinect: disparity in px times depth in m
+# What a Kinect measures of depths and colours
+_DISPARITY_M_PX = 0.075 * 580.0
+"""Baseline (m) times focal length (px) of a Kinect: disparity is this over depth."""
 _DISPARITY_STEPS = 8.0  # a Kinect measures disparities in steps of 1/8 px
-_MIN_DEPTH_M = 0.4  # a Kinect measures no nearer depths
-_MAX_DEPTH_M = 6.0  # depths beyond are not simulated
-_GRAZING_COSINE = 0.10  # smallest cosine of incidence at which a surface reflects the sensor's pattern
-_SHADOW_RATIO = 1.06  # ratio of two neighbouring depths from which on the farther pixel is in a shadow
-_RANDOM_HOLES = 0.002  # fraction of pixels without depth for no visible reason
-_IMAGE_NOISE = 2.0  # standard deviation of the image noise, grey levels of 255
+_MIN_DEPTH_M = 0.4  # smallest depth that a Kinect measures
+_MAX_DEPTH_M = 6.0  # largest depth of a reading; farther surfaces give none
+_GRAZING_COSINE = 0.10  # smallest cosine of incidence at which a surface gives a reading
+_SHADOW_RATIO = 1.06
+"""A pixel gives no reading if its depth is more than this many times that of a pixel near it: the nearer
+surface shades it from the infrared projector."""
+_RANDOM_HOLES = 0.002  # fraction of random pixels without a reading
+_IMAGE_NOISE = 2.0  # standard deviation of the image noise, in grey levels of 255
 
 
 class Renderer:
@@ -114,9 +122,9 @@ class Renderer:
     ) -> tuple[_Image, npt.NDArray[np.int32]]:
         """Return depth ``(h, w)`` (infinite without a face) and face number (-1 without) of each pixel.
 
-        The face is the nearest one whose visible side the camera is on.  *rays* ``(3, h, w)`` are the
-        directions of the pixels in the world, of depth 1, and *origin* ``(3,)`` is the position of the
-        camera.  Each face is tested only within its bounding box in the image.
+        The face is the nearest one that shows the camera its visible side; the others are skipped.  *rays*
+        ``(3, h, w)`` are the directions of the pixels in the world, scaled to the depth 1, and *origin*
+        ``(3,)`` is the position of the camera.  A face is tested only within its bounding box in the image.
         """
         depth_m = np.full(rays.shape[1:], np.inf, dtype=np.float32)
         face_numbers = np.full(rays.shape[1:], -1, dtype=np.int32)
@@ -142,7 +150,7 @@ class Renderer:
     def _bounding_box(self, face: Face, T_world_camera: Array) -> tuple[slice, slice] | None:
         """Return rows and columns of a face's bounding box in the image; None if the face is not in view.
 
-        Only the part of the face in front of the near plane counts.
+        The box is that of the part of the face that is farther than the near plane.
         """
         u_axis, v_axis = (axis for axis in range(3) if axis != face.axis)
         corners = np.empty((4, 3))
@@ -169,7 +177,7 @@ class Renderer:
     def _sample_texture(
         self, face: npt.NDArray[np.intp], u: _Image, v: _Image, depths: _Image, cosine: _Image
     ) -> _Image:
-        """Return texture values 0..1, bilinear in the mip level whose texel is about as large as the pixel.
+        """Return texture values 0..1, bilinear in the mip level whose texels are about as large as a pixel.
 
         All arguments are ``(n,)`` for n pixels: the number of the face, the coordinates *u* and *v* of the
         point from the lower corner of the face (m), the depth (m), and the cosine of the angle of incidence.
@@ -205,10 +213,11 @@ class Renderer:
     def _brightness(
         self, face: npt.NDArray[np.intp], points: _Image, edge_distance: _Image, cosine: _Image
     ) -> _Image:
-        """Return the factors ``(n,)`` by which the light changes the colours of ``(3, n)`` points.
+        """Return the brightness ``(n,)`` of ``(3, n)`` points, by which their colours are multiplied.
 
-        The lamp is that of the room of each point's *face*; edges of faces are darker, and surfaces that face
-        the camera a little brighter.  *edge_distance* ``(n,)`` is in metres.
+        A point is lit by the lamp of the room of its *face*; it is darker near an edge of its face, and a
+        little brighter if its face is perpendicular to the ray.  *edge_distance* ``(n,)``, m, is that from
+        the nearest edge.
         """
         x, y = points[0] - self._lamp_x[face], points[1] - DEPTH_M / 2
         z = points[2] - (HEIGHT_M - _LAMP_BELOW_CEILING_M)
@@ -219,18 +228,20 @@ class Renderer:
 
 
 def add_depth_noise(depth_m: _Image, cosine: _Image, rng: np.random.Generator) -> _Image:
-    """Return a new image of depths ``(h, w)``, metres, as a Kinect measures them; 0 where it measures none.
+    """Return the depths ``(h, w)``, metres, that a Kinect would measure; 0 where it would measure none.
 
-    The noise has a standard deviation of ``0.0012 + 0.0019 (z - 0.4)^2`` m, and depths are multiples of 1/8
-    px of disparity.  Depth is missing below 0.4 m and above 6 m, at grazing angles of incidence (*cosine*
-    below 0.1), on the far side of depth edges, and at 0.2 % random pixels.
+    The noise has a standard deviation of ``0.0012 + 0.0019 (z - 0.4)^2`` m for the exact depth z, and the
+    disparity of a measured depth is a multiple of 1/8 px.  There is no reading below 0.4 m and above 6 m, at
+    grazing angles of incidence (*cosine* below 0.1), on the far side of depth edges, and at 0.2 % random
+    pixels.
     """
     sigma = 0.0012 + 0.0019 * (depth_m - 0.4) ** 2
     noisy = depth_m + sigma * rng.standard_normal(depth_m.shape, dtype=np.float32)
     steps = np.rint(_DISPARITY_STEPS * _DISPARITY_M_PX / np.maximum(noisy, 0.1))
     measured = (_DISPARITY_STEPS * _DISPARITY_M_PX / np.maximum(steps, 1)).astype(np.float32)
     holes = (depth_m < _MIN_DEPTH_M) | (depth_m > _MAX_DEPTH_M) | (cosine < _GRAZING_COSINE)
-    # The pattern projector is to the side of the camera: its shadow is wider to the right of a near surface.
+    # The infrared projector is beside the camera: the shadow of a near surface is 3 px wide on its right
+    # side, and 1 px on the others.
     for shift in (1, 2, 3):
         holes[:, shift:] |= depth_m[:, shift:] > _SHADOW_RATIO * depth_m[:, :-shift]
     holes[:, :-1] |= depth_m[:, :-1] > _SHADOW_RATIO * depth_m[:, 1:]
@@ -242,7 +253,7 @@ def add_depth_noise(depth_m: _Image, cosine: _Image, rng: np.random.Generator) -
 
 
 def add_image_noise(colour: _Image, rng: np.random.Generator) -> npt.NDArray[np.uint8]:
-    """Return colours ``(h, w, 3)`` of 0..255 as uint8, with Gaussian noise of two grey levels."""
+    """Return colours ``(h, w, 3)`` of 0..255 as uint8, with Gaussian noise (standard deviation 2)."""
     noisy = colour + _IMAGE_NOISE * rng.standard_normal(colour.shape, dtype=np.float32)
     return np.clip(noisy + 0.5, 0, 255).astype(np.uint8)
 

@@ -25,8 +25,8 @@ __all__ = [
     "make_world",
 ]
 
-ROOM_M = 5.0  # extent of a simulated room along x, metres
-DEPTH_M = 4.6  # extent of all simulated rooms along y, metres
+ROOM_M = 5.0  # extent of each simulated room along x, metres
+DEPTH_M = 4.6  # extent of each simulated room along y, metres
 HEIGHT_M = 2.6  # height of the ceiling of the simulated rooms, metres
 ROOMS = 3  # default number of rooms of the simulated world
 DOOR_Y_M = (1.55, 3.05)  # y in metres of the two sides of each door
@@ -51,7 +51,7 @@ _DOOR_COLOURS: _Colours = ((250, 244, 226), (176, 150, 118))
 _SIDEBOARD_COLOURS: _Colours = ((150, 104, 66), (70, 42, 26))
 _TABLE_COLOURS: _Colours = ((214, 170, 116), (120, 78, 46))
 _BOOK_COLOURS: _Colours = ((246, 226, 190), (96, 40, 36))
-# Background and print of the wallpapers; room i has that of index i modulo 3.
+# Background and print of the wallpapers; room i has the entry with index i modulo 3.
 _WALLPAPER_COLOURS: tuple[_Colours, ...] = (
     ((232, 222, 202), (150, 120, 92)),
     ((196, 214, 200), (74, 112, 104)),
@@ -71,18 +71,20 @@ _FABRIC_COLOURS: tuple[_Colours, ...] = (
 )
 
 # Shapes of the printed motifs of the wallpapers: an ellipse, a diamond and a bar.  Each function maps
-# coordinates in the motif's axes to a distance that is 1 at the motif's border.
+# coordinates along the motif's axes, in units of its size, to a distance from its centre that is 1 at its
+# border.
 _MOTIFS: tuple[Callable[[_Image, _Image], _Image], ...] = (
     lambda a, b: np.hypot(a, 1.8 * b),
     lambda a, b: np.abs(a) + np.abs(b),
     lambda a, b: np.maximum(np.abs(a), 2.2 * np.abs(b)),
 )
-_MOTIF_CELL_PX = 64  # texels between the motifs of a wallpaper, before each is moved at random
-_MOTIF_REACH_PX = 40  # texels drawn on each side of a motif's centre; the largest motif reaches 26 texels
+_MOTIF_CELL_TEXELS = 64  # distance of the motifs of a wallpaper, before each is moved at random
+_MOTIF_REACH_TEXELS = 40  # a motif changes texels up to this far from its centre; the largest has 26 texels
 _POSTER_SHAPES = 26  # number of discs and bars that are drawn on a poster
 _DRAWN_SIZES = 1.06
-"""Half the side of the square of texels that is drawn for a disc or bar of a poster, in sizes of the shape:
-the corners of a bar of half-length 1 and half-width 1/3 are sqrt(1 + 1/9) = 1.054 from its centre."""
+"""A disc or bar of a poster is drawn within a square whose half side is this many times the shape's size,
+which is the radius of a disc or half the length of a bar.  The corners of a bar, which is a third as wide as
+long, are sqrt(1 + 1/9) = 1.054 sizes from its centre."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,11 +95,11 @@ class Face:
         axis: Axis that is perpendicular to the plane: 0 for x, 1 for y, 2 for z.
         offset: Coordinate of the plane on that axis, metres.
         sign: 1 if the face is visible from larger coordinates, -1 if from smaller ones.
-        low: Smallest coordinates on the two other axes, in the order x, y, z, metres.
-        high: Largest coordinates on these axes, metres.
+        low: Smallest coordinates of the face on the two other axes, in the order x, y, z, metres.
+        high: Largest coordinates of the face on these axes, metres.
         texture: Index of the texture in `World.textures`; the texture begins at *low*, and repeats.
         texel_m: Width of a texel, metres.
-        colour_0: Colour of the texture value 0; values between are blended.
+        colour_0: Colour of the texture value 0; the colour of a value between 0 and 1 is a linear mixture.
         colour_1: Colour of the texture value 1.
         room: Index of the room whose lamp lights the face.
     """
@@ -199,10 +201,10 @@ def make_world(seed: int, rooms: int = ROOMS) -> World:
 
 
 def _wall_pieces(has_door: bool) -> list[tuple[float, float, float]]:
-    """Return the rectangles of a wall, metres: smallest and largest y, and smallest z.
+    """Return the rectangles of the wall at an end of a room: smallest y, largest y and smallest z, metres.
 
-    All of them end at the ceiling.  A wall with a door has three: both sides of the door, and the part above
-    it.
+    The largest z of each rectangle is that of the ceiling.  A wall with a door has three rectangles: one on
+    each side of the door, and one above it.
     """
     if not has_door:
         return [(0.0, DEPTH_M, 0.0)]
@@ -280,8 +282,8 @@ def _add_shelf(
 def _add_pictures(builder: _Builder, room: int) -> None:
     """Add square pictures to the four walls of a room, 1 cm in front of them."""
     x = room * ROOM_M
-    # Of each picture: axis, offset and sign of its wall as in `Face`, then the position along the wall and
-    # the height of its lower corner, and its side, metres.
+    # For each picture: axis, offset and sign of its wall as in `Face`; then the position along the wall and
+    # the height of its lower corner, and the length of its side, metres.
     pictures = [
         (1, 0.0, 1, x + 0.7, 1.35, 0.75),
         (1, DEPTH_M, -1, x + 1.6, 1.2, 0.9),
@@ -311,10 +313,10 @@ def _make_noise(
 
     Args:
         rng: Random generator.
-        n: Texels of a side.
-        min_waves: Waves per side of the lowest frequency.
-        max_waves: Waves per side of the highest frequency.
-        falloff: The amplitude falls with the frequency to the power of -(1 + falloff).
+        n: Number of texels of a side.
+        min_waves: Lowest frequency, in waves per side.
+        max_waves: Highest frequency, in waves per side.
+        falloff: The amplitude is proportional to the frequency to the power of -(1 + falloff).
     """
     weight = _noise_spectrum(n, min_waves, max_waves, falloff)
     image = np.fft.irfft2(np.fft.rfft2(rng.standard_normal((n, n))) * weight, s=(n, n))
@@ -331,18 +333,18 @@ def _noise_spectrum(n: int, min_waves: float, max_waves: float, falloff: float) 
 
 def _make_wallpaper(rng: np.random.Generator, room: int) -> _Image:
     """Return marbled wallpaper with printed motifs, of which no two are equal."""
-    n, reach = 1024, _MOTIF_REACH_PX
+    n, reach = 1024, _MOTIF_REACH_TEXELS
     paper = 0.16 + 0.12 * _make_noise(rng, n, 3, 40, 0.5) + 0.10 * _make_noise(rng, n, 60, 220, 0.0)
     rows, columns = np.mgrid[-reach : reach + 1, -reach : reach + 1].astype(np.float32)
-    for y in range(0, n, _MOTIF_CELL_PX):
-        for x in range(0, n, _MOTIF_CELL_PX):
+    for y in range(0, n, _MOTIF_CELL_TEXELS):
+        for x in range(0, n, _MOTIF_CELL_TEXELS):
             angle, size = rng.uniform(0, np.pi), rng.uniform(12, 26)
             cosine, sine = float(np.cos(angle) / size), float(np.sin(angle) / size)
             a, b = cosine * columns + sine * rows, cosine * rows - sine * columns
             distance = _MOTIFS[room % len(_MOTIFS)](a, b)
             ink = np.clip((1.0 - distance) * size / 1.5, 0, 1) * rng.uniform(0.25, 0.75)
-            motif_rows = (y + int(rng.integers(_MOTIF_CELL_PX)) + np.arange(-reach, reach + 1)) % n
-            motif_columns = (x + int(rng.integers(_MOTIF_CELL_PX)) + np.arange(-reach, reach + 1)) % n
+            motif_rows = (y + int(rng.integers(_MOTIF_CELL_TEXELS)) + np.arange(-reach, reach + 1)) % n
+            motif_columns = (x + int(rng.integers(_MOTIF_CELL_TEXELS)) + np.arange(-reach, reach + 1)) % n
             texels = np.ix_(motif_rows, motif_columns)
             paper[texels] += ink * (0.9 - paper[texels])
     return paper
