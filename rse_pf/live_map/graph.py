@@ -32,8 +32,9 @@ from rse_pf.live_map.decisions import (
     RejectEdges,
     StateReason,
 )
-from rse_pf.live_map.events import MapStarted, MeasuredLoopClosure, matrix_of
+from rse_pf.live_map.events import KeyframeAdded, MapStarted, MeasuredLoopClosure, matrix_of
 from rse_pf.live_map.graph_rows import NO_LOOP_CLOSURE_YET, UP_TO_SCALE, LiveKeyframe, LoopEdge, Segment
+from rse_pf.live_map.measure import assumed_scale
 from rse_pf.live_map.outcomes import (
     Ambiguous,
     Corrected,
@@ -306,45 +307,40 @@ class MapGraph:
         self.segments.append(segment)
         return row
 
-    def add_keyframe(
-        self,
-        keyframe: LiveKeyframe,
-        T_odom_camera: Array,
-        *,
-        is_metric: bool = True,
-        assumed_scale: float = 1.0,
-    ) -> int:
+    def add_keyframe(self, event: KeyframeAdded) -> int:
         """Add a keyframe at the pose that odometry gives it; return the id of the keyframe.
 
         Its segment is added if there is none, and becomes the robot's newest one.  If no segment defines the
         frame of the map yet, this segment does, provided that it is metric.
-
-        Args:
-            keyframe: The keyframe.
-            T_odom_camera: ``(4, 4)``, its pose in the odometry frame, in the unit of the segment.
-            is_metric: Whether this unit is a metre; only used for the first keyframe of a segment.
-            assumed_scale: Metres for which another unit is taken until the scale of the segment is estimated;
-                only used for the first keyframe of a segment.
         """
-        row = self._find_or_add_segment(keyframe.robot, keyframe.segment)
+        sent = event.keyframe
+        T_odom = sent.T_odom_camera
+        row = self._find_or_add_segment(event.robot, event.segment)
         segment = self.segments[row]
         # 1. State the unit of a new segment; its first keyframe defines the frame of its component.
         if not segment.keyframes:
-            segment.is_metric = is_metric
-            if not is_metric:
-                segment.scale, segment.reason = assumed_scale, UP_TO_SCALE
-            T_component = T_odom_camera if is_metric else scaled(T_odom_camera, segment.scale)
-            steps = 0.0
+            segment.is_metric = sent.features.is_metric
+            if not segment.is_metric:
+                segment.scale, segment.reason = assumed_scale(sent.features), UP_TO_SCALE
+            T_component, steps = T_odom if segment.is_metric else scaled(T_odom, segment.scale), 0.0
         # 2. Compute the pose of a later keyframe by odometry from the newest keyframe of the segment.
         else:
             newest = segment.keyframes[-1]
-            motion = inverse(self.T_odom_camera[newest]) @ T_odom_camera
+            motion = inverse(self.T_odom_camera[newest]) @ T_odom
             motion = motion if segment.is_metric else scaled(motion, segment.scale)
             T_component = self.T_component_camera[newest] @ motion
             steps = float(self.odometry_steps[newest]) + _count_odometry_steps(motion)
-        i = self._append(keyframe, row, T_odom_camera, T_component, steps)
-        self.next_numbers[keyframe.robot] = keyframe.number + 1
-        self.newest_segments[keyframe.robot] = row
+        keyframe = LiveKeyframe(
+            robot=event.robot,
+            segment=event.segment,
+            number=event.number,
+            timestamp_s=sent.timestamp_s,
+            data=event.data,
+            objects=tuple(each.digest for each in (sent.points, sent.image) if each is not None),
+        )
+        i = self._append(keyframe, row, T_odom, T_component, steps)
+        self.next_numbers[event.robot] = event.number + 1
+        self.newest_segments[event.robot] = row
         if self.root < 0 and segment.is_metric:
             self.root = row
         return i

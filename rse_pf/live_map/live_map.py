@@ -35,7 +35,6 @@ from rse_pf.live_map.events import (
     matrix_bytes,
 )
 from rse_pf.live_map.graph import MapGraph
-from rse_pf.live_map.graph_rows import LiveKeyframe
 from rse_pf.live_map.measure import (
     LOOP_CLOSURE_EVIDENCE,
     StoredView,
@@ -56,7 +55,6 @@ from rse_pf.live_map.outcomes import (
 from rse_pf.live_map.outlier_rejection import decide_edges, decide_measured, has_odometry_jump
 from rse_pf.live_map.smoothing import (
     CAUCHY_WIDTH,
-    SmoothedWindows,
     moved_keyframes,
     smooth_changes,
     smooth_everything,
@@ -88,9 +86,6 @@ from rse_pf.slam.pose_graph import PoseGraph
 __all__ = ["LiveMap"]
 
 MAX_SEGMENTS = 2**31  # segment numbers of a robot are below this, so that they fit into 32 bits
-MIN_KEYFRAMES_BETWEEN_OPTIMISATIONS = 20
-"""Keyframes that arrive, at least, between two outcomes `OptimiseWanted` that smoothing causes, because an
-optimisation of all poses is expensive.  After a robot was forgotten or excluded there is no such limit."""
 RELOCALISATION_POOL = 6
 """Ratio of the keyframes that place recognition proposes to those that a relocalisation compares.  Those
 compared are chosen spread over the map: if two places look the same, both are compared, and the pose is
@@ -447,22 +442,9 @@ class LiveMap:
     def _add_keyframe(self, event: KeyframeAdded) -> list[Outcome]:
         """Add a keyframe at the pose that odometry gives it after the newest keyframe of its segment."""
         graph = self._graph
-        keyframe = event.keyframe
-        features = keyframe.features
         # 1. Add the keyframe to the graph and to the index of place recognition.
-        objects = tuple(each.digest for each in (keyframe.points, keyframe.image) if each is not None)
-        row = LiveKeyframe(
-            robot=event.robot,
-            segment=event.segment,
-            number=event.number,
-            timestamp_s=keyframe.timestamp_s,
-            data=event.data,
-            objects=objects,
-        )
-        scale = assumed_scale(features)
-        T_odom_camera = keyframe.T_odom_camera
-        i = graph.add_keyframe(row, T_odom_camera, is_metric=features.is_metric, assumed_scale=scale)
-        self._places.add(i, place_vector(features.descriptors))
+        i = graph.add_keyframe(event)
+        self._places.add(i, place_vector(event.keyframe.features.descriptors))
         # 2. Report alignments. Odometry changes none, so only a segment without an alignment can get one.
         if graph.segment_of(i).reported_T_map_odom is not None or not self.is_in_map(i):
             return [Added(id=i)]
@@ -491,14 +473,17 @@ class LiveMap:
         decided_again = self._decide_again() if is_excluded else []
         # 3. Smooth the poses around the changed loop closures.
         robot, number = graph.keyframes[keyframe].robot, graph.keyframes[keyframe].number
-        windows = self._smooth(moved_keyframes(outcomes), robot)
+        windows = smooth_changes(graph, moved_keyframes(outcomes), self.options, robot)
         graph.drop_oldest_pending()
         # 4. Report the alignments that changed.
         reports = graph.apply(report_alignments(graph, (robot, number), windows.covariances))
         # 5. Drop redundant features, and those of a keyframe whose odometry jumped, since later loop closures
         #    with it would contradict the graph.
         surplus = (keyframe,) if has_jumped else find_redundant_keyframes(graph, keyframe)
-        culled = self._drop_features(surplus)
+        for i in surplus:
+            graph.drop_features(i)
+            self._places.remove(i)
+        culled = [Culled(ids=surplus)] if surplus else []
         return [*outcomes, *windows.outcomes, *decided_again, *reports, *culled]
 
     def _take_optimised_poses(self, event: Optimised) -> list[Outcome]:
@@ -527,7 +512,7 @@ class LiveMap:
                 graph.set_poses(segment.keyframes, T)
                 motions[row] = motion
         # 2. Move segments that joined the map later, and smooth the poses where they are connected.
-        windows = self._smooth(self._move_joined_segments(motions))
+        windows = smooth_changes(graph, self._move_joined_segments(motions), self.options)
         # 3. Report the alignments that changed.
         return [*windows.outcomes, *graph.apply(report_alignments(graph, None, windows.covariances))]
 
@@ -593,32 +578,11 @@ class LiveMap:
         graph.reopen_rejected()
         for keyframe, numbers in groupby(list(graph.pending), lambda number: graph.edges[number].a):
             outcomes = graph.apply(decide_edges(graph, keyframe, list(filter(graph.is_pending, numbers))))
-            self._smooth(moved_keyframes(outcomes))
+            smooth_changes(graph, moved_keyframes(outcomes), self.options)
             ambiguous += [outcome for outcome in outcomes if isinstance(outcome, Ambiguous)]
         smooth_everything(graph, self.options)
         wanted = [OptimiseWanted()] if graph.edges and graph.root >= 0 else []
         return [*ambiguous, *wanted]
-
-    def _smooth(self, moved: list[int], robot: str | None = None) -> SmoothedWindows:
-        """Smooth around the keyframes *moved*, which a keyframe of *robot* caused.
-
-        Add a request to optimise the whole graph to the outcomes of the result if the border of the largest
-        window moved too far, and at least 20 keyframes arrived since the last such request.
-        """
-        graph = self._graph
-        windows = smooth_changes(graph, moved, self.options, robot)
-        is_due = len(graph) - graph.optimised_at >= MIN_KEYFRAMES_BETWEEN_OPTIMISATIONS
-        if windows.is_strained and is_due and graph.root >= 0:
-            graph.note_optimisation()
-            windows.outcomes.append(OptimiseWanted())
-        return windows
-
-    def _drop_features(self, ids: tuple[int, ...]) -> list[Outcome]:
-        """Drop the features of keyframes, so that no other keyframe is compared with them."""
-        for i in ids:
-            self._graph.drop_features(i)
-            self._places.remove(i)
-        return [Culled(ids=ids)] if ids else []
 
     def _stored(self, i: int) -> StoredView | None:
         """Return the id and the encoded keyframe *i*, None if its features were dropped."""

@@ -270,11 +270,11 @@ def find_weakest_connection(graph: MapGraph, row_a: int, row_b: int) -> list[int
     connections = {
         pair: numbers for pair, numbers in graph.accepted_edges_by_segments().items() if pair[0] != pair[1]
     }
-    is_metric = _are_metric(graph, (row_a, row_b))
+    metric = {row for row, segment in enumerate(graph.segments) if segment.is_metric}
     weights = {
         pair: FIXED_WEIGHT
         if any(graph.edges[number].is_fixed for number in numbers)
-        or (_are_metric(graph, pair) and not is_metric)
+        or (metric.issuperset(pair) and not metric.issuperset((row_a, row_b)))
         else total_weight(graph, numbers)
         for pair, numbers in connections.items()
     }
@@ -289,33 +289,21 @@ def find_weakest_connection(graph: MapGraph, row_a: int, row_b: int) -> list[int
     return []
 
 
-def _are_metric(graph: MapGraph, rows: Iterable[int]) -> bool:
-    return all(graph.segments[row].is_metric for row in rows)
-
-
 def _find_path(start: int, goal: int, pairs: list[tuple[int, int]]) -> list[tuple[int, int]]:
-    """Return the connections on a shortest path from *goal* back to *start*; empty if there is none.
+    """Return the connections on a shortest path from *start* to *goal*; empty if there is none.
 
     Connections are *pairs* of rows of segments.  The search is breadth-first.
     """
-    came_from: dict[int, tuple[int, tuple[int, int]]] = {start: (start, (start, start))}
-    frontier = [start]
-    while frontier and goal not in came_from:
-        next_frontier = []
-        for row in frontier:
-            for pair in sorted(pairs):
-                if row in pair:
-                    neighbour = pair[1] if pair[0] == row else pair[0]
-                    if neighbour not in came_from:
-                        came_from[neighbour] = (row, pair)
-                        next_frontier.append(neighbour)
-        frontier = next_frontier
-    path = []
-    row = goal
-    while row in came_from and row != start:
-        row, pair = came_from[row]
-        path.append(pair)
-    return path
+    paths: dict[int, list[tuple[int, int]]] = {start: []}
+    queue = [start]
+    for row in queue:
+        for pair in sorted(pairs):
+            if row in pair:
+                neighbour = pair[1] if pair[0] == row else pair[0]
+                if neighbour not in paths:
+                    paths[neighbour] = [*paths[row], pair]
+                    queue.append(neighbour)
+    return paths.get(goal, [])
 
 
 # --- Joins and perceptual aliases ---

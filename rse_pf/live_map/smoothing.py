@@ -18,7 +18,7 @@ from rse_pf.geometry import Array, adjoint, inverse, scaled
 from rse_pf.live_map.graph import MapGraph
 from rse_pf.live_map.graph_rows import LoopEdge
 from rse_pf.live_map.options import LiveMapOptions
-from rse_pf.live_map.outcomes import LoopClosureAccepted, LoopClosureRejected, Outcome
+from rse_pf.live_map.outcomes import LoopClosureAccepted, LoopClosureRejected, OptimiseWanted, Outcome
 from rse_pf.live_map.outlier_rejection import decide_misfits
 from rse_pf.live_map.pairwise_consistency import find_neighbours, relative_pose_of, unit_segment_of
 from rse_pf.slam.consistency import OdometryNoise
@@ -44,6 +44,9 @@ DRIFT = OdometryNoise(step_m=0.007, step_deg=0.35)
 times as much, so that no true loop closure fails."""
 CAUCHY_WIDTH = 3.0
 """Width of the Cauchy kernel on loop closures, standard deviations; larger residuals have less effect."""
+MIN_KEYFRAMES_BETWEEN_OPTIMISATIONS = 20
+"""Keyframes that arrive, at least, between two outcomes `OptimiseWanted` that smoothing causes, because an
+optimisation of all poses is expensive.  After a robot was forgotten or excluded there is no such limit."""
 MAX_SCALE_KEYFRAMES = 600
 """Keyframes of a segment, from 300 before the window on, whose edges determine the scale of the segment.  The
 limit bounds the CPU time of a window."""
@@ -76,7 +79,7 @@ class SmoothedWindows:
     also of those that were replaced by a larger one.  ``covariances`` has the ``(6, 6)`` covariance of the
     newest pose of each robot that has not left, by keyframe, if this pose was smoothed.  It is that of a left
     twist (metres, radians) in the frame of the component, given the held poses, so it leaves out their
-    uncertainty.  ``outcomes`` are rejections of loop closures that misfitted for long.
+    uncertainty.  ``outcomes`` are what `smooth_changes` reports.
     """
 
     is_strained: bool = False
@@ -90,6 +93,9 @@ def smooth_changes(
     graph: MapGraph, moved: list[int], options: LiveMapOptions, robot: str | None = None
 ) -> SmoothedWindows:
     """Smooth around changed loop closures, and reject those that misfit for long.
+
+    The outcomes of the result have a request to optimise the whole graph if the border of the largest window
+    moved too far, and at least 20 keyframes arrived since the last such request.
 
     Args:
         graph: The graph; its poses and loop closures change.
@@ -114,6 +120,11 @@ def smooth_changes(
     allowance = options.smoothing_allowance
     if robot is not None and (debt or keyframe_count > allowance):
         graph.set_smoothing_debt(robot, max(0, debt + keyframe_count - allowance))
+    # 4. Request an optimisation of the whole graph if no window was large enough.
+    is_due = len(graph) - graph.optimised_at >= MIN_KEYFRAMES_BETWEEN_OPTIMISATIONS
+    if windows.is_strained and is_due and graph.root >= 0:
+        graph.note_optimisation()
+        windows.outcomes.append(OptimiseWanted())
     return windows
 
 

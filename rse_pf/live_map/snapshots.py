@@ -140,7 +140,19 @@ def encode_graph(graph: MapGraph, extra: dict[str, bytes], with_features: bool =
             (each.robot, each.segment, each.number, each.timestamp_s, each.data if with_features else None)
             for each in graph.keyframes
         ],
-        segments=[_pack_segment(segment) for segment in graph.segments],
+        segments=[
+            (
+                segment.robot,
+                segment.number,
+                segment.keyframes,
+                segment.component,
+                None if segment.reported_T_map_odom is None else segment.reported_T_map_odom.tobytes(),
+                segment.covariance.tobytes(),
+                segment.reason,
+                segment.is_from_version,
+            )
+            for segment in graph.segments
+        ],
         links=[_pack_edge(number, edge) for number, edge in graph.edges.items()],
         removed=[_pack_edge(number, edge) for number, edge in graph.rejected.items()],
         smoothing=list(graph.smoothing_debt.items()),
@@ -230,20 +242,6 @@ def decode_graph(data: bytes) -> tuple[MapGraph, dict[str, bytes]]:
     except (msgspec.MsgspecError, LookupError, ValueError, ArithmeticError) as error:
         raise _damaged(message_of(error)) from error
     return graph, extra
-
-
-def _pack_segment(segment: Segment) -> tuple[str, int, list[int], int, bytes | None, bytes, str, bool]:
-    reported = segment.reported_T_map_odom
-    return (
-        segment.robot,
-        segment.number,
-        segment.keyframes,
-        segment.component,
-        None if reported is None else reported.tobytes(),
-        segment.covariance.tobytes(),
-        segment.reason,
-        segment.is_from_version,
-    )
 
 
 def _unpack_segments(packed: _Packed) -> list[Segment]:
@@ -361,7 +359,9 @@ class SnapshotWriter:
             if name in stored and members.issuperset(ids) and 2 * len(ids) >= len(members):
                 data = None
             else:
-                data = msgspec.msgpack.encode([_pack_features(graph, places, i) for i in ids])
+                vectors = [places.vector_of(i).astype("<f4").tobytes() for i in ids]
+                rows = [(i, graph.keyframes[i].data, vector) for i, vector in zip(ids, vectors, strict=True)]
+                data = msgspec.msgpack.encode(rows)
                 name = hashlib.sha256(data).hexdigest()
                 if begin + PART_KEYFRAMES <= len(graph):
                     self._full[number] = name, frozenset(ids)
@@ -406,12 +406,6 @@ def decode_parts(
     if not np.array_equal(graph.has_features, has_features):
         raise _damaged("the parts do not have the features of all keyframes that the head lists")
     return graph, places, SnapshotWriter(full_parts)
-
-
-def _pack_features(graph: MapGraph, places: PlaceIndex, i: int) -> _PartRow:
-    data = graph.keyframes[i].data
-    assert data is not None
-    return i, data, places.vector_of(i).astype("<f4").tobytes()
 
 
 def decode_places(extra: dict[str, bytes]) -> PlaceIndex:

@@ -24,7 +24,7 @@ from rse_pf.live_map.events import (
 )
 from rse_pf.slam.keyframe import SentKeyframe, encode_keyframe, make_features, make_scaleless_features
 
-__all__ = ["GeneratedDrive", "GeneratedWorld", "circle", "make_link", "straight"]
+__all__ = ["GeneratedDrive", "GeneratedWorld", "circle", "first_view", "make_link", "straight"]
 
 CAMERA = Camera(fx=525.0, fy=525.0, cx=319.5, cy=239.5, width=640, height=480)
 STEP_M = 0.1  # metres between two keyframes along a path
@@ -197,6 +197,26 @@ class GeneratedWorld:
                 if number < len(drive.T_world_camera):
                     yield self.keyframe(drive, number)
                     yield self.links_of(len(self.seen) - 1, wrong)
+
+
+def first_view(
+    robot: str,
+    segment: int = 0,
+    number: int = 0,
+    T_odom_camera: Array | None = None,
+    *,
+    is_metric: bool = True,
+) -> KeyframeAdded:
+    """Return a keyframe with two features as an event, at the origin of its odometry by default."""
+    pixels, depths, descriptors = np.array([[9.0, 9.0], [9.0, 99.0]]), np.ones(2), np.zeros((2, 32), np.uint8)
+    make = make_features if is_metric else make_scaleless_features
+    keyframe = SentKeyframe(
+        timestamp_s=0.0,
+        T_odom_camera=np.eye(4) if T_odom_camera is None else T_odom_camera,
+        camera=CAMERA,
+        features=make(pixels, depths, descriptors),
+    )
+    return KeyframeAdded(robot=robot, segment=segment, number=number, data=encode_keyframe(keyframe))
 
 
 def make_link(other: int, T_keyframe_other: Array, inliers: int = 100) -> MeasuredLoopClosure:

@@ -9,11 +9,11 @@ from rse_pf.geometry import Array, exp_se3, inverse
 from rse_pf.live_map.decisions import AddEdges, JoinComponents
 from rse_pf.live_map.events import KeyframeAdded, LoopClosuresMeasured, MeasuredLoopClosure, matrix_bytes
 from rse_pf.live_map.graph import MapGraph
-from rse_pf.live_map.graph_rows import LiveKeyframe
 from rse_pf.live_map.live_map import LiveMap
 from rse_pf.live_map.outcomes import Culled
 from rse_pf.live_map.outlier_rejection import find_weakest_connection, has_odometry_jump
 from rse_pf.slam.keyframe import decode_keyframe
+from tests.live_map.generated_drives import first_view
 from tests.live_map.hostile_rig import (
     ACCEPTED,
     HOSTILE,
@@ -88,8 +88,7 @@ def path(metres: list[float], is_metric: bool = True) -> MapGraph:
     """Return a graph with one robot, whose odometry is at these metres along x, keyframe by keyframe."""
     graph = MapGraph()
     for number, at in enumerate(metres):
-        keyframe = LiveKeyframe(robot="x", segment=0, number=number, timestamp_s=0.0, data=None)
-        graph.add_keyframe(keyframe, step_of(at), is_metric=is_metric)
+        graph.add_keyframe(first_view("x", 0, number, step_of(at), is_metric=is_metric))
     return graph
 
 
@@ -141,8 +140,7 @@ def test_a_robot_without_metres_separates_no_two_robots_with_metres(
 ) -> None:
     graph = MapGraph()
     for robot in ("a", "b", "x"):
-        keyframe = LiveKeyframe(robot=robot, segment=0, number=0, timestamp_s=0.0, data=None)
-        graph.add_keyframe(keyframe, np.eye(4))
+        graph.add_keyframe(first_view(robot))
     graph.segments[2].is_metric = is_metric
     for one, other, count in ((0, 1, 1), (1, 2, 5)):
         numbers = list(range(graph.next_edge, graph.next_edge + count))

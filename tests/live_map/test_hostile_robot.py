@@ -12,12 +12,11 @@ from rse_pf.geometry import inverse
 from rse_pf.live_map.decisions import ExcludeSegment, RecordContradictions
 from rse_pf.live_map.events import RobotForgotten
 from rse_pf.live_map.graph import MapGraph
-from rse_pf.live_map.graph_rows import LiveKeyframe, Segment
 from rse_pf.live_map.live_map import LiveMap
 from rse_pf.live_map.options import LiveMapOptions
 from rse_pf.live_map.outcomes import Ambiguous, LoopClosureRejected, Unaligned
 from rse_pf.live_map.smoothing import smooth_changes
-from tests.live_map.generated_drives import GeneratedWorld, circle
+from tests.live_map.generated_drives import GeneratedWorld, circle, first_view
 from tests.live_map.hostile_robot import HOSTILE, error_cm, joins, play, scenario, without
 
 JOINED = {"a": True, "b": True, "c": True}
@@ -102,15 +101,11 @@ def test_smoothing_that_a_robot_causes_has_a_budget_of_its_own() -> None:
 
 def test_a_robot_that_opens_segments_does_not_lose_its_record() -> None:
     graph = MapGraph()
-
-    def first_segment(robot: str, number: int) -> Segment:
-        keyframe = LiveKeyframe(robot=robot, segment=number, number=number, timestamp_s=0.0, data=None)
-        return graph.segment_of(graph.add_keyframe(keyframe, np.eye(4)))
-
-    first_segment(HOSTILE, 0)
+    graph.add_keyframe(first_view(HOSTILE))
     graph.apply([RecordContradictions(row=0, contradictions=0xFFFFFFFF), ExcludeSegment(row=0, reason="x")])
 
-    second, honest = first_segment(HOSTILE, 1), first_segment("a", 0)
+    later = [first_view(HOSTILE, segment=1, number=1), first_view("a")]
+    second, honest = (graph.segment_of(graph.add_keyframe(event)) for event in later)
 
     assert (second.contradictions, second.is_excluded) == (0xFFFF, False)
     assert (honest.contradictions, honest.is_excluded) == (0, False)

@@ -10,13 +10,12 @@ import pytest
 
 from rse_pf.live_map.events import KeyframeAdded, LoopClosuresMeasured, MeasuredLoopClosure, matrix_bytes
 from rse_pf.live_map.graph import MapGraph
-from rse_pf.live_map.graph_rows import LiveKeyframe
 from rse_pf.live_map.live_map import LiveMap
 from rse_pf.live_map.measure import measure_loop_closures
 from rse_pf.live_map.outcomes import Outcome, Unaligned
 from rse_pf.live_map.outlier_rejection import decide_exclusion, has_wrong_scale
 from rse_pf.slam.keyframe import decode_keyframe, make_features
-from tests.live_map.generated_drives import GeneratedWorld, circle
+from tests.live_map.generated_drives import GeneratedWorld, circle, first_view
 from tests.live_map.hostile_rig import generated_drives
 
 
@@ -24,8 +23,7 @@ def graph_of(*robots: str) -> MapGraph:
     """Return a graph with one keyframe of each robot, without loop closures."""
     graph = MapGraph()
     for robot in robots:
-        keyframe = LiveKeyframe(robot=robot, segment=0, number=0, timestamp_s=0.0, data=None)
-        graph.add_keyframe(keyframe, np.eye(4))
+        graph.add_keyframe(first_view(robot))
     return graph
 
 
