@@ -181,8 +181,7 @@ def list_folder(folder: Path, rate_hz: float | None = None) -> FolderImages:
 def pair_folders(folder: Path) -> tuple[Path, Path] | None:
     """Return the folders of the left and of the right images of a stereo pair, inside *folder*.
 
-    They have the first names of `_PAIR_FOLDERS` for which both folders exist; the result is None without
-    such.
+    They have the first names of `_PAIR_FOLDERS` for which both folders exist; None if there are none.
     """
     for name in _PAIR_FOLDERS:
         left, right = (folder / name.format(side) for side in ("left", "right"))

@@ -48,8 +48,7 @@ def open_realsense() -> tuple[Iterator[RawFrame], Intrinsics, Callable[[], None]
         raise UsageError(f"no RealSense camera can be opened: {error}", hint=_CABLE_HINT) from error
     lens = profile.get_stream(rs.stream.color).as_video_stream_profile().get_intrinsics()
     unit_m = float(profile.get_device().first_depth_sensor().get_depth_scale())
-    # Images of any other lens model than Brown-Conrady, such as its inverse, are used as if undistorted: the
-    # coefficients of RealSense cameras are then nearly 0.
+    # Coefficients of any other lens model than Brown-Conrady are not used: the images count as undistorted.
     is_distorted = lens.model == rs.distortion.brown_conrady
     intrinsics = Intrinsics(
         camera=Camera(

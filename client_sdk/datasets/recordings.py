@@ -89,8 +89,8 @@ def open_dataset(
 
     Raises:
         UsageError: The path has no known format, a part of the recording is missing or broken, facts about it
-            contradict each other, it has no such camera or IMU, or *intrinsics* is given for a format
-            that has a calibration of its own.
+            contradict each other, it has no such camera or IMU, or *intrinsics* is given for a format that
+            has a calibration of its own.
         MissingExtra: OpenCV or rosbags is needed and not installed.
     """
     path = Path(path)

@@ -1,8 +1,7 @@
 """Inertial measurement units: samples, preintegration, and alignment with the poses of a camera.
 
-1. `samples` holds the samples that come with a frame, and the model of the IMU; `history` collects the
-samples
-   of the last five minutes.
+1. `samples` holds the samples that come with a frame, and the model of the IMU; `history` collects those of
+   the last five minutes.
 2. `checks` refuses an IMU whose samples are faulty, or whose gyroscope contradicts the camera's rotations.
 3. `preintegration` integrates the samples between two frames on the manifold (Forster et al. 2017).
 4. `alignment` estimates metric scale, gravity, velocities and biases from tracked poses and preintegrated

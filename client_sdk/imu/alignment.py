@@ -7,9 +7,8 @@ The camera's poses, which may be up to scale, are measurements with noise (a loo
    negative, or the magnitude of gravity certainly wrong, the accelerometer is refused.  Then the magnitude of
    gravity is set to 9.81 m/s^2.
 3. A nonlinear least-squares problem refines velocities, gravity and scale together with the rotations,
-positions
-   and biases of all poses: residuals of preintegrated motions (Forster et al. 2017) and of poses, Huber loss,
-   Levenberg-Marquardt.  Each pose has biases of its own.
+   positions and biases of all poses: residuals of preintegrated motions (Forster et al. 2017) and of poses,
+   Huber loss, Levenberg-Marquardt.  Each pose has biases of its own.
 
 Source:
     Qin et al., "VINS-Mono", T-RO 2018, for steps 1 and 2; Campos et al., "Inertial-Only Optimization for

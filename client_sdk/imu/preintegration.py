@@ -73,8 +73,8 @@ def preintegrate(samples: ImuSamples, gyro_bias_rad_s: Array, accel_bias_m_s2: A
         UsageError: There are fewer than two samples.
 
     Source:
-        Forster et al. 2017, Sect. VI and appendices A and B.  While integrating, the biases are part of
-        the error state, so that one product of ``(15, 15)`` matrices propagates both.  The result keeps the
+        Forster et al. 2017, Sect. VI and appendices A and B.  While integrating, the biases are part of the
+        error state, so that one product of ``(15, 15)`` matrices propagates both.  The result keeps the
         ``(9, 9)`` covariance and the ``(9, 6)`` derivatives by the biases.
     """
     if len(samples) < 2:

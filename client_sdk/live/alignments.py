@@ -127,8 +127,8 @@ class Alignments:
         """Number of keyframes of all robots in the map."""
         self.map_state = ""
         """State of the map in its last update of the key ``map``, empty before the first: ``live``,
-        ``moving`` (to another server) or ``waiting for the store`` (the platform cannot
-        use its object store, so keyframes are not accepted)."""
+        ``moving`` (to another server) or ``waiting for the store`` (the platform cannot use its object store,
+        so keyframes are not accepted)."""
         self.map_server = ""
         """Id of the backend server on which the map server runs; empty before the first update of the key
         ``map``, and while the map moves."""

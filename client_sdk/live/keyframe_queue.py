@@ -107,8 +107,8 @@ class KeyframeQueue:
         program that starts again does not know where the robot is in the earlier odometry frame.
 
         Raises:
-            UsageError: The folder cannot be read or written, holds a file with an invalid name, or is used
-                by another program.
+            UsageError: The folder cannot be read or written, holds a file with an invalid name, or is used by
+                another program.
         """
         folder = self._folder
         if folder is None:

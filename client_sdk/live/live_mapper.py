@@ -57,7 +57,7 @@ __all__ = ["LiveMapper"]
 
 _JOIN_REFUSALS = (*REFUSALS, BadRequest, UnsupportedProtocol)
 """Errors with which the platform refuses a robot that joins a map, and would refuse it again: joining raises
-them, and repeats its call after all others."""
+them; after any other error the call is repeated in the background."""
 _RESUBSCRIBE_PAUSE_S = 1.0  # pause before the robot subscribes to the map's updates again after a failure
 _LEAVE_DEADLINE_S = 1.0  # deadline of the call that leaves the map, so that a lost connection delays no exit
 _NEVER = 1_000_000_000
@@ -341,9 +341,9 @@ class LiveMapper:
         """Number of the present segment, which is one odometry frame, in the robot's own count.
 
         The first segment of a run is 0, or one more than that of the newest keyframe in the spool folder.
-        With depth, a new segment begins after `LiveOptions.segment_after` lost frames; without depth, when
-        the tracker begins, changes or joins its segments, or a loop closure corrects lengths by more than 3
-        %.
+        With depth, a new segment begins after `LiveOptions.segment_after` lost frames.  Without depth, it
+        begins when the tracker begins, changes or joins segments, or when a loop closure corrects lengths by
+        more than 3 %.
         """
         return self._segment
 
@@ -376,8 +376,8 @@ class LiveMapper:
 
         ``refused: ...`` if the platform refuses all keyframes of this robot, ``offline`` without a
         connection, ``joining`` before the first update of the map.  Then the state that the platform reports:
-        ``live``, ``moving`` (to another server) or ``waiting for the store`` (the platform cannot use
-        its object store, so keyframes are not accepted).
+        ``live``, ``moving`` (to another server) or ``waiting for the store`` (the platform cannot use its
+        object store, so keyframes are not accepted).
         """
         if self._sender.is_refused:
             return f"refused: {self._sender.trouble}"

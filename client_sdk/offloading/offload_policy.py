@@ -72,8 +72,8 @@ class CloudFirst:
         robot_solve_s: Expected time in seconds of an answer of the robot itself, until it is measured.
         slack_s: Time in seconds by which the robot starts earlier, because its processor has other work.
         take_faster: Whether to apply the rule of the paper, too: if the expected time of the robot is at most
-            the expected round trip to a server, ask the robot alone.  Without it, the servers are asked
-            first even if they are slower.
+            the expected round trip to a server, ask the robot alone.  Without it, the servers are asked first
+            even if they are slower.
     """
 
     registry: Registry | None = None

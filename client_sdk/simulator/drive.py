@@ -132,8 +132,8 @@ def render_pairs(truth: Trajectory, world: World, noise: Sequence[int], baseline
 def true_trajectory(robot: int, robots: int, frames: int, seed: int, rooms: int = ROOMS) -> Trajectory:
     """Return the exact poses ``T_world_camera`` of the frames of `render_frames` with the same arguments.
 
-    The z axis of the world points up.  From frame to frame a robot moves by 6.8 cm and rotates by at most 4
-    degrees; in three rooms the loop is about 28 m long.
+    The z axis of the world points up.  From frame to frame a robot moves by 6.8 cm and rotates by at most
+    4 degrees; in three rooms the loop is about 28 m long.
 
     Raises:
         UsageError: The robot is not one of *robots*, there are no frames, or fewer than 2 rooms.

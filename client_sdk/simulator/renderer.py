@@ -34,8 +34,8 @@ _LAMP_FALLOFF = 0.12
 """Per m^2: the lamp's part is divided by 1 + this times the squared distance from the lamp."""
 _CORNER_SHADE = 0.28  # darkening at the edges of a face, where surfaces meet: 0 is none, 1 is black
 _CORNER_FALLOFF = 70.0
-"""Per m^2: `_CORNER_SHADE` is divided by 1 + this times the squared distance of a point from the
-nearest edge of its face."""
+"""Per m^2: `_CORNER_SHADE` is divided by 1 + this times the squared distance of a point from the nearest edge
+of its face."""
 _FACING_LIGHT = 0.06
 """This share of the brightness is multiplied by the cosine of incidence of the camera's ray."""
 

@@ -5,7 +5,7 @@ or on a disk.  `DataClient` blocks; an asyncio program runs it in a thread.  Obj
 sha256, so a repeated or resumed transfer can neither store an object twice nor mix two versions.  An upload
 returns when the data service has reported the object durable.  For a large object, the data service may offer
 a presigned URL of its bucket, so that the bytes do not pass through a data server; if the transfer with that
-URL fails, they do.
+URL fails, the bytes go through a data server.
 """
 
 from __future__ import annotations
@@ -184,7 +184,7 @@ class DataClient:
     def upload(self, source: bytes | Path, progress: OnBytes | None = None) -> str:
         """Store bytes or a file as an object, and return its sha256 once it is durable.
 
-        If an earlier upload of the same bytes was interrupted, also by the end of its process, it is resumed.
+        If an earlier upload of the same bytes was interrupted, even in another process, it is resumed.
         *progress* is called after each part.
 
         Raises:
@@ -240,7 +240,7 @@ class DataClient:
             return {entry.name: entry.head for entry in self._reply("GET", "/data/v1/maps", _MapPage).maps}
 
     def map_version(self, name: str, version: str = "head") -> dict[str, Any]:
-        """Return a version of the map *name* as a dict of ``id`` and ``record`` (digest, parent, note).
+        """Return a version of the map *name* as a dict: its ``id`` and the ``record`` (`MapRecord`).
 
         *version* is the id of a version, or ``head`` for the newest one.
 

@@ -105,7 +105,7 @@ class DataConnection:
 
         Raises:
             ConnectError: There is no answer.
-            Unauthorized: *token* is no text of a token.
+            Unauthorized: *token* is not a text, is empty, or has characters that no token has.
             UsageError: The environment variable for the proxy does not hold the address of an HTTP proxy.
         """
         authorization = {"Authorization": f"Bearer {strip_token(token)}"}
@@ -176,7 +176,10 @@ class DataConnection:
         )
 
     def _explain_no_answer(self, error: OSError | http.client.HTTPException) -> ConnectError:
-        """Return the typed error of a request without an answer; a peer that has answered before is known."""
+        """Return the typed error of a request without an answer.
+
+        If the peer has never answered, the error says what may be wrong with the address.
+        """
         address = self._parts.geturl()
         if isinstance(error, ssl.SSLCertVerificationError):
             self.is_wrong_address = True
