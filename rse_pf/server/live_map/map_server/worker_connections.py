@@ -78,14 +78,12 @@ class WorkerConnections:
         self._connections: set[_WorkerConnection] = set()
         self._listener: TlsListener | None = None
 
-    def open(
-        self, listener: socket.socket, context: ssl.SSLContext, *, hello_s: float = FIRST_REQUEST_S
-    ) -> None:
+    def open(self, listener: socket.socket, context: ssl.SSLContext) -> None:
         """Accept connections on the listening socket *listener*.
 
-        A connection without a complete ``hello`` after *hello_s* seconds is closed.
+        A connection without a complete ``hello`` after `FIRST_REQUEST_S` seconds is closed.
         """
-        self._listener = TlsListener(listener, context, self._serve, seconds=hello_s)
+        self._listener = TlsListener(listener, context, self._serve, seconds=FIRST_REQUEST_S)
         self._listener.open()
 
     def send_update(self, payload: dict[str, Any]) -> None:
