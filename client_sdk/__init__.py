@@ -107,7 +107,7 @@ _HOMES = {
 
 
 def __getattr__(name: str) -> Any:
-    """Import *name* from its home."""
+    """Import *name* from the module that defines it."""
     home = _HOMES.get(name)
     if home is None:
         raise AttributeError(f"module 'client_sdk' has no attribute {name!r}")

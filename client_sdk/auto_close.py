@@ -1,4 +1,4 @@
-"""Let a ``with`` block close an object at its end; subclasses say what their `close` releases."""
+"""Let a ``with`` block call the method ``close`` of an object at its end."""
 
 from __future__ import annotations
 

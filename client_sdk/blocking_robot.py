@@ -1,7 +1,8 @@
 """Offer a robot to programs without asyncio: its event loop runs in a thread, and methods wait for answers.
 
 Every method calls the method of `client_sdk.robot.Robot` with the same name.  Any number of threads may call
-at the same time, also functions that the program gave to the SDK; these are called in a thread of their own.
+methods at the same time.  Functions that the program gave to the SDK run in one further thread, and may call
+methods, too.
 """
 
 from __future__ import annotations
@@ -30,8 +31,8 @@ if TYPE_CHECKING:
 __all__ = ["BlockingRobot", "connect_blocking"]
 
 GRACE_S = 0.5
-"""A call with *deadline_s* waits this many seconds longer before it gives up: the event loop ends the call at
-its deadline, unless the loop hangs."""
+"""A call with *deadline_s* ends at its deadline, unless the event loop hangs; then it raises Expired this
+many seconds after the deadline."""
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -153,10 +154,8 @@ class BlockingRobot(AutoClose):
 
         try:
             return self._wait(snapshot())
-        except (
-            Disconnected,
-            UsageError,
-        ):  # the loop has ended, or this is its thread
+        except (Disconnected, UsageError):
+            # The loop has ended, or this is its thread: the counters can be read without it.
             return self._robot.stats
 
     def _wait(self, work: Coroutine[Any, Any, T], limit_s: float | None = None) -> T:

@@ -1,4 +1,7 @@
-"""Read the enrolment file of a robot (``rse-pf robot enrol ROBOT --out FILE``): address, authority and key.
+"""Read the enrolment file of a robot, which ``rse-pf robot enrol ROBOT --out FILE`` writes.
+
+It holds the address of the platform, the certificate authority, and the key with which the robot signs
+tokens.
 
 ``client_sdk.connect(enrolment="robot-1.enrolment")`` reads the file by itself; these functions are for
 programs that need the address or a token for other clients, such as the data client.  Nothing here connects.
@@ -25,8 +28,8 @@ class EnrolledRobotAccess:
         url: WebSocket address of the platform.
         ssl_context: Trusts the authority in the file and no other; None if the file names no authority: then
             those of the machine are trusted.
-        token: Async function for `client_sdk.connect`, which signs a new token at each call.
-        fresh_token: Function for `client_sdk.DataClient`, which signs a new token at each call.
+        token: Async function that signs a new token at each call, as `client_sdk.connect` takes it.
+        fresh_token: Function that does the same without asyncio, as `client_sdk.DataClient` takes it.
     """
 
     robot: str
@@ -40,7 +43,8 @@ def read_enrolment(path: str | Path) -> EnrolledRobotAccess:
     """Return the content of the enrolment file *path*.
 
     Raises:
-        UsageError: The file cannot be read, other users may read it, or it holds no enrolment.
+        UsageError: The file cannot be read, its permissions let other users read it, or it holds no
+            enrolment.
         MissingExtra: The extra ``keys`` is not installed.
     """
     from rse_pf.enrolment import EnrolmentFile

@@ -48,7 +48,7 @@ def map_to_pinhole(lens: Lens, camera: Camera | None = None) -> ImageMap:
     None for the camera keeps the intrinsics of the lens, and removes its distortion only.
 
     Raises:
-        MissingExtra: OpenCV is not installed, and images are not those of the camera already.
+        MissingExtra: OpenCV is not installed, and images must be resampled.
     """
     wanted = lens.camera if camera is None else camera
     if lens.is_pinhole and lens.camera == wanted:

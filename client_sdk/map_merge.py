@@ -27,14 +27,16 @@ async def merge_maps(
 ) -> MergeReply:
     """Return one map of several, merged by a server; the world frame is that of the first map.
 
-    A map that shows no place of the others is not in the result: ``not_joined`` of the reply says why.
+    A further map that shows no place of the others is not in the result: ``not_joined`` of the reply says
+    why.
 
     Args:
         robot: Sends the command, which may take minutes.
         data: Data client of the same robot, as whose objects the maps are stored.
         maps: Encoded maps, such as those of `Mapper.encoded_map` or `DataClient.download_map`.
         options: Conditions of loop closures within and between the maps; None means the defaults.
-        on_progress: Called with the share that is done (0..1), and the name of the step that was done last.
+        on_progress: Called with the share that is done (0..1), and the name of the last step that is
+            complete.
 
     Raises:
         RsePfError: The typed failure of an upload, of the command, or of the download.
@@ -44,7 +46,7 @@ async def merge_maps(
     if options is not None:
         request["options"] = options
     answer = await robot.call("merge", request, MergeReply, on_progress=on_progress or _ignore_progress)
-    if answer.reply is None:  # the reply is too large for a message
+    if answer.reply is None:  # too large for a message, so that the server has stored it as an object
         stored = await asyncio.to_thread(data.download, answer.object)
         return decode_reply(stored, MergeReply)
     reply: MergeReply = answer.reply
@@ -52,5 +54,4 @@ async def merge_maps(
 
 
 def _ignore_progress(done: float, step: str) -> None:
-    """Ignore the progress: it stands in for the caller's function, since a call with any function has no
-    default deadline."""
+    """Ignore the progress; a call of `Robot.call` with an *on_progress* has no default deadline."""

@@ -12,8 +12,8 @@ until odometry, a marker or an IMU gives the metric scale.
 tracker begins another segment, with a world of its own.  Segment 0 is the trajectory and the map that users
 see.
 
-**Join.**  When the camera recognises a place of an older segment, the newer segment is moved into the world
-of the older one: poses, cloud and keyframes.
+**Join.**  When the camera, in a newer segment, recognises a place of an older segment, the newer segment is
+moved into the world of the older one: poses, cloud and keyframes.
 
 **Correction.**  A change of poses that were returned before: after a join, after the world was turned so that
 z points up, or after a monocular tracker adjusted its keyframes.  The result of the frame that caused it has
@@ -67,22 +67,23 @@ __all__ = ["AskPose", "BlockingMapper", "Mapper", "ask_robot"]
 AskPose = Callable[[PoseQuery], Awaitable[PoseAnswer]]
 """Function that answers one pose query.
 
-If it raises an RsePfError, the query counts as not answered.  `Mapper.track` raises a ConfigurationError
-(such as a UsageError) and every other exception of it again.
+If the function raises an RsePfError, the query counts as not answered.  `Mapper.track` passes on a
+ConfigurationError (such as a UsageError) and every exception that is no RsePfError.
 """
 
 _MIN_READINGS = 2  # readings that a voxel of a dense map needs to be saved: single ones are mostly noise
 _UP_TO_SCALE: Final = "up to scale"
 _GRAVITY_OF_LEVEL_CAMERA: Array = np.array([0.0, 9.81, 0.0])
-"""Gravity in m/s^2 in the frame of a level camera (y down): the first camera counts as level if the first IMU
-samples are not those of a stationary camera."""
-_DEFAULT_DEPTH_M = 2.0  # median depth for the position noise of poses while the last frame has no depth
+"""Gravity in m/s^2 in the frame of a level camera, whose y axis points down.  It is assumed for the first
+camera if the first IMU samples cannot measure gravity, because the camera moved."""
+_DEFAULT_DEPTH_M = 2.0
+"""Median depth in metres that is assumed for a frame without depth, to compute the noise of positions."""
 
 
 def ask_robot(solve_pnp: Callable[..., Awaitable[PoseAnswer]], deadline_s: float | None = None) -> AskPose:
     """Return a function that answers pose queries with `Robot.solve_pnp`, each within *deadline_s* seconds.
 
-    None means ``session.answer_timeout_s``.  A query is answered even if newer ones follow.
+    None means ``session.answer_timeout_s``.  Queries have ``keep``: newer ones do not replace a query.
     """
 
     async def ask(query: PoseQuery) -> PoseAnswer:
@@ -143,12 +144,12 @@ class Mapper:
             camera: Intrinsics; frames of another camera are refused.  None takes those of the first frame.
             options: Options of the tracker for depth and stereo pairs.
             monocular: Options of the tracker for frames without depth.
-            depth: Whether to use the depth images of frames.  None: if the first frame has some depth.
+            depth: Whether to use the depth images of frames.  None: if the first frame has a depth reading.
                 Stereo pairs are used in each case.
             scale: Source of the metric scale of frames without depth.  None: the IMU, if frames carry its
                 samples, else the map stays up to scale.
             map_options: Density of the map of frames with depth.
-            T_world_start: ``(4, 4)`` pose of the first camera in the world; with it the world is not turned
+            T_world_start: ``(4, 4)`` pose of the first frame in the world; with it the world is not turned
                 when gravity becomes known.  None: the identity; with an IMU a pose whose world has z up, in
                 which a level camera looks along x.
             keyframes_of: Name of the robot whose keyframes are kept for `encoded_map`, about 50 kB each.
@@ -190,7 +191,7 @@ class Mapper:
         self._adds_frames = adds_frames
         self._recorder = recorder
         self._plugins = Plugins.wrap(features=features, motion=motion, loops=loops, optimiser=optimiser)
-        self._processed_joins = 0  # joins that were applied; of a monocular tracker also its loop closures
+        self._processed_joins = 0  # joins that were applied; with a monocular tracker, plus its loop closures
         self._depth_source: Literal["depth", "stereo"] = "depth"
         self._metric_segments: set[int] = set()  # segments of a monocular tracker whose scale is known
         self._frame_lock = asyncio.Lock()
@@ -208,8 +209,9 @@ class Mapper:
             position_m: ``(3,)`` position of the camera by the robot's odometry, metres, for `OdometryScale`.
 
         Raises:
-            UsageError: The frame is of another camera, not later than the one before, or its depth is not in
-                metres; such a frame changes nothing.  Or a function of the user, such as *features*, failed.
+            UsageError: The frame is of another camera, not later than the one before, or the median of its
+                depths is impossible in metres; such a frame changes nothing.  Or a function of the user, such
+                as *features*, failed.
             ConfigurationError: The function that answers pose queries cannot work, such as without a package.
         """
         async with self._frame_lock:
@@ -252,9 +254,9 @@ class Mapper:
     def map(self) -> PointMap:
         """Points of segment 0 so far: depth readings, features of stereo pairs, or monocular landmarks.
 
-        With depth this is the map itself: later frames are added to it, until a turn of the world or an
-        adjustment replaces it by another map.  Of a camera without depth it is made anew from the landmarks
-        at each access, and later frames do not change it.
+        With depth this is the map itself: later frames are added to it.  A turn of the world or an adjustment
+        makes another map, and one that was returned before gets no more frames.  Of a camera without depth it
+        is made anew from the landmarks at each access, and later frames do not change it.
         """
         tracker = self._tracker
         if not isinstance(tracker, MonocularTracker):
@@ -311,8 +313,9 @@ class Mapper:
     def imu(self) -> str:
         """State of the IMU: ``none``, ``used``, ``not used yet``, or ``not used: `` with the reason.
 
-        ``none``: the first frame had no samples.  ``not used yet``: the newest alignment with the poses of
-        the camera did not succeed.  ``not used``: the samples are faulty or contradict the camera.
+        ``none``: the first frame had no samples.  ``not used yet``: no alignment with the poses of the camera
+        was tried, or the newest one did not succeed.  ``not used``: the samples are faulty or contradict the
+        camera.
         """
         if self._imu is None:
             return "none"
@@ -322,7 +325,7 @@ class Mapper:
 
     @property
     def gravity(self) -> Array | None:
-        """Gravity ``(3,)`` in the world, m/s^2; None while it is not known within 0.5 degrees."""
+        """Gravity ``(3,)`` in the world, m/s^2; None while its direction is uncertain (1 sigma > 0.5 deg)."""
         return None if self._imu is None else self._imu.gravity_m_s2
 
     def keyframe_imu(
@@ -336,9 +339,9 @@ class Mapper:
 
     @property
     def unrecognised(self) -> int:
-        """Number of lost frames since the last pose that have enough features; 0 without depth.
+        """Number of frames without a pose since the last pose; only of a camera with depth, else 0.
 
-        Frames of a covered lens have too few features and do not count.
+        Frames with too few features, such as those of a covered lens, do not count.
         """
         return self._tracker.unrecognised if isinstance(self._tracker, Tracker) else 0
 
@@ -354,14 +357,15 @@ class Mapper:
 
     @property
     def depth_noise(self) -> DepthNoise:
-        """Noise of the camera's depths, as measured during the drive; that of a Kinect without depth."""
+        """Noise of depths as measured during the drive; of a Kinect if the camera has no depth."""
         return self._tracker.noise.noise if isinstance(self._tracker, Tracker) else DepthNoise()
 
     def restart(self, T_world_start: Array) -> None:
         """Begin another world: the next frame with enough features gets the ``(4, 4)`` pose *T_world_start*.
 
         The tracker forgets its keyframes, and gravity is estimated anew from the poses that follow.  Poses
-        and points so far stay in `trajectory` and `map`, and those that follow are added to them.
+        and points so far stay in `trajectory` and `map`, and those that follow are added to them as they
+        are.
 
         Raises:
             UsageError: The camera has no depth, or no frame was tracked, or a frame is being tracked.
@@ -380,7 +384,7 @@ class Mapper:
     def report(self) -> dict[str, Any]:
         """Return the figures of the drive, which `save` writes to ``report.json``.
 
-        ``map_points`` counts all voxels here, and in ``report.json`` only those that were saved.
+        ``map_points`` is the number of all voxels of the map, but in ``report.json`` of the saved ones only.
         """
         trips = np.array(self._round_trips_ms)
         trajectory, separate = self.trajectory, self._separate_segments()
@@ -411,9 +415,10 @@ class Mapper:
         }
 
     def encoded_map(self) -> bytes:
-        """Return cloud and keyframes of segment 0 as one encoded map, for merging and for localisation.
+        """Return cloud and keyframes of segment 0 as one encoded map.
 
-        `DataClient.update_map` shares it, and `merge_maps` merges several.
+        `DataClient.update_map` stores it for the tenant, `merge_maps` merges several, and the service
+        ``localise`` finds cameras in it.
 
         Raises:
             UsageError: There is no keyframe in metres: the scale is not known, or *keyframes_of* is empty.
@@ -440,7 +445,7 @@ class Mapper:
         IMU, the world is turned so that z points up if gravity is known, unless *holds_world* or
         *T_world_start* forbids it.
 
-        A map with depth has the voxels that were read at least twice, and the report counts only these.
+        A map with depth has the voxels with at least two depth readings, and the report counts only these.
         Segments that were not joined to segment 0 have files of their own: ``map-2.ply``,
         ``trajectory-2.txt`` and so on.  With a rig and in metres, ``trajectory-body.txt`` has the poses of
         the rig's body.
@@ -516,7 +521,7 @@ class Mapper:
 
     @property
     def _min_readings(self) -> int:
-        """How often a voxel must have been read to be in a saved map: twice, once if the map is sparse."""
+        """Least readings of a voxel in a saved map: 2, and 1 for maps of features (stereo and landmarks)."""
         is_sparse = isinstance(self._tracker, MonocularTracker) or self._depth_source == "stereo"
         return 1 if is_sparse else _MIN_READINGS
 
@@ -641,7 +646,7 @@ class Mapper:
         return self._apply_gravity(tracker, self._apply_joins(tracker, tracked))
 
     def _apply_joins(self, tracker: Tracker, tracked: TrackedFrame) -> TrackedFrame:
-        """Move the records of the segments that were joined since the last frame into those they joined.
+        """Move each segment that was joined since the last frame into the world of the older segment.
 
         Return *tracked*, marked as corrected if there were any: poses that were returned before have moved.
         """
@@ -779,7 +784,7 @@ async def _run_in_thread(
 ) -> PoseQuery | TrackedFrame:
     """Run a step of a tracker in a thread and return its result.
 
-    A cancellation waits for the thread, which cannot be stopped, and closes the query that it returned.
+    A cancellation waits for the step, which cannot be stopped, and closes the query that the step returned.
     """
     task = asyncio.ensure_future(asyncio.to_thread(work))
     try:

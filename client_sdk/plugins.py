@@ -59,12 +59,13 @@ _MAX_FOUND_FEATURES = 100_000
 _MOTION_HISTORY_POSES = 10
 """Number of newest poses that a user's motion model is given."""
 _MIN_PLACE_SIZE = 8
-"""Smallest length of a place vector of a user: shorter ones do not tell places apart."""
+"""Smallest length of the vector that a user's place recogniser returns: shorter ones do not tell places
+apart."""
 _MAX_PLACE_SIZE = 4096
-"""Largest length of a place vector of a user: bounds the memory of a keyframe."""
+"""Largest length of the vector that a user's place recogniser returns: bounds the memory of a keyframe."""
 _CLIP_RMS = 4.0
-"""When a float descriptor becomes int8, its numbers are clipped at this many times the root mean square of
-that descriptor."""
+"""When a float descriptor becomes int8, its numbers are clipped at this many times their root mean square;
+the limit becomes 127."""
 
 _PARTS_HINT = "see docs/own_parts.md"
 _FEATURES_HINT = (
@@ -79,10 +80,10 @@ class FoundFeatures:
 
     Attributes:
         pixels: ``(n, 2)``, column and row; the centre of the first pixel is (0, 0).
-        scores: ``(n,)``, strength; features with the highest scores are used.
+        scores: ``(n,)``, strength; the tracker uses the features with the highest scores.
         descriptors: ``(n, d)``: uint8 for binary descriptors (Hamming distance), int8 or floats for vectors
-            (Euclidean distance).  Float vectors are scaled to one length and sent as int8.  None is allowed
-            only without features.
+            (Euclidean distance).  Float vectors are scaled to length 1 and rounded to int8.  None is allowed
+            only if n is 0.
         orientations_deg: ``(n,)``, angle of each feature in the image, clockwise from the x axis; None if the
             detector measures none: then a match may be rotated by any angle.
         sizes: ``(n,)``, scale of each feature, above 0, 1 for the finest; None if the detector measures none:
@@ -98,7 +99,7 @@ class FoundFeatures:
 
 FeaturesFunction = Callable[[npt.NDArray[np.uint8]], FoundFeatures]
 """A feature extractor: takes an ``(h, w, 3)`` uint8 image, red first.  The function's attribute ``name``,
-else its ``__name__``, is the name of the kind of features."""
+else its ``__name__``, is the name of the kind of features: maps hold features of one kind only."""
 MotionFunction = Callable[[Array, Array, float], npt.ArrayLike]
 """A motion model: takes ``(k,)`` times in seconds and ``(k, 4, 4)`` poses ``T_world_camera`` of the newest
 tracked frames, ten at most, oldest first, and the time of the next frame; returns the predicted ``(4, 4)``
@@ -136,7 +137,8 @@ class FeaturesPlugin:
 
     ``name`` is the name of its features, in lower case.  ``kind``, ``is_oriented`` and ``is_scaled`` (the
     kind of its descriptors, and whether it measures orientations and sizes) are those of the first image with
-    features, and every later image must have the same; before that image they are ORB, False and False.
+    features, and every later image must have the same; before that image they are placeholders:
+    ORB, False and False.
     """
 
     def __init__(self, function: FeaturesFunction) -> None:
@@ -254,7 +256,7 @@ class MotionPlugin:
         self._recent.append((timestamp_s, T_world_camera))
 
     def clear(self) -> None:
-        """Forget all poses: the camera was lost, or the world frame was moved."""
+        """Forget all poses: tracking was lost, or the poses were moved to another world."""
         self._recent.clear()
 
     def predict(self, timestamp_s: float) -> Array | None:
@@ -351,10 +353,10 @@ def _call_user(name: str, function: Callable[..., Any], *arguments: Any) -> Any:
     """
     try:
         return function(*arguments)
-    except (Exception, asyncio.CancelledError, SystemExit) as error:  # also what would end a thread or a task
+    except (Exception, asyncio.CancelledError, SystemExit) as error:  # also what would end a task or a thread
         raise UsageError(
             f"the {name} failed: {type(error).__name__}: {_describe_error(error)}",
-            hint="call it with values of your own, or see docs/own_parts.md",
+            hint="call the function without a mapper to find the cause, or see docs/own_parts.md",
         ) from error
 
 
@@ -390,14 +392,14 @@ def _has_shape(array: Array, shape: tuple[int, ...]) -> bool:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Plugins:
-    """The parts of a tracker that a user replaces, and the IMU that helps it.
+    """The parts of a tracker that a user replaces, and the IMU whose rotations the tracker uses.
 
     Attributes:
         features: Feature extractor; None for ORB.
         motion: Motion model; None for a constant velocity.
         loops: Place recogniser; None for the VLAD vector of the descriptors.
         optimiser: Bundle adjustment of a camera without depth; None for the built-in one.
-        inertial: The IMU of the camera; None without one.
+        inertial: The IMU of the camera, which the mapper sets with the first samples; None without one.
     """
 
     features: FeaturesPlugin | None = None
@@ -458,7 +460,7 @@ class Plugins:
             self.motion.add(timestamp_s, T_world_camera)
 
     def forget_poses(self) -> None:
-        """Drop the poses kept for the user's motion model: the camera was lost, or the world frame was moved.
+        """Drop the poses of the user's motion model, after tracking was lost or poses moved to another world.
 
         The model predicts again after the next `add_pose`.
         """

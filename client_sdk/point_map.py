@@ -27,8 +27,8 @@ __all__ = ["MapOptions", "PointMap", "read_ply", "write_ply"]
 
 _EMPTY = -1  # key of a slot of the hash table that holds no voxel
 _MAX_VOXEL_INDEX = 1 << 20
-"""Voxels on either side of the origin along each axis; points beyond are left out.  Three indices of 21 bits
-make one int64 key."""
+"""Voxels on either side of the origin along each axis; points beyond are left out.  An index has 21 bits, and
+three indices make one int64 key."""
 _FIRST_VOXELS = 2048  # voxels for which a new map has memory; the memory doubles when they are full
 _FIRST_SLOTS = 4096  # slots of a new hash table, at least twice as many as voxels
 _MIN_VOXEL_M = 0.001  # smallest edge of a voxel: no depth sensor is more exact
@@ -50,8 +50,8 @@ class MapOptions:
         max_depth_m: Largest depth that is added, in metres.
         every_px: Distance in pixels between the rows, and between the columns, of which readings are added.
         edge_percent: Largest difference between the depths of a pixel and of each of its four neighbours, in
-            percent of the right or lower depth of the two.  A reading beyond it lies on a depth edge, between
-            two surfaces, and is left out.
+            percent of the depth of the pixel that is to the right or below of the other.  A reading beyond it
+            lies on a depth edge, between two surfaces, and is left out.
         max_points: Largest number of voxels; readings that need another one are left out.  A point takes
             about 60 to 120 bytes.
 
@@ -137,8 +137,9 @@ def _native_function(name: str) -> Any:
 class PointMap:
     """Voxel grid that holds the mean position and the mean colour of the readings in each voxel.
 
-    Voxels are found with an open-addressing hash table over flat arrays.  Both double when they are full, so
-    that a frame costs amortised time in proportion to its own points.  The native core adds the readings.
+    Voxels are found with an open-addressing hash table over flat arrays.  Table and arrays double when they
+    are too small, so that a frame costs amortised time in proportion to its own points.  The native core adds
+    the readings.
 
     Attributes:
         options: Density of the map, and choice of readings.
@@ -164,7 +165,7 @@ class PointMap:
     def add(self, frame: Frame, T_world_camera: Array) -> int:
         """Add the depth readings of a frame at a ``(4, 4)`` pose; return how many readings were added.
 
-        Those that `MapOptions` excludes are left out, and those beyond the end of the grid.
+        Readings that `MapOptions` excludes are left out, and those beyond the end of the grid.
         """
         options, camera = self.options, frame.camera
         depth_m, rgb = aligned(frame.depth_m, np.float32), aligned(frame.rgb, np.uint8)
@@ -188,7 +189,7 @@ class PointMap:
         return self._call("add_frame", _NO_POINTS, ctypes.byref(native_frame))
 
     def add_map(self, other: PointMap, T_world_other: Array) -> None:
-        """Add the voxels of another map, moved by a ``(4, 4)`` pose, each weighted by its readings."""
+        """Add the mean points of another map, moved by a ``(4, 4)`` pose, each weighted by its readings."""
         means = other._means[: other._voxels]
         points = transform(T_world_other, means[:, :3].astype(np.float64))
         self._add(points, means[:, 3:], other._counts[: other._voxels])

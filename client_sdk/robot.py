@@ -95,10 +95,11 @@ class Robot:
         Args:
             url: ``ws://HOST:PORT/ws`` or ``wss://HOST/ws``.  Of a list of addresses (regions) the robot uses
                 the one with the shortest round trip, and keeps a connection to each of the others.
-            token: The robot's token, or an async function that returns one (a run outlives a token).
+            token: The robot's token, or an async function that returns a valid one: a token is valid for
+                minutes, and the function is called for each connection and each renewal.
             enrolment: File of ``rse-pf robot enrol --out``, instead of *url* and *token*.  A list of
                 addresses in *url* replaces the address in the file.
-            codec: ``zlib`` (the paper's), ``json`` or ``bin``.
+            codec: Format of messages: ``json``, ``zlib`` (JSON compressed by zlib) or ``bin`` (MessagePack).
             settings: Limits and timeouts of the platform; None means the defaults.
             timings: Timeouts and pauses of attempts to connect; None means the defaults.
             offload: `CloudFirst` lets the robot answer commands itself when the cloud cannot; None never
@@ -115,8 +116,8 @@ class Robot:
                 first connection.  None takes the address that the servers name, and "" uses no function.
 
         Raises:
-            UsageError: The address or the codec cannot be used, or *enrolment* is combined with *token* or a
-                single address.
+            UsageError: The address or the codec cannot be used, or *enrolment* is combined with *token* or
+                with a single address; a list of addresses is allowed.
         """
         urls = [url] if isinstance(url, str) else list(url)
         is_list = not isinstance(url, str)
@@ -177,7 +178,10 @@ class Robot:
         self._process = os.getpid()
 
     async def __aenter__(self) -> Robot:
-        """Connect and return this robot; with *offload* or *burst_url* also while no server answers.
+        """Connect and return this robot.
+
+        With *offload* or a *burst_url* that is neither None nor empty, it returns also while no server
+        answers.
 
         Raises:
             Unauthorized: The token is missing, wrong or expired.
@@ -252,7 +256,7 @@ class Robot:
         stream: str = "pose",
         keep: bool = False,
     ) -> PoseAnswer:
-        """Estimate the camera pose of one frame by PnP with RANSAC, in the cloud.
+        """Estimate the camera pose of one frame by PnP with RANSAC, where `call` has it computed.
 
         Args:
             points_world: ``(n, 3)``, metres, world frame.
@@ -260,13 +264,13 @@ class Robot:
             camera: Intrinsics of the image.
             options: Settings of RANSAC; None means those of the server.
             depths_m: ``(n,)``, metres, depths that a depth camera measured at the pixels, 0 where it measured
-                none.  The pose is refined with them; the world frame must then be the frame of the camera
-                that measured the points.
-            depth_noise: Noise of both depth cameras; None means that of a Kinect.
+                none.  The pose is refined with them; *points_world* must then be in the frame of the camera
+                that measured these points.
+            depth_noise: Noise of the depths of the points and of *depths_m*; None means that of a Kinect.
             deadline_s: Seconds within which the answer is needed; None means ``session.answer_timeout_s``.
             stream: Name of the sequence of frames; a newer frame of a stream replaces an older one, whose
                 command then ends with Stale.
-            keep: Whether this frame is answered although newer ones follow.
+            keep: Whether this frame is answered even if a newer frame of its stream is sent.
 
         Returns:
             The pose ``T_camera_world`` with covariance, inliers and verdict in ``solution``.
@@ -302,8 +306,9 @@ class Robot:
     ) -> Answer:
         """Call *service* and wait for the reply; any number of calls may run concurrently.
 
-        A long service (``merge``, ``optimise``) runs as a job: it has no deadline but *deadline_s*, survives
-        reconnects and crashes of its server, and ends when the call is cancelled or its deadline passes.
+        A long service (``merge``, ``optimise``) runs as a job: it survives reconnects and crashes of its
+        server, and is ended there when the call is cancelled or *deadline_s* has passed.  While no
+        server can answer, the burst function of the platform does, or with *offload* the robot itself.
 
         Args:
             service: Name of the service, such as ``pnp``.
@@ -465,8 +470,7 @@ class Robot:
 
         Args:
             frame: Image and time.
-            T_odom_camera: ``(4, 4)``, from the camera frame to the odometry frame, metres; None records no
-                pose.
+            T_odom_camera: ``(4, 4)`` pose of the camera in the odometry frame, metres; None records no pose.
         """
         if self._recorder is not None:
             self._recorder.record_frame(frame.timestamp_s, frame.rgb, T_odom_camera)
@@ -500,7 +504,7 @@ class Robot:
         stream: str = "",
         keep: bool = False,
     ) -> int:
-        """Send a command without waiting for it, and return its id; *on_end* is called once with its answer.
+        """Send a command without waiting for it, and return its id; *on_end* gets its answer or failure once.
 
         This is for load generators: it makes no task, future or statistics, and *request* may be a
         `PreencodedCommand`.  As with `call`, a command waits while the connection is lost.  Neither the burst
@@ -522,8 +526,8 @@ class Robot:
     def subscribe(self, topic: str) -> Updates:
         """Subscribe to *topic*, such as ``live/MAP``; call this in the robot's event loop.
 
-        ``async for key, value in robot.subscribe(topic)`` receives the present values first, and newer ones
-        later. The subscription survives reconnects and changes of the server.
+        ``async for key, value in robot.subscribe(topic)`` receives the present value of each key first, and
+        newer values later.  The subscription survives reconnects and changes of the server.
 
         Raises:
             Disconnected: The robot is not open.
@@ -629,4 +633,4 @@ def _sdk_version() -> str:
 
 
 connect = Robot
-"""Make a robot for ``async with connect(url, token=...) as robot``; the arguments are those of `Robot`."""
+"""Another name of `Robot`, for ``async with connect(url, token=...) as robot``, which connects."""

@@ -2,9 +2,9 @@
 
 Each reader (folder, data set, bag, video, device) fills in `SourceFacts`: what files and messages state, what
 the reader assumed, and what the images show.  `check_source` compares these facts before a frame is tracked.
-Facts that contradict each other are an error with both numbers.  Facts that are only unlikely are a `Doubt`:
-the source is used, the doubt is printed as a finding, and ``rse-pf check`` gives no advice until the user
-accepts the doubt by its name (``--accept NAME``).
+Facts that contradict each other are an error with both numbers.  Facts that are only unlikely are a `Doubt`,
+which users see as a *finding*: the source is used, the finding is printed, and ``rse-pf check`` proposes no
+calibration until the user accepts the finding by its name (``--accept NAME``).
 """
 
 from __future__ import annotations
@@ -56,8 +56,8 @@ _MAX_EPOCH_S = 1e10  # median from which on time stamps do not count as seconds 
 _TIME_UNITS_S = {"seconds": 1.0, "milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9}
 """Units that time stamps of recordings have, each with its length in seconds."""
 _USUAL_LOSS_SHARE = 0.1
-"""Share of lost images, up to which a loss with `LossFacts.is_usual` is a note and no finding: two cameras
-that are not triggered together always lose some images without a partner."""
+"""Share of lost images, up to which a loss with `LossFacts.is_usual` is printed as a note and not as a
+finding: of two cameras that are not triggered together, some images always have no partner."""
 _MAX_VIDEO_END_DIFFERENCE = 0.5
 """Difference between the times of the last images of two videos, in image intervals of the faster video: more
 means that one video lacks an image."""
@@ -73,7 +73,7 @@ class DoubtName(str, Enum):
     LEFT_OUT = "left-out"  # images are not used: damaged, empty, or without a partner
     ENDED_EARLY = "ended-early"  # the source failed after it had delivered frames
     CAMERA_CHANGES = "camera-changes"  # several calibrations of one camera are stated in one recording
-    DEPTH_REGISTRATION = "depth-registration"  # depth that may not be registered is used as if it were
+    DEPTH_REGISTRATION = "depth-registration"  # depth that is perhaps not registered is used as if it were
     DEPTH_ALONG_RAY = "depth-along-ray"  # depth is measured along the ray, not along the optical axis
     STATIC_PATTERN = "static-pattern"  # something is fixed in the image while the camera moves, such as dirt
     FROZEN_IMAGES = "frozen-images"  # the driver or the recorder repeats an image while the camera moves
@@ -149,8 +149,8 @@ class LossFacts:
         sentence: Which images are lost, and why, for the user.
         lost: Number of lost images.
         total: Number of images that the source lists.
-        is_usual: Whether every recorder loses some images in this way, such as those without a partner of
-            cameras that are not triggered together.
+        is_usual: Whether every recorder loses some images in this way: of two cameras that are not triggered
+            together, some images have no partner.
     """
 
     sentence: str
@@ -246,7 +246,7 @@ class DoubtLog:
             self._doubts += check_reference(reference, span_s)
 
     def leave_out(self, image: str) -> None:
-        """Count an image that cannot be used; *image* is its file name or time."""
+        """Note an image that cannot be used; *image* is its file name or time."""
         self._left_out.append(image)
 
     @property
@@ -300,8 +300,9 @@ def unresolved(doubts: Iterable[Doubt], accepted: Iterable[str]) -> tuple[Doubt,
 def time_unit_s(stamps: Array) -> tuple[str, float]:
     """Return the name and the length (s) of the most likely unit of time stamps ``(n,)`` that state no unit.
 
-    Time stamps since 1970 show their unit by their size.  All others show it by their median interval: below
-    10 they are seconds, below 10,000 milliseconds, below 10 million microseconds, and else nanoseconds.
+    Time stamps since 1970 show their unit by their size.  All others show it by their median interval, since
+    cameras are slower than 10,000 Hz and faster than 0.1 Hz: below 10 they are seconds, below 10,000
+    milliseconds, below 10 million microseconds, and else nanoseconds.
     Without two different time stamps, there is no interval, and the unit is the second.
     """
     unit = _unit_since_1970(stamps)
@@ -362,13 +363,13 @@ def median_depth_m(images: Iterable[npt.NDArray[np.float32]]) -> float | None:
 def rows_in_time(times: TimeFacts) -> tuple[list[int], tuple[Doubt, ...]]:
     """Return the indices of the time stamps that are used, which increase, and the doubts about all others.
 
-    A time stamp that equals the one before is left out.  If a time stamp is earlier than the one before,
-    which may happen once, it and all later ones are left out.  There is one doubt for each of these two
-    reasons.
+    A time stamp that equals the one before is left out.  A recording whose clock is set back once ends there:
+    the first time stamp that is earlier than the one before, and all later ones, are left out.  There is one
+    doubt for each of these two reasons.
 
     Raises:
-        UsageError: The time stamps go back more than once, or between the first two, so that they are not in
-            the order of time.
+        UsageError: The time stamps go back more than once, or already from the first to the second: they are
+            not in the order of time.
     """
     steps_s = np.diff(times.stamps_s)
     total = len(times.stamps_s)
@@ -433,7 +434,7 @@ def some_names(names: Sequence[str]) -> str:
 
 
 def _check_cameras(facts: SourceFacts) -> Iterable[Doubt]:
-    """Refuse intrinsics that do not fit the images.
+    """Refuse intrinsics that do not fit the images; there are no doubts.
 
     Refused are another image size, a principal point outside of the image, and an implausible field of view.
     """

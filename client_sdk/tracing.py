@@ -36,8 +36,8 @@ def new_trace() -> str:
 def traced(trace: str = "") -> Iterator[str]:
     """Send the id *trace*, by default a new one, with all commands of a ``with`` block; yield the id.
 
-    Only the first `MAX_ID_CHARACTERS` of *trace* are sent.  The id takes precedence over an OpenTelemetry
-    span and over an outer block.
+    A longer *trace* is cut to its first `MAX_ID_CHARACTERS`.  The id takes precedence over an OpenTelemetry
+    span and over the id of an outer ``with traced()`` block.
     """
     trace_id = (trace or new_trace())[:MAX_ID_CHARACTERS]
     earlier = _trace_id.set(trace_id)

@@ -54,8 +54,9 @@ class Trajectory:
 
     @property
     def length_m(self) -> float:
-        """Length of the path in the unit of the poses: the sum of the distances between consecutive poses.
+        """Length of the path, in metres or in the unit of a trajectory up to scale.
 
+        It is the sum of the distances between consecutive poses.
         Poses count in the order of the arrays, whatever their time stamps are.
         """
         return float(np.linalg.norm(np.diff(self.positions, axis=0), axis=1).sum())
@@ -63,6 +64,7 @@ class Trajectory:
     def at(self, stamps_s: npt.ArrayLike) -> Array:
         """Return ``(n, 4, 4)`` poses at other times, interpolated with a constant twist between two poses.
 
+        The poses of the trajectory are sorted by their time stamps for this.
         Before the first time stamp this is the first pose, after the last time stamp the last pose.  The
         trajectory must have two or more poses.
         """
