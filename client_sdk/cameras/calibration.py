@@ -23,9 +23,9 @@ _MAX_FOCAL_DEVIATION_PERCENT = 2.0
 """Largest standard deviation of the focal length, in percent of it, of a calibration that is not refused:
 with a larger one the views are too similar."""
 _MIN_TILT_DEG = 20.0
-"""A calibration is refused if no two of its views show the board at orientations that differ by this angle:
-then focal length and distance of the board cannot be separated, and even a small standard deviation of the
-focal length proves nothing."""
+"""A calibration is refused if the normals of the board in no two of its views differ by this angle: then
+focal length and distance of the board cannot be separated, and even a small standard deviation of the focal
+length proves nothing."""
 _MIN_MOTION_SHARE = 0.05
 """An image is a new view only if, compared with each earlier view, some corner has moved by this fraction of
 the image width; otherwise it is counted as similar and not used."""

@@ -88,7 +88,8 @@ class FolderImages:
     def facts(self, lens: Intrinsics, stated_by: str, *, has_depth: bool) -> SourceFacts:
         """Return what the folder states, and the image size and median depth with which that is compared.
 
-        Both are measured in the first, the middle and the last image.
+        For both, the first, the middle and the last image are read; the size is that of the first readable
+        one.
 
         Args:
             lens: Intrinsics of the images.

@@ -44,7 +44,7 @@ __all__ = [
 ]
 
 _CHECKED_AT_START = 8  # first stereo frames that are read and checked before the first one is delivered
-_CHECK_INTERVAL = 5  # later, the left and right image of each this-many-th stereo frame are compared
+_CHECK_INTERVAL = 5  # later, the left and the right image of one stereo frame in this many are compared
 _CHECKS_TO_REFUSE = 2
 """The rig is refused by the matches of this many successive comparisons together: one comparison may be of a
 blurred image.  A comparison matches features of the left image with those of the right image of one frame."""

@@ -24,7 +24,7 @@ class Thinning:
 
     The wanted period is ``1 / rate_hz``; the frame interval is the median time between two given frames.
     Frames are due at multiples of the wanted period after the first frame.  For each due time, the first
-    frame later than half a frame interval before it is selected; two selected frames are at least half a
+    frame that is at most half a frame interval early is selected; two selected frames are at least half a
     wanted period apart.  All frames are selected if the wanted rate is that of the frames, or higher.
     """
 

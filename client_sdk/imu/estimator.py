@@ -255,10 +255,10 @@ class ImuEstimator:
     def _covered_by_samples(
         self, timestamps_s: Array, rows: list[int]
     ) -> tuple[list[int], list[Preintegration]]:
-        """Return the longest end of *rows* between whose poses no samples are missing, and the motions.
+        """Return the newest of *rows* back to the first gap in the samples, and the motions between them.
 
-        The motions are those between successive rows of the result.  *rows* are ascending and not empty; the
-        last one is always in the result.
+        A gap is a motion between two successive rows for which samples are missing.  *rows* are ascending and
+        not empty; the last one is always in the result.
         """
         covered = rows[-1:]
         motions: list[Preintegration] = []

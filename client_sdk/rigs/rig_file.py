@@ -37,13 +37,7 @@ __all__ = ["read_calibration", "read_rig", "write_rig"]
 
 _HINT = "write cameras, each with name, fx fy cx cy width height and T_body_camera: see docs/cameras.md"
 _CAMERA_FIELDS = ("name", "T_body_camera", "time_offset_s")  # fields of a camera that intrinsics.json has not
-_IMU_FIELDS = (
-    "gyro_noise",
-    "gyro_walk",
-    "accel_noise",
-    "accel_walk",
-    "rate_hz",
-)  # numbers of an IMU, all needed
+_IMU_FIELDS = ("gyro_noise", "gyro_walk", "accel_noise", "accel_walk", "rate_hz")  # numbers that an IMU needs
 _IMU_RANGE_FIELDS = ("max_gyro", "max_accel")  # measuring ranges of an IMU; if left out, it does not saturate
 
 

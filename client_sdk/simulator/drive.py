@@ -76,7 +76,7 @@ def render_frames(robot: int, robots: int, frames: int, seed: int, rooms: int = 
 
     Raises:
         UsageError: The robot is not one of *robots*, there are no frames, or fewer than 2 rooms; raised when
-            the first frame is asked for.
+            the first frame is requested.
     """
     truth = true_trajectory(robot, robots, frames, seed, rooms)
     yield from render_along(truth, make_world(seed, rooms), (seed, robots, robot))
