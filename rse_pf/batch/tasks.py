@@ -127,7 +127,7 @@ def _pairs(store: ObjectStore, part: Part) -> PartResult:
     of_map = np.concatenate([np.full(len(each), which) for which, each in enumerate(vectors)])
     stacked = np.concatenate(vectors)
     pairs = choose_candidate_pairs(
-        PlaceIndex.from_vectors(stacked),
+        PlaceIndex.from_pairs(enumerate(stacked)),
         of_map,
         np.arange(len(stacked)),
         _options(part),

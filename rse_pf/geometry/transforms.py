@@ -78,8 +78,7 @@ def body_poses(T_world_camera: Array, T_body_camera: Array) -> Array:
 
     *T_body_camera* ``(4, 4)`` is the pose of the camera in the frame of the body.
     """
-    T_world_body: Array = T_world_camera @ inverse(T_body_camera)
-    return T_world_body
+    return T_world_camera @ inverse(T_body_camera)
 
 
 def scaled(T: Array, scale: float | Array) -> Array:
@@ -324,8 +323,7 @@ def from_quaternion(q: npt.ArrayLike) -> Array:
 
 def exp_so3(phi: Array) -> Array:
     """Return the rotations ``(..., 3, 3)`` of rotation vectors *phi* ``(..., 3)``, radians."""
-    rotations: Array = exp_se3(np.concatenate([np.zeros_like(phi), phi], axis=-1))[..., :3, :3]
-    return rotations
+    return exp_se3(np.concatenate([np.zeros_like(phi), phi], axis=-1))[..., :3, :3]
 
 
 def log_so3(R: Array) -> Array:
@@ -361,5 +359,4 @@ def left_jacobian_so3(phi: Array) -> Array:
     a = np.where(is_small, 0.5 - squared / 24.0, 2.0 * np.square(np.sin(0.5 * safe) / safe))
     b = np.where(is_small, 1.0 / 6.0, (safe - np.sin(safe)) / safe**3)
     K = skew(phi)
-    J: Array = np.eye(3) + a[..., None, None] * K + b[..., None, None] * (K @ K)
-    return J
+    return np.eye(3) + a[..., None, None] * K + b[..., None, None] * (K @ K)

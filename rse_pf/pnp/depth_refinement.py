@@ -61,8 +61,7 @@ class DepthNoise(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     def variance_m2(self, depth_m: Array) -> Array:
         """Return the variances (square metres) of *depth_m* (metres), a new array of the same shape."""
         beyond = np.maximum(0.0, depth_m - self.from_m)
-        variance: Array = (self.base_m + self.growth_per_m * beyond * beyond) ** 2
-        return variance
+        return (self.base_m + self.growth_per_m * beyond * beyond) ** 2
 
 
 _KINECT = DepthNoise()

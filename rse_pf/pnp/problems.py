@@ -13,10 +13,8 @@ __all__ = [
     "DEGENERATE",
     "KINECT",
     "PnpProblem",
-    "TwoViews",
     "make_degenerate",
     "make_problem",
-    "make_two_views",
 ]
 
 KINECT = Camera(fx=518.86, fy=519.47, cx=325.58, cy=253.74, width=640, height=480)
@@ -79,7 +77,6 @@ def make_problem(
     n: int = 200,
     noise_px: float = 1.0,
     outlier_ratio: float = 0.3,
-    depth_noise: bool = False,
     camera: Camera = KINECT,
 ) -> PnpProblem:
     """Make a PnP problem with points 0.8 to 6 m in front of the camera.
@@ -89,19 +86,14 @@ def make_problem(
         n: Number of correspondences.
         noise_px: Standard deviation of the noise of each pixel coordinate.
         outlier_ratio: Share of the correspondences whose pixel is random.
-        depth_noise: Whether each point is moved along its ray by the depth error of a Kinect.
         camera: Intrinsics.
-
-    Source:
-        Depth error after Nguyen et al., 3DIMPVT 2012.
     """
     rng = np.random.default_rng(seed)
     T_camera_world = exp_se3(np.concatenate([rng.uniform(-2, 2, 3), rng.normal(size=3) * 0.6]))
     size = np.array([camera.width, camera.height], dtype=np.float64)
     exact_pixels = rng.uniform(_BORDER_PX, size - _BORDER_PX, (n, 2))
     depth_m = rng.uniform(_MIN_DEPTH_M, _MAX_DEPTH_M, n)
-    measured_m = _add_depth_noise(rng, depth_m) if depth_noise else depth_m
-    points_world = transform(inverse(T_camera_world), camera.back_project(exact_pixels, measured_m))
+    points_world = transform(inverse(T_camera_world), camera.back_project(exact_pixels, depth_m))
     pixels = exact_pixels + rng.normal(size=(n, 2)) * noise_px
     outliers = rng.permutation(n)[: round(outlier_ratio * n)]
     pixels[outliers] = rng.uniform(0, size, (len(outliers), 2))
@@ -114,66 +106,6 @@ def make_problem(
         T_camera_world=T_camera_world,
         is_inlier=is_inlier,
     )
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class TwoViews:
-    """Correspondences of two depth images with their true relative pose, rounded as a ``pnp`` command is.
-
-    Attributes:
-        points_reference: ``(n, 3)``, metres, in the frame of the first camera, which measured them.
-        pixels: ``(n, 2)``, in the second image; row *i* observes point *i*, except for outliers.
-        depths_m: ``(n,)``, depths that the second camera measured at these pixels; 0 where there is none.
-        camera: Intrinsics of both images.
-        T_camera_reference: ``(4, 4)``, the true pose, which maps the first camera's frame to the second's.
-    """
-
-    points_reference: Array
-    pixels: Array
-    depths_m: Array
-    camera: Camera
-    T_camera_reference: Array
-
-
-def make_two_views(
-    *, seed: int, n: int = 150, noise_px: float = 1.0, outlier_ratio: float = 0.2, missing_ratio: float = 0.1
-) -> TwoViews:
-    """Make correspondences of two depth images taken about 0.2 m apart, with the noise of a Kinect in both.
-
-    Points lie 1.5 to 4.5 m in front of the first camera.
-
-    Args:
-        seed: Seed of the random generator.
-        n: Number of correspondences.
-        noise_px: Standard deviation of the noise of each pixel coordinate in both images.
-        outlier_ratio: Share of the correspondences whose second pixel and depth are random.
-        missing_ratio: Share of the depths in the second image that are missing.
-    """
-    rng = np.random.default_rng(seed)
-    T = exp_se3(np.concatenate([rng.uniform(-0.17, 0.17, 3), rng.normal(size=3) * 0.08]))
-    exact_pixels, depth_m = rng.uniform(60.0, [580.0, 420.0], (n, 2)), rng.uniform(1.5, 4.5, n)
-    points_camera = transform(T, KINECT.back_project(exact_pixels, depth_m))
-    noisy_pixels = exact_pixels + rng.normal(size=(n, 2)) * noise_px
-    points = KINECT.back_project(noisy_pixels, _add_depth_noise(rng, depth_m))
-    pixels = KINECT.project(points_camera) + rng.normal(size=(n, 2)) * noise_px
-    depths_m = _add_depth_noise(rng, points_camera[:, 2])
-    outliers = rng.permutation(n)[: round(outlier_ratio * n)]
-    pixels[outliers] = rng.uniform(0.0, [KINECT.width, KINECT.height], (len(outliers), 2))
-    depths_m[outliers] = rng.uniform(1.0, 5.0, len(outliers))
-    depths_m[rng.random(n) < missing_ratio] = 0.0
-    return TwoViews(
-        points_reference=np.round(points, 4),
-        pixels=np.round(pixels, 2),
-        depths_m=np.round(depths_m, 3),
-        camera=KINECT,
-        T_camera_reference=T,
-    )
-
-
-def _add_depth_noise(rng: np.random.Generator, depth_m: Array) -> Array:
-    """Return depths (metres) with the noise of a Kinect (Nguyen et al. 2012, eq. 5), a new array."""
-    noisy_m: Array = depth_m + rng.normal(size=len(depth_m)) * (0.0012 + 0.0019 * (depth_m - 0.4) ** 2)
-    return noisy_m
 
 
 def make_degenerate(kind: str, *, seed: int, n: int = 100, camera: Camera = KINECT) -> PnpProblem:

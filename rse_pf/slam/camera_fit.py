@@ -214,8 +214,7 @@ def _covariance_of(
     # 2. Add the prior, and invert.
     corrected /= variance_px2
     corrected[range(6, 11), range(6, 11)] += prior_information
-    covariance: Array = np.linalg.inv(corrected)
-    return covariance
+    return np.linalg.inv(corrected)
 
 
 def _projection_jacobian(rays: Array, depths: Array, focal: Array, row_fractions: Array) -> Array:

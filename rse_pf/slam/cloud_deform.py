@@ -126,8 +126,7 @@ def voxel_keys(points: Array, voxel_m: float) -> npt.NDArray[np.int64]:
     voxels = np.floor(points / voxel_m).astype(np.int64)
     voxels -= voxels.min(axis=0, initial=0)
     if voxels.max(initial=0) < 1 << 21:
-        keys: npt.NDArray[np.int64] = (voxels[:, 0] << 42) | (voxels[:, 1] << 21) | voxels[:, 2]
-        return keys
+        return (voxels[:, 0] << 42) | (voxels[:, 1] << 21) | voxels[:, 2]
     return voxels
 
 

@@ -219,9 +219,8 @@ def are_pairwise_consistent(
         return _are_twists_noise(trip, variance_m2, variance_rad2)
     variance_m2 = variance_m2 + mean_scale_variance * (along_b[:, :3, 3] ** 2).sum(axis=1)
     scale_variance = scale_variance + steps * noise.step_scale**2
-    return _are_twists_noise(trip, variance_m2, variance_rad2) & are_scales_consistent(
-        scale_difference2, scale_variance
-    )
+    has_same_scale = scale_difference2 <= CHI2_99_PERCENT_1 * scale_variance
+    return _are_twists_noise(trip, variance_m2, variance_rad2) & has_same_scale
 
 
 def fits_prediction(
@@ -248,19 +247,6 @@ def fits_prediction(
     return _are_twists_noise(
         error, variance_m2 + steps * noise.step_m**2 + drift_rad2 * lever_m**2, variance_rad2 + drift_rad2
     )
-
-
-def are_scales_consistent(difference2: Array, variance: Array) -> npt.NDArray[np.bool_]:
-    """Return ``(m,)``: whether differences of logarithms of scales are explained as noise.
-
-    A chi-squared test is used that accepts 99 % of noise.
-
-    Args:
-        difference2: ``(m,)``, the squares of the differences.
-        variance: ``(m,)``, the variances of the differences.
-    """
-    fits: npt.NDArray[np.bool_] = difference2 <= CHI2_99_PERCENT_1 * variance
-    return fits
 
 
 def _are_twists_noise(xi: Array, variance_m2: Array, variance_rad2: Array) -> npt.NDArray[np.bool_]:

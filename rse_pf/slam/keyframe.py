@@ -420,8 +420,7 @@ def _is_encodable_pixel(pixels: npt.NDArray[np.floating]) -> npt.NDArray[np.bool
 
 def _round_pixels(pixels: npt.NDArray[np.floating]) -> npt.NDArray[np.float32]:
     scale = 2.0 ** _pixel_fraction(float(pixels.max(initial=0.0)))
-    rounded: npt.NDArray[np.float32] = (np.rint(pixels.astype(np.float64) * scale) / scale).astype(np.float32)
-    return rounded
+    return (np.rint(pixels.astype(np.float64) * scale) / scale).astype(np.float32)
 
 
 def _pixel_fraction(largest_px: float) -> int:

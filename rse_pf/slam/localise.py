@@ -291,8 +291,7 @@ def _camera_covariance(fit: CameraFit, T_map_camera: Array) -> Array:
     and the given pose, plus the covariance of the fitted one.
     """
     difference = log_se3((fit.T_map_camera @ inverse(T_map_camera))[None])[0]
-    covariance: Array = np.outer(difference, difference) + fit.covariance
-    return covariance
+    return np.outer(difference, difference) + fit.covariance
 
 
 def _camera_weakness(fit: CameraFit, T_map_camera: Array) -> str:

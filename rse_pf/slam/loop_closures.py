@@ -176,7 +176,9 @@ def propose_loop_closures(
             f"up to {pair_limit} pairs of keyframes are above {MAX_PAIRS}",
             hint="merge fewer maps at once, or ask for fewer candidates",
         )
-    index = PlaceIndex.from_vectors(place_vector(keyframe.descriptors) for keyframe in atlas.keyframes)
+    index = PlaceIndex.from_pairs(
+        (row, place_vector(keyframe.descriptors)) for row, keyframe in enumerate(atlas.keyframes)
+    )
     pairs = choose_candidate_pairs(index, atlas.of_map, atlas.order, options)
     loop_closures, failed = measure_pairs(
         atlas, pairs, options, lambda progress, text: report(0.1 + 0.7 * progress, text)

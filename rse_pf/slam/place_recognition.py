@@ -123,6 +123,14 @@ class PlaceIndex:
         self._row_of_id = np.full(_INITIAL_ROWS, -1, dtype=np.int64)
 
     @classmethod
+    def from_pairs(cls, pairs: Iterable[tuple[int, PlaceVector]]) -> PlaceIndex:
+        """Return an index of vectors with their ids; raises ValueError if an id occurs twice."""
+        index = cls()
+        for keyframe_id, vector in pairs:
+            index.add(keyframe_id, vector)
+        return index
+
+    @classmethod
     def from_bytes(cls, data: bytes) -> PlaceIndex:
         """Return the index that `to_bytes` encoded.
 
@@ -139,10 +147,7 @@ class PlaceIndex:
             )
         ids = np.frombuffer(data, dtype="<i8", count=count)
         vectors = np.frombuffer(data, dtype="<f4", offset=8 * count).reshape(count, PLACE_VECTOR_SIZE)
-        index = cls()
-        for keyframe_id, vector in zip(ids.tolist(), vectors, strict=True):
-            index.add(keyframe_id, vector)
-        return index
+        return cls.from_pairs(zip(ids.tolist(), vectors, strict=True))
 
     def to_bytes(self) -> bytes:
         """Return ids and vectors in ascending order of the ids, so that equal contents give equal bytes."""
@@ -155,14 +160,6 @@ class PlaceIndex:
 
     def __contains__(self, keyframe_id: int) -> bool:
         return 0 <= keyframe_id < len(self._row_of_id) and self._row_of_id[keyframe_id] >= 0
-
-    @classmethod
-    def from_vectors(cls, vectors: Iterable[PlaceVector]) -> PlaceIndex:
-        """Return an index of *vectors*, whose ids are 0, 1, 2 and so on."""
-        index = cls()
-        for keyframe_id, vector in enumerate(vectors):
-            index.add(keyframe_id, vector)
-        return index
 
     def vector_of(self, keyframe_id: int) -> PlaceVector:
         """Return a copy of the vector of a keyframe; raises KeyError if the index does not have it."""

@@ -68,8 +68,7 @@ class NormalEquations:
         *reduced* is what `reduce` returned for these equations, with the damping of the landmarks.
         """
         right = -(self.g_landmarks + self.E @ step)
-        steps: Array = (reduced.landmark_covariance @ right[:, :, None])[:, :, 0]
-        return steps
+        return (reduced.landmark_covariance @ right[:, :, None])[:, :, 0]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

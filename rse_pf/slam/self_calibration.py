@@ -182,8 +182,7 @@ class Calibrated:
     @property
     def deviations(self) -> Array:
         """The standard deviations ``(9,)`` of the values, in the units of `UNKNOWNS`."""
-        deviations: Array = np.sqrt(np.diag(self.covariance))
-        return deviations
+        return np.sqrt(np.diag(self.covariance))
 
     def bend_m(self, error: Array) -> float:
         """Return how far a calibration that is wrong by *error* ``(9,)`` bends the path, m.
@@ -431,6 +430,7 @@ class _DriveSystem:
         self.keyframes, self.landmarks = observed.keyframes[order], observed.landmarks[order]
         self.pixels, self.pixel_deviations_px = observed.pixels[order], observed.pixel_deviations_px[order]
         self.has_depth = np.isfinite(observed.depths_m[order])
+        self.has_metric_scale = bool(self.has_depth.any())
         self.depths_m = np.where(self.has_depth, observed.depths_m[order], 0.0)
         self.depth_deviations_m = np.where(self.has_depth, observed.depth_deviations_m[order], 1.0)
         self.rates_m_s = np.where(self.has_depth, observed.rates_m_s[order], 0.0)
@@ -674,7 +674,7 @@ class _DriveSystem:
             points_world=state.points,
             bends_m=bends_m,
             noise_m=self._path_noise_m(state, inverse_S[:poses_size, :poses_size], rho_to_centre),
-            has_metric_scale=self._has_metric_scale(),
+            has_metric_scale=self.has_metric_scale,
             depth_factor=self.depth_factor,
         )
 
@@ -719,9 +719,6 @@ class _DriveSystem:
             inflation += np.maximum(clustered / np.maximum(variances, 1e-30) - 1.0, 0.0)
         return inflation
 
-    def _has_metric_scale(self) -> bool:
-        return bool(self.has_depth.any())
-
     def _path_noise_m(self, state: _State, poses_covariance: Array, rho_to_centre: Array) -> float:
         """Return the root mean square error of the path after alignment, m.
 
@@ -741,9 +738,9 @@ class _DriveSystem:
         twists = drawn.reshape(self._keyframe_count, self._keyframe_size, _NOISE_SAMPLES)
         moved = np.einsum("kij,kjs->ski", rho_to_centre, twists[:, :3])
         positions = inverse(state.T_camera_world)[:, :3, 3]
-        has_metric_scale = self._has_metric_scale()
         squares = [
-            rms_after_alignment(positions, sample, has_metric_scale=has_metric_scale) ** 2 for sample in moved
+            rms_after_alignment(positions, sample, has_metric_scale=self.has_metric_scale) ** 2
+            for sample in moved
         ]
         return float(np.sqrt(np.mean(squares)))
 
@@ -772,5 +769,4 @@ def _sum_by_index(values: Array, indices: Rows, count: int) -> Array:
     """Return the sums ``(count, ...)`` of those values ``(n, ...)`` that have the same index ``(n,)``."""
     flat = values.reshape(len(values), -1)
     total = np.stack([np.bincount(indices, column, count) for column in flat.T], axis=1)
-    sums: Array = total.astype(np.float64, copy=False).reshape(count, *values.shape[1:])
-    return sums
+    return total.astype(np.float64, copy=False).reshape(count, *values.shape[1:])

@@ -248,8 +248,7 @@ def _scale_residuals(scales: ScaleTerms, log_scales: Array) -> Array:
 
 
 def _scale_squares(scales: ScaleTerms, log_scales: Array) -> Array:
-    squares: Array = scales.information * _scale_residuals(scales, log_scales) ** 2
-    return squares
+    return scales.information * _scale_residuals(scales, log_scales) ** 2
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,6 +18,7 @@ from rse_pf.geometry import Array, Camera, exp_se3, inverse, pose_difference, tr
 from rse_pf.pnp import PnpOptions, WeakLimits, engines, solve_pnp
 from rse_pf.pnp.native_solver import Evidence, native_solver
 from rse_pf.pnp.problems import DEGENERATE, KINECT, make_degenerate, make_problem
+from tests.two_views import add_depth_noise
 
 EVERY = pytest.mark.parametrize("engine", ["native", "opencv"])
 RIGHT_M, RIGHT_DEG = 0.1, 2.0
@@ -37,6 +38,15 @@ class Case:
     camera: Camera = KINECT
 
 
+def with_depth_noise(rng: np.random.Generator, points_world: Array, T_camera_world: Array) -> Array:
+    """Return points that are moved along their rays by the depth error of a Kinect."""
+    points_camera = transform(T_camera_world, points_world)
+    depth_m = points_camera[:, 2]
+    return transform(
+        inverse(T_camera_world), points_camera * (add_depth_noise(rng, depth_m) / depth_m)[:, None]
+    )
+
+
 def case(number: int) -> Case:
     """Return problem *number*: a room, a plane, a line or few points; equal numbers give equal problems."""
     kind, seed = KINDS[number % len(KINDS)], number // len(KINDS)
@@ -46,9 +56,11 @@ def case(number: int) -> Case:
         tenths = 1 + seed % 8
         problem = make_problem(
             seed=number, n=(30, 60, 100, 200, 300)[seed // 8 % 5], outlier_ratio=tenths / 10,
-            depth_noise=seed // 40 % 2 == 1,
         )  # fmt: skip
-        return Case(f"room {10 * tenths} %", problem.points_world, problem.pixels, problem.T_camera_world)
+        T, points = problem.T_camera_world, problem.points_world
+        if seed // 40 % 2 == 1:
+            points = with_depth_noise(rng, points, T)
+        return Case(f"room {10 * tenths} %", points, problem.pixels, T)
     if kind == "few":
         problem = make_problem(
             seed=number, n=4 + seed % 13, outlier_ratio=(0.0, 0.2, 0.4)[seed // 13 % 3],

@@ -16,7 +16,8 @@ from rse_pf.pnp import (
     refine_with_depth,
     solve_pnp,
 )
-from rse_pf.pnp.problems import KINECT, TwoViews, make_two_views
+from rse_pf.pnp.problems import KINECT
+from tests.two_views import TwoViews, make_two_views
 
 _NOISE = DepthNoise()
 _options = PnpOptions(inlier_px=5.0)

@@ -146,8 +146,8 @@ class MapIndex:
         self.keyframes = tuple(keyframes)
         self.kind = common_kind((keyframe.kind for keyframe in self.keyframes), "the map")
         self.T_map_keyframe = np.array([keyframe.T_world_camera for keyframe in self.keyframes])
-        self._places = PlaceIndex.from_vectors(
-            place_vector(keyframe.descriptors) for keyframe in self.keyframes
+        self._places = PlaceIndex.from_pairs(
+            (row, place_vector(keyframe.descriptors)) for row, keyframe in enumerate(self.keyframes)
         )
 
     def nearest(
