@@ -22,6 +22,7 @@ from client_sdk.datasets.images import (
     image_files,
     numbers_in_name,
     probe,
+    probe_size_px,
     read_colour,
     read_depth,
     readable,
@@ -129,8 +130,7 @@ class FolderImages:
     @property
     def size_px(self) -> tuple[int, int]:
         """Width and height of the images, px; raises UsageError if no image can be read."""
-        height, width = probe(self.images, read_colour)[0].shape[:2]
-        return width, height
+        return probe_size_px(self.images)
 
     def frames(self, log: DoubtLog, depth_units_per_m: float | None) -> Iterator[RawFrame]:
         """Yield the frames, not undistorted; leave out, and count in *log*, unreadable ones.

@@ -26,6 +26,7 @@ __all__ = [
     "is_image",
     "numbers_in_name",
     "probe",
+    "probe_size_px",
     "read_colour",
     "read_depth",
     "read_stored_pixels",
@@ -125,6 +126,16 @@ def probe(rows: Sequence[_Row], read: Callable[[_Row], _Result]) -> list[_Result
     if failed is not None and not results:
         raise failed
     return results
+
+
+def probe_size_px(paths: Sequence[Path]) -> tuple[int, int]:
+    """Return width and height of colour images, px, from the first image that `probe` can read.
+
+    Raises:
+        UnreadableImage: `probe` cannot read any.
+    """
+    height, width = probe(paths, read_colour)[0].shape[:2]
+    return width, height
 
 
 def read_colour(path: Path) -> npt.NDArray[np.uint8]:

@@ -8,7 +8,7 @@ EuRoC and KITTI are read in `client_sdk.datasets.rig_recordings`, bags in `clien
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -20,14 +20,13 @@ from client_sdk.bags import Bag, BagOptions, is_bag, lens_or_rig, open_bag
 from client_sdk.bags.index import pair_stamps
 from client_sdk.datasets import nyu
 from client_sdk.datasets.dataset import Dataset
-from client_sdk.datasets.images import check_size, probe, read_colour, read_depth
+from client_sdk.datasets.images import check_size, probe, probe_size_px, read_colour, read_depth
 from client_sdk.datasets.rig_recordings import CameraChoice, is_euroc, is_kitti, open_euroc, open_kitti
 from client_sdk.frontend import Frame
 from client_sdk.image_map import map_to_pinhole
-from client_sdk.rigs.folder_camera import find_folder_camera
+from client_sdk.rigs.folder_camera import OWN_FILE, find_folder_camera
 from client_sdk.rigs.intrinsics import Intrinsics
-from client_sdk.rigs.rig import Rig
-from client_sdk.rigs.rig_file import read_calibration
+from client_sdk.rigs.rig_file import read_lens
 from client_sdk.source_facts import (
     CameraFacts,
     DepthFacts,
@@ -117,7 +116,7 @@ def open_dataset(
         raise UsageError(f"{path} has no IMU", hint="leave out --imu")
     if not is_listed(path) and any(path.glob("d-*.pgm")):
         return _open_raw(path)
-    return _open_tum(path, path / "intrinsics.json" if intrinsics is None else Path(intrinsics))
+    return _open_tum(path, None if intrinsics is None else Path(intrinsics))
 
 
 def _is_bag(path: Path) -> bool:
@@ -188,12 +187,8 @@ class _ImageList:
     notes: tuple[str, ...]
 
 
-def _open_tum(folder: Path, intrinsics_file: Path) -> Dataset:
-    """Return the recording of a folder in TUM layout.
-
-    If *intrinsics_file* is a path directly in *folder*, such as the default ``intrinsics.json``, it need not
-    exist: then a file of another program in *folder* is used, or without one the camera of the benchmark.  A
-    path elsewhere must exist.
+def _open_tum(folder: Path, named_intrinsics: Path | None) -> Dataset:
+    """Return the recording of a folder in TUM layout, with the intrinsics of `_find_intrinsics`.
 
     Raises:
         UsageError: A file is missing or broken, or facts about the recording contradict each other.
@@ -201,17 +196,11 @@ def _open_tum(folder: Path, intrinsics_file: Path) -> Dataset:
     """
     # 1. Read the lists of images, and the intrinsics.
     colours, depths = _read_lists(folder)
-
-    def size_px() -> tuple[int, int]:
-        height, width = probe(colours.images, lambda name: read_colour(folder / name))[0].shape[:2]
-        return width, height
-
-    stated = None
-    if not intrinsics_file.exists() and intrinsics_file.parent == folder:
-        stated = find_folder_camera(folder, size_px)
-    intrinsics_file = intrinsics_file if stated is None else stated[0]
-    intrinsics, is_unit_stated, notes = _find_intrinsics(
-        folder, intrinsics_file, None if stated is None else stated[1], has_depth=depths is not None
+    stated_by, intrinsics, is_unit_stated, notes = _find_intrinsics(
+        folder,
+        named_intrinsics,
+        lambda: probe_size_px([folder / image for image in colours.images]),
+        has_depth=depths is not None,
     )
     # 2. Pair each colour image with the depth image that is nearest in time; without depth, use all of them.
     pairs = [(row, row) for row in range(len(colours.images))]
@@ -257,7 +246,6 @@ def _open_tum(folder: Path, intrinsics_file: Path) -> Dataset:
 
     # 4. Collect the facts about the recording, and compare them.
     truth, truth_kind, truth_notes = _read_truth(folder)
-    stated_by = str(intrinsics_file if intrinsics_file.exists() else folder)
     probed = probe(range(len(pairs)), read_depth_of)
     depth = DepthFacts(
         median_m=median_depth_m(probed),
@@ -379,42 +367,41 @@ def _read_rows(path: Path, columns: int) -> list[list[str]]:
 
 
 def _find_intrinsics(
-    folder: Path, file: Path, stated: Intrinsics | None, *, has_depth: bool
-) -> tuple[Intrinsics, bool, tuple[str, ...]]:
+    folder: Path, named: Path | None, size_px: Callable[[], tuple[int, int]], *, has_depth: bool
+) -> tuple[str, Intrinsics, bool, tuple[str, ...]]:
     """Find the intrinsics of a folder in TUM layout.
 
-    They are *stated* if it is not None, else those of *file*.  If *file* is a path directly in *folder* and
-    does not exist, they are those of the benchmark's camera whose name is part of the folder's name, else
-    those of a Kinect.
+    They are those of the file *named*, else of `find_folder_camera`, else of the benchmark's camera whose
+    name is part of the folder's name, else of a Kinect.
 
     Args:
         folder: The folder, whose name may contain that of a camera of the benchmark.
-        file: ``intrinsics.json``, the file that the user named, or the file of another program.
-        stated: The intrinsics in the file of another program; None if *file* is not of another program.
+        named: A file of intrinsics or of a rig that the user named; None without one.
+        size_px: Returns width and height of the colour images, px.
         has_depth: Whether the folder has depth images.
 
     Returns:
-        The intrinsics (those of the left camera if the file is one of a rig); False if the unit of depth is
-        assumed, else True; and sentences for the user on what was assumed.
+        The file that states the intrinsics, or the folder; the intrinsics (those of the left camera of a
+        rig); False if the unit of depth is assumed, else True; and sentences for the user on what was
+        assumed.
 
     Raises:
-        UsageError: The file cannot be read, or states no unit of depth although there is depth.
+        UsageError: The file cannot be read, or *named* or ``intrinsics.json`` states no unit of depth
+            although there is depth.
     """
-    if stated is not None:
-        note = (
-            f"{file} states no unit of depth: {_FREIBURG_DEPTH_SCALE:g} units a metre are assumed, as TUM's"
-        )
-        has_unit = stated.depth_scale is not None or not has_depth
-        lens = stated if has_unit else replace(stated, depth_scale=_FREIBURG_DEPTH_SCALE)
-        return lens, has_unit, () if has_unit else (note,)
-    if file.exists() or file.parent != folder:
-        calibration = read_calibration(file)
-        lens = calibration.left.lens if isinstance(calibration, Rig) else calibration
-        if has_depth and lens.depth_scale is None:
+    found = find_folder_camera(folder, size_px) if named is None else (named, read_lens(named))
+    if found is not None:
+        file, lens = found
+        if lens.depth_scale is not None or not has_depth:
+            return str(file), lens, True, ()
+        if named is not None or file.name == OWN_FILE:
             raise UsageError(
                 f"{file} has no depth_scale", hint="state it: 5000 for TUM, 1000 for millimetres"
             )
-        return lens, True, ()
+        note = (
+            f"{file} states no unit of depth: {_FREIBURG_DEPTH_SCALE:g} units a metre are assumed, as TUM's"
+        )
+        return str(file), replace(lens, depth_scale=_FREIBURG_DEPTH_SCALE), False, (note,)
     name = next(key for key in _FREIBURG if key in folder.resolve().name)
     fx, fy, cx, cy, distortion = _FREIBURG[name]
     camera = Camera(fx=fx, fy=fy, cx=cx, cy=cy, width=640, height=480)
@@ -424,7 +411,7 @@ def _find_intrinsics(
         f"{camera.width}x{camera.height} px, depth_scale {_FREIBURG_DEPTH_SCALE:g}"
     )
     assumed = Intrinsics(camera=camera, distortion=distortion, depth_scale=_FREIBURG_DEPTH_SCALE)
-    return assumed, bool(name), (note,)
+    return str(folder), assumed, bool(name), (note,)
 
 
 def _read_truth(

@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from client_sdk.bags.index import pair_stamps
 from client_sdk.datasets.dataset import Dataset
-from client_sdk.datasets.images import check_size, image_files, probe, read_colour
+from client_sdk.datasets.images import check_size, image_files, probe_size_px, read_colour
 from client_sdk.frontend import Frame, load_opencv
 from client_sdk.image_map import map_to_pinhole
 from client_sdk.rigs.benchmark_files import (
@@ -193,9 +193,8 @@ def open_kitti(folder: Path, camera: CameraChoice | None = None, imu: bool | Non
     if poses is not None:
         truth = Trajectory(stamps_s[used], poses[rows["poses.txt"]][used])
     lefts = [paths[row] for row in used]
-    height, width = probe(lefts, read_colour)[0].shape[:2]
     projections = (f"P{left[-1]}", f"P{right[-1]}") if has_stereo else (f"P{left[-1]}",)
-    rig = read_kitti_rig(folder / "calib.txt", (width, height), projections)
+    rig = read_kitti_rig(folder / "calib.txt", probe_size_px(lefts), projections)
     dataset = _make_dataset(
         folder.name,
         rig,

@@ -1,4 +1,5 @@
-"""Find the intrinsics of a folder of images in a file of Open3D, ETH3D, SUN3D or ScanNet."""
+"""Find the intrinsics of a folder of images: ``intrinsics.json``, or a file of Open3D, ETH3D, SUN3D or
+ScanNet."""
 
 from __future__ import annotations
 
@@ -8,13 +9,17 @@ from pathlib import Path
 import numpy as np
 
 from client_sdk.rigs.benchmark_files import read_numbers, read_text
-from client_sdk.rigs.intrinsics import INTRINSICS_HINT, Intrinsics, name_file_in_errors, read_intrinsics
+from client_sdk.rigs.intrinsics import INTRINSICS_HINT, Intrinsics, name_file_in_errors
+from client_sdk.rigs.rig_file import read_lens
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Camera
 
-__all__ = ["find_folder_camera"]
+__all__ = ["OWN_FILE", "find_folder_camera"]
 
-_JSON_FILES = ("camera_intrinsic.json", "intrinsic.json")  # files of Open3D and of its recorders
+OWN_FILE = (
+    "intrinsics.json"  # file of the intrinsics of a folder in the format of `client_sdk.rigs.intrinsics`
+)
+_JSON_FILES = (OWN_FILE, "camera_intrinsic.json", "intrinsic.json")  # the others are those of Open3D
 _TEXT_FILES = ("calibration.txt", "intrinsics.txt", "intrinsic/intrinsic_color.txt")
 """Files of ETH3D, SUN3D and ScanNet, in this order: numbers without names."""
 
@@ -33,7 +38,7 @@ def find_folder_camera(
     """
     for name in _JSON_FILES:
         if (folder / name).is_file():
-            return folder / name, read_intrinsics(folder / name)
+            return folder / name, read_lens(folder / name)
     for name in _TEXT_FILES:
         file = folder / name
         if file.is_file():
