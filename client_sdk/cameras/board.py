@@ -1,4 +1,4 @@
-"""Calibration boards: print a chessboard or a ChArUco board, and find its corners in images.
+"""Calibration boards: print a chessboard, and find its corners in images.
 
 The size of a board counts inner corners, as OpenCV does: a board of 9x6 has 10 by 7 squares.
 """
@@ -8,7 +8,6 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -19,15 +18,10 @@ from rse_pf.geometry import Array
 
 __all__ = ["Board", "find_corners", "write_board"]
 
-_MARKER_SHARE = 0.75  # side of a ChArUco marker as a fraction of the side of its square
-_SQUARE_PX = 8
-"""Side of a square in pixels, in the smallest image of a board in which all edges lie between pixels: the
-marker of a ChArUco board has 6x6 modules, which are 6 of the 8 pixels (`_MARKER_SHARE`) at one pixel each."""
-_MIN_CHARUCO_CORNERS = 6  # fewest corners of a ChArUco board with which an image is used
 _MIN_CORNERS = 3  # fewest inner corners of a board in a row or column: OpenCV needs three
-_MAX_CORNERS = 40
-"""Most inner corners of a board in a row or column: a board of 40x40 needs 840 of the 1000 markers of the
-dictionary DICT_4X4_1000."""
+_MAX_CORNERS = (
+    40  # most inner corners of a board in a row or column: more are too close to each other in an image
+)
 _MIN_SQUARE_M = 0.001  # smallest side of a square: users who state less have stated metres as millimetres
 _MAX_SQUARE_M = 1.0  # largest side of a square: a larger number is probably not in millimetres
 _MM_PER_POINT = 25.4 / 72.0  # millimetres in a point, the unit of PDF
@@ -37,14 +31,12 @@ _MARGIN_MM = 10.0  # white margin around the board on a PDF page: printers do no
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Board:
-    """A calibration board.
+    """A calibration board: a chessboard, of which an image must show all inner corners.
 
     Attributes:
         columns: Number of inner corners in a row.
         rows: Number of inner corners in a column.
         square_m: Side of a square, m.
-        charuco: Whether the board is a ChArUco board, of which an image may show a part; else it is a
-            chessboard, of which an image must show all.
 
     Raises:
         UsageError: The size is not within 3..40 corners, or the squares are not within 1 mm to 1 m.
@@ -53,7 +45,6 @@ class Board:
     columns: int
     rows: int
     square_m: float
-    charuco: bool = False
 
     def __post_init__(self) -> None:
         if not all(_MIN_CORNERS <= count <= _MAX_CORNERS for count in (self.columns, self.rows)):
@@ -68,7 +59,7 @@ class Board:
             )
 
     @classmethod
-    def parse(cls, size: str, square_mm: float, *, charuco: bool = False) -> Board:
+    def parse(cls, size: str, square_mm: float) -> Board:
         """Return the board with *size* inner corners, a word such as ``9x6``, and squares of *square_mm*.
 
         Raises:
@@ -77,7 +68,7 @@ class Board:
         match = re.fullmatch(r"(\d{1,3})x(\d{1,3})", size)
         if match is None:
             raise UsageError(f"{size} is not the size of a board", hint="count inner corners, such as 9x6")
-        return cls(columns=int(match[1]), rows=int(match[2]), square_m=square_mm / 1e3, charuco=charuco)
+        return cls(columns=int(match[1]), rows=int(match[2]), square_m=square_mm / 1e3)
 
     @property
     def corners(self) -> int:
@@ -93,25 +84,17 @@ class Board:
         return grid
 
 
-def find_corners(gray: npt.NDArray[np.uint8], board: Board) -> tuple[npt.NDArray[np.int64], Array] | None:
+def find_corners(gray: npt.NDArray[np.uint8], board: Board) -> Array | None:
     """Find the corners of *board* in a grey image ``(h, w)``.
 
-    All corners of a chessboard must be visible; of a ChArUco board, six are enough.
-
     Returns:
-        Indices ``(n,)`` of the corners in `Board.points`, and their pixels ``(n, 2)``, column and row, to a
-        fraction of a pixel; None if too few corners are found.
+        The pixels ``(corners, 2)`` of `Board.points`, column and row, to a fraction of a pixel; None if not
+        all corners are found.
 
     Raises:
         MissingExtra: OpenCV is not installed.
     """
     cv2 = load_opencv()
-    if board.charuco:
-        detector = cv2.aruco.CharucoDetector(_charuco_board(cv2, board))
-        corners, indices, _, _ = detector.detectBoard(gray)
-        if indices is None or len(indices) < _MIN_CHARUCO_CORNERS:
-            return None
-        return indices.ravel().astype(np.int64), corners.reshape(-1, 2).astype(np.float64)
     size = (board.columns, board.rows)
     flags = cv2.CALIB_CB_ADAPTIVE_THRESH + cv2.CALIB_CB_NORMALIZE_IMAGE + cv2.CALIB_CB_FAST_CHECK
     is_found, corners = cv2.findChessboardCorners(gray, size, flags=flags)
@@ -121,7 +104,8 @@ def find_corners(gray: npt.NDArray[np.uint8], board: Board) -> tuple[npt.NDArray
     spacing_px = np.linalg.norm(np.diff(corners.reshape(board.rows, board.columns, 2), axis=1), axis=2).min()
     half_window_px = int(np.clip(spacing_px / 3, 2, 11))  # the window must not reach the next corner
     refined = cv2.cornerSubPix(gray, corners, (half_window_px, half_window_px), (-1, -1), criteria)
-    return np.arange(board.corners), refined.reshape(-1, 2).astype(np.float64)
+    pixels: Array = refined.reshape(-1, 2).astype(np.float64)
+    return pixels
 
 
 def write_board(path: Path, board: Board) -> None:
@@ -138,38 +122,19 @@ def write_board(path: Path, board: Board) -> None:
         raise UsageError(
             f"{path} is neither .pdf nor .png", hint="write board.pdf: it prints at its true size"
         )
-    image = _draw_board(board)
-    pixel_mm = 1e3 * board.square_m / _SQUARE_PX
+    is_white = np.indices((board.rows + 1, board.columns + 1)).sum(axis=0) % 2
+    image, square_mm = (255 * is_white).astype(np.uint8), 1e3 * board.square_m
     try:
         if path.suffix == ".pdf":
-            path.write_bytes(_pdf_of(image, pixel_mm))
+            path.write_bytes(_pdf_of(image, square_mm))
             return
         cv2 = load_opencv()
-        size = [round(pixels * pixel_mm * _PNG_PX_PER_MM) for pixels in image.shape[::-1]]
+        size = [round(squares * square_mm * _PNG_PX_PER_MM) for squares in image.shape[::-1]]
         is_encoded, data = cv2.imencode(".png", cv2.resize(image, size, interpolation=cv2.INTER_NEAREST))
         assert is_encoded
         path.write_bytes(data.tobytes())
     except OSError as error:
         raise UsageError(f"cannot write {path}: {error.strerror}", hint="name another file") from error
-
-
-def _draw_board(board: Board) -> npt.NDArray[np.uint8]:
-    """Return the image ``(h, w)`` of a board, 8 pixels for the side of a square, 0 black and 255 white."""
-    columns, rows = board.columns + 1, board.rows + 1
-    if board.charuco:
-        cv2 = load_opencv()
-        image: npt.NDArray[np.uint8] = _charuco_board(cv2, board).generateImage(
-            (columns * _SQUARE_PX, rows * _SQUARE_PX), marginSize=0, borderBits=1
-        )
-        return np.where(image > 127, 255, 0).astype(np.uint8)
-    is_white = np.indices((rows, columns)).sum(axis=0) % 2
-    return np.kron(is_white * 255, np.ones((_SQUARE_PX, _SQUARE_PX))).astype(np.uint8)
-
-
-def _charuco_board(cv2: Any, board: Board) -> Any:
-    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_1000)
-    size = (board.columns + 1, board.rows + 1)
-    return cv2.aruco.CharucoBoard(size, board.square_m, _MARKER_SHARE * board.square_m, dictionary)
 
 
 def _pdf_of(image: npt.NDArray[np.uint8], pixel_mm: float) -> bytes:

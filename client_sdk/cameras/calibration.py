@@ -44,15 +44,14 @@ class BoardViews:
         size: Width and height of the images, px; None before the first image.
         images: Number of images that were searched for the board.
         similar: Number of images that show the board, but nearly as an earlier view does.
-        views: For each view, the indices ``(n,)`` of its corners in `Board.points`, and their pixels ``(n,
-            2)``.
+        views: For each view, the pixels ``(corners, 2)`` of the corners in `Board.points`.
     """
 
     board: Board
     size: tuple[int, int] | None = None
     images: int = 0
     similar: int = 0
-    views: list[tuple[npt.NDArray[np.int64], Array]] = field(default_factory=list)
+    views: list[Array] = field(default_factory=list)
 
     def add(self, gray: npt.NDArray[np.uint8]) -> bool:
         """Find the board in a grey image ``(h, w)``, and return whether the image is a new view of the board.
@@ -75,25 +74,12 @@ class BoardViews:
         corners = find_corners(gray, self.board)
         if corners is None:
             return False
-        if any(self._is_similar(corners, view) for view in self.views):
+        min_motion_px = _MIN_MOTION_SHARE * size[0]
+        if any(np.linalg.norm(corners - view, axis=1).max() < min_motion_px for view in self.views):
             self.similar += 1
             return False
         self.views.append(corners)
         return True
-
-    def _is_similar(
-        self, first: tuple[npt.NDArray[np.int64], Array], second: tuple[npt.NDArray[np.int64], Array]
-    ) -> bool:
-        """Return whether all corners that two views share have nearly the same pixels.
-
-        Views without a common corner are not similar.
-        """
-        _, first_rows, second_rows = np.intersect1d(first[0], second[0], return_indices=True)
-        assert self.size is not None
-        if not len(first_rows):
-            return False
-        moved_px = np.linalg.norm(first[1][first_rows] - second[1][second_rows], axis=1).max()
-        return bool(moved_px < _MIN_MOTION_SHARE * self.size[0])
 
 
 def calibrate(views: BoardViews, *, max_rms_px: float = 1.0, depth_scale: float | None = None) -> Intrinsics:
@@ -124,8 +110,8 @@ def calibrate(views: BoardViews, *, max_rms_px: float = 1.0, depth_scale: float 
         )
     # 1. Calibrate with all views.
     cv2 = load_opencv()
-    points = [board.points[indices] for indices, _ in views.views]
-    pixels = [corners.astype(np.float32) for _, corners in views.views]
+    points = [board.points for _ in views.views]
+    pixels = [corners.astype(np.float32) for corners in views.views]
     rms_px, K, distortion, rotations, _, deviations, _, view_errors_px = cv2.calibrateCameraExtended(
         points, pixels, views.size, None, None
     )

@@ -21,8 +21,6 @@ from rse_pf.geometry import inverse
 
 __all__ = ["PairViews", "StereoCalibration", "calibrate_pair"]
 
-_MIN_COMMON_CORNERS = 6  # fewest corners that both images of a pair must show, so that the pair is used
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StereoCalibration:
@@ -32,7 +30,7 @@ class StereoCalibration:
         rig: The rig; the frame of its body is that of the left camera.
         baseline_m: Distance between both cameras, metres.
         rms_px: Root mean square reprojection error over both images, px.
-        views: Number of pairs of views that were used: their images have six or more corners in common.
+        views: Number of pairs of views that were used.
     """
 
     rig: Rig
@@ -99,17 +97,10 @@ def calibrate_pair(views: PairViews, *, max_rms_px: float = 1.0) -> StereoCalibr
             lenses.append(calibrate(views_of_side, max_rms_px=max_rms_px))
         except CommandFailed as error:
             raise CommandFailed(f"the {side} camera: {error.message}", hint=error.hint) from error
-    # 2. Select the corners of each pair that both cameras see, and leave out pairs with fewer than six of
-    #    them.
-    points, left_pixels, right_pixels = [], [], []
-    for left_view, right_view in views.pairs:
-        left_indices, left_corners = views.left.views[left_view]
-        right_indices, right_corners = views.right.views[right_view]
-        common, left_rows, right_rows = np.intersect1d(left_indices, right_indices, return_indices=True)
-        if len(common) >= _MIN_COMMON_CORNERS:
-            points.append(views.board.points[common])
-            left_pixels.append(left_corners[left_rows].astype(np.float32))
-            right_pixels.append(right_corners[right_rows].astype(np.float32))
+    # 2. Take the pairs of views that show the board to both cameras.
+    points = [views.board.points for _ in views.pairs]
+    left_pixels = [views.left.views[left_view].astype(np.float32) for left_view, _ in views.pairs]
+    right_pixels = [views.right.views[right_view].astype(np.float32) for _, right_view in views.pairs]
     if len(points) < MIN_VIEWS:
         raise CommandFailed(
             f"both cameras see the board in {len(points)} views at once; a pair needs {MIN_VIEWS}",

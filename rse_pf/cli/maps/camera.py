@@ -48,7 +48,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     board.add_argument(
         "--square-mm", type=float, default=25.0, metavar="MM", help="edge of a square (default: 25)"
     )
-    board.add_argument("--charuco", action="store_true", help="a ChArUco board instead of a chessboard")
     calibrate = actions.add_parser("calibrate", parents=[board], help="write the intrinsics of a camera")
     calibrate.add_argument(
         "sources",
@@ -84,7 +83,7 @@ def run(args: argparse.Namespace, settings: PlatformSettings) -> int:
         return _check(args)
     from client_sdk.cameras.board import Board, write_board
 
-    board = Board.parse(args.board, args.square_mm, charuco=args.charuco)
+    board = Board.parse(args.board, args.square_mm)
     if args.action == "calibrate":
         return _calibrate(args, board)
     write_board(args.out, board)
