@@ -409,7 +409,8 @@ class LogWriter:
         """Queue *event* for the log and return a future for its outcomes.
 
         The future is done when the event is durable and applied to the map, or fails with the error with
-        which the event is refused.  To cancel the future does not withdraw the event.
+        which the event is refused.  Callers await it by `asyncio.shield`, so that it is never cancelled: an
+        event cannot be withdrawn.
 
         Args:
             event: Keyframe or other event.
@@ -426,7 +427,7 @@ class LogWriter:
             )
         submitted = SubmittedEvent(event, size_bytes, asyncio.get_running_loop().create_future())
         # asyncio logs an exception that nobody reads; a request that was cancelled does not read it.
-        submitted.applied.add_done_callback(lambda future: future.cancelled() or future.exception())
+        submitted.applied.add_done_callback(lambda future: future.exception())
         self._outstanding.add(submitted.applied)
         submitted.applied.add_done_callback(self._outstanding.discard)
         self._queue.append(submitted)
@@ -522,6 +523,6 @@ class LogWriter:
 def _refuse_keyframes(batch: list[SubmittedEvent], error: StoreFull) -> list[SubmittedEvent]:
     """Fail the keyframes of *batch* with *error*, so that robots send them again; return the other events."""
     for submitted in batch:
-        if isinstance(submitted.event, KeyframeAdded) and not submitted.applied.done():
+        if isinstance(submitted.event, KeyframeAdded):
             submitted.applied.set_exception(error)
     return [submitted for submitted in batch if not isinstance(submitted.event, KeyframeAdded)]

@@ -124,7 +124,8 @@ class MapServer:
         self._updates = MapUpdates(self._requests.name_of)
         self._renewed = asyncio.Event()
         self._snapshot_position = 0  # entry of the log at the last snapshot of this process; 0: none
-        self._bytes_since_snapshot = 0  # bytes that were charged for entries since then
+        self._logged_bytes = 0  # bytes of the entries of this process, as they were charged
+        self._saved_bytes = 0  # value of _logged_bytes at the last snapshot
         self._has_unsent_updates = False  # whether an update was not sent because the lease was too old
         self._is_waiting_for_store = False
         self._is_closing = False
@@ -294,7 +295,9 @@ class MapServer:
         the whole pose graph for an optimisation if the map asks for that.
         """
         for submitted, outcomes, defect in zip(batch, applied.outcomes, applied.defects, strict=True):
-            if defect is not None:
+            if defect is None:
+                submitted.applied.set_result(outcomes)
+            else:
                 self._environment.log.error(
                     "live-map-defect", map=self._environment.map_name, error=repr(defect)
                 )
@@ -304,8 +307,6 @@ class MapServer:
                         hint="report the line live-map-defect of the server's log",
                     )
                 )
-            elif not submitted.applied.done():
-                submitted.applied.set_result(outcomes)
             if any(isinstance(outcome, OptimiseWanted) for outcome in outcomes):
                 self._measurer.request_optimisation()
             if isinstance(submitted.event, KeyframeAdded):
@@ -326,21 +327,20 @@ class MapServer:
         """
         account = self._environment.account
         if not account.try_charge(size_bytes):
-            reserve = functools.partial(
-                account.reserve, size_bytes, margin=self._bytes_since_snapshot + size_bytes
-            )
+            unsaved_bytes = self._logged_bytes - self._saved_bytes
+            reserve = functools.partial(account.reserve, size_bytes, margin=unsaved_bytes + size_bytes)
             try:
                 await self._environment.threads.store(reserve)
             except StoreFull:
                 raise
             except StoreError:  # the log entry waits until the store works, and is counted later
                 pass
-        self._bytes_since_snapshot += size_bytes
+        self._logged_bytes += size_bytes
 
     async def _write_snapshot(self) -> None:
         """Write a snapshot; if the store fails, only warn, since a restart can read the log instead."""
         threads = self._environment.threads
-        saved_bytes = self._bytes_since_snapshot
+        saved_bytes = self._logged_bytes
         snapshot = await threads.compute(
             Urgency.APPLY, functools.partial(self._state.make_snapshot, self._log.stored_parts)
         )
@@ -352,7 +352,7 @@ class MapServer:
             )
         else:
             self._snapshot_position = snapshot.position
-            self._bytes_since_snapshot -= saved_bytes
+            self._saved_bytes = saved_bytes
 
     # --- Renewal of the lease, and the end of the service ---
 
