@@ -270,9 +270,11 @@ def source_of_frames(
 def is_recording(path: Path) -> bool:
     """Return whether a path is a recording that `open_camera` opens with `open_dataset`.
 
-    These are folders in the layout of TUM, EuRoC or KITTI, and raw folders of NYU Depth V2; ROS bags are not.
+    These are folders in the layout of TUM, EuRoC or KITTI, raw folders of NYU Depth V2, and files whose name
+    ends in ``.mat``; ROS bags are not.
     """
-    return is_listed(path) or any(path.glob("d-*.pgm")) or is_euroc(path) or is_kitti(path)
+    is_raw = any(path.glob("d-*.pgm"))
+    return path.suffix == ".mat" or is_listed(path) or is_raw or is_euroc(path) or is_kitti(path)
 
 
 def _open_stereo_video(

@@ -1,4 +1,4 @@
-"""Open a recording of any known format, and read RGB-D recordings: TUM folders, and dumps of NYU Depth V2.
+"""Open a recording of any known format, and read RGB-D recordings: TUM folders, and NYU Depth V2.
 
 Frames are undistorted RGB images with depth in metres; the depth images of NYU Depth V2 are registered to the
 colour camera here, those of TUM folders must be already.  An image is read only when its frame is needed.
@@ -67,6 +67,7 @@ _FREIBURG_DEPTH_SCALE = 5000.0  # units of a depth image of the TUM benchmark pe
 def open_dataset(
     path: Path | str,
     *,
+    scene: str | None = None,
     camera: CameraChoice | None = None,
     imu: bool | None = None,
     intrinsics: Path | str | None = None,
@@ -75,10 +76,12 @@ def open_dataset(
 
     Accepts a folder in TUM layout (``rgb.txt``, ``depth.txt``, or a list of associations; with or without
     ``intrinsics.json``), a recording of EuRoC or a sequence of KITTI's odometry benchmark, a raw NYU Depth V2
-    folder (``r-*.ppm``, ``d-*.pgm``), or a ROS bag.
+    folder (``r-*.ppm``, ``d-*.pgm``), its labelled ``.mat`` file, of which *scene* picks one scene, or a ROS
+    bag.
 
     Args:
         path: The folder or file.
+        scene: Name of a scene of the labelled file; None for all images, and for other formats.
         camera: ``stereo`` uses both cameras of a stereo pair, and refuses a recording without; ``left`` uses
             the left camera of a pair, or the only camera; None uses both cameras if there are two.
         imu: Whether frames have samples of the IMU; True refuses a recording without an IMU; None means yes
@@ -88,9 +91,9 @@ def open_dataset(
 
     Raises:
         UsageError: The path has no known format, a part of the recording is missing or broken, facts about it
-            contradict each other, it has no such camera or IMU, or *intrinsics* is given for a format that
-            has a calibration of its own.
-        MissingExtra: OpenCV or rosbags is needed and not installed.
+            contradict each other, it has no such scene, camera or IMU, or *intrinsics* is given for a format
+            that has a calibration of its own.
+        MissingExtra: OpenCV, h5py or rosbags is needed and not installed.
     """
     path = Path(path)
     check_exists(path, "name a folder of TUM (rgb.txt, depth.txt, images), EuRoC or KITTI, or a ROS bag")
@@ -99,24 +102,21 @@ def open_dataset(
             f"{path} has a calibration in a format of its own",
             hint="leave out --intrinsics, or correct the calibration file of the recording",
         )
-    if is_euroc(path):
+    if scene is None and is_euroc(path):
         return open_euroc(path, camera=camera, imu=imu)
-    if is_kitti(path):
+    if scene is None and is_kitti(path):
         return open_kitti(path, camera=camera, imu=imu)
-    if _is_bag(path):
+    if scene is None and _is_bag(path):
         use_stereo = None if camera is None else camera == "stereo"
         lens, rig = (None, None) if intrinsics is None else lens_or_rig(Path(intrinsics))
         options = BagOptions(use_stereo=use_stereo, use_imu=imu, lens=lens, rig=rig)
         return dataset_of_bag(open_bag(path, options))
-    if path.is_file():
-        raise UsageError(f"{path} is not a recording", hint="name a folder or a ROS bag")
+    dataset = _open_single(path, scene, None if intrinsics is None else Path(intrinsics))
     if camera == "stereo":
         raise UsageError(f"{path} has one camera", hint="leave out --camera stereo")
     if imu:
         raise UsageError(f"{path} has no IMU", hint="leave out --imu")
-    if not is_listed(path) and any(path.glob("d-*.pgm")):
-        return _open_raw(path)
-    return _open_tum(path, None if intrinsics is None else Path(intrinsics))
+    return dataset
 
 
 def _is_bag(path: Path) -> bool:
@@ -135,6 +135,18 @@ def _find_associations(folder: Path) -> Path | None:
     and a depth image, in either order, each after its time stamp.
     """
     return next(iter(sorted(folder.glob("*assoc*.txt"))), None)
+
+
+def _open_single(path: Path, scene: str | None, intrinsics: Path | None) -> Dataset:
+    if path.is_file():
+        if path.suffix != ".mat":
+            raise UsageError(f"{path} is not a recording", hint="name a folder, a ROS bag or the .mat file")
+        return _open_labelled(path, scene)
+    if scene is not None:
+        raise UsageError(f"{path} has no scenes", hint="name scenes for the labelled .mat file only")
+    if not is_listed(path) and any(path.glob("d-*.pgm")):
+        return _open_raw(path)
+    return _open_tum(path, intrinsics)
 
 
 def dataset_of_bag(bag: Bag) -> Dataset:
@@ -441,7 +453,7 @@ def _read_truth(
     return None, "none", ("",)
 
 
-# --- Raw dumps of NYU Depth V2 ---
+# --- NYU Depth V2: raw dumps, and the labelled file ---
 
 
 def _open_raw(folder: Path) -> Dataset:
@@ -478,9 +490,37 @@ def _open_raw(folder: Path) -> Dataset:
         total=len(depths),
         is_usual=True,
     )
-    name, camera = folder.name, nyu.COLOUR_CAMERA
-    stamps_s = tuple(depths[row].timestamp_s for row, _ in pairs)
-    depths_m = probe(range(len(pairs)), lambda row: read(row).depth_m)
+    stamps_s = [depths[row].timestamp_s for row, _ in pairs]
+    return _nyu_dataset(folder.name, stamps_s, read, (unpaired,) if lost else ())
+
+
+def _open_labelled(path: Path, scene: str | None) -> Dataset:
+    """Return the images of the labelled file, one second apart, because the file has no time stamps."""
+    file = nyu.LabelledFile(path)
+    rows = file.rows(scene)
+
+    def read(row: int) -> Frame:
+        rgb, depth_m = file.read(rows[row])
+        return Frame(timestamp_s=float(row), rgb=rgb, depth_m=depth_m, camera=nyu.COLOUR_CAMERA)
+
+    stamps_s = [float(row) for row in range(len(rows))]
+    assumed = f"{path} holds no time stamps: 1 s between images is assumed"
+    return _nyu_dataset(scene or path.stem, stamps_s, read, assumed=(assumed,))
+
+
+def _nyu_dataset(
+    name: str,
+    stamps_s: Sequence[float],
+    read: Callable[[int], Frame],
+    losses: Sequence[LossFacts] = (),
+    assumed: tuple[str, ...] = (),
+) -> Dataset:
+    """Return a recording of NYU Depth V2, whose camera and depth unit the toolbox of the data set states.
+
+    *read* reads the frame of a row, with depth in metres; *stamps_s* has a time stamp for each row.
+    """
+    camera = nyu.COLOUR_CAMERA
+    depths_m = probe(range(len(stamps_s)), lambda row: read(row).depth_m)
     whose = (
         f"the camera of {name} is that of the toolbox of NYU Depth V2: fx {camera.fx:.2f} fy {camera.fy:.2f} "
         f"cx {camera.cx:.2f} cy {camera.cy:.2f}"
@@ -492,13 +532,13 @@ def _open_raw(folder: Path) -> Dataset:
             median_m=median_depth_m(depths_m), units_per_m=1.0, is_unit_stated=True, is_registered=True
         ),
         times=(TimeFacts(stated_by=name, stamps_s=np.array(stamps_s)),),
-        losses=(unpaired,) if lost else (),
-        assumed=(whose,),
+        losses=losses,
+        assumed=(whose, *assumed),
     )
     return Dataset(
         name=name,
         camera=camera,
-        timestamps_s=stamps_s,
+        timestamps_s=tuple(stamps_s),
         truth=None,
         truth_kind="none",
         rows=tuple(range(len(stamps_s))),

@@ -55,10 +55,10 @@ EXTRAS: dict[str, Extra] = {
     ),
     "vision": Extra(
         modules={
-            "rse_pf_native": "rse-pf-native", "cv2": "opencv-python-headless", "yaml": "pyyaml",
-            "mcap": "mcap",
+            "rse_pf_native": "rse-pf-native", "cv2": "opencv-python-headless", "h5py": "h5py",
+            "yaml": "pyyaml", "mcap": "mcap",
         },
-        enables="features, poses on the robot, cameras and recordings",
+        enables="features, poses on the robot, cameras, recordings and NYU Depth V2 files",
     ),
     "demo": Extra(
         modules={"cv2": "opencv-python-headless"}, enables="robots that track frames", includes=("local",)
@@ -131,7 +131,7 @@ VERBS_NEED: dict[str, tuple[str, ...]] = {
 }
 """Verb, with the action or option that needs more, to extras."""
 
-_OPTIONAL = {"yaml"}
+_OPTIONAL = {"h5py", "yaml"}
 """Modules without which the verbs work: their readers name the extra at use."""
 
 

@@ -101,6 +101,7 @@ _CALLS: Mapping[str, Callable[[Any], object]] = {
     "prometheus_client": lambda prometheus_client: prometheus_client.CollectorRegistry(),
     "jwt": lambda jwt: jwt.encode({}, "k" * 32, algorithm="HS256"),
     "cv2": _detect_features,
+    "h5py": lambda h5py: h5py.File("unused", "w", driver="core", backing_store=False).close(),
     "yaml": lambda yaml: yaml.safe_load("[1]"),
     "gtsam": lambda gtsam: gtsam.Pose3(),
     "onnxruntime": lambda onnxruntime: onnxruntime.get_available_providers(),

@@ -280,5 +280,29 @@ def test_the_head_of_a_raw_image_takes_no_time(tmp_path: Path, head: bytes):
         read_raw_depth(tmp_path / "d-1.0-1.pgm")
 
 
+@pytest.mark.parametrize("kind", ["enormous", "elsewhere", "linked", "virtual", "no set", "other counts"])
+def test_a_labelled_file_holds_images_of_one_size_in_itself(tmp_path: Path, kind: str):
+    h5py = pytest.importorskip("h5py", reason="pip install 'rse-pf[vision]'")
+    path = tmp_path / "nyu.mat"
+    shape = (2, 3, 640, 480)
+    with h5py.File(path, "w") as file:
+        file.create_dataset("depths", (2, 640, 480), dtype="f4", chunks=(1, 640, 480))
+        if kind == "enormous":
+            file.create_dataset("images", (2, 3, 50_000, 50_000), dtype="u1", chunks=(1, 3, 640, 480))
+        elif kind == "elsewhere":
+            file.create_dataset("images", shape, dtype="u1", external=[(b"/etc/passwd", 0, 1843200)])
+        elif kind == "linked":
+            file["images"] = h5py.ExternalLink("other.mat", "/images")
+        elif kind == "virtual":
+            file.create_virtual_dataset("images", h5py.VirtualLayout(shape, dtype="u1"))
+        elif kind == "no set":
+            file.create_group("images")
+        else:
+            file.create_dataset("images", (2**40, 3, 640, 480), dtype="u1", chunks=(1, 3, 640, 480))
+
+    with pytest.raises(UsageError, match="holds no images and depths"):
+        open_dataset(path)
+
+
 def _pinhole() -> dict[str, float]:
     return {name: value for name, value in CAMERA.items() if name != "depth_scale"}

@@ -18,7 +18,7 @@ import pytest
 BASE = {"numpy", "websockets", "msgspec"}
 HEAVY = (
     "cv2", "boto3", "botocore", "aws_cdk", "cryptography", "jwt", "picows", "uvloop", "matplotlib",
-    "PIL", "rich", "lupa",
+    "PIL", "h5py", "rich", "lupa",
 )  # fmt: skip
 IMPORT_S = 0.3
 

@@ -250,7 +250,7 @@ def _frames(source: str) -> Iterator[tuple[float, npt.NDArray[np.uint8], str]]:
     if path.is_dir() and not has_pairs and not is_recording(path) and not (path / "rgb.txt").exists():
         images = list_folder(path).frames(DoubtLog(), 1000.0)
         yield from ((stamp, rgb, "" if depth_m is None else "depth") for stamp, rgb, depth_m in images)
-    elif source == "realsense" or path.is_dir() or path.suffix in (".bag", ".mcap", ".db3"):
+    elif source == "realsense" or path.is_dir() or path.suffix in (".bag", ".mat", ".mcap", ".db3"):
         with open_camera(source) as frames:
             for frame in frames:
                 by_depth = "depth" if frame.depth_m.any() else ""

@@ -235,6 +235,31 @@ def test_a_raw_dump_is_paired_by_the_times_in_its_names(tmp_path: Path):
     assert frames[0].camera.fx == pytest.approx(518.8579)
 
 
+def test_the_labelled_file_is_read_with_its_axes_turned(tmp_path: Path):
+    h5py = pytest.importorskip("h5py", reason="pip install 'rse-pf[vision]'")
+    images = np.zeros((3, 3, 640, 480), np.uint8)
+    images[1, 2, 100, 50] = 77  # blue at row 50, column 100
+    depths = np.zeros((3, 640, 480), np.float32)
+    depths[1, 100, 50] = 2.5
+    with h5py.File(tmp_path / "nyu.mat", "w") as file:
+        file["images"], file["rawDepths"], file["depths"] = images, depths, depths + 9
+        cells = []
+        for name in ("bath", "cafe", "cafe"):
+            file[f"#refs#/{len(cells)}"] = np.array([[ord(letter)] for letter in name], np.uint16)
+            cells.append(file[f"#refs#/{len(cells)}"].ref)
+        file.create_dataset("scenes", data=np.array([cells], dtype=h5py.ref_dtype), dtype=h5py.ref_dtype)
+
+    cafe = open_dataset(tmp_path / "nyu.mat", scene="cafe")
+
+    frame = next(iter(cafe))
+    assert (len(cafe), len(open_dataset(tmp_path / "nyu.mat"))) == (2, 3)
+    assert frame.rgb[50, 100].tolist() == [0, 0, 77]
+    assert frame.depth_m[50, 100] == 2.5
+    assert any("1 s between images is assumed" in note for note in cafe.notes)
+    with pytest.raises(UsageError, match="no scene attic"):
+        open_dataset(tmp_path / "nyu.mat", scene="attic")
+
+
 def test_a_recording_may_be_named_by_text(tmp_path: Path):
     assert len(open_dataset(str(write_tum(tmp_path / "x", [0.0, 0.1])))) == 2
 
