@@ -218,15 +218,12 @@ def installed_services(folder: Path) -> list[InstalledService]:
             f"there is no services folder {folder}",
             hint=f"install one there: rse-pf service install FOLDER --services {folder}",
         )
-    services = []
-    for target in sorted(folder.iterdir()):
-        if target.is_dir() and not target.name.startswith("."):
-            verify_installed(target)
-            services.append(_read_installed(target))
-    dependencies = dict(_dependencies_in(folder))
-    for name, packages in dependencies.items():
-        verify_dependencies(packages, name)
-    require_same_versions({name: packages.packages for name, packages in dependencies.items()})
+    services = [
+        verify_installed(target)
+        for target in sorted(folder.iterdir())
+        if target.is_dir() and not target.name.startswith(".")
+    ]
+    require_same_versions({name: dependencies.packages for name, dependencies in _dependencies_in(folder)})
     return services
 
 
@@ -307,14 +304,14 @@ def read_identity(target: Path) -> str:
     return _file_sha256(target / _PINS)
 
 
-def verify_installed(target: Path) -> None:
-    """Check that the folder *target* holds an installed service with unchanged files.
+def verify_installed(target: Path) -> InstalledService:
+    """Return the installed service in the folder *target*, whose files and packages must be unchanged.
 
-    Files in folders ``__pycache__`` are ignored.  The service's Python packages, which lie in another folder,
-    are not checked.
+    Files in folders ``__pycache__`` are ignored.
 
     Raises:
-        ConfigurationError: The service was not installed, or a file was changed, added or removed.
+        ConfigurationError: The service was not installed; a file of it or of its Python packages was changed,
+            added or removed; or the packages are for another platform.
     """
     try:
         pins = json.loads((target / _PINS).read_text(encoding="utf-8"))
@@ -331,6 +328,10 @@ def verify_installed(target: Path) -> None:
             f"{target.name} was changed after it was installed: {', '.join(changed[:5])}",
             hint="install it again with: rse-pf service install FOLDER",
         )
+    dependencies = read_dependencies(target)
+    if dependencies is not None:
+        verify_dependencies(dependencies, target.name)
+    return _read_installed(target)
 
 
 def _list_files(folder: Path) -> list[str]:

@@ -13,11 +13,10 @@ import os
 import shutil
 import stat
 import tempfile
-from dataclasses import replace
 from pathlib import Path
 
 from rse_pf.errors import ConfigurationError, RsePfError
-from rse_pf.services.custom.dependencies import copy_dependencies, verify_dependencies
+from rse_pf.services.custom.dependencies import copy_dependencies
 from rse_pf.services.custom.installed import (
     DEPENDENCIES_FOLDER,
     InstalledService,
@@ -109,7 +108,6 @@ class VerifiedCopy:
         file_statuses, target = _file_statuses(original), self._into / original.name
         try:
             copy_regular_files(original.folder, target, ("__pycache__",))
-            verify_installed(target)
             if read_identity(target) != original.identity:
                 raise ConfigurationError(
                     f"{original.name} was installed again while its server started",
@@ -118,10 +116,7 @@ class VerifiedCopy:
             dependencies = read_dependencies(original.folder)
             if dependencies is not None:
                 copy_dependencies(dependencies, self._into / DEPENDENCIES_FOLDER)
-                dependencies = replace(
-                    dependencies, folder=self._into / DEPENDENCIES_FOLDER / dependencies.digest
-                )
-                verify_dependencies(dependencies, original.name)
+            self.service = verify_installed(target)
         except OSError as error:
             raise ConfigurationError(
                 f"{original.name} cannot be copied: {error}",
@@ -129,8 +124,6 @@ class VerifiedCopy:
             ) from error
         except RsePfError as error:
             raise ConfigurationError(error.message, hint=error.hint) from error
-        folder = None if dependencies is None else dependencies.folder
-        self.service = replace(original, folder=target, dependencies=folder)
         self._file_statuses = file_statuses
 
     def problem(self) -> ConfigurationError | None:
@@ -147,9 +140,6 @@ class VerifiedCopy:
             if read_identity(self.original.folder) != self.original.identity:
                 return None
             verify_installed(self.original.folder)
-            dependencies = read_dependencies(self.original.folder)
-            if dependencies is not None:
-                verify_dependencies(dependencies, self.original.name)
         except OSError:
             return None  # The service is being removed or replaced.
         except ConfigurationError as error:
