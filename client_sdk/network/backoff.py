@@ -13,6 +13,7 @@ Two rules bound the attempts:
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from random import Random
 
 from client_sdk.network.connect_timings import ConnectTimings
@@ -49,10 +50,17 @@ MAX_PAUSE_DOUBLINGS = 16
 class Backoff:
     """Compute the pauses before the attempts of one robot to connect to one address."""
 
-    def __init__(self, timings: ConnectTimings, random: Random) -> None:
-        """Begin with short pauses and a full token bucket; *random* is the source of the jitter."""
+    def __init__(self, timings: ConnectTimings, random: Random, wall_clock: Callable[[], float]) -> None:
+        """Begin with short pauses and a full token bucket.
+
+        Args:
+            timings: Longest pauses.
+            random: Source of the jitter.
+            wall_clock: Unix seconds, by which servers state when they accept tokens again.
+        """
         self._timings = timings
         self._random = random
+        self._wall_clock = wall_clock
         self._attempts = 0
         self._failing_since_s: float | None = None
         self._bucket = TokenBucket(DIALS_PER_MINUTE / 60.0, DIAL_BURST)
@@ -75,7 +83,6 @@ class Backoff:
         now_s: float,
         failure: DialError | None = None,
         *,
-        valid_in_s: float | None = None,
         spent_s: float = 0.0,
         is_move: bool = False,
     ) -> float:
@@ -88,8 +95,8 @@ class Backoff:
               ``reconnect_max_s``; once attempts have failed for more than three times ``reconnect_max_s``, a
               sixth to a third of the time for which they have failed, up to ``reconnect_long_max_s``;
             - after an attempt that nobody answered: 1 to 1.25 s;
-            - after a refusal: half of ``reconnect_long_max_s`` to all of it, but at most half a second longer
-              than *valid_in_s*.
+            - after a refusal: half of ``reconnect_long_max_s`` to all of it, but at most until half a second
+              after the time from which the servers accept new tokens.
 
         The time that the server asked for (``Retry-After``), times 1 to 1.25, is added, and the token bucket
         may demand a longer pause.  The duration of the last attempt is a part of the pause, except after a
@@ -98,8 +105,6 @@ class Backoff:
         Args:
             now_s: Seconds of the robot's clock.
             failure: Failure of the last attempt; None if none has failed since the connection was lost.
-            valid_in_s: After a refusal: seconds until the servers accept a bearer token that is signed then;
-                None if unknown.
             spent_s: Duration of the last attempt, in seconds.
             is_move: Whether the robot is connected and only changes the server; half of the token bucket then
                 stays in reserve.
@@ -110,15 +115,16 @@ class Backoff:
         if is_move:
             missing_tokens = MOVE_RESERVE * self._bucket.burst + 1.0 - self._bucket.tokens
             bucket_s = max(bucket_s, missing_tokens / self._bucket.rate)
-        pause_s = max(asked_s + self._backoff_s(now_s, failure, valid_in_s), bucket_s)
+        pause_s = max(asked_s + self._backoff_s(now_s, failure), bucket_s)
         if failure is not None and failure.is_refusal:
             return pause_s
         return max(retry_after_s, pause_s - spent_s)
 
-    def _backoff_s(self, now_s: float, failure: DialError | None, valid_in_s: float | None) -> float:
+    def _backoff_s(self, now_s: float, failure: DialError | None) -> float:
         timings, uniform = self._timings, self._random.uniform
         if failure is not None and failure.is_refusal:
             pause_s = uniform(0.5 * timings.reconnect_long_max_s, timings.reconnect_long_max_s)
+            valid_in_s = failure.valid_in_s(self._wall_clock())
             if valid_in_s is None:
                 return pause_s
             return min(pause_s, max(0.0, valid_in_s) + uniform(0.0, REVOCATION_JITTER_S))

@@ -116,9 +116,6 @@ lead to the same platform."""
 LATE_WELCOME_S = 60.0
 """A stalled server may accept an attempt to connect up to this many seconds after the robot gave it up.  The
 platform then closes the robot's newer connection as replaced, and no other program is the cause."""
-SHORT_REFUSAL_S = 2.0
-"""If the servers will accept this robot within this many seconds, their refusal is not reported: commands and
-a first connect wait until then."""
 TOKEN_CLOCK_STEP_S = 1.0
 """After a revocation the robot waits this many seconds before it signs a new token: a token states its time
 in whole seconds, which must be later than the revocation."""
@@ -237,7 +234,7 @@ class Connection:
                 break
             if attempt == FIRST_CONNECT_ATTEMPTS:
                 raise failure.error from None
-            await asyncio.sleep(self._pause_s(self._regions[0], failure))
+            await asyncio.sleep(self._regions[0].backoff.pause_s(self._clock(), failure))
         region_tasks = [self._start_task(self._maintain_region(region)) for region in self._regions]
         self._main_tasks = [self._start_task(self._run_timers()), *region_tasks]
         for socket in self._usable_sockets().values():
@@ -273,7 +270,10 @@ class Connection:
                 f"{len(urls)} addresses were given, of which {len(set(urls))} are different",
                 hint=f"give connect 1 to {MAX_REGIONS} different addresses",
             )
-        regions = [Region(n, url, Backoff(self._timings, self._random)) for n, url in enumerate(urls)]
+        regions = []
+        for number, url in enumerate(urls):
+            backoff = Backoff(self._timings, self._random, self._wall_clock)
+            regions.append(Region(number, url, backoff))
         return regions, RegionChoice(len(regions), hold_s=self._timings.region_hold_s)
 
     def _current_region(self) -> Region:
@@ -283,7 +283,7 @@ class Connection:
 
     def _is_hopeless(self, failure: DialError) -> bool:
         """Return whether another attempt of a first connect would fail in the same way."""
-        return failure.is_wrong_address or self._is_lasting_refusal(failure)
+        return failure.is_wrong_address or failure.is_lasting_refusal(self._wall_clock())
 
     def _usable_sockets(self) -> dict[int, RegionSocket]:
         """Return the STANDBY and CURRENT sockets by the number of their region."""
@@ -409,7 +409,9 @@ class Connection:
         began_s = self._clock()
         while True:
             # 1. Pause for as long as the last failure demands.
-            await asyncio.sleep(self._pause_s(region, region.last_failure, self._clock() - began_s))
+            now_s = self._clock()
+            pause_s = region.backoff.pause_s(now_s, region.last_failure, spent_s=now_s - began_s)
+            await asyncio.sleep(pause_s)
             # 2. Dial the region, and wait for the Welcome.
             began_s = self._clock()
             region.last_failure = await self._join_region(region)
@@ -419,37 +421,14 @@ class Connection:
                 return
             self._fail_refused_commands()
 
-    def _pause_s(
-        self, region: Region, failure: DialError | None, spent_s: float = 0.0, *, is_move: bool = False
-    ) -> float:
-        """Return how many seconds to wait from now before the next attempt; see `Backoff.pause_s`."""
-        return region.backoff.pause_s(
-            self._clock(),
-            failure,
-            valid_in_s=self._valid_in_s(failure),
-            spent_s=spent_s,
-            is_move=is_move,
-        )
-
-    def _is_lasting_refusal(self, failure: DialError | None) -> bool:
-        """Return whether a server refused this robot and does not accept it again within two seconds."""
-        valid_in_s = self._valid_in_s(failure)
-        is_short = valid_in_s is not None and valid_in_s <= SHORT_REFUSAL_S
-        return failure is not None and failure.is_refusal and not is_short
-
-    def _valid_in_s(self, failure: DialError | None) -> float | None:
-        """Return in how many seconds tokens that are signed then are accepted again, None if unknown."""
-        if failure is None or failure.valid_from_s is None:
-            return None
-        return failure.valid_from_s - self._wall_clock()
-
     def _fail_refused_commands(self) -> None:
         """End all commands with the reason if every region refuses this robot; dialling goes on."""
-        if not all(self._is_lasting_refusal(region.last_failure) for region in self._regions):
+        now_unix_s = self._wall_clock()
+        failures = [region.last_failure for region in self._regions if region.last_failure is not None]
+        refusals = [failure for failure in failures if failure.is_lasting_refusal(now_unix_s)]
+        if len(refusals) < len(self._regions):
             return
-        failure = self._regions[0].last_failure
-        assert failure is not None
-        error, earlier = failure.error, self.refusal
+        error, earlier = refusals[0].error, self.refusal
         self.refusal = error
         self.last_error = error.message
         self._handle_events(None, self._session.end_commands(error.code, error.message, error.hint))
@@ -492,7 +471,7 @@ class Connection:
                     self._notify_change("moved", fresh.state.server)
                     return
                 self._start_task(self._close_socket(fresh))
-            pause_s = self._pause_s(region, failure, is_move=True)
+            pause_s = region.backoff.pause_s(self._clock(), failure, is_move=True)
             await wait_for_event(old.has_ended, min(pause_s, max(0.0, until_s - self._clock())))
 
     # --- One WebSocket, from its handshake to its end -------------------------------------------

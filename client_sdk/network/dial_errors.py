@@ -60,6 +60,9 @@ WRONG_ADDRESS_STATUSES = (400, 404, 405, 407, 410, 426)
 that a first connect raises its error at once."""
 ANSWERED_ERRNOS = (errno.ECONNREFUSED, errno.ECONNRESET, errno.ECONNABORTED)
 """Errors of a TCP connection that a machine at the address caused: it is there, and answered."""
+SHORT_REFUSAL_S = 2.0
+"""If the servers will accept this robot within this many seconds, their refusal is not reported: commands and
+a first connect wait until then."""
 REFUSALS_OF_ANY_TOKEN = ("disabled", CUT_OFF, "not-yet-valid")
 """Causes that a refusal names and that a token signed now would meet as well, so that none is signed."""
 
@@ -101,6 +104,16 @@ class DialError(Exception):
         self.may_be_accepted_late = may_be_accepted_late
         self.refuses_any_token = cause in REFUSALS_OF_ANY_TOKEN
         self.valid_from_s = valid_from_s
+
+    def valid_in_s(self, unix_s: float) -> float | None:
+        """Return in how many seconds from *unix_s* new tokens are accepted, None if unknown."""
+        return None if self.valid_from_s is None else self.valid_from_s - unix_s
+
+    def is_lasting_refusal(self, unix_s: float) -> bool:
+        """Return whether a server refuses this robot, and accepts no token within two seconds from
+        *unix_s*."""
+        valid_in_s = self.valid_in_s(unix_s)
+        return self.is_refusal and (valid_in_s is None or valid_in_s > SHORT_REFUSAL_S)
 
 
 def tcp_error(address: str, error: OSError) -> DialError:

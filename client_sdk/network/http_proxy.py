@@ -15,13 +15,12 @@ from dataclasses import dataclass, field
 from urllib.parse import SplitResult, unquote, urlsplit
 
 from client_sdk.network.dial_errors import ANSWERED_ERRNOS, DialError
-from client_sdk.network.peer_diagnosis import shorten
+from client_sdk.network.peer_diagnosis import WEB_SCHEME, shorten
 from rse_pf.config.placement import is_loopback
 from rse_pf.errors import ConnectError, UsageError
 
 __all__ = [
     "Proxy",
-    "connect_tcp",
     "find_proxy",
     "open_tunnel",
     "port_of",
@@ -29,8 +28,6 @@ __all__ = [
 
 DEFAULT_PROXY_PORT = 80
 """Port of a proxy whose address names none."""
-PROXY_SCHEMES = {"ws": "http", "http": "http", "wss": "https", "https": "https"}
-"""For each URL scheme the one whose variable names the proxy: ``ws:`` uses ``HTTP_PROXY``."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,23 +49,6 @@ class Proxy:
 def port_of(parts: SplitResult) -> int:
     """Return the port of an address, 443 or 80 by its scheme if it names none."""
     return parts.port or (443 if parts.scheme in ("wss", "https") else 80)
-
-
-def connect_tcp(parts: SplitResult, timeout_s: float) -> socket.socket:
-    """Return a TCP connection to the host of *parts*, through the proxy of the environment if it has one.
-
-    This function blocks.  Each step takes at most *timeout_s* seconds.
-
-    Raises:
-        DialError: The proxy refuses the tunnel, or cannot be reached.
-        OSError: There is no connection to the host.
-        UsageError: The environment variable names no HTTP proxy.
-    """
-    host, port = parts.hostname or "", port_of(parts)
-    proxy = find_proxy(parts.scheme, host, port)
-    if proxy is None:
-        return socket.create_connection((host, port), timeout_s)
-    return open_tunnel(proxy, parts, timeout_s)
 
 
 def open_tunnel(proxy: Proxy, parts: SplitResult, timeout_s: float) -> socket.socket:
@@ -124,7 +104,7 @@ def find_proxy(scheme: str, host: str, port: int) -> Proxy | None:
         UsageError: The environment variable names no HTTP proxy.
     """
     proxies = urllib.request.getproxies()
-    name = next((name for name in (PROXY_SCHEMES[scheme], "all") if proxies.get(name)), None)
+    name = next((name for name in (WEB_SCHEME[scheme], "all") if proxies.get(name)), None)
     if name is None or is_loopback(host) or _is_exempt(host, port, proxies.get("no", "")):
         return None
     return _parse_proxy(proxies[name], f"{name.upper()}_PROXY")

@@ -19,6 +19,7 @@ from rse_pf.errors import ConnectError
 from rse_pf.wire.refusal import refusal_in
 
 __all__ = [
+    "WEB_SCHEME",
     "HttpAnswer",
     "explain_answer",
     "explain_certificate",
@@ -30,7 +31,8 @@ __all__ = [
 OTHER_SCHEME = {"ws": "wss", "wss": "ws", "http": "https", "https": "http"}
 """For each URL scheme the one that differs in TLS only."""
 WEB_SCHEME = {"ws": "http", "wss": "https", "http": "http", "https": "https"}
-"""For each URL scheme the one by which a web browser opens the same host."""
+"""For each URL scheme that of plain HTTP at the same port: for a web browser, for the data service, and for
+the name of the variable of a proxy (``ws:`` uses ``HTTP_PROXY``)."""
 CHECK_PORT = "check host and port of the URL: no RSE-PF server answers there"
 FOREIGN_STATUSES = (101, 301, 302, 303, 308, 407, 511)
 """HTTP statuses that login pages and proxies send and the data service of the platform never sends; it

@@ -16,8 +16,9 @@ import msgspec
 
 from client_sdk.network.bearer_token import strip_token
 from client_sdk.network.dial_errors import DialError, explain_tcp_failure, show_wrong_url, split_address
-from client_sdk.network.http_proxy import connect_tcp, port_of
+from client_sdk.network.http_proxy import find_proxy, open_tunnel, port_of
 from client_sdk.network.peer_diagnosis import (
+    WEB_SCHEME,
     HttpAnswer,
     explain_answer,
     explain_certificate,
@@ -45,9 +46,6 @@ MAX_SINGLE_PUT_BYTES = 262_144
 resumed."""
 NO_UPSTREAM = b"no healthy upstream"
 """Body of the 503 that the load balancer (Envoy) sends while it knows no data server at all."""
-HTTP_SCHEMES = {"ws": "http", "wss": "https"}
-"""For each scheme of the backend servers' WebSocket address, the scheme of the data service at the same host
-and port."""
 Response = tuple[int, http.client.HTTPMessage, bytes]
 """HTTP status, headers and body of an answer."""
 T = TypeVar("T")
@@ -79,7 +77,7 @@ class DataConnection:
             f"{show_wrong_url(url)!r} is not an address of a data service", hint="write https://HOST"
         )
         parts = split_address(url, ("http", "https", "ws", "wss"), error)
-        scheme = HTTP_SCHEMES.get(parts.scheme, parts.scheme)
+        scheme = WEB_SCHEME[parts.scheme]
         netloc = parts.netloc.rpartition("@")[2]
         self._parts = SplitResult(scheme, netloc, "", "", "")
         self.uses_tls = scheme == "https"
@@ -209,8 +207,12 @@ def open_connection(
     host, port = parts.hostname or "", port_of(parts)
     connection = http.client.HTTPConnection(host, port, timeout=timeout_s)
     connection.auto_open = 0  # http.client would connect again without the proxy
+    proxy = find_proxy(parts.scheme, host, port)
     try:
-        tcp = connect_tcp(parts, timeout_s)
+        if proxy is None:
+            tcp = socket.create_connection((host, port), timeout_s)
+        else:
+            tcp = open_tunnel(proxy, parts, timeout_s)
     except OSError as error:
         raise explain_tcp_failure(parts._replace(path="", query="").geturl(), error) from error
     tcp.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)

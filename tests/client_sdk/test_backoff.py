@@ -23,6 +23,14 @@ UNANSWERED = DialError(ConnectError("no route"), is_unanswered=True)
 REFUSED = DialError(ConnectError("refused"), is_refusal=True)
 
 
+def _backoff(timings: ConnectTimings, random: Random) -> Backoff:
+    return Backoff(timings, random, wall_clock=lambda: 0.0)
+
+
+def _revoked(valid_in_s: float) -> DialError:
+    return DialError(ConnectError("revoked"), is_refusal=True, valid_from_s=valid_in_s)
+
+
 @dataclass
 class Outage:
     """Result of an outage for robots behind one IP address: times of reconnects, and blocked attempts."""
@@ -35,7 +43,7 @@ class Outage:
 def play(settings: PlatformSettings, *, robots: int, outage_s: float, seed: int = 0) -> Outage:
     """Disconnect all robots at once; the load balancer answers 503, and the firewall applies its rules."""
     firewall = PlayedFirewall(rules_of_settings(settings))
-    backoffs = [Backoff(ConnectTimings(), Random(f"{seed}/{robot}")) for robot in range(robots)]
+    backoffs = [_backoff(ConnectTimings(), Random(f"{seed}/{robot}")) for robot in range(robots)]
     due = [(BEGAN_S + each.pause_s(BEGAN_S, ANSWERED), robot) for robot, each in enumerate(backoffs)]
     heapq.heapify(due)
     connected_s: list[float] = []
@@ -81,7 +89,7 @@ def test_no_robot_dials_more_often_than_the_limit_is_derived_from(outage_s):
 
 def test_a_server_that_accepts_and_dies_again_and_again_does_not_empty_the_allowance():
     timings = ConnectTimings()
-    backoff, now, dials = Backoff(timings, Random(1)), 0.0, 0
+    backoff, now, dials = _backoff(timings, Random(1)), 0.0, 0
     while now < 600.0:
         now += backoff.pause_s(now, ANSWERED)
         backoff.count_attempt(now)
@@ -95,7 +103,7 @@ def test_a_server_that_accepts_and_dies_again_and_again_does_not_empty_the_allow
 
 def test_a_move_that_does_not_succeed_leaves_half_of_the_allowance():
     timings = ConnectTimings()
-    backoff, now = Backoff(timings, Random(2)), 0.0
+    backoff, now = _backoff(timings, Random(2)), 0.0
     dials_until_s = []
     while now < 30.0:
         backoff.count_attempt(now)
@@ -111,12 +119,12 @@ def test_a_move_that_does_not_succeed_leaves_half_of_the_allowance():
 
 def test_a_server_that_dies_is_dialled_again_within_a_second():
     for seed in range(50):
-        assert Backoff(ConnectTimings(), Random(seed)).pause_s(50.0, ANSWERED) <= 0.1
+        assert _backoff(ConnectTimings(), Random(seed)).pause_s(50.0, ANSWERED) <= 0.1
 
 
 def test_the_pauses_grow_to_a_bound_and_not_beyond():
     timings = ConnectTimings()
-    backoff, now, pauses = Backoff(timings, Random(5)), 0.0, []
+    backoff, now, pauses = _backoff(timings, Random(5)), 0.0, []
     while now < 3600.0:
         pauses.append(backoff.pause_s(now, ANSWERED))
         now += pauses[-1]
@@ -127,14 +135,14 @@ def test_the_pauses_grow_to_a_bound_and_not_beyond():
 
 def test_robots_that_are_told_the_same_time_do_not_come_back_together():
     full = DialError(ConnectError("full"), retry_after_s=60.0)
-    pauses = [Backoff(ConnectTimings(), Random(seed)).pause_s(0.0, full) for seed in range(100)]
+    pauses = [_backoff(ConnectTimings(), Random(seed)).pause_s(0.0, full) for seed in range(100)]
 
     assert min(pauses) >= 60.0
     assert max(pauses) - min(pauses) >= 10.0
 
 
 def test_attempts_that_nobody_answers_go_on_once_a_second_and_cost_no_allowance():
-    backoff, now = Backoff(ConnectTimings(), Random(3)), 0.0
+    backoff, now = _backoff(ConnectTimings(), Random(3)), 0.0
     pauses = []
     for _ in range(200):
         pauses.append(backoff.pause_s(now, UNANSWERED))
@@ -147,7 +155,7 @@ def test_attempts_that_nobody_answers_go_on_once_a_second_and_cost_no_allowance(
 def test_pauses_grow_with_the_time_of_answers_and_not_with_that_of_silence():
     timings = ConnectTimings()
     for seed in range(20):
-        backoff, now = Backoff(timings, Random(seed)), 0.0
+        backoff, now = _backoff(timings, Random(seed)), 0.0
         backoff.pause_s(now)
         while now < 120.0:
             now += backoff.pause_s(now, UNANSWERED)
@@ -156,7 +164,7 @@ def test_pauses_grow_with_the_time_of_answers_and_not_with_that_of_silence():
 
 
 def test_a_robot_that_is_refused_tries_again_every_20_to_40_s_for_ever():
-    backoff, now, pauses = Backoff(ConnectTimings(), Random(4)), 0.0, []
+    backoff, now, pauses = _backoff(ConnectTimings(), Random(4)), 0.0, []
     while now < 7200.0:
         backoff.count_attempt(now)
         pauses.append(backoff.pause_s(now, REFUSED))
@@ -170,19 +178,19 @@ def test_a_robot_that_is_refused_tries_again_every_20_to_40_s_for_ever():
 @pytest.mark.parametrize(("valid_in_s", "least_s"), [(-120.0, 0.0), (0.0, 0.0), (0.7, 0.7), (9.0, 9.0)])
 def test_after_a_cut_off_a_robot_is_back_half_a_second_after_its_tokens_are_late_enough(valid_in_s, least_s):
     for seed in range(50):
-        pause_s = Backoff(ConnectTimings(), Random(seed)).pause_s(5.0, REFUSED, valid_in_s=valid_in_s)
+        pause_s = _backoff(ConnectTimings(), Random(seed)).pause_s(5.0, _revoked(valid_in_s))
 
         assert least_s <= pause_s <= least_s + 0.5
 
 
 def test_a_cut_off_far_away_by_a_wrong_clock_does_not_keep_a_robot_from_trying():
-    assert Backoff(ConnectTimings(), Random(1)).pause_s(0.0, REFUSED, valid_in_s=1e6) <= 40.0
+    assert _backoff(ConnectTimings(), Random(1)).pause_s(0.0, _revoked(1e6)) <= 40.0
 
 
 def test_refusals_cost_the_allowance_of_the_firewall_like_every_other_answer():
     timings = ConnectTimings()
-    backoff = Backoff(timings, Random(1))
+    backoff = _backoff(timings, Random(1))
     for _ in range(DIAL_BURST):
         backoff.count_attempt(0.0)
 
-    assert backoff.pause_s(0.0, REFUSED, valid_in_s=0.0) >= 60.0 / DIALS_PER_MINUTE
+    assert backoff.pause_s(0.0, _revoked(0.0)) >= 60.0 / DIALS_PER_MINUTE
