@@ -25,7 +25,6 @@ _MAX_CORNERS = (
 _MIN_SQUARE_M = 0.001  # smallest side of a square: users who state less have stated metres as millimetres
 _MAX_SQUARE_M = 1.0  # largest side of a square: a larger number is probably not in millimetres
 _MM_PER_POINT = 25.4 / 72.0  # millimetres in a point, the unit of PDF
-_PNG_PX_PER_MM = 300 / 25.4  # pixels of a PNG per millimetre, at 300 dots per inch
 _MARGIN_MM = 10.0  # white margin around the board on a PDF page: printers do not print to the edge
 
 
@@ -109,30 +108,16 @@ def find_corners(gray: npt.NDArray[np.uint8], board: Board) -> Array | None:
 
 
 def write_board(path: Path, board: Board) -> None:
-    """Write an image of a board to print: ``.pdf``, which has its true size, or ``.png``.
-
-    A PNG must be printed at 300 dots per inch to have the true size; the file does not state this resolution,
-    so that the printing program must be told.
+    """Write a PDF page that shows a board in its true size.
 
     Raises:
-        UsageError: The file name has another ending, or the file cannot be written.
-        MissingExtra: OpenCV is not installed.
+        UsageError: The file name does not end in ``.pdf``, or the file cannot be written.
     """
-    if path.suffix not in (".pdf", ".png"):
-        raise UsageError(
-            f"{path} is neither .pdf nor .png", hint="write board.pdf: it prints at its true size"
-        )
+    if path.suffix != ".pdf":
+        raise UsageError(f"{path} is no .pdf", hint="write board.pdf: it prints at its true size")
     is_white = np.indices((board.rows + 1, board.columns + 1)).sum(axis=0) % 2
-    image, square_mm = (255 * is_white).astype(np.uint8), 1e3 * board.square_m
     try:
-        if path.suffix == ".pdf":
-            path.write_bytes(_pdf_of(image, square_mm))
-            return
-        cv2 = load_opencv()
-        size = [round(squares * square_mm * _PNG_PX_PER_MM) for squares in image.shape[::-1]]
-        is_encoded, data = cv2.imencode(".png", cv2.resize(image, size, interpolation=cv2.INTER_NEAREST))
-        assert is_encoded
-        path.write_bytes(data.tobytes())
+        path.write_bytes(_pdf_of((255 * is_white).astype(np.uint8), 1e3 * board.square_m))
     except OSError as error:
         raise UsageError(f"cannot write {path}: {error.strerror}", hint="name another file") from error
 

@@ -12,6 +12,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+import msgspec
+
 from client_sdk.commands.answer_types import Answer
 from client_sdk.live.keyframe_queue import (
     KeyframeQueue,
@@ -20,7 +22,6 @@ from client_sdk.live.keyframe_queue import (
     choose_number_offset,
 )
 from rse_pf.errors import (
-    BadMessage,
     BadRequest,
     Busy,
     Conflict,
@@ -40,8 +41,7 @@ __all__ = [
     "KeyframeSender",
     "KeyframeSent",
     "LiveRobot",
-    "RobotInMap",
-    "fetch_robot_in_map",
+    "MapShown",
     "make_request",
 ]
 
@@ -83,23 +83,32 @@ class LiveRobot(Protocol):
         """Return an async iterator over the updates of a topic, as pairs of key and payload."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RobotInMap:
-    """Reply of the service ``live-show`` to this robot.
+class RobotInMap(msgspec.Struct, frozen=True, kw_only=True):
+    """What a live map knows of this robot; the defaults are those of a map that does not exist.
 
     Attributes:
-        name: Name of the robot in the map; empty while the map does not exist.
-        next_number: Number that the map expects of the next keyframe of this robot.
-        unused_segment: The smallest segment number that no keyframe of this robot in the map has.
-        map_keyframes: Number of keyframes of all robots in the map.
-        allows_images: Whether the operator allows robots to store the images of keyframes (``live.images``).
+        robot: Name of the robot in the map; empty while the map does not exist.
+        number: Number that the map expects of the next keyframe of this robot.
+        segment: The smallest segment number that no keyframe of this robot in the map has.
     """
 
-    name: str
-    next_number: int
-    unused_segment: int
-    map_keyframes: int
-    allows_images: bool = False
+    robot: str = ""
+    number: int = 0
+    segment: int = 0
+
+
+class MapShown(msgspec.Struct, frozen=True, kw_only=True):
+    """Reply of the service ``live-show``; the defaults are those of a map that does not exist.
+
+    Attributes:
+        you: What the map knows of this robot.
+        keyframes: Number of keyframes of all robots in the map.
+        images: Whether the operator allows robots to store the images of keyframes (``live.images``).
+    """
+
+    you: RobotInMap = RobotInMap()
+    keyframes: int = 0
+    images: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,36 +126,6 @@ class KeyframeSent:
     acknowledged_s: float
 
 
-async def fetch_robot_in_map(robot: LiveRobot, map_name: str, deadline_s: float) -> RobotInMap:
-    """Ask the service ``live-show`` for this robot's name and numbers in the live map *map_name*.
-
-    If the map does not exist, the name is empty, and all numbers are 0.
-
-    Raises:
-        BadMessage: The reply lacks a field.
-        RsePfError: The call failed, or the platform refused it.
-    """
-    try:
-        answer = await robot.call("live-show", {"map": map_name}, deadline_s=deadline_s, keep=True)
-    except NotFound:
-        return RobotInMap(name="", next_number=0, unused_segment=0, map_keyframes=0)
-    reply = answer.reply
-    try:
-        you = reply["you"]
-        return RobotInMap(
-            name=str(you["robot"]),
-            next_number=int(you["number"]),
-            unused_segment=int(you["segment"]),
-            map_keyframes=int(reply["keyframes"]),
-            allows_images=bool(reply.get("images", False)),
-        )
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise BadMessage(
-            "the reply of live-show does not say how the map knows this robot",
-            hint="use the same version of server and SDK",
-        ) from error
-
-
 class KeyframeSender:
     """Send queued keyframes to one live map for as long as `run` is not cancelled."""
 
@@ -160,7 +139,7 @@ class KeyframeSender:
         bytes_per_s: float,
         clock: Callable[[], float],
         current_segment: Callable[[], int],
-        on_introduced: Callable[[RobotInMap, NumberOffset], None],
+        on_introduced: Callable[[MapShown, NumberOffset], None],
         on_acknowledged: Callable[[KeyframeSent], None],
     ) -> None:
         """Store the arguments; only `introduce` and `run` use the network.
@@ -207,31 +186,38 @@ class KeyframeSender:
         self.is_empty.clear()
         self._has_keyframe.set()
 
-    async def introduce(self) -> RobotInMap:
-        """Ask the map for this robot's name and numbers, set the queue's number offset, and return the reply.
+    async def introduce(self) -> None:
+        """Ask the map for this robot's name and numbers, and set the queue's number offset.
 
         Queued keyframes that the map already has are removed: their acknowledgements were lost.
 
         Raises:
+            BadMessage: The reply lacks a field.
             RsePfError: The call failed, or the platform refused it.
         """
         async with self._introduction_lock:
-            robot_in_map = await fetch_robot_in_map(self._robot, self._map_name, self._deadline_s)
+            request = {"map": self._map_name}
+            try:
+                answer = await self._robot.call(
+                    "live-show", request, MapShown, deadline_s=self._deadline_s, keep=True
+                )
+                shown: MapShown = answer.reply
+            except NotFound:
+                shown = MapShown()
             queue = self._queue
             offset, acknowledged = choose_number_offset(
                 queue.offset,
                 first_index=queue.first_index,
                 first_segment=queue.first().segment if len(queue) else self._current_segment(),
                 next_index=queue.next_index,
-                next_number=robot_in_map.next_number,
-                unused_segment=robot_in_map.unused_segment,
+                next_number=shown.you.number,
+                unused_segment=shown.you.segment,
             )
             for _ in range(acknowledged):
                 queue.remove_first()
             queue.set_offset(offset)
-            self._is_known_to_map = bool(robot_in_map.name)
-            self._on_introduced(robot_in_map, offset)
-        return robot_in_map
+            self._is_known_to_map = bool(shown.you.robot)
+            self._on_introduced(shown, offset)
 
     async def run(self) -> None:
         """Send the queued keyframes until cancelled; repeat failed attempts after a pause.

@@ -38,7 +38,7 @@ from client_sdk.live.alignments import Alignments, Correction, CorrectionStream,
 from client_sdk.live.attachments import Attachments, EncodedAttachments, StoreObject
 from client_sdk.live.keyframe_encoding import encode_depth_keyframe, encode_monocular_keyframe
 from client_sdk.live.keyframe_queue import KeyframeQueue, NumberOffset, QueuedKeyframe
-from client_sdk.live.keyframe_sender import REFUSALS, KeyframeSender, KeyframeSent, LiveRobot, RobotInMap
+from client_sdk.live.keyframe_sender import REFUSALS, KeyframeSender, KeyframeSent, LiveRobot, MapShown
 from client_sdk.live.monocular_odometry import MonocularOdometry
 from client_sdk.live.options import LiveOptions
 from client_sdk.live.relocaliser import Relocaliser
@@ -658,14 +658,14 @@ class LiveMapper:
                 self._update_trouble = f"{error.code}: {error.message}"
             await asyncio.sleep(_RESUBSCRIBE_PAUSE_S)
 
-    def _apply_introduction(self, robot_in_map: RobotInMap, offset: NumberOffset) -> None:
+    def _apply_introduction(self, shown: MapShown, offset: NumberOffset) -> None:
         """Apply the map's reply about this robot: name, segment numbers, permission for images."""
         self._is_introduced = True
-        self._attachments.may_store_images = robot_in_map.allows_images
-        if robot_in_map.name:
-            for correction in self._alignments.identify_robot(robot_in_map.name, offset.segment):
+        self._attachments.may_store_images = shown.images
+        if shown.you.robot:
+            for correction in self._alignments.identify_robot(shown.you.robot, offset.segment):
                 self._publish(correction)
-        self._alignments.map_keyframes = max(self._alignments.map_keyframes, robot_in_map.map_keyframes)
+        self._alignments.map_keyframes = max(self._alignments.map_keyframes, shown.keyframes)
 
     def _publish(self, correction: Correction | None) -> None:
         """Publish a correction, if any; one of the present segment sets ``corrected`` of the next frame."""

@@ -213,7 +213,7 @@ WRONG_INPUTS: tuple[WrongInput, ...] = (
     WrongInput("camera calibrate 0 --square-mm 0", USAGE, "squares of 0 mm", "measure one printed square, in millimetres"),
     WrongInput("camera calibrate 0 --max-rms-px 0", USAGE, "--max-rms-px 0 is not above 0", "good cameras reach 0.5"),
     WrongInput("camera calibrate 0 --out typo/i.json", USAGE, "there is no folder", "create it"),
-    WrongInput("camera board --out b.jpg", USAGE, "neither .pdf nor .png", "write board.pdf: it prints at its true size"),
+    WrongInput("camera board --out b.jpg", USAGE, "is no .pdf", "write board.pdf: it prints at its true size"),
     WrongInput("camera check 0 --frames 1", USAGE, "--frames 1 is below 2", "60 is two seconds of a webcam"),
     WrongInput("token isue robot-1", USAGE, "'isue' is not one of issue", "did you mean issue?"),
     WrongInput("token issue", USAGE, "needs the name of a robot", "--help"),
