@@ -15,6 +15,7 @@ from client_sdk.monocular.bundle import Adjuster, Bundle, adjust
 from client_sdk.tracking.landmark_matching import (
     NO_LANDMARK,
     PIXEL_SIGMA_PX,
+    VERIFY_LOWE_RATIO,
     Landmarks,
     LazyPlaceVector,
     Matches,
@@ -78,8 +79,6 @@ parallax."""
 _OBSERVE_RADIUS_PX = 3.0
 """Radius, in pixels, around a projected new landmark in which it is matched with a feature of a further
 keyframe."""
-_PROJECTED_LOWE_RATIO = 0.9
-"""Lowe's ratio for matches around the pixels of a triangulated landmark in another keyframe."""
 _LOCAL_ITERATIONS = 5
 """Iterations of the bundle adjustment that follows every keyframe: bounds the time of a frame."""
 _CULL_AGE_KEYFRAMES = 3
@@ -445,7 +444,7 @@ class LandmarkMap:
     def _match_projected(self, keyframe: MonocularKeyframe, landmarks: Rows, radius_px: float) -> Matches:
         """Match landmarks that are alive and that a keyframe does not see near their projections in it."""
         landmarks = landmarks[self.is_alive[landmarks] & ~np.isin(landmarks, keyframe.landmarks)]
-        limits = GuidedMatchLimits(radius_px=radius_px, lowe_ratio=_PROJECTED_LOWE_RATIO)
+        limits = GuidedMatchLimits(radius_px=radius_px, lowe_ratio=VERIFY_LOWE_RATIO)
         return self.landmarks(landmarks).match(
             keyframe.T_camera_world, self.camera, keyframe.view.features, limits, 0.0
         )

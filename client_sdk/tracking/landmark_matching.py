@@ -7,7 +7,7 @@ ones by their number of matches.  The trackers decide which matches and which ke
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields
 from typing import Protocol
 
@@ -22,17 +22,22 @@ from rse_pf.slam.place_recognition import PlaceVector, place_vector
 from rse_pf.slam.tracking import Features, GuidedMatchLimits, LandmarkAppearance, match_landmarks
 
 __all__ = [
+    "GUIDED_MATCHES_FACTOR",
+    "JOIN_INTERVAL_FRAMES",
     "LATEST_KEYFRAMES",
+    "MAX_JOIN_DIFFERENCE_DEG",
     "NO_LANDMARK",
     "PIXEL_SIGMA_PX",
+    "VERIFY_LOWE_RATIO",
+    "VERIFY_RADIUS_PX",
     "Candidate",
     "Landmarks",
     "LazyPlaceVector",
     "Matches",
-    "list_other_segments",
-    "list_relocalisation_candidates",
     "make_place_vector",
     "match_candidates",
+    "match_known_places",
+    "match_other_segments",
     "shift_landmarks",
 ]
 
@@ -47,6 +52,23 @@ LATEST_KEYFRAMES = 3
 """Number of newest keyframes of the present segment that are compared with a frame after the camera was lost:
 most losses end near the place where they began.  Without depth, also those at which an unclear answer is
 accepted."""
+GUIDED_MATCHES_FACTOR = 3
+"""Fewest matches near predicted pixels for which a pose is queried, as a multiple of ``min_inliers``: with
+fewer the predicted pose is most likely wrong."""
+VERIFY_RADIUS_PX = 8.0
+"""Radius, in pixels, around projected landmarks in which features are matched to verify a solved pose, and to
+fuse the landmarks of two keyframes of one place."""
+VERIFY_LOWE_RATIO = 0.9
+"""Lowe's ratio for matches around the pixels of a pose that was solved: looser than usual, since the radius
+is small."""
+JOIN_INTERVAL_FRAMES = 3
+"""Every third frame is compared with other segments, if there are any: bounds the time of a frame."""
+MAX_JOIN_DIFFERENCE_DEG = 4.0
+"""Largest rotation, in degrees, between two measurements of where one segment lies in another one, with which
+they confirm each other."""
+_MAX_RELOCALISATION_QUERIES = 3
+"""Largest number of pose queries by which one lost frame is relocalised, against the keyframes with the most
+matches: bounds the time of a lost frame."""
 _SIMILAR_KEYFRAMES = 5
 """Number of keyframes of each segment that place recognition proposes for a frame."""
 
@@ -228,29 +250,44 @@ def make_place_vector(
     return LazyPlaceVector(lambda: plugin(rgb))
 
 
-def list_relocalisation_candidates(
-    maps: Mapping[int, RecognisableMap], place: LazyPlaceVector, current_segment: int
-) -> Iterator[tuple[int, int]]:
-    """Yield (segment, keyframe) of all keyframes that may show the place of an untracked frame.
+def match_known_places(
+    maps: Mapping[int, RecognisableMap], place: LazyPlaceVector, image: Features, current_segment: int
+) -> list[Candidate]:
+    """Match the keyframes that may show the place of an untracked frame; return the best three, best first.
 
-    These are the five most similar keyframes of every segment, and the three newest ones of the current
-    segment; each keyframe is yielded once.
+    These keyframes are the five most similar ones of every segment, and the three newest ones of the current
+    segment.
+
+    Args:
+        maps: Map of each segment by its number.
+        place: Place vector of the frame's image.
+        image: Features of the image.
+        current_segment: Number of the current segment.
     """
+    keyframes: dict[tuple[int, int], None] = {}
     for segment, segment_map in maps.items():
-        keyframes = segment_map.rank_by_similarity(place, _SIMILAR_KEYFRAMES)
+        similar = segment_map.rank_by_similarity(place, _SIMILAR_KEYFRAMES)
         if segment == current_segment:
             newest = segment_map.keyframe_count - 1
-            keyframes = [*range(newest, max(-1, newest - LATEST_KEYFRAMES), -1), *keyframes]
-        yield from ((segment, keyframe) for keyframe in dict.fromkeys(keyframes))
+            similar = [*range(newest, max(-1, newest - LATEST_KEYFRAMES), -1), *similar]
+        keyframes.update(dict.fromkeys((segment, keyframe) for keyframe in similar))
+    return match_candidates(maps, keyframes, image)[:_MAX_RELOCALISATION_QUERIES]
 
 
-def list_other_segments(
-    maps: Mapping[int, RecognisableMap], place: LazyPlaceVector, current_segment: int
-) -> Iterator[tuple[int, int]]:
-    """Yield (segment, keyframe) of the five most similar keyframes of each segment but the current one."""
-    for segment, segment_map in maps.items():
-        if segment != current_segment:
-            yield from ((segment, k) for k in segment_map.rank_by_similarity(place, _SIMILAR_KEYFRAMES))
+def match_other_segments(
+    maps: Mapping[int, RecognisableMap], place: LazyPlaceVector, image: Features, current_segment: int
+) -> Candidate:
+    """Match the five most similar keyframes of each segment but the current one; return the best.
+
+    The arguments are those of `match_known_places`; there must be another segment.
+    """
+    keyframes = [
+        (segment, keyframe)
+        for segment, segment_map in maps.items()
+        if segment != current_segment
+        for keyframe in segment_map.rank_by_similarity(place, _SIMILAR_KEYFRAMES)
+    ]
+    return match_candidates(maps, keyframes, image)[0]
 
 
 def match_candidates(

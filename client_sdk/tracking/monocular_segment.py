@@ -8,7 +8,13 @@ import numpy as np
 import numpy.typing as npt
 
 from client_sdk.tracking.landmark_map import OUTLIER_SIGMAS, LandmarkMap, MonocularView
-from client_sdk.tracking.landmark_matching import NO_LANDMARK, PIXEL_SIGMA_PX, Matches
+from client_sdk.tracking.landmark_matching import (
+    MAX_JOIN_DIFFERENCE_DEG,
+    NO_LANDMARK,
+    PIXEL_SIGMA_PX,
+    VERIFY_LOWE_RATIO,
+    Matches,
+)
 from client_sdk.trajectory import Trajectory
 from rse_pf.geometry import Array, inverse, pose_difference, rigid, scaled, transform
 from rse_pf.slam.descriptors import match_all
@@ -21,15 +27,9 @@ Rows = npt.NDArray[np.int64]
 _REFINE_RADIUS_PX = 5.0
 """Radius, in pixels, around landmarks projected by a fitted pose in which they are matched again, for a
 second fit."""
-_VERIFY_LOWE_RATIO = 0.9
-"""Lowe's ratio for matches around the pixels of a solved pose: looser than elsewhere, since the radius is
-small."""
 _AGREEMENT_DEPTH_SHARE = 0.07
 """Two measurements of where one segment lies in another confirm each other only if the two points to which
 they move the centre of the camera are at most this share of the median depth apart."""
-_AGREEMENT_DEG = 4.0
-"""Two measurements of where one segment lies in another confirm each other only if their rotations differ by
-at most this angle, in degrees."""
 _AGREEMENT_SCALE_RATIO = 1.1
 """Two measurements of where one segment lies in another confirm each other only if the ratio of their scales,
 the larger over the smaller, is at most this."""
@@ -134,7 +134,7 @@ class Similarity:
         scale_ratio = max(self.scale / other.scale, other.scale / self.scale)
         return (
             float(np.linalg.norm(first - second)) <= _AGREEMENT_DEPTH_SHARE * depth
-            and apart_deg <= _AGREEMENT_DEG
+            and apart_deg <= MAX_JOIN_DIFFERENCE_DEG
             and scale_ratio <= _AGREEMENT_SCALE_RATIO
         )
 
@@ -257,7 +257,7 @@ class MonocularSegment:
             around: Keyframe around which landmarks are matched; None for the reference keyframe.
         """
         for radius in (radius_px, _REFINE_RADIUS_PX):
-            near = GuidedMatchLimits(radius_px=radius, lowe_ratio=_VERIFY_LOWE_RATIO)
+            near = GuidedMatchLimits(radius_px=radius, lowe_ratio=VERIFY_LOWE_RATIO)
             matches = self.match(view, T_camera_world, near, around)
             count = len(matches)
             if count < min_inliers:

@@ -9,7 +9,7 @@ takes the unit of the older one at that time.
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterable, Iterator
+from collections.abc import Generator, Iterator
 from dataclasses import dataclass, field, replace
 from itertools import chain
 from typing import Literal
@@ -28,13 +28,17 @@ from client_sdk.tracking.landmark_map import (
     MonocularView,
 )
 from client_sdk.tracking.landmark_matching import (
+    GUIDED_MATCHES_FACTOR,
+    JOIN_INTERVAL_FRAMES,
     LATEST_KEYFRAMES,
     NO_LANDMARK,
+    VERIFY_RADIUS_PX,
+    Candidate,
     Matches,
-    list_other_segments,
-    list_relocalisation_candidates,
     make_place_vector,
     match_candidates,
+    match_known_places,
+    match_other_segments,
     shift_landmarks,
 )
 from client_sdk.tracking.monocular_segment import (
@@ -70,21 +74,10 @@ _MAX_WAITING_FRAMES = 30
 dropped: bounds memory."""
 _MIN_START_MATCHES = 100
 """Fewest features of a frame, and fewest matches between two frames, with which a segment can begin."""
-_MAX_RELOCALISATION_QUERIES = 3
-"""Largest number of pose queries by which one lost frame is relocalised, against the keyframes with the most
-matches: bounds the time of a lost frame."""
-_GUIDED_MATCHES_FACTOR = 3
-"""Fewest matches near the predicted pose for which a pose is queried, as a multiple of ``min_inliers``: with
-fewer the prediction is most likely wrong."""
 _WIDE_SEARCH_FACTOR = 2.5
 """Radius of the second guided search as a multiple of ``search_px``, for a camera that moved unexpectedly."""
-_VERIFY_RADIUS_PX = 8.0
-"""Radius, in pixels, around projected landmarks in which features are matched to verify a solved pose, and to
-fuse the landmarks of two keyframes of one place."""
 _TRACKED_RATIO = 0.25
 """Smallest share of inliers among the matches that a query sent, for its pose to be accepted."""
-_JOIN_INTERVAL_FRAMES = 3
-"""Every third frame is compared with other segments, if there are any: bounds the time of a frame."""
 _LOOP_CANDIDATES = 2
 """Number of similar older keyframes with which a new keyframe is matched to find a loop closure: bounds the
 time of a keyframe."""
@@ -405,7 +398,7 @@ class MonocularTracker:
         # 3. Keep the frame in the map, and look for its place in other segments or earlier in this one.
         self._waiting = []
         is_keyframe = self._keep(posed)
-        if len(self._segments) > 1 and self.frames % _JOIN_INTERVAL_FRAMES == 0:
+        if len(self._segments) > 1 and self.frames % JOIN_INTERVAL_FRAMES == 0:
             yield from self._find_join()
         elif is_keyframe:
             yield from self._find_loop()
@@ -451,7 +444,7 @@ class MonocularTracker:
         last, number, min_inliers = self._state.last, self._state.segment, self.options.min_inliers
         if last is None:
             return
-        T_predicted, min_guided_matches = self._predict_pose(last), _GUIDED_MATCHES_FACTOR * min_inliers
+        T_predicted, min_guided_matches = self._predict_pose(last), GUIDED_MATCHES_FACTOR * min_inliers
         for factor in (1.0, _WIDE_SEARCH_FACTOR):
             limits = GuidedMatchLimits(radius_px=factor * self.options.search_px)
             matches = self._present.match(view, T_predicted, limits)
@@ -464,10 +457,9 @@ class MonocularTracker:
 
         Of these, only the best one may have too few matches for a query.
         """
-        min_inliers, maps = self.options.min_inliers, self._maps
-        keyframes = list_relocalisation_candidates(maps, view.place_vector, self._state.segment)
-        candidates = match_candidates(maps, keyframes, view.features)
-        for rank, candidate in enumerate(candidates[:_MAX_RELOCALISATION_QUERIES]):
+        min_inliers, present = self.options.min_inliers, self._state.segment
+        candidates = match_known_places(self._maps, view.place_vector, view.features, present)
+        for rank, candidate in enumerate(candidates):
             if rank == 0 or len(candidate.matches) >= min_inliers:
                 yield _Attempt(
                     matches=candidate.matches,
@@ -532,8 +524,8 @@ class MonocularTracker:
         """
         last, present = self._state.last, self._state.segment
         assert last is not None
-        keyframes = list_other_segments(self._maps, last.view.place_vector, present)
-        similarity = yield from self._measure_similarity(last, keyframes)
+        best = match_other_segments(self._maps, last.view.place_vector, last.view.features, present)
+        similarity = yield from self._measure_similarity(last, best)
         if similarity is None:
             return
         # Move the newer of the two segments into the older one, whose poses and unit stay as they are.
@@ -553,11 +545,12 @@ class MonocularTracker:
         apart = np.flatnonzero(shared < MIN_SHARED_LANDMARKS)
         if not len(apart) or newest < state.next_loop_keyframe:
             return
-        similar = own.rank_by_similarity(state.last.view.place_vector, _LOOP_CANDIDATES, apart)
-        # 2. Measure where the new keyframe lies by the older ones.
-        similarity = yield from self._measure_similarity(
-            state.last, [(state.segment, keyframe) for keyframe in similar]
-        )
+        view = state.last.view
+        similar = own.rank_by_similarity(view.place_vector, _LOOP_CANDIDATES, apart)
+        keyframes = [(state.segment, keyframe) for keyframe in similar]
+        # 2. Measure where the new keyframe lies by that of the older ones with the most matches.
+        best = match_candidates(self._maps, keyframes, view.features)[0]
+        similarity = yield from self._measure_similarity(state.last, best)
         if similarity is None:
             return
         # 3. Bend the map between the two keyframes, fuse the landmarks of both places, and adjust all.
@@ -572,20 +565,19 @@ class MonocularTracker:
         self.loop_scales.append(similarity.scale)
 
     def _measure_similarity(
-        self, posed: PosedView, keyframes: Iterable[tuple[int, int]]
+        self, posed: PosedView, best: Candidate
     ) -> Generator[PoseQuery, QueryAnswer, Similarity | None]:
-        """Measure where the present segment lies by the place of a frame among keyframes.
+        """Measure where the present segment lies by the place of a frame at an older or another keyframe.
 
         Args:
             posed: The frame with its pose in the present segment.
-            keyframes: (segment, keyframe) of the candidates.
+            best: The keyframe, and the matches of its landmarks with the frame.
 
         Returns:
             The similarity, if the measurement before this one is of the same segment and agrees with it.
             Otherwise None; a new measurement is kept in the state for the comparison with the next one.
         """
-        # 1. Solve and verify the pose by the keyframe with the most matches.
-        best = match_candidates(self._maps, keyframes, posed.view.features)[0]
+        # 1. Solve and verify the pose by the keyframe.
         count, segment = len(best.matches), self._segments[best.segment]
         if count < CLEAR_INLIERS:
             return None
@@ -666,7 +658,7 @@ class MonocularTracker:
         if bend_by is not None:
             own.bend(older, newer, bend_by.T, bend_by.scale)
         for keyframe in own.local_keyframes(newer):
-            own.fuse(keyframe, own.local_landmarks(older), _VERIFY_RADIUS_PX)
+            own.fuse(keyframe, own.local_landmarks(older), VERIFY_RADIUS_PX)
         own.adjust_around(newer)
         own.adjust_all(iterations=_MERGE_ITERATIONS)
         if last is not None and T_camera_reference is not None:
@@ -719,7 +711,7 @@ class MonocularTracker:
         pose = answer.accepted_pose(max(self.options.min_inliers, _TRACKED_RATIO * sent))
         if pose is None:
             return None, "the matches agree on no pose"
-        fitted = segment.fit(view, pose, _VERIFY_RADIUS_PX, self.options.min_inliers, around)
+        fitted = segment.fit(view, pose, VERIFY_RADIUS_PX, self.options.min_inliers, around)
         if fitted is None:
             return None, "too few landmarks agree with the pose"
         return replace(fitted, matches=match_count, is_weak=answer.is_weak), ""

@@ -23,12 +23,16 @@ from client_sdk.tracking.appearance_check import has_predicted_appearance
 from client_sdk.tracking.depth_noise import NoiseEstimate
 from client_sdk.tracking.keyframe_map import KeyframeMap, PosedView, View, observe_landmarks
 from client_sdk.tracking.landmark_matching import (
+    GUIDED_MATCHES_FACTOR,
+    JOIN_INTERVAL_FRAMES,
+    MAX_JOIN_DIFFERENCE_DEG,
     NO_LANDMARK,
+    VERIFY_LOWE_RATIO,
+    VERIFY_RADIUS_PX,
     Matches,
-    list_other_segments,
-    list_relocalisation_candidates,
     make_place_vector,
-    match_candidates,
+    match_known_places,
+    match_other_segments,
     shift_landmarks,
 )
 from client_sdk.tracking.pose_queries import CLEAR_INLIERS, FrameSteps, OpenQuery, QueryAnswer, make_query
@@ -47,9 +51,6 @@ __all__ = ["Tracker"]
 
 Rows = npt.NDArray[np.int64]
 
-_GUIDED_MATCHES_FACTOR = 3
-"""Fewest matches near the predicted pose for which a pose is queried, as a multiple of ``min_inliers``: with
-fewer the prediction is most likely wrong, and the frame is matched with the last one instead."""
 _BEGIN_DEPTHS_FACTOR = 3
 """Fewest features with depth of the frame that begins a later segment, as a multiple of ``min_inliers``: a
 frame with fewer is most likely of a covered lens."""
@@ -65,13 +66,6 @@ which an untracked frame is relocalised near the camera's last pose: low, becaus
 plausible."""
 _VERIFIED_RATIO = 0.3
 """Smallest share of the landmarks matched around a solved pose that must agree with the fitted pose."""
-_VERIFY_RADIUS_PX = 8.0
-"""Radius around predicted pixels in which landmarks are matched to verify a solved pose."""
-_GUIDED_LOWE_RATIO = 0.8
-"""Lowe's ratio for matches around the pixels of a predicted pose."""
-_VERIFY_LOWE_RATIO = 0.9
-"""Lowe's ratio for matches around the pixels of a solved pose: looser than usual, since the radius is
-small."""
 _WIDE_RADIUS_PX = 160.0
 """Radius of the last search of a stereo pair around its last pose: 10 degrees of unexpected rotation of a
 car's camera."""
@@ -91,19 +85,11 @@ _MAX_RATE_RAD_S = 3.0
 """Largest rotation rate, in rad/s, at which the rolling shutter is undone: with a readout of 20 ms the image
 is sheared by 3.4 degrees.  A faster rotation between two frames is most likely a cut in a video; such a frame
 is tracked, but its image is used as it is."""
-_MAX_RELOCALISATION_QUERIES = 3
-"""Largest number of pose queries by which one lost frame is relocalised, against the keyframes with the most
-matches: bounds the time of a lost frame."""
 _MAX_STEREO_MATCHES = 250
 """Largest number of matches that a query of a stereo pair sends: after the answer, the robot itself fits the
 pose to all matched landmarks."""
-_JOIN_INTERVAL_FRAMES = 3
-"""Every third frame is compared with other segments, if there are any: bounds the time of a frame."""
-_JOIN_AGREEMENT_M = 0.15
+_MAX_JOIN_DIFFERENCE_M = 0.15
 """Largest translation, in metres, between two measurements of the pose of one segment in another one, for the
-two to confirm each other."""
-_JOIN_AGREEMENT_DEG = 4.0
-"""Largest rotation, in degrees, between two measurements of the pose of one segment in another one, for the
 two to confirm each other."""
 
 
@@ -364,7 +350,7 @@ class Tracker:
             return self._begin_or_lose(view, match_count)
         # 3. Keep the frame in the map, and look for its place in other segments.
         is_keyframe = self._keep(posed)
-        if len(self._segments) > 1 and self.frames % _JOIN_INTERVAL_FRAMES == 0:
+        if len(self._segments) > 1 and self.frames % JOIN_INTERVAL_FRAMES == 0:
             yield from self._find_join(posed)
         return self._make_result(posed, is_keyframe=is_keyframe)
 
@@ -410,13 +396,13 @@ class Tracker:
         if state.last is None:
             return
         T_predicted, T_last = self._predict_pose(), state.T_world_camera
-        guided = GuidedMatchLimits(radius_px=self.options.search_px, lowe_ratio=_GUIDED_LOWE_RATIO)
+        guided = GuidedMatchLimits(radius_px=self.options.search_px)
         yield _Attempt(
             matches=self._map.match(view, T_predicted, guided, self._state.last, noise),
             segment=state.segment,
             T_world_reference=T_predicted,
             against="map",
-            min_matches=_GUIDED_MATCHES_FACTOR * min_inliers,
+            min_matches=GUIDED_MATCHES_FACTOR * min_inliers,
             min_ratio=_GUIDED_RATIO,
         )
         # Verifying the attempt before may have replaced the last frame, see `_replace_first_keyframe`.
@@ -430,7 +416,7 @@ class Tracker:
             min_ratio=_LAST_FRAME_RATIO,
         )
         if view.is_stereo:
-            wide = GuidedMatchLimits(radius_px=_WIDE_RADIUS_PX, lowe_ratio=_GUIDED_LOWE_RATIO)
+            wide = GuidedMatchLimits(radius_px=_WIDE_RADIUS_PX)
             yield _Attempt(
                 matches=self._map.match(view, T_last, wide, self._state.last, noise),
                 segment=state.segment,
@@ -442,9 +428,8 @@ class Tracker:
 
     def _match_known_places(self, view: View) -> Iterator[_Attempt]:
         """Match a frame with the three keyframes of all segments that have the most matches."""
-        keyframes = list_relocalisation_candidates(self._segments, view.place_vector, self._state.segment)
-        candidates = match_candidates(self._segments, keyframes, view.features)
-        for candidate in candidates[:_MAX_RELOCALISATION_QUERIES]:
+        present = self._state.segment
+        for candidate in match_known_places(self._segments, view.place_vector, view.features, present):
             yield _Attempt(
                 matches=candidate.matches,
                 segment=candidate.segment,
@@ -545,8 +530,8 @@ class Tracker:
         them.
         """
         # 1. Solve and verify the pose against the keyframe of another segment with the most matches.
-        keyframes = list_other_segments(self._segments, posed.view.place_vector, self._state.segment)
-        best = match_candidates(self._segments, keyframes, posed.view.features)[0]
+        view, present = posed.view, self._state.segment
+        best = match_other_segments(self._segments, view.place_vector, view.features, present)
         count, segment_map = len(best.matches), self._segments[best.segment]
         if count < CLEAR_INLIERS:
             return
@@ -558,10 +543,10 @@ class Tracker:
             min_matches=CLEAR_INLIERS,
             min_ratio=0.0,
         )
-        T_other_camera, answer = yield from self._solve(posed.view, attempt)
+        T_other_camera, answer = yield from self._solve(view, attempt)
         if T_other_camera is None or not answer.is_clear(min(count, self._max_matches)):
             return
-        there = self._verify(posed.view, T_other_camera, answer, count, segment_map, is_recognised=True)
+        there = self._verify(view, T_other_camera, answer, count, segment_map, is_recognised=True)
         if there is None:
             return
         # 2. Keep the measurement as the candidate; go on only if the candidate before it agrees.
@@ -571,13 +556,13 @@ class Tracker:
         if previous is None or previous[0] != best.segment:
             return
         apart_m, apart_deg = pose_difference(previous[1], T_other_present)
-        if apart_m > _JOIN_AGREEMENT_M or apart_deg > _JOIN_AGREEMENT_DEG:
+        if apart_m > _MAX_JOIN_DIFFERENCE_M or apart_deg > MAX_JOIN_DIFFERENCE_DEG:
             return
         # 3. Move the newer of the two segments into the older one, whose poses stay as they are.
-        if best.segment < self._state.segment:
-            self._join(self._state.segment, best.segment, T_other_present)
+        if best.segment < present:
+            self._join(present, best.segment, T_other_present)
         else:
-            self._join(best.segment, self._state.segment, inverse(T_other_present))
+            self._join(best.segment, present, inverse(T_other_present))
 
     def _join(self, segment: int, into: int, T_into_segment: Array) -> None:
         """Move all of *segment*, the newer one, into the map of *into*, which keeps its world.
@@ -665,7 +650,7 @@ class Tracker:
         """
         state, min_inliers, noise = self._state, self.options.min_inliers, self.noise.noise
         # 1. Match the landmarks around the pose; the last frame is left out in the map of another segment.
-        limits = GuidedMatchLimits(radius_px=_VERIFY_RADIUS_PX, lowe_ratio=_VERIFY_LOWE_RATIO)
+        limits = GuidedMatchLimits(radius_px=VERIFY_RADIUS_PX, lowe_ratio=VERIFY_LOWE_RATIO)
         last = state.last if segment_map is self._map else None
         matches = segment_map.match(view, T_world_camera, limits, last, noise, _ENOUGH_MAP_MATCHES)
         if len(matches) < min_inliers:
