@@ -150,11 +150,6 @@ class LandmarkMap:
         """The number of keyframes."""
         return len(self.keyframes)
 
-    @property
-    def landmark_count(self) -> int:
-        """The number of landmarks that are alive."""
-        return int(self.is_alive.sum())
-
     # --- Add keyframes and landmarks ---
 
     def add_keyframe(self, view: MonocularView, T_camera_world: Array, landmarks: Rows) -> int:
@@ -201,8 +196,8 @@ class LandmarkMap:
             self.keyframes[keyframe].landmarks[features] = numbers
             self._update_appearance(keyframe, numbers, features)
 
-    def extend(self, number: int) -> int:
-        """Triangulate new landmarks from a keyframe and its neighbours; return how many were added.
+    def extend(self, number: int) -> None:
+        """Triangulate new landmarks from a keyframe and its neighbours.
 
         All neighbours then observe the new landmarks, too, where a feature matches.  A keyframe that sees no
         landmark adds none: the depths of its features, by which their pixels in the neighbours are predicted,
@@ -211,12 +206,11 @@ class LandmarkMap:
         count = len(self.points)
         depths = self._interpolate_depths(number)
         if depths is None:
-            return 0
+            return
         for neighbour in self._neighbours(number)[:_TRIANGULATION_NEIGHBOURS]:
             self._triangulate(number, neighbour, depths)
         for neighbour in self._neighbours(number):
             self._observe_again(neighbour, np.arange(count, len(self.points)))
-        return len(self.points) - count
 
     def append(self, other: LandmarkMap) -> tuple[int, int]:
         """Add all of another map in the same frame and unit.
@@ -407,7 +401,7 @@ class LandmarkMap:
         of = self._creation_keyframes
         self.points = scales[of, None] * np.einsum("nij,nj->ni", rotations[of], self.points) + shifts[of]
 
-    def fuse(self, number: int, landmarks: Rows, radius_px: float) -> int:
+    def fuse(self, number: int, landmarks: Rows, radius_px: float) -> None:
         """Match landmarks with a keyframe that does not see them yet, and fuse duplicates.
 
         Where the matched feature has another landmark already, both are the same point: all keyframes see the
@@ -417,9 +411,6 @@ class LandmarkMap:
             number: Number of the keyframe.
             landmarks: Numbers of landmarks.
             radius_px: Radius around the projected landmarks.
-
-        Returns:
-            How many pairs of landmarks became one.
         """
         keyframe = self.keyframes[number]
         matches = self._match_projected(keyframe, landmarks, radius_px)
@@ -437,7 +428,6 @@ class LandmarkMap:
             record.landmarks = np.full(len(renumbered), NO_LANDMARK)
             record.landmarks[firsts[unique != NO_LANDMARK]] = unique[unique != NO_LANDMARK]
         self.is_alive[existing[~is_free]] = False
-        return int((~is_free).sum())
 
     # --- Private: triangulation ---
 

@@ -29,6 +29,7 @@ from client_sdk.tracking.landmark_matching import (
     NO_LANDMARK,
     VERIFY_LOWE_RATIO,
     VERIFY_RADIUS_PX,
+    Candidate,
     Matches,
     make_place_vector,
     match_known_places,
@@ -149,6 +150,11 @@ class _Attempt:
     against: Literal["map", "frame", "keyframe", "segment"]
     min_matches: int
     min_ratio: float
+
+    @property
+    def is_recognised(self) -> bool:
+        """Whether the matches show a known place, and are not those around the last pose."""
+        return self.against in ("keyframe", "segment")
 
 
 class Tracker:
@@ -430,14 +436,18 @@ class Tracker:
         """Match a frame with the three keyframes of all segments that have the most matches."""
         present = self._state.segment
         for candidate in match_known_places(self._segments, view.place_vector, view.features, present):
-            yield _Attempt(
-                matches=candidate.matches,
-                segment=candidate.segment,
-                T_world_reference=self._segments[candidate.segment].poses[candidate.keyframe],
-                against="keyframe",
-                min_matches=self.options.min_inliers,
-                min_ratio=0.0,
-            )
+            yield self._attempt_at(candidate, "keyframe")
+
+    def _attempt_at(self, place: Candidate, against: Literal["keyframe", "segment"]) -> _Attempt:
+        """Return the attempt at a known place, whose keyframe is the reference camera."""
+        return _Attempt(
+            matches=place.matches,
+            segment=place.segment,
+            T_world_reference=self._segments[place.segment].poses[place.keyframe],
+            against=against,
+            min_matches=self.options.min_inliers,
+            min_ratio=0.0,
+        )
 
     # --- Solve ---
 
@@ -459,25 +469,15 @@ class Tracker:
                 continue
             # 2. Far from the last pose, only a clear answer by a known place is accepted: perceptual aliases,
             #    places that look alike, exist.
-            is_recognised = attempt.against == "keyframe"
             is_near = attempt.segment == self._state.segment and self._is_plausible(T_world_camera)
-            is_accepted = is_near
-            if is_recognised:
-                has_support = is_near and answer.inliers >= _NEARBY_RATIO * count
-                is_accepted = has_support or answer.is_clear(count)
-            if not is_accepted:
+            has_support = not attempt.is_recognised or answer.inliers >= _NEARBY_RATIO * count
+            is_clear = attempt.is_recognised and answer.is_clear(count)
+            if not ((is_near and has_support) or is_clear):
                 continue
             # 3. Verify the pose by the landmarks around it, and at a known place by the appearance.
             is_continuous = is_near and self._is_continuous(T_world_camera)
-            posed = self._verify(
-                view if is_continuous else self._raw,
-                T_world_camera,
-                answer,
-                count,
-                self._segments[attempt.segment],
-                is_continuous=is_continuous,
-                is_recognised=is_recognised,
-            )
+            image = view if is_continuous else self._raw
+            posed = self._verify(image, T_world_camera, attempt, answer, is_continuous=is_continuous)
             if posed is None:
                 continue
             if attempt.segment != self._state.segment:
@@ -532,21 +532,14 @@ class Tracker:
         # 1. Solve and verify the pose against the keyframe of another segment with the most matches.
         view, present = posed.view, self._state.segment
         best = match_other_segments(self._segments, view.place_vector, view.features, present)
-        count, segment_map = len(best.matches), self._segments[best.segment]
+        count = len(best.matches)
         if count < CLEAR_INLIERS:
             return
-        attempt = _Attempt(
-            matches=best.matches,
-            segment=best.segment,
-            T_world_reference=segment_map.poses[best.keyframe],
-            against="segment",
-            min_matches=CLEAR_INLIERS,
-            min_ratio=0.0,
-        )
+        attempt = self._attempt_at(best, "segment")
         T_other_camera, answer = yield from self._solve(view, attempt)
         if T_other_camera is None or not answer.is_clear(min(count, self._max_matches)):
             return
-        there = self._verify(view, T_other_camera, answer, count, segment_map, is_recognised=True)
+        there = self._verify(view, T_other_camera, attempt, answer)
         if there is None:
             return
         # 2. Keep the measurement as the candidate; go on only if the candidate before it agrees.
@@ -624,34 +617,32 @@ class Tracker:
         self,
         view: View,
         T_world_camera: Array,
+        attempt: _Attempt,
         answer: QueryAnswer,
-        match_count: int,
-        segment_map: KeyframeMap,
         *,
         is_continuous: bool = False,
-        is_recognised: bool = False,
     ) -> PosedView | None:
         """Fit a solved pose to all landmarks of the map around it; None if too few agree.
 
         An accepted pose updates the estimate of the depth noise.  With *is_continuous* the image of a depth
         camera (not of a stereo pair) also updates the estimate of the readout time, and the second frame of a
-        segment gives the rotation rate by which the rolling shutter of the first frame is undone.
+        segment gives the rotation rate by which the rolling shutter of the first frame is undone.  At a
+        recognised place the image must also look as the landmarks predict.  A user's features cannot be
+        computed at given pixels: they are not compared.
 
         Args:
             view: The image.
-            T_world_camera: ``(4, 4)``, the solved pose.
-            answer: The answer that it comes from.
-            match_count: Number of matches of the query.
-            segment_map: The map in which the pose was solved.
+            T_world_camera: ``(4, 4)``, the solved pose, in the world of the attempt's segment.
+            attempt: The matches by which the pose was solved.
+            answer: The answer to their query.
             is_continuous: Whether the camera moved there from its last pose; then its rolling shutter is
                 undone by that motion.
-            is_recognised: Whether the place was recognised; then the image must also look as the landmarks
-                predict.  A user's features cannot be computed at given pixels: they are not compared.
         """
         state, min_inliers, noise = self._state, self.options.min_inliers, self.noise.noise
+        segment_map = self._segments[attempt.segment]
         # 1. Match the landmarks around the pose; the last frame is left out in the map of another segment.
         limits = GuidedMatchLimits(radius_px=VERIFY_RADIUS_PX, lowe_ratio=VERIFY_LOWE_RATIO)
-        last = state.last if segment_map is self._map else None
+        last = state.last if attempt.segment == state.segment else None
         matches = segment_map.match(view, T_world_camera, limits, last, noise, _ENOUGH_MAP_MATCHES)
         if len(matches) < min_inliers:
             return None
@@ -664,18 +655,12 @@ class Tracker:
         if fitted is not None and is_continuous:
             T_world_camera = inverse(fitted.T_camera_world)
             rate = rotation_rate(state.T_world_camera, T_world_camera, self._interval_s, state.rotation_rate)
-            if state.first is not None and int(fitted.is_inlier.sum()) >= CLEAR_INLIERS:
-                self._replace_first_keyframe(correct_view(state.first, self.readout.readout_s, rate))
-                return self._verify(
-                    view,
-                    T_world_camera,
-                    answer,
-                    match_count,
-                    self._map,
-                    is_continuous=True,
-                    is_recognised=is_recognised,
-                )
-            view = correct_view(self._raw, self.readout.readout_s, rate)
+            first = state.first if int(fitted.is_inlier.sum()) >= CLEAR_INLIERS else None
+            corrected = correct_view(first or self._raw, self.readout.readout_s, rate)
+            if first is not None:
+                self._replace_first_keyframe(corrected)
+                return self._verify(view, T_world_camera, attempt, answer, is_continuous=True)
+            view = corrected
             observed = observe_landmarks(view, matches, T_world_camera, noise)
             fitted = fit_pose(observed, view.camera, fitted.T_camera_world)
         accepted = None if fitted is None else rigid(fitted.T_camera_world)
@@ -695,7 +680,7 @@ class Tracker:
             return None
         # 6. Update the noise estimate, compare the appearance, and note which features show which landmarks.
         self.noise.add(observed, inliers, accepted)
-        can_compare = is_recognised and self._plugins.features is None
+        can_compare = attempt.is_recognised and self._plugins.features is None
         if can_compare and not has_predicted_appearance(
             self._frame, segment_map, T_world_camera, min_inliers
         ):
@@ -707,7 +692,7 @@ class Tracker:
             T_world_camera=T_world_camera,
             landmarks=landmarks,
             inliers=len(inliers),
-            matches=max(match_count, len(matches)),
+            matches=max(len(attempt.matches), len(matches)),
             is_weak=answer.is_weak,
             rotation_rate=mean_rate,
         )
