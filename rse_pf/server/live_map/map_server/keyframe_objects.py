@@ -37,7 +37,7 @@ _MAX_CACHED_BYTES = 128 << 20
 need not be read from the object store again for the next version."""
 _MAX_DISTANCE_M = 100.0
 """Largest absolute value in metres of a coordinate of a point in the camera frame; points beyond it are left
-out, since depth cameras and stereo pairs do not measure so far."""
+out, because depths this large are wrong or very inexact."""
 _DELETIONS = 2
 """Number of times that each object of a forgotten robot is deleted: its upload may end after the first
 time."""
