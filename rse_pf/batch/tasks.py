@@ -129,7 +129,6 @@ def _pairs(store: ObjectStore, part: Part) -> PartResult:
     pairs = choose_candidate_pairs(
         PlaceIndex.from_pairs(enumerate(stacked)),
         of_map,
-        np.arange(len(stacked)),
         _options(part),
         between=(0, len(vectors) - 1),
     )
@@ -152,7 +151,7 @@ def _agree(store: ObjectStore, part: Part) -> PartResult:
     links = [link for name in part.inputs[maps:] for link in links_of(read_result(store, name))]
     tried = strongest_rows(links, part.arguments["most"])
     rows, refused = select_consistent(
-        (0, maps - 1), [links[row] for row in tried], atlas.T_world_camera, atlas.order, _options(part)
+        (0, maps - 1), [links[row] for row in tried], atlas.T_world_camera, _options(part)
     )
     counts = {**_by_reason(refused), "surplus": len(links) - len(tried)}
     return PartResult(arrays={"rows": np.array([tried[row] for row in rows], dtype=np.int64)}, counts=counts)

@@ -140,15 +140,14 @@ def evidence_weight(inliers: int, matches: int) -> float:
 def find_consistent_set(
     loop_closures: Sequence[LoopClosure],
     T_world_camera: Array,
-    order: npt.NDArray[np.int64],
     noise: OdometryNoise,
 ) -> npt.NDArray[np.int64]:
     """Return the sorted indices of the largest set of loop closures that agree pairwise; deterministic.
 
     Args:
         loop_closures: All between the same two trajectories, or all within one trajectory.
-        T_world_camera: ``(n, 4, 4)``, poses of the keyframes by odometry, each trajectory in its own frame.
-        order: ``(n,)``, position of each keyframe along its trajectory.
+        T_world_camera: ``(n, 4, 4)``, poses of the keyframes by odometry, each trajectory in its own frame;
+            the keyframes of a trajectory have consecutive rows.
         noise: Drift of the odometry from one keyframe to the next.
 
     Source:
@@ -160,7 +159,7 @@ def find_consistent_set(
     # 1. Test all loop closures against each of them as the reference.
     agree = np.zeros((len(loop_closures), len(loop_closures)), dtype=np.bool_)
     for k in range(len(loop_closures)):
-        steps = np.abs(order[edges.a] - order[edges.a[k]]) + np.abs(order[edges.b] - order[edges.b[k]])
+        steps = np.abs(edges.a - edges.a[k]) + np.abs(edges.b - edges.b[k])
         agree[k] = are_pairwise_consistent(T_world_camera, edges, edges.select(slice(k, k + 1)), steps, noise)
     # 2. Keep the pairs that agree in both directions: the test depends on which of both is the reference.
     agree &= agree.T

@@ -59,7 +59,7 @@ WEAK_POSE_VARIANCE = 4.0
 become twice as large.  In rendered worlds the errors of such poses were typically 1.2 to 1.7 times, and at
 most 2.7 times, the unmultiplied standard deviations.  Weak poses are used because they are a third of the
 loop closures between two maps."""
-MIN_LOOP_KEYFRAMES = 3  # smallest difference of `Atlas.order` between the ends of a loop within one map
+MIN_LOOP_KEYFRAMES = 3  # smallest difference of the rows of both ends of a loop within one map
 PAIRS_PER_REPORT = 16  # keyframe pairs between two reports of progress
 
 
@@ -106,19 +106,16 @@ class Atlas:
     """The keyframes of several maps in one list, by map, robot and time.
 
     Attributes:
-        keyframes: All *n* keyframes.
+        keyframes: All *n* keyframes.  The difference of two rows of one map counts as the number of odometry
+            steps between the keyframes.  For keyframes of two robots this is an approximation, since no
+            odometry connects the last keyframe of one robot with the first one of the next.
         of_map: ``(n,)``, the map of each keyframe.
-        order: ``(n,)``, position of each keyframe in the list.  The difference of two positions in one map
-            counts as the number of odometry steps between the keyframes.  For keyframes of two robots this is
-            an approximation, since no odometry connects the last keyframe of one robot with the first one of
-            the next.
         T_world_camera: ``(n, 4, 4)``, each pose in the world frame of its own map, metres.
         row_of: Row of each keyframe by (map, id).
     """
 
     keyframes: tuple[Keyframe, ...]
     of_map: npt.NDArray[np.int64]
-    order: npt.NDArray[np.int64]
     T_world_camera: Array
     row_of: Mapping[tuple[int, int], int]
 
@@ -138,7 +135,6 @@ class Atlas:
         return cls(
             keyframes=tuple(keyframe for _, keyframe in rows),
             of_map=np.array([map_index for map_index, _ in rows], dtype=np.int64),
-            order=np.arange(len(rows), dtype=np.int64),
             T_world_camera=np.array([keyframe.T_world_camera for _, keyframe in rows], dtype=np.float64),
             row_of={(map_index, keyframe.id): row for row, (map_index, keyframe) in enumerate(rows)},
         )
@@ -179,7 +175,7 @@ def propose_loop_closures(
     index = PlaceIndex.from_pairs(
         (row, place_vector(keyframe.descriptors)) for row, keyframe in enumerate(atlas.keyframes)
     )
-    pairs = choose_candidate_pairs(index, atlas.of_map, atlas.order, options)
+    pairs = choose_candidate_pairs(index, atlas.of_map, options)
     loop_closures, failed = measure_pairs(
         atlas, pairs, options, lambda progress, text: report(0.1 + 0.7 * progress, text)
     )
@@ -189,7 +185,6 @@ def propose_loop_closures(
 def choose_candidate_pairs(
     index: PlaceIndex,
     of_map: npt.NDArray[np.int64],
-    order: npt.NDArray[np.int64],
     options: MergeOptions,
     *,
     between: tuple[int, int] | None = None,
@@ -198,9 +193,8 @@ def choose_candidate_pairs(
 
     Args:
         index: Place recognition vectors of all keyframes, by row.
-        of_map: ``(n,)``, the map of each keyframe.
-        order: ``(n,)``, position of each keyframe, see `Atlas`; keyframes of one map are paired if their
-            positions differ by 3 or more.
+        of_map: ``(n,)``, the map of each keyframe; keyframes of one map are paired if their rows differ by 3
+            or more.
         options: How many candidates are chosen, and whether pairs within one map are.
         between: Two maps, or one map twice, if only pairs between them are wanted.
     """
@@ -216,7 +210,7 @@ def choose_candidate_pairs(
                 continue
             allowed = rows[of_map == map_index]
             if is_same_map:
-                allowed = allowed[np.abs(order[allowed] - order[a]) >= MIN_LOOP_KEYFRAMES]
+                allowed = allowed[np.abs(allowed - a) >= MIN_LOOP_KEYFRAMES]
             for b, _ in index.nearest(index.vector_of(a), options.candidates, allowed):
                 pairs.add((min(a, b), max(a, b)))
     return sorted(pairs)
@@ -267,7 +261,6 @@ def select_consistent(
     maps: tuple[int, int],
     loop_closures: Sequence[LoopClosure],
     T_world_camera: Array,
-    order: npt.NDArray[np.int64],
     options: MergeOptions,
 ) -> tuple[list[int], RejectionCounts]:
     """Return the indices of the loop closures that agree pairwise, and how many were rejected, by reason.
@@ -279,7 +272,6 @@ def select_consistent(
         maps: The two maps that all loop closures connect, or one map twice.
         loop_closures: Their ends are rows of the two arrays.
         T_world_camera: ``(n, 4, 4)``, poses of the keyframes, each in the world frame of its own map.
-        order: ``(n,)``, position of each keyframe, whose differences count steps of odometry, see `Atlas`.
         options: How many loop closures must agree to join two maps.
     """
     first, second = maps
@@ -288,12 +280,10 @@ def select_consistent(
     candidates = list(range(len(loop_closures)))
     # 1. Within one map, reject the loop closures that contradict the odometry.
     if first == second:
-        candidates = _find_fitting_odometry(T_world_camera, order, loop_closures, noise)
+        candidates = _find_fitting_odometry(T_world_camera, loop_closures, noise)
         rejected[first, second, "against-odometry"] += len(loop_closures) - len(candidates)
     # 2. Keep the largest set that agrees pairwise.
-    consistent = find_consistent_set(
-        [loop_closures[index] for index in candidates], T_world_camera, order, noise
-    )
+    consistent = find_consistent_set([loop_closures[index] for index in candidates], T_world_camera, noise)
     # 3. Between two maps, reject all loop closures if fewer than `min_links` agree.
     if first != second and len(consistent) < options.min_links:
         rejected[first, second, "too-few-agree"] += len(loop_closures)
@@ -310,7 +300,6 @@ def map_pair_of(atlas: Atlas, a: int, b: int) -> tuple[int, int]:
 
 def _find_fitting_odometry(
     T_world_camera: Array,
-    order: npt.NDArray[np.int64],
     loop_closures: Sequence[LoopClosure],
     noise: OdometryNoise,
 ) -> list[int]:
@@ -319,7 +308,7 @@ def _find_fitting_odometry(
         return []
     edges = EdgeArrays.of(loop_closures)
     predicted = inverse(T_world_camera[edges.a]) @ T_world_camera[edges.b]
-    steps = np.abs(order[edges.a] - order[edges.b]).astype(np.float64)
+    steps = np.abs(edges.a - edges.b).astype(np.float64)
     lever_m = np.array([_lever_m(T_world_camera, closure) for closure in loop_closures])
     fits = fits_prediction(predicted, edges, steps, lever_m, noise)
     return [int(index) for index in np.flatnonzero(fits)]

@@ -100,7 +100,7 @@ def _select(
     rejected = Counter(proposals.failed)
     accepted: list[LoopClosure] = []
     for pair, closures in sorted(_group_by_maps(atlas, proposals.loop_closures).items()):
-        rows, reasons = select_consistent(pair, closures, atlas.T_world_camera, atlas.order, options)
+        rows, reasons = select_consistent(pair, closures, atlas.T_world_camera, options)
         accepted += [closures[row] for row in rows]
         rejected.update(reasons)
     return accepted, Counter({key: count for key, count in rejected.items() if count})
