@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from rse_pf.errors import RsePfError
 
 if TYPE_CHECKING:
-    from client_sdk.blocking_robot import BlockingRobot, connect_blocking
+    from client_sdk.blocking_robot import BlockingMapper, BlockingRobot, connect_blocking
     from client_sdk.commands.answer_types import Answer, PoseAnswer, decode_reply
     from client_sdk.commands.subscriptions import BlockingUpdates, Updates
     from client_sdk.commands.traffic_stats import Stats
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from client_sdk.frontend import Frame, FrontEndOptions, PoseQuery, TrackedFrame
     from client_sdk.live import BlockingLiveMapper, Correction, LiveMapper, LiveOptions, OtherRobot
     from client_sdk.map_merge import merge_maps
-    from client_sdk.mapper import BlockingMapper, Mapper
+    from client_sdk.mapper import Mapper
     from client_sdk.monocular.scale import MarkerScale, OdometryScale
     from client_sdk.offloading.offload_policy import CloudFirst
     from client_sdk.point_map import MapOptions, PointMap
@@ -71,7 +71,7 @@ __all__ = [
 _HOMES = {
     "Answer": "commands.answer_types",
     "BlockingLiveMapper": "live",
-    "BlockingMapper": "mapper",
+    "BlockingMapper": "blocking_robot",
     "BlockingRobot": "blocking_robot",
     "BlockingUpdates": "commands.subscriptions",
     "CloudFirst": "offloading.offload_policy",

@@ -1,12 +1,13 @@
-"""Offer a robot to programs without asyncio: its event loop runs in a thread, and methods wait for answers.
+"""Offer robots and mappers to programs without asyncio: methods wait for answers.
 
-Every method calls the method of `client_sdk.robot.Robot` with the same name.  Any number of threads may call
-methods at the same time.  Functions that the program gave to the SDK run in one further thread, and may call
-methods, too.
+The event loop of a robot runs in a thread.  Every method calls the method of `client_sdk.robot.Robot` or of
+`client_sdk.mapper.Mapper` with the same name.  Any number of threads may call methods of a robot at the same
+time.  Functions that the program gave to the SDK run in one further thread, and may call methods, too.
 """
 
 from __future__ import annotations
 
+import asyncio
 import functools
 from collections.abc import Callable, Coroutine
 from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, TypeVar
@@ -20,15 +21,20 @@ from rse_pf.errors import Disconnected, RsePfError, UsageError
 from rse_pf.wire import Welcome
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     import numpy as np
     import numpy.typing as npt
 
-    from client_sdk.frontend import Frame
+    from client_sdk.frontend import Frame, TrackedFrame
     from client_sdk.live.blocking import BlockingLiveMapper
     from client_sdk.live.live_mapper import LiveMapper
-    from client_sdk.mapper import BlockingMapper, Mapper
+    from client_sdk.mapper import Mapper
+    from client_sdk.point_map import PointMap
+    from client_sdk.trajectory import Trajectory
+    from rse_pf.geometry import Array
 
-__all__ = ["BlockingRobot", "connect_blocking"]
+__all__ = ["BlockingMapper", "BlockingRobot", "connect_blocking"]
 
 GRACE_S = 0.5
 """A call with *deadline_s* ends at its deadline, unless the event loop hangs; then it raises Expired this
@@ -60,8 +66,6 @@ def _blocking_mapper(
 
     @functools.wraps(make)
     def mapper(self: BlockingRobot, /, *args: P.args, **kwargs: P.kwargs) -> BlockingMapper:
-        from client_sdk.mapper import BlockingMapper
-
         return BlockingMapper(make(self._robot, *args, **kwargs), self._wait)
 
     return mapper
@@ -160,6 +164,48 @@ class BlockingRobot(AutoClose):
 
     def _wait(self, work: Coroutine[Any, Any, T], limit_s: float | None = None) -> T:
         return self._thread.wait(work, limit_s)
+
+
+class BlockingMapper:
+    """Wrap a `Mapper` for programs without asyncio; properties that are not here are read from ``mapper``."""
+
+    def __init__(self, mapper: Mapper, wait: Callable[[Coroutine[Any, Any, Any]], Any] = asyncio.run) -> None:
+        """Wrap a mapper.
+
+        Args:
+            mapper: The mapper to use; it stays available as ``mapper``.
+            wait: Runs a coroutine and returns its result, such as in the event loop of a blocking robot.
+        """
+        self.mapper = mapper
+        self._wait = wait
+
+    def track(self, frame: Frame, *, position_m: Array | None = None) -> TrackedFrame:
+        """Return the pose of the next frame; see `Mapper.track`."""
+        tracked: TrackedFrame = self._wait(self.mapper.track(frame, position_m=position_m))
+        return tracked
+
+    @property
+    def map(self) -> PointMap:
+        """The map of segment 0 so far; see `Mapper.map`."""
+        return self.mapper.map
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """Poses of segment 0 so far; see `Mapper.trajectory`."""
+        return self.mapper.trajectory
+
+    @property
+    def scale(self) -> str:
+        """Source of the metric scale; see `Mapper.scale`."""
+        return self.mapper.scale
+
+    def encoded_map(self) -> bytes:
+        """Return cloud and keyframes as one encoded map; see `Mapper.encoded_map`."""
+        return self.mapper.encoded_map()
+
+    def save(self, folder: Path) -> dict[str, Any]:
+        """Write map, trajectory and report to a folder; see `Mapper.save`."""
+        return self.mapper.save(folder)
 
 
 def _blocking_connect(make: Callable[P, Robot]) -> Callable[P, BlockingRobot]:

@@ -26,7 +26,7 @@ import asyncio
 import functools
 import json
 from collections import Counter
-from collections.abc import Awaitable, Callable, Coroutine, Mapping
+from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal
@@ -61,7 +61,7 @@ from rse_pf.slam.inertial import KeyframeImu, upright_rotation
 if TYPE_CHECKING:  # importing the recorder costs memory, which only robots that record should pay
     from rse_pf.recording.robot_recorder import RobotRecorder
 
-__all__ = ["AskPose", "BlockingMapper", "Mapper", "ask_robot"]
+__all__ = ["AskPose", "Mapper", "ask_robot"]
 
 
 AskPose = Callable[[PoseQuery], Awaitable[PoseAnswer]]
@@ -735,48 +735,6 @@ class Mapper:
         if segment == min(tracker.segments):
             self._turn_upright(tracker)
         return True
-
-
-class BlockingMapper:
-    """Wrap a `Mapper` for programs without asyncio; properties that are not here are read from ``mapper``."""
-
-    def __init__(self, mapper: Mapper, wait: Callable[[Coroutine[Any, Any, Any]], Any] = asyncio.run) -> None:
-        """Wrap a mapper.
-
-        Args:
-            mapper: The mapper to use; it stays available as ``mapper``.
-            wait: Runs a coroutine and returns its result, such as in the event loop of a blocking robot.
-        """
-        self.mapper = mapper
-        self._wait = wait
-
-    def track(self, frame: Frame, *, position_m: Array | None = None) -> TrackedFrame:
-        """Return the pose of the next frame; see `Mapper.track`."""
-        tracked: TrackedFrame = self._wait(self.mapper.track(frame, position_m=position_m))
-        return tracked
-
-    @property
-    def map(self) -> PointMap:
-        """The map of segment 0 so far; see `Mapper.map`."""
-        return self.mapper.map
-
-    @property
-    def trajectory(self) -> Trajectory:
-        """Poses of segment 0 so far; see `Mapper.trajectory`."""
-        return self.mapper.trajectory
-
-    @property
-    def scale(self) -> str:
-        """Source of the metric scale; see `Mapper.scale`."""
-        return self.mapper.scale
-
-    def encoded_map(self) -> bytes:
-        """Return cloud and keyframes as one encoded map; see `Mapper.encoded_map`."""
-        return self.mapper.encoded_map()
-
-    def save(self, folder: Path) -> dict[str, Any]:
-        """Write map, trajectory and report to a folder; see `Mapper.save`."""
-        return self.mapper.save(folder)
 
 
 async def _run_in_thread(

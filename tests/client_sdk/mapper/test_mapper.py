@@ -14,10 +14,11 @@ import msgspec
 import numpy as np
 import pytest
 
+from client_sdk.blocking_robot import BlockingMapper
 from client_sdk.commands.answer_types import PoseAnswer
 from client_sdk.datasets import open_dataset
 from client_sdk.frontend import Frame, FrontEndOptions, PoseQuery, TrackedFrame
-from client_sdk.mapper import BlockingMapper, Mapper
+from client_sdk.mapper import Mapper
 from client_sdk.monocular.scale import OdometryScale
 from client_sdk.point_map import read_ply
 from client_sdk.robot import Robot, connect
