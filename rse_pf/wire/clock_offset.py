@@ -62,20 +62,6 @@ class ClockOffset:
         """Server clock minus robot clock, or None before the first exchange."""
         return self._best.offset_s if self._window else None
 
-    @property
-    def uncertainty_s(self) -> float | None:
-        """Bound of the error of the offset: half the shortest round trip."""
-        return self._best.round_trip_s / 2 if self._window else None
-
-    def delays_s(self, exchange: Exchange) -> tuple[float, float] | None:
-        """Return ``(up, down)`` of *exchange*: the paper's two one-way delays."""
-        offset = self.offset_s
-        if offset is None:
-            return None
-        up = exchange.received_s - offset - exchange.sent_s
-        down = exchange.returned_s - (exchange.answered_s - offset)
-        return up, down
-
     def split_s(
         self, sent_s: float, received_s: float, answered_s: float, returned_s: float
     ) -> tuple[float, float] | tuple[None, None]:
