@@ -31,7 +31,8 @@ from benchmarks.frame.report import say
 from client_sdk.datasets import CameraChoice, associate_stamps
 from client_sdk.frontend import load_opencv
 from client_sdk.rigs.benchmark_files import read_euroc_camera
-from client_sdk.rigs.intrinsics import Intrinsics, read_intrinsics
+from client_sdk.rigs.intrinsics import Intrinsics
+from client_sdk.rigs.rig_file import read_intrinsics
 from client_sdk.trajectory import Trajectory, read_trajectory
 from rse_pf.config import PlatformSettings
 from rse_pf.errors import UsageError

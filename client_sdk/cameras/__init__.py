@@ -6,9 +6,9 @@ Tracking and mapping of the frames belong to `client_sdk.mapper`, recordings of 
 
 from client_sdk.cameras.open_camera import open_camera, source_of_frames
 from client_sdk.cameras.source import FrameSource
-from client_sdk.rigs.intrinsics import Intrinsics, read_intrinsics, write_intrinsics
+from client_sdk.rigs.intrinsics import Intrinsics, write_intrinsics
 from client_sdk.rigs.rig import Rig, RigCamera, RigImu
-from client_sdk.rigs.rig_file import read_rig, write_rig
+from client_sdk.rigs.rig_file import read_intrinsics, read_rig, write_rig
 
 __all__ = [
     "FrameSource",

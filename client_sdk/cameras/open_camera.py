@@ -29,7 +29,7 @@ from client_sdk.rigs.folder_camera import OWN_FILE, find_folder_camera
 from client_sdk.rigs.intrinsics import TYPICAL_HINT, Intrinsics
 from client_sdk.rigs.rectification import Rectification
 from client_sdk.rigs.rig import Rig
-from client_sdk.rigs.rig_file import read_calibration, read_lens, read_rig
+from client_sdk.rigs.rig_file import read_calibration, read_intrinsics, read_rig
 from client_sdk.source_facts import CameraFacts, DoubtLog, SourceFacts, check_source
 from rse_pf.errors import UsageError
 from rse_pf.files import check_exists
@@ -154,7 +154,7 @@ def open_camera(
     if path.is_dir():
         if own is None:
             found = find_folder_camera(path, lambda: list_folder(path).size_px)
-            file, own = found or (path / OWN_FILE, read_lens(path / OWN_FILE))
+            file, own = found or (path / OWN_FILE, read_intrinsics(path / OWN_FILE))
             stated_by = str(file)
         return _open_folder(path, own, stated_by, rate_hz, depth)
     if word.count(",") == 1 and not path.exists():

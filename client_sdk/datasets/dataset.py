@@ -13,7 +13,7 @@ from client_sdk.datasets.thinning import Thinning, median_interval_s
 from client_sdk.frontend import Frame
 from client_sdk.rigs.imu_track import ImuTrack, with_imu
 from client_sdk.rigs.stereo_pair_checks import check_stereo_pairs, choose_pairs
-from client_sdk.source_facts import Doubt, DoubtLog
+from client_sdk.source_facts import DoubtLog
 from client_sdk.trajectory import Trajectory
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Array, Camera
@@ -26,7 +26,7 @@ class Dataset:
     """A recording: iterate over it for its frames in the order of time.
 
     Images are read during the iteration; a frame whose image cannot be read is left out, and counted in
-    `doubts`.
+    `log`.
 
     Attributes:
         name: Name of the recording, for messages.
@@ -42,7 +42,8 @@ class Dataset:
         T_body_camera: ``(4, 4)``, m, pose of the camera of the frames in the body of its rig, which each
             frame gets; None if it is not known.  *truth* is the trajectory of the camera in any case.
         imu: All samples of the IMU, or None; each frame gets those since the frame before it.
-        log: Collects the `doubts`; recordings that `thinned` and `share` return have the same log.
+        log: Collects the doubts about the recording; recordings that `thinned` and `share` return have the
+            same log.
     """
 
     name: str
@@ -58,11 +59,6 @@ class Dataset:
     T_body_camera: Array | None = None
     imu: ImuTrack | None = None
     log: DoubtLog = field(default_factory=DoubtLog)
-
-    @property
-    def doubts(self) -> tuple[Doubt, ...]:
-        """The doubts about the recording, including the images that iterations so far have left out."""
-        return self.log.doubts
 
     @property
     def span_s(self) -> tuple[float, float] | None:
@@ -101,7 +97,7 @@ class Dataset:
     def sample_pairs(self) -> Iterator[tuple[Frame, Frame]]:
         """Yield up to 14 frames, spread over the recording, each with the frame after it.
 
-        Pairs with an image that cannot be read are left out, and not counted in `doubts`.
+        Pairs with an image that cannot be read are left out, and not counted in `log`.
 
         Raises:
             UnreadableImage: Each pair has an image that cannot be read.

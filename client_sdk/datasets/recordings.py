@@ -26,7 +26,7 @@ from client_sdk.frontend import Frame
 from client_sdk.image_map import map_to_pinhole
 from client_sdk.rigs.folder_camera import OWN_FILE, find_folder_camera
 from client_sdk.rigs.intrinsics import Intrinsics
-from client_sdk.rigs.rig_file import read_lens
+from client_sdk.rigs.rig_file import read_intrinsics
 from client_sdk.source_facts import (
     CameraFacts,
     DepthFacts,
@@ -401,7 +401,7 @@ def _find_intrinsics(
         UsageError: The file cannot be read, or *named* or ``intrinsics.json`` states no unit of depth
             although there is depth.
     """
-    found = find_folder_camera(folder, size_px) if named is None else (named, read_lens(named))
+    found = find_folder_camera(folder, size_px) if named is None else (named, read_intrinsics(named))
     if found is not None:
         file, lens = found
         if lens.depth_scale is not None or not has_depth:

@@ -10,7 +10,7 @@ import numpy as np
 
 from client_sdk.rigs.benchmark_files import read_numbers, read_text
 from client_sdk.rigs.intrinsics import INTRINSICS_HINT, Intrinsics, name_file_in_errors
-from client_sdk.rigs.rig_file import read_lens
+from client_sdk.rigs.rig_file import read_intrinsics
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Camera
 
@@ -38,7 +38,7 @@ def find_folder_camera(
     """
     for name in _JSON_FILES:
         if (folder / name).is_file():
-            return folder / name, read_lens(folder / name)
+            return folder / name, read_intrinsics(folder / name)
     for name in _TEXT_FILES:
         file = folder / name
         if file.is_file():

@@ -40,7 +40,6 @@ __all__ = [
     "name_file_in_errors",
     "parse_intrinsics",
     "parse_lens_model",
-    "read_intrinsics",
     "read_json",
     "write_intrinsics",
     "write_json",
@@ -165,18 +164,6 @@ class Intrinsics(Lens):
     def depth_units_per_m(self) -> float:
         """Units of a depth image per metre: ``depth_scale``, or 1000 (millimetres) if nobody stated it."""
         return _DEFAULT_DEPTH_SCALE if self.depth_scale is None else self.depth_scale
-
-
-def read_intrinsics(path: Path | str) -> Intrinsics:
-    """Return the intrinsics of ``intrinsics.json``, or of a JSON file of another program.
-
-    Raises:
-        UsageError: The file is missing, lacks a number, has an unknown field, or a number is impossible.
-    """
-    path = Path(path)
-    values = read_json(path, INTRINSICS_HINT)
-    with name_file_in_errors(path, INTRINSICS_HINT):
-        return parse_intrinsics(values)
 
 
 def read_json(path: Path, hint: str) -> Any:
@@ -321,7 +308,8 @@ def _convert_optional(value: Any, convert: Callable[[Any], _T]) -> _T | None:
 
 
 def write_intrinsics(path: Path | str, intrinsics: Intrinsics) -> None:
-    """Write the file that `read_intrinsics` reads; raises UsageError if it cannot be written."""
+    """Write the file that `client_sdk.rigs.rig_file.read_intrinsics` reads; raises UsageError if it cannot be
+    written."""
     write_json(path, intrinsics_to_json(intrinsics))
 
 

@@ -33,7 +33,7 @@ from client_sdk.rigs.rig import Rig, RigCamera, RigImu
 from rse_pf.errors import UsageError
 from rse_pf.geometry import Array
 
-__all__ = ["read_calibration", "read_lens", "read_rig", "write_rig"]
+__all__ = ["read_calibration", "read_intrinsics", "read_rig", "write_rig"]
 
 _HINT = "write cameras, each with name, fx fy cx cy width height and T_body_camera: see docs/cameras.md"
 _CAMERA_FIELDS = ("name", "T_body_camera", "time_offset_s")  # fields of a camera that intrinsics.json has not
@@ -79,8 +79,13 @@ def read_calibration(path: Path | str) -> Intrinsics | Rig:
         )
 
 
-def read_lens(path: Path) -> Intrinsics:
-    """Return the intrinsics of a file that `read_calibration` reads; those of the left camera of a rig."""
+def read_intrinsics(path: Path | str) -> Intrinsics:
+    """Return the intrinsics of a file that `read_calibration` reads; those of the left camera of a rig.
+
+    Raises:
+        UsageError: See `read_calibration`.
+        MissingExtra: The file is YAML, and PyYAML is not installed.
+    """
     calibration = read_calibration(path)
     return calibration.left.lens if isinstance(calibration, Rig) else calibration
 

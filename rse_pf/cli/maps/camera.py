@@ -70,7 +70,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="units of a 16-bit depth image in a metre (default: left out, which means 1000)",
     )  # fmt: skip
     write = actions.add_parser("board", parents=[board], help="write a board to print")
-    write.add_argument("--out", type=Path, default=Path("board.pdf"), metavar="FILE", help="a .pdf file (default: %(default)s)")
+    write.add_argument("--out", type=Path, default=Path("board.pdf"), metavar="FILE", help="a .pdf file")
     check = actions.add_parser("check", help="say what a camera gives: size, rate, depth, blur")
     check.add_argument("source", metavar="SOURCE", help="a device, a video, a folder or a recording")
     check.add_argument("--frames", type=int, default=60, metavar="N", help="frames to look at (default: 60)")

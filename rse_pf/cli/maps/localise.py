@@ -133,7 +133,7 @@ def _lens_of(args: argparse.Namespace) -> PhotoLens:
     if args.camera is not None:
         fx, fy, cx, cy = _four_numbers(args.camera)
         return PhotoLens(fx=fx, fy=fy, cx=cx, cy=cy)
-    from client_sdk.rigs.intrinsics import read_intrinsics
+    from client_sdk.rigs.rig_file import read_intrinsics
 
     read = read_intrinsics(args.intrinsics)
     camera = read.camera

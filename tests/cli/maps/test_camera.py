@@ -12,7 +12,7 @@ import pytest
 
 from client_sdk.cameras.board import Board, find_corners
 from client_sdk.cameras.calibration import BoardViews, calibrate
-from client_sdk.rigs.intrinsics import read_intrinsics
+from client_sdk.rigs.rig_file import read_intrinsics
 from rse_pf.cli.main import main
 from rse_pf.errors import CommandFailed, UsageError
 from rse_pf.geometry import Array, Camera, exp_se3, transform

@@ -226,7 +226,7 @@ def test_a_raw_dump_is_paired_by_the_times_in_its_names(tmp_path: Path):
     dataset = open_dataset(tmp_path)
     frames = list(dataset)
 
-    (doubt,) = dataset.doubts
+    (doubt,) = dataset.log.doubts
     assert doubt.sentence.endswith("left out, damaged or empty: d-100.066000-5.pgm")
     assert any("is that of the toolbox of NYU Depth V2: fx 518.86" in note for note in dataset.notes)
     assert [frame.timestamp_s for frame in frames] == [100.0, 100.033]
@@ -353,7 +353,7 @@ def test_colour_images_without_depth_are_left_out_and_counted(tmp_path: Path) ->
     dataset = open_dataset(folder)
 
     assert len(dataset) == 3
-    assert dataset.doubts[0].sentence.startswith("2 of 5 colour images")
+    assert dataset.log.doubts[0].sentence.startswith("2 of 5 colour images")
 
 
 def test_a_few_images_without_a_partner_are_a_note(tmp_path: Path) -> None:
@@ -363,5 +363,5 @@ def test_a_few_images_without_a_partner_are_a_note(tmp_path: Path) -> None:
 
     dataset = open_dataset(folder)
 
-    assert dataset.doubts == ()
+    assert dataset.log.doubts == ()
     assert any(note.startswith("1 of 20 colour images") for note in dataset.notes)

@@ -156,7 +156,7 @@ def test_left_images_without_a_right_one_are_left_out_and_told(tmp_path: Path) -
     dataset = open_euroc(folder)
 
     assert (len(dataset), len(open_euroc(folder, camera="left"))) == (2, 3)
-    (doubt,) = dataset.doubts
+    (doubt,) = dataset.log.doubts
     assert doubt.sentence == "1 of 3 images of MH_01's left camera have no right one, and are left out"
     assert [int(frame.rgb[24, 32, 0]) for frame in dataset] == [10, 20]
 
