@@ -77,7 +77,7 @@ class LeaseLost(Conflict):
     """Another process serves the live map: it wrote the log entry or the lease that this one tried to write.
 
     Cause: The map server was paused or cut off from the store for longer than live.lease_s.
-    Check: The logs of the servers: which one serves the map now.
+    Check: rse-pf map live list: which server serves the map now.
     Fix: Nothing; robots are served by the new map server.
     """
 

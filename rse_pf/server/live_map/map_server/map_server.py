@@ -71,7 +71,7 @@ the map server has a defect."""
 class MapMoving(Busy):
     """The live map is being given up: the worker sends the request to the next map server.
 
-    Cause: The server of the map drains, or was paused.
+    Cause: The server of the map drains or was paused, nobody used the map, or another map needs its process.
     Check: rse-pf map live list: which server serves the map.
     Fix: Nothing; the worker repeats the request.
     """

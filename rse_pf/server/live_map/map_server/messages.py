@@ -172,7 +172,7 @@ class MapUpdates:
                 for them.
             outcomes: Outcomes of the last entry; those of the class `Corrected` name the keyframe that caused
                 a correction.
-            version: Position of the map in its log.
+            version: Position of the map in its log, which has nothing to do with versions in the registry.
         """
         causes = {outcome.robot: outcome.cause for outcome in outcomes if isinstance(outcome, Corrected)}
         self._alignments = {alignment.robot: alignment for alignment in alignments}
