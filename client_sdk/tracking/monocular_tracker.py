@@ -136,8 +136,8 @@ class _TrackState:
         timestamp_s: Time of the last pose, in seconds.
         T_next_last: ``(4, 4)``, maps the frame of the last camera to that of the next one: the motion between
             the last two frames, which is assumed to repeat; the identity after a loss.
-        unrecognised: Number of frames since the last accepted pose that show enough features and no known
-            place.
+        unrecognised: Number of frames since the last accepted pose that show at least 100 features and no
+            known place.
         candidate: Where the segment may lie in another one, or its newest part in an older one, measured once
             and not confirmed by a second measurement; None without one.
         next_loop_keyframe: Number of the first keyframe for which a loop closure is looked for, after the
@@ -231,14 +231,6 @@ class MonocularTracker:
     def loops(self) -> int:
         """The number of loop closures."""
         return len(self.loop_scales)
-
-    @property
-    def unrecognised(self) -> int:
-        """Number of frames since the last pose that show at least 100 features and no known place.
-
-        An image with fewer features, such as that of a covered lens, does not count.
-        """
-        return self._state.unrecognised
 
     @property
     def segment(self) -> int:
@@ -354,8 +346,8 @@ class MonocularTracker:
     def adjust(self) -> None:
         """Adjust all keyframes and landmarks of each segment together, such as at the end of a drive.
 
-        This takes seconds, and corrects poses that were returned before.  A segment with more keyframes than
-        200 stays as it is.  The next frame is relocalised.
+        This takes seconds, and corrects poses that were returned before.  A segment of more than 200
+        keyframes stays as it is.  The next frame is relocalised.
 
         Raises:
             UsageError: A query is open.
@@ -411,7 +403,8 @@ class MonocularTracker:
         wider = max(1.0, frame.camera.width / _FEATURES_WIDTH_PX)
         count = int(min(max(self.options.features, _MAX_FEATURES), self.options.features * wider))
         described = describe(frame.rgb, count, plugin=self._plugins.features)
-        features = make_features(described, np.full((len(described.pixels), 3), np.nan))
+        no_points = np.broadcast_to(np.nan, (len(described.pixels), 3))  # takes no memory
+        features = make_features(described, no_points)
         last_pixel = np.array([frame.camera.width - 1, frame.camera.height - 1])
         columns, lines = np.clip(np.rint(features.pixels).astype(np.int64), 0, last_pixel).T
         return MonocularView(

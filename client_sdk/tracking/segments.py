@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -60,6 +61,9 @@ class KeyframePoints:
     colours: npt.NDArray[np.uint8]
 
 
+_Kept = TypeVar("_Kept", Keyframe, KeyframePoints)
+
+
 @dataclass(slots=True, kw_only=True, eq=False)
 class SegmentRecord:
     """The record of one segment, in the frame of the segment.
@@ -81,20 +85,16 @@ class SegmentRecord:
 
     def append(self, other: SegmentRecord, T_own_other: Array) -> None:
         """Add all of another segment, moved by ``T_own_other`` ``(4, 4)`` into the frame of this one."""
+
+        def moved(kept: _Kept) -> _Kept:
+            return replace(kept, T_world_camera=_move_pose(T_own_other, kept.T_world_camera))
+
         self.stamps_s += other.stamps_s
         self.poses += [_move_pose(T_own_other, pose) for pose in other.poses]
         self.cloud.add_map(other.cloud, T_own_other)
-        self.keyframes += [
-            replace(keyframe, T_world_camera=_move_pose(T_own_other, keyframe.T_world_camera))
-            for keyframe in other.keyframes
-        ]
-        moved = other.keyframe_points
-        if moved is not None:
-            moved = [
-                replace(points, T_world_camera=_move_pose(T_own_other, points.T_world_camera))
-                for points in moved
-            ]
-        self.add_keyframe_points(moved)
+        self.keyframes += map(moved, other.keyframes)
+        points = other.keyframe_points
+        self.add_keyframe_points(None if points is None else [moved(kept) for kept in points])
 
     def add_keyframe_points(self, added: list[KeyframePoints] | None) -> None:
         """Keep the points of further stereo keyframes, or forget those of all keyframes for good.
@@ -117,30 +117,18 @@ class SegmentRecord:
             T = adjustment.moved(np.array([stamp_s]), pose[None])[0]
             return _move_pose(T @ inverse(pose), pose)
 
-        def with_corrected_depth(points_camera: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-            points = with_offset(
-                points_camera.astype(np.float64), adjustment.f_baseline, adjustment.offset_px
+        def corrected(kept: _Kept) -> _Kept:
+            points = kept.points_camera.astype(np.float64)
+            points = with_offset(points, adjustment.f_baseline, adjustment.offset_px)
+            return replace(
+                kept,
+                T_world_camera=moved(kept.timestamp_s, kept.T_world_camera),
+                points_camera=points.astype(np.float32),
             )
-            return points.astype(np.float32)
 
-        keyframes = [
-            replace(
-                keyframe,
-                T_world_camera=moved(keyframe.timestamp_s, keyframe.T_world_camera),
-                points_camera=with_corrected_depth(keyframe.points_camera),
-            )
-            for keyframe in self.keyframes
-        ]
         keyframe_points = self.keyframe_points
         if keyframe_points is not None:
-            keyframe_points = [
-                replace(
-                    points,
-                    T_world_camera=moved(points.timestamp_s, points.T_world_camera),
-                    points_camera=with_corrected_depth(points.points_camera),
-                )
-                for points in keyframe_points
-            ]
+            keyframe_points = [corrected(kept) for kept in keyframe_points]
         cloud = PointMap(self.cloud.options) if keyframe_points else self.cloud
         for points in keyframe_points or ():
             has_depth = np.isfinite(points.points_camera[:, 2])
@@ -150,7 +138,7 @@ class SegmentRecord:
             cloud=cloud,
             stamps_s=self.stamps_s,
             poses=[moved(stamp_s, pose) for stamp_s, pose in zip(self.stamps_s, self.poses, strict=True)],
-            keyframes=keyframes,
+            keyframes=[corrected(keyframe) for keyframe in self.keyframes],
             keyframe_points=keyframe_points,
         )
 
