@@ -193,8 +193,10 @@ class FeaturesPlugin:
         # 2. Compare the kind of the features with that of the first image.
         has_fields = found.orientations_deg is not None, found.sizes is not None
         kind = DescriptorKind(self.name, str(descriptors.dtype), descriptors.shape[1])
-        if self._is_kind_known and (kind != self.kind or has_fields != (self.is_oriented, self.is_scaled)):
-            raise self._refusal(f"returned {kind} after {self.kind}, or other fields than before")
+        if self._is_kind_known and kind != self.kind:
+            raise self._refusal(f"returned {kind} after {self.kind}")
+        if self._is_kind_known and has_fields != (self.is_oriented, self.is_scaled):
+            raise self._refusal("returned orientations_deg or sizes for some images only")
         self.kind, self._is_kind_known = kind, True
         self.is_oriented, self.is_scaled = has_fields
         # 3. Check orientations and sizes; missing ones become 0 degrees and 1.
