@@ -104,11 +104,8 @@ FIRST_CONNECT_ATTEMPTS = 4
 """How many attempts a robot's first connect makes before it raises; later reconnects have no limit."""
 MIN_TIMER_PAUSE_S = 0.001
 """Shortest pause of the timer task, so that deadlines that are due at once do not make it spin."""
-OTHER_REGIONS_WAIT_RATIO = 1.0
-"""Once the first region can be used, a first connect waits for the others for this multiple of the time that
-has passed: a region that needs longer is not the nearest."""
 OTHER_REGIONS_MAX_WAIT_S = 0.7
-"""Longest wait for the other regions of a first connect once one of them can be used."""
+"""Longest wait for the other regions of a first connect once one of them can be used, in seconds."""
 DUPLICATE_REGION_S = 5.0
 """A platform keeps one connection of a robot, and closes the older one as replaced when a newer one opens.
 If it does so within this many seconds after the robot opened a connection in another region, both addresses
@@ -303,10 +300,9 @@ class Connection:
         try:
             while running and not self._usable_sockets():
                 _, running = await asyncio.wait(running, return_when=asyncio.FIRST_COMPLETED)
-            # 2. Wait about as long again for the other regions: one of them may be nearer.
+            # 2. Wait as long again for the other regions: one that needs longer is not the nearest.
             if running:
-                elapsed_s = self._clock() - began_s
-                others_s = min(OTHER_REGIONS_MAX_WAIT_S, OTHER_REGIONS_WAIT_RATIO * elapsed_s)
+                others_s = min(OTHER_REGIONS_MAX_WAIT_S, self._clock() - began_s)
                 _, running = await asyncio.wait(running, timeout=others_s)
         except asyncio.CancelledError:
             await cancel_tasks(joins)
@@ -315,8 +311,7 @@ class Connection:
         for region, task in zip(self._regions, joins, strict=True):
             region.first_join = task if task in running else None
             region.last_failure = None if task in running else task.result()
-        results = (task.result() for task in joins if task not in running)
-        failures = [failure for failure in results if failure is not None]
+        failures = [region.last_failure for region in self._regions if region.last_failure is not None]
         lost = DialError(ConnectError(f"{self.region} closed the connection at once", hint=CHECK_RUNNING))
         return failures or [lost]
 
