@@ -40,12 +40,15 @@ Rows = npt.NDArray[np.int64]
 
 _ABI = PART_ABIS["track"]
 _GRID_WORDS = 16_400
-"""Words of 8 bytes that the native core's guided matcher needs for its grid of image cells."""
-_ORB_DISTANCE_LIMIT = 256
-"""Bits: largest Hamming distance of two ORB descriptors; stands for "no other feature to compare with"."""
+"""Words of 8 bytes of the workspace that the native core's guided matcher uses for its grid of image cells,
+whatever the size of the image."""
+_MAX_ORB_DISTANCE = 256
+"""Largest possible Hamming distance of two ORB descriptors, in bits: the native core is given no larger
+limit."""
 _DESCRIPTOR_DTYPES = (np.uint8, np.int8)
 _BAND_KEY_STEP = 1e6
-"""Step between the sort keys of two horizontal bands of an image, in pixels: wider than any image."""
+"""Step between the sort keys of two horizontal bands of an image, in pixels: columns are clipped to less than
+half of it on either side, so that the keys of two bands never overlap."""
 _MAX_PIXEL_PX = 1e9
 """Features and predictions whose pixel coordinates exceed this absolute value match nothing."""
 _MIN_LANDMARK_DEPTH_M = 0.1
@@ -54,11 +57,11 @@ _MIN_VIEW_COSINE = 0.6
 """Smallest cosine between the present and the last viewing ray of a landmark (53 degrees): seen from another
 direction, a landmark has another descriptor."""
 _MAX_APPROACH_RATIO = 2.0
-"""A landmark is not predicted where its distance from the camera is less than its distance in the last image
-that showed it, divided by this ratio."""
+"""A landmark is not predicted where its distance from the camera is less than that from the camera of the
+last image that showed it, divided by this ratio: its descriptor then shows another scale."""
 _MAX_RETREAT_RATIO = 2.0
-"""A landmark is not predicted where its distance from the camera is more than its distance in the last image
-that showed it, times this ratio."""
+"""A landmark is not predicted where its distance from the camera is more than that from the camera of the
+last image that showed it, times this ratio: its descriptor then shows another scale."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -140,14 +143,15 @@ class GuidedMatchLimits:
         radius_px: Largest distance between the feature and the predicted pixel.
         lowe_ratio: Lowe's ratio test: the best descriptor distance must be below this share of the second
             best within the radius.
-        distinctiveness_ratio: The best descriptor distance must be below this share of the feature's
-            distinctiveness: tiles and carpets repeat beyond the radius, too.
+        distinctiveness_ratio: The best descriptor distance must be below this share of the distance between
+            the feature's descriptor and the most similar other one of its image (`Features.distinctiveness`):
+            tiles and carpets repeat beyond the radius, where Lowe's ratio test does not look.
         min_orientation_cosine: Smallest cosine of the angle between the predicted and the measured
             orientation; not used for features without orientations.
         max_size_ratio: Largest ratio of the predicted and the measured size, either way; not used for
             features without sizes.
-        max_distance: Largest Hamming distance in bits of 256; scaled for binary descriptors of other lengths,
-            not used for vectors.
+        max_distance: Largest Hamming distance of two descriptors of 256 bits, in bits; for binary descriptors
+            of another length it is multiplied by their length over 256, for vectors it is not used.
     """
 
     radius_px: float
@@ -198,7 +202,8 @@ class FittedPose:
         T_camera_world: ``(4, 4)``, metres.
         information: ``(6, 6)``, inverse covariance of the pose's twist (metres, radians), applied on the left
             of ``T_camera_world``.
-        is_inlier: ``(n,)``, whether each observation is within the gate at this pose.
+        is_inlier: ``(n,)``, whether the squared distance of each observation from its prediction by this
+            pose, in variances, is at most the argument *gate2* of `fit_pose`.
     """
 
     T_camera_world: Array
@@ -211,19 +216,19 @@ _WORKSPACE = Workspace()
 
 
 class _NearRequest(ctypes.Structure):
-    """``rse_pf_near_request`` of ``rse_pf_track.h``."""
+    """Request to match predicted features with those of an image, ``rse_pf_near_request`` of the C header."""
 
     _fields_ = (
         ("abi", ctypes.c_uint32),
         ("flags", ctypes.c_uint32),
-        ("sought_rows", _I),
+        ("predicted_rows", _I),
         ("rows", _I),
-        ("predicted", _P),
-        ("sought_turns", _P),
-        ("sought_sizes", _P),
-        ("sought", _P),
+        ("predicted_pixels", _P),
+        ("predicted_directions", _P),
+        ("predicted_sizes", _P),
+        ("predicted_descriptors", _P),
         ("pixels", _P),
-        ("turns", _P),
+        ("directions", _P),
         ("sizes", _P),
         ("descriptors", _P),
         ("distinct", _P),
@@ -237,7 +242,7 @@ class _NearRequest(ctypes.Structure):
 
 
 class _SeekRequest(ctypes.Structure):
-    """``rse_pf_seek_request`` of ``rse_pf_track.h``."""
+    """Request to predict the features of landmarks, ``rse_pf_seek_request`` of the C header."""
 
     _fields_ = (
         ("abi", ctypes.c_uint32),
@@ -247,7 +252,7 @@ class _SeekRequest(ctypes.Structure):
         ("numbers", _P),
         ("points", _P),
         ("rays", _P),
-        ("turns", _P),
+        ("directions", _P),
         ("sizes", _P),
         ("descriptors", _P),
         ("fx", _D),
@@ -257,7 +262,7 @@ class _SeekRequest(ctypes.Structure):
         ("width", _D),
         ("height", _D),
         ("margin_px", _D),
-        ("nearest_m", _D),
+        ("min_depth_m", _D),
         ("min_cosine", _D),
         ("max_nearer", _D),
         ("max_farther", _D),
@@ -266,18 +271,18 @@ class _SeekRequest(ctypes.Structure):
 
 
 class _FitRequest(ctypes.Structure):
-    """``rse_pf_fit_request`` of ``rse_pf_track.h``."""
+    """Request to fit a pose to observations, ``rse_pf_fit_request`` of the C header."""
 
     _fields_ = (
         ("abi", ctypes.c_uint32),
         ("flags", ctypes.c_uint32),
         ("rows", _I),
         ("points", _P),
-        ("spreads", _P),
+        ("point_covariances", _P),
         ("pixels", _P),
-        ("pixels_px", _P),
+        ("pixel_sigmas_px", _P),
         ("depths_m", _P),
-        ("depths_dev", _P),
+        ("depth_sigmas_m", _P),
         ("fx", _D),
         ("fy", _D),
         ("cx", _D),
@@ -308,7 +313,7 @@ def _core(name: str) -> Any:
 
 
 def predict_features(
-    landmarks: LandmarkAppearance, numbers: Rows, T_camera_world: Array, camera: Camera, margin_px: float
+    landmarks: LandmarkAppearance, candidates: Rows, T_camera_world: Array, camera: Camera, margin_px: float
 ) -> tuple[Rows, PredictedFeatures]:
     """Predict how a camera at a pose sees landmarks.
 
@@ -317,17 +322,18 @@ def predict_features(
 
     Args:
         landmarks: All landmarks.
-        numbers: ``(m,)`` rows of *landmarks* that are considered.
+        candidates: ``(m,)`` rows of *landmarks* that are considered.
         T_camera_world: ``(4, 4)``.
         camera: Its intrinsics.
-        margin_px: Width of the border around the image that counts as image; negative to leave a border out.
+        margin_px: Width of the border outside the image in which landmarks are predicted, too; negative to
+            leave out a border of this width inside the image.
 
     Returns:
-        The ``(k,)`` ascending indices into *numbers* (not rows of *landmarks*) of the landmarks that are
-        predicted, and their *k* predicted features.
+        ``(k,)`` ascending indices *i*: landmark ``candidates[i]`` is predicted; and the *k* predicted
+        features.
     """
     # 1. Project the landmarks, and keep those before the camera and in the image with its margin.
-    points = transform(T_camera_world, landmarks.points[numbers])
+    points = transform(T_camera_world, landmarks.points[candidates])
     rows = np.flatnonzero(points[:, 2] > _MIN_LANDMARK_DEPTH_M)
     pixels = camera.project(points[rows])
     u, v = pixels.T
@@ -337,7 +343,7 @@ def predict_features(
     rows, pixels = rows[is_inside], pixels[is_inside]
     # 2. Keep those whose viewing ray is similar, in direction and length, to that of the last image.
     distances = np.linalg.norm(points[rows], axis=1)
-    last_rays = landmarks.rays[numbers[rows]] @ T_camera_world[:3, :3].T
+    last_rays = landmarks.rays[candidates[rows]] @ T_camera_world[:3, :3].T
     last_distances = np.linalg.norm(last_rays, axis=1)
     cosines = (last_rays * points[rows]).sum(axis=1) / np.maximum(distances * last_distances, 1e-9)
     is_similar = (
@@ -347,11 +353,11 @@ def predict_features(
     )
     rows, pixels = rows[is_similar], pixels[is_similar]
     # 3. Turn the orientation into this image, and scale the size by the change of distance.
-    orientations = landmarks.orientations[numbers[rows]] @ T_camera_world[:2, :3].T
-    sizes = landmarks.sizes[numbers[rows]] * last_distances[is_similar]
+    orientations = landmarks.orientations[candidates[rows]] @ T_camera_world[:2, :3].T
+    sizes = landmarks.sizes[candidates[rows]] * last_distances[is_similar]
     return rows, PredictedFeatures(
         pixels=pixels,
-        descriptors=landmarks.descriptors[numbers[rows]],
+        descriptors=landmarks.descriptors[candidates[rows]],
         orientations=orientations / np.maximum(np.linalg.norm(orientations, axis=1), 1e-9)[:, None],
         sizes=sizes / np.maximum(distances[is_similar], 1e-9),
     )
@@ -359,7 +365,7 @@ def predict_features(
 
 def match_landmarks(
     landmarks: LandmarkAppearance,
-    numbers: Rows,
+    candidates: Rows,
     T_camera_world: Array,
     camera: Camera,
     image: Features,
@@ -373,26 +379,27 @@ def match_landmarks(
 
     Args:
         landmarks: All landmarks.
-        numbers: ``(m,)`` rows of *landmarks* that are considered.
+        candidates: ``(m,)`` rows of *landmarks* that are considered.
         T_camera_world: ``(4, 4)``, the predicted pose.
         camera: Intrinsics of the image.
         image: Features of the image.
         limits: Conditions of a match.
-        margin_px: Width of the border around the image in which landmarks are predicted, too.
+        margin_px: Width of the border outside the image in which landmarks are predicted, too.
 
     Returns:
-        Ascending indices into *numbers* (not rows of *landmarks*), and the row of *image* that matches each.
+        ``(k,)`` ascending indices *i*: landmark ``candidates[i]`` is matched; and the ``(k,)`` rows of
+        *image* that match these landmarks.
 
     Raises:
-        BadRequest: Descriptors are not ORB, and shapes or the radius do not fit.  The shapes of ORB features
-            are not checked.
+        BadRequest: Shapes or the radius do not fit, for descriptors other than ORB.  With ORB nothing is
+            checked: the caller must give one row for each landmark or feature in every array.
         MissingExtra: The descriptors are ORB, and the native core is not installed.
     """
     if not ORB.is_kind_of(image.descriptors):
-        predicted_rows, predicted = predict_features(landmarks, numbers, T_camera_world, camera, margin_px)
+        predicted_rows, predicted = predict_features(landmarks, candidates, T_camera_world, camera, margin_px)
         rows, features = match_predictions(predicted, image, limits)
         return predicted_rows[rows], features
-    chosen = aligned(numbers, np.int64)
+    chosen = aligned(candidates, np.int64)
     points, rays, orientations, sizes, descriptors = _align_arrays(
         landmarks.points,
         landmarks.rays,
@@ -407,7 +414,7 @@ def match_landmarks(
         numbers=address_of(chosen),
         points=address_of(points),
         rays=address_of(rays),
-        turns=address_of(orientations),
+        directions=address_of(orientations),
         sizes=address_of(sizes),
         descriptors=address_of(descriptors),
         fx=camera.fx,
@@ -417,7 +424,7 @@ def match_landmarks(
         width=camera.width,
         height=camera.height,
         margin_px=margin_px,
-        nearest_m=_MIN_LANDMARK_DEPTH_M,
+        min_depth_m=_MIN_LANDMARK_DEPTH_M,
         min_cosine=_MIN_VIEW_COSINE,
         max_nearer=_MAX_APPROACH_RATIO,
         max_farther=_MAX_RETREAT_RATIO,
@@ -469,7 +476,7 @@ def match_predictions(
     if not 0.0 <= limits.radius_px <= _MAX_PIXEL_PX:
         raise BadRequest(
             f"a search radius of {limits.radius_px:g} px is not within 0 to {_MAX_PIXEL_PX:g} px",
-            hint="give a radius of 0 to 1e9 px",
+            hint="give a finite search radius, such as 40 px",
         )
     if not ORB.is_kind_of(image.descriptors):
         return _match_by_numpy(predicted, image, limits)
@@ -493,7 +500,8 @@ def _make_near_request(
 ) -> tuple[_NearRequest, list[npt.NDArray[Any]]]:
     """Return a request for the native core, and the arrays that it points to, which must outlive the call.
 
-    *predicted* are the arrays of `PredictedFeatures`, aligned; none where the core predicts the features.
+    *predicted* are the arrays of `PredictedFeatures`, aligned.  Where the core predicts the features itself,
+    there are none, and *predicted_count* is 0.
     """
     arrays = _align_arrays(image.pixels, image.orientations, image.sizes, descriptors=image.descriptors)
     arrays.append(aligned(image.distinctiveness, np.int32))
@@ -508,7 +516,7 @@ def _make_near_request(
         *predicted_addresses,
         *map(address_of, arrays),
         *map(float, thresholds),
-        int(min(max(max_distance, -1), _ORB_DISTANCE_LIMIT)),
+        int(min(max(max_distance, -1), _MAX_ORB_DISTANCE)),
     )
     return request, arrays
 
@@ -518,7 +526,7 @@ def _call_matcher(
 ) -> tuple[Rows, Rows]:
     """Call a matching function of the native core; return the rows that match on both sides.
 
-    There are none if the core rejects a size.
+    There are none if the core refuses a size: more than 2^24 rows.
     """
     rows, features = np.empty((2, min(predicted_count, feature_count)), dtype=np.int64)
     workspace = _WORKSPACE.words(11 * predicted_count + 12 * feature_count + _GRID_WORDS)
@@ -529,7 +537,8 @@ def _call_matcher(
 def _thresholds(limits: GuidedMatchLimits, image: Features) -> tuple[float, float, float, float, float, int]:
     """Return the six *limits* in the order in which the native core's request has them.
 
-    If the features of *image* have no orientations, or no sizes, the limit of these is one that all meet.
+    If the features of *image* have no orientations, or no sizes, the limit of these is an infinite one, which
+    every feature passes.
     """
     return (
         limits.radius_px,
@@ -644,12 +653,13 @@ def fit_pose(
         camera: Its intrinsics.
         T_camera_world: ``(4, 4)``, the initial pose.
         cauchy: Distance, in standard deviations, at which an observation has half its weight.
-        gate2: Squared distance, in variances, beyond which an observation is an outlier; 11.3 keeps 99 % of
-            Gaussian observations of three numbers.
+        gate2: Squared distance of pixel and depth from their prediction, in variances, beyond which an
+            observation is an outlier; 11.3 keeps 99 % of Gaussian observations of three numbers, and more of
+            those without depth, which have two.
 
     Returns:
-        None where the observations do not determine the pose, where a number is not finite, or where it is
-        beyond what cameras measure: 1e9 m, 1e9 px, depths of 1 km.
+        None where the observations do not determine the pose, and where any number of any observation is not
+        finite, or beyond its limit: 1e9 m for a point, 1e9 px for a pixel, 1 km for a depth.
 
     Raises:
         BadRequest: Shapes do not fit.
@@ -692,16 +702,16 @@ def _make_fit_request(
     upper_triangles = observed.covariances.reshape(-1, 9)[:, (0, 1, 2, 4, 5, 8)]
     measured = observed.pixels, observed.pixel_sigmas_px, observed.depths_m, observed.depth_sigmas_m
     arrays = [aligned(array, np.float64) for array in (observed.points, upper_triangles, *measured)]
-    points, spreads, pixels, pixels_px, depths_m, depths_dev = map(address_of, arrays)
+    points, point_covariances, pixels, pixel_sigmas_px, depths_m, depth_sigmas_m = map(address_of, arrays)
     request = _FitRequest(
         abi=_ABI,
         rows=len(observed.points),
         points=points,
-        spreads=spreads,
+        point_covariances=point_covariances,
         pixels=pixels,
-        pixels_px=pixels_px,
+        pixel_sigmas_px=pixel_sigmas_px,
         depths_m=depths_m,
-        depths_dev=depths_dev,
+        depth_sigmas_m=depth_sigmas_m,
         fx=camera.fx,
         fy=camera.fy,
         cx=camera.cx,
@@ -728,8 +738,9 @@ def fit_readout_change(
 
     Args:
         observed: Inliers of one image.
-        displacements: ``(n, 3)`` metres for each second that the readout takes longer, camera axes: the
-            displacement of the landmark in the map minus that of its measured point.
+        displacements: ``(n, 3)`` metres per second, camera axes.  If the readout time is wrong, the landmark
+            in the map and its point measured by this image are both in a wrong place.  This is the derivative
+            of the landmark's position by the readout time minus that of the measured point.
         camera: Intrinsics.
         T_camera_world: ``(4, 4)``, the pose that fits.
         cauchy: Distance, in standard deviations, at which an observation has half its weight.
