@@ -168,7 +168,8 @@ class MapGraph:
 
     def segment_of(self, i: int) -> Segment:
         """Return the segment of keyframe *i*, whose robot was not forgotten."""
-        return self.segments[int(self.segment_rows[i])]
+        # This is called most often of all, and the view of `segment_rows` would take twice the time.
+        return self.segments[int(self._tables["segment_rows"][i])]
 
     def find_segment(self, robot: str, number: int) -> Segment | None:
         """Return segment *number* of a robot, None if there is none or it has no keyframes left."""
@@ -180,7 +181,8 @@ class MapGraph:
 
     def segment_pair_of(self, edge: LoopEdge) -> tuple[int, int]:
         """Return the rows of the segments of both ends of a loop closure, the lower row first."""
-        row_a, row_b = int(self.segment_rows[edge.a]), int(self.segment_rows[edge.b])
+        rows = self.segment_rows
+        row_a, row_b = int(rows[edge.a]), int(rows[edge.b])
         return min(row_a, row_b), max(row_a, row_b)
 
     def root_component(self) -> int:
@@ -243,7 +245,7 @@ class MapGraph:
         A pair is missing at an end of the segment.  In the segment of a stored version, whose keyframes are
         not consecutive, there is no pair at all.
         """
-        segment = self.segments[self.segment_rows[i]]
+        segment = self.segment_of(i)
         if segment.is_from_version:
             return []
         position, ids = int(self.positions[i]), segment.keyframes
@@ -454,7 +456,8 @@ class MapGraph:
                 return self._accept(decision.numbers)
             case RejectEdges():
                 edges = [self._reject(number) for number in decision.numbers]
-                if any(self.segment_rows[edge.a] != self.segment_rows[edge.b] for edge in edges):
+                rows = self.segment_rows
+                if any(rows[edge.a] != rows[edge.b] for edge in edges):
                     self._update_components()
                     self._drop_pair_consistency()
                 return [LoopClosureRejected(a=edge.a, b=edge.b, reason=decision.reason) for edge in edges]
@@ -617,8 +620,7 @@ class MapGraph:
 
         for edge in self.edges.values():
             if edge.state == "accepted":
-                row_a = find_root(int(self.segment_rows[edge.a]))
-                row_b = find_root(int(self.segment_rows[edge.b]))
+                row_a, row_b = (find_root(row) for row in self.segment_pair_of(edge))
                 parent[max(row_a, row_b)] = min(row_a, row_b)
         for row, segment in enumerate(self.segments):
             segment.component = find_root(row)
