@@ -507,159 +507,7 @@ class MonocularTracker:
         """The map of each segment by its number."""
         return {number: segment.map for number, segment in self._segments.items()}
 
-    # --- Join segments, and close loops ---
-
-    def _find_join(self) -> Generator[PoseQuery, QueryAnswer, None]:
-        """Ask for the place of the last frame in other segments; join two once two measurements agree.
-
-        Two measurements are compared if they are of the same other segment and no measurement lies between
-        them.
-        """
-        last, present = self._state.last, self._state.segment
-        assert last is not None
-        best = match_other_segments(self._maps, last.view.place_vector, last.view.features, present)
-        similarity = yield from self._measure_similarity(last, best)
-        if similarity is None:
-            return
-        # Move the newer of the two segments into the older one, whose poses and unit stay as they are.
-        if similarity.segment < present:
-            self._join(present, similarity, self._present.reference)
-        else:
-            back = similarity.inverted(present, self._present.reference)
-            self._join(similarity.segment, back, similarity.keyframe)
-
-    def _find_loop(self) -> Generator[PoseQuery, QueryAnswer, None]:
-        """Ask for the place of a new keyframe among older ones; close a loop once two measurements agree."""
-        # 1. Choose older keyframes that share few landmarks with the new one.
-        state, own = self._state, self._present.map
-        assert state.last is not None
-        newest = own.keyframe_count - 1
-        shared = own.count_shared_landmarks(newest)[: max(0, newest - _LOOP_AGE_KEYFRAMES)]
-        apart = np.flatnonzero(shared < MIN_SHARED_LANDMARKS)
-        if not len(apart) or newest < state.next_loop_keyframe:
-            return
-        view = state.last.view
-        similar = own.rank_by_similarity(view.place_vector, _LOOP_CANDIDATES, apart)
-        keyframes = [(state.segment, keyframe) for keyframe in similar]
-        # 2. Measure where the new keyframe lies by that of the older ones with the most matches.
-        best = match_candidates(self._maps, keyframes, view.features)[0]
-        similarity = yield from self._measure_similarity(state.last, best)
-        if similarity is None:
-            return
-        # 3. Bend the map between the two keyframes, fuse the landmarks of both places, and adjust all.
-        self._state = replace(
-            self._state,
-            T_next_last=scaled(self._state.T_next_last, similarity.scale),
-            next_loop_keyframe=newest + _LOOP_AGE_KEYFRAMES,
-        )
-        self._plugins.forget_poses()
-        self._merge_places(similarity.keyframe, newest, similarity)
-        self._present.length_factor *= similarity.scale
-        self.loop_scales.append(similarity.scale)
-
-    def _measure_similarity(
-        self, posed: PosedView, best: Candidate
-    ) -> Generator[PoseQuery, QueryAnswer, Similarity | None]:
-        """Measure where the present segment lies by the place of a frame at an older or another keyframe.
-
-        Args:
-            posed: The frame with its pose in the present segment.
-            best: The keyframe, and the matches of its landmarks with the frame.
-
-        Returns:
-            The similarity, if the measurement before this one is of the same segment and agrees with it.
-            Otherwise None; a new measurement is kept in the state for the comparison with the next one.
-        """
-        # 1. Solve and verify the pose by the keyframe.
-        count, segment = len(best.matches), self._segments[best.segment]
-        if count < CLEAR_INLIERS:
-            return None
-        answer = yield self._make_query(posed.view, best.matches, "segment")
-        if not self._is_clear(answer, count):
-            return None
-        there, _ = self._verify(segment, posed.view, answer, count, best.keyframe)
-        if there is None:
-            return None
-        # 2. Measure the scale by the depths of landmarks in both maps.
-        scale = measure_scale(posed, self._present.map, there, segment.map, self.options.min_inliers)
-        if scale is None:
-            return None
-        # 3. Keep the measurement as the candidate, and compare it with the candidate before it.
-        measured = Similarity(
-            segment=best.segment,
-            keyframe=best.keyframe,
-            T=inverse(there.T_camera_world) @ scaled(posed.T_camera_world, scale),
-            scale=scale,
-        )
-        previous = self._state.candidate
-        self._state = replace(self._state, candidate=measured)
-        if previous is None or previous.segment != best.segment:
-            return None
-        centre, depth = inverse(posed.T_camera_world)[:3, 3], segment.map.median_depth(best.keyframe)
-        return measured if previous.agrees_with(measured, centre, depth) else None
-
-    def _join(self, segment: int, similarity: Similarity, keyframe: int) -> None:
-        """Move all of *segment*, the newer one, into an older one, which keeps its frame and its unit.
-
-        Args:
-            segment: Number of the newer segment.
-            similarity: Where it lies in the older one.
-            keyframe: Keyframe of the newer segment that shows the same place as ``similarity.keyframe``, a
-                keyframe of the older one.
-        """
-        newer, into = self._segments.pop(segment), self._segments[similarity.segment]
-        newer.move(similarity.T, similarity.scale)
-        first_keyframe, first_landmark = into.append(newer)
-        start = self._T_world_start
-        T_into_segment = start @ similarity.T @ scaled(inverse(start), similarity.scale)
-        self.joins.append(Join(segment, similarity.segment, T_into_segment, similarity.scale))
-        if segment == self._state.segment:
-            self._state = replace(self._state, segment=similarity.segment)
-            into.set_reference(newer.reference + first_keyframe)
-            self._move_state(similarity.T, similarity.scale, first_landmark)
-        self._merge_places(similarity.keyframe, first_keyframe + keyframe)
-
-    def _move_state(self, T_new_old: Array, scale: float, first_landmark: int = 0) -> None:
-        """Express the last pose in another frame and unit after its segment was moved or appended.
-
-        Args:
-            T_new_old: ``(4, 4)``, applied after the lengths are multiplied.
-            scale: Factor of all lengths.
-            first_landmark: Number of the segment's first landmark in the map that it was appended to.
-        """
-        state = self._state
-        last = state.last
-        if last is not None:
-            last = replace(
-                last,
-                T_camera_world=scaled(last.T_camera_world, scale) @ inverse(T_new_old),
-                landmarks=shift_landmarks(last.landmarks, first_landmark),
-            )
-        self._state = replace(state, T_next_last=scaled(state.T_next_last, scale), last=last)
-        self._plugins.forget_poses()
-
-    def _merge_places(self, older: int, newer: int, bend_by: Similarity | None = None) -> None:
-        """Fuse the landmarks around two keyframes of one place, and adjust the whole present map.
-
-        With *bend_by*, where the newer keyframe lies by the older one, the map between the two is bent
-        before, so that the newer keyframe is in its place.  The last pose moves with the reference keyframe.
-        """
-        own, reference, last = self._present.map, self._present.reference, self._state.last
-        T_camera_reference = None
-        if last is not None:
-            T_camera_reference = last.T_camera_world @ inverse(own.keyframes[reference].T_camera_world)
-        if bend_by is not None:
-            own.bend(older, newer, bend_by.T, bend_by.scale)
-        for keyframe in own.local_keyframes(newer):
-            own.fuse(keyframe, own.local_landmarks(older), VERIFY_RADIUS_PX)
-        own.adjust_around(newer)
-        own.adjust_all(iterations=_MERGE_ITERATIONS)
-        if last is not None and T_camera_reference is not None:
-            T_camera_world = T_camera_reference @ own.keyframes[reference].T_camera_world
-            last = replace(last, T_camera_world=T_camera_world)
-        self._state = replace(self._state, last=last, candidate=None)
-
-    # --- Solve and verify ---
+    # --- Query and verify ---
 
     def _make_query(
         self, view: MonocularView, matches: Matches, against: Literal["map", "frame", "keyframe", "segment"]
@@ -903,3 +751,155 @@ class MonocularTracker:
             scale="up to scale",
             features=self._raw,
         )
+
+    # --- Join segments, and close loops ---
+
+    def _find_join(self) -> Generator[PoseQuery, QueryAnswer, None]:
+        """Ask for the place of the last frame in other segments; join two once two measurements agree.
+
+        Two measurements are compared if they are of the same other segment and no measurement lies between
+        them.
+        """
+        last, present = self._state.last, self._state.segment
+        assert last is not None
+        best = match_other_segments(self._maps, last.view.place_vector, last.view.features, present)
+        similarity = yield from self._measure_similarity(last, best)
+        if similarity is None:
+            return
+        # Move the newer of the two segments into the older one, whose poses and unit stay as they are.
+        if similarity.segment < present:
+            self._join(present, similarity, self._present.reference)
+        else:
+            back = similarity.inverted(present, self._present.reference)
+            self._join(similarity.segment, back, similarity.keyframe)
+
+    def _find_loop(self) -> Generator[PoseQuery, QueryAnswer, None]:
+        """Ask for the place of a new keyframe among older ones; close a loop once two measurements agree."""
+        # 1. Choose older keyframes that share few landmarks with the new one.
+        state, own = self._state, self._present.map
+        assert state.last is not None
+        newest = own.keyframe_count - 1
+        shared = own.count_shared_landmarks(newest)[: max(0, newest - _LOOP_AGE_KEYFRAMES)]
+        apart = np.flatnonzero(shared < MIN_SHARED_LANDMARKS)
+        if not len(apart) or newest < state.next_loop_keyframe:
+            return
+        view = state.last.view
+        similar = own.rank_by_similarity(view.place_vector, _LOOP_CANDIDATES, apart)
+        keyframes = [(state.segment, keyframe) for keyframe in similar]
+        # 2. Measure where the new keyframe lies by that of the older ones with the most matches.
+        best = match_candidates(self._maps, keyframes, view.features)[0]
+        similarity = yield from self._measure_similarity(state.last, best)
+        if similarity is None:
+            return
+        # 3. Bend the map between the two keyframes, fuse the landmarks of both places, and adjust all.
+        self._state = replace(
+            self._state,
+            T_next_last=scaled(self._state.T_next_last, similarity.scale),
+            next_loop_keyframe=newest + _LOOP_AGE_KEYFRAMES,
+        )
+        self._plugins.forget_poses()
+        self._merge_places(similarity.keyframe, newest, similarity)
+        self._present.length_factor *= similarity.scale
+        self.loop_scales.append(similarity.scale)
+
+    def _measure_similarity(
+        self, posed: PosedView, best: Candidate
+    ) -> Generator[PoseQuery, QueryAnswer, Similarity | None]:
+        """Measure where the present segment lies by the place of a frame at an older or another keyframe.
+
+        Args:
+            posed: The frame with its pose in the present segment.
+            best: The keyframe, and the matches of its landmarks with the frame.
+
+        Returns:
+            The similarity, if the measurement before this one is of the same segment and agrees with it.
+            Otherwise None; a new measurement is kept in the state for the comparison with the next one.
+        """
+        # 1. Solve and verify the pose by the keyframe.
+        count, segment = len(best.matches), self._segments[best.segment]
+        if count < CLEAR_INLIERS:
+            return None
+        answer = yield self._make_query(posed.view, best.matches, "segment")
+        if not self._is_clear(answer, count):
+            return None
+        there, _ = self._verify(segment, posed.view, answer, count, best.keyframe)
+        if there is None:
+            return None
+        # 2. Measure the scale by the depths of landmarks in both maps.
+        scale = measure_scale(posed, self._present.map, there, segment.map, self.options.min_inliers)
+        if scale is None:
+            return None
+        # 3. Keep the measurement as the candidate, and compare it with the candidate before it.
+        measured = Similarity(
+            segment=best.segment,
+            keyframe=best.keyframe,
+            T=inverse(there.T_camera_world) @ scaled(posed.T_camera_world, scale),
+            scale=scale,
+        )
+        previous = self._state.candidate
+        self._state = replace(self._state, candidate=measured)
+        if previous is None or previous.segment != best.segment:
+            return None
+        centre, depth = inverse(posed.T_camera_world)[:3, 3], segment.map.median_depth(best.keyframe)
+        return measured if previous.agrees_with(measured, centre, depth) else None
+
+    def _join(self, segment: int, similarity: Similarity, keyframe: int) -> None:
+        """Move all of *segment*, the newer one, into an older one, which keeps its frame and its unit.
+
+        Args:
+            segment: Number of the newer segment.
+            similarity: Where it lies in the older one.
+            keyframe: Keyframe of the newer segment that shows the same place as ``similarity.keyframe``, a
+                keyframe of the older one.
+        """
+        newer, into = self._segments.pop(segment), self._segments[similarity.segment]
+        newer.move(similarity.T, similarity.scale)
+        first_keyframe, first_landmark = into.append(newer)
+        start = self._T_world_start
+        T_into_segment = start @ similarity.T @ scaled(inverse(start), similarity.scale)
+        self.joins.append(Join(segment, similarity.segment, T_into_segment, similarity.scale))
+        if segment == self._state.segment:
+            self._state = replace(self._state, segment=similarity.segment)
+            into.set_reference(newer.reference + first_keyframe)
+            self._move_state(similarity.T, similarity.scale, first_landmark)
+        self._merge_places(similarity.keyframe, first_keyframe + keyframe)
+
+    def _move_state(self, T_new_old: Array, scale: float, first_landmark: int = 0) -> None:
+        """Express the last pose in another frame and unit after its segment was moved or appended.
+
+        Args:
+            T_new_old: ``(4, 4)``, applied after the lengths are multiplied.
+            scale: Factor of all lengths.
+            first_landmark: Number of the segment's first landmark in the map that it was appended to.
+        """
+        state = self._state
+        last = state.last
+        if last is not None:
+            last = replace(
+                last,
+                T_camera_world=scaled(last.T_camera_world, scale) @ inverse(T_new_old),
+                landmarks=shift_landmarks(last.landmarks, first_landmark),
+            )
+        self._state = replace(state, T_next_last=scaled(state.T_next_last, scale), last=last)
+        self._plugins.forget_poses()
+
+    def _merge_places(self, older: int, newer: int, bend_by: Similarity | None = None) -> None:
+        """Fuse the landmarks around two keyframes of one place, and adjust the whole present map.
+
+        With *bend_by*, where the newer keyframe lies by the older one, the map between the two is bent
+        before, so that the newer keyframe is in its place.  The last pose moves with the reference keyframe.
+        """
+        own, reference, last = self._present.map, self._present.reference, self._state.last
+        T_camera_reference = None
+        if last is not None:
+            T_camera_reference = last.T_camera_world @ inverse(own.keyframes[reference].T_camera_world)
+        if bend_by is not None:
+            own.bend(older, newer, bend_by.T, bend_by.scale)
+        for keyframe in own.local_keyframes(newer):
+            own.fuse(keyframe, own.local_landmarks(older), VERIFY_RADIUS_PX)
+        own.adjust_around(newer)
+        own.adjust_all(iterations=_MERGE_ITERATIONS)
+        if last is not None and T_camera_reference is not None:
+            T_camera_world = T_camera_reference @ own.keyframes[reference].T_camera_world
+            last = replace(last, T_camera_world=T_camera_world)
+        self._state = replace(self._state, last=last, candidate=None)

@@ -521,72 +521,6 @@ class Tracker:
         most = self.options.max_matches
         return most if self._frame.stereo is None else min(most, _MAX_STEREO_MATCHES)
 
-    # --- Join segments ---
-
-    def _find_join(self, posed: PosedView) -> Generator[PoseQuery, QueryAnswer, None]:
-        """Ask for the place of a tracked frame in other segments; join two once two measurements agree.
-
-        Two measurements are compared if they are of the same other segment and no measurement lies between
-        them.
-        """
-        # 1. Solve and verify the pose against the keyframe of another segment with the most matches.
-        view, present = posed.view, self._state.segment
-        best = match_other_segments(self._segments, view.place_vector, view.features, present)
-        count = len(best.matches)
-        if count < CLEAR_INLIERS:
-            return
-        attempt = self._attempt_at(best, "segment")
-        T_other_camera, answer = yield from self._solve(view, attempt)
-        if T_other_camera is None or not answer.is_clear(min(count, self._max_matches)):
-            return
-        there = self._verify(view, T_other_camera, attempt, answer)
-        if there is None:
-            return
-        # 2. Keep the measurement as the candidate; go on only if the candidate before it agrees.
-        T_other_present = orthonormalise(there.T_world_camera @ inverse(posed.T_world_camera))
-        previous = self._state.join_candidate
-        self._state = replace(self._state, join_candidate=(best.segment, T_other_present))
-        if previous is None or previous[0] != best.segment:
-            return
-        apart_m, apart_deg = pose_difference(previous[1], T_other_present)
-        if apart_m > _MAX_JOIN_DIFFERENCE_M or apart_deg > MAX_JOIN_DIFFERENCE_DEG:
-            return
-        # 3. Move the newer of the two segments into the older one, whose poses stay as they are.
-        if best.segment < present:
-            self._join(present, best.segment, T_other_present)
-        else:
-            self._join(best.segment, present, inverse(T_other_present))
-
-    def _join(self, segment: int, into: int, T_into_segment: Array) -> None:
-        """Move all of *segment*, the newer one, into the map of *into*, which keeps its world.
-
-        *T_into_segment* ``(4, 4)`` is the pose of the newer segment's world in that of the older one.
-        """
-        segment_map = self._segments.pop(segment)
-        segment_map.move(T_into_segment)
-        first_landmark = self._segments[into].append(segment_map)
-        self.joins.append(Join(segment, into, T_into_segment))
-        if segment == self._state.segment and self._state.last is not None:
-            self._state = replace(self._state, segment=into)
-            self._move_state(T_into_segment, first_landmark)
-        else:
-            self._state = replace(self._state, join_candidate=None)
-
-    def _move_state(self, T_new_old: Array, first_landmark: int = 0) -> None:
-        """Express the last pose in another frame after its segment was moved or appended.
-
-        Args:
-            T_new_old: ``(4, 4)``.
-            first_landmark: Number of the segment's first landmark in the map that it was appended to.
-        """
-        T_world_camera = orthonormalise(T_new_old @ self._state.T_world_camera)
-        last = self._state.last
-        if last is not None:
-            landmarks = shift_landmarks(last.landmarks, first_landmark)
-            last = replace(last, T_world_camera=T_world_camera, landmarks=landmarks)
-        self._state = replace(self._state, T_world_camera=T_world_camera, last=last, join_candidate=None)
-        self._plugins.forget_poses()
-
     # --- Verify ---
 
     def _is_plausible(self, T_world_camera: Array) -> bool:
@@ -844,3 +778,69 @@ class Tracker:
             features=self._raw.features,
             reason="" if is_joined else NOT_JOINED,
         )
+
+    # --- Join segments ---
+
+    def _find_join(self, posed: PosedView) -> Generator[PoseQuery, QueryAnswer, None]:
+        """Ask for the place of a tracked frame in other segments; join two once two measurements agree.
+
+        Two measurements are compared if they are of the same other segment and no measurement lies between
+        them.
+        """
+        # 1. Solve and verify the pose against the keyframe of another segment with the most matches.
+        view, present = posed.view, self._state.segment
+        best = match_other_segments(self._segments, view.place_vector, view.features, present)
+        count = len(best.matches)
+        if count < CLEAR_INLIERS:
+            return
+        attempt = self._attempt_at(best, "segment")
+        T_other_camera, answer = yield from self._solve(view, attempt)
+        if T_other_camera is None or not answer.is_clear(min(count, self._max_matches)):
+            return
+        there = self._verify(view, T_other_camera, attempt, answer)
+        if there is None:
+            return
+        # 2. Keep the measurement as the candidate; go on only if the candidate before it agrees.
+        T_other_present = orthonormalise(there.T_world_camera @ inverse(posed.T_world_camera))
+        previous = self._state.join_candidate
+        self._state = replace(self._state, join_candidate=(best.segment, T_other_present))
+        if previous is None or previous[0] != best.segment:
+            return
+        apart_m, apart_deg = pose_difference(previous[1], T_other_present)
+        if apart_m > _MAX_JOIN_DIFFERENCE_M or apart_deg > MAX_JOIN_DIFFERENCE_DEG:
+            return
+        # 3. Move the newer of the two segments into the older one, whose poses stay as they are.
+        if best.segment < present:
+            self._join(present, best.segment, T_other_present)
+        else:
+            self._join(best.segment, present, inverse(T_other_present))
+
+    def _join(self, segment: int, into: int, T_into_segment: Array) -> None:
+        """Move all of *segment*, the newer one, into the map of *into*, which keeps its world.
+
+        *T_into_segment* ``(4, 4)`` is the pose of the newer segment's world in that of the older one.
+        """
+        segment_map = self._segments.pop(segment)
+        segment_map.move(T_into_segment)
+        first_landmark = self._segments[into].append(segment_map)
+        self.joins.append(Join(segment, into, T_into_segment))
+        if segment == self._state.segment and self._state.last is not None:
+            self._state = replace(self._state, segment=into)
+            self._move_state(T_into_segment, first_landmark)
+        else:
+            self._state = replace(self._state, join_candidate=None)
+
+    def _move_state(self, T_new_old: Array, first_landmark: int = 0) -> None:
+        """Express the last pose in another frame after its segment was moved or appended.
+
+        Args:
+            T_new_old: ``(4, 4)``.
+            first_landmark: Number of the segment's first landmark in the map that it was appended to.
+        """
+        T_world_camera = orthonormalise(T_new_old @ self._state.T_world_camera)
+        last = self._state.last
+        if last is not None:
+            landmarks = shift_landmarks(last.landmarks, first_landmark)
+            last = replace(last, T_world_camera=T_world_camera, landmarks=landmarks)
+        self._state = replace(self._state, T_world_camera=T_world_camera, last=last, join_candidate=None)
+        self._plugins.forget_poses()
