@@ -167,8 +167,10 @@ class MapGraph:
         return number in self.edges and self.edges[number].state == "pending"
 
     def segment_of(self, i: int) -> Segment:
-        """Return the segment of keyframe *i*, whose robot was not forgotten."""
-        # This is called most often of all, and the view of `segment_rows` would take twice the time.
+        """Return the segment of keyframe *i*, whose robot was not forgotten.
+
+        This is called most often of all, so it reads the table and not the slower view `segment_rows`.
+        """
         return self.segments[int(self._tables["segment_rows"][i])]
 
     def find_segment(self, robot: str, number: int) -> Segment | None:
