@@ -156,7 +156,7 @@ class MapGraph:
         """``(n,)``: whether the encoded features of each keyframe are kept, so that others can match them."""
         return self._tables["has_features"][: self._size]
 
-    # --- Queries ---
+    # --- Queries; the most frequent one, `segment_of`, reads its table without a view, which is faster ---
 
     def exists(self, i: int) -> bool:
         """Return whether *i* is the id of a keyframe whose robot was not forgotten."""
@@ -167,10 +167,7 @@ class MapGraph:
         return number in self.edges and self.edges[number].state == "pending"
 
     def segment_of(self, i: int) -> Segment:
-        """Return the segment of keyframe *i*, whose robot was not forgotten.
-
-        This is called most often of all, so it reads the table and not the slower view `segment_rows`.
-        """
+        """Return the segment of keyframe *i*, whose robot was not forgotten."""
         return self.segments[int(self._tables["segment_rows"][i])]
 
     def find_segment(self, robot: str, number: int) -> Segment | None:
