@@ -24,6 +24,7 @@ from detect_secrets.settings import transient_settings
 SOURCES = ("rse_pf", "client_sdk", "lambda_pnp", "stacks", "scripts", "app.py")
 
 HARMLESS: Mapping[tuple[str, str], str] = {
+    ("client_sdk/concurrency/user_callbacks.py", "B105"): "the name of a function in reports",
     ("lambda_pnp/keys.py", "B310"): "the address of the bucket, from the stack, always https",
     ("rse_pf/aws/fleet/instance.py", "B105"): "seconds that a metadata token lives",
     ("rse_pf/aws/fleet/instance.py", "B310"): "the instance's own metadata, a literal address",
@@ -32,6 +33,10 @@ HARMLESS: Mapping[tuple[str, str], str] = {
         "rse_pf/server/sandbox/isolation.py",
         "B108",
     ): "what an environment does not see; its own scratch folder",
+    (
+        "rse_pf/server/live_map/map_server/process.py",
+        "B104",
+    ): "an address that is read: the server found out which address of its machine others reach",
     ("rse_pf/cli/main.py", "B105"): "help of the verb named token",
     ("rse_pf/data_server/app.py", "B106"): "an empty default",
     ("rse_pf/local/control/operator_port.py", "B105"): "an empty default",
