@@ -523,7 +523,7 @@ class MapServer:
                 self._send_update(payload)
 
     def service_state(self) -> str:
-        """Return what the map does now: ``live``, ``waiting for the store``, or ``moving`` to another server."""
+        """Return what the map does: ``live``, ``waiting for the store``, or ``moving`` to another server."""
         if self._is_closing:
             return "moving"
         return _WAITING_FOR_STORE if self._is_waiting_for_store else "live"
