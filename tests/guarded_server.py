@@ -93,6 +93,13 @@ class GuardedServer:
             self._process.wait()
             self._process = None
 
+    def drain(self) -> None:
+        """Let it drain and exit by itself, as an operator does: its recording is then complete."""
+        assert self._process is not None
+        self._process.terminate()
+        self._process.wait(_START_S)
+        self._process = None
+
     def restart(self, port: int = 0) -> None:
         """Kill it and start it again on the same folder."""
         self.stop()

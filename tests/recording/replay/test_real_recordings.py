@@ -64,6 +64,7 @@ def test_commands_of_two_runs_of_a_server_are_equal_to_the_byte_and_hold_no_toke
         home.mkdir()
         with GuardedServer(home, recording={"folder": str(recordings)}) as server:
             asyncio.run(all_robots(server))
+            server.drain()
 
     with LimitedReplay() as replay:
         for folder in (recordings, on_robots):
