@@ -194,10 +194,21 @@ def _open_single(
     close: Callable[[], None] | None = None,
     span_s: tuple[float, float] | None = None,
 ) -> FrameSource:
-    """Check the facts of one camera, and return its frames.
+    """Check the facts of a source that has one camera, and return its undistorted frames.
+
+    Only *facts* are checked.  A frame that is not later than the frame before is left out.
+
+    Args:
+        facts: What is known of the source before its first image is read.
+        frames: Yields the images, not yet undistorted; called once, with the log that takes later doubts.
+        lens: Intrinsics by which the images are undistorted.
+        rate_hz: Frames per second to which the frames are thinned; None yields all.
+        has_depth: Whether the frames have depth, as the `FrameSource` will state.
+        close: Closes the device or the file; called when the `FrameSource` is closed, or before an error.
+        span_s: First and last time stamp of the frames, s; None takes the span of *facts*.
 
     Raises:
-        UsageError: Two facts contradict each other; the source is closed then.
+        UsageError: Two of the facts contradict each other.
     """
     log = _check(facts, close)
     thinning = None if rate_hz is None else Thinning(rate_hz)

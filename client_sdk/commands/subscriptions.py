@@ -160,7 +160,10 @@ class RobotSubscriptions:
 
 
 class BlockingUpdates(AutoClose):
-    """Iterate over the updates of one topic in a program without asyncio; see `Updates`."""
+    """Iterate over the updates of one topic in a program without asyncio, as pairs of key and value.
+
+    The end of a ``for`` loop does not close the subscription; `close` or the end of a ``with`` block does.
+    """
 
     def __init__(self, updates: Updates, wait: Callable[[Coroutine[Any, Any, Any]], Any]) -> None:
         """Wrap *updates*; *wait* runs a coroutine in the event loop of their robot and returns its result."""

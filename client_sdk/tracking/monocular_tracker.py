@@ -692,10 +692,12 @@ class MonocularTracker:
             segment.set_reference(number)
             keyframe = segment.map.keyframes[number]
             posed = replace(posed, T_camera_world=keyframe.T_camera_world, landmarks=keyframe.landmarks)
-        # 3. Keep the frame as the last one, from which the next frame is tracked.
-        if last is None or is_keyframe:  # the camera was lost before, or the map was adjusted
+        # 3. Let the user's motion model forget earlier poses that no longer fit the pose of this frame: the
+        # camera was lost before, or the map was adjusted.
+        if last is None or is_keyframe:
             self._plugins.forget_poses()
         self._plugins.add_pose(self._frame.timestamp_s, inverse(posed.T_camera_world))
+        # 4. Store the frame as the last one, from which the next frame is tracked.
         self._state = replace(
             self._state,
             last=posed,

@@ -113,7 +113,8 @@ def adjust_stereo(segment_map: KeyframeMap, f_baseline: float) -> StereoAdjustme
     landmark_count, observed = _collect_observations(segment_map)
     if landmark_count < _MIN_LANDMARKS:
         return None
-    # 1. Adjust twice, with the noise of depths at the expected depths.
+    # 1. Adjust poses, points and the disparity offset twice; the noise of a depth is evaluated at the
+    # geometric mean of the measured depth and the depth that the poses and points predict.
     old = segment_map.poses
     T_camera_world = inverse(old)
     points = triangulate_landmarks(observed, T_camera_world, landmark_count)
@@ -191,7 +192,8 @@ def _set_depth_noise(
 ) -> DriveObservations:
     """Return observations with the noise of stereo depths, and with the prior of the disparity offset.
 
-    The noise is that of disparities, evaluated as `depths_for_noise` says at these poses and points.
+    The noise of a depth is the constant noise of disparities, converted at the geometric mean of the measured
+    depth and the depth that these poses and points predict (`depths_for_noise`).
     """
     T = T_camera_world[observed.keyframes]
     expected_m = np.einsum("ni,ni->n", T[:, 2, :3], points[observed.landmarks]) + T[:, 2, 3]

@@ -308,8 +308,9 @@ class Tracker:
     def prepare(self, frame: Frame) -> PoseQuery | TrackedFrame:
         """Take the next frame; return a query for its pose, or its result if no query is needed.
 
-        The first frame with enough features is the start and needs no query; a frame without enough matches
-        is lost without a query.
+        A frame needs no query if its matches are too few, or if there is no map yet.  Such a frame is lost,
+        or begins a segment: the first segment if ``min_inliers`` of its features have depth, a further
+        segment after more than ``segment_after`` unrecognised frames.
 
         Raises:
             UsageError: The last query was not answered yet, or a user's feature extractor failed.
