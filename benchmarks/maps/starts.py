@@ -1,0 +1,399 @@
+"""Track one lens without depth from its first frame: where it must start, and where it must not.
+
+    python -m benchmarks maps.starts ../shared/data [--only drives rest] [--seconds 60] [--seed 0]
+
+``drives``: KITTI 06 and 00 forwards, backwards and at half rate, and rendered corridors.  Bars: >= 98 % of
+the frames posed, the first pose within 8 frames, ATE (Sim(3)) <= 1.5 % of the path.
+``rest``: one image of each of five scenes is repeated at 10 Hz with shake, changes of light and noise, as it
+is and with a textured patch of 10 to 30 % of the image that moves before it.  A pose is a false start.  Bars:
+0, and at most 1 of 5 with a patch.
+``rotation``: one image of each of six scenes as a camera sees it that rotates about its centre, with the
+right intrinsics and with wrong ones (focal length 5 or 7 % off, or a distortion that is not stated).  A pose
+is a false start.  Bars: 0 and 0.
+``planes``: a camera moves past a plane 2 m away: sideways, sideways with an oblique plane, and towards it.
+The relative pose of the two views of the start is right if the translation is within 30 deg of the true one
+and the rotation within 5 deg.  Bar: 9 of 9.
+
+Frames between the two views of a start count as posed; the first posed frame is the first whose pose was
+returned at once, counted from 1.  Poses are solved in this process as the service does.  Everything is
+deterministic: n = 1, and load changes no figure.  The seed chooses images, patches, motions and corridors.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from benchmarks.frame.registry import Bar, Recordings, benchmark
+from benchmarks.frame.report import say
+from benchmarks.recorded_drives import track
+from client_sdk.datasets import Dataset, open_dataset
+from client_sdk.frontend import Frame
+from client_sdk.simulator import World, make_world, render_along, render_frames
+from client_sdk.simulator.world import DEPTH_M, HEIGHT_M, ROOM_M, Face
+from client_sdk.tracking.monocular_tracker import MonocularTracker
+from client_sdk.trajectory import Trajectory
+from rse_pf.experiments.results.trajectory_error import accuracy
+from rse_pf.geometry import Array, Camera, exp_so3, inverse, rotation_angle_deg
+from rse_pf.images import load_opencv
+
+Image = npt.NDArray[np.uint8]
+
+PARTS = ("drives", "rest", "rotation", "planes")
+SCENES = (
+    "7scenes_redkitchen", "tum_fr1_rpy_start", "euroc_mh01_start", "kitti_06_start", "rendered",
+    "nyu_dining_room",
+)  # fmt: skip
+"""Recordings of which one image is shown; ``rendered`` is a room of the simulator.  The first five are shown
+at rest, and the first three as planes."""
+RATE_HZ = 10.0  # frames per second of all sequences but those of KITTI
+
+NOISE = 2.0  # standard deviation of the noise of each pixel, in grey levels of 255
+GAIN = 0.03  # standard deviation of a frame's brightness, as a share of the scene's
+OFFSET = 2.0  # standard deviation of the level that is added to all pixels of a frame, in grey levels
+SHAKE_DEG = 0.1  # standard deviation of the rotation of a camera at rest about each axis, in each frame
+SWAY_DEG = 1.0  # amplitude of the rotation of a moving camera about each axis
+SWAY_PERIOD_S = 2.0  # of the sway about y
+PATCH_SHARES = (0.1, 0.15, 0.2, 0.25, 0.3)  # of the image, one for each scene at rest
+PATCH_SPEED_PX = (2.0, 6.0)  # slowest and fastest motion of a patch from frame to frame, along each axis
+
+ROTATION_FRAMES = 120
+ROTATION_DEG = (5.0, 15.0, 3.0)  # amplitudes about x (pitch), y (yaw) and z (roll)
+ROTATION_PERIOD_S = 6.0  # of the yaw, which turns by at most 1.6 deg from frame to frame
+WRONG_INTRINSICS = ((0.93, 0.0), (0.95, 0.0), (1.05, 0.0), (1.07, 0.0), (1.0, 0.1), (1.0, 0.2))
+"""Stated focal length as a multiple of the true one, and radial distortion k1 of the images that is not
+stated; one for each scene."""
+
+PLANE_M = 2.0  # depth of a plane in the middle of the scene's image
+PLANE_FRAMES = 40
+PLANE_PATH_M = 1.2  # distance from the first to the last frame
+OBLIQUE_DEG = (20.0, 30.0, 40.0)  # angle of an oblique plane with the image, one for each scene
+RIGHT_DIRECTION_DEG = 30.0  # largest error of the direction of a right relative pose
+RIGHT_ROTATION_DEG = 5.0  # largest error of the rotation of a right relative pose
+
+CORRIDOR_ROOMS = 5  # length of a corridor in rooms of the simulator, 5 m each
+CORRIDOR_WIDTH_M = (1.6, 3.0)  # narrowest and widest corridor
+CORRIDOR_FRAMES = 60
+CORRIDOR_SPEED_M_S = (0.5, 1.5)  # slowest and fastest drive
+PICTURE_TEXELS = 256  # side of the textures of pictures in a world; other textures have other sizes
+PICTURE_EVERY_M = 1.5  # distance of the pictures along each wall
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Scene:
+    """One image, and the camera that took it."""
+
+    name: str
+    rgb: Image
+    camera: Camera
+
+
+@benchmark(
+    Bar("drives.*.posed_percent", at_least=98.0, unit="%"),
+    Bar("drives.*.first_posed_frame", at_most=8),
+    Bar("drives.*.ate_percent", at_most=1.5, unit="% of the path"),
+    Bar("rest.false_starts", at_most=0),
+    Bar("rest_with_patch.false_starts", at_most=1),
+    Bar("rotation.false_starts", at_most=0),
+    Bar("rotation_with_wrong_intrinsics.false_starts", at_most=0),
+    Bar("planes.wrong", at_most=0),
+)
+def run_benchmark(
+    *,
+    data: Recordings,
+    only: Annotated[tuple[str, ...], "parts to measure", PARTS] = PARTS,
+    seconds: Annotated[float, "duration of each sequence at rest"] = 60.0,
+    corridors: Annotated[int, "rendered corridors"] = 10,
+    seed: Annotated[int, "chooses images, patches, motions and corridors"] = 0,
+) -> dict[str, Any]:
+    """Track the sequences of the parts."""
+    figures: dict[str, Any] = {}
+    if "drives" in only:
+        rows = figures["drives"] = {}
+        for name, frames, truth in drives(data, corridors, seed):
+            rows[name] = row_of_drive(frames, truth)
+            say(f"{name}: {rows[name]}")
+    scenes = [scene_of(data, name, seed) for name in SCENES]
+    if "rest" in only:
+        count = round(seconds * RATE_HZ)
+        still = {scene.name: resting_frames(scene, count, seed) for scene in scenes[:-1]}
+        figures["rest"] = false_starts("rest", still)
+        patched = {
+            f"{scene.name}, {share:.0%}": resting_frames(scene, count, seed, patch_of(other, scene, share))
+            for scene, other, share in zip(scenes[:-1], scenes[1:], PATCH_SHARES, strict=True)
+        }
+        figures["rest_with_patch"] = false_starts("rest with patch", patched)
+    if "rotation" in only:
+        rotating = {scene.name: rotating_frames(scene, seed) for scene in scenes}
+        figures["rotation"] = false_starts("rotation", rotating)
+        wrong = {
+            f"{scene.name}, focal length x {factor:g}, k1 {k1:g}": rotating_frames(scene, seed, factor, k1)
+            for scene, (factor, k1) in zip(scenes, np.roll(WRONG_INTRINSICS, seed, axis=0), strict=True)
+        }
+        figures["rotation_with_wrong_intrinsics"] = false_starts("rotation, wrong intrinsics", wrong)
+    if "planes" in only:
+        rows = {}
+        for scene, degrees in zip(scenes, OBLIQUE_DEG, strict=False):
+            for motion in ("sideways", f"oblique {degrees:g} deg", "towards"):
+                name = f"{scene.name}, {motion}"
+                tilt_deg = degrees if motion.startswith("oblique") else 0.0
+                rows[name] = row_of_plane(scene, tilt_deg, 2 if motion == "towards" else 0, seed)
+                say(f"plane {name}: {rows[name]}")
+        figures["planes"] = {"wrong": sum(not row["is_right"] for row in rows.values()), "rows": rows}
+    return figures
+
+
+# --- Drives ---
+
+
+def drives(data: Path, corridors: int, seed: int) -> Iterator[tuple[str, Iterable[Frame], Trajectory]]:
+    """Yield the name of each drive, its frames and its true path."""
+    for name, folder in (("KITTI 06", "kitti_06_start"), ("KITTI 00", "kitti_00_left_start")):
+        dataset = open_dataset(data / folder, camera="left", imu=False)
+        assert dataset.truth is not None
+        yield f"{name} forwards", dataset, dataset.truth
+        yield f"{name} backwards", *backwards(dataset, dataset.truth)
+        half = replace(dataset, rows=dataset.rows[::2], timestamps_s=dataset.timestamps_s[::2])
+        yield f"{name} at half rate", half, dataset.truth
+    for number in range(corridors * seed, corridors * (seed + 1)):
+        truth = corridor_path(number)
+        yield f"corridor {number}", render_along(truth, make_corridor(number), (number, 3)), truth
+
+
+def backwards(dataset: Dataset, truth: Trajectory) -> tuple[Iterator[Frame], Trajectory]:
+    """Return the frames of a recording in reverse order, at increasing times, and their true path."""
+    stamps_s = np.array(dataset.timestamps_s)
+    reversed_s = (stamps_s[0] + stamps_s[-1] - stamps_s)[::-1]
+    frames = (
+        replace(dataset.read(row), timestamp_s=float(stamp_s))
+        for row, stamp_s in zip(reversed(dataset.rows), reversed_s, strict=True)
+    )
+    return frames, Trajectory(reversed_s, truth.at(stamps_s)[::-1])
+
+
+def make_corridor(seed: int) -> World:
+    """Return a straight corridor along x with pictures on both walls, made of faces of a furnished world."""
+    world, rng = make_world(seed), np.random.default_rng([seed, 4])
+    # 1. Stretch the first three faces of the world, which are its floor, its ceiling and a wall.
+    floor, ceiling, wall = world.faces[:3]
+    half_width_m = 0.5 * rng.uniform(*CORRIDOR_WIDTH_M)
+    right, left = 0.5 * DEPTH_M - half_width_m, 0.5 * DEPTH_M + half_width_m
+    faces: list[Face] = []
+    for room in range(CORRIDOR_ROOMS):
+        begin, end = room * ROOM_M, (room + 1) * ROOM_M
+        faces += [replace(face, low=(begin, right), high=(end, left), room=room) for face in (floor, ceiling)]
+        side = replace(wall, low=(begin, 0.0), high=(end, HEIGHT_M), room=room)
+        faces += [replace(side, offset=right, sign=1), replace(side, offset=left, sign=-1)]
+    length_m, last = CORRIDOR_ROOMS * ROOM_M, CORRIDOR_ROOMS - 1
+    faces.append(
+        replace(wall, axis=0, offset=length_m, sign=-1, low=(right, 0.0), high=(left, HEIGHT_M), room=last)
+    )
+    # 2. Hang pictures of all sizes on both walls, 1 cm before them.
+    pictures = [face for face in world.faces if len(world.textures[face.texture]) == PICTURE_TEXELS]
+    for along in np.arange(0.5, length_m - PICTURE_EVERY_M, PICTURE_EVERY_M):
+        for y, sign in ((right, 1), (left, -1)):
+            side_m, x, z = rng.uniform(0.4, 1.0), along + rng.uniform(0.0, 0.5), rng.uniform(0.6, 1.4)
+            faces.append(
+                replace(
+                    pictures[int(rng.integers(len(pictures)))], axis=1, offset=y + 0.01 * sign, sign=sign,
+                    low=(x, z), high=(x + side_m, z + side_m), texel_m=side_m / PICTURE_TEXELS,
+                    room=int(x // ROOM_M),
+                )
+            )  # fmt: skip
+    return World(tuple(faces), world.textures)
+
+
+def corridor_path(seed: int) -> Trajectory:
+    """Return the path of a camera that drives along a corridor at a constant speed, and sways a little."""
+    rng = np.random.default_rng([seed, 5])
+    stamps_s = np.arange(CORRIDOR_FRAMES) / RATE_HZ
+    # x of the camera points to the right (-y of the world), y down (-z), and z along the corridor (x).
+    R_world_camera = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+    poses = swaying(CORRIDOR_FRAMES, np.full(3, SWAY_DEG), SWAY_PERIOD_S, rng)
+    poses[:, :3, :3] = R_world_camera @ poses[:, :3, :3]
+    poses[:, 0, 3] = 1.0 + rng.uniform(*CORRIDOR_SPEED_M_S) * stamps_s
+    poses[:, 1, 3] = 0.5 * DEPTH_M + rng.uniform(-0.3, 0.3) + 0.05 * np.sin(stamps_s)
+    poses[:, 2, 3] = 0.5 * HEIGHT_M + 0.01 * np.sin(3.0 * stamps_s)
+    return Trajectory(stamps_s, poses)
+
+
+def row_of_drive(frames: Iterable[Frame], truth: Trajectory) -> dict[str, Any]:
+    """Track a drive; return its frames with a pose in the first segment, and their error."""
+    tracker, first = MonocularTracker(), None
+    for frame in frames:
+        has_pose = track(tracker, frame).T_world_camera is not None
+        first = tracker.frames if first is None and has_pose else first
+    path = tracker.trajectory()
+    ate_m = accuracy(path, truth, with_scale=True).ate_m if len(path) >= 3 else np.nan
+    return {
+        "frames": tracker.frames,
+        "posed_percent": 100.0 * len(path) / tracker.frames,
+        "first_posed_frame": first,
+        "ate_percent": 100.0 * ate_m / truth.length_m,
+        "segments": len(tracker.segments),
+    }
+
+
+# --- One image, as a camera sees it that shakes, rotates, or moves past its plane ---
+
+
+def scene_of(data: Path, name: str, seed: int) -> Scene:
+    """Return an image of a recording, or of a rendered room, that the seed chooses."""
+    if name == "rendered":
+        frame = next(render_frames(seed % 3, 3, 1, 40 + seed))
+    else:
+        dataset = open_dataset(data / name, camera="left", imu=False)
+        frame = dataset.read(int(np.random.default_rng([seed, 6]).choice(dataset.rows)))
+    return Scene(name=name, rgb=frame.rgb, camera=frame.camera)
+
+
+def swaying(count: int, degrees: Array, period_s: float, rng: np.random.Generator) -> Array:
+    """Return poses ``(n, 4, 4)`` that sway about x, y and z by some degrees, with periods that differ."""
+    periods_s = period_s * np.array([1.3, 1.0, 1.7])
+    phases = 2.0 * np.pi * (np.arange(count)[:, None] / RATE_HZ / periods_s + rng.uniform(size=3))
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[:, :3, :3] = [exp_so3(each) for each in np.radians(degrees) * np.sin(phases)]
+    return poses
+
+
+def photograph(
+    scene: Scene,
+    T_scene_camera: Array,
+    number: int,
+    rng: np.random.Generator,
+    *,
+    tilt_deg: float = 0.0,
+    k1: float = 0.0,
+) -> Frame:
+    """Return the frame of a camera before the plane that shows the image of a scene, with light and noise.
+
+    Beyond its edges the image goes on as if mirrored.
+
+    Args:
+        scene: The image, as the camera sees it from the pose of identity.
+        T_scene_camera: Pose of the camera, metres.
+        number: Number of the frame, which gives its time.
+        rng: Random generator of light and noise.
+        tilt_deg: Angle of the plane with the image, about y.
+        k1: Radial distortion of the camera.
+    """
+    cv2, camera = load_opencv(), scene.camera
+    # 1. Intersect the ray of each pixel with the plane.
+    columns, lines = np.meshgrid(np.arange(float(camera.width)), np.arange(float(camera.height)))
+    pixels = np.column_stack([columns.ravel(), lines.ravel()])
+    on_unit_plane = cv2.undistortPoints(pixels[:, None], camera.matrix, np.array([k1, 0.0, 0.0, 0.0]))
+    directions = np.insert(on_unit_plane[:, 0], 2, 1.0, axis=1) @ T_scene_camera[:3, :3].T
+    normal = np.array([np.sin(np.radians(tilt_deg)), 0.0, np.cos(np.radians(tilt_deg))])
+    position = T_scene_camera[:3, 3]
+    distances = (PLANE_M * normal[2] - normal @ position) / (directions @ normal)
+    # 2. Look up the colour of each point in the image of the scene.
+    points = position + distances[:, None] * directions
+    places = camera.project(points).astype(np.float32).reshape(camera.height, camera.width, 2)
+    clean = cv2.remap(scene.rgb, places, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
+    # 3. Change the light, and add noise.
+    lit = (1.0 + GAIN * rng.standard_normal()) * clean + OFFSET * rng.standard_normal()
+    noisy = lit + NOISE * rng.standard_normal(clean.shape, dtype=np.float32)
+    return Frame(
+        timestamp_s=number / RATE_HZ,
+        rgb=np.clip(np.rint(noisy), 0, 255).astype(np.uint8),
+        depth_m=np.zeros(clean.shape[:2], dtype=np.float32),
+        camera=camera,
+    )
+
+
+def patch_of(other: Scene, scene: Scene, share: float) -> Image:
+    """Return a corner of another scene's image, with a *share* of the pixels of *scene*."""
+    size = np.rint(np.sqrt(share) * np.array([scene.camera.width, scene.camera.height])).astype(int)
+    corner = other.rgb[: size[1], : size[0]]
+    patch: Image = load_opencv().resize(corner, tuple(size.tolist()))
+    return patch
+
+
+def resting_frames(scene: Scene, count: int, seed: int, patch: Image | None = None) -> Iterator[Frame]:
+    """Yield the frames of a shaken camera at rest, before which a patch may move to and fro."""
+    rng = np.random.default_rng([seed, 1])
+    height, width = (0, 0) if patch is None else patch.shape[:2]
+    room = np.array([scene.camera.width - width, scene.camera.height - height])
+    begin, step = rng.uniform(0.0, 2.0 * room), rng.uniform(*PATCH_SPEED_PX, size=2)
+    for number in range(count):
+        rgb = scene.rgb.copy()
+        if patch is not None:
+            x, y = np.rint(np.abs((begin + number * step) % (2.0 * room) - room)).astype(int)
+            rgb[y : y + height, x : x + width] = patch
+        pose = np.eye(4)
+        pose[:3, :3] = exp_so3(np.radians(SHAKE_DEG) * rng.standard_normal(3))
+        yield photograph(replace(scene, rgb=rgb), pose, number, rng)
+
+
+def rotating_frames(scene: Scene, seed: int, focal_factor: float = 1.0, k1: float = 0.0) -> Iterator[Frame]:
+    """Yield the frames of a camera that rotates about its centre.
+
+    They state *focal_factor* times the true focal lengths, and do not state the distortion *k1*.
+    """
+    rng, camera = np.random.default_rng([seed, 3]), scene.camera
+    stated = Camera(
+        fx=focal_factor * camera.fx, fy=focal_factor * camera.fy, cx=camera.cx, cy=camera.cy,
+        width=camera.width, height=camera.height,
+    )  # fmt: skip
+    poses = swaying(ROTATION_FRAMES, np.array(ROTATION_DEG), ROTATION_PERIOD_S, rng)
+    for number, pose in enumerate(poses):
+        yield replace(photograph(scene, pose, number, rng, k1=k1), camera=stated)
+
+
+# --- The start ---
+
+
+def first_posed_frame(
+    tracker: MonocularTracker, frames: Iterable[Frame]
+) -> tuple[int | None, dict[str, int]]:
+    """Track until the first pose; return the number of its frame, and how often each reason was given."""
+    reasons = Counter[str]()
+    for frame in frames:
+        result = track(tracker, frame)
+        if result.T_world_camera is not None:
+            return tracker.frames, dict(reasons)
+        reasons[re.sub(r"[0-9.]+", "N", result.reason)] += 1
+    return None, dict(reasons)
+
+
+def false_starts(part: str, sequences: dict[str, Iterator[Frame]]) -> dict[str, Any]:
+    """Track cameras that do not move from their place; return how many got a pose."""
+    rows: dict[str, Any] = {}
+    for name, frames in sequences.items():
+        first, reasons = first_posed_frame(MonocularTracker(), frames)
+        rows[name] = {"first_posed_frame": first, "reasons": reasons}
+        say(f"{part}, {name}: {rows[name]}")
+    starts = sum(row["first_posed_frame"] is not None for row in rows.values())
+    return {"n": len(rows), "false_starts": starts, "rows": rows}
+
+
+def row_of_plane(scene: Scene, tilt_deg: float, axis: int, seed: int) -> dict[str, Any]:
+    """Move a camera along an axis past a plane; return the error of the relative pose of the start."""
+    rng = np.random.default_rng([seed, 7])
+    poses = swaying(PLANE_FRAMES, np.full(3, SWAY_DEG), SWAY_PERIOD_S, rng)
+    poses[:, axis, 3] = PLANE_PATH_M * np.linspace(-0.5, 0.5, PLANE_FRAMES)
+    frames = (photograph(scene, pose, number, rng, tilt_deg=tilt_deg) for number, pose in enumerate(poses))
+    tracker = MonocularTracker()
+    first, reasons = first_posed_frame(tracker, frames)
+    if first is None:
+        return {"first_posed_frame": None, "is_right": False, "reasons": reasons}
+    path = tracker.trajectory()
+    views = np.rint(path.timestamps_s[[0, -1]] * RATE_HZ).astype(int)
+    moved = inverse(path.T_world_camera[0]) @ path.T_world_camera[-1]
+    truly_moved = inverse(poses[views[0]]) @ poses[views[1]]
+    along, truly_along = (T[:3, 3] / np.linalg.norm(T[:3, 3]) for T in (moved, truly_moved))
+    direction_deg = float(np.degrees(np.arccos(np.clip(along @ truly_along, -1.0, 1.0))))
+    rotation_deg = rotation_angle_deg(moved[:3, :3].T @ truly_moved[:3, :3])
+    return {
+        "first_posed_frame": first,
+        "direction_error_deg": direction_deg,
+        "rotation_error_deg": rotation_deg,
+        "is_right": direction_deg <= RIGHT_DIRECTION_DEG and rotation_deg <= RIGHT_ROTATION_DEG,
+    }
