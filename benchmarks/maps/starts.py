@@ -285,20 +285,28 @@ def photograph(
         k1: Radial distortion of the camera.
     """
     cv2, camera = load_opencv(), scene.camera
-    # 1. Intersect the ray of each pixel with the plane.
-    columns, lines = np.meshgrid(np.arange(float(camera.width)), np.arange(float(camera.height)))
-    pixels = np.column_stack([columns.ravel(), lines.ravel()])
-    on_unit_plane = cv2.undistortPoints(pixels[:, None], camera.matrix, np.array([k1, 0.0, 0.0, 0.0]))
-    directions = np.insert(on_unit_plane[:, 0], 2, 1.0, axis=1) @ T_scene_camera[:3, :3].T
+    # 1. Look up each pixel at the place where its ray meets the plane: a homography.
     normal = np.array([np.sin(np.radians(tilt_deg)), 0.0, np.cos(np.radians(tilt_deg))])
-    position = T_scene_camera[:3, 3]
-    distances = (PLANE_M * normal[2] - normal @ position) / (directions @ normal)
-    # 2. Look up the colour of each point in the image of the scene.
-    points = position + distances[:, None] * directions
-    places = camera.project(points).astype(np.float32).reshape(camera.height, camera.width, 2)
-    clean = cv2.remap(scene.rgb, places, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
+    rotation, position = T_scene_camera[:3, :3], T_scene_camera[:3, 3]
+    distance_m = PLANE_M * normal[2] - normal @ position
+    to_plane = (np.outer(position, normal) + distance_m * np.eye(3)) @ rotation
+    clean = cv2.warpPerspective(
+        scene.rgb,
+        camera.matrix @ to_plane @ np.linalg.inv(camera.matrix),
+        (camera.width, camera.height),
+        flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+        borderMode=cv2.BORDER_REFLECT_101,
+    )
+    # 2. Distort the image.
+    if k1:
+        columns, lines = np.meshgrid(np.arange(float(camera.width)), np.arange(float(camera.height)))
+        pixels = np.stack([columns, lines], axis=-1).reshape(-1, 1, 2)
+        coefficients = np.array([k1, 0.0, 0.0, 0.0])
+        undistorted = cv2.undistortPoints(pixels, camera.matrix, coefficients, P=camera.matrix)
+        places = undistorted.reshape(*columns.shape, 2).astype(np.float32)
+        clean = cv2.remap(clean, places, None, cv2.INTER_LINEAR)
     # 3. Change the light, and add noise.
-    lit = (1.0 + GAIN * rng.standard_normal()) * clean + OFFSET * rng.standard_normal()
+    lit = (1.0 + GAIN * rng.standard_normal()) * clean.astype(np.float32) + OFFSET * rng.standard_normal()
     noisy = lit + NOISE * rng.standard_normal(clean.shape, dtype=np.float32)
     return Frame(
         timestamp_s=number / RATE_HZ,
